@@ -1,0 +1,1 @@
+"""The wire: messages, codec, transport and recordings. Importing it needs no torch."""

@@ -1,0 +1,1 @@
+"""The processes: each takes topics and gives topics; and the command line."""
