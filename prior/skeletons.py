@@ -103,7 +103,7 @@ class Skeleton:
     @cached_property
     def observable(self) -> NDArray[np.bool_]:
         """(22,) which canonical joints this sensor can see at all."""
-        return self.to_canonical.any(axis=1)
+        return self.to_canonical.sum(axis=1) > 0
 
 
 def _mean(*names: str) -> dict[str, float]:
@@ -129,7 +129,7 @@ def _replace_side(name: str, swap: tuple[str, str]) -> str:
 
 _ARMS_AND_LEGS = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 
-SMPL22 = Skeleton("smpl22", JOINTS, {j: j for j in JOINTS})
+CANONICAL = Skeleton("smpl22", JOINTS, {j: j for j in JOINTS})
 
 COCO17 = Skeleton(
     "coco17",
@@ -267,7 +267,7 @@ OPENPOSE25 = Skeleton(
 
 SKELETONS: Mapping[str, Skeleton] = {
     s.name: s
-    for s in (SMPL22, COCO17, BLAZEPOSE33, H36M17, KINECT22, AZURE_KINECT32, ZED38, OPENPOSE25)
+    for s in (CANONICAL, COCO17, BLAZEPOSE33, H36M17, KINECT22, AZURE_KINECT32, ZED38, OPENPOSE25)
 }  # fmt: skip
 """Every skeleton that ``pose/raw`` may name."""
 
@@ -282,6 +282,11 @@ def get_skeleton(name: str) -> Skeleton:
         return SKELETONS[name]
     except KeyError:
         raise KeyError(f"unknown skeleton '{name}': expected one of {', '.join(SKELETONS)}") from None
+
+
+def finite_joints(positions: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """(..., J) which joints of (..., J, 3) have three finite coordinates: those that were observed."""
+    return np.asarray(np.isfinite(positions).all(axis=-1))
 
 
 def to_canonical(
@@ -301,11 +306,11 @@ def to_canonical(
     weights = skeleton.to_canonical
     if confidence is None:
         confidence = np.ones(positions.shape[:-1])
-    missing = ~np.isfinite(positions).all(axis=-1)
+    missing = ~finite_joints(positions)
     filled = np.where(missing[..., None], 0.0, positions)
     mapped = weights @ filled
     needs = weights > 0
-    unobserved = (missing.astype(np.float64) @ needs.T.astype(np.float64) > 0) | ~skeleton.observable
+    unobserved = (missing @ needs.T.astype(np.float64) > 0) | ~skeleton.observable
     mapped[unobserved] = np.nan
     contributors = np.where(needs, confidence[..., None, :], np.inf).min(axis=-1)
     return mapped, np.where(unobserved, 0.0, contributors)
