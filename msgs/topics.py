@@ -1,0 +1,23 @@
+"""The topics, and what travels on each."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from msgs.types import Diagnostics, Message, PoseClean, PoseRaw, PoseWorld
+
+POSE_RAW = "pose/raw"
+POSE_CLEAN = "pose/clean"
+POSE_WORLD = "pose/world"
+POSE_TRUTH = "pose/truth"
+"""the ground truth of a simulated stream"""
+DIAGNOSTICS = "diagnostics"
+
+TOPICS: Mapping[str, type[Message]] = MappingProxyType(
+    {
+        POSE_RAW: PoseRaw,
+        POSE_CLEAN: PoseClean,
+        POSE_WORLD: PoseWorld,
+        POSE_TRUTH: PoseWorld,
+        DIAGNOSTICS: Diagnostics,
+    }
+)
