@@ -321,7 +321,7 @@ def estimate_offsets(positions: NDArray[np.floating]) -> Floats:
     """
     p = np.asarray(positions, dtype=np.float64)
     offsets = REST_OFFSETS.copy()
-    for joint, ancestor in _seen_bones(finite_joints(p).any(axis=0)):
+    for joint, ancestor in _seen_bones(np.asarray(finite_joints(p).any(axis=0))):
         path = _path(ancestor, joint)
         lengths = np.linalg.norm(p[:, joint] - p[:, ancestor], axis=-1)
         if np.isfinite(lengths).any():
