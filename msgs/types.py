@@ -186,9 +186,11 @@ class RawBody(_Record):
 
     def __post_init__(self) -> None:
         self._integer("id", -_INT32, _INT32)
-        joints = np.shape(self.positions)[0] if np.ndim(self.positions) else 0
-        self._array("positions", np.float32, joints, 3)
-        self._array("confidence", np.float32, joints)
+        shape = np.shape(self.positions)
+        if len(shape) != 2:
+            raise self._fail("positions", "shape (J, 3)", f"shape {shape}")
+        self._array("positions", np.float32, shape[0], 3)
+        self._array("confidence", np.float32, shape[0])
 
 
 @dataclass(slots=True, eq=False)
