@@ -1,0 +1,211 @@
+"""Streaming textbook smoothers: what a user has for free, and what the prior's fuse stage is built on.
+
+Both take one frame at a time, work on any number of joints at once (arrays of shape (..., 3)), use the real
+time between frames, and read a joint with a non-finite coordinate as missing. Nothing here looks at a clock.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+class Smoothed(NamedTuple):
+    """The estimate of one frame."""
+
+    stamp_s: float
+    positions: Array  # (..., 3) metres; NaN for a joint that had not been seen by then
+    sigma: Array  # (...) metres, standard deviation of each coordinate; inf where positions are NaN
+
+
+class OneEuroFilter:
+    """Low-pass filter whose cut-off rises with speed (Casiez, Roussel and Vogel, CHI 2012).
+
+    The speed is the norm of the joint's filtered velocity, so the result does not depend on how the axes lie.
+    A missing joint holds its last estimate; the next measurement of it is weighed by the time since its last.
+    """
+
+    def __init__(self, min_cutoff_hz: float, beta: float, velocity_cutoff_hz: float = 1.0) -> None:
+        """`beta` is in Hz per m/s: the cut-off is `min_cutoff_hz + beta * speed`."""
+        if min_cutoff_hz <= 0 or velocity_cutoff_hz <= 0 or beta < 0:
+            raise ValueError(
+                "One-Euro filter: expected cut-offs above 0 Hz and beta of at least 0, "
+                f"got {min_cutoff_hz=}, {beta=}, {velocity_cutoff_hz=}"
+            )
+        self._min_cutoff = min_cutoff_hz
+        self._beta = beta
+        self._velocity_cutoff = velocity_cutoff_hz
+        self.reset()
+
+    def reset(self) -> None:
+        self._stamp: float | None = None
+        self._seen_at = np.empty(0)
+        self._previous = self._estimate = self._velocity = np.empty(0)
+
+    def update(self, positions: ArrayLike, stamp_s: float) -> Array:
+        """Take a frame (..., 3) in metres and give its estimate (..., 3); NaN until a joint is first seen."""
+        measured = np.asarray(positions, dtype=np.float64)
+        seen = _seen(measured)
+        if self._stamp is None:
+            self._seen_at = np.where(seen, stamp_s, np.nan)
+            self._previous = np.where(seen[..., None], measured, np.nan)
+            self._estimate = self._previous.copy()
+            self._velocity = np.zeros_like(measured)
+        else:
+            _check_frame(measured, stamp_s, self._estimate.shape, self._stamp)
+            known = np.isfinite(self._seen_at)
+            step = np.where(known, stamp_s - self._seen_at, 1.0)[..., None]
+            velocity = (measured - self._previous) / step
+            velocity = self._velocity + _weight(self._velocity_cutoff, step) * (velocity - self._velocity)
+            speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
+            weight = _weight(self._min_cutoff + self._beta * speed, step)
+            estimate = self._estimate + weight * (measured - self._estimate)
+
+            moved, first = (seen & known)[..., None], (seen & ~known)[..., None]
+            self._velocity = np.where(moved, velocity, self._velocity)
+            self._estimate = np.where(moved, estimate, np.where(first, measured, self._estimate))
+            self._previous = np.where(seen[..., None], measured, self._previous)
+            self._seen_at = np.where(seen, stamp_s, self._seen_at)
+        self._stamp = stamp_s
+        return self._estimate.copy()
+
+
+class FixedLagRTS:
+    """Constant-velocity Kalman filter with a Rauch-Tung-Striebel smoother over the last `delay` frames.
+
+    Process: white-noise acceleration (Bar-Shalom, Li and Kirubarajan 2001, equation 6.2.2-12); measurement:
+    position with an isotropic error. The three coordinates of a joint then share one 2x2 covariance, and the
+    smoother is computed in its augmented-state form (Anderson and Moore 1979, section 7.3): the positions of
+    the last frames are updated along with the newest one, by way of their covariance with it. That is the RTS
+    result to rounding, without a backward pass: the cost of an update hardly grows with the delay.
+
+    A joint starts at its first measurement, with a velocity of 0 +- `initial_speed` m/s. A missing joint
+    coasts, with a standard deviation that says so.
+    """
+
+    def __init__(
+        self,
+        delay: int,
+        acceleration_density: ArrayLike,
+        measurement_sigma: float = 0.02,
+        initial_speed: float = 1.0,
+    ) -> None:
+        """`delay`: frames of look-ahead. `acceleration_density`: power spectral density of the acceleration in
+        m^2/s^3, one for all joints or one each. `measurement_sigma`: metres, where `update` is not told."""
+        if delay < 0:
+            raise ValueError(f"fixed-lag smoother: expected a delay of 0 frames or more, got {delay}")
+        self.delay = delay
+        self._density = np.asarray(acceleration_density, dtype=np.float64)
+        if (self._density <= 0).any() or measurement_sigma <= 0 or initial_speed <= 0:
+            raise ValueError(
+                "fixed-lag smoother: expected an acceleration density, measurement sigma and initial speed "
+                f"above 0, got {acceleration_density}, {measurement_sigma}, {initial_speed}"
+            )
+        self._sigma = measurement_sigma
+        self._initial_velocity_variance = initial_speed**2
+        self.reset()
+
+    def reset(self) -> None:
+        self._count = 0
+
+    def _allocate(self, shape: tuple[int, ...]) -> None:
+        slots, joints = self.delay + 1, shape[:-1]
+        self._stamps = np.zeros(slots)
+        # Of each frame in the ring: its position given all measurements so far, the variance of that, and its
+        # covariance with the newest position and velocity. The newest frame's own slot is the filter's state.
+        self._position = np.full((slots, *shape), np.nan)
+        self._variance = np.zeros((slots, *joints))
+        self._with_position = np.zeros((slots, *joints))
+        self._with_velocity = np.zeros((slots, *joints))
+        self._velocity = np.zeros(shape)
+        self._velocity_variance = np.zeros(joints)
+        self._known = np.zeros(joints, dtype=bool)
+
+    def update(self, positions: ArrayLike, stamp_s: float, sigma: ArrayLike | None = None) -> Smoothed | None:
+        """Take a frame; give the estimate of the frame `delay` before it, or None while there is none.
+
+        positions: (..., 3) metres, non-finite where missing. stamp_s: seconds of capture, increasing.
+        sigma: standard deviation of a coordinate in metres, one number or (...); inf counts as missing.
+        """
+        measured = np.asarray(positions, dtype=np.float64)
+        noise = np.asarray(self._sigma if sigma is None else sigma, dtype=np.float64) ** 2
+        slot, last = self._count % (self.delay + 1), (self._count - 1) % (self.delay + 1)
+        if self._count == 0:
+            self._allocate(measured.shape)
+        else:
+            _check_frame(measured, stamp_s, self._velocity.shape, self._stamps[last])
+            self._predict(slot, last, stamp_s - self._stamps[last])
+        self._stamps[slot] = stamp_s
+        self._correct(slot, measured, np.broadcast_to(noise, measured.shape[:-1]))
+        self._count += 1
+        return self._at(self._count - 1 - self.delay) if self._count > self.delay else None
+
+    def flush(self) -> list[Smoothed]:
+        """Give the estimates still held, oldest first, and start afresh."""
+        held = [self._at(frame) for frame in range(max(0, self._count - self.delay), self._count)]
+        self.reset()
+        return held
+
+    def _predict(self, slot: int, last: int, step: float) -> None:
+        growth = self._density * step
+        position_variance, covariance = self._with_position[last], self._with_velocity[last]
+        position_variance = position_variance + step * (2 * covariance + step * (self._velocity_variance + growth / 3))
+        covariance = covariance + step * (self._velocity_variance + growth / 2)
+        # The positions of past frames do not move, but their covariance with the newest state does.
+        self._with_position += step * self._with_velocity
+        self._position[slot] = self._position[last] + step * self._velocity
+        self._variance[slot] = self._with_position[slot] = position_variance
+        self._with_velocity[slot] = covariance
+        self._velocity_variance = self._velocity_variance + growth
+
+    def _correct(self, slot: int, measured: Array, noise: Array) -> None:
+        seen = _seen(measured) & np.isfinite(noise)
+        old = seen & self._known
+        position_variance, covariance = self._with_position[slot].copy(), self._with_velocity[slot].copy()
+        precision = np.zeros(noise.shape)
+        np.divide(1.0, position_variance + noise, out=precision, where=old)
+        innovation = np.where(old[..., None], measured - self._position[slot], 0.0)
+        gain = self._with_position * precision
+        velocity_gain = covariance * precision
+
+        self._position += gain[..., None] * innovation
+        self._variance -= gain * self._with_position
+        self._with_position -= gain * position_variance
+        self._with_velocity -= gain * covariance
+        self._velocity += velocity_gain[..., None] * innovation
+        self._velocity_variance = self._velocity_variance - velocity_gain * covariance
+
+        first = seen & ~self._known
+        if first.any():
+            self._position[slot][first] = measured[first]
+            self._with_position[:, first] = self._with_velocity[:, first] = 0.0
+            self._variance[slot][first] = self._with_position[slot][first] = noise[first]
+            self._velocity[first] = 0.0
+            self._velocity_variance[first] = self._initial_velocity_variance
+            self._known |= seen
+
+    def _at(self, frame: int) -> Smoothed:
+        slot = frame % (self.delay + 1)
+        positions = self._position[slot].copy()
+        # Rounding may leave the variance of a long-settled frame a hair under zero.
+        sigma = np.sqrt(np.maximum(self._variance[slot], 0.0))
+        sigma[np.isnan(positions[..., 0])] = np.inf
+        return Smoothed(float(self._stamps[slot]), positions, sigma)
+
+
+def _seen(measured: Array) -> NDArray[np.bool_]:
+    return np.all(np.isfinite(measured), axis=-1)
+
+
+def _weight(cutoff_hz: ArrayLike, step_s: Array) -> Array:
+    """Weight of the new sample in an exponential filter (One-Euro paper, equation 5)."""
+    return 1.0 / (1.0 + 1.0 / (2 * np.pi * np.asarray(cutoff_hz) * step_s))
+
+
+def _check_frame(measured: Array, stamp_s: float, shape: tuple[int, ...], last_stamp_s: float) -> None:
+    if measured.shape != shape:
+        raise ValueError(f"filter: expected positions of shape {shape} as before, got {measured.shape}")
+    if not stamp_s > last_stamp_s:
+        raise ValueError(f"filter: expected a stamp after {last_stamp_s} s, got {stamp_s} s")
