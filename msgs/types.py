@@ -101,8 +101,8 @@ class _Record:
 
     def _states(self, name: str) -> None:
         states = np.asarray(getattr(self, name))
-        if states.size and not (states.min() >= 0 and states.max() <= max(JointState)):
-            raise self._fail(name, f"JointState values, 0 to {max(JointState):d}", states.tolist())
+        if states.size and not (states.min() >= 0 and states.max() <= JointState.IMPUTED):
+            raise self._fail(name, f"JointState values, 0 to {JointState.IMPUTED:d}", states.tolist())
         self._array(name, np.uint8, _J)
 
     def _integer(self, name: str, low: int, end: int) -> None:
@@ -321,7 +321,7 @@ class WorldBody(_Record):
         self._states("state")
         self._array("sigma", np.float32, _J)
         self._array("contacts", np.float32, _C)
-        self._integer("tracking", min(Tracking), max(Tracking) + 1)
+        self._integer("tracking", Tracking.OK, Tracking.LOST + 1)
         self.tracking = Tracking(self.tracking)
 
 
@@ -364,7 +364,7 @@ class Diagnostics(_Record):
     def __post_init__(self) -> None:
         self._stamp()
         self._texts("node", "message")
-        self._integer("level", min(Level), max(Level) + 1)
+        self._integer("level", Level.OK, Level.STALE + 1)
         self.level = Level(self.level)
         if not all(isinstance(text, str) for pair in self.values.items() for text in pair):
             raise self._fail("values", "strings for keys and values", repr(self.values)[:80])
