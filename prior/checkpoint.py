@@ -23,7 +23,7 @@ def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: 
 
     Args:
         path: ends in ``.safetensors``; the card is written beside it as ``.md``.
-        model: its state dict is saved, in half the size nowhere: float32 as trained.
+        model: its state dict is saved.
         config: what rebuilds the model, as JSON in the file's metadata.
         card: heading to content: data, licence, seed, training command, results.
     """

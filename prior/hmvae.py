@@ -1,0 +1,172 @@
+"""HM-VAE: a hierarchical motion VAE over windows of local rotations (Li et al., "Task-Generic Hierarchical Human
+Motion Prior using VAEs", 3DV 2021), sections 3.1 and 3.2.
+
+Four building blocks (skeleton convolution, pooling, LeakyReLU) encode a window; the features after the first give
+the local latent z_l, those after the last the global latent z_g, one of each for every edge at that level. The
+decoder mirrors the encoder and takes z_l in before its last block. Layer plan, kernels and strides follow the
+official code for windows of 8 (and 64) frames; the pooling comes from our 22-joint graph.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from prior.skeleton_conv import EdgeLinear, SkeletonConv, SkeletonPool, SkeletonUnpool, pooling_levels
+from prior.skeletons import PARENTS
+
+ROTATION_FEATURES = 6
+"""A joint's features: the first two columns of its local rotation."""
+
+
+@dataclass(frozen=True)
+class HMVAEConfig:
+    """The sizes of an HM-VAE.
+
+    Attributes:
+        window: frames T.
+        kernel: time steps a convolution sees (official: 3 for T = 8, 15 for T = 64).
+        strides: of the four encoder blocks (official: 1, 2, 2, 1 for T = 8; 2, 2, 2, 2 for T = 64).
+        local_latent: dimensions of z_l an edge (official: 6; 12).
+        global_latent: dimensions of z_g an edge (official: 6; 24).
+    """
+
+    window: int = 8
+    kernel: int = 3
+    strides: tuple[int, int, int, int] = (1, 2, 2, 1)
+    local_latent: int = 6
+    global_latent: int = 6
+
+    @classmethod
+    def from_dict(cls, config: dict[str, Any]) -> HMVAEConfig:
+        """From the JSON of a weights file."""
+        return cls(**{**config, "strides": tuple(config["strides"])})
+
+
+class Posterior(NamedTuple):
+    """q(z_l, z_g | x), equation 4: means and log-variances, each (B, edges at its level, latent)."""
+
+    local_mean: Tensor
+    local_log_var: Tensor
+    global_mean: Tensor
+    global_log_var: Tensor
+
+    def sample(self) -> tuple[Tensor, Tensor]:
+        """z_l and z_g by the reparametrisation trick."""
+        local = self.local_mean + torch.randn_like(self.local_mean) * (0.5 * self.local_log_var).exp()
+        deep = self.global_mean + torch.randn_like(self.global_mean) * (0.5 * self.global_log_var).exp()
+        return local, deep
+
+    def kl(self) -> tuple[Tensor, Tensor]:
+        """KL to N(0, I) of z_l and of z_g, summed over latent dimensions, mean over batch and edges.
+
+        The reduction belongs to the weight 0.003 of the official code: change both or neither.
+        """
+        return _kl(self.local_mean, self.local_log_var), _kl(self.global_mean, self.global_log_var)
+
+
+def _kl(mean: Tensor, log_var: Tensor) -> Tensor:
+    return (0.5 * (mean.square() + log_var.exp() - 1.0 - log_var).sum(dim=-1)).mean()
+
+
+class HMVAE(nn.Module):
+    """Encoder and decoder of windows (B, T, 22, 6) of local 6D rotations (the root's is its orientation)."""
+
+    CHANNELS = (ROTATION_FEATURES, 12, 24, 48, 96)
+
+    def __init__(self, config: HMVAEConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.levels = pooling_levels(PARENTS)
+        steps = [config.window]
+        for stride in config.strides:
+            if steps[-1] % stride:
+                raise ValueError(f"a window of {config.window} frames cannot be strided by {config.strides}")
+            steps.append(steps[-1] // stride)
+        self._steps = steps
+        c = self.CHANNELS
+        self.encoder = nn.ModuleList(
+            nn.ModuleList(
+                [
+                    SkeletonConv(c[k], c[k + 1], level.neighbours, config.kernel, config.strides[k]),
+                    SkeletonPool(level.groups),
+                ]
+            )
+            for k, level in enumerate(self.levels)
+        )
+        self.to_local = EdgeLinear(c[1], steps[1], 2 * config.local_latent)
+        self.to_global = EdgeLinear(c[4], steps[4], 2 * config.global_latent)
+        self.from_local = nn.Linear(config.local_latent, c[1] * steps[1])
+        self.from_global = nn.Linear(config.global_latent, c[4] * steps[4])
+        self.decoder = nn.ModuleList(
+            nn.ModuleList(
+                [
+                    SkeletonUnpool(level.groups),
+                    SkeletonConv(
+                        c[k + 1] * (2 if k == 0 else 1), c[k], level.neighbours, config.kernel, bias=k in (0, 3)
+                    ),
+                ]
+            )
+            for k, level in reversed(list(enumerate(self.levels)))
+        )
+
+    def encode(self, x: Tensor) -> Posterior:
+        """The posterior of windows x (B, T, 22, 6), equations 2 and 4."""
+        features = x.flatten(2).transpose(1, 2)
+        local = features
+        for k, block in enumerate(self.encoder):
+            conv, pool = block  # type: ignore[misc]  (a ModuleList of two)
+            features = F.leaky_relu(pool(conv(features)), 0.2)
+            if k == 0:
+                local = features
+        return Posterior(*self.to_local(local).chunk(2, dim=-1), *self.to_global(features).chunk(2, dim=-1))
+
+    def decode(self, local: Tensor, deep: Tensor) -> Tensor:
+        """Windows (B, T, 22, 6) of z_l (B, E1, d) and z_g (B, E4, d)."""
+        features = self.from_global(deep).reshape(deep.shape[0], -1, self._steps[4])
+        local_features = self.from_local(local).reshape(local.shape[0], -1, self._steps[1])
+        for k, block in zip(reversed(range(4)), self.decoder, strict=True):
+            unpool, conv = block  # type: ignore[misc]
+            if k == 0:
+                features = _join_edges(features, local_features, self.CHANNELS[1])
+            if self.config.strides[k] > 1:
+                features = F.interpolate(features, scale_factor=self.config.strides[k], mode="linear")
+            features = conv(unpool(features))
+            if k > 0:
+                features = F.leaky_relu(features, 0.2)
+        return features.transpose(1, 2).reshape(len(features), self.config.window, -1, ROTATION_FEATURES)
+
+    def reconstruct(self, x: Tensor) -> Tensor:
+        """Decode the posterior's mean: what refinement does with each window (equations 10 and 11)."""
+        posterior = self.encode(x)
+        return self.decode(posterior.local_mean, posterior.global_mean)
+
+
+def _join_edges(a: Tensor, b: Tensor, channels: int) -> Tensor:
+    """Concatenate the channels of each edge of two (B, E * channels, T) features."""
+    batch, features, time = a.shape
+    joined = torch.cat(
+        [
+            a.reshape(batch, features // channels, channels, time),
+            b.reshape(batch, features // channels, channels, time),
+        ],
+        dim=2,
+    )
+    return joined.reshape(batch, 2 * features, time)
+
+
+def to_6d(rotations: Tensor) -> Tensor:
+    """(..., 3, 3) rotation matrices to (..., 6): first column, then second."""
+    return rotations[..., :2].transpose(-1, -2).flatten(-2)
+
+
+def from_6d(x: Tensor) -> Tensor:
+    """(..., 6) to rotation matrices (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019)."""
+    a, b = x[..., :3], x[..., 3:]
+    first = F.normalize(a, dim=-1)
+    second = F.normalize(b - (first * b).sum(dim=-1, keepdim=True) * first, dim=-1)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)

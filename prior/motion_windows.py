@@ -1,0 +1,124 @@
+"""Windows of prepared motion for training: sampled, mirrored, resampled, heading-normalised."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from prior.skeletons import MIRROR
+
+FPS = 30.0
+"""Frames a second of prepared motion and of every model."""
+
+
+@dataclass(frozen=True)
+class MotionSet:
+    """Prepared clips of one split, concatenated.
+
+    Attributes:
+        rotations: (N, 22, 3, 3) local, float32.
+        positions: (N, 22, 3) metres, world, z up, floor at 0.
+        offsets: (N, 22, 3) metres, the bones of the person in each frame.
+        contacts: (N, 8) labels.
+        clip_start: (C + 1,) first frame of each clip, and the end.
+    """
+
+    rotations: Tensor
+    positions: Tensor
+    offsets: Tensor
+    contacts: Tensor
+    clip_start: NDArray[np.int64]
+
+    @classmethod
+    def load(cls, path: Path, weights: str, split: str) -> MotionSet:
+        """Read ``steadypose prepare``'s output.
+
+        Args:
+            path: ``prepared.npz``.
+            weights: ``default`` takes the clips free for products; ``research`` takes the others too.
+            split: ``train`` or ``val``.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: no clip of this split in it.
+        """
+        if not path.is_file():
+            raise FileNotFoundError(f"no prepared motion at {path}: make it with 'steadypose prepare MOCAP --out DIR'")
+        data = np.load(path)
+        starts = data["clip_start"]
+        wanted = (data["split"] == split) & ((data["set"] == "default") | (weights == "research"))
+        if not wanted.any():
+            raise ValueError(f"{path} has no clip of split '{split}' for the '{weights}' weights")
+        frames = np.concatenate([np.arange(starts[c], starts[c + 1]) for c in np.flatnonzero(wanted)])
+        lengths = np.diff(starts)[wanted]
+        return cls(
+            rotations=roma.unitquat_to_rotmat(torch.from_numpy(data["rotations"][frames])),
+            positions=torch.from_numpy(data["positions"][frames]),
+            offsets=torch.from_numpy(np.repeat(data["offsets"][wanted], lengths, axis=0)),
+            contacts=torch.from_numpy(data["contacts"][frames]),
+            clip_start=np.concatenate([[0], np.cumsum(lengths)]),
+        )
+
+    def sample(
+        self, count: int, window: int, strides: Sequence[int], generator: np.random.Generator
+    ) -> NDArray[np.int64]:
+        """(count, window) frame numbers: random windows inside clips, each at a random stride (a frame rate)."""
+        stride = generator.choice(np.asarray(strides), size=count)
+        lengths = np.diff(self.clip_start)
+        starts = np.empty(count, dtype=np.int64)
+        for k in np.unique(stride):
+            rows = np.flatnonzero(stride == k)
+            room = np.maximum(lengths - (window - 1) * k, 0)
+            clip = generator.choice(len(room), size=len(rows), p=room / room.sum())
+            starts[rows] = self.clip_start[clip] + (generator.random(len(rows)) * room[clip]).astype(np.int64)
+        return starts[:, None] + stride[:, None] * np.arange(window)
+
+    def all_windows(self, window: int, step: int) -> NDArray[np.int64]:
+        """(count, window) frame numbers of every ``step``-th window of every clip."""
+        starts = [
+            np.arange(a, b - window + 1, step) for a, b in zip(self.clip_start, self.clip_start[1:], strict=False)
+        ]
+        return np.concatenate(starts)[:, None] + np.arange(window)
+
+
+def mirror_rotations(rotations: Tensor) -> Tensor:
+    """Exchange left and right in local rotations (..., 22, 3, 3), as a mirror across the body's xz plane does."""
+    flip = rotations.new_tensor([1.0, -1.0, 1.0])
+    return rotations[..., MIRROR.tolist(), :, :] * flip[:, None] * flip
+
+
+def mirror_offsets(offsets: Tensor) -> Tensor:
+    """Exchange left and right in bones or root-centred positions (..., 22, 3), across the xz plane."""
+    return offsets[..., MIRROR.tolist(), :] * offsets.new_tensor([1.0, -1.0, 1.0])
+
+
+def remove_heading(rotations: Tensor, frame: int) -> tuple[Tensor, Tensor]:
+    """Turn windows about the vertical so that the body faces +x in ``frame``.
+
+    Args:
+        rotations: (B, T, 22, 3, 3) local, z up.
+        frame: which frame of the window defines the heading.
+
+    Returns:
+        The turned rotations, and the yaw matrices (B, 3, 3) that turn them back.
+    """
+    left = rotations[:, frame, 0, :, 1]
+    yaw = torch.atan2(-left[:, 0], left[:, 1])
+    back = yaw_rotation(yaw)
+    turned = rotations.clone()
+    turned[:, :, 0] = back.transpose(-1, -2)[:, None] @ rotations[:, :, 0]
+    return turned, back
+
+
+def yaw_rotation(yaw: Tensor) -> Tensor:
+    """Rotations (..., 3, 3) about z by ``yaw`` (...) radians."""
+    axis = torch.zeros(*yaw.shape, 3, dtype=yaw.dtype)
+    axis[..., 2] = yaw
+    return roma.rotvec_to_rotmat(axis)
