@@ -21,3 +21,11 @@ TOPICS: Mapping[str, type[Message]] = MappingProxyType(
         DIAGNOSTICS: Diagnostics,
     }
 )
+
+
+def check_topic(topic: str, message: Message) -> None:
+    """Raise `ValueError` unless `message` is of the type that travels on `topic`."""
+    if topic not in TOPICS:
+        raise ValueError(f"topic: expected one of {', '.join(TOPICS)}, got {topic!r}")
+    if type(message) is not TOPICS[topic]:
+        raise ValueError(f"{topic}: expected {TOPICS[topic].__name__}, got {type(message).__name__}")

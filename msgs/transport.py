@@ -25,7 +25,7 @@ import zmq
 
 from msgs.codec import DecodeError, decode, encode, typestore
 from msgs.keys import Keys
-from msgs.topics import TOPICS
+from msgs.topics import TOPICS, check_topic
 from msgs.types import Message
 
 if TYPE_CHECKING:
@@ -116,9 +116,7 @@ class Publisher:
         Raises:
             ValueError: if the message is not of the topic's type, or encodes to more than `MAX_FRAME` bytes.
         """
-        if type(message) is not TOPICS.get(topic):
-            expected = TOPICS[topic].__name__ if topic in TOPICS else f"a topic of {', '.join(TOPICS)}"
-            raise ValueError(f"{topic}: expected {expected}, got {type(message).__name__}")
+        check_topic(topic, message)
         frame = topic.encode() + b"\0" + _PREFIX.pack(VERSION, self._id, self._sequence[topic]) + encode(message)
         if len(frame) > MAX_FRAME:
             raise ValueError(f"{topic}: expected a message of at most {MAX_FRAME} bytes, got {len(frame)}")
