@@ -17,7 +17,7 @@ import socket as posix
 import struct
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -42,6 +42,9 @@ LINGER_MS = 1000
 """how long `Publisher.close` waits for what is on its way"""
 
 _PREFIX = struct.Struct("<BII")
+# before a listener's name: sorts after every topic, so that ZeroMQ, which subscribes in this order when it connects
+# again, says who listens after it has said to what
+_BEACON = "~"
 _PUBLISHERS = 256
 _FAILED_HANDSHAKES = (
     zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
@@ -75,6 +78,7 @@ class Publisher:
         typestore()
         self._sequence: Counter[str] = Counter()
         self._subscribers: Counter[str] = Counter()
+        self._listeners: Counter[str] = Counter()
         self._id = int.from_bytes(os.urandom(4), "little")
         self._lossless = lossless
         self._context = zmq.Context()
@@ -136,9 +140,26 @@ class Publisher:
         Returns:
             whether they came; False when `timeout_s` passed before.
         """
+        return self._wait(lambda: self._subscribers[topic] >= count, timeout_s)
+
+    @property
+    def listeners(self) -> frozenset[str]:
+        """The subscribers that gave a name, and get every message of their topics published from now on."""
+        self._note_subscriptions()
+        return frozenset(+self._listeners)
+
+    def wait_for_listeners(self, names: frozenset[str], *, timeout_s: float) -> bool:
+        """Wait until the subscribers of these names are among `listeners`.
+
+        Returns:
+            whether they came; False when `timeout_s` passed before.
+        """
+        return self._wait(lambda: names <= self.listeners, timeout_s)
+
+    def _wait(self, came: Callable[[], bool], timeout_s: float) -> bool:
         deadline = time.monotonic() + timeout_s
         self._note_subscriptions()
-        while self._subscribers[topic] < count:
+        while not came():
             left = deadline - time.monotonic()
             if left <= 0:
                 return False
@@ -156,6 +177,8 @@ class Publisher:
             topic = frame[1:-1].decode(errors="replace")
             if change and topic in TOPICS:
                 self._subscribers[topic] += change
+            elif change and topic.startswith(_BEACON):
+                self._listeners[topic.removeprefix(_BEACON)] += change
 
     def close(self) -> None:
         """Stop, once what was published is on its way, or after `LINGER_MS`."""
@@ -186,6 +209,7 @@ class Subscriber:
         conflate: bool = False,
         high_water: int = HIGH_WATER,
         keys: Keys | None = None,
+        name: str = "",
     ) -> None:
         """Connect to `endpoints`, now or as soon as a publisher is there, and subscribe to `topics`.
 
@@ -194,6 +218,7 @@ class Subscriber:
                 history. For one topic, because ZeroMQ keeps one message a publisher.
             high_water: messages held unread; beyond it the newest are lost.
             keys: for publishers that have them.
+            name: what `Publisher.listeners` calls this subscriber; without one it is not among them.
 
         Raises:
             TransportError: if an address is malformed.
@@ -229,6 +254,8 @@ class Subscriber:
         try:
             for topic in topics:
                 self.socket.setsockopt(zmq.SUBSCRIBE, topic.encode() + b"\0")
+            if name:
+                self.socket.setsockopt(zmq.SUBSCRIBE, _BEACON.encode() + name.encode() + b"\0")
             for endpoint in endpoints:
                 self.socket.setsockopt(zmq.IPV6, "[" in endpoint)
                 self.socket.connect(endpoint)

@@ -1,0 +1,284 @@
+"""Launch files: what to start, from where, and how the nodes reach each other.
+
+A launch file is TOML, one section a subject, and read strictly: a key that does not exist is an error that names
+the nearest one that does. Every section may be left out; the defaults play nothing but run. ``[prior]`` and
+``[trajectory]`` are passed on as they are to the stages they configure (`prior.pipeline.PriorSettings`,
+`prior.trajectory.TrajectorySettings`), which check them just as strictly, so that reading a launch file needs no torch.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tempfile
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+
+T = TypeVar("T")
+
+#: The graph: each node, and for every node it listens to the topics it takes from there.
+LISTENS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
+    "pose_input": {},
+    "prior": {"pose_input": (POSE_RAW, DIAGNOSTICS)},
+    "trajectory": {"prior": (POSE_CLEAN,), "pose_input": (DIAGNOSTICS,)},
+    "recorder": {
+        "pose_input": (POSE_RAW, POSE_TRUTH, DIAGNOSTICS),
+        "prior": (POSE_CLEAN, DIAGNOSTICS),
+        "trajectory": (POSE_WORLD, DIAGNOSTICS),
+    },
+    "viewer": {
+        "pose_input": (POSE_RAW, POSE_TRUTH, DIAGNOSTICS),
+        "prior": (POSE_CLEAN, DIAGNOSTICS),
+        "trajectory": (POSE_WORLD, DIAGNOSTICS),
+    },
+}
+
+#: The publishers that carry poses; what a listener from outside the graph (echo, hz, viewer) connects to.
+POSE_NODES = ("pose_input", "prior", "trajectory")
+
+
+class LaunchError(ValueError):
+    """A launch file, or a setting given on the command line, cannot be used. The text says what to do."""
+
+
+@dataclass(frozen=True)
+class InputSettings:
+    """``[input]``: where skeletons come from."""
+
+    recording: str = ""
+    """rosbag2 directory or .npz to play; a relative path starts at the launch file"""
+    rate: float = 1.0
+    """times real time; 0 is as fast as the listeners take it"""
+    loop: bool = False
+    """start again at the end, with stamps that go on rising"""
+
+
+@dataclass(frozen=True)
+class TransportSettings:
+    """``[transport]``: how messages travel."""
+
+    directory: str = ""
+    """of the ipc sockets; empty: ``steadypose`` in the user's runtime directory"""
+    endpoints: dict[str, str] = field(default_factory=dict)
+    """node to address (``tcp://192.168.1.5:7101``); a node not named here has an ipc socket in ``directory``"""
+    keys: str = ""
+    """directory of CurveZMQ keys, needed where an address is not local"""
+    lossless: bool = True
+    """a recording can wait, a camera cannot: true lets a slow node hold its source up, false drops its oldest frames"""
+    wait_s: float = 30.0
+    """lossless only: how long a node waits for the nodes that must hear it before it goes on without them"""
+    queue: int = 8
+    """not lossless: frames a node keeps when it falls behind"""
+
+    def __post_init__(self) -> None:
+        for node in self.endpoints:
+            if node not in LISTENS:
+                raise LaunchError(
+                    f"[transport.endpoints] names {node!r}, which is no node{_nearest(node, LISTENS)}; "
+                    f"nodes are {', '.join(LISTENS)}"
+                )
+
+    def endpoint(self, node: str) -> str:
+        """The address ``node`` publishes at."""
+        if node in self.endpoints:
+            return self.endpoints[node]
+        return f"ipc://{self.ipc_directory / node}"
+
+    @property
+    def ipc_directory(self) -> Path:
+        return Path(self.directory) if self.directory else default_directory()
+
+
+@dataclass(frozen=True)
+class RecorderSettings:
+    """``[recorder]``: what is written, where."""
+
+    directory: str = ""
+    """the rosbag2 directory to make; a relative path starts at the launch file"""
+    topics: list[str] = field(
+        default_factory=lambda: [POSE_RAW, POSE_TRUTH, POSE_CLEAN, POSE_WORLD, DIAGNOSTICS],
+    )
+
+    def __post_init__(self) -> None:
+        known = [POSE_RAW, POSE_TRUTH, POSE_CLEAN, POSE_WORLD, DIAGNOSTICS]
+        for topic in self.topics:
+            if topic not in known:
+                raise LaunchError(
+                    f"[recorder] topics names {topic!r}, which nobody publishes{_nearest(topic, known)}; "
+                    f"topics are {', '.join(known)}"
+                )
+
+
+@dataclass(frozen=True)
+class ViewerSettings:
+    """``[viewer]``: the picture in the browser."""
+
+    port: int = 9090
+    """of the web page"""
+
+
+@dataclass(frozen=True)
+class Launch:
+    """A launch file as read, with the overrides of the command line applied."""
+
+    path: Path
+    nodes: list[str] = field(default_factory=lambda: list(POSE_NODES))
+    input: InputSettings = field(default_factory=InputSettings)
+    prior: dict[str, Any] = field(default_factory=dict)
+    trajectory: dict[str, Any] = field(default_factory=dict)
+    transport: TransportSettings = field(default_factory=TransportSettings)
+    recorder: RecorderSettings = field(default_factory=RecorderSettings)
+    viewer: ViewerSettings = field(default_factory=ViewerSettings)
+
+    def __post_init__(self) -> None:
+        for node in self.nodes:
+            if node not in LISTENS:
+                raise LaunchError(
+                    f"nodes names {node!r}, which is no node{_nearest(node, LISTENS)}; nodes are {', '.join(LISTENS)}"
+                )
+
+    @classmethod
+    def read(cls, path: str | Path, overrides: Iterable[str] = ()) -> Launch:
+        """Read a launch file.
+
+        Args:
+            path: a file, or the name of one of the project's own (``replay``, ``server``).
+            overrides: ``section.key=value`` each, over what the file says; the value is TOML, or else plain text.
+
+        Raises:
+            LaunchError: no such file, not TOML, an unknown key, or a value of the wrong type.
+        """
+        file = find(path)
+        try:
+            table = tomllib.loads(file.read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise LaunchError(f"{file} is not TOML: {error}") from error
+        _refuse_unknown([field.name for field in fields(cls) if field.name != "path"], table, f"{file.name}: section")
+        for section, key in (("input", "recording"), ("recorder", "directory"), ("transport", "keys")):
+            value = table.get(section, {}).get(key) if isinstance(table.get(section), dict) else None
+            if isinstance(value, str) and value:
+                table[section][key] = str(file.parent / Path(value).expanduser())
+        for override in overrides:
+            apply_override(table, override)
+        return from_table(cls, table | {"path": file}, file.name)
+
+    def listeners(self, node: str) -> frozenset[str]:
+        """The nodes that must not miss a pose of ``node``: those of this launch that work on it or record it."""
+        if not self.transport.lossless:
+            return frozenset()
+        return frozenset(
+            name
+            for name in self.nodes
+            if name != "viewer" and any(topic != DIAGNOSTICS for topic in LISTENS[name].get(node, ()))
+        )
+
+
+def default_directory() -> Path:
+    """Where ipc sockets live unless a launch file says otherwise: private to the user, gone after a reboot."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(runtime) / "steadypose" if runtime else Path(tempfile.gettempdir()) / f"steadypose-{os.getuid()}"
+
+
+def checkout(*parts: str) -> Path:
+    """A path inside the checkout this package runs from: launch files and recorded streams live there.
+
+    Raises:
+        LaunchError: it is not there, as in an install that is not editable.
+    """
+    path = Path(__file__).resolve().parent.parent.joinpath(*parts)
+    if not path.exists():
+        raise LaunchError(
+            f"{path} does not exist: launch files and sim_data belong to the checkout. Install from it with "
+            "`pip install -e .`, or give the path of your own file"
+        )
+    return path
+
+
+def find(launch: str | Path) -> Path:
+    """The launch file of that path, or of that name among the project's own."""
+    path = Path(launch).expanduser()
+    if path.is_file():
+        return path.resolve()
+    if path.parent == Path() and not path.suffix:
+        own = sorted(file.stem for file in checkout("launch").glob("*.toml"))
+        if path.name in own:
+            return checkout("launch", f"{path.name}.toml")
+        raise LaunchError(
+            f"no launch file {path.name!r}{_nearest(path.name, own)}; there are {', '.join(own)}, or give a path"
+        )
+    raise LaunchError(f"no launch file at {path}")
+
+
+def apply_override(table: dict[str, Any], override: str) -> None:
+    """Set one ``section.key=value`` in a table of settings, making the sections on the way.
+
+    Raises:
+        LaunchError: it has no ``=``, or goes through something that is not a section.
+    """
+    path, separator, text = override.partition("=")
+    if not separator or not path.strip():
+        raise LaunchError(f"expected section.key=value, got {override!r}")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *sections, key = (part.strip() for part in path.split("."))
+    for section in sections:
+        table = table.setdefault(section, {})
+        if not isinstance(table, dict):
+            raise LaunchError(f"cannot set {path}: {section} is a value, not a section")
+    table[key] = value
+
+
+def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
+    """Make a dataclass of settings from a table, strictly.
+
+    Args:
+        cls: a dataclass whose fields are str, int, float, bool, Path, list[str], dict, or such a dataclass.
+        table: its fields by name; those left out keep their defaults.
+        where: what to call the table in an error.
+
+    Raises:
+        LaunchError: a key that is no field (the nearest one is named), or a value of another type.
+    """
+    hints = get_type_hints(cls)
+    _refuse_unknown(list(hints), table, f"{where}: key")
+    return cls(**{key: _value(hints[key], value, f"{where}: {key}") for key, value in table.items()})
+
+
+def _value(kind: Any, value: Any, where: str) -> Any:
+    if is_dataclass(kind) and isinstance(kind, type):
+        if not isinstance(value, dict):
+            raise LaunchError(f"{where}: expected a section, got {value!r}")
+        return from_table(kind, value, where)
+    if kind is float and type(value) is int:
+        return float(value)
+    origin = get_origin(kind) or kind
+    if not isinstance(value, origin) or (isinstance(value, bool) and origin is not bool):
+        raise LaunchError(f"{where}: expected {_spell(kind)}, got {value!r}")
+    inner = get_args(kind)
+    members = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    if inner and inner[-1] is str and any(not isinstance(member, str) for member in members):
+        raise LaunchError(f"{where}: expected {_spell(kind)}, got {value!r}")
+    return value
+
+
+def _spell(kind: Any) -> str:
+    names = {str: "text", int: "a whole number", float: "a number", bool: "true or false", list[str]: "a list of texts"}
+    return names.get(kind, "a section")
+
+
+def _refuse_unknown(known: list[str], table: Mapping[str, Any], what: str) -> None:
+    for key in table:
+        if key not in known:
+            raise LaunchError(f"{what} {key!r} does not exist{_nearest(key, known)}; there are {', '.join(known)}")
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f", did you mean {close[0]!r}?" if close else ""
