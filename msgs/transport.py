@@ -42,6 +42,9 @@ LINGER_MS = 1000
 """how long `Publisher.close` waits for what is on its way"""
 
 _PREFIX = struct.Struct("<BII")
+# A subscriber tells its name as a subscription to what nobody publishes: no topic begins with this byte. It is also
+# the last in order, and ZeroMQ subscribes in that order: who has told its name gets its topics.
+_NAME = b"\xff"
 # before a listener's name: sorts after every topic, so that ZeroMQ, which subscribes in this order when it connects
 # again, says who listens after it has said to what
 _BEACON = "~"
@@ -77,7 +80,7 @@ class Publisher:
             )
         typestore()
         self._sequence: Counter[str] = Counter()
-        self._subscribers: Counter[str] = Counter()
+        self._listeners: set[str] = set()
         self._listeners: Counter[str] = Counter()
         self._id = int.from_bytes(os.urandom(4), "little")
         self._lossless = lossless
@@ -85,7 +88,6 @@ class Publisher:
         self._authenticator = _authenticate(self._context, keys) if keys else None
         # XPUB, not PUB, because it tells who has subscribed
         self._socket = self._context.socket(zmq.XPUB)
-        self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)
         self._socket.setsockopt(zmq.XPUB_NODROP, lossless)
         self._socket.setsockopt(zmq.SNDHWM, SEND_HIGH_WATER)
         self._socket.setsockopt(zmq.LINGER, LINGER_MS)
@@ -134,37 +136,21 @@ class Publisher:
         self._sequence[topic] = (self._sequence[topic] + 1) % 2**32
         return True
 
-    def wait_for_subscribers(self, topic: str, count: int = 1, *, timeout_s: float) -> bool:
-        """Wait until `count` subscribers get every message published on `topic` from now on.
-
-        Returns:
-            whether they came; False when `timeout_s` passed before.
-        """
-        return self._wait(lambda: self._subscribers[topic] >= count, timeout_s)
-
     @property
     def listeners(self) -> frozenset[str]:
-        """The subscribers that gave a name, and get every message of their topics published from now on."""
+        """The names of the subscribers that are connected and get what is published from now on."""
         self._note_subscriptions()
-        return frozenset(+self._listeners)
+        return frozenset(self._listeners)
 
-    def wait_for_listeners(self, names: frozenset[str], *, timeout_s: float) -> bool:
-        """Wait until the subscribers of these names are among `listeners`.
-
-        Returns:
-            whether they came; False when `timeout_s` passed before.
-        """
-        return self._wait(lambda: names <= self.listeners, timeout_s)
-
-    def _wait(self, came: Callable[[], bool], timeout_s: float) -> bool:
+    def wait_for_listeners(self, names: Iterable[str], *, timeout_s: float) -> bool:
+        """Wait until the subscribers of these names are there; False if `timeout_s` passed before."""
+        wanted = frozenset(names)
         deadline = time.monotonic() + timeout_s
-        self._note_subscriptions()
-        while not came():
+        while not wanted <= self.listeners:
             left = deadline - time.monotonic()
             if left <= 0:
                 return False
             self._socket.poll(_milliseconds(left))
-            self._note_subscriptions()
         return True
 
     def _note_subscriptions(self) -> None:
@@ -173,12 +159,13 @@ class Publisher:
                 frame = self._socket.recv(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            change = {b"\1": 1, b"\0": -1}.get(frame[:1])
-            topic = frame[1:-1].decode(errors="replace")
-            if change and topic in TOPICS:
-                self._subscribers[topic] += change
-            elif change and topic.startswith(_BEACON):
-                self._listeners[topic.removeprefix(_BEACON)] += change
+            change, prefix = frame[:1], frame[1:]
+            if prefix.startswith(_NAME):
+                name = prefix.removeprefix(_NAME).decode(errors="replace")
+                if change == b"\1":
+                    self._listeners.add(name)
+                elif change == b"\0":
+                    self._listeners.discard(name)
 
     def close(self) -> None:
         """Stop, once what was published is on its way, or after `LINGER_MS`."""
@@ -218,6 +205,7 @@ class Subscriber:
                 history. For one topic, because ZeroMQ keeps one message a publisher.
             high_water: messages held unread; beyond it the newest are lost.
             keys: for publishers that have them.
+            name: to be known by to `Publisher.listeners`.
             name: what `Publisher.listeners` calls this subscriber; without one it is not among them.
 
         Raises:
@@ -254,6 +242,8 @@ class Subscriber:
         try:
             for topic in topics:
                 self.socket.setsockopt(zmq.SUBSCRIBE, topic.encode() + b"\0")
+            if name:
+                self.socket.setsockopt(zmq.SUBSCRIBE, _NAME + name.encode())
             if name:
                 self.socket.setsockopt(zmq.SUBSCRIBE, _BEACON.encode() + name.encode() + b"\0")
             for endpoint in endpoints:
