@@ -17,7 +17,7 @@ import socket as posix
 import struct
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -45,9 +45,6 @@ _PREFIX = struct.Struct("<BII")
 # A subscriber tells its name as a subscription to what nobody publishes: no topic begins with this byte. It is also
 # the last in order, and ZeroMQ subscribes in that order: who has told its name gets its topics.
 _NAME = b"\xff"
-# before a listener's name: sorts after every topic, so that ZeroMQ, which subscribes in this order when it connects
-# again, says who listens after it has said to what
-_BEACON = "~"
 _PUBLISHERS = 256
 _FAILED_HANDSHAKES = (
     zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
@@ -81,7 +78,6 @@ class Publisher:
         typestore()
         self._sequence: Counter[str] = Counter()
         self._listeners: set[str] = set()
-        self._listeners: Counter[str] = Counter()
         self._id = int.from_bytes(os.urandom(4), "little")
         self._lossless = lossless
         self._context = zmq.Context()
@@ -205,7 +201,6 @@ class Subscriber:
                 history. For one topic, because ZeroMQ keeps one message a publisher.
             high_water: messages held unread; beyond it the newest are lost.
             keys: for publishers that have them.
-            name: to be known by to `Publisher.listeners`.
             name: what `Publisher.listeners` calls this subscriber; without one it is not among them.
 
         Raises:
@@ -244,8 +239,6 @@ class Subscriber:
                 self.socket.setsockopt(zmq.SUBSCRIBE, topic.encode() + b"\0")
             if name:
                 self.socket.setsockopt(zmq.SUBSCRIBE, _NAME + name.encode())
-            if name:
-                self.socket.setsockopt(zmq.SUBSCRIBE, _BEACON.encode() + name.encode() + b"\0")
             for endpoint in endpoints:
                 self.socket.setsockopt(zmq.IPV6, "[" in endpoint)
                 self.socket.connect(endpoint)
