@@ -1,0 +1,80 @@
+"""What every reader gives: one recording, its joints in metres, z up, and where it comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prior.skeletons import CANONICAL, Skeleton, to_canonical
+
+Y_UP_TO_Z_UP: NDArray[np.float64] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Turns a y-up frame into a z-up one by a quarter turn about x (both right-handed)."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One recording of one person.
+
+    Attributes:
+        name: unique within its source.
+        source: the data set.
+        licence: its licence, as an SPDX identifier where there is one.
+        subject: who moves, as far as the source tells.
+        action: what they do, as far as the source tells; else empty.
+        fps: frames a second.
+        skeleton: whose joints ``positions`` holds.
+        positions: (T, J, 3) metres, z up; NaN where missing.
+    """
+
+    name: str
+    source: str
+    licence: str
+    subject: str
+    action: str
+    fps: float
+    skeleton: Skeleton
+    positions: NDArray[np.float64]
+
+    @property
+    def seconds(self) -> float:
+        """Duration."""
+        return len(self.positions) / self.fps
+
+    def canonical(self) -> Clip:
+        """The same recording with the canonical joints.
+
+        Raises:
+            ValueError: the skeleton's table leaves a canonical joint out; training needs complete bodies.
+        """
+        if not self.skeleton.observable.all():
+            raise ValueError(f"{self.name}: the table of '{self.skeleton.name}' does not give all 22 joints")
+        return replace(self, skeleton=CANONICAL, positions=to_canonical(self.skeleton, self.positions)[0])
+
+
+def forward(
+    parents: Sequence[int], offsets: NDArray[np.float64], local: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions of any skeleton from its local rotations.
+
+    Args:
+        parents: of J joints, each before its children; -1 for a root.
+        offsets: (J, 3) or, with bones that move, (T, J, 3), each joint in its parent's frame; a root's is its
+            position.
+        local: (T, J, 3, 3) rotations.
+
+    Returns:
+        positions (T, J, 3) in the unit of ``offsets``, and global rotations (T, J, 3, 3).
+    """
+    offsets = np.broadcast_to(offsets, local.shape[:-1])
+    positions, rotations = np.empty(local.shape[:-1]), np.empty(local.shape)
+    for joint, parent in enumerate(parents):
+        if parent < 0:
+            positions[:, joint], rotations[:, joint] = offsets[:, joint], local[:, joint]
+        else:
+            step = rotations[:, parent] @ offsets[:, joint, :, None]
+            positions[:, joint] = positions[:, parent] + step[..., 0]
+            rotations[:, joint] = rotations[:, parent] @ local[:, joint]
+    return positions, rotations

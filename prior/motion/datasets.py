@@ -1,0 +1,277 @@
+"""The data sets that are known: who moves in them, under which licence, and what is held out for validation.
+
+What is validated on is never a random choice of frames or clips where the subject is known: the motion model
+would be measured on people it has learnt.
+"""
+
+from __future__ import annotations
+
+import tarfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prior.motion.amc import Asf, read_amc, read_asf
+from prior.motion.bvh import Bvh, read_bvh
+from prior.motion.clip import Y_UP_TO_Z_UP, Clip
+from prior.motion.npz import read_expmap
+from prior.motion.tables import BANDAI, BVH_RIGS, CMU_AMC, CMU_BVH, ICLONE, REACTIDLE, Rig
+from prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
+from prior.skeletons import CANONICAL, Skeleton
+
+CMU_LICENCE = "CMU Graphics Lab: free for all uses, no resale of the data (NSF EIA-0196217)"
+CMU_FPS = 120.0
+"""Frames a second of CMU's AMC files, which do not tell it themselves."""
+
+REST_POSE_SPEED = 30.0
+"""m/s. No body does this: a first frame that is left faster is a rest pose that a converter has put in front."""
+
+UNREADABLE = "cannot be read"
+
+Split = Literal["train", "val"]
+WeightSet = Literal["default", "research"]
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A recording, or a part of one, that does not go into training, and why.
+
+    Attributes:
+        name: of the recording.
+        source: its data set.
+        kind: the cause in general words, to count by.
+        cause: the cause in this case, with its figures.
+    """
+
+    name: str
+    source: str
+    kind: str
+    cause: str
+
+
+Progress = Callable[[float], None]
+"""Told how much of a file, 0 to 1, has been read."""
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A source of motion.
+
+    Attributes:
+        name: of the source.
+        files: a pattern (regex) of the names of the files or folders that hold it.
+        weights: ``default`` if models trained on it may go into products, else ``research``.
+        read: reads a file or folder.
+        split: tells of a clip whether it trains or validates.
+    """
+
+    name: str
+    files: str
+    weights: WeightSet
+    read: Callable[[Path, Progress], Iterator[Clip | Dropped]]
+    split: Callable[[Clip], Split]
+
+
+def members(path: Path, suffixes: tuple[str, ...], progress: Progress) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of the files with some suffix in an archive (.tar, .tar.xz, ...), folder, or file.
+
+    Archives are read as a stream, in their own order; folders by name.
+    """
+    if path.is_file() and path.suffix not in suffixes:
+        size = path.stat().st_size
+        with path.open("rb") as raw, tarfile.open(fileobj=raw, mode="r|*") as archive:
+            for entry in archive:
+                if entry.isfile() and entry.name.endswith(suffixes) and (file := archive.extractfile(entry)):
+                    yield entry.name, file.read()
+                    progress(raw.tell() / size)
+        return
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.suffix in suffixes)
+    root = path.parent if path.is_file() else path
+    for i, file in enumerate(files):
+        yield file.relative_to(root).as_posix(), file.read_bytes()
+        progress((i + 1) / len(files))
+
+
+def bvh_motion(text: str, rig: Rig | None = None) -> tuple[Bvh, Skeleton, NDArray[np.float64]]:
+    """A BVH file, its skeleton, and the positions (T, J, 3) of that skeleton's joints, metres, z up.
+
+    Args:
+        text: the file's contents.
+        rig: the family it belongs to; recognised by its joints' names if left out.
+
+    Raises:
+        ValueError: it cannot be read, or its joints are of no known family.
+    """
+    bvh = read_bvh(text)
+    rigs = BVH_RIGS if rig is None else (rig,)
+    rig = next((r for r in rigs if set(r.skeleton.joints) <= set(bvh.joints)), None)
+    if rig is None:
+        known = ", ".join(r.skeleton.name for r in rigs)
+        raise ValueError(f"expected joints named as in {known} (prior/motion/tables.py), got {bvh.joints[:8]}...")
+    wanted = [bvh.joints.index(j) for j in rig.skeleton.joints]
+    positions = bvh.positions(rig.lost_bones)[:, wanted] * rig.metres @ Y_UP_TO_Z_UP.T
+    if len(positions) > 1 and np.abs(positions[1] - positions[0]).max() * bvh.fps > REST_POSE_SPEED:
+        positions = positions[1:]
+    return bvh, rig.skeleton, positions
+
+
+def amc_motions(path: Path, progress: Progress) -> Iterator[tuple[str, NDArray[np.float64] | ValueError]]:
+    """Names and positions (T, J, 3), metres, z up, of AMC files; of one that cannot be read, the reason.
+
+    The skeleton of ``01/01_05.amc`` is the ``.asf`` in the same folder.
+    """
+    skeletons: dict[str, Asf] = {}
+    waiting: list[tuple[str, str]] = []
+    for name, content in members(path, (".asf", ".amc"), progress):
+        # An archive has its files in any order.
+        if name.endswith(".asf"):
+            skeletons[_folder(name)] = read_asf(content.decode("ascii", "replace"))
+        else:
+            waiting.append((name, content.decode("ascii", "replace")))
+    for name, text in waiting:
+        try:
+            if _folder(name) not in skeletons:
+                raise ValueError("expected the subject's .asf file in the same folder, found none")
+            skeleton = skeletons[_folder(name)]
+            wanted = [skeleton.joints.index(j) for j in CMU_AMC.skeleton.joints]
+            yield name, read_amc(text, skeleton)[:, wanted] @ Y_UP_TO_Z_UP.T
+        except ValueError as error:
+            yield name, error
+
+
+def _folder(name: str) -> str:
+    return PurePosixPath(name).parent.as_posix()
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).stem
+
+
+def _read_cmu_amc(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
+    for name, motion in amc_motions(path, progress):
+        stem = _stem(name)
+        if isinstance(motion, ValueError):
+            yield Dropped(stem, "CMU (AMC)", UNREADABLE, str(motion))
+            continue
+        subject = stem.split("_")[0]
+        action = _CMU_ACTIONS.get(stem, _CMU_ACTIONS.get(subject, ""))
+        yield Clip(stem, "CMU (AMC)", CMU_LICENCE, subject, action, CMU_FPS, CMU_AMC.skeleton, motion)
+
+
+_CMU_ACTIONS = {
+    "01": "playground",
+    "02_01": "walk",
+    "02_02": "walk",
+    "02_03": "run",
+    "02_04": "jump, balance",
+    "02_05": "punch",
+    "02_06": "bend, lift",
+    "02_07": "swordplay",
+    "02_08": "swordplay",
+    "02_09": "swordplay",
+    "02_10": "wash",
+    "06": "basketball",
+    "07": "walk",
+}
+
+
+def _read_cmu_bvh(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
+    for name, content in members(path, (".bvh",), progress):
+        stem, source = _stem(name), "CMU (BVH)"
+        subject = stem.split("_")[0][-2:]
+        if subject == "02":
+            yield Dropped(stem, source, "repeats another", "repeats an AMC clip; serves to compare the importers")
+            continue
+        try:
+            bvh, skeleton, positions = bvh_motion(content.decode("ascii", "replace"), ICLONE)
+        except ValueError as error:
+            yield Dropped(stem, source, UNREADABLE, str(error))
+            continue
+        yield Clip(stem, source, CMU_LICENCE, subject, _CMU_ACTIONS[subject], bvh.fps, skeleton, positions)
+
+
+def _read_cmu_expmap(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
+    with path.open("rb") as file:
+        for i, (name, fps, positions) in enumerate(read_expmap(file)):
+            action = name.split("_", 1)[1].rsplit("_", 1)[0]
+            yield Clip(
+                name, "CMU (expmap)", CMU_LICENCE, "unknown", action, fps, CMU_BVH.skeleton,
+                positions @ Y_UP_TO_Z_UP.T,
+            )  # fmt: skip
+            progress((i + 1) / 96)
+
+
+def _read_reactidle(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
+    for name, content in members(path, (".bvh",), progress):
+        stem = _stem(name)
+        subject, kind = stem.split("_")
+        try:
+            bvh, skeleton, positions = bvh_motion(content.decode("ascii", "replace"), REACTIDLE)
+        except ValueError as error:
+            yield Dropped(stem, "ReActIdle", UNREADABLE, str(error))
+            continue
+        yield Clip(stem, "ReActIdle", "MIT", subject, f"idle, {kind}", bvh.fps, skeleton, positions)
+
+
+def _read_bandai(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
+    for name, content in members(path, (".bvh",), progress):
+        stem = _stem(name)
+        action = " ".join(stem.split("_")[1:-1])
+        try:
+            bvh, skeleton, positions = bvh_motion(content.decode("ascii", "replace"), BANDAI)
+        except ValueError as error:
+            yield Dropped(stem, "Bandai-Namco", UNREADABLE, str(error))
+            continue
+        # All bones have been retargeted to one body; the place of the hips in the rest pose differs by session.
+        subject = " ".join(f"{v:.1f}" for v in bvh.offsets[bvh.joints.index("Hips")])
+        yield Clip(stem, "Bandai-Namco", "CC-BY-NC-4.0", subject, action, bvh.fps, skeleton, positions)
+
+
+def _read_ui_prmd(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
+    pairs = load_pairs(path, TRAIN_SUBJECTS + VALIDATION_SUBJECTS)
+    for i, pair in enumerate(pairs):
+        yield Clip(
+            pair.name, "UI-PRMD (Vicon)", "PDDL-1.0", pair.subject, pair.movement, pair.fps, CANONICAL, pair.vicon
+        )
+        progress((i + 1) / len(pairs))
+
+
+def _held_out(test: bool) -> Split:
+    return "val" if test else "train"
+
+
+REACTIDLE_VALIDATION = ("013", "014", "015")
+"""Subjects."""
+
+BANDAI_VALIDATION = "-17.2 93.2 453.0"
+"""The rest pose's hips of the session held out: one of the second set's three, 807 clips."""
+
+DATA_SETS: tuple[DataSet, ...] = (
+    # The unnamed expmap clips may be of subjects 06 and 07, who therefore never validate.
+    DataSet(
+        "CMU (AMC)", r"cmu_amc\b.*", "default", _read_cmu_amc,
+        lambda clip: _held_out(clip.subject == "02" and int(clip.name.split("_")[1]) >= 5),
+    ),
+    DataSet("CMU (BVH)", r"cmu_bvh\b.*", "default", _read_cmu_bvh, lambda _: "train"),
+    DataSet(
+        "CMU (expmap)", r"cmu_expmap\b.*", "default", _read_cmu_expmap,
+        lambda clip: _held_out(clip.name.startswith("test_")),
+    ),
+    DataSet(
+        "ReActIdle", r"reactidle\b.*", "default", _read_reactidle,
+        lambda clip: _held_out(clip.subject in REACTIDLE_VALIDATION),
+    ),
+    DataSet(
+        "UI-PRMD (Vicon)", r"ui_prmd\b.*", "default", _read_ui_prmd,
+        lambda clip: _held_out(clip.subject in VALIDATION_SUBJECTS),
+    ),
+    DataSet(
+        "Bandai-Namco", r"bandai_\d\b.*", "research", _read_bandai,
+        lambda clip: _held_out(clip.subject == BANDAI_VALIDATION),
+    ),
+)  # fmt: skip
+"""In the order of preparation."""

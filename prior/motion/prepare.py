@@ -1,0 +1,193 @@
+"""From recordings to training data: complete bodies at 30 Hz, on a floor, checked, labelled and split."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.signal import butter, sosfiltfilt
+from scipy.spatial.transform import Rotation
+
+from prior.kinematics import CONTACT_SPEED, estimate_offsets, label_contacts, solve_rotations
+from prior.motion.clip import Clip
+from prior.motion.datasets import Dropped, Split, WeightSet
+from prior.skeletons import JOINTS, PARENTS, J
+
+FPS = 30.0
+"""Frames a second of everything that is trained on."""
+
+CUTOFF = 12.0
+"""Hz. What is faster cannot be told apart at 30 Hz and is taken out before frames are."""
+
+MAX_GAP = 0.2
+"""Seconds. A joint lost for no longer is interpolated; for longer, the recording is cut there."""
+
+MIN_SECONDS = 1.0
+"""Shorter recordings are dropped, as in HuMoR."""
+
+MAX_BONE_CHANGE = 0.10
+"""Metres that a bone may differ from its median in the recording. Skin markers move by 2 cm over soft tissue, a
+shoulder by 5 cm about the chest; a marker mistaken for another does by more."""
+
+MAX_SPEED = 15.0
+"""m/s. A thrown punch reaches 10, a hand that throws a ball 20 for a few milliseconds, which 30 Hz does not show."""
+
+TOE_HEIGHT = 0.015
+"""Metres above the floor at which the forefoot's joint rests."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A recording ready for training.
+
+    Attributes:
+        clip: its joints canonical, at 30 Hz, z up, floor at z = 0.
+        weights: the set of weights it may train.
+        split: whether it trains or validates.
+        offsets: (22, 3) metres, its subject's bones.
+        rotations: (T, 22, 4) local, xyzw.
+        contacts: (T, 8).
+    """
+
+    clip: Clip
+    weights: WeightSet
+    split: Split
+    offsets: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+    contacts: NDArray[np.bool_]
+
+
+def prepare_clip(clip: Clip, weights: WeightSet, split: Split) -> Iterator[Prepared | Dropped]:
+    """Resample, find the floor, check and label a recording; yields its good parts and what was dropped, and why."""
+    clip = clip.canonical()
+    filled = fill_gaps(clip.positions, clip.fps)
+    complete = np.isfinite(filled).all(axis=(1, 2))
+    if not complete.all():
+        lost = [JOINTS[j] for j in np.flatnonzero(~np.isfinite(filled).all(axis=(0, 2)))]
+        cause = f"{(~complete).sum() / clip.fps:.2f} s of {clip.seconds:.2f} s lack {', '.join(lost)}"
+        yield Dropped(clip.name, clip.source, f"cut: joints lost for more than {MAX_GAP} s or at an end", cause)
+    parts = list(_runs(complete))
+    for number, (start, stop) in enumerate(parts):
+        name = clip.name if len(parts) == 1 else f"{clip.name}#{number}"
+        part = replace(clip, name=name, positions=filled[start:stop])
+        if part.seconds < MIN_SECONDS:
+            yield Dropped(name, clip.source, f"shorter than {MIN_SECONDS:.0f} s", f"{part.seconds:.2f} s long")
+            continue
+        positions = resample(part.positions, part.fps)
+        positions[..., 2] -= floor_height(positions)
+        fault = find_fault(positions)
+        if fault:
+            yield Dropped(name, clip.source, "impossible motion", fault)
+            continue
+        offsets = estimate_offsets(positions)
+        rotations = Rotation.from_matrix(solve_rotations(positions, offsets).reshape(-1, 3, 3)).as_quat()
+        yield Prepared(
+            clip=replace(part, fps=FPS, positions=positions),
+            weights=weights,
+            split=split,
+            offsets=offsets,
+            rotations=rotations.reshape(*positions.shape[:2], 4),
+            contacts=label_contacts(positions, FPS),
+        )
+
+
+def fill_gaps(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
+    """Interpolate, in a straight line, joints that are lost for at most `MAX_GAP`; longer gaps stay NaN.
+
+    Args:
+        positions: (T, J, 3), NaN where lost.
+        fps: frames a second.
+    """
+    filled = positions.copy()
+    lost = ~np.isfinite(positions).all(axis=-1)
+    time = np.arange(len(positions))
+    for joint in np.flatnonzero(lost.any(axis=0)):
+        seen = ~lost[:, joint]
+        for start, stop in _runs(lost[:, joint]):
+            filled[start:stop, joint] = np.nan
+            if 0 < start and stop < len(positions) and (stop - start) / fps <= MAX_GAP:
+                for axis in range(3):
+                    filled[start:stop, joint, axis] = np.interp(
+                        time[start:stop], time[seen], positions[seen, joint, axis]
+                    )
+    return filled
+
+
+def _runs(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Starts and stops of the runs of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
+    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+
+
+def resample(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
+    """(T, J, 3) at ``fps`` to (T', J, 3) at 30 Hz, by time, the first frame staying the first.
+
+    Faster recordings pass a Butterworth filter of fourth order at 12 Hz, forwards and backwards so that nothing is
+    delayed; then all are read off a cubic spline. A blow's impact loses what it has above 12 Hz.
+    """
+    if abs(fps / FPS - 1) < 1e-4:
+        return positions.copy()
+    if fps > FPS:
+        positions = sosfiltfilt(butter(4, CUTOFF, fs=fps, output="sos"), positions, axis=0)
+    time = np.arange(len(positions)) / fps
+    frames = int(time[-1] * FPS + 1e-6) + 1
+    return CubicSpline(time, positions)(np.arange(frames) / FPS)
+
+
+def floor_height(positions: NDArray[np.float64]) -> float:
+    """Height of the floor (metres) under a recording at 30 Hz, from where toes come to rest.
+
+    HuMoR's idea: the lowest heights at which toes stand still (their fifth percentile, safe from outliers). Where
+    none ever does (a run in mid-stride), the second percentile of the lower toe.
+    """
+    toes = positions[:, [J["left_foot"], J["right_foot"]]]
+    speed = np.linalg.norm(np.gradient(toes, 1 / FPS, axis=0), axis=-1)
+    still = toes[..., 2][speed < CONTACT_SPEED]
+    resting = np.percentile(still, 5) if len(still) >= 5 else np.percentile(toes[..., 2].min(axis=1), 2)
+    return float(resting) - TOE_HEIGHT
+
+
+def find_fault(positions: NDArray[np.float64]) -> str | None:
+    """What is impossible about (T, 22, 3) positions at 30 Hz, in words; None if nothing is."""
+    bones = np.linalg.norm(positions[:, 1:] - positions[:, list(PARENTS[1:])], axis=-1)
+    change = np.abs(bones - np.median(bones, axis=0))
+    frame, bone = np.unravel_index(change.argmax(), change.shape)
+    if change[frame, bone] > MAX_BONE_CHANGE:
+        return f"the bone to {JOINTS[bone + 1]} is {change[frame, bone] * 100:.0f} cm off its length at {frame / FPS:.1f} s"
+    speed = np.linalg.norm(np.diff(positions, axis=0), axis=-1) * FPS
+    frame, joint = np.unravel_index(speed.argmax(), speed.shape)
+    if speed[frame, joint] > MAX_SPEED:
+        return f"{JOINTS[joint]} moves at {speed[frame, joint]:.0f} m/s at {frame / FPS:.1f} s"
+    return None
+
+
+def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:
+    """Write ``prepared.npz``: whole, or not at all.
+
+    Arrays: ``positions`` (N, 22, 3) float32 metres, z up, floor 0, all recordings in a row at 30 Hz; ``rotations``
+    (N, 22, 4) float32 local, xyzw; ``contacts`` (N, 8) bool; ``offsets`` (C, 22, 3) float32 metres; ``clip_start``
+    (C + 1,) int64; and for each of the C recordings ``name``, ``source``, ``licence``, ``subject``, ``action``,
+    ``split`` and ``set``.
+    """
+    frames = [len(p.clip.positions) for p in prepared]
+    arrays = {
+        "positions": np.concatenate([p.clip.positions for p in prepared], dtype=np.float32),
+        "rotations": np.concatenate([p.rotations for p in prepared], dtype=np.float32),
+        "contacts": np.concatenate([p.contacts for p in prepared]),
+        "offsets": np.stack([p.offsets for p in prepared]).astype(np.float32),
+        "clip_start": np.concatenate([[0], np.cumsum(frames)]).astype(np.int64),
+        "split": np.array([p.split for p in prepared]),
+        "set": np.array([p.weights for p in prepared]),
+        **{k: np.array([getattr(p.clip, k) for p in prepared]) for k in _TEXTS},
+    }
+    partial = path.with_name(f"{path.stem}.partial.npz")
+    np.savez(partial, **arrays)
+    os.replace(partial, path)
+
+
+_TEXTS = ("name", "source", "licence", "subject", "action")
