@@ -142,23 +142,43 @@ class FixedLagRTS:
         self._count += 1
         return self._at(self._count - 1 - self.delay) if self._count > self.delay else None
 
+    def predict(self, stamp_s: float) -> Smoothed | None:
+        """Where the joints are expected at `stamp_s`, before they are seen; None before the first frame."""
+        if self._count == 0:
+            return None
+        last = (self._count - 1) % (self.delay + 1)
+        position, variance, _ = self._coast(last, stamp_s - self._stamps[last])
+        return Smoothed(stamp_s, position, np.where(self._known, np.sqrt(variance), np.inf))
+
+    def forget(self, joints: NDArray[np.bool_]) -> None:
+        """Start these joints (...) afresh at their next measurement; estimates still held of them are lost."""
+        if self._count:
+            self._known &= ~joints
+            self._position[:, joints] = np.nan
+            self._velocity[joints] = 0.0
+
     def flush(self) -> list[Smoothed]:
         """Give the estimates still held, oldest first, and start afresh."""
         held = [self._at(frame) for frame in range(max(0, self._count - self.delay), self._count)]
         self.reset()
         return held
 
-    def _predict(self, slot: int, last: int, step: float) -> None:
+    def _coast(self, last: int, step: float) -> tuple[Array, Array, Array]:
+        """Position after `step` seconds without a measurement, its variance, and its covariance with velocity."""
         growth = self._density * step
-        position_variance, covariance = self._with_position[last], self._with_velocity[last]
-        position_variance = position_variance + step * (2 * covariance + step * (self._velocity_variance + growth / 3))
+        covariance = self._with_velocity[last]
+        variance = self._with_position[last] + step * (2 * covariance + step * (self._velocity_variance + growth / 3))
         covariance = covariance + step * (self._velocity_variance + growth / 2)
+        return self._position[last] + step * self._velocity, variance, covariance
+
+    def _predict(self, slot: int, last: int, step: float) -> None:
+        position, variance, covariance = self._coast(last, step)
         # The positions of past frames do not move, but their covariance with the newest state does.
         self._with_position += step * self._with_velocity
-        self._position[slot] = self._position[last] + step * self._velocity
-        self._variance[slot] = self._with_position[slot] = position_variance
+        self._position[slot] = position
+        self._variance[slot] = self._with_position[slot] = variance
         self._with_velocity[slot] = covariance
-        self._velocity_variance = self._velocity_variance + growth
+        self._velocity_variance = self._velocity_variance + self._density * step
 
     def _correct(self, slot: int, measured: Array, noise: Array) -> None:
         seen = _seen(measured) & np.isfinite(noise)

@@ -97,6 +97,36 @@ def test_a_missing_joint_coasts_and_grows_unsure() -> None:
     assert coasted.sigma[0] > 20 * seen.sigma[0]
 
 
+def test_predict_is_what_a_missing_frame_would_give() -> None:
+    positions, stamps, sigmas = stream(8)
+    smoother = FixedLagRTS(0, DENSITY)
+    assert smoother.predict(0.0) is None
+    for p, t, s in zip(positions, stamps, sigmas, strict=True):
+        smoother.update(p, t, s)
+    expected = smoother.predict(stamps[-1] + 0.2)
+    coasted = smoother.update(np.full_like(positions[0], np.nan), stamps[-1] + 0.2)
+    assert expected
+    assert coasted
+    np.testing.assert_array_equal(expected.positions, coasted.positions)
+    np.testing.assert_array_equal(expected.sigma, coasted.sigma)
+
+
+def test_a_forgotten_joint_starts_afresh_and_leaves_the_others_alone() -> None:
+    positions, stamps, sigmas = stream(9)
+    known, whole, fresh = FixedLagRTS(2, DENSITY), FixedLagRTS(2, DENSITY), FixedLagRTS(2, DENSITY)
+    forgotten = np.array([False, True, False])
+    for i, (p, t, s) in enumerate(zip(positions, stamps, sigmas, strict=True)):
+        if i == 12:
+            known.forget(forgotten)
+        a, b = known.update(p, t, s), whole.update(p, t, s)
+        c = fresh.update(p, t, s) if i >= 12 else None
+        if a and b:
+            np.testing.assert_array_equal(a.positions[~forgotten], b.positions[~forgotten])
+        if a and c:
+            np.testing.assert_array_equal(a.positions[1], c.positions[1])
+            np.testing.assert_array_equal(a.sigma[1], c.sigma[1])
+
+
 def test_stays_settled_over_a_long_stream() -> None:
     """Ten minutes at a delay of 16 frames: the recursions must neither drift apart nor lose their sign."""
     rng = np.random.default_rng(0)
