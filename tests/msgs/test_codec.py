@@ -1,0 +1,137 @@
+"""Whatever can be said arrives as it was said; whatever else arrives is a `DecodeError` and costs no memory."""
+
+import struct
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msg_strategies import ANY, EXAMPLES, clean, diagnostics, raw
+
+from msgs.codec import DecodeError, decode, encode, typestore, wire_type
+from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, TOPICS
+from msgs.types import Message
+
+PAYLOADS = {topic: encode(message) for topic, message in EXAMPLES.items()}
+TOPIC_NAMES = st.sampled_from(list(TOPICS))
+
+
+@given(ANY)
+@settings(deadline=None, max_examples=300)
+def test_round_trip(sent: tuple[str, Message]):
+    topic, message = sent
+    assert decode(topic, encode(message)) == message
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_the_other_byte_order_is_read_too(topic: str):
+    store, name = typestore(), wire_type(TOPICS[topic])
+    big_endian = store.serialize_cdr(store.deserialize_cdr(PAYLOADS[topic], name), name, little_endian=False)
+    assert bytes(big_endian[:2]) == b"\0\0"
+    assert decode(topic, bytes(big_endian)) == EXAMPLES[topic]
+
+
+def test_what_is_decoded_owns_its_arrays():
+    payload = bytearray(PAYLOADS[POSE_CLEAN])
+    message = decode(POSE_CLEAN, memoryview(payload))
+    payload[:] = bytes(len(payload))
+    assert message == clean()
+    message.bodies[0].positions[0] = 5  # type: ignore[union-attr]
+
+
+def test_arrays_that_are_not_contiguous_are_encoded_by_value():
+    message = raw()
+    message.bodies[0].positions = np.asfortranarray(message.bodies[0].positions)
+    message.bodies[0].confidence = np.ones(64, np.float32)[::2]
+    assert decode(POSE_RAW, encode(message)) == raw()
+
+
+@given(TOPIC_NAMES, st.binary(max_size=3000))
+@settings(deadline=None, max_examples=500)
+def test_random_bytes_are_refused(topic: str, payload: bytes):
+    _decode_or_refuse(topic, payload)
+    _decode_or_refuse(topic, b"\0\1\0\0" + payload)
+
+
+@given(st.data(), TOPIC_NAMES)
+@settings(deadline=None, max_examples=500)
+def test_mutated_messages_are_refused_or_read(data: st.DataObject, topic: str):
+    payload = bytearray(PAYLOADS[topic])
+    for _ in range(data.draw(st.integers(1, 8))):
+        at = data.draw(st.integers(0, len(payload) - 1))
+        new = data.draw(st.binary(min_size=1, max_size=8))
+        payload[at : at + (len(new) if data.draw(st.booleans()) else 0)] = new
+    _decode_or_refuse(topic, bytes(payload))
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_truncated_messages_are_refused(topic: str):
+    payload = PAYLOADS[topic]
+    for size in range(len(payload)):
+        with pytest.raises(DecodeError, match=f"{topic}: {size} bytes are not a "):
+            decode(topic, payload[:size])
+
+
+@pytest.mark.parametrize("claimed", [2**31 - 1, 2**31, 2**32 - 1])
+@pytest.mark.parametrize("what", ["positions", "confidence", "bodies", "source", "values"])
+def test_a_hostile_length_allocates_nothing(what: str, claimed: int):
+    topic, payload, at = _length_field(what)
+    hostile = payload[:at] + struct.pack("<I", claimed) + payload[at + 4 :]
+    tracemalloc.start()
+    try:
+        with pytest.raises(DecodeError):
+            decode(topic, hostile)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 2**20
+
+
+def _length_field(what: str) -> tuple[str, bytes, int]:
+    message = raw(joints=32)
+    body = message.bodies[0]
+    start = {
+        "positions": struct.pack("<I", 96) + body.positions.tobytes(),
+        "confidence": struct.pack("<I", 32) + body.confidence.tobytes(),
+        "bodies": struct.pack("<IiI", 1, body.id, 96),
+        "source": struct.pack("<I", 5) + b"test\0",
+        "values": struct.pack("<I", 2) + struct.pack("<I", 5) + b"rate\0",
+    }[what]
+    topic, payload = (DIAGNOSTICS, encode(diagnostics())) if what == "values" else (POSE_RAW, encode(message))
+    assert payload.count(start) == 1
+    return topic, payload, payload.index(start)
+
+
+def test_joints_without_their_confidence_are_refused():
+    message = raw(joints=4)
+    message.bodies[0].confidence = np.ones(3, np.float32)
+    with pytest.raises(DecodeError, match=r"RawBody.confidence: expected shape \(4,\), got shape \(3,\)"):
+        decode(POSE_RAW, encode(message))
+
+
+def test_a_stamp_of_too_many_nanoseconds_is_refused():
+    payload = bytearray(PAYLOADS[POSE_RAW])
+    struct.pack_into("<I", payload, 8, 10**9)
+    with pytest.raises(DecodeError, match="nanosec"):
+        decode(POSE_RAW, bytes(payload))
+
+
+def test_a_diagnostic_array_of_two_is_refused():
+    store, name = typestore(), wire_type(TOPICS[DIAGNOSTICS])
+    array = store.deserialize_cdr(PAYLOADS[DIAGNOSTICS], name)
+    array.status *= 2  # type: ignore[attr-defined]
+    with pytest.raises(DecodeError, match="status: expected one, got 2"):
+        decode(DIAGNOSTICS, bytes(store.serialize_cdr(array, name)))
+
+
+def test_an_unknown_topic_is_refused():
+    with pytest.raises(DecodeError, match="unknown topic 'pose/row': expected one of pose/raw"):
+        decode("pose/row", PAYLOADS[POSE_RAW])
+
+
+def _decode_or_refuse(topic: str, payload: bytes) -> None:
+    try:
+        assert type(decode(topic, payload)) is TOPICS[topic]
+    except DecodeError as error:
+        assert str(error).startswith(f"{topic}: {len(payload)} bytes are not a ")

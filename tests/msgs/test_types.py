@@ -1,0 +1,132 @@
+"""The constructors refuse what has not the form they document, by name; the definitions say the same as the classes."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from msg_strategies import EXAMPLES, clean, diagnostics, raw, world
+from rosbags.typesys import get_types_from_msg
+from scipy.spatial.transform import Rotation
+
+from msgs.codec import DEFINITIONS
+from msgs.types import CONTACTS, JOINTS, CleanBody, JointState, Pose, PoseClean, PoseRaw, RawBody, Tracking, WorldBody
+
+
+@pytest.mark.parametrize(
+    ("message", "field", "value", "said"),
+    [
+        (raw().bodies[0], "positions", np.zeros((17, 3)), "confidence: expected shape (17,), got shape (32,)"),
+        (raw().bodies[0], "positions", np.zeros(96), "positions: expected shape (J, 3), got shape (96,)"),
+        (raw().bodies[0], "confidence", ["sure"] * 32, "confidence: expected float32 numbers"),
+        (raw().bodies[0], "id", 2**31, "id: expected an integer of"),
+        (raw().bodies[0], "id", "1", "id: expected an integer, got '1'"),
+        (raw(), "stamp_ns", -1, "stamp_ns: expected an integer of 0 or more"),
+        (raw(), "stamp_ns", 1.5, "stamp_ns: expected an integer, got 1.5"),
+        (raw(), "stamp_ns", 2**31 * 10**9, "stamp_ns: expected an integer"),
+        (raw(), "skeleton", None, "skeleton: expected a string, got None"),
+        (raw(), "bodies", clean().bodies, "bodies: expected a list of RawBody"),
+        (raw(), "bodies", tuple(raw().bodies), "bodies: expected a list of RawBody"),
+        (clean(), "delay_frames", -1, "delay_frames: expected an integer of 0 or more"),
+        (clean().bodies[0], "positions", np.zeros((21, 3)), "positions: expected shape (22, 3), got shape (21, 3)"),
+        (clean().bodies[0], "rotations", np.zeros((22, 3)), "rotations: expected shape (22, 4)"),
+        (clean().bodies[0], "state", np.full(22, 4), "state: expected JointState values, 0 to 3"),
+        (clean().bodies[0], "state", np.full(22, 256), "state: expected JointState values"),
+        (clean().bodies[0], "anomaly", None, "anomaly: expected a number, got None"),
+        (world().bodies[0], "covariance", np.eye(3), "covariance: expected shape (6, 6)"),
+        (world().bodies[0], "contacts", np.zeros(9), "contacts: expected shape (8,)"),
+        (world().bodies[0], "tracking", 3, "tracking: expected an integer of 0 or more and under 3, got 3"),
+        (world(), "ground_plane", [0, 0, 1], "ground_plane: expected shape (4,)"),
+        (diagnostics(), "level", 4, "level: expected an integer"),
+        (diagnostics(), "values", {"rate": 30.0}, "values: expected strings"),
+        (Pose.identity(), "orientation", np.eye(3), "orientation: expected shape (4,), got shape (3, 3)"),
+    ],
+)
+def test_a_wrong_field_is_named(message: Any, field: str, value: object, said: str):
+    with pytest.raises(ValueError, match="expected") as caught:
+        dataclasses.replace(message, **{field: value})
+    assert str(caught.value).startswith(f"{type(message).__name__}.{said}")
+
+
+def test_arrays_get_their_type_from_lists_and_integers():
+    body = RawBody(np.int64(3), [[1, 2, 3]], [1])  # type: ignore[arg-type]
+    assert body.positions.dtype == body.confidence.dtype == np.float32
+    assert type(body.id) is int
+    assert type(world().bodies[0].tracking) is Tracking
+
+
+def test_no_bodies_and_no_joints_are_messages():
+    assert RawBody(1, np.zeros((0, 3)), np.zeros(0)).positions.shape == (0, 3)
+    assert PoseRaw(0, "", "", "", Pose.identity(), False, [], end_of_stream=True).end_of_stream
+
+
+@pytest.mark.parametrize("message", EXAMPLES.values(), ids=EXAMPLES)
+def test_equality_is_by_value(message: Any):
+    assert message == dataclasses.replace(message)
+    assert message != dataclasses.replace(message, stamp_ns=1)
+    assert message != "something else"
+
+
+def test_nan_equals_nan_and_nothing_else():
+    body = clean().bodies[0]
+    assert np.isnan(body.raw_positions).all()
+    assert body == dataclasses.replace(body, anomaly=0.5)
+    assert dataclasses.replace(body, anomaly=np.nan) == dataclasses.replace(body, anomaly=np.nan)
+    assert dataclasses.replace(body, anomaly=np.nan) != body
+    assert dataclasses.replace(body, raw_positions=np.zeros((22, 3))) != body
+
+
+@pytest.mark.parametrize(("up", "axis"), [("z", [0, 0, 1]), ("y", [0, 1, 0]), ("-y", [0, -1, 0])])
+def test_from_up_brings_the_axis_to_the_worlds_z(up: str, axis: list[int]):
+    pose = Pose.from_up(up)
+    turn = Rotation.from_quat(pose.orientation)
+    np.testing.assert_allclose(turn.apply(axis), [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(turn.apply([1, 0, 0]), [1, 0, 0], atol=1e-12)
+    assert not pose.position.any()
+
+
+def test_a_level_camera_looks_along_y():
+    np.testing.assert_allclose(Rotation.from_quat(Pose.from_up("-y").orientation).apply([0, 0, 1]), [0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("up", ["x", "-z", "Y", ""])
+def test_from_up_refuses_other_axes(up: str):
+    with pytest.raises(ValueError, match=rf"expected one of 'z', 'y', '-y', got '{up}'"):
+        Pose.from_up(up)
+
+
+def test_the_definitions_name_joints_and_states_alike():
+    constants = _constants("CleanBody")
+    assert [constants[name.upper()] for name in JOINTS] == list(range(22))
+    assert {s.name: s.value for s in JointState} == _with_prefix(constants, "STATE_")
+    assert {t.name: t.value for t in Tracking} == _with_prefix(_constants("WorldBody"), "TRACKING_")
+    assert set(CONTACTS) < set(JOINTS)
+
+
+@pytest.mark.parametrize("kind", [RawBody, CleanBody])
+def test_the_definitions_have_the_fields_of_the_bodies(kind: type):
+    assert _fields(kind.__name__) == [f.name for f in dataclasses.fields(kind)]
+
+
+def test_the_definitions_have_the_fields_of_the_rest():
+    header = {"stamp_ns", "frame_id"}
+    assert set(_fields("PoseRaw")) - {"header"} == {f.name for f in dataclasses.fields(PoseRaw)} - header
+    assert set(_fields("PoseClean")) - {"header"} == {f.name for f in dataclasses.fields(PoseClean)} - header
+    root = {"root_position", "root_orientation"}
+    assert set(_fields("WorldBody")) - {"root_pose"} == {f.name for f in dataclasses.fields(WorldBody)} - root
+
+
+def _definition(name: str):
+    return get_types_from_msg((DEFINITIONS / f"{name}.msg").read_text(), name)[f"msg/{name}"]
+
+
+def _fields(name: str) -> list[str]:
+    return [field for field, _ in _definition(name)[1]]
+
+
+def _constants(name: str) -> dict[str, Any]:
+    return {constant: value for constant, _, value in _definition(name)[0]}
+
+
+def _with_prefix(constants: dict[str, Any], prefix: str) -> dict[str, Any]:
+    return {name.removeprefix(prefix): value for name, value in constants.items() if name.startswith(prefix)}
