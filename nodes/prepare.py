@@ -42,8 +42,9 @@ def prepare(mocap: Path, out: Path = Path("data")) -> None:
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=console) as progress:
-        tasks = [progress.add_task(path.name, total=1.0, count="") for path, _ in sources]
+        tasks = [progress.add_task(path.name, start=False, total=1.0, count="") for path, _ in sources]
         for task, (path, data_set) in zip(tasks, sources, strict=True):
+            progress.start_task(task)
             _read(path, data_set, result, progress, task)
     if not result.prepared:
         raise SystemExit(f"prepare: nothing usable in {mocap}; dropped: {dict(result.causes())}")
@@ -102,6 +103,7 @@ class _Result:
                 for (source, licence, weights), splits in self.hours().items()
             ],
             "dropped": [asdict(d) for d in self.dropped],
+            "not_flat": [p.clip.name for p in self.prepared if not p.flat],
         }
 
     def hours_table(self) -> Table:

@@ -23,7 +23,9 @@ from prior.motion.tables import BANDAI, BVH_RIGS, CMU_AMC, CMU_BVH, ICLONE, REAC
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
 from prior.skeletons import CANONICAL, Skeleton
 
-CMU_LICENCE = "CMU Graphics Lab: free for all uses, no resale of the data (NSF EIA-0196217)"
+CMU_LICENCE = "CMU mocap: free, no resale"
+"""Free for all uses, products included; the data itself may not be resold; acknowledge NSF EIA-0196217."""
+
 CMU_FPS = 120.0
 """Frames a second of CMU's AMC files, which do not tell it themselves."""
 

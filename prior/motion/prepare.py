@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from prior.kinematics import CONTACT_SPEED, estimate_offsets, label_contacts, solve_rotations
 from prior.motion.clip import Clip
 from prior.motion.datasets import Dropped, Split, WeightSet
-from prior.skeletons import JOINTS, PARENTS, J
+from prior.skeletons import JOINTS, PARENTS, J, finite_joints
 
 FPS = 30.0
 """Frames a second of everything that is trained on."""
@@ -40,6 +40,9 @@ MAX_SPEED = 15.0
 TOE_HEIGHT = 0.015
 """Metres above the floor at which the forefoot's joint rests."""
 
+RAISED = 0.12
+"""Metres above the floor at which a toe that stands still stands on something else, or on its tip no longer."""
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -52,6 +55,7 @@ class Prepared:
         offsets: (22, 3) metres, its subject's bones.
         rotations: (T, 22, 4) local, xyzw.
         contacts: (T, 8).
+        flat: whether it stays on the floor; where somebody climbs onto things, contacts up there are not labelled.
     """
 
     clip: Clip
@@ -60,15 +64,16 @@ class Prepared:
     offsets: NDArray[np.float64]
     rotations: NDArray[np.float64]
     contacts: NDArray[np.bool_]
+    flat: bool
 
 
 def prepare_clip(clip: Clip, weights: WeightSet, split: Split) -> Iterator[Prepared | Dropped]:
     """Resample, find the floor, check and label a recording; yields its good parts and what was dropped, and why."""
     clip = clip.canonical()
     filled = fill_gaps(clip.positions, clip.fps)
-    complete = np.isfinite(filled).all(axis=(1, 2))
+    complete = np.asarray(finite_joints(filled).all(axis=1))
     if not complete.all():
-        lost = [JOINTS[j] for j in np.flatnonzero(~np.isfinite(filled).all(axis=(0, 2)))]
+        lost = [JOINTS[j] for j in np.flatnonzero(~finite_joints(filled).all(axis=0))]
         cause = f"{(~complete).sum() / clip.fps:.2f} s of {clip.seconds:.2f} s lack {', '.join(lost)}"
         yield Dropped(clip.name, clip.source, f"cut: joints lost for more than {MAX_GAP} s or at an end", cause)
     parts = list(_runs(complete))
@@ -93,6 +98,7 @@ def prepare_clip(clip: Clip, weights: WeightSet, split: Split) -> Iterator[Prepa
             offsets=offsets,
             rotations=rotations.reshape(*positions.shape[:2], 4),
             contacts=label_contacts(positions, FPS),
+            flat=stays_on_floor(positions),
         )
 
 
@@ -104,13 +110,13 @@ def fill_gaps(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]
         fps: frames a second.
     """
     filled = positions.copy()
-    lost = ~np.isfinite(positions).all(axis=-1)
+    lost = ~finite_joints(positions)
     time = np.arange(len(positions))
     for joint in np.flatnonzero(lost.any(axis=0)):
         seen = ~lost[:, joint]
         for start, stop in _runs(lost[:, joint]):
             filled[start:stop, joint] = np.nan
-            if 0 < start and stop < len(positions) and (stop - start) / fps <= MAX_GAP:
+            if start > 0 and stop < len(positions) and (stop - start) / fps <= MAX_GAP:
                 for axis in range(3):
                     filled[start:stop, joint, axis] = np.interp(
                         time[start:stop], time[seen], positions[seen, joint, axis]
@@ -145,11 +151,25 @@ def floor_height(positions: NDArray[np.float64]) -> float:
     HuMoR's idea: the lowest heights at which toes stand still (their fifth percentile, safe from outliers). Where
     none ever does (a run in mid-stride), the second percentile of the lower toe.
     """
-    toes = positions[:, [J["left_foot"], J["right_foot"]]]
-    speed = np.linalg.norm(np.gradient(toes, 1 / FPS, axis=0), axis=-1)
+    toes, speed = _toes(positions)
     still = toes[..., 2][speed < CONTACT_SPEED]
     resting = np.percentile(still, 5) if len(still) >= 5 else np.percentile(toes[..., 2].min(axis=1), 2)
     return float(resting) - TOE_HEIGHT
+
+
+def stays_on_floor(positions: NDArray[np.float64]) -> bool:
+    """Whether a recording at 30 Hz, floor at 0, has hardly a moment in which the lower toe stands still above it."""
+    toes, speed = _toes(positions)
+    lower = toes[..., 2].argmin(axis=1)[:, None]
+    height = np.take_along_axis(toes[..., 2], lower, axis=1)
+    raised = (height > RAISED) & (np.take_along_axis(speed, lower, axis=1) < CONTACT_SPEED)
+    return float(raised.mean()) < 0.02
+
+
+def _toes(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions (T, 2, 3) and speeds (T, 2) of both toes."""
+    toes = positions[:, [J["left_foot"], J["right_foot"]]]
+    return toes, np.linalg.norm(np.gradient(toes, 1 / FPS, axis=0), axis=-1)
 
 
 def find_fault(positions: NDArray[np.float64]) -> str | None:
@@ -158,7 +178,8 @@ def find_fault(positions: NDArray[np.float64]) -> str | None:
     change = np.abs(bones - np.median(bones, axis=0))
     frame, bone = np.unravel_index(change.argmax(), change.shape)
     if change[frame, bone] > MAX_BONE_CHANGE:
-        return f"the bone to {JOINTS[bone + 1]} is {change[frame, bone] * 100:.0f} cm off its length at {frame / FPS:.1f} s"
+        off = f"{change[frame, bone] * 100:.0f} cm off its length at {frame / FPS:.1f} s"
+        return f"the bone to {JOINTS[bone + 1]} is {off}"
     speed = np.linalg.norm(np.diff(positions, axis=0), axis=-1) * FPS
     frame, joint = np.unravel_index(speed.argmax(), speed.shape)
     if speed[frame, joint] > MAX_SPEED:
@@ -172,7 +193,7 @@ def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:
     Arrays: ``positions`` (N, 22, 3) float32 metres, z up, floor 0, all recordings in a row at 30 Hz; ``rotations``
     (N, 22, 4) float32 local, xyzw; ``contacts`` (N, 8) bool; ``offsets`` (C, 22, 3) float32 metres; ``clip_start``
     (C + 1,) int64; and for each of the C recordings ``name``, ``source``, ``licence``, ``subject``, ``action``,
-    ``split`` and ``set``.
+    ``split``, ``set``, and ``flat`` (bool, see `Prepared`).
     """
     frames = [len(p.clip.positions) for p in prepared]
     arrays = {
@@ -183,6 +204,7 @@ def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:
         "clip_start": np.concatenate([[0], np.cumsum(frames)]).astype(np.int64),
         "split": np.array([p.split for p in prepared]),
         "set": np.array([p.weights for p in prepared]),
+        "flat": np.array([p.flat for p in prepared]),
         **{k: np.array([getattr(p.clip, k) for p in prepared]) for k in _TEXTS},
     }
     partial = path.with_name(f"{path.stem}.partial.npz")
