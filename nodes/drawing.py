@@ -1,0 +1,76 @@
+"""What the viewer and the plots share: the colours of joint states, the bones of a skeleton, the way to the world."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from msgs.types import CONTACTS, JOINTS, JointState, Pose
+from prior.skeletons import PARENTS, J
+
+# Okabe and Ito's palette: told apart with any kind of colour vision, on white and on black.
+STATE_COLOURS: dict[JointState, str] = {
+    JointState.UNKNOWN: "#8c8c8c",
+    JointState.SEEN: "#10a37f",
+    JointState.REFINED: "#56b4e9",
+    JointState.IMPUTED: "#e8710a",
+}
+RAW_COLOUR = "#b9a7c9"
+CLEAN_COLOUR = "#0072b2"
+TRUTH_COLOUR = "#7f7f7f"
+CONTACT_COLOUR = "#f0c808"
+ALARM_COLOUR = "#d81b60"
+
+CONTACT_INDICES: NDArray[np.intp] = np.array([J[name] for name in CONTACTS])
+"""(8,) canonical joints that the contact probabilities of ``pose/world`` are of."""
+
+
+def bones(observable: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """The bones to draw between the canonical joints that a sensor can see.
+
+    A joint that a sensor's skeleton lacks is skipped: its children hang from its nearest ancestor. A joint that is
+    only missing for a moment is no reason to redraw the skeleton: leave out the bones that end in it.
+
+    Args:
+        observable: (22,) the canonical joints that the sensor's skeleton has.
+
+    Returns:
+        (B, 2) canonical indices of parent and child.
+    """
+    pairs = []
+    for child in range(len(JOINTS)):
+        parent = PARENTS[child]
+        while parent >= 0 and not observable[parent]:
+            parent = PARENTS[parent]
+        if observable[child] and parent >= 0:
+            pairs.append((parent, child))
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2)
+
+
+ALL_BONES: NDArray[np.intp] = bones(np.ones(len(JOINTS), dtype=bool))
+"""(21, 2) parent and child of each canonical bone."""
+
+
+def bone_states(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(21,) state of each canonical bone: that of the less certain of its ends, unknown being the least certain."""
+    doubt = np.where(state == JointState.UNKNOWN, len(JointState), state)
+    worse = doubt[ALL_BONES].max(axis=1)
+    return np.where(worse == len(JointState), JointState.UNKNOWN, worse).astype(np.uint8)
+
+
+def to_world(positions: NDArray[np.floating], sensor_pose: Pose) -> NDArray[np.float64]:
+    """Positions (..., 3) in metres from a message's own frame to the z-up world; what is not finite becomes NaN."""
+    rotation = Rotation.from_quat(sensor_pose.orientation)
+    flat = np.where(np.isfinite(positions), positions, np.nan).astype(np.float64).reshape(-1, 3)
+    return (rotation.apply(flat) + sensor_pose.position).reshape(positions.shape)
+
+
+def facing(positions: NDArray[np.floating]) -> NDArray[np.float64] | None:
+    """(3,) horizontal unit vector in which the hips and shoulders of (22, 3) world joints face; None if unseen."""
+    across = np.nansum(
+        [positions[J[f"left_{part}"]] - positions[J[f"right_{part}"]] for part in ("hip", "shoulder")], axis=0
+    )
+    forward = np.array([across[1], -across[0], 0.0])
+    length = float(np.linalg.norm(forward))
+    return forward / length if length > 0.05 else None
