@@ -118,21 +118,30 @@ def _frame(left: Floats, up: Floats) -> Floats:
     return np.stack([x, y, _cross(x, y)], axis=-1)
 
 
-def swing(a: Floats, b: Floats) -> Floats:
-    """The smallest rotation that turns direction ``a`` (..., 3) into ``b`` (..., 3), as (..., 3, 3) matrices."""
-    a, b = _normalised(a), _normalised(b)
-    axis = _cross(a, b)
-    cosine = _dot(a, b)[..., None]
-    # Rodrigues without the angle. Opposite directions have no smallest rotation: any half turn will do, and the
-    # one about the normal nearest to a coordinate axis is taken.
-    scaled = axis / np.maximum(1 + cosine[..., 0], 1e-9)
-    rotation = cosine * _EYE + _skew(axis) + axis[..., :, None] * scaled[..., None, :]
-    opposite = cosine[..., 0, 0] < -1 + 1e-8
+def _against(a: Floats) -> Floats:
+    """(..., 4, 3) such that times a vector v it is cross(a, v) and a · v: all that turning unit ``a`` to v needs."""
+    return np.concatenate([_skew(a), a[..., None, :]], axis=-2)
+
+
+def _swing(against: Floats, b: Floats) -> Floats:
+    """The smallest rotations (..., 3, 3) that turn unit vectors, given by `_against`, into the directions ``b``."""
+    products = _apply(against, b) / np.maximum(np.sqrt(_dot(b, b)), 1e-9)
+    axis, cosine = products[..., :3], products[..., 3:]
+    # Rodrigues without the angle. Opposite directions have no smallest rotation: any half turn will do.
+    scaled = axis / np.maximum(1 + cosine, 1e-9)
+    rotation = cosine[..., None] * _EYE + _skew(axis) + axis[..., :, None] * scaled[..., None, :]
+    opposite = cosine[..., 0] < -1 + 1e-8
     if opposite.any():
+        a = against[..., 3, :]
         normal = _normalised(_cross(a, np.where(np.abs(a[..., :1]) < 0.9, _EYE[0], _EYE[1])))
         half_turn = 2 * normal[..., :, None] * normal[..., None, :] - _EYE
         rotation = np.where(opposite[..., None, None], half_turn, rotation)
     return rotation
+
+
+def swing(a: Floats, b: Floats) -> Floats:
+    """The smallest rotation that turns direction ``a`` (..., 3) into ``b`` (..., 3), as (..., 3, 3) matrices."""
+    return _swing(_against(_normalised(a)), b)
 
 
 def _about(axis: Floats, angle: Floats) -> Floats:
@@ -154,7 +163,7 @@ _BEND_NONE, _BEND_FULL = 0.1, 0.35
 
 # What shows the frame of pelvis and chest, best first: a left-right pair, and a place above (a mean of joints).
 _TRUNK_LEFT: dict[int, list[tuple[int, int]]] = {
-    J["pelvis"]: [(J["left_hip"], J["right_hip"])],
+    J["pelvis"]: [(J["left_hip"], J["right_hip"]), (J["left_shoulder"], J["right_shoulder"])],
     J["spine3"]: [(J["left_shoulder"], J["right_shoulder"]), (J["left_collar"], J["right_collar"])],
 }
 _TRUNK_UP: dict[int, list[tuple[int, ...]]] = {
@@ -191,9 +200,10 @@ def solve_rotations(
     its bone from where forward kinematics has put it towards the next joint seen below, so that an error is not
     handed down the chain; a shoulder or hip also twists so that the limb bends in the plane seen, as far as it is
     bent enough to show one. The twist of neck, head, wrists and feet cannot be seen in 22 positions: identity.
+    With the hips hidden, the pelvis is taken to be upright below the shoulders.
 
     Args:
-        positions: (..., 22, 3) metres, any frame; NaN where unobserved.
+        positions: (..., 22, 3) metres, z up; NaN where unobserved.
         offsets: (22, 3) or (..., 22, 3) metres, the person's bones.
         fallback: (..., 22, 3, 3) local rotations for what cannot be solved (the last frame's, say); identity
             if left out.
@@ -201,6 +211,13 @@ def solve_rotations(
     Returns:
         (..., 22, 3, 3) local rotation matrices, float64.
     """
+    return solve_pose(positions, offsets, fallback)[0]
+
+
+def solve_pose(
+    positions: NDArray[np.floating], offsets: NDArray[np.floating], fallback: NDArray[np.floating] | None = None
+) -> tuple[Floats, Floats]:
+    """`solve_rotations`, and the positions (..., 22, 3) where those rotations put the joints on these bones."""
     p = np.asarray(positions, dtype=np.float64)
     batch, joints = p.shape[:-2], len(PARENTS)
     offsets = np.asarray(offsets, dtype=np.float64)
@@ -216,14 +233,14 @@ def solve_rotations(
     place = np.take_along_axis(p, target[..., None], axis=-2)
     at_rest = np.take_along_axis(np.broadcast_to(rest, p.shape), target[..., None], axis=-2) - rest
     at_rest[~aimed] = _EYE[0]
+    against = _against(_normalised(at_rest))
 
     orientations: list[Floats] = []
     reached: list[Floats] = []
     for depth, level in enumerate(LEVELS):
         if depth == 0:
             above = np.broadcast_to(_EYE, (*batch, 1, 3, 3))
-            hips = (p[..., 1:2, :] + p[..., 2:3, :]) / 2
-            here = np.where(seen[..., :1, None], p[..., :1, :], hips)
+            here = _pelvis(p, seen, rest)
         else:
             parents = [q - LEVELS[depth - 1].start for q in PARENTS[level]]
             above = orientations[-1][..., parents, :, :]
@@ -233,7 +250,7 @@ def solve_rotations(
             known = aimed[..., level]
             direction = _apply(back, place[..., level, :] - here)
             direction[~known] = _EYE[0]
-            turn = swing(at_rest[..., level, :], direction)
+            turn = _swing(against[..., level, :, :], direction)
             hinges = [j for j in range(level.start, level.stop) if j in _HINGE]
             if hinges:
                 k = slice(hinges[0] - level.start, hinges[-1] + 1 - level.start)
@@ -251,7 +268,22 @@ def solve_rotations(
                 )
         reached.append(here)
         orientations.append(above @ local[..., level, :, :])
-    return local
+    return local, np.concatenate(reached, axis=-2)
+
+
+def _pelvis(p: Floats, seen: NDArray[np.bool_], rest: Floats) -> Floats:
+    """(..., 1, 3) the pelvis: seen, between the hips, or upright below the highest part of the trunk seen."""
+    hips, shoulders = [J["left_hip"], J["right_hip"]], [J["left_shoulder"], J["right_shoulder"]]
+    place = p[..., :1, :]
+    unseen = ~seen[..., 0]
+    for group in (hips, [J["spine3"]], [J["neck"]], shoulders):
+        if not unseen.any():
+            break
+        usable = unseen & seen[..., group].all(axis=-1)
+        centre = p[..., group, :].mean(axis=-2) - rest[..., group, :].mean(axis=-2) * _EYE[2]
+        place = np.where(usable[..., None, None], centre[..., None, :], place)
+        unseen = unseen & ~usable
+    return place
 
 
 def _solve_trunk(
@@ -321,7 +353,8 @@ def estimate_offsets(positions: NDArray[np.floating]) -> Floats:
     """
     p = np.asarray(positions, dtype=np.float64)
     offsets = REST_OFFSETS.copy()
-    for joint, ancestor in _seen_bones(np.asarray(finite_joints(p).any(axis=0))):
+    seen = np.asarray(finite_joints(p).any(axis=0))
+    for joint, ancestor in _seen_bones(seen):
         path = _path(ancestor, joint)
         lengths = np.linalg.norm(p[:, joint] - p[:, ancestor], axis=-1)
         if np.isfinite(lengths).any():
@@ -330,14 +363,16 @@ def estimate_offsets(positions: NDArray[np.floating]) -> Floats:
     world = global_rotations(solve_rotations(p, offsets))
     for trunk, children in ((0, (J["left_hip"], J["right_hip"])), (J["spine3"], (J["neck"], *_COLLARS))):
         for joint in children:
-            vectors = np.einsum("tji,tj->ti", world[:, trunk], p[:, joint] - p[:, trunk])
-            usable = np.isfinite(vectors).all(axis=-1)
+            end = joint if joint not in _COLLARS or seen[joint] else joint + _COLLAR_TO_SHOULDER
+            vectors = np.einsum("tji,tj->ti", world[:, trunk], p[:, end] - p[:, trunk])
+            usable = finite_joints(vectors)
             if usable.any():
-                offsets[joint] = np.median(vectors[usable], axis=0)
+                offsets[joint] = np.median(vectors[usable], axis=0) - (offsets[end] if end != joint else 0.0)
     return offsets
 
 
 _COLLARS = (J["left_collar"], J["right_collar"])
+_COLLAR_TO_SHOULDER = J["left_shoulder"] - J["left_collar"]
 
 
 def _seen_bones(seen: NDArray[np.bool_]) -> list[tuple[int, int]]:

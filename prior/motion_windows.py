@@ -14,9 +14,6 @@ from torch import Tensor
 
 from prior.skeletons import MIRROR
 
-FPS = 30.0
-"""Frames a second of prepared motion and of every model."""
-
 
 @dataclass(frozen=True)
 class MotionSet:
@@ -119,6 +116,6 @@ def remove_heading(rotations: Tensor, frame: int) -> tuple[Tensor, Tensor]:
 
 def yaw_rotation(yaw: Tensor) -> Tensor:
     """Rotations (..., 3, 3) about z by ``yaw`` (...) radians."""
-    axis = torch.zeros(*yaw.shape, 3, dtype=yaw.dtype)
-    axis[..., 2] = yaw
-    return roma.rotvec_to_rotmat(axis)
+    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    c, s = yaw.cos(), yaw.sin()
+    return torch.stack([c, -s, zero, s, c, zero, zero, zero, one], dim=-1).reshape(*yaw.shape, 3, 3)

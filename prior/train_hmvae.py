@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 
@@ -25,14 +26,14 @@ KL_WEIGHT = 0.003
 # The paper varies the frame rate; prepared motion has 30 Hz, so its thirds and halves are left. Half the windows keep
 # the rate at which the live node runs.
 STRIDES = (1, 1, 1, 2, 2, 3)
-TILT_SD = np.deg2rad(3.0)
+TILT_SD = math.radians(3.0)
 
 
 def train_hmvae(
     data: Path,
     runs: Path,
     weights: str = "default",
-    iterations: int = 24_000,
+    iterations: int = 14_000,
     batch: int = 64,
     learning_rate: float = 5e-4,
     seed: int = 0,
@@ -126,7 +127,7 @@ def _loss(model: HMVAE, rotations: Tensor, offsets: Tensor, detach_local: bool) 
     l_joints = (joints[0] - joints[1]).square().mean()
     loss = l_6d + l_rot + JOINT_WEIGHT * l_joints + KL_WEIGHT * (local_kl + global_kl)
     return loss, {
-        "loss": float(loss), "L_6d": float(l_6d), "KL local": float(local_kl), "KL global": float(global_kl),
+        "loss": loss.item(), "L_6d": l_6d.item(), "KL local": local_kl.item(), "KL global": global_kl.item(),
     }  # fmt: skip
 
 

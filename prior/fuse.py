@@ -1,0 +1,124 @@
+"""Fusion: the observation smoothed, the prior's opinion, this person's bones, and how sure the result is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from msgs.types import JointState
+from prior.filters import FixedLagRTS, Smoothed
+from prior.kinematics import forward_kinematics, solve_pose
+from prior.skeletons import JOINTS, PARENTS
+from prior.window import FPS, Estimate, Ring, Window
+
+
+@dataclass(frozen=True)
+class FuseSettings:
+    """How much to believe whom. Lengths are standard deviations along one axis.
+
+    Attributes:
+        enabled: whether to; off, the body stands as the refinement model decoded it, where its pelvis was seen.
+        measurement_sigma: metres, the fast noise of a joint seen with full confidence.
+        bias_sigma: metres, the sensor's slow error, which no filter averages out.
+        acceleration_density: m²/s³, how freely joints accelerate (of the fixed-lag smoother).
+        prior_sigma: metres, of a joint placed by the refinement model, when its body is well seen.
+        prior_drift: m/s, how fast that grows for a joint that is not seen.
+        fade: seconds after which a joint not seen is unknown.
+    """
+
+    enabled: bool = True
+    measurement_sigma: float = 0.02
+    bias_sigma: float = 0.02
+    acceleration_density: float = 2.0
+    prior_sigma: float = 0.05
+    prior_drift: float = 0.25
+    fade: float = 3.0
+
+
+class Fuse:
+    """Joins a fixed-lag smoother of what was seen with forward kinematics of what the prior decoded.
+
+    Each joint is the mean of the two, weighted by their precisions: one well seen stays near the observation,
+    one hidden follows the prior as the smoother's uncertainty grows. The mean is then put on the person's bones by
+    solving rotations for it, so that lengths are constant, and positions and rotations agree.
+    """
+
+    def __init__(self, settings: FuseSettings, delay_frames: int, slots: int) -> None:
+        self._settings = settings
+        self.delay_frames = delay_frames
+        self._smoother = FixedLagRTS(delay_frames, settings.acceleration_density, settings.measurement_sigma)
+        self._unseen_s = Ring(delay_frames + 1, (slots, len(JOINTS)), fill=np.inf)
+
+    def reset(self, slot: NDArray[np.bool_]) -> None:
+        """Forget the bodies in these slots."""
+        self._smoother.forget(np.repeat(slot[:, None], len(JOINTS), axis=1))
+        self._unseen_s.clear(slot)
+
+    def update(self, window: Window) -> Window:
+        """Write the estimate of the frame ``delay_frames`` before the newest, once there is one."""
+        positions = window.positions.newest
+        self._unseen_s.push(np.where(np.isfinite(positions[..., 0]), 0.0, self._unseen_s.newest + 1 / FPS))
+        sigma = self._settings.measurement_sigma / np.clip(window.confidence.newest, 0.1, 1.0)
+        smoothed = self._smoother.update(positions, float(window.stamp_s.newest), sigma)
+        window.out = None if smoothed is None else self._estimate(window, smoothed, self.delay_frames)
+        return window
+
+    def flush(self, window: Window) -> list[Estimate]:
+        """The estimates of the last ``delay_frames`` frames (fewer if there were fewer), oldest first."""
+        held = self._smoother.flush()
+        return [self._estimate(window, smoothed, len(held) - 1 - k) for k, smoothed in enumerate(held)]
+
+    def _estimate(self, window: Window, smoothed: Smoothed, back: int) -> Estimate:
+        s = self._settings
+        slots = np.flatnonzero(window.present)
+        offsets, decoded = window.offsets[slots], window.decoded[-1 - back][slots]
+        unseen_s = self._unseen_s.all[-1 - back][slots]
+        held_s = _least_below(unseen_s)
+        seen_weight = 1 / (smoothed.sigma[slots] ** 2 + s.bias_sigma**2)
+        prior_weight = 1 / (s.prior_sigma**2 + (s.prior_drift * np.minimum(held_s, s.fade)) ** 2)
+        known = seen_weight > 0
+        observed = np.where(known[..., None], smoothed.positions[slots], 0.0)
+        body = forward_kinematics(torch.from_numpy(decoded), torch.from_numpy(offsets))[0].numpy()
+        # The pelvis goes where it brings the decoded body nearest to all joints seen, not only to itself.
+        weight = (seen_weight * prior_weight / (seen_weight + prior_weight))[..., None]
+        total = weight.sum(axis=1, keepdims=True)
+        body += (weight * (observed - body)).sum(axis=1, keepdims=True) / np.maximum(total, 1e-12)
+        if s.enabled:
+            share = (seen_weight / (seen_weight + prior_weight))[..., None]
+            mean = body + share * (observed - body)
+            rotations, body = solve_pose(mean, offsets, decoded)
+        else:
+            rotations = decoded
+        placed = total[:, 0, 0] > 0
+        state = _states(unseen_s, held_s, s.fade)
+        sigma = 1 / np.sqrt(seen_weight + prior_weight)
+        return Estimate(
+            stamp_s=smoothed.stamp_s,
+            positions=_scatter(window.slots, slots[placed], body[placed], np.nan),
+            rotations=_scatter(window.slots, slots[placed], rotations[placed], np.nan),
+            sigma=_scatter(window.slots, slots[placed], sigma[placed], np.inf),
+            state=_scatter(window.slots, slots[placed], state[placed], JointState.UNKNOWN).astype(np.uint8),
+        )
+
+
+def _scatter(slots: int, rows: NDArray[np.intp], values: NDArray[Any], fill: float) -> NDArray[Any]:
+    full = np.full((slots, *values.shape[1:]), fill)
+    full[rows] = values
+    return full
+
+
+def _least_below(unseen_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """For how long neither a joint (S, 22) nor any below it was seen: a joint between two seen is held by them."""
+    least = unseen_s.copy()
+    for joint in range(len(PARENTS) - 1, 0, -1):
+        least[:, PARENTS[joint]] = np.minimum(least[:, PARENTS[joint]], least[:, joint])
+    return least
+
+
+def _states(unseen_s: NDArray[np.float64], held_s: NDArray[np.float64], fade: float) -> NDArray[np.uint8]:
+    hidden = np.where(held_s <= fade, JointState.IMPUTED, JointState.UNKNOWN)
+    return np.where(unseen_s == 0.0, JointState.REFINED, hidden).astype(np.uint8)

@@ -1,0 +1,139 @@
+"""The gate: jumps, impossible bone lengths and exchanged limbs, before they reach a network."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prior.filters import FixedLagRTS
+from prior.skeletons import MIRROR, PARENTS, J
+from prior.window import FPS, Window
+
+
+@dataclass(frozen=True)
+class GateSettings:
+    """Thresholds of the gate.
+
+    Attributes:
+        enabled: whether to refuse anything; off, all that is seen passes.
+        jump: metres a joint may be from where it was expected, beyond three standard deviations of that.
+        bone: fraction by which a bone may differ from this person's.
+        patience: seconds after which a joint refused (or limbs exchanged) throughout is believed after all.
+        min_confidence: joints below are unobserved.
+    """
+
+    enabled: bool = True
+    jump: float = 0.12
+    bone: float = 0.5
+    patience: float = 0.3
+    min_confidence: float = 0.1
+
+
+# Limbs that detectors exchange: whole arms and whole legs, on both sides.
+_LIMBS = tuple(
+    (np.array([J[f"left_{j}"] for j in limb]), np.array([J[f"right_{j}"] for j in limb]))
+    for limb in (("elbow", "wrist"), ("knee", "ankle", "foot"))
+)
+_SWAP_APART = 0.15  # metres between expected and seen, mean of a limb's joints, below which no exchange is suspected
+_SWAP_BETTER = 0.4  # an exchange must bring the joints this much nearer to where they were expected
+_BODY_JUMP = 0.5  # if more of the joints jump at once, the body did (a new track, a gap), not the joints
+
+
+class Gate:
+    """Refuses what cannot be: a refused joint becomes unobserved, exchanged limbs are put back.
+
+    Expectation comes from a constant-velocity Kalman filter fed with what passed. Nothing is refused for longer
+    than ``patience``: then the sensor is right and the expectation wrong.
+    """
+
+    delay_frames = 0
+
+    def __init__(self, settings: GateSettings, slots: int, counters: Counter[str]) -> None:
+        self._settings = settings
+        self._counters = counters
+        self._filter = FixedLagRTS(0, acceleration_density=20.0, measurement_sigma=0.015)
+        self._refused = np.zeros((slots, 22))
+        self._swapped = np.zeros((slots, len(_LIMBS)))
+
+    def reset(self, slot: NDArray[np.bool_]) -> None:
+        """Forget the bodies in these slots."""
+        if slot.all():
+            self._filter.reset()  # a new stream: its stamps may be earlier
+        self._filter.forget(np.repeat(slot[:, None], 22, axis=1))
+        self._refused[slot] = 0
+        self._swapped[slot] = 0
+
+    def update(self, window: Window) -> Window:
+        """Write the newest frame's positions from its raw ones, NaN where refused."""
+        s = self._settings
+        stamp = float(window.stamp_s.newest)
+        positions = window.raw.newest.copy()
+        positions[window.confidence.newest < s.min_confidence] = np.nan
+        expected = self._filter.predict(stamp)
+        if expected is not None and s.enabled:
+            known = np.isfinite(expected.positions[..., 0])
+            self._exchange(positions, expected.positions, known)
+            seen = np.isfinite(positions[..., 0])
+            distance = np.sqrt(((positions - expected.positions) ** 2).sum(axis=-1))
+            jumped = seen & known & (distance > s.jump + 3 * expected.sigma)
+            everywhere = jumped.sum(axis=1) > _BODY_JUMP * np.maximum((seen & known).sum(axis=1), 1)
+            self._believe(everywhere[:, None] & jumped)
+            jumped &= ~everywhere[:, None]
+            refused = jumped | (self._bad_bones(window, positions) & ~everywhere[:, None])
+            self._refused = np.where(refused, self._refused + 1, 0)
+            overruled = self._refused > s.patience * FPS
+            self._believe(overruled)
+            refused &= ~overruled
+            self._refused[overruled] = 0
+            if refused.any():
+                self._counters["joints_refused"] += int(refused.sum())
+                positions[refused] = np.nan
+        self._filter.update(positions, stamp)
+        window.positions.push(positions)
+        return window
+
+    def _believe(self, joints: NDArray[np.bool_]) -> None:
+        if joints.any():
+            self._filter.forget(joints)
+
+    def _exchange(
+        self, positions: NDArray[np.float64], expected: NDArray[np.float64], known: NDArray[np.bool_]
+    ) -> None:
+        """Put exchanged limbs back: both sides are nearer to where the other was expected."""
+        for k, (left, right) in enumerate(_LIMBS):
+            pair = np.concatenate([left, right])
+            keep = np.linalg.norm(positions[:, pair] - expected[:, pair], axis=-1).mean(axis=1)
+            swap = np.linalg.norm(positions[:, MIRROR[pair]] - expected[:, pair], axis=-1).mean(axis=1)
+            with np.errstate(invalid="ignore"):  # a limb with a joint unseen compares as False
+                exchanged = (keep > _SWAP_APART) & (swap < _SWAP_BETTER * keep) & known[:, pair].all(axis=1)
+            self._swapped[:, k] = np.where(exchanged, self._swapped[:, k] + 1, 0)
+            overruled = self._swapped[:, k] > self._settings.patience * FPS
+            if overruled.any():
+                exchanged &= ~overruled
+                self._swapped[overruled, k] = 0
+                forget = np.zeros(known.shape, dtype=bool)
+                forget[np.ix_(overruled, pair)] = True
+                self._believe(forget)
+                expected[forget] = np.nan
+            if exchanged.any():
+                self._counters["limbs_exchanged"] += int(exchanged.sum())
+                rows = np.flatnonzero(exchanged)[:, None]
+                positions[rows, pair] = positions[rows, MIRROR[pair]]
+
+    def _bad_bones(self, window: Window, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(S, 22) joints at the end of a bone of impossible length."""
+        own = np.linalg.norm(window.offsets, axis=-1)
+        length = np.linalg.norm(positions - positions[:, _PARENT], axis=-1)
+        with np.errstate(invalid="ignore"):
+            bad = np.abs(length - own) > np.maximum(self._settings.bone * own, 0.10)
+        bad[:, 0] = False
+        # A bad bone does not say which end is wrong: where the next bone is bad too, it is the joint between.
+        bad[:, _LEAF] &= ~bad[:, _PARENT][:, _LEAF]
+        return bad & window.measured[:, None]
+
+
+_PARENT = np.maximum(np.array(PARENTS), 0)
+_LEAF = np.array([j not in PARENTS for j in range(22)])

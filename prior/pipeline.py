@@ -1,0 +1,267 @@
+"""The prior, stage by stage: adapt, gate, bones, solve, refine, fuse.
+
+One object serves a stream: `PriorPipeline.process` takes ``pose/raw`` messages and gives the ``pose/clean`` messages
+they complete. All bodies go through each stage together, one slot a body. Nothing here reads a clock or draws a
+random number: the same input gives the same output, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+
+from msgs.types import CleanBody, PoseClean, PoseRaw, RawBody
+from prior.bones import Bones, BonesSettings
+from prior.fuse import Fuse, FuseSettings
+from prior.gate import Gate, GateSettings
+from prior.refine import Refine, RefineSettings
+from prior.resample import Resampler
+from prior.settings import build_settings
+from prior.skeletons import SKELETONS, Skeleton, finite_joints, to_canonical
+from prior.solve import Solve
+from prior.window import Estimate, Stage, Window
+
+MAX_DISTANCE = 30.0
+"""Metres from the sensor beyond which a joint is no sighting."""
+MIN_JOINTS = 6
+"""Canonical joints that must be seen for a body to be taken up."""
+BACKWARDS_NS = 1_000_000_000
+"""A stamp this far before the last starts a new stream; one nearer is a frame out of order."""
+
+
+@dataclass(frozen=True)
+class PriorSettings:
+    """Settings of the prior: ``[prior]`` of a launch file.
+
+    Attributes:
+        delay: frames at 30 Hz to wait for before answering, 0 to half the model's window (4, the default, is the
+            paper's centre-frame refinement).
+        max_bodies: bodies followed at once.
+        timeout: seconds without a sighting after which a body is dropped, and without a frame after which the
+            stream starts anew.
+        gate, bones, refine, fuse: settings of the stages.
+    """
+
+    delay: int = 4
+    max_bodies: int = 8
+    timeout: float = 0.5
+    gate: GateSettings = field(default_factory=GateSettings)
+    bones: BonesSettings = field(default_factory=BonesSettings)
+    refine: RefineSettings = field(default_factory=RefineSettings)
+    fuse: FuseSettings = field(default_factory=FuseSettings)
+
+    @classmethod
+    def from_dict(cls, settings: Mapping[str, Any]) -> PriorSettings:
+        """From the section of a launch file.
+
+        Raises:
+            ValueError: a key that does not exist (the message names the nearest that does) or a wrong type.
+        """
+        return build_settings(cls, settings, "prior")
+
+
+class PriorPipeline:
+    """The stages of the prior over a stream.
+
+    Attributes:
+        counters: what was refused or dropped so far, by cause.
+        delay_frames: frames at 30 Hz between a frame and its answer.
+    """
+
+    def __init__(self, settings: PriorSettings) -> None:
+        self.settings = settings
+        self.counters: Counter[str] = Counter()
+        self.delay_frames = settings.delay
+        slots = settings.max_bodies
+        refine = Refine(settings.refine, settings.delay)
+        self._resampler = Resampler(slots)
+        self._window = Window(refine.window, slots)
+        self._fuse = Fuse(settings.fuse, settings.delay, slots)
+        self._stages: tuple[Stage, ...] = (
+            Gate(settings.gate, slots, self.counters),
+            Bones(settings.bones, slots),
+            Solve(),
+            refine,
+            self._fuse,
+        )
+        self._ids: list[int | None] = [None] * slots
+        self._unseen_ns = np.zeros(slots, dtype=np.int64)
+        self._last: PoseRaw | None = None
+        self._origin_ns = 0  # stage times are seconds since: a float of seconds since 1970 would round stamps
+
+    def process(self, raw: PoseRaw) -> list[PoseClean]:
+        """Take a ``pose/raw`` message and give the ``pose/clean`` messages it completes, oldest first.
+
+        A message that cannot be used is counted in `counters` and otherwise ignored.
+        """
+        if raw.end_of_stream:
+            ended = self._clean(raw.stamp_ns, raw, [])
+            ended.end_of_stream = True
+            return [*self.flush(), ended]
+        skeleton = SKELETONS.get(raw.skeleton)
+        if skeleton is None:
+            self.counters["unknown_skeleton"] += 1
+            return []
+        flushed: list[PoseClean] = []
+        if self._last is not None:
+            step = raw.stamp_ns - self._last.stamp_ns
+            if -BACKWARDS_NS < step <= 0:
+                self.counters["stamp_repeated" if step == 0 else "stamp_out_of_order"] += 1
+                return []
+            if step <= 0 or step > self.settings.timeout * 1e9:
+                self.counters["stamp_jumped_back" if step <= 0 else "stream_gap"] += 1
+                flushed = self.flush()
+        if self._last is None:
+            self._origin_ns = raw.stamp_ns
+        self._last = raw
+        positions, confidence = self._adapt(raw, skeleton)
+        cleaned = []
+        for stamp_ns, tick_positions, tick_confidence in self._resampler.update(raw.stamp_ns, positions, confidence):
+            cleaned += self._step(stamp_ns, tick_positions, tick_confidence, raw)
+        return flushed + cleaned
+
+    def flush(self) -> list[PoseClean]:
+        """Give the frames that the delay still holds, and forget the stream."""
+        last = self._last
+        cleaned = []
+        if last is not None:
+            estimates = self._fuse.flush(self._window)
+            for back, estimate in zip(reversed(range(len(estimates))), estimates, strict=True):
+                cleaned.append(self._message(estimate, back, last))
+        self._drop(np.ones(self.settings.max_bodies, dtype=bool))
+        self._resampler.reset()
+        self._last = None
+        return cleaned
+
+    def _adapt(self, raw: PoseRaw, skeleton: Skeleton) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Canonical joints of every slot, (S, 22, 3) metres with z up, and their confidence (S, 22)."""
+        slots = self.settings.max_bodies
+        positions = np.full((slots, 22, 3), np.nan)
+        confidence = np.zeros((slots, 22))
+        taken: set[int] = set()
+        to_world, origin = _sensor(raw)
+        for body in raw.bodies:
+            if len(body.positions) != len(skeleton.joints):
+                self.counters["wrong_joint_count"] += 1
+                continue
+            if body.id in taken:
+                self.counters["body_id_repeated"] += 1
+                continue
+            taken.add(body.id)
+            joints, trust = self._sighting(body, skeleton)
+            slot = self._slot(body.id, seen=int(np.isfinite(joints[:, 0]).sum()))
+            if slot is None:
+                continue
+            positions[slot] = joints @ to_world.T + origin
+            confidence[slot] = trust
+        return positions, confidence
+
+    def _sighting(self, body: RawBody, skeleton: Skeleton) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """A body's canonical joints in the sensor's frame; what is not finite or too far away is missing."""
+        joints = body.positions.astype(np.float64)
+        finite = finite_joints(joints)
+        far = finite & (np.abs(np.where(finite[:, None], joints, 0.0)).max(axis=1) > MAX_DISTANCE)
+        if far.any():
+            self.counters["joints_too_far"] += int(far.sum())
+            joints[far] = np.nan
+        trust = np.nan_to_num(body.confidence.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
+        return to_canonical(skeleton, joints, np.clip(trust, 0.0, 1.0))
+
+    def _slot(self, body_id: int, seen: int) -> int | None:
+        """The slot of a body, a free one if it is new and enough of it is seen."""
+        if body_id in self._ids:
+            return self._ids.index(body_id)
+        if seen < MIN_JOINTS:
+            self.counters["body_too_little_seen"] += 1
+            return None
+        if None not in self._ids:
+            self.counters["too_many_bodies"] += 1
+            return None
+        slot = self._ids.index(None)
+        self._ids[slot] = body_id
+        self._unseen_ns[slot] = 0
+        return slot
+
+    def _step(
+        self, stamp_ns: int, positions: NDArray[np.float64], confidence: NDArray[np.float64], raw: PoseRaw
+    ) -> list[PoseClean]:
+        """One step of the 30 Hz grid through all stages."""
+        window = self._window
+        taken = np.array([i is not None for i in self._ids])
+        seen = np.asarray(finite_joints(positions).any(axis=1))
+        window.present = window.present & taken | seen
+        self._unseen_ns = np.where(seen, stamp_ns, np.where(self._unseen_ns == 0, stamp_ns, self._unseen_ns))
+        gone = taken & (stamp_ns - self._unseen_ns > self.settings.timeout * 1e9)
+        if gone.any():
+            self._drop(gone)
+        window.stamp_s.push((stamp_ns - self._origin_ns) * 1e-9)
+        window.raw.push(positions)
+        window.confidence.push(confidence)
+        for stage in self._stages:
+            window = stage.update(window)
+        return [] if window.out is None else [self._message(window.out, self.delay_frames, raw)]
+
+    def _drop(self, slot: NDArray[np.bool_]) -> None:
+        for stage in self._stages:
+            stage.reset(slot)
+        self._window.clear(slot)
+        self._resampler.clear(slot)
+        for k in np.flatnonzero(slot):
+            self._ids[k] = None
+
+    def _message(self, estimate: Estimate, back: int, raw: PoseRaw) -> PoseClean:
+        """The estimate of the frame ``back`` before the newest, in the frame of the message that completed it."""
+        window = self._window
+        to_world, origin = _sensor(raw)
+        to_sensor = to_world.T
+        rotations = estimate.rotations.copy()
+        rotations[:, 0] = to_sensor @ rotations[:, 0]
+        quaternions = roma.rotmat_to_unitquat(torch.from_numpy(rotations)).numpy()
+        positions = (estimate.positions - origin) @ to_world
+        raw_positions = (window.raw.all[-1 - back] - origin) @ to_world
+        bodies = [
+            CleanBody(
+                id=body_id,
+                positions=positions[slot],
+                rotations=quaternions[slot],
+                state=estimate.state[slot],
+                sigma=estimate.sigma[slot],
+                anomaly=np.nan,
+                anomaly_flag=False,
+                bone_lengths=np.linalg.norm(window.offsets[slot], axis=-1),
+                raw_positions=raw_positions[slot],
+                raw_confidence=window.confidence.all[-1 - back][slot],
+            )
+            for slot, body_id in enumerate(self._ids)
+            if body_id is not None and np.isfinite(estimate.positions[slot, 0, 0])
+        ]
+        return self._clean(self._origin_ns + round(estimate.stamp_s * 1e9), raw, bodies)
+
+    def _clean(self, stamp_ns: int, raw: PoseRaw, bodies: list[CleanBody]) -> PoseClean:
+        return PoseClean(
+            stamp_ns=stamp_ns,
+            frame_id=raw.frame_id,
+            source=raw.source,
+            sensor_pose=raw.sensor_pose,
+            calibrated=raw.calibrated,
+            delay_frames=self.delay_frames,
+            bodies=bodies,
+        )
+
+
+@lru_cache(maxsize=8)
+def _rotation(quaternion: bytes) -> NDArray[np.float64]:
+    return roma.unitquat_to_rotmat(torch.from_numpy(np.frombuffer(quaternion).copy())).numpy()
+
+
+def _sensor(raw: PoseRaw) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation (3, 3) and position (3,) of the sensor in the world."""
+    return _rotation(raw.sensor_pose.orientation.tobytes()), raw.sensor_pose.position

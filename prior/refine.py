@@ -1,0 +1,71 @@
+"""Refinement: encode a window, decode it, keep one frame, slide by one (HM-VAE, equations 10 to 13)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from prior.checkpoint import load_weights
+from prior.hmvae import HMVAE, HMVAEConfig, from_6d, to_6d
+from prior.motion_windows import remove_heading
+from prior.window import Window
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """Whether, and with which weights, to refine.
+
+    Attributes:
+        enabled: whether to; off, the solved rotations pass as they are.
+        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
+    """
+
+    enabled: bool = True
+    weights: str = "default"
+
+
+class Refine:
+    """Centre-frame refinement by HM-VAE, with a delay of one's choice.
+
+    A window N_1 … N_T goes through the posterior's mean and the decoder, and its frame ``T - 1 - delay`` (counted
+    from 0) is kept by the fusion that follows. With the default delay T / 2 that is index T / 2 - 1, the paper's
+    M_{T/2} of equation 12. Smaller delays keep later frames of the same windows, down to 0, the newest. At the start
+    of a stream, windows are filled up with the first frame.
+    """
+
+    def __init__(self, settings: RefineSettings, delay_frames: int) -> None:
+        self._enabled = settings.enabled
+        state, config = load_weights(settings.weights, "hmvae")
+        self._model = HMVAE(HMVAEConfig.from_dict(config))
+        self._model.load_state_dict(state)
+        self._model.eval()
+        self.window = self._model.config.window
+        if not 0 <= delay_frames <= self.window // 2:
+            raise ValueError(
+                f"delay: expected 0 to {self.window // 2} frames (half of the model's window), got {delay_frames}"
+            )
+        self.delay_frames = delay_frames
+
+    def reset(self, slot: NDArray[np.bool_]) -> None:
+        """Nothing is kept here."""
+
+    @torch.inference_mode()
+    def update(self, window: Window) -> Window:
+        """Write ``window.decoded`` for every body present, all of them in one batch."""
+        slots = np.flatnonzero(window.present)
+        frames = window.rotations.all[:, slots]
+        missing = np.isnan(frames[..., 0, 0, 0]).sum(axis=0)  # a body younger than the window repeats its first frame
+        order = np.maximum(np.arange(self.window)[:, None], missing)
+        frames = frames[order, np.arange(len(slots))]
+        if not self._enabled or not len(slots):
+            window.decoded[:, slots] = frames
+            return window
+        rotations = torch.from_numpy(frames).float().transpose(0, 1)
+        turned, back = remove_heading(rotations, self.window // 2 - 1)
+        decoded = from_6d(self._model.reconstruct(to_6d(turned)))
+        decoded[:, :, 0] = back[:, None] @ decoded[:, :, 0]
+        window.decoded[:, slots] = decoded.transpose(0, 1).double().numpy()
+        return window

@@ -1,0 +1,82 @@
+"""From a camera's irregular stamps to the prior's 30 Hz grid, by capture time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prior.window import FPS
+
+PERIOD_NS = round(1e9 / FPS)
+MAX_GAP_NS = 150_000_000
+"""A joint not seen for longer than this is missing in between, not interpolated."""
+LOOK_AHEAD_NS = 10_000_000
+"""A frame this much older than its grid time is carried forward to it, rather than waiting for the next frame."""
+
+
+class Resampler:
+    """Interpolates every slot's joints to grid times ``anchor + n / 30 s``, as frames come in.
+
+    Between two sightings of a joint positions are interpolated linearly and the lesser confidence holds. A grid
+    time is given out as soon as a frame is no more than 10 ms older: a stream of 30 Hz whose stamps jitter by a
+    few milliseconds then costs no extra frame of delay.
+    """
+
+    def __init__(self, slots: int) -> None:
+        self._slots = slots
+        self.reset()
+
+    def reset(self) -> None:
+        """Start a new grid at the next frame."""
+        self._anchor: int | None = None
+        self._ticks = 0
+        self._stamp = np.full(2, -1, dtype=np.int64)
+        self._seen_ns = np.full((2, self._slots, 22), np.iinfo(np.int64).min // 2)
+        self._positions = np.full((2, self._slots, 22, 3), np.nan)
+        self._confidence = np.zeros((2, self._slots, 22))
+
+    def clear(self, slot: NDArray[np.bool_]) -> None:
+        """Forget the sightings of these slots (S,)."""
+        self._seen_ns[:, slot] = np.iinfo(np.int64).min // 2
+
+    def update(
+        self, stamp_ns: int, positions: NDArray[np.float64], confidence: NDArray[np.float64]
+    ) -> list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
+        """Take a frame and give the grid frames that it completes.
+
+        Args:
+            stamp_ns: capture time, later than the last.
+            positions: (S, 22, 3) metres, NaN where unobserved.
+            confidence: (S, 22).
+
+        Returns:
+            (stamp_ns, positions, confidence) of each grid time reached, oldest first.
+        """
+        if self._anchor is None:
+            self._anchor = stamp_ns
+        seen = np.isfinite(positions[..., 0])
+        # Row 1 is each joint's last sighting, row 0 the one before.
+        for store, value in (
+            (self._seen_ns, np.full(seen.shape, stamp_ns)),
+            (self._positions, positions),
+            (self._confidence, confidence),
+        ):
+            store[0][seen] = store[1][seen]
+            store[1][seen] = value[seen]
+        frames = []
+        while (tick := self._anchor + self._ticks * PERIOD_NS) <= stamp_ns + LOOK_AHEAD_NS:
+            frames.append((tick, *self._at(tick, stamp_ns)))
+            self._ticks += 1
+        return frames
+
+    def _at(self, tick: int, now: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        before, after = self._seen_ns
+        span = after - before
+        between = (span <= MAX_GAP_NS) & (before - LOOK_AHEAD_NS <= tick) & (tick <= after + LOOK_AHEAD_NS)
+        alone = ~between & (np.abs(tick - after) <= LOOK_AHEAD_NS)
+        share = np.where(between, (tick - before) / np.maximum(span, 1), 1.0)[..., None]
+        earlier = np.where(between[..., None], self._positions[0], self._positions[1])
+        positions = earlier + share * (self._positions[1] - earlier)
+        known = (between | alone) & (now - after <= MAX_GAP_NS)
+        confidence = np.where(between, self._confidence.min(axis=0), self._confidence[1])
+        return np.where(known[..., None], positions, np.nan), np.where(known, confidence, 0.0)

@@ -1,0 +1,118 @@
+"""What the stages of the prior hand to each other: the last frames of every body, in preallocated rings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prior.skeletons import REST_OFFSETS
+
+FPS = 30.0
+"""Frames a second of the prior's grid, of prepared motion and of every model."""
+
+
+class Ring:
+    """The last ``frames`` arrays of one shape, readable at once and in order, without copying or allocating.
+
+    Each frame is written twice, half the buffer apart, so that the newest ``frames`` always lie side by side.
+    """
+
+    def __init__(self, frames: int, shape: tuple[int, ...], fill: float = np.nan) -> None:
+        self._data = np.full((2 * frames, *shape), fill)
+        self._frames, self._fill = frames, fill
+        self._next = 0
+
+    def push(self, frame: NDArray[np.floating] | float) -> None:
+        """Append the newest frame, forgetting the oldest."""
+        self._data[self._next] = self._data[self._next + self._frames] = frame
+        self._next = (self._next + 1) % self._frames
+
+    @property
+    def all(self) -> NDArray[np.float64]:
+        """(frames, ...) oldest first; a view, to be read."""
+        return self._data[self._next : self._next + self._frames]
+
+    @property
+    def newest(self) -> NDArray[np.float64]:
+        """The frame pushed last."""
+        return self._data[(self._next - 1) % self._frames]
+
+    def clear(self, slot: NDArray[np.bool_]) -> None:
+        """Refill these slots, the first axis of a frame, with the initial value in all frames."""
+        self._data[:, slot] = self._fill
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The prior's answer for one moment and every slot, in world-aligned coordinates.
+
+    Attributes:
+        stamp_s: the moment, seconds.
+        positions: (S, 22, 3) metres; NaN for a body of which nothing is known.
+        rotations: (S, 22, 3, 3) local.
+        sigma: (S, 22) metres, standard deviation along an axis.
+        state: (S, 22) `JointState`.
+    """
+
+    stamp_s: float
+    positions: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    state: NDArray[np.uint8]
+
+
+class Window:
+    """The last T frames of S bodies in world-aligned coordinates (z up); the newest is the last.
+
+    Attributes:
+        stamp_s: ring of capture times, seconds.
+        raw: ring of (S, 22, 3) metres, the canonical joints that came in; NaN where unobserved.
+        confidence: ring of (S, 22) in 0..1.
+        positions: ring of (S, 22, 3) metres after the gate; NaN where unobserved or refused.
+        rotations: ring of (S, 22, 3, 3) local, solved from the positions.
+        present: (S,) which slots hold a body.
+        offsets: (S, 22, 3) metres, each person's bones.
+        measured: (S,) whether these are the person's own, not yet those of a generic adult.
+        decoded: (T, S, 22, 3, 3) local rotations of the same frames, from the refinement model.
+        out: the estimate of the frame ``delay`` before the newest, or None while there is none.
+    """
+
+    def __init__(self, frames: int, slots: int) -> None:
+        self.frames, self.slots = frames, slots
+        self.stamp_s = Ring(frames, ())
+        self.raw = Ring(frames, (slots, 22, 3))
+        self.confidence = Ring(frames, (slots, 22), fill=0.0)
+        self.positions = Ring(frames, (slots, 22, 3))
+        self.rotations = Ring(frames, (slots, 22, 3, 3))
+        self.present = np.zeros(slots, dtype=bool)
+        self.offsets = np.tile(REST_OFFSETS, (slots, 1, 1))
+        self.measured = np.zeros(slots, dtype=bool)
+        self.decoded = np.broadcast_to(np.eye(3), (frames, slots, 22, 3, 3)).copy()
+        self.out: Estimate | None = None
+
+    def clear(self, slot: NDArray[np.bool_]) -> None:
+        """Forget what these slots (S,) held."""
+        for ring in (self.raw, self.confidence, self.positions, self.rotations):
+            ring.clear(slot)
+        self.present &= ~slot
+        self.measured &= ~slot
+        self.offsets[slot] = REST_OFFSETS
+        self.decoded[:, slot] = np.eye(3)
+
+
+class Stage(Protocol):
+    """One step of the prior. A stage keeps its state by slot, and reads and writes the window."""
+
+    delay_frames: int
+    """How many later frames it needs."""
+
+    def update(self, window: Window) -> Window:
+        """Work on the newest frame; return the window."""
+        ...
+
+    def reset(self, slot: NDArray[np.bool_]) -> None:
+        """Forget the bodies in these slots (S,)."""
+        ...
