@@ -13,13 +13,16 @@ import os
 import tempfile
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any
 
-from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
+from prior.settings import build_settings
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from prior.pipeline import PriorSettings
+    from prior.trajectory import TrajectorySettings
 
 #: The graph: each node, and for every node it listens to the topics it takes from there.
 LISTENS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
@@ -40,6 +43,9 @@ LISTENS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
 
 #: The publishers that carry poses; what a listener from outside the graph (echo, hz, viewer) connects to.
 POSE_NODES = ("pose_input", "prior", "trajectory")
+
+_PATHS = (("input", "recording"), ("recorder", "directory"), ("transport", "keys"), ("transport", "directory"))
+"""settings that are paths: relative ones in a launch file start at that file"""
 
 
 class LaunchError(ValueError):
@@ -76,10 +82,12 @@ class TransportSettings:
     """not lossless: frames a node keeps when it falls behind"""
 
     def __post_init__(self) -> None:
-        for node in self.endpoints:
+        for node, address in self.endpoints.items():
+            if not isinstance(address, str):
+                raise LaunchError(f"[transport.endpoints] {node}: expected an address, got {address!r}")
             if node not in LISTENS:
                 raise LaunchError(
-                    f"[transport.endpoints] names {node!r}, which is no node{_nearest(node, LISTENS)}; "
+                    f"[transport.endpoints] names {node!r}, which is no node{nearest(node, LISTENS)}; "
                     f"nodes are {', '.join(LISTENS)}"
                 )
 
@@ -100,17 +108,14 @@ class RecorderSettings:
 
     directory: str = ""
     """the rosbag2 directory to make; a relative path starts at the launch file"""
-    topics: list[str] = field(
-        default_factory=lambda: [POSE_RAW, POSE_TRUTH, POSE_CLEAN, POSE_WORLD, DIAGNOSTICS],
-    )
+    topics: list[str] = field(default_factory=lambda: list(TOPICS))
 
     def __post_init__(self) -> None:
-        known = [POSE_RAW, POSE_TRUTH, POSE_CLEAN, POSE_WORLD, DIAGNOSTICS]
         for topic in self.topics:
-            if topic not in known:
+            if topic not in TOPICS:
                 raise LaunchError(
-                    f"[recorder] topics names {topic!r}, which nobody publishes{_nearest(topic, known)}; "
-                    f"topics are {', '.join(known)}"
+                    f"[recorder] topics names {topic!r}, which nobody publishes{nearest(topic, TOPICS)}; "
+                    f"topics are {', '.join(TOPICS)}"
                 )
 
 
@@ -126,7 +131,6 @@ class ViewerSettings:
 class Launch:
     """A launch file as read, with the overrides of the command line applied."""
 
-    path: Path
     nodes: list[str] = field(default_factory=lambda: list(POSE_NODES))
     input: InputSettings = field(default_factory=InputSettings)
     prior: dict[str, Any] = field(default_factory=dict)
@@ -139,7 +143,7 @@ class Launch:
         for node in self.nodes:
             if node not in LISTENS:
                 raise LaunchError(
-                    f"nodes names {node!r}, which is no node{_nearest(node, LISTENS)}; nodes are {', '.join(LISTENS)}"
+                    f"nodes names {node!r}, which is no node{nearest(node, LISTENS)}; there are {', '.join(LISTENS)}"
                 )
 
     @classmethod
@@ -158,14 +162,18 @@ class Launch:
             table = tomllib.loads(file.read_text(encoding="utf-8"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise LaunchError(f"{file} is not TOML: {error}") from error
-        _refuse_unknown([field.name for field in fields(cls) if field.name != "path"], table, f"{file.name}: section")
-        for section, key in (("input", "recording"), ("recorder", "directory"), ("transport", "keys")):
-            value = table.get(section, {}).get(key) if isinstance(table.get(section), dict) else None
-            if isinstance(value, str) and value:
-                table[section][key] = str(file.parent / Path(value).expanduser())
+        for section, key in _PATHS:
+            values = table.get(section)
+            if isinstance(values, dict) and isinstance(text := values.get(key), str) and text:
+                values[key] = str(file.parent / Path(text).expanduser())
         for override in overrides:
             apply_override(table, override)
-        return from_table(cls, table | {"path": file}, file.name)
+        try:
+            return build_settings(cls, table, file.name)
+        except LaunchError:
+            raise
+        except ValueError as error:
+            raise LaunchError(str(error)) from error
 
     def listeners(self, node: str) -> frozenset[str]:
         """The nodes that must not miss a pose of ``node``: those of this launch that work on it or record it."""
@@ -209,7 +217,7 @@ def find(launch: str | Path) -> Path:
         if path.name in own:
             return checkout("launch", f"{path.name}.toml")
         raise LaunchError(
-            f"no launch file {path.name!r}{_nearest(path.name, own)}; there are {', '.join(own)}, or give a path"
+            f"no launch file {path.name!r}{nearest(path.name, own)}; there are {', '.join(own)}, or give a path"
         )
     raise LaunchError(f"no launch file at {path}")
 
@@ -235,50 +243,35 @@ def apply_override(table: dict[str, Any], override: str) -> None:
     table[key] = value
 
 
-def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
-    """Make a dataclass of settings from a table, strictly.
-
-    Args:
-        cls: a dataclass whose fields are str, int, float, bool, Path, list[str], dict, or such a dataclass.
-        table: its fields by name; those left out keep their defaults.
-        where: what to call the table in an error.
+def prior_settings(table: Mapping[str, Any]) -> PriorSettings:
+    """The settings of the prior from ``[prior]``.
 
     Raises:
-        LaunchError: a key that is no field (the nearest one is named), or a value of another type.
+        LaunchError: an unknown key, or a value that cannot be.
     """
-    hints = get_type_hints(cls)
-    _refuse_unknown(list(hints), table, f"{where}: key")
-    return cls(**{key: _value(hints[key], value, f"{where}: {key}") for key, value in table.items()})
+    from prior.pipeline import PriorSettings  # brings torch
+
+    try:
+        return PriorSettings.from_dict(table)
+    except ValueError as error:
+        raise LaunchError(str(error)) from error
 
 
-def _value(kind: Any, value: Any, where: str) -> Any:
-    if is_dataclass(kind) and isinstance(kind, type):
-        if not isinstance(value, dict):
-            raise LaunchError(f"{where}: expected a section, got {value!r}")
-        return from_table(kind, value, where)
-    if kind is float and type(value) is int:
-        return float(value)
-    origin = get_origin(kind) or kind
-    if not isinstance(value, origin) or (isinstance(value, bool) and origin is not bool):
-        raise LaunchError(f"{where}: expected {_spell(kind)}, got {value!r}")
-    inner = get_args(kind)
-    members = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    if inner and inner[-1] is str and any(not isinstance(member, str) for member in members):
-        raise LaunchError(f"{where}: expected {_spell(kind)}, got {value!r}")
-    return value
+def trajectory_settings(table: Mapping[str, Any]) -> TrajectorySettings:
+    """The settings of the trajectory from ``[trajectory]``.
+
+    Raises:
+        LaunchError: an unknown key, or a value that cannot be.
+    """
+    from prior.trajectory import TrajectorySettings  # brings torch
+
+    try:
+        return TrajectorySettings.from_dict(table)
+    except ValueError as error:
+        raise LaunchError(str(error)) from error
 
 
-def _spell(kind: Any) -> str:
-    names = {str: "text", int: "a whole number", float: "a number", bool: "true or false", list[str]: "a list of texts"}
-    return names.get(kind, "a section")
-
-
-def _refuse_unknown(known: list[str], table: Mapping[str, Any], what: str) -> None:
-    for key in table:
-        if key not in known:
-            raise LaunchError(f"{what} {key!r} does not exist{_nearest(key, known)}; there are {', '.join(known)}")
-
-
-def _nearest(name: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The end of an error's sentence: the known name that was probably meant, if there is one."""
+    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
     return f", did you mean {close[0]!r}?" if close else ""

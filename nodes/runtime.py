@@ -253,7 +253,7 @@ class Node(ABC):
         except Exception as error:
             cause = f"refused.{type(error).__name__}"
             if cause not in self.counts:
-                logger.exception("%s: could not work on a message of %s; more of these are only counted", self.name, topic)
+                logger.exception("%s: a message of %s failed; more of these are only counted", self.name, topic)
             self.counts[cause] += 1
         if not isinstance(message, Diagnostics):
             self._compute_ns.append(self.clock.now_ns() - started - self._blocked_ns)
@@ -351,16 +351,16 @@ class Node(ABC):
         if self._required - self._given_up <= present:
             return
         state, self._state = self._state, f"waiting for {', '.join(sorted(self._required - present))}"
-        until = self.clock.now_ns() + round(self.launch.transport.wait_s * 1e9)
+        transport = self.launch.transport
+        until = self.clock.now_ns() + round(transport.wait_s * 1e9)
         self.report()
         while not self._publisher.wait_for_listeners(self._required - self._given_up, timeout_s=TURN_S):
             if self._stopping:
                 break
             if self.clock.now_ns() >= until:
                 self._given_up = self._required - self._publisher.listeners
-                logger.warning(
-                    "%s: no %s after %g s; going on without", self.name, ", ".join(self._given_up), self.launch.transport.wait_s
-                )
+                missing = ", ".join(sorted(self._given_up))
+                logger.warning("%s: no %s after %g s; going on without", self.name, missing, transport.wait_s)
             self.report_if_due()
         self._state = state
 

@@ -1,0 +1,95 @@
+"""The ``steadypose`` command: one line of help for each subcommand here, everything else where it is done.
+
+A subcommand is a typed function with a docstring, in a module of its own that is imported when it is chosen, so that
+`steadypose --help`, or a subcommand that needs no torch, never waits for one that does.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import sys
+from importlib.metadata import version
+
+#: name: (where, what it does)
+COMMANDS = {
+    "run": ("nodes.run:run", "start the nodes of a launch file, watch them, show how they do"),
+    "node": ("nodes.node:node", "one node, for another machine or a supervisor such as systemd"),
+    "clean": ("nodes.clean:clean", "clean a recording or .npz offline, with the nodes' own code"),
+    "echo": ("nodes.inspect:echo", "print the messages of a topic or recording"),
+    "hz": ("nodes.inspect:hz", "measure the rate of a topic or recording"),
+    "info": ("nodes.inspect:info", "what is in a recording, or on a topic"),
+    "plot": ("nodes.plot:plot", "what happened in a recording, as pictures"),
+    "prepare": ("nodes.prepare:prepare", "motion capture into training data"),
+    "train": ("prior.train:train", "train a model of the prior"),
+    "simulate": ("nodes.simulate:simulate", "make streams as a depth camera would see them, with their truth"),
+    "doctor": ("nodes.doctor:doctor", "what is missing on this machine, and how to get it"),
+    "keys": ("nodes.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),
+}
+
+USAGE_ERROR = 2
+"""exit status: what was asked for cannot be done, and will not be the next time either"""
+INTERRUPTED = 130
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(usage())
+        return 0
+    if arguments[0] == "--version":
+        print(version("steadypose"))
+        return 0
+    name = arguments[0]
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(COMMANDS)}"
+        print(f"steadypose: no command {name!r}: {hint}", file=sys.stderr)
+        return USAGE_ERROR
+    import tyro
+
+    module, function = COMMANDS[name][0].split(":")
+    try:
+        status = tyro.cli(
+            getattr(importlib.import_module(module), function),
+            prog=f"steadypose {name}",
+            args=arguments[1:],
+            config=(tyro.conf.PositionalRequiredArgs, tyro.conf.UseAppendAction, tyro.conf.FlagCreatePairsOff),
+        )
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:
+        # the reader of a pipe, as in `steadypose echo … | head`, has seen enough; spare Python the flush at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        if not _is_for_user(error):
+            raise
+        print(f"steadypose {name}: {error}", file=sys.stderr)
+        return USAGE_ERROR
+    return status if isinstance(status, int) else 0
+
+
+def usage() -> str:
+    """The help of the command itself."""
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {what}" for name, (_, what) in COMMANDS.items()]
+    return "\n".join(
+        (
+            "steadypose: clean, world-space human pose from any noisy 3D skeleton source\n",
+            "commands:",
+            *lines,
+            "\n`steadypose COMMAND --help` says more; `steadypose run` plays a bundled stream.",
+        )
+    )
+
+
+def _is_for_user(error: Exception) -> bool:
+    """Errors of this project's own, and of files, say what to do; any other is a bug and keeps its traceback."""
+    return isinstance(error, OSError) or type(error).__module__.partition(".")[0] in ("msgs", "prior", "nodes")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,145 @@
+"""The input node: gives the skeletons of a source at the pace they were captured, at another, or as they are taken."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Protocol
+
+from msgs.recording import RecordingError, RecordingReader
+from msgs.topics import POSE_RAW, POSE_TRUTH
+from msgs.types import Diagnostics, Message, PoseRaw
+from nodes.launch import Launch, LaunchError
+from nodes.npz import NpzSource
+from nodes.runtime import TURN_S, Clock, Node, Timeline
+
+LEAP_NS = 15_000_000_000
+"""a step of stamps, either way, that is no pause but another clock: it is not waited for"""
+LOOP_PAUSE_NS = 1_000_000_000
+"""between the end of a stream and its start over; long enough for every stage to let go of its bodies"""
+
+
+class Source(Protocol):
+    """Skeletons in the order they came, each with its topic: ``pose/raw``, and ``pose/truth`` where it is known."""
+
+    refused: Counter[str]
+    """what could not be read, by cause"""
+
+    def __iter__(self) -> Iterator[tuple[str, Message]]: ...
+
+
+class RecordingSource:
+    """The skeletons of a recording, without the mark of its end.
+
+    Raises:
+        RecordingError: there is no recording, or no ``pose/raw`` in it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with RecordingReader(path) as recording:
+            if not recording.count(POSE_RAW):
+                raise RecordingError(
+                    f"{path}: expected messages on {POSE_RAW}, got {', '.join(recording.topics)}; record that topic too"
+                )
+            self.refused: Counter[str] = Counter({"bytes of a truncated recording": recording.lost_bytes})
+            self._frames = recording.count(POSE_RAW)
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def __iter__(self) -> Iterator[tuple[str, Message]]:
+        with RecordingReader(self.path) as recording:
+            try:
+                for topic, _, message in recording.messages([POSE_RAW, POSE_TRUTH]):
+                    if not isinstance(message, Diagnostics) and not message.end_of_stream:
+                        yield topic, message
+            except RecordingError:
+                self.refused["damaged recording"] += 1
+            self.refused.update({f"undecodable {topic}": n for topic, n in recording.refused.items()})
+
+
+def open_source(path: str | Path) -> RecordingSource | NpzSource:
+    """The recording at ``path``: a rosbag2 directory, an ``.mcap``, or an ``.npz``.
+
+    Raises:
+        LaunchError: there is nothing at the path.
+        RecordingError, NpzError: what is there holds no skeletons. All are ValueErrors that say what to do.
+    """
+    if not str(path):
+        raise LaunchError("[input] recording: expected a recording or .npz to play, got none; give --input")
+    path = Path(path)
+    if not path.exists():
+        raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap or an .npz")
+    return NpzSource(path) if path.suffix == ".npz" else RecordingSource(path)
+
+
+def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:
+    """The messages, and after the last the mark that the stream ends there."""
+    last: PoseRaw | None = None
+    for topic, message in messages:
+        yield topic, message
+        if isinstance(message, PoseRaw):
+            last = message
+    if last:
+        yield POSE_RAW, dataclasses.replace(last, bodies=[], end_of_stream=True)
+
+
+class PoseInputNode(Node):
+    """Publishes ``pose/raw``, and ``pose/truth`` where the source has it; ends when the source does."""
+
+    name = "pose_input"
+
+    def __init__(self, launch: Launch, clock: Clock | None = None, source: Source | None = None) -> None:
+        super().__init__(launch, clock)
+        settings = launch.input
+        if settings.rate < 0:
+            raise LaunchError(f"[input] rate: expected 0 (as fast as possible) or more, got {settings.rate:g}")
+        self._source = source or open_source(settings.recording)
+        self._rate = settings.rate
+        self._loop = settings.loop
+        self._last_ns: int | None = None
+
+    def handle(self, topic: str, message: Message) -> None:
+        raise AssertionError("the input node listens to none")
+
+    def work(self) -> None:
+        for topic, message in with_end(self._messages()):
+            if message.stamp_ns != self._last_ns:
+                self._wait_for(message.stamp_ns)
+            if self.stopping:
+                return
+            self.publish(topic, message)
+            self.report_if_due()
+
+    def status(self) -> dict[str, str]:
+        refused = {f"refused.{cause}": str(n) for cause, n in self._source.refused.items() if n}
+        return refused | (self.timeline.values() if self.timeline else {})
+
+    def _messages(self) -> Iterator[tuple[str, Message]]:
+        shift_ns = 0
+        while True:
+            newest_ns = 0
+            first_ns: int | None = None
+            for topic, message in self._source:
+                first_ns = message.stamp_ns if first_ns is None else first_ns
+                newest_ns = max(newest_ns, message.stamp_ns)
+                yield topic, dataclasses.replace(message, stamp_ns=message.stamp_ns + shift_ns) if shift_ns else message
+            if not self._loop or first_ns is None:
+                return
+            shift_ns += newest_ns - first_ns + LOOP_PAUSE_NS
+
+    def _wait_for(self, stamp_ns: int) -> None:
+        """Wait until a stamp is due; where the source's clock was set, go on from now."""
+        last_ns, self._last_ns = self._last_ns, stamp_ns
+        if not self._rate:
+            return
+        if self.timeline is None or last_ns is None or abs(stamp_ns - last_ns) > LEAP_NS:
+            self.timeline = Timeline(stamp_ns, self.clock.now_ns(), self._rate)
+            self.report()
+        due_ns = self.timeline.wall(stamp_ns)
+        while (left_ns := due_ns - self.clock.now_ns()) > 0 and not self.stopping:
+            self.clock.sleep(min(left_ns, round(TURN_S * 1e9)))
+            self.report_if_due()

@@ -1,0 +1,40 @@
+"""The prior node: ``pose/raw`` in, ``pose/clean`` out."""
+
+from __future__ import annotations
+
+import torch
+
+from msgs.topics import POSE_CLEAN
+from msgs.types import Message, PoseRaw
+from nodes.launch import Launch, prior_settings
+from nodes.runtime import FRAME_NS, Clock, Node
+from prior.pipeline import PriorPipeline
+
+
+class PriorNode(Node):
+    """Runs `PriorPipeline` over what the input node gives."""
+
+    name = "prior"
+
+    def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
+        super().__init__(launch, clock)
+        # two threads that share the cores with other nodes wait for each other: a p99 of 100 ms
+        torch.set_num_threads(1)
+        self._pipeline = PriorPipeline(prior_settings(launch.prior))
+        self._bodies = 0
+        self._anomalies = 0
+
+    def handle(self, topic: str, message: Message) -> None:
+        if not isinstance(message, PoseRaw):
+            return
+        for clean in self._pipeline.process(message):
+            self._bodies = len(clean.bodies)
+            self._anomalies += sum(body.anomaly_flag for body in clean.bodies)
+            self.publish(POSE_CLEAN, clean, delay_ns=round(clean.delay_frames * FRAME_NS))
+
+    def status(self) -> dict[str, str]:
+        return {
+            "bodies": str(self._bodies),
+            "anomalies": str(self._anomalies),
+            "delay_frames": str(self._pipeline.delay_frames),
+        } | {f"refused.{cause}": str(n) for cause, n in self._pipeline.counters.items()}

@@ -1,0 +1,258 @@
+"""``steadypose run``: a launch file's nodes as processes, and a live table of how they do."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from msgs.keys import load_keys
+from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
+from msgs.transport import Subscriber
+from msgs.types import Diagnostics, Level
+from nodes.launch import LISTENS, Launch, LaunchError
+from nodes.pose_input import open_source
+from nodes.runtime import Clock, SystemClock
+from nodes.supervisor import Supervisor
+
+LINE_NS = 5_000_000_000
+"""between lines where there is no terminal for a table"""
+STUCK_NS = 15_000_000_000
+"""the source has ended and nothing more arrives for so long: something was lost on the way"""
+TURN_S = 0.1
+FRAME_MS = 1000 / 30
+STREAM_TOPICS = {"pose_input": POSE_RAW, "prior": POSE_CLEAN, "trajectory": POSE_WORLD}
+
+
+def run(
+    launch: Annotated[str, tyro.conf.Positional] = "replay",
+    input: Path | None = None,
+    rate: Annotated[float | None, tyro.conf.arg(metavar="X")] = None,
+    loop: bool = False,
+    record: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    view: bool = False,
+    settings: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="SECTION.KEY=VALUE")] = (),
+) -> int:
+    """Start the nodes of a launch file, watch them and show how they do, until the stream ends or Ctrl-C.
+
+    Args:
+        launch: a launch file, or the name of one of the project's own: replay, server.
+        input: the recording or .npz to play in place of the launch file's.
+        rate: times real time; 0 is as fast as it goes.
+        loop: play it again and again.
+        record: a recording to make of all topics.
+        view: serve the picture for a browser, and print its address.
+        settings: any setting of the launch file, over what it says. May be given again.
+    """
+    overrides = list(settings)
+    if input is not None:
+        overrides.append(f"input.recording={json.dumps(str(input.resolve()))}")
+    if rate is not None:
+        overrides.append(f"input.rate={rate}")
+    if loop:
+        overrides.append("input.loop=true")
+    if record is not None:
+        overrides.append(f"recorder.directory={json.dumps(str(record.resolve()))}")
+    nodes = Launch.read(launch, overrides).nodes
+    nodes = [*nodes, *(name for name, asked in (("recorder", record), ("viewer", view)) if asked and name not in nodes)]
+    overrides.append(f"nodes={json.dumps(nodes)}")
+    settled = Launch.read(launch, overrides)
+    _check(settled)
+    arguments = ["--launch", launch]
+    for override in overrides:
+        arguments += ["--set", override]
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
+    console = Console()
+    try:
+        return _Run(settled, arguments, console, SystemClock()).watch()
+    except KeyboardInterrupt:
+        return 0
+
+
+def _check(launch: Launch) -> None:
+    """Find here, before any process starts, what every one of them would stumble over."""
+    if "pose_input" in launch.nodes:
+        open_source(launch.input.recording)
+    if "recorder" in launch.nodes and Path(launch.recorder.directory).exists():
+        raise LaunchError(f"{launch.recorder.directory} exists: expected a new directory to record to")
+    if "viewer" in launch.nodes:
+        from nodes.viewer import require_rerun
+
+        require_rerun()
+
+
+class _Run:
+    """One run: the processes, their news, and when it is over."""
+
+    def __init__(self, launch: Launch, arguments: list[str], console: Console, clock: Clock) -> None:
+        self._launch = launch
+        self._arguments = arguments
+        self._console = console
+        self._clock = clock
+        self._news: dict[str, Diagnostics] = {}
+        self._moved_ns = clock.now_ns()
+        self._lines_ns = clock.now_ns()
+
+    def watch(self) -> int:
+        """Start the nodes and show their news until the stream has ended; returns the exit status."""
+        transport = self._launch.transport
+        transport.ipc_directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        keys = load_keys(transport.keys) if transport.keys else None
+        endpoints = [transport.endpoint(name) for name in self._launch.nodes]
+        live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
+        with (
+            Subscriber(endpoints, DIAGNOSTICS, keys=keys) as subscriber,
+            Supervisor(self._launch.nodes, self._arguments, self._clock, self._say) as supervisor,
+        ):
+            if live:
+                live.start()
+            try:
+                status = None
+                while status is None:
+                    self._take(subscriber.receive(TURN_S))
+                    supervisor.poll()
+                    self._show(supervisor, live)
+                    status = self._verdict(supervisor)
+                supervisor.stop()
+                while received := subscriber.receive(0):
+                    self._take(received)
+            finally:
+                if live:
+                    live.stop()
+        self._console.print(table(self._launch.nodes, self._news, supervisor))
+        return status
+
+    def _say(self, line: str) -> None:
+        self._console.print(line, markup=False, highlight=False)
+
+    def _take(self, received: tuple[str, object] | None) -> None:
+        if received is None or not isinstance(news := received[1], Diagnostics):
+            return
+        last = self._news.get(news.node)
+        if last is None or _counts(last) != _counts(news):
+            self._moved_ns = self._clock.now_ns()
+        self._news[news.node] = news
+
+    def _show(self, supervisor: Supervisor, live: Live | None) -> None:
+        if live:
+            live.update(table(self._launch.nodes, self._news, supervisor), refresh=True)
+        elif self._clock.now_ns() - self._lines_ns >= LINE_NS:
+            self._lines_ns = self._clock.now_ns()
+            self._say(line(self._launch.nodes, self._news, supervisor))
+
+    def _verdict(self, supervisor: Supervisor) -> int | None:
+        """The exit status, or None while there is something to wait for."""
+        if supervisor.failed:
+            self._say(f"{', '.join(supervisor.failed)} cannot run; stopping")
+            return 1
+        source = supervisor.children.get("pose_input")
+        if source is None or source.state != "ended":
+            self._moved_ns = self._moved_ns if source else self._clock.now_ns()
+            return None
+        if self._drained():
+            return 0
+        if self._clock.now_ns() - self._moved_ns > STUCK_NS:
+            self._say("the stream ended, but its end did not come through all nodes; see dropped and restarts")
+            return 1
+        return None
+
+    def _drained(self) -> bool:
+        """Whether the end of the stream has come through every node."""
+        topics = {topic for name, topic in STREAM_TOPICS.items() if name in self._launch.nodes}
+        for name in self._launch.nodes:
+            if name == "viewer":
+                continue
+            heard = {topic for listened in LISTENS[name].values() for topic in listened} | {STREAM_TOPICS.get(name)}
+            wanted = topics & (heard if name != "recorder" else heard & set(self._launch.recorder.topics))
+            news = self._news.get(name)
+            if news is None or not wanted <= set(news.values.get("ended", "").split()):
+                return False
+        return True
+
+
+def _counts(news: Diagnostics) -> list[str]:
+    return [value for key, value in news.values.items() if key.startswith("count.") or key in ("ended", "written")]
+
+
+def table(nodes: list[str], news: dict[str, Diagnostics], supervisor: Supervisor) -> Group:
+    """A row for each node: what it publishes and how fast, how late, what went wrong, what it weighs."""
+    rows = Table(box=None, header_style="bold", pad_edge=False)
+    rows.add_column("node")
+    rows.add_column("state")
+    rows.add_column("topic")
+    for heading in ("Hz", "count", "latency ms p50/p99", "compute ms p50/p99", "delay ms"):
+        rows.add_column(heading, justify="right")
+    for heading in ("bodies", "flagged", "queue", "dropped", "refused", "restarts", "MB"):
+        rows.add_column(heading, justify="right")
+    warnings: list[Text] = []
+    for name in nodes:
+        child = supervisor.children[name]
+        latest = news.get(name)
+        values = latest.values if latest else {}
+        topic = STREAM_TOPICS.get(name, "")
+        delay = values.get("delay_frames")
+        rows.add_row(
+            name,
+            _state(child.state, values),
+            topic,
+            _short(values.get(f"rate.{topic}"), 1),
+            values.get(f"count.{topic}") or values.get("written", ""),
+            _pair(values, "latency_ms"),
+            _pair(values, "compute_ms"),
+            f"{int(delay) * FRAME_MS:.0f}" if delay else "",
+            values.get("bodies", ""),
+            values.get("anomalies", ""),
+            values.get("queue", ""),
+            str(_sum(values, "dropped.")),
+            str(_sum(values, "refused.")),
+            str(child.restarts),
+            _short(values.get("memory_mb"), 0),
+        )
+        if latest and latest.level != Level.OK:
+            causes = [f"{key} {n}" for key, n in values.items() if key.startswith(("dropped.", "refused."))]
+            warnings.append(Text(f"{name}: {latest.message} ({', '.join(causes)})", style="yellow"))
+    return Group(rows, *warnings)
+
+
+def line(nodes: list[str], news: dict[str, Diagnostics], supervisor: Supervisor) -> str:
+    """The gist of `table` in one line."""
+    parts = []
+    for name in nodes:
+        values = news[name].values if name in news else {}
+        topic = STREAM_TOPICS.get(name)
+        if topic is None or f"rate.{topic}" not in values:
+            parts.append(f"{name} {_state(supervisor.children[name].state, values)}")
+            continue
+        late = _pair(values, "latency_ms")
+        trouble = _sum(values, "dropped."), _sum(values, "refused.")
+        parts.append(
+            f"{topic} {_short(values[f'rate.{topic}'], 1)} Hz"
+            + (f", {late} ms" if late else "")
+            + (f", {trouble[0]} dropped, {trouble[1]} refused" if any(trouble) else "")
+        )
+    return " | ".join(parts)
+
+
+def _state(process: str, values: dict[str, str]) -> str:
+    return values.get("state", "starting") if process == "running" else process
+
+
+def _short(number: str | None, digits: int) -> str:
+    return "" if number is None else f"{float(number):.{digits}f}"
+
+
+def _pair(values: dict[str, str], name: str) -> str:
+    if f"{name}.p50" not in values:
+        return ""
+    return f"{_short(values[f'{name}.p50'], 1)}/{_short(values[f'{name}.p99'], 1)}"
+
+
+def _sum(values: dict[str, str], prefix: str) -> int:
+    return sum(int(value) for key, value in values.items() if key.startswith(prefix))

@@ -1,0 +1,37 @@
+"""The trajectory node: ``pose/clean`` in, ``pose/world`` out."""
+
+from __future__ import annotations
+
+import torch
+
+from msgs.topics import POSE_WORLD
+from msgs.types import Message, PoseClean
+from nodes.launch import Launch, trajectory_settings
+from nodes.runtime import FRAME_NS, Clock, Node
+from prior.trajectory import TrajectoryPipeline
+
+
+class TrajectoryNode(Node):
+    """Runs `TrajectoryPipeline` over what the prior node gives."""
+
+    name = "trajectory"
+
+    def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
+        super().__init__(launch, clock)
+        torch.set_num_threads(1)  # as in the prior node
+        self._pipeline = TrajectoryPipeline(trajectory_settings(launch.trajectory))
+        self._delay_frames = 0
+        self._bodies = 0
+
+    def handle(self, topic: str, message: Message) -> None:
+        if not isinstance(message, PoseClean):
+            return
+        self._delay_frames = message.delay_frames
+        for world in self._pipeline.process(message):
+            self._bodies = len(world.bodies)
+            self.publish(POSE_WORLD, world, delay_ns=round(message.delay_frames * FRAME_NS))
+
+    def status(self) -> dict[str, str]:
+        return {"bodies": str(self._bodies), "delay_frames": str(self._delay_frames)} | {
+            f"refused.{cause}": str(n) for cause, n in self._pipeline.counters.items()
+        }
