@@ -198,22 +198,23 @@ class Subscriber:
 
         Args:
             conflate: keep the newest message alone: for a picture or a control loop that wants the state, not the
-                history. For one topic, because ZeroMQ keeps one message a publisher.
+                history. For one topic and without a name, because ZeroMQ then keeps one message of each publisher,
+                and one subscription to it; open a subscriber for each topic.
             high_water: messages held unread; beyond it the newest are lost.
             keys: for publishers that have them.
             name: what `Publisher.listeners` calls this subscriber; without one it is not among them.
 
         Raises:
             TransportError: if an address is malformed.
-            ValueError: if a topic does not exist, or `conflate` is asked for several.
+            ValueError: if a topic does not exist, or for `conflate` with several topics or a name.
         """
         endpoints = [endpoints] if isinstance(endpoints, str) else list(endpoints)
         topics = [topics] if isinstance(topics, str) else list(topics)
         for topic in topics:
             if topic not in TOPICS:
                 raise ValueError(f"topic: expected one of {', '.join(TOPICS)}, got {topic!r}")
-        if conflate and len(topics) != 1:
-            raise ValueError(f"conflate: expected one topic, got {topics}; open a subscriber for each")
+        if conflate and (len(topics) != 1 or name):
+            raise ValueError(f"conflate: expected one topic and no name, got {topics} and {name!r}")
         for endpoint in endpoints:
             _parse(endpoint)
         typestore()

@@ -31,6 +31,11 @@ CONTACTS = (
 )  # fmt: skip
 """The joints of `WorldBody.contacts`, in its order (an ankle stands for the heel, a foot for the toe)."""
 
+# What a field holds. For a type checker any array will do, because the constructors convert.
+Float32 = NDArray[Any]
+Float64 = NDArray[Any]
+UInt8 = NDArray[Any]
+
 _J = len(JOINTS)
 _C = len(CONTACTS)
 _SECONDS_END = 2**31  # builtin_interfaces/Time counts seconds in an int32
@@ -141,9 +146,9 @@ class _Record:
 class Pose(_Record):
     """A frame's pose in the z-up world: world = orientation · point + position."""
 
-    position: NDArray[np.float64]
+    position: Float64
     """(3,) metres, world"""
-    orientation: NDArray[np.float64]
+    orientation: Float64
     """(4,) xyzw, from the frame to the world"""
 
     def __post_init__(self) -> None:
@@ -179,9 +184,9 @@ class RawBody(_Record):
 
     id: int
     """the sensor's track id, int32"""
-    positions: NDArray[np.float32]
+    positions: Float32
     """(J, 3) metres, header frame; NaN where missing"""
-    confidence: NDArray[np.float32]
+    confidence: Float32
     """(J,) 0 to 1"""
 
     def __post_init__(self) -> None:
@@ -225,24 +230,24 @@ class CleanBody(_Record):
 
     id: int
     """the sensor's track id, int32"""
-    positions: NDArray[np.float32]
+    positions: Float32
     """(22, 3) metres, header frame"""
-    rotations: NDArray[np.float32]
+    rotations: Float32
     """(22, 4) xyzw, each from the joint's to its parent's frame; the pelvis' to the header frame. At rest, all
     identity, the body stands in a T with +x forward, +y left, +z up"""
-    state: NDArray[np.uint8]
+    state: UInt8
     """(22,) `JointState`"""
-    sigma: NDArray[np.float32]
+    sigma: Float32
     """(22,) metres, standard deviation of a position along an axis"""
     anomaly: float
     """how unlike human motion the window is; the scale is that of the threshold behind `anomaly_flag`"""
     anomaly_flag: bool
     """the estimate cannot be trusted"""
-    bone_lengths: NDArray[np.float32]
+    bone_lengths: Float32
     """(22,) metres, joint to parent; 0 for the pelvis"""
-    raw_positions: NDArray[np.float32]
+    raw_positions: Float32
     """(22, 3) metres, header frame: the joints that went in; NaN where missing"""
-    raw_confidence: NDArray[np.float32]
+    raw_confidence: Float32
     """(22,) 0 to 1"""
 
     def __post_init__(self) -> None:
@@ -290,23 +295,23 @@ class WorldBody(_Record):
 
     id: int
     """the sensor's track id, int32"""
-    root_position: NDArray[np.float64]
+    root_position: Float64
     """(3,) metres, world: the pelvis"""
-    root_orientation: NDArray[np.float64]
+    root_orientation: Float64
     """(4,) xyzw, from the body (+x forward, +y left, +z up) to the world"""
-    root_velocity: NDArray[np.float64]
+    root_velocity: Float64
     """(3,) m/s, world"""
-    covariance: NDArray[np.float64]
+    covariance: Float64
     """(6, 6) of root position and velocity: m², m²/s, m²/s²"""
-    positions: NDArray[np.float32]
+    positions: Float32
     """(22, 3) metres, world"""
-    rotations: NDArray[np.float32]
+    rotations: Float32
     """(22, 4) xyzw, each from the joint's to its parent's frame; the pelvis' to the world"""
-    state: NDArray[np.uint8]
+    state: UInt8
     """(22,) `JointState`"""
-    sigma: NDArray[np.float32]
+    sigma: Float32
     """(22,) metres, standard deviation of a position along an axis"""
-    contacts: NDArray[np.float32]
+    contacts: Float32
     """(8,) probability that each of `CONTACTS` rests on something"""
     tracking: Tracking
 
@@ -335,7 +340,7 @@ class PoseWorld(_Record):
     """the world's name"""
     source: str
     """the camera or recording, by name"""
-    ground_plane: NDArray[np.float64]
+    ground_plane: Float64
     """(4,) a, b, c, d with ax + by + cz + d = 0, the unit normal (a, b, c) up, d in metres"""
     bodies: list[WorldBody]
     end_of_stream: bool = False

@@ -86,7 +86,9 @@ def test_from_up_brings_the_axis_to_the_worlds_z(up: str, axis: list[int]):
 
 
 def test_a_level_camera_looks_along_y():
-    np.testing.assert_allclose(Rotation.from_quat(Pose.from_up("-y").orientation).apply([0, 0, 1]), [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        Rotation.from_quat(Pose.from_up("-y").orientation).apply([0, 0, 1]), [0, 1, 0], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("up", ["x", "-z", "Y", ""])

@@ -1,0 +1,411 @@
+"""Real sockets: what is published arrives, what is lost is counted, and nobody is stopped by anybody."""
+
+import dataclasses
+import resource
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+from msg_strategies import EXAMPLES, diagnostics, raw
+
+from msgs import transport
+from msgs.codec import encode
+from msgs.keys import Keys, create_keys, load_keys
+from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
+from msgs.transport import MAX_FRAME, Publisher, Subscriber, TransportError
+
+SOON_S = 10.0
+"""for what must happen; the machine may be busy"""
+NEVER_S = 0.3
+"""for what must not happen"""
+BIG = raw(joints=100, bodies=100)
+"""160 kB, so that the kernel's buffers hold few"""
+
+
+@pytest.fixture(params=["ipc", "tcp"])
+def endpoint(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    return f"ipc://{tmp_path}/socket" if request.param == "ipc" else "tcp://127.0.0.1:*"
+
+
+@pytest.fixture
+def small_buffers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transport, "SEND_HIGH_WATER", 5)
+
+
+@pytest.fixture
+def rogue() -> Iterator[zmq.Socket[bytes]]:
+    """A publisher that does not keep to the layout."""
+    with zmq.Context() as context, context.socket(zmq.XPUB) as publisher:
+        publisher.bind("tcp://127.0.0.1:*")
+        yield publisher
+
+
+def frame(sequence: int, payload: bytes | None = None, *, topic: bytes = b"pose/raw", version: int = 1) -> bytes:
+    return topic + b"\0" + struct.pack("<BII", version, 42, sequence) + (encode(raw()) if payload is None else payload)
+
+
+def address(publisher: zmq.Socket[bytes]) -> str:
+    return publisher.get_string(zmq.LAST_ENDPOINT)
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + SOON_S
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        threading.Event().wait(0.001)
+
+
+def drain(subscriber: Subscriber) -> list[int]:
+    """The stamps of all that is left."""
+    stamps = []
+    while received := subscriber.receive(NEVER_S):
+        stamps.append(received[1].stamp_ns)
+    return stamps
+
+
+def test_every_message_arrives_as_it_was(endpoint: str):
+    with Publisher(endpoint) as publisher, Subscriber(publisher.endpoint, EXAMPLES, name="test") as subscriber:
+        assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+        for topic, message in EXAMPLES.items():
+            assert publisher.publish(topic, message)
+        for topic, message in EXAMPLES.items():
+            assert subscriber.receive(SOON_S) == (topic, message)
+        assert subscriber.receive(0) is None
+        assert not subscriber.dropped
+        assert not subscriber.refused
+
+
+def test_only_the_topics_subscribed_to_arrive(endpoint: str):
+    with Publisher(endpoint) as publisher, Subscriber(publisher.endpoint, POSE_WORLD, name="test") as subscriber:
+        assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+        for topic in (POSE_RAW, POSE_CLEAN, POSE_WORLD):
+            publisher.publish(topic, EXAMPLES[topic])
+        assert subscriber.receive(SOON_S) == (POSE_WORLD, EXAMPLES[POSE_WORLD])
+        assert subscriber.receive(NEVER_S) is None
+
+
+def test_the_last_message_arrives_though_the_publisher_is_gone(endpoint: str):
+    with Publisher(endpoint) as publisher:
+        subscriber = Subscriber(publisher.endpoint, POSE_RAW, name="test")
+        assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+        publisher.publish(POSE_RAW, raw())
+    with subscriber:
+        assert subscriber.receive(SOON_S) == (POSE_RAW, raw())
+
+
+def test_a_subscriber_may_be_first_and_outlive_its_publisher(tmp_path: Path):
+    path = f"ipc://{tmp_path}/socket"
+    with Subscriber(path, POSE_RAW, name="test") as subscriber:
+        for start in (0, 10):
+            with Publisher(path) as publisher:
+                # ZeroMQ subscribes again when the subscriber next looks for messages
+                wait_until(lambda publisher=publisher: subscriber.receive(0) or publisher.listeners)
+                for stamp in range(start, start + 3):
+                    publisher.publish(POSE_RAW, raw(stamp))
+                    assert subscriber.receive(SOON_S) == (POSE_RAW, raw(stamp))
+        assert not subscriber.dropped, "a publisher that starts again counts from 0, which is no loss"
+
+
+def test_publishers_of_one_topic_are_counted_apart(tmp_path: Path):
+    paths = [f"ipc://{tmp_path}/{n}" for n in range(3)]
+    with (
+        Publisher(paths[0]) as first,
+        Publisher(paths[1]) as second,
+        Subscriber(paths, [DIAGNOSTICS, POSE_RAW], name="test") as subscriber,
+    ):
+        for publisher in (first, second):
+            assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+        for publisher in (first, first, second, first, second):
+            publisher.publish(DIAGNOSTICS, diagnostics())
+            publisher.publish(POSE_RAW, raw())
+        assert len(drain(subscriber)) == 10
+        assert not subscriber.dropped
+
+
+def test_listeners_come_and_go(endpoint: str):
+    with Publisher(endpoint) as publisher, Subscriber(publisher.endpoint, POSE_RAW):
+        with Subscriber(publisher.endpoint, POSE_RAW, name="a"), Subscriber(publisher.endpoint, POSE_RAW, name="ab"):
+            assert publisher.wait_for_listeners(["a", "ab"], timeout_s=SOON_S)
+            assert publisher.listeners == {"a", "ab"}
+            assert not publisher.wait_for_listeners(["a", "c"], timeout_s=NEVER_S)
+        wait_until(lambda: not publisher.listeners)
+        assert publisher.wait_for_listeners([], timeout_s=0)
+
+
+def test_conflate_gives_the_newest_and_counts_the_others(endpoint: str):
+    with Publisher(endpoint) as publisher, Subscriber(publisher.endpoint, POSE_RAW, conflate=True) as subscriber:
+        wait_until(lambda: publisher.publish(POSE_RAW, raw(0)) and subscriber.receive(0.01))
+        drain(subscriber)
+        dropped_before = subscriber.dropped[POSE_RAW]
+        for stamp in range(1, 100):
+            publisher.publish(POSE_RAW, raw(stamp))
+        stamps = drain(subscriber)
+        assert stamps == sorted(set(stamps))
+        assert stamps[-1] == 99
+        assert len(stamps) + subscriber.dropped[POSE_RAW] - dropped_before == 99
+
+
+def test_a_conflating_subscriber_that_never_reads_holds_up_no_lossless_publisher(endpoint: str):
+    with (
+        Publisher(endpoint, lossless=True) as publisher,
+        Subscriber(publisher.endpoint, POSE_RAW, conflate=True) as subscriber,
+    ):
+        wait_until(lambda: publisher.publish(POSE_RAW, BIG) and subscriber.receive(0.01))
+        for stamp in range(transport.SEND_HIGH_WATER + 500):
+            assert publisher.publish(POSE_RAW, raw(stamp), timeout_s=SOON_S)
+
+
+@pytest.mark.usefixtures("small_buffers")
+def test_what_does_not_fit_is_lost_and_counted(endpoint: str):
+    with (
+        Publisher(endpoint) as publisher,
+        Subscriber(publisher.endpoint, POSE_RAW, high_water=5, name="test") as subscriber,
+    ):
+        assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+        for stamp in range(300):
+            publisher.publish(POSE_RAW, dataclasses.replace(BIG, stamp_ns=stamp))
+        stamps = drain(subscriber)
+        # a loss is seen when the next message comes
+        publisher.publish(POSE_RAW, raw(300))
+        stamps += drain(subscriber)
+        assert stamps == sorted(set(stamps))
+        assert stamps[-1] == 300
+        assert subscriber.dropped[POSE_RAW] == 301 - len(stamps) > 0
+
+
+@pytest.mark.usefixtures("small_buffers")
+def test_a_subscriber_that_never_reads_neither_blocks_nor_fills_its_publisher(endpoint: str):
+    with Publisher(endpoint) as publisher, Subscriber(publisher.endpoint, POSE_RAW, high_water=5, name="test"):
+        assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+        publisher.publish(POSE_RAW, BIG)
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+        def publish() -> None:
+            for _ in range(1500):
+                publisher.publish(POSE_RAW, BIG)
+
+        publishing = threading.Thread(target=publish, daemon=True)
+        publishing.start()
+        publishing.join(60)
+        assert not publishing.is_alive(), "publish waits"
+        grown_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+        assert grown_kib < 50_000, "240 MB were published"
+
+
+@pytest.mark.usefixtures("small_buffers")
+def test_lossless_waits_for_the_slowest(endpoint: str):
+    with (
+        Publisher(endpoint, lossless=True) as publisher,
+        Subscriber(publisher.endpoint, POSE_RAW, high_water=5, name="slow") as slow,
+    ):
+        assert publisher.wait_for_listeners(["slow"], timeout_s=SOON_S)
+        received, waits = [], 0
+        for stamp in range(200):
+            message = dataclasses.replace(BIG, stamp_ns=stamp)
+            while not publisher.publish(POSE_RAW, message, timeout_s=0):
+                waits += 1
+                got = slow.receive(SOON_S)
+                assert got
+                received.append(got[1].stamp_ns)
+        received += drain(slow)
+        assert waits > 0
+        assert received == list(range(200))
+        assert not slow.dropped
+
+
+@pytest.mark.parametrize(
+    "host", ["0.0.0.0", "*", "192.168.1.5", "[::]", "example.org", "eth0", "127.0.0.1;192.168.1.5:1"]
+)
+def test_an_address_others_can_reach_needs_keys(host: str):
+    with pytest.raises(TransportError, match="can be reached from other machines: expected keys, got none"):
+        Publisher(f"tcp://{host}:7101")
+
+
+@pytest.mark.parametrize(
+    "bad", ["", "7101", "tcp://", "tcp://127.0.0.1", "tcp://:1", "tcp://a:b", "udp://a:1", "ipc://"]
+)
+def test_a_malformed_address_is_refused(bad: str):
+    expected = r"expected ipc://PATH or tcp://HOST:PORT, got "
+    with pytest.raises(TransportError, match=expected):
+        Publisher(bad)
+    with pytest.raises(TransportError, match=expected):
+        Subscriber(bad, POSE_RAW)
+
+
+def test_an_address_is_not_taken_from_another_publisher(endpoint: str):
+    with Publisher(endpoint) as publisher, pytest.raises(TransportError, match="cannot publish at"):
+        Publisher(publisher.endpoint)
+    with Publisher(publisher.endpoint):
+        pass
+
+
+def test_an_address_that_cannot_be_made_is_refused(tmp_path: Path):
+    with pytest.raises(TransportError, match=r"cannot publish at .*No such file or directory"):
+        Publisher(f"ipc://{tmp_path}/missing/socket")
+
+
+def test_topics_are_checked(tmp_path: Path):
+    path = f"ipc://{tmp_path}/socket"
+    with pytest.raises(ValueError, match=r"expected one of pose/raw, .*, got 'pose/row'"):
+        Subscriber(path, "pose/row")
+    with pytest.raises(ValueError, match="conflate: expected one topic and no name"):
+        Subscriber(path, [POSE_RAW, POSE_CLEAN], conflate=True)
+    with pytest.raises(ValueError, match="conflate: expected one topic and no name"):
+        Subscriber(path, POSE_RAW, conflate=True, name="test")
+    with Publisher(path) as publisher:
+        with pytest.raises(ValueError, match="pose/clean: expected PoseClean, got PoseRaw"):
+            publisher.publish(POSE_CLEAN, raw())
+        with pytest.raises(ValueError, match="topic: expected one of"):
+            publisher.publish("pose/row", raw())
+        with pytest.raises(ValueError, match=f"at most {MAX_FRAME} bytes"):
+            publisher.publish(POSE_RAW, raw(joints=70_000))
+
+
+def test_garbage_is_counted_by_cause(rogue: zmq.Socket[bytes]):
+    with Subscriber(address(rogue), POSE_RAW) as subscriber:
+        subscriber.socket.setsockopt(zmq.SUBSCRIBE, b"")
+        wait_until(lambda: rogue.poll(0) and rogue.recv() == b"\1")
+        for garbage in [
+            b"",
+            b"pose/raw",
+            b"pose/raw\0",
+            b"pose/raw\0\1\0\0",
+            b"\xff\xfe\0" + bytes(20),
+            frame(0, topic=b"pose/row"),
+            frame(0, version=2),
+            frame(0, b"\0\1\0\0garbage"),
+            frame(1, b""),
+        ]:
+            rogue.send(garbage)
+        rogue.send_multipart([frame(2), b"more"])
+        rogue.send(frame(2))
+        rogue.send(frame(2))
+        assert subscriber.receive(SOON_S) == (POSE_RAW, raw())
+        assert subscriber.receive(NEVER_S) is None
+        assert subscriber.refused == {
+            "malformed": 4,
+            "unknown topic": 2,
+            "version": 1,
+            "undecodable": 2,
+            "multipart": 1,
+            "repeated": 1,
+        }
+        assert not subscriber.dropped
+
+
+def test_sequence_numbers_wrap(rogue: zmq.Socket[bytes]):
+    with Subscriber(address(rogue), POSE_RAW) as subscriber:
+        assert rogue.poll(round(SOON_S * 1000))
+        for sequence in (2**32 - 3, 2**32 - 1, 0, 4):
+            rogue.send(frame(sequence))
+        assert len(drain(subscriber)) == 4
+        assert subscriber.dropped == {POSE_RAW: 1 + 3}
+
+
+def test_a_flood_of_garbage_does_not_outlast_the_timeout(rogue: zmq.Socket[bytes]):
+    with Subscriber(address(rogue), POSE_RAW) as subscriber:
+        assert rogue.poll(round(SOON_S * 1000))
+        for _ in range(10):
+            rogue.send(b"pose/raw\0")
+        wait_until(lambda: subscriber.socket.poll(0))
+        assert subscriber.receive(0) is None
+        assert subscriber.refused["malformed"] < 10
+
+
+def test_a_frame_too_big_is_not_even_received(rogue: zmq.Socket[bytes]):
+    with Subscriber(address(rogue), POSE_RAW) as subscriber:
+        assert rogue.poll(round(SOON_S * 1000))
+        rogue.send(frame(0, bytes(MAX_FRAME)))
+        assert subscriber.receive(NEVER_S) is None
+
+
+def test_a_publisher_survives_strangers(tmp_path: Path):
+    with Publisher("tcp://127.0.0.1:*") as publisher:
+        port = int(publisher.endpoint.rpartition(":")[2])
+        with socket.create_connection(("127.0.0.1", port)) as stranger:
+            stranger.sendall(bytes(range(256)) * 100)
+        with zmq.Context() as context, context.socket(zmq.XSUB) as talker:
+            talker.connect(publisher.endpoint)
+            for upstream in (b"", b"\1\xff\xfe\xfd", b"\0\xffnobody", b"\2garbage", b"hello"):
+                talker.send(upstream)
+            with Subscriber(publisher.endpoint, POSE_RAW, name="test") as subscriber:
+                assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+                publisher.publish(POSE_RAW, raw())
+                assert subscriber.receive(SOON_S) == (POSE_RAW, raw())
+
+
+@pytest.fixture(scope="module")
+def key_directories(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """Of a robot, of a guest on its list, and of one who is not."""
+    directories = [tmp_path_factory.mktemp("keys") / name for name in ("robot", "guest", "stranger")]
+    robot, guest, stranger = directories
+    for directory in directories:
+        create_keys(directory)
+    for other in (guest, stranger):
+        (other / "server.key").write_text((robot / "own.key").read_text())
+    (robot / "clients" / "guest.key").write_text((guest / "own.key").read_text())
+    return robot, guest, stranger
+
+
+@pytest.mark.parametrize("at", ["tcp://127.0.0.1:*", "tcp://0.0.0.0:*", "ipc://{}/socket"])
+def test_with_keys_only_the_listed_listen(at: str, key_directories: tuple[Path, Path, Path], tmp_path: Path):
+    robot, guest, stranger = (load_keys(directory) for directory in key_directories)
+    with Publisher(at.format(tmp_path), keys=robot) as publisher:
+        reach = publisher.endpoint.replace("0.0.0.0", "127.0.0.1")
+        with (
+            Subscriber(reach, POSE_RAW, keys=robot, name="own") as own,
+            Subscriber(reach, POSE_RAW, keys=guest, name="guest") as listed,
+            Subscriber(reach, POSE_RAW, keys=stranger, name="stranger") as unlisted,
+            Subscriber(reach, POSE_RAW, name="keyless") as keyless,
+        ):
+            assert publisher.wait_for_listeners(["own", "guest"], timeout_s=SOON_S)
+            for refused in (unlisted, keyless):
+                wait_until(lambda refused=refused: refused.receive(0) or refused.refused["handshake"])
+            publisher.publish(POSE_RAW, raw())
+            assert own.receive(SOON_S) == (POSE_RAW, raw())
+            assert listed.receive(SOON_S) == (POSE_RAW, raw())
+            assert unlisted.receive(NEVER_S) is None
+            assert keyless.receive(NEVER_S) is None
+            assert publisher.listeners == {"own", "guest"}
+
+
+def test_a_subscriber_with_keys_does_not_trust_an_impostor(key_directories: tuple[Path, Path, Path]):
+    _, guest, stranger = (load_keys(directory) for directory in key_directories)
+    impostor = dataclasses.replace(stranger, clients=frozenset({guest.public}))
+    with (
+        Publisher("tcp://127.0.0.1:*", keys=impostor) as publisher,
+        Subscriber(publisher.endpoint, POSE_RAW, keys=guest, name="guest"),
+    ):
+        assert not publisher.wait_for_listeners(["guest"], timeout_s=NEVER_S)
+
+
+def test_the_secret_key_is_for_its_owner_alone(tmp_path: Path):
+    keys = create_keys(tmp_path / "keys")
+    secret_file = tmp_path / "keys" / "own.key_secret"
+    assert secret_file.stat().st_mode & 0o777 == 0o600
+    assert keys.secret.decode() in secret_file.read_text()
+    assert keys.secret.decode() not in repr(keys)
+    assert load_keys(tmp_path / "keys") == keys
+    assert keys == Keys(keys.public, keys.secret, server=keys.public, clients=frozenset({keys.public}))
+    with pytest.raises(ValueError, match="exists already"):
+        create_keys(tmp_path / "keys")
+    secret_file.chmod(0o640)
+    with pytest.raises(ValueError, match="chmod 600"):
+        load_keys(tmp_path / "keys")
+
+
+def test_keys_that_are_none_are_refused(tmp_path: Path):
+    with pytest.raises(ValueError, match="no such file; make keys with `steadypose keys"):
+        load_keys(tmp_path)
+    create_keys(tmp_path)
+    (tmp_path / "clients" / "short.key").write_text('curve\n    public-key = "short"\n')
+    with pytest.raises(ValueError, match="expected keys of 40 characters, got one of 5"):
+        load_keys(tmp_path)
+    (tmp_path / "own.key_secret").write_text((tmp_path / "own.key").read_text())
+    with pytest.raises(ValueError, match="expected a secret key, found none"):
+        load_keys(tmp_path)
