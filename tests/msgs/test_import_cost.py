@@ -1,0 +1,34 @@
+"""A subscriber needs `msgs` alone: light to import, and without torch."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+MEASURE = """
+import json, resource, sys
+import msgs.codec, msgs.keys, msgs.recording, msgs.topics, msgs.transport, msgs.types
+usage = resource.getrusage(resource.RUSAGE_SELF)
+print(json.dumps({
+    "modules": list(sys.modules), "cpu_s": usage.ru_utime + usage.ru_stime, "rss_mib": usage.ru_maxrss / 1024
+}))
+"""
+
+
+def test_msgs_is_light(tmp_path: Path):
+    # bytecode of its own, so that the second run is the usual one wherever the tests run
+    environment = {**os.environ, "PYTHONPYCACHEPREFIX": str(tmp_path)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    run = [sys.executable, "-c", MEASURE]
+    subprocess.run(run, env=environment, capture_output=True, check=True)
+    measured = json.loads(subprocess.run(run, env=environment, capture_output=True, check=True).stdout)
+    assert not {"torch", "scipy", "prior", "nodes", "asyncio"} & set(measured["modules"])
+    assert measured["rss_mib"] < 100
+    assert measured["cpu_s"] < 5, "0.3 s on an idle machine; the bound is 0.5 s"
+
+
+def test_each_module_stands_alone():
+    for module in Path(__file__).parents[2].glob("msgs/*.py"):
+        name = "msgs" if module.stem == "__init__" else f"msgs.{module.stem}"
+        subprocess.run([sys.executable, "-c", f"import {name}"], check=True)

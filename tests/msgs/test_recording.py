@@ -1,0 +1,373 @@
+"""A recording gives back what went in, in order, to us and to others; a broken one gives what is there, or an error."""
+
+import contextlib
+import dataclasses
+import subprocess
+import sys
+from collections.abc import Iterable
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+from msg_strategies import ANY, EXAMPLES, raw
+from rosbags.highlevel import AnyReader
+
+from msgs.codec import DEFINITIONS, decode, encode, typestore, wire_type
+from msgs.recording import Recorded, RecordingError, RecordingReader, RecordingWriter
+from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
+from msgs.types import Message
+
+START_NS = 1_700_000_000_000_000_000
+FRAME_NS = 33_333_333
+
+
+def stream(frames: int = 90) -> list[Recorded]:
+    """As a recorder hears it: the clean poses four frames behind the raw ones, diagnostics once a second."""
+    heard = []
+    for frame in range(frames):
+        stamp = START_NS + frame * FRAME_NS
+        heard += [(POSE_RAW, stamp), (POSE_TRUTH, stamp)]
+        if frame >= 4:
+            heard += [(POSE_CLEAN, stamp - 4 * FRAME_NS), (POSE_WORLD, stamp - 4 * FRAME_NS)]
+        if frame % 30 == 0:
+            heard.append((DIAGNOSTICS, stamp))
+    return [Recorded(topic, stamp, dataclasses.replace(EXAMPLES[topic], stamp_ns=stamp)) for topic, stamp in heard]
+
+
+def record(directory: Path, messages: Iterable[tuple[str, int, Message]]) -> Path:
+    with RecordingWriter(directory) as writer:
+        for topic, stamp_ns, message in messages:
+            writer.write(topic, message, stamp_ns)
+    return directory
+
+
+def read(path: Path) -> list[Recorded]:
+    with RecordingReader(path) as reader:
+        return list(reader)
+
+
+def mcap_of(directory: Path) -> Path:
+    (path,) = directory.glob("*.mcap")
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("recordings") / "whole", stream())
+
+
+def test_what_went_in_comes_out_in_the_order_of_stamps(whole: Path):
+    with RecordingReader(whole) as reader:
+        assert list(reader) == sorted(stream(), key=lambda recorded: recorded.stamp_ns)
+        assert reader.topics == tuple(TOPICS)
+        assert [reader.count(topic) for topic in TOPICS] == [90, 86, 86, 90, 3]
+        assert reader.duration_s == pytest.approx(89 / 30, abs=1e-6)
+        assert (reader.start_ns, reader.end_ns) == (START_NS, START_NS + 89 * FRAME_NS)
+        assert reader.complete
+        assert reader.lost_bytes == 0
+        assert not reader.refused
+        assert list(reader) == list(reader)
+
+
+@given(st.lists(st.tuples(ANY, st.integers(0, 2**62)), min_size=1, max_size=8))
+@settings(deadline=None, max_examples=30)
+def test_any_message_at_any_stamp_is_kept(tmp_path_factory: pytest.TempPathFactory, given_: list):
+    messages = [Recorded(topic, stamp, message) for (topic, message), stamp in given_]
+    directory = record(tmp_path_factory.mktemp("any") / "recording", messages)
+    assert read(directory) == sorted(messages, key=lambda recorded: recorded.stamp_ns)
+
+
+def test_the_same_messages_make_the_same_bytes(whole: Path, tmp_path: Path):
+    again = record(tmp_path / "elsewhere", stream())
+    assert mcap_of(again).read_bytes() == mcap_of(whole).read_bytes()
+
+
+def test_topics_can_be_chosen(whole: Path):
+    with RecordingReader(whole) as reader:
+        chosen = list(reader.messages([POSE_CLEAN, DIAGNOSTICS]))
+    assert {recorded.topic for recorded in chosen} == {POSE_CLEAN, DIAGNOSTICS}
+    assert len(chosen) == 86 + 3
+
+
+@pytest.mark.parametrize("frame", [0, 1, 15, 16, 44, 89])
+def test_seek(whole: Path, frame: int):
+    start = START_NS + frame * FRAME_NS
+    with RecordingReader(whole) as reader:
+        found = list(reader.messages(start_ns=start))
+        assert found == [recorded for recorded in reader if recorded.stamp_ns >= start]
+        assert found[0].stamp_ns == start
+        assert list(reader.messages(start_ns=reader.end_ns + 1)) == []
+
+
+def test_stamps_that_repeat_jump_back_and_stop(tmp_path: Path):
+    hour = 3600 * 10**9
+    stamps = [hour, hour, hour, hour + 1, 0, 1, 1, hour + 10**10, 5]
+    messages = [Recorded(POSE_RAW, stamp, raw(n)) for n, stamp in enumerate(stamps)]
+    found = read(record(tmp_path / "recording", messages))
+    assert found == sorted(messages, key=lambda recorded: recorded.stamp_ns)
+
+
+def test_rosbags_reads_it(whole: Path):
+    expected = sorted(stream(), key=lambda recorded: recorded.stamp_ns)
+    with AnyReader([whole]) as bag:
+        assert bag.message_count == len(expected)
+        assert bag.duration == 89 * FRAME_NS + 1
+        types = {topic: wire_type(kind) for topic, kind in TOPICS.items()}
+        assert {name: info.msgtype for name, info in bag.topics.items()} == {f"/{t}": w for t, w in types.items()}
+        found = []
+        for connection, stamp, data in bag.messages():
+            wire = bag.deserialize(data, connection.msgtype)
+            assert wire.header.stamp.sec * 10**9 + wire.header.stamp.nanosec == stamp  # type: ignore[attr-defined]
+            topic = connection.topic.removeprefix("/")
+            found.append(Recorded(topic, stamp, decode(topic, data)))
+    key = lambda recorded: (recorded.stamp_ns, recorded.topic)  # noqa: E731
+    assert sorted(found, key=key) == sorted(expected, key=key)
+
+
+def test_rosbags_reads_the_values(whole: Path):
+    with AnyReader([whole]) as bag:
+        connection, _, data = next(bag.messages([c for c in bag.connections if c.topic == "/pose/world"]))
+        body = bag.deserialize(data, connection.msgtype).bodies[0]  # type: ignore[attr-defined]
+    expected = EXAMPLES[POSE_WORLD].bodies[0]  # type: ignore[union-attr]
+    np.testing.assert_array_equal(body.positions.reshape(22, 3), expected.positions)
+    np.testing.assert_array_equal(body.covariance.reshape(6, 6), expected.covariance)
+    assert (body.root_velocity.x, body.root_velocity.y, body.root_velocity.z) == (0, 1, 2)
+    assert body.tracking == expected.tracking == body.TRACKING_COASTING
+
+
+WRITE_UNTIL_KILLED = """
+import dataclasses, itertools, sys
+sys.path.insert(0, sys.argv[2])
+from msg_strategies import EXAMPLES
+from msgs.recording import RecordingWriter
+writer = RecordingWriter(sys.argv[1])
+for frame in itertools.count():
+    stamp = frame * 33_333_333
+    for topic, message in EXAMPLES.items():
+        writer.write(topic, dataclasses.replace(message, stamp_ns=stamp), stamp)
+    print(stamp, flush=True)
+"""
+
+
+def test_a_killed_writer_loses_less_than_the_last_second(tmp_path: Path):
+    directory = tmp_path / "recording"
+    command = [sys.executable, "-c", WRITE_UNTIL_KILLED, directory, Path(__file__).parent]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
+        assert writer.stdout
+        written = 0
+        while written < 20 * 10**9:
+            written = int(writer.stdout.readline())
+        writer.kill()
+        # the last line may be half a line
+        written = max([written, *map(int, writer.stdout.read().split("\n")[:-1])])
+    assert not (directory / "metadata.yaml").exists()
+    with RecordingReader(directory) as reader:
+        assert not reader.complete
+        found = list(reader)
+        assert reader.end_ns > written - 10**9
+    for topic in TOPICS:
+        stamps = [recorded.stamp_ns for recorded in found if recorded.topic == topic]
+        assert stamps == [frame * 33_333_333 for frame in range(len(stamps))]
+        assert stamps[-1] > written - 10**9
+
+
+def test_a_slow_topic_beside_a_fast_one_loses_no_more(tmp_path: Path):
+    writer = RecordingWriter(tmp_path / "recording")
+    for frame in range(100):
+        writer.write(POSE_RAW, raw(frame), frame * FRAME_NS)
+        if frame % 50 == 0:
+            # the clock of the diagnostics has nothing to do with that of the frames
+            writer.write(DIAGNOSTICS, EXAMPLES[DIAGNOSTICS], 10**18 + frame)
+    # read while the writer is at it, as after a kill
+    found = read(tmp_path / "recording")
+    writer.close()
+    assert [r.stamp_ns for r in found if r.topic == DIAGNOSTICS] == [10**18, 10**18 + 50]
+    assert max(r.stamp_ns for r in found if r.topic == POSE_RAW) > 99 * FRAME_NS - 10**9
+
+
+def test_a_recording_in_the_making_can_be_read(tmp_path: Path):
+    with RecordingWriter(tmp_path / "recording") as writer:
+        with pytest.raises(RecordingError, match="holds no message"):
+            RecordingReader(tmp_path / "recording")
+        writer.write(POSE_RAW, raw(), 0)
+        assert read(tmp_path / "recording") == [(POSE_RAW, 0, raw())]
+
+
+def test_an_error_while_recording_completes_it(tmp_path: Path):
+    def messages():
+        yield POSE_RAW, 0, raw()
+        yield POSE_RAW, 1, raw(1)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record(tmp_path / "recording", messages())
+    with RecordingReader(tmp_path / "recording") as reader:
+        assert reader.complete
+        assert reader.count(POSE_RAW) == 2
+    assert (tmp_path / "recording" / "metadata.yaml").exists()
+
+
+def largest_chunk(content: bytes) -> int:
+    """Bytes from the start of a chunk to that of the next, at most."""
+    records = StreamReader(BytesIO(content), emit_chunks=True).records
+    return 4096 + max(len(record.data) for record in records if isinstance(record, Chunk))
+
+
+@given(data=st.data())
+@settings(deadline=None, max_examples=60)
+def test_a_truncated_recording_gives_what_is_there(
+    data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
+):
+    content = mcap_of(whole).read_bytes()
+    size = data.draw(st.integers(0, len(content) - 1))
+    cut = tmp_path_factory.mktemp("cut") / "cut.mcap"
+    cut.write_bytes(content[:size])
+    expected = stream()
+    found, complete, lost = [], False, size
+    with contextlib.suppress(RecordingError), RecordingReader(cut) as reader:
+        found, complete, lost = list(reader), reader.complete, reader.lost_bytes
+    # what was written first, without a hole
+    assert found == sorted(expected[: len(found)], key=lambda recorded: recorded.stamp_ns)
+    assert lost <= largest_chunk(content)
+    assert complete == (len(found) == len(expected) and lost == 0)
+
+
+@given(data=st.data())
+@settings(deadline=None, max_examples=150)
+def test_a_damaged_recording_is_an_error_and_never_another_message(
+    data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
+):
+    content = bytearray(mcap_of(whole).read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        # near the ends, where the structure is, as often as among the messages
+        at = data.draw(st.one_of(st.integers(0, 4000), st.integers(0, len(content) - 1), st.integers(-9000, -1)))
+        content[at] = data.draw(st.sampled_from([0, 1, 127, 128, 255]))
+    damaged = tmp_path_factory.mktemp("damaged") / "damaged.mcap"
+    damaged.write_bytes(content)
+    expected = {(topic, encode(message)) for topic, _, message in stream()}
+    with contextlib.suppress(RecordingError), RecordingReader(damaged) as reader:
+        for recorded in reader:
+            assert (recorded.topic, encode(recorded.message)) in expected
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"not a recording", bytes(1000)])
+def test_files_that_are_none_are_refused(content: bytes, tmp_path: Path):
+    (tmp_path / "bag.mcap").write_bytes(content)
+    for path in (tmp_path, tmp_path / "bag.mcap"):
+        with pytest.raises(RecordingError, match=r"is not an MCAP file|holds no message"):
+            RecordingReader(path)
+
+
+def test_a_place_without_a_recording_is_refused(tmp_path: Path):
+    for path in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(
+            RecordingError, match=r"expected a directory with \.mcap files, .*; found none"
+        ):
+            RecordingReader(path)
+
+
+def test_an_empty_recording_is_refused(tmp_path: Path):
+    record(tmp_path / "empty", [])
+    with pytest.raises(RecordingError, match="holds no message on any of pose/raw, "):
+        RecordingReader(tmp_path / "empty")
+    with AnyReader([tmp_path / "empty"]) as bag:
+        assert bag.message_count == 0
+
+
+def test_a_recording_is_not_overwritten(whole: Path):
+    before = mcap_of(whole).read_bytes()
+    with pytest.raises(RecordingError, match=r"cannot record to .*: File exists"):
+        RecordingWriter(whole)
+    assert mcap_of(whole).read_bytes() == before
+
+
+def test_what_is_written_is_checked(tmp_path: Path):
+    with RecordingWriter(tmp_path / "recording") as writer:
+        with pytest.raises(ValueError, match="pose/clean: expected PoseClean, got PoseRaw"):
+            writer.write(POSE_CLEAN, raw(), 0)
+        with pytest.raises(ValueError, match="stamp_ns: expected 0 or more, got -1"):
+            writer.write(POSE_RAW, raw(), -1)
+        writer.write(POSE_RAW, raw(), 7)
+    assert read(tmp_path / "recording") == [(POSE_RAW, 7, raw())]
+
+
+def foreign(
+    path: Path,
+    definition: str,
+    *,
+    name: str = "steadypose_msgs/msg/PoseRaw",
+    topic: str = "/pose/raw",
+    encoding: str = "cdr",
+    payload: bytes | None = None,
+    compression: CompressionType = CompressionType.NONE,
+) -> Path:
+    """A recording of one message made by somebody else."""
+    writer = Writer(str(path), compression=compression)
+    writer.start("ros2", "somebody")
+    schema = writer.register_schema(name, "ros2msg", definition.encode())
+    channel = writer.register_channel(topic, encoding, schema)
+    for _ in range(2):
+        writer.add_message(channel, 5, encode(raw()) if payload is None else payload, 5)
+    writer.finish()
+    return path
+
+
+def ros_definition() -> str:
+    """As `ros2 bag record` writes it: the definitions' own text, comments and all."""
+    rule = "=" * 80
+    standard, _ = typestore().generate_msgdef("geometry_msgs/msg/Pose", ros_version=2)
+    header, _ = typestore().generate_msgdef("std_msgs/msg/Header", ros_version=2)
+    own = [(DEFINITIONS / f"{name}.msg").read_text() for name in ("PoseRaw", "RawBody")]
+    parts = [own[0], f"MSG: steadypose_msgs/RawBody\n{own[1]}", f"MSG: geometry_msgs/Pose\n{standard}"]
+    return f"\n{rule}\n".join([*parts, f"MSG: std_msgs/Header\n{header}"])
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4])
+def test_a_recording_made_by_ros_is_read(compression: CompressionType, tmp_path: Path):
+    path = foreign(tmp_path / "ros.mcap", ros_definition(), compression=compression)
+    assert read(path) == [(POSE_RAW, 5, raw())] * 2
+
+
+def test_other_definitions_of_our_types_are_refused(tmp_path: Path):
+    other = ros_definition().replace("float32[] confidence", "float64[] confidence")
+    with pytest.raises(RecordingError, match="another definition of steadypose_msgs/msg/PoseRaw"):
+        RecordingReader(foreign(tmp_path / "other.mcap", other))
+    with pytest.raises(RecordingError, match="cannot read the definition"):
+        RecordingReader(foreign(tmp_path / "broken.mcap", "float32 !"))
+    with pytest.raises(RecordingError, match=r"expected .*PoseRaw as cdr on pose/raw, got std_msgs/msg/String as cdr"):
+        RecordingReader(foreign(tmp_path / "string.mcap", "string data", name="std_msgs/msg/String"))
+    with pytest.raises(RecordingError, match="got steadypose_msgs/msg/PoseRaw as json"):
+        RecordingReader(foreign(tmp_path / "json.mcap", ros_definition(), encoding="json"))
+
+
+def test_topics_of_others_are_passed_over(whole: Path, tmp_path: Path):
+    camera = foreign(tmp_path / "camera.mcap", "string data", name="std_msgs/msg/String", topic="/camera")
+    with pytest.raises(RecordingError, match="holds no message on any of"):
+        RecordingReader(camera)
+    (tmp_path / "whole.mcap").write_bytes(mcap_of(whole).read_bytes())
+    assert read(tmp_path) == read(whole)
+
+
+def test_a_recording_in_several_files_is_read_in_order(tmp_path: Path):
+    everything = stream()
+    record(tmp_path / "a", everything[::2])
+    record(tmp_path / "b", everything[1::2])
+    for name in ("a", "b"):
+        mcap_of(tmp_path / name).rename(tmp_path / f"{name}.mcap")
+    with RecordingReader(tmp_path) as reader:
+        found = list(reader)
+        assert reader.count(POSE_RAW) == 90
+    assert [r.stamp_ns for r in found] == sorted(r.stamp_ns for r in everything)
+    assert len(found) == len(everything)
+
+
+def test_messages_that_cannot_be_decoded_are_counted(tmp_path: Path):
+    with RecordingReader(foreign(tmp_path / "bad.mcap", ros_definition(), payload=b"\0\1\0\0bad")) as reader:
+        assert list(reader) == []
+        assert reader.refused == {POSE_RAW: 2}

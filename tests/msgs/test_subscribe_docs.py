@@ -1,0 +1,72 @@
+"""The programs of docs/subscribe.md run as they are printed."""
+
+import re
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from msg_strategies import raw, world
+
+from msgs.recording import RecordingWriter
+from msgs.topics import POSE_RAW, POSE_WORLD
+from msgs.transport import Publisher, Subscriber
+
+PAGE = Path(__file__).parents[2] / "docs" / "subscribe.md"
+SUBSCRIBER, PUBLISHER, READER = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+SOON_S = 30.0
+
+
+@contextmanager
+def running(code: str, argument: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    program = tmp_path / "program.py"
+    program.write_text(code)
+    with subprocess.Popen([sys.executable, program, argument], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("code", [SUBSCRIBER, PUBLISHER, READER])
+def test_they_are_short(code: str):
+    assert len([line for line in code.splitlines() if line.strip()]) <= 12
+
+
+def test_the_subscriber_prints_a_wrist(tmp_path: Path):
+    address = f"ipc://{tmp_path}/trajectory"
+    with Publisher(address) as publisher, running(SUBSCRIBER, address, tmp_path) as process:
+        assert process.stdout
+        deadline = time.monotonic() + SOON_S
+        while not select.select([process.stdout], [], [], 0.01)[0]:
+            assert time.monotonic() < deadline, "it printed nothing"
+            publisher.publish(POSE_WORLD, world())
+        assert process.stdout.readline() == "7 [63. 64. 65.] IMPUTED\n"
+
+
+def test_the_publishers_frames_arrive(tmp_path: Path):
+    address = f"ipc://{tmp_path}/pose_input"
+    with Subscriber(address, POSE_RAW) as subscriber, running(PUBLISHER, address, tmp_path):
+        received = subscriber.receive(SOON_S)
+        assert received
+        topic, message = received
+        assert topic == POSE_RAW
+        assert message.source == "my tracker"  # type: ignore[union-attr]
+
+
+def test_the_reader_reads(tmp_path: Path):
+    with RecordingWriter(tmp_path / "recording") as writer:
+        for second in range(3):
+            writer.write(POSE_WORLD, world(second * 10**9), second * 10**9)
+            writer.write(POSE_RAW, raw(second * 10**9), second * 10**9)
+    with running(READER, str(tmp_path / "recording"), tmp_path) as process:
+        printed, _ = process.communicate(timeout=SOON_S)
+    assert printed.splitlines() == [
+        "2.0 s of pose/raw pose/world",
+        "1000000000 [0. 1. 2.]",
+        "2000000000 [0. 1. 2.]",
+    ]
