@@ -1,0 +1,68 @@
+"""Writes the tables of the last results into the README, between markers.
+
+Where a line reads ``<!-- results:NAME -->``, what stands up to ``<!-- /results -->`` is replaced by table NAME of
+``benchmarks/results/*.json``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+
+from benchmarks.machine import ROOT
+from benchmarks.results import RESULTS, load
+
+_BLOCK = re.compile(r"(<!-- results:(?P<name>[\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Args:
+    """Write the measured tables into a Markdown file."""
+
+    file: Path = ROOT / "README.md"
+    """holds the markers"""
+    results: Path = RESULTS
+    """holds the JSON files"""
+
+
+def markdown(table: Mapping[str, Any], machine: Mapping[str, Any], command: str) -> str:
+    """A table as Markdown, with its note, the command that makes it, and the machine."""
+    cells = [table["columns"], ["---", *["---:"] * (len(table["columns"]) - 1)], *table["rows"]]
+    lines = [f"**{table['title']}**", ""]
+    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in cells]
+    lines += ["", table["note"]] if table["note"] else []
+    source = f"{machine['cpu']}, {machine['cores']} cores; commit {machine['commit']}, {machine['date']}"
+    return "\n".join([*lines, "", f"<sub>`{command}` · {source}</sub>", ""])
+
+
+def fill(text: str, results: Mapping[str, Mapping[str, Any]]) -> str:
+    """The text with every block between markers replaced.
+
+    Raises:
+        KeyError: a marker names a table that no result holds.
+    """
+    tables = {t["name"]: markdown(t, r["machine"], r["command"]) for r in results.values() for t in r["tables"]}
+
+    def block(match: re.Match[str]) -> str:
+        name = match["name"]
+        if name not in tables:
+            raise KeyError(f"marker results:{name}: expected one of {', '.join(tables) or 'none: run a benchmark'}")
+        return f"{match[1]}{tables[name]}{match[3]}"
+
+    return _BLOCK.sub(block, text)
+
+
+def main(args: Args) -> None:
+    """Rewrite the file in place."""
+    args.file.write_text(fill(args.file.read_text(), load(args.results)))
+    Console().print(f"wrote the tables of {args.file}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

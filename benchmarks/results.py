@@ -1,0 +1,76 @@
+"""Results of a benchmark: tables for people, figures for programs, in one JSON file beside the code."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from benchmarks.machine import ROOT, describe
+
+RESULTS = Path(__file__).parent / "results"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the README. The first column is text, the others figures.
+
+    Attributes:
+        name: of the README's markers.
+        title: what is measured, with units.
+        columns: headers.
+        rows: cells, ready to print.
+        note: what a reader must know to read it right.
+    """
+
+    name: str
+    title: str
+    columns: list[str]
+    rows: list[list[str]]
+    note: str = ""
+
+
+def show(table: Table, console: Console) -> None:
+    """Print a table."""
+    rich = RichTable(title=table.title, caption=table.note or None, caption_justify="left")
+    for index, column in enumerate(table.columns):
+        rich.add_column(column, justify="right" if index else "left", overflow="fold")
+    for row in table.rows:
+        rich.add_row(*row)
+    console.print(rich)
+
+
+def save(name: str, arguments: list[str], tables: list[Table], data: dict[str, Any], directory: Path = RESULTS) -> Path:
+    """Write ``NAME.json``: the command, the machine, the tables, and ``data``, whatever the benchmark found.
+
+    Args:
+        name: of the benchmark, as in ``python -m benchmarks.NAME``.
+        arguments: of the command; folders are cut to their last part.
+        tables: for the README.
+        data: figures; JSON types.
+        directory: where to.
+    """
+    command = shlex.join(["python", "-m", f"benchmarks.{name}", *(_portable(a) for a in arguments)])
+    path = directory / f"{name}.json"
+    content = {"benchmark": name, "command": command, "machine": describe()}
+    content |= {"tables": [asdict(t) for t in tables], **data}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    return path
+
+
+def load(directory: Path = RESULTS) -> dict[str, dict[str, Any]]:
+    """All results by the benchmark's name."""
+    return {path.stem: json.loads(path.read_text()) for path in sorted(directory.glob("*.json"))}
+
+
+def _portable(argument: str) -> str:
+    path = Path(argument)
+    if not path.is_absolute():
+        return argument
+    return str(path.relative_to(ROOT)) if path.is_relative_to(ROOT) else path.name

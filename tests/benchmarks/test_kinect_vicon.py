@@ -1,0 +1,77 @@
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.kinect_vicon import SCORED, Clip, learn_offset, run_filter, score
+from prior.filters import FixedLagRTS, OneEuroFilter
+
+REST = np.array(
+    [[0.0, 0.0, 1.6]]
+    + [[x, sign * y, z] for x, y, z in ((0, 0.2, 1.4), (0.1, 0.25, 1.1), (0.3, 0.25, 1.0)) for sign in (1, -1)]
+    + [[x, sign * y, z] for x, y, z in ((0, 0.1, 0.9), (0.1, 0.1, 0.5), (0, 0.1, 0.1)) for sign in (1, -1)]
+)
+OFFSET = np.random.default_rng(0).normal(0, 0.03, REST.shape)
+
+
+def person(seed: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Truth and what a sensor sees of it, from elsewhere, with joints that sit elsewhere in the body; (T, 13, 3)."""
+    rng = np.random.default_rng(seed)
+    body = REST + np.cumsum(rng.normal(0, 0.002, (frames, len(SCORED), 3)), axis=0)
+    turns = Rotation.from_rotvec((np.linspace(0, 2, frames) + rng.uniform(0, 6))[:, None] * [0, 0, 1]).as_matrix()
+    truth = np.einsum("tab,tjb->tja", turns, body)
+    seen = np.einsum("tab,tjb->tja", turns, body - OFFSET)
+    view = Rotation.random(rng=rng).as_matrix()
+    return truth, seen @ view.T + rng.normal(size=3)
+
+
+def clip(seed: int, frames: int) -> Clip:
+    truth, seen = person(seed, frames)
+    return Clip("m01_s07_e01", "s07", 30.0, np.zeros((frames, 22, 3)), seen, truth, truth)
+
+
+def test_a_constant_offset_in_the_body_is_learned_on_one_subject_and_taken_from_another() -> None:
+    train, validation = [clip(s, 40) for s in range(4)], [clip(s, 40) for s in range(10, 14)]
+    offset = learn_offset([c.centres for c in train], [c.raw for c in train])
+    truths, raws = [c.centres for c in validation], [c.raw for c in validation]
+    without = score(truths, raws, np.zeros_like(offset))
+    corrected = score(truths, raws, offset)
+    assert without.position.mean() > 0.03
+    # The trunk's frame is that of the joints as seen, which an offset tilts a little.
+    assert corrected.position.mean() < 0.2 * without.position.mean()
+    assert corrected.joints.shape == (len(SCORED),)
+
+
+def test_scores_do_not_depend_on_where_the_sensor_stands() -> None:
+    here = clip(1, 30)
+    offset = np.random.default_rng(2).normal(0, 0.02, OFFSET.shape)
+    turn = Rotation.random(rng=np.random.default_rng(9)).as_matrix()
+    a, b = (score([here.centres], [seen], offset) for seen in (here.raw, here.raw @ turn.T + 2.0))
+    np.testing.assert_allclose(a.position, b.position, atol=1e-12)
+    np.testing.assert_allclose(a.acceleration, b.acceleration, atol=1e-12)
+    np.testing.assert_allclose(a.variation, b.variation, atol=1e-12)
+
+
+def test_lost_markers_are_left_out() -> None:
+    here = clip(3, 30)
+    truth = here.centres.copy()
+    truth[5:9, 3] = np.nan
+    result = score([truth], [here.raw], OFFSET)
+    assert np.isfinite([result.position[0], result.acceleration[0], *result.joints]).all()
+
+
+@pytest.mark.parametrize("make", [partial(FixedLagRTS, 3, 1.0), partial(OneEuroFilter, 1.0, 2.0)])
+def test_clips_side_by_side_are_filtered_as_if_alone(make: partial) -> None:
+    clips = [clip(0, 12), clip(1, 2), clip(2, 30)]
+    together = run_filter(clips, make)
+    for one, answer in zip(clips, together, strict=True):
+        assert answer.shape == one.raw.shape
+        np.testing.assert_allclose(answer, run_filter([one], make)[0], atol=1e-12)
+
+
+def test_a_delay_of_zero_knows_nothing_of_later_frames() -> None:
+    here = clip(4, 20)
+    cut = here._replace(raw=here.raw[:11])
+    make = partial(FixedLagRTS, 0, 1.0)
+    np.testing.assert_array_equal(run_filter([here], make)[0][:11], run_filter([cut], make)[0])

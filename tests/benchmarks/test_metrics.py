@@ -1,0 +1,125 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from benchmarks.metrics import (
+    acceleration_error,
+    body_frame,
+    bootstrap,
+    bootstrap_ratio,
+    contact_speed,
+    length_variation,
+    position_error,
+    rigid_alignment,
+)
+
+FPS = 30.0
+
+
+def walk(seed: int, frames: int = 12, joints: int = 5) -> np.ndarray:
+    return np.cumsum(np.random.default_rng(seed).normal(0, 0.1, (frames, joints, 3)), axis=0)
+
+
+def test_errors_of_a_known_displacement() -> None:
+    truth = walk(0)
+    moved = truth.copy()
+    moved[6, 2] += [0.0, 0.03, 0.04]
+    error = position_error(moved, truth)
+    assert error[6, 2] == pytest.approx(0.05)
+    assert error.sum() == pytest.approx(0.05)
+    # One frame out of place bends the path thrice: 1, -2, 1.
+    np.testing.assert_allclose(acceleration_error(moved, truth)[4:7, 2], [0.05, 0.10, 0.05])
+    assert acceleration_error(moved, truth).sum() == pytest.approx(0.20)
+
+
+def test_errors_against_loops() -> None:
+    a, b = walk(1), walk(2)
+    a[3, 1] = np.nan
+    for t in range(len(a)):
+        for j in range(a.shape[1]):
+            expected = sum((a[t, j, i] - b[t, j, i]) ** 2 for i in range(3)) ** 0.5
+            np.testing.assert_allclose(position_error(a, b)[t, j], expected)
+    for t in range(1, len(a) - 1):
+        for j in range(a.shape[1]):
+            bend = [x[t + 1, j] - 2 * x[t, j] + x[t - 1, j] for x in (a, b)]
+            np.testing.assert_allclose(
+                acceleration_error(a, b)[t - 1, j], np.linalg.norm(bend[0] - bend[1]), atol=1e-12
+            )
+
+
+def test_a_constant_velocity_drift_is_no_acceleration_error() -> None:
+    truth = walk(3)
+    drift = np.arange(len(truth), dtype=np.float64)[:, None, None] * np.array([0.01, 0.0, -0.02])
+    np.testing.assert_allclose(acceleration_error(truth + drift, truth), 0.0, atol=1e-12)
+
+
+def test_length_variation_of_a_known_bone() -> None:
+    positions = np.zeros((4, 3, 3))
+    positions[:, 1, 0] = [0.9, 1.1, 0.9, 1.1]
+    positions[:, 2, 1] = 0.5
+    assert length_variation(positions, [(0, 1)]) == pytest.approx(0.1)
+    assert length_variation(positions, [(0, 1), (0, 2)]) == pytest.approx(0.05)
+
+
+def test_contact_speed_is_horizontal_and_of_each_foot_for_itself() -> None:
+    positions = np.zeros((4, 2, 3))
+    positions[:, 0, 0] = [0.0, 0.01, 0.03, 0.03]
+    positions[:, :, 2] = np.arange(4)[:, None]
+    contact = np.array([[True, True], [True, False], [True, True], [False, True]])
+    speed = contact_speed(positions, contact, FPS)
+    np.testing.assert_allclose(speed[:, 0], [0.3, 0.6, np.nan])
+    np.testing.assert_allclose(speed[:, 1], [np.nan, np.nan, 0.0])
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_rigid_alignment_undoes_a_rigid_motion_and_never_mirrors(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(6, 4, 3))
+    rotation, translation = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    target = source @ rotation.T + translation
+    target[0, 0] = source[1, 2] = np.nan
+    found = rigid_alignment(source, target)
+    np.testing.assert_allclose(found[0], rotation, atol=1e-9)
+    np.testing.assert_allclose(found[1], translation, atol=1e-9)
+    mirrored = rigid_alignment(source, source * [1, 1, -1])
+    assert np.linalg.det(mirrored[0]) == pytest.approx(1.0)
+
+
+def test_rigid_alignment_is_scipys_on_noisy_points() -> None:
+    rng = np.random.default_rng(4)
+    a, b = rng.normal(size=(2, 50, 3))
+    rotation, _ = rigid_alignment(a, b)
+    expected = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))[0].as_matrix()
+    np.testing.assert_allclose(rotation, expected, atol=1e-9)
+
+
+def test_rigid_alignment_refuses_two_points() -> None:
+    with pytest.raises(ValueError, match="at least 3 points"):
+        rigid_alignment(np.zeros((2, 3)), np.zeros((2, 3)))
+
+
+def test_body_frame_turns_with_the_body() -> None:
+    corners = np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0], [0.02, 0.2, 0.5], [0.02, -0.2, 0.5]])
+    upright = body_frame(*corners)
+    np.testing.assert_allclose(upright[:, 1], [0.0, 1.0, 0.0], atol=1e-12)
+    assert upright[2, 2] > 0.99
+    rotation = Rotation.random(rng=np.random.default_rng(1)).as_matrix()
+    np.testing.assert_allclose(body_frame(*(corners @ rotation.T + 3.0)), rotation @ upright, atol=1e-12)
+    np.testing.assert_allclose(upright.T @ upright, np.eye(3), atol=1e-12)
+
+
+def test_bootstrap_covers_the_mean_as_the_normal_interval_does() -> None:
+    values = np.random.default_rng(5).normal(3.0, 1.0, 400)
+    low, high = bootstrap(values)
+    half = 1.96 * values.std() / 20
+    assert low == pytest.approx(values.mean() - half, abs=0.02)
+    assert high == pytest.approx(values.mean() + half, abs=0.02)
+
+
+def test_a_paired_ratio_is_surer_than_its_parts() -> None:
+    baseline = np.random.default_rng(6).uniform(1.0, 10.0, 100)
+    ratio, low, high = bootstrap_ratio(0.8 * baseline, baseline)
+    assert (ratio, low, high) == pytest.approx((0.8, 0.8, 0.8))

@@ -1,0 +1,62 @@
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from benchmarks.machine import describe
+from benchmarks.report import Args, fill, main
+from benchmarks.results import Table, load, save, show
+
+TABLE = Table("speed", "Speed, ms", ["method", "p50", "a|b"], [["raw", "1.0", "2"], ["ours", "0.5", "3"]], "A note.")
+TEXT = "# Title\n<!-- results:speed -->\nold\n<!-- /results -->\ntail\n"
+
+
+def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tmp_path: Path) -> None:
+    save("latency", ["--quick", str(tmp_path / "input")], [TABLE], {"rows": [1]}, tmp_path)
+    results = load(tmp_path)
+    assert results["latency"]["rows"] == [1]
+    assert str(tmp_path) not in (tmp_path / "latency.json").read_text()
+
+    readme = tmp_path / "README.md"
+    readme.write_text(TEXT)
+    main(Args(readme, tmp_path))
+    once = readme.read_text()
+    assert "| ours | 0.5 | 3 |" in once
+    assert "| method | p50 | a\\|b |" in once
+    assert "`python -m benchmarks.latency --quick input`" in once
+    assert "old" not in once
+    assert once.startswith("# Title\n")
+    assert once.endswith("<!-- /results -->\ntail\n")
+    main(Args(readme, tmp_path))
+    assert readme.read_text() == once
+
+
+def test_a_marker_without_a_result_is_an_error_that_names_those_there_are(tmp_path: Path) -> None:
+    save("latency", [], [TABLE], {}, tmp_path)
+    with pytest.raises(KeyError, match=r"results:other.*speed"):
+        fill("<!-- results:other -->\n<!-- /results -->", load(tmp_path))
+
+
+def test_blocks_do_not_swallow_each_other(tmp_path: Path) -> None:
+    save("latency", [], [TABLE], {}, tmp_path)
+    filled = fill(TEXT + "between\n" + TEXT, load(tmp_path))
+    assert filled.count("| ours |") == 2
+    assert "between" in filled
+
+
+def test_the_machine_is_described() -> None:
+    machine = describe()
+    assert machine["cpu"]
+    assert int(machine["cores"]) >= 1
+    assert float(machine["memory_gb"]) > 0
+    assert set(machine) >= {"load_1min", "python", "torch", "commit", "date"}
+
+
+def test_show_prints_every_cell() -> None:
+    console = Console(width=100, file=io.StringIO())
+    with console.capture() as capture:
+        show(TABLE, console)
+    text = capture.get()
+    assert all(cell in text for row in TABLE.rows for cell in row)
+    assert "A note." in text
