@@ -134,16 +134,16 @@ class ViewerServer:
         try:
             for wanted in (port, port + 1):
                 self._wait_for(wanted)
-        except ViewerError:
+        except RuntimeError:
             self.close()
             raise
 
     def check(self) -> None:
         """Raises:
-        ViewerError: the server has stopped.
+        RuntimeError: the server has stopped; to be started again, unlike what a `ViewerError` says.
         """
         if self._process.poll() is not None:
-            raise ViewerError(f"Rerun's server has stopped, exit code {self._process.returncode}")
+            raise RuntimeError(f"Rerun's server has stopped, exit code {self._process.returncode}")
 
     def close(self) -> None:
         self._process.terminate()
