@@ -17,11 +17,11 @@ from rich.progress import Progress
 from msgs.recording import RecordingWriter
 from msgs.topics import POSE_CLEAN, POSE_WORLD
 from msgs.types import Message, PoseClean, PoseRaw, PoseWorld
-from nodes.launch import LaunchError, apply_override, prior_settings, trajectory_settings
+from nodes.launch import LaunchError, apply_override
 from nodes.npz import NpzCollector
 from nodes.pose_input import open_source, with_end
-from prior.pipeline import PriorPipeline
-from prior.trajectory import TrajectoryPipeline
+from nodes.prior import make_prior
+from nodes.trajectory import make_trajectory
 
 
 class Cleaner(Protocol):
@@ -64,24 +64,25 @@ def clean(
     Args:
         source: a recording, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps.
         out: the recording to make, or .npz with one row for each row of the input.
-        weights: weight set of the prior, 'default' unless given.
+        weights: weight set of the models: 'default', unless given, or 'research'.
         delay: frames at 30 Hz to wait for, 0 to 4; more is smoother. 4 unless given.
         settings: any setting of [prior], such as gate.enabled=false, or of [trajectory], such as
             trajectory.contacts=false. May be given again.
     """
-    table: dict[str, Any] = {}
+    table: dict[str, Any] = {"prior": {}, "trajectory": {}}
+    if weights is not None:
+        table = {"prior": {"refine": {"weights": weights}}, "trajectory": {"weights": weights}}
+    if delay is not None:
+        table["prior"]["delay"] = delay
     for override in settings:
-        apply_override(table, override)
-    placing = table.pop("trajectory", {})
-    table |= {} if weights is None else {"weights": weights}
-    table |= {} if delay is None else {"delay": delay}
+        apply_override(table, override if override.startswith("trajectory.") else f"prior.{override}")
     if source.resolve() == out.resolve():
         raise LaunchError(f"{out}: expected another path than the input's; nothing is cleaned in place")
     if not out.resolve().parent.is_dir():
         raise LaunchError(f"{out}: expected its folder {out.resolve().parent} to exist; make it first")
     frames = open_source(source)
     torch.set_num_threads(1)  # the models are too small to gain from more
-    prior, trajectory = PriorPipeline(prior_settings(table)), TrajectoryPipeline(trajectory_settings(placing))
+    prior, trajectory = make_prior(table["prior"]), make_trajectory(table["trajectory"])
     collector = NpzCollector() if out.suffix == ".npz" else None
     stamps_ns: list[int] = []
     answers = 0

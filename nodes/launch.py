@@ -15,14 +15,10 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
 from prior.settings import build_settings
-
-if TYPE_CHECKING:
-    from prior.pipeline import PriorSettings
-    from prior.trajectory import TrajectorySettings
 
 #: The graph: each node, and for every node it listens to the topics it takes from there.
 LISTENS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
@@ -75,9 +71,8 @@ class TransportSettings:
     keys: str = ""
     """directory of CurveZMQ keys, needed where an address is not local"""
     lossless: bool = True
-    """a recording can wait, a camera cannot: true lets a slow node hold its source up, false drops its oldest frames"""
-    wait_s: float = 30.0
-    """lossless only: how long a node waits for the nodes that must hear it before it goes on without them"""
+    """a recording can wait, a camera cannot: true lets a node hold up its source while it is slow, or not there yet;
+    false drops its oldest frames"""
     queue: int = 8
     """not lossless: frames a node keeps when it falls behind"""
 
@@ -241,34 +236,6 @@ def apply_override(table: dict[str, Any], override: str) -> None:
         if not isinstance(table, dict):
             raise LaunchError(f"cannot set {path}: {section} is a value, not a section")
     table[key] = value
-
-
-def prior_settings(table: Mapping[str, Any]) -> PriorSettings:
-    """The settings of the prior from ``[prior]``.
-
-    Raises:
-        LaunchError: an unknown key, or a value that cannot be.
-    """
-    from prior.pipeline import PriorSettings  # brings torch
-
-    try:
-        return PriorSettings.from_dict(table)
-    except ValueError as error:
-        raise LaunchError(str(error)) from error
-
-
-def trajectory_settings(table: Mapping[str, Any]) -> TrajectorySettings:
-    """The settings of the trajectory from ``[trajectory]``.
-
-    Raises:
-        LaunchError: an unknown key, or a value that cannot be.
-    """
-    from prior.trajectory import TrajectorySettings  # brings torch
-
-    try:
-        return TrajectorySettings.from_dict(table)
-    except ValueError as error:
-        raise LaunchError(str(error)) from error
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 
 from msgs.topics import POSE_CLEAN
 from msgs.types import Message, PoseRaw
-from nodes.launch import Launch, prior_settings
+from nodes.launch import Launch, LaunchError
 from nodes.runtime import FRAME_NS, Clock, Node
-from prior.pipeline import PriorPipeline
+from prior.pipeline import PriorPipeline, PriorSettings
+
+
+def make_prior(settings: Mapping[str, Any]) -> PriorPipeline:
+    """The prior as ``[prior]`` of a launch file wants it.
+
+    Raises:
+        LaunchError: an unknown setting, a value that cannot be, or weights that are not there.
+    """
+    try:
+        return PriorPipeline(PriorSettings.from_dict(settings))
+    except (ValueError, FileNotFoundError) as error:
+        raise LaunchError(str(error)) from error
 
 
 class PriorNode(Node):
@@ -20,7 +35,7 @@ class PriorNode(Node):
         super().__init__(launch, clock)
         # two threads that share the cores with other nodes wait for each other: a p99 of 100 ms
         torch.set_num_threads(1)
-        self._pipeline = PriorPipeline(prior_settings(launch.prior))
+        self._pipeline = make_prior(launch.prior)
         self._bodies = 0
         self._anomalies = 0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -69,7 +70,8 @@ def run(
     for override in overrides:
         arguments += ["--set", override]
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
-    console = Console()
+    # a log file has no width, and a table cut to 80 columns says little
+    console = Console(width=None if sys.stdout.isatty() else 140)
     try:
         return _Run(settled, arguments, console, SystemClock()).watch()
     except KeyboardInterrupt:
@@ -126,11 +128,11 @@ class _Run:
             finally:
                 if live:
                     live.stop()
-        self._console.print(table(self._launch.nodes, self._news, supervisor))
+        self._console.print(table(self._launch.nodes, self._news, supervisor, summary=True))
         return status
 
     def _say(self, line: str) -> None:
-        self._console.print(line, markup=False, highlight=False)
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def _take(self, received: tuple[str, object] | None) -> None:
         if received is None or not isinstance(news := received[1], Diagnostics):
@@ -178,47 +180,52 @@ class _Run:
 
 
 def _counts(news: Diagnostics) -> list[str]:
-    return [value for key, value in news.values.items() if key.startswith("count.") or key in ("ended", "written")]
+    return [value for key, value in news.values.items() if key.startswith("count.") or key == "ended"]
 
 
-def table(nodes: list[str], news: dict[str, Diagnostics], supervisor: Supervisor) -> Group:
-    """A row for each node: what it publishes and how fast, how late, what went wrong, what it weighs."""
-    rows = Table(box=None, header_style="bold", pad_edge=False)
-    rows.add_column("node")
-    rows.add_column("state")
-    rows.add_column("topic")
-    for heading in ("Hz", "count", "latency ms p50/p99", "compute ms p50/p99", "delay ms"):
-        rows.add_column(heading, justify="right")
-    for heading in ("bodies", "flagged", "queue", "dropped", "refused", "restarts", "MB"):
-        rows.add_column(heading, justify="right")
-    warnings: list[Text] = []
+def table(nodes: list[str], news: dict[str, Diagnostics], supervisor: Supervisor, *, summary: bool = False) -> Group:
+    """A row for each node: how fast, how late, what went wrong, what it weighs.
+
+    A column in which there is nothing to say is left out. The rates of a ``summary`` are over all the run.
+    """
+    rows, notes = [], []
     for name in nodes:
         child = supervisor.children[name]
         latest = news.get(name)
         values = latest.values if latest else {}
         topic = STREAM_TOPICS.get(name, "")
+        state = _state(child.state, values)
         delay = values.get("delay_frames")
-        rows.add_row(
-            name,
-            _state(child.state, values),
-            topic,
-            _short(values.get(f"rate.{topic}"), 1),
-            values.get(f"count.{topic}") or values.get("written", ""),
-            _pair(values, "latency_ms"),
-            _pair(values, "compute_ms"),
-            f"{int(delay) * FRAME_MS:.0f}" if delay else "",
-            values.get("bodies", ""),
-            values.get("anomalies", ""),
-            values.get("queue", ""),
-            str(_sum(values, "dropped.")),
-            str(_sum(values, "refused.")),
-            str(child.restarts),
-            _short(values.get("memory_mb"), 0),
+        rows.append(
+            {
+                "node": name,
+                "state": state.partition(" ")[0],
+                "frames": values.get(f"count.{topic}") or values.get("written", ""),
+                "Hz": _short(values.get(f"mean_rate.{topic}" if summary else f"rate.{topic}"), 1),
+                "latency ms\np50/p99": _pair(values, "latency_ms"),
+                "compute ms\np50/p99": _pair(values, "compute_ms"),
+                "delay\nms": f"{int(delay) * FRAME_MS:.0f}" if delay else "",
+                "bodies": values.get("bodies", ""),
+                "flagged": values.get("anomalies", "0"),
+                "queue": values.get("queue", ""),
+                "dropped": str(_sum(values, "dropped.")),
+                "refused": str(_sum(values, "refused.")),
+                "restarts": str(child.restarts),
+                "MB": _short(values.get("memory_mb"), 0),
+            }
         )
-        if latest and latest.level != Level.OK:
-            causes = [f"{key} {n}" for key, n in values.items() if key.startswith(("dropped.", "refused."))]
-            warnings.append(Text(f"{name}: {latest.message} ({', '.join(causes)})", style="yellow"))
-    return Group(rows, *warnings)
+        if " " in state:
+            notes.append(Text(f"{name}: {state}"))
+        causes = [f"{key} {n}" for key, n in values.items() if key.startswith(("dropped.", "refused."))]
+        if latest and causes and (summary or latest.level != Level.OK):
+            notes.append(Text(f"{name}: {', '.join(causes)}", style="yellow"))
+    grid = Table(box=None, header_style="bold", pad_edge=False)
+    for heading in rows[0]:
+        if any(row[heading] not in ("", "0") for row in rows):
+            grid.add_column(heading, justify="left" if heading in ("node", "state") else "right", no_wrap=True)
+    for row in rows:
+        grid.add_row(*(row[str(column.header)] for column in grid.columns))
+    return Group(grid, *notes)
 
 
 def line(nodes: list[str], news: dict[str, Diagnostics], supervisor: Supervisor) -> str:

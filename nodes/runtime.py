@@ -1,12 +1,12 @@
 """What every node is: a process that takes messages, gives messages, and says once a second how it is doing.
 
-**Order of start.** A node publishes, waits until those that must hear it listen, and only then listens itself.
-So a stream starts at the source when the whole way to its end is open, whatever the order in which the processes
-came up, and its first frame is not lost. The same holds for a node that is restarted in the middle.
-
 **When a node falls behind.** A recording can wait: with ``lossless`` a full node holds up the one before it, back to
 the source, so that every frame arrives and a replay repeats. A camera cannot: otherwise a node keeps the newest
 frames, drops the oldest and counts them. Recorders lose nothing either way.
+
+**Order of start.** With ``lossless``, a node opens its publisher, waits until those that must hear it listen, and
+only then listens itself. So a stream starts when the whole way to its end is open, whatever the order in which the
+processes came up, and its first frame is not lost; and it halts while a node on the way is started again.
 
 **Latency.** Stamps are of capture, and in a replay long past. The input node says in its diagnostics which stamp
 it plays at which time (`Timeline`); with that, every node knows how late it is. Stamps are never touched.
@@ -160,11 +160,11 @@ class Node(ABC):
         self._stopping = False
         self._state = "starting"
         self._required = launch.listeners(self.name)
-        self._given_up: frozenset[str] = frozenset()
         self._ended: set[str] = set()
         self._published: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()
         self._rates: dict[str, float] = {}
+        self._span_ns: dict[str, tuple[int, int]] = {}
         self._latency_ns: deque[int] = deque(maxlen=SAMPLES)
         self._compute_ns: deque[int] = deque(maxlen=SAMPLES)
         self._blocked_ns = 0
@@ -280,6 +280,7 @@ class Node(ABC):
         now = self.clock.now_ns()
         self._blocked_ns += now - asked
         self._published[topic] += 1
+        self._span_ns[topic] = self._span_ns.get(topic, (now, now))[0], now
         if not isinstance(message, Diagnostics):
             self._stamp_ns = message.stamp_ns
             if message.end_of_stream:
@@ -322,6 +323,10 @@ class Node(ABC):
         self._queue = 0
         values |= {f"count.{topic}": str(n) for topic, n in self._published.items()}
         values |= {f"rate.{topic}": f"{rate:.2f}" for topic, rate in self._rates.items()}
+        values |= {
+            f"mean_rate.{topic}": f"{(self._published[topic] - 1) * 1e9 / max(last - first, 1):.2f}"
+            for topic, (first, last) in self._span_ns.items()
+        }
         values |= _percentiles("latency_ms", self._latency_ns) | _percentiles("compute_ms", self._compute_ns)
         values |= {key: str(n) for key, n in sorted(counts.items()) if n}
         values |= {"memory_mb": f"{resident_bytes() / 1e6:.1f}"} | status
@@ -345,22 +350,14 @@ class Node(ABC):
         self._reported, self._rated_at = self._published.copy(), now
 
     def _await_listeners(self) -> None:
-        """Wait until all who must hear this node listen; after ``wait_s``, go on without the missing."""
-        present = self._publisher.listeners
-        self._given_up -= present
-        if self._required - self._given_up <= present:
+        """Wait until all who must hear this node listen, or it is stopped."""
+        if self._required <= self._publisher.listeners:
             return
-        state, self._state = self._state, f"waiting for {', '.join(sorted(self._required - present))}"
-        transport = self.launch.transport
-        until = self.clock.now_ns() + round(transport.wait_s * 1e9)
+        missing = ", ".join(sorted(self._required - self._publisher.listeners))
+        logger.info("%s: waiting for %s", self.name, missing)
+        state, self._state = self._state, f"waiting for {missing}"
         self.report()
-        while not self._publisher.wait_for_listeners(self._required - self._given_up, timeout_s=TURN_S):
-            if self._stopping:
-                break
-            if self.clock.now_ns() >= until:
-                self._given_up = self._required - self._publisher.listeners
-                missing = ", ".join(sorted(self._given_up))
-                logger.warning("%s: no %s after %g s; going on without", self.name, missing, transport.wait_s)
+        while not self._stopping and not self._publisher.wait_for_listeners(self._required, timeout_s=TURN_S):
             self.report_if_due()
         self._state = state
 

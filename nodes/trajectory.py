@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 
 from msgs.topics import POSE_WORLD
 from msgs.types import Message, PoseClean
-from nodes.launch import Launch, trajectory_settings
+from nodes.launch import Launch, LaunchError
 from nodes.runtime import FRAME_NS, Clock, Node
-from prior.trajectory import TrajectoryPipeline
+from prior.trajectory import TrajectoryPipeline, TrajectorySettings
+
+
+def make_trajectory(settings: Mapping[str, Any]) -> TrajectoryPipeline:
+    """The trajectory as ``[trajectory]`` of a launch file wants it.
+
+    Raises:
+        LaunchError: an unknown setting, a value that cannot be, or weights that are not there.
+    """
+    try:
+        return TrajectoryPipeline(TrajectorySettings.from_dict(settings))
+    except (ValueError, FileNotFoundError) as error:
+        raise LaunchError(str(error)) from error
 
 
 class TrajectoryNode(Node):
@@ -19,7 +34,7 @@ class TrajectoryNode(Node):
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
         torch.set_num_threads(1)  # as in the prior node
-        self._pipeline = TrajectoryPipeline(trajectory_settings(launch.trajectory))
+        self._pipeline = make_trajectory(launch.trajectory)
         self._delay_frames = 0
         self._bodies = 0
 
