@@ -54,7 +54,7 @@ class Gate:
     def __init__(self, settings: GateSettings, slots: int, counters: Counter[str]) -> None:
         self._settings = settings
         self._counters = counters
-        self._filter = FixedLagRTS(0, acceleration_density=20.0, measurement_sigma=0.015)
+        self._filter = FixedLagRTS(0, acceleration_density=8.0, measurement_sigma=0.015)
         self._refused = np.zeros((slots, 22))
         self._swapped = np.zeros((slots, len(_LIMBS)))
 
