@@ -1,0 +1,357 @@
+"""``steadypose doctor``: what works on this machine, what is missing, and what to type about it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+
+# what is looked for is imported where it is looked for: a doctor who needs it all could not say what is missing
+if TYPE_CHECKING:
+    from msgs.types import PoseRaw
+
+INSTALL = "in the checkout: rm -f .venv/.installed && ./steadypose doctor"
+"""installs whatever is missing, then looks again"""
+MODELS = ("hmvae", "trajectory")
+FRAMES = 100
+FRAME_NS = 1_000_000_000 / 30
+WARM_UP = 20
+TARGET_MS = 5.0
+BUDGET_MS = 1000 / 30
+LONGEST_IPC_PATH = 107
+"""bytes of a unix socket's path that the system takes"""
+NEEDED_GB = 2.0
+LUXONIS_USB = "03e7"
+UDEV_RULE = (
+    f"""echo 'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{LUXONIS_USB}", MODE="0666"' | """
+    "sudo tee /etc/udev/rules.d/80-movidius.rules && sudo udevadm control --reload-rules && sudo udevadm trigger"
+)
+
+
+class Verdict(Enum):
+    """How a check came out, as it is printed."""
+
+    GOOD = "[green]ok[/]"
+    NOTE = "[yellow]note[/]"
+    """works, but not as well as it could, or for want of something optional"""
+    BAD = "[bold red]missing[/]"
+    """`steadypose run` cannot work"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found, and what to type to change it."""
+
+    what: str
+    verdict: Verdict
+    found: str
+    fix: str = ""
+
+
+def doctor() -> int:
+    """Check this machine: what works, what is missing, and what to type about it.
+
+    Returns:
+        0 if `steadypose run` can work here, otherwise 1.
+    """
+    console = Console(highlight=False)
+    table = Table("", "what", "found", box=None, pad_edge=False, header_style="bold")
+    with console.status("looking") as status:
+        findings = []
+        for check in CHECKS:
+            status.update(f"looking at {_name(check)}")
+            findings += _examine(check)
+    for finding in findings:
+        table.add_row(finding.verdict.value, finding.what, finding.found)
+    console.print(table)
+    for finding in findings:
+        if finding.fix:
+            console.print(f"\n{finding.verdict.value} {finding.what}: {finding.found}")
+            console.print(f"  {finding.fix}", markup=False, soft_wrap=True)
+    bad = [finding.what for finding in findings if finding.verdict is Verdict.BAD]
+    console.print()
+    console.print(f"`steadypose run` cannot work yet: {', '.join(bad)}" if bad else "`steadypose run` can work here")
+    return 1 if bad else 0
+
+
+def _examine(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
+    found: list[Finding] = []
+    try:
+        found.extend(check())
+    except Exception as error:  # a doctor who faints at the first broken thing is of no use for the others
+        found.append(Finding(_name(check), Verdict.BAD, f"{type(error).__name__}: {error}", INSTALL))
+    return found
+
+
+def _name(check: Callable[[], Iterator[Finding]]) -> str:
+    return check.__name__.removeprefix("check_").replace("_", " ")
+
+
+def check_python() -> Iterator[Finding]:
+    running = ".".join(map(str, sys.version_info[:3]))
+    good = sys.version_info[:2] == (3, 11)
+    fix = "" if good else "install Python 3.11; then in the checkout: rm -rf .venv .uv && ./steadypose doctor"
+    yield Finding("Python", Verdict.GOOD if good else Verdict.BAD, running, fix)
+
+
+def check_packages() -> Iterator[Finding]:
+    """The distribution's own requirements, optional extras apart."""
+    from packaging.requirements import Requirement
+
+    try:
+        wanted = [Requirement(text) for text in requires("steadypose") or []]
+    except PackageNotFoundError:
+        yield Finding("packages", Verdict.BAD, "steadypose itself is not installed", INSTALL)
+        return
+    missing = []
+    for requirement in wanted:
+        optional = requirement.marker is not None and "extra" in str(requirement.marker)
+        try:
+            installed = version(requirement.name)
+        except PackageNotFoundError:
+            installed = ""
+        if installed and requirement.specifier.contains(installed, prereleases=True):
+            continue
+        found = f"{installed or 'not installed'}, expected {requirement.specifier}"
+        if optional:
+            extra = str(requirement.marker).split('"')[1]
+            yield Finding(f"{requirement.name} (optional: {extra})", Verdict.NOTE, found, INSTALL)
+        else:
+            missing.append(f"{requirement.name} {found}")
+    told = ("torch", "numpy", "rosbags", "pyzmq", "depthai", "rerun-sdk")
+    names = [name for name in told if any(r.name == name for r in wanted) and not any(name in m for m in missing)]
+    versions = []
+    for name in names:
+        try:
+            versions.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    if missing:
+        yield Finding("packages", Verdict.BAD, "; ".join(missing), INSTALL)
+    else:
+        yield Finding("packages", Verdict.GOOD, ", ".join(versions))
+
+
+def check_processor() -> Iterator[Finding]:
+    """Cores that are free, and whether they run at full speed."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    load = os.getloadavg()[0]
+    busy = load > max(cores - 1, 0.5)
+    yield Finding(
+        "processor",
+        Verdict.NOTE if busy else Verdict.GOOD,
+        f"{cores} cores, load {load:.1f}",
+        "stop what else is running: frames will be late. `top` shows what it is" if busy else "",
+    )
+    settings = Path("/sys/devices/system/cpu").glob("cpu*/cpufreq/scaling_governor")
+    governors = {path.read_text().strip() for path in settings}
+    if governors:
+        slow = "powersave" in governors
+        yield Finding(
+            "processor speed",
+            Verdict.NOTE if slow else Verdict.GOOD,
+            f"governor {', '.join(sorted(governors))}",
+            "for steady latency: sudo cpupower frequency-set -g performance" if slow else "",
+        )
+
+
+def check_memory() -> Iterator[Finding]:
+    file = Path("/proc/meminfo")
+    if not file.exists():
+        return
+    lines = dict(line.split(":") for line in file.read_text().splitlines())
+    free = int(lines["MemAvailable"].split()[0]) / 1e6
+    short = free < NEEDED_GB
+    fix = f"free some: the nodes take about {NEEDED_GB:g} GB" if short else ""
+    yield Finding("memory", Verdict.NOTE if short else Verdict.GOOD, f"{free:.1f} GB available", fix)
+
+
+def check_clock() -> Iterator[Finding]:
+    """Stamps are of capture, so the wall clock must be set, and intervals need a fine monotonic clock."""
+    clock = time.get_clock_info("monotonic")
+    coarse = clock.resolution > 1e-3
+    year = time.gmtime().tm_year
+    found = f"monotonic to {clock.resolution * 1e9:.0f} ns, the year is {year}"
+    fix = "set the clock: sudo timedatectl set-ntp true" if year < 2025 else ""
+    yield Finding("clock", Verdict.NOTE if coarse or fix else Verdict.GOOD, found, fix)
+
+
+def check_messages() -> Iterator[Finding]:
+    """The directory of the ipc sockets, and a message there and back."""
+    from nodes.launch import TransportSettings
+
+    directory = TransportSettings().ipc_directory
+    longest = len(os.fsencode(directory / "trajectory"))
+    if longest > LONGEST_IPC_PATH:
+        fix = "set XDG_RUNTIME_DIR, or [transport] directory in the launch file, to a shorter path"
+        yield Finding("messages", Verdict.BAD, f"{directory} is too long a path for sockets", fix)
+        return
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=directory, prefix="") as folder:
+            took_ms = _round_trip(f"ipc://{folder}/s") * 1e3
+    except OSError as error:
+        fix = f"sudo chown {os.getuid()} {directory}; or set [transport] directory in the launch file"
+        yield Finding("messages", Verdict.BAD, f"cannot write to {directory}: {error.strerror}", fix)
+        return
+    yield Finding("messages", Verdict.GOOD, f"{took_ms:.1f} ms through {directory}")
+
+
+def _round_trip(endpoint: str) -> float:
+    """Seconds that a message takes from a publisher to a subscriber."""
+    from msgs.topics import POSE_RAW
+    from msgs.transport import Publisher, Subscriber
+
+    name = "doctor"
+    with Publisher(endpoint) as publisher, Subscriber(endpoint, POSE_RAW, name=name) as subscriber:
+        if not publisher.wait_for_listeners({name}, timeout_s=5.0):
+            raise TimeoutError(f"no connection over {endpoint} within 5 s")
+        started = time.perf_counter()
+        publisher.publish(POSE_RAW, _standing(0))
+        if subscriber.receive(5.0) is None:
+            raise TimeoutError(f"no message over {endpoint} within 5 s")
+        return time.perf_counter() - started
+
+
+def check_torch() -> Iterator[Finding]:
+    import torch
+
+    vector = torch.ones(3)
+    assert float(vector @ vector) == 3.0
+    yield Finding("torch", Verdict.GOOD, f"{torch.__version__}, {torch.get_num_threads()} threads; nodes use 1")
+
+
+def check_models() -> Iterator[Finding]:
+    """The weights that the nodes load, and what a frame costs with them."""
+    from prior.checkpoint import WEIGHTS, load_weights
+
+    whole = True
+    for model in MODELS:
+        try:
+            state, _ = load_weights("default", model)
+        except (OSError, ValueError, KeyError) as error:
+            whole = False
+            fix = f"git checkout -- {WEIGHTS.relative_to(WEIGHTS.parent.parent)}, or steadypose train {model}"
+            yield Finding(f"weights of {model}", Verdict.BAD, str(error).split(". ")[0], fix)
+        else:
+            numbers = sum(tensor.numel() for tensor in state.values())
+            yield Finding(f"weights of {model}", Verdict.GOOD, f"default, {numbers / 1e6:.2f} million numbers")
+    if whole:
+        yield _self_test()
+
+
+def _self_test() -> Finding:
+    """A body that stands for a hundred frames, through the prior."""
+    import numpy as np
+    import torch
+
+    from prior.pipeline import PriorPipeline, PriorSettings
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        pipeline = PriorPipeline(PriorSettings())
+        spent_ms, bodies = [], []
+        for frame in range(FRAMES):
+            raw = _standing(frame)
+            started = time.perf_counter()
+            for clean in pipeline.process(raw):
+                bodies += clean.bodies
+            spent_ms.append((time.perf_counter() - started) * 1e3)
+    finally:
+        torch.set_num_threads(threads)
+    p50, p99 = np.percentile(spent_ms[WARM_UP:], (50, 99))
+    found = f"{p50:.1f} ms a frame, p99 {p99:.1f} ms, of {BUDGET_MS:.0f}"
+    if not bodies or not all(np.isfinite(body.positions).all() for body in bodies):
+        return Finding("prior", Verdict.BAD, "gave no pose for a body that stands still", "git checkout -- prior")
+    if p99 > BUDGET_MS:
+        return Finding("prior", Verdict.NOTE, found, "too slow for 30 Hz at the moment: free the processor")
+    if p99 > TARGET_MS:
+        return Finding("prior", Verdict.NOTE, found, f"keeps up, but slower than the {TARGET_MS:g} ms of a free core")
+    return Finding("prior", Verdict.GOOD, found)
+
+
+def _standing(frame: int) -> PoseRaw:
+    """A body in a T-pose, two metres in front of the world's origin, that sways a little."""
+    import numpy as np
+
+    from msgs.types import Pose, PoseRaw, RawBody
+    from prior.skeletons import CANONICAL, PARENTS, REST_OFFSETS, J
+
+    positions = np.zeros((len(CANONICAL.joints), 3))
+    positions[J["pelvis"]] = [2.0, 0.02 * np.sin(frame / 10), 0.95]
+    for child, parent in enumerate(PARENTS):
+        if parent >= 0:
+            positions[child] = positions[parent] + REST_OFFSETS[child]
+    body = RawBody(0, positions.astype(np.float32), np.ones(len(positions), np.float32))
+    stamp_ns = round(frame * FRAME_NS)
+    return PoseRaw(stamp_ns, "world", "doctor", CANONICAL.name, Pose.identity(), True, [body])
+
+
+def check_streams() -> Iterator[Finding]:
+    """What the default launch file plays."""
+    from msgs.recording import RecordingReader
+    from nodes.launch import Launch, checkout
+    from nodes.pose_input import open_source
+
+    fix = "git checkout -- sim_data launch, or play your own: steadypose run --input RECORDING"
+    recording = Path(Launch.read("replay").input.recording).resolve()
+    try:
+        open_source(recording)
+    except (OSError, ValueError) as error:
+        yield Finding("bundled streams", Verdict.BAD, str(error), fix)
+        return
+    streams = sorted({file.parent for file in checkout("sim_data").rglob("*.mcap")})
+    seconds = 0.0
+    for stream in streams:
+        with RecordingReader(stream) as reader:
+            seconds += reader.duration_s
+    yield Finding("bundled streams", Verdict.GOOD, f"{len(streams)}, {seconds:.0f} s together")
+
+
+def check_camera() -> Iterator[Finding]:
+    """OAK cameras: none is fine."""
+    # its own warnings are about what is said here better
+    os.environ.setdefault("DEPTHAI_LEVEL", "error")
+    import depthai
+
+    devices = depthai.Device.getAllAvailableDevices()
+    plugged = [file for file in Path("/sys/bus/usb/devices").glob("*/idVendor") if _reads(file, LUXONIS_USB)]
+    if devices:
+        names = ", ".join(device.getDeviceId() for device in devices)
+        yield Finding("OAK cameras", Verdict.GOOD, names)
+    elif plugged:
+        yield Finding("OAK cameras", Verdict.NOTE, f"{len(plugged)} plugged in that cannot be opened", UDEV_RULE)
+    else:
+        yield Finding("OAK cameras", Verdict.GOOD, f"none; depthai {depthai.__version__} is ready for one")
+
+
+def _reads(file: Path, text: str) -> bool:
+    try:
+        return file.read_text().strip() == text
+    except OSError:
+        return False
+
+
+CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
+    check_python,
+    check_packages,
+    check_processor,
+    check_memory,
+    check_clock,
+    check_messages,
+    check_torch,
+    check_models,
+    check_streams,
+    check_camera,
+)
