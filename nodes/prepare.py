@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections import Counter, defaultdict
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,21 +15,32 @@ from prior.motion.datasets import DATA_SETS, DataSet, Dropped
 from prior.motion.prepare import FPS, Prepared, prepare_clip, write_prepared
 
 
+class PrepareError(ValueError):
+    """There is nothing to prepare; the message says what was looked for."""
+
+
 def prepare(mocap: Path, out: Path = Path("data")) -> None:
     """Turn motion capture into training data: 22 joints at 30 Hz, z up, on a floor, with contacts and splits.
 
-    Reads what it finds of CMU (AMC, BVH, exponential maps), ReActIdle, UI-PRMD's Vicon and Bandai-Namco, packed or
-    unpacked, and writes prepared.npz and prepare-report.json, which lists every recording that was left out and
-    why. Models trained on the set 'default' may go into products; 'research' is Bandai-Namco, for non-commercial
-    use. Validation holds out whole subjects, not frames.
+    Writes prepared.npz, and prepare-report.json, which lists every recording that was left out and why. Validation
+    holds out subjects, or whole recordings where subjects are not known, never frames. Models trained on the set
+    'default' may go into products; 'research' is what only non-commercial models may use.
 
-    Try: steadypose prepare mocap/                     everything, a few minutes
-         steadypose prepare mocap/cmu_amc.tar.xz       one archive
+    What is read, by the name of the archive (.tar.xz, .npz) or folder:
+      cmu_amc, cmu_bvh, cmu_expmap   CMU Graphics Lab, free for all uses            default
+      reactidle                      ReActIdle, MIT                                 default
+      ui_prmd                        UI-PRMD, the Vicon's joints, public domain     default
+      bandai_1, bandai_2             Bandai-Namco, CC BY-NC                         research
+      amass                          AMASS' .npz, non-commercial                    research
+      own                            your own BVH; a folder 'val' in it validates   default
+
+    Try:
+      steadypose prepare mocap/                        all of it, a few minutes
+      steadypose prepare mocap/cmu_amc.tar.xz --out /tmp/cmu
 
     Args:
-        mocap: a folder with the archives (cmu_amc, cmu_bvh, cmu_expmap, reactidle, ui_prmd, bandai_1, bandai_2; as
-            .tar.xz, .npz or folders of those names), or one of them.
-        out: the folder to write to.
+        mocap: folder with these, or one of them.
+        out: folder to write to.
     """
     console = Console()
     sources = find_sources(mocap)
@@ -47,7 +57,7 @@ def prepare(mocap: Path, out: Path = Path("data")) -> None:
             progress.start_task(task)
             _read(path, data_set, result, progress, task)
     if not result.prepared:
-        raise SystemExit(f"prepare: nothing usable in {mocap}; dropped: {dict(result.causes())}")
+        raise PrepareError(f"nothing usable in {mocap}; dropped: {len(result.dropped)}")
     out.mkdir(parents=True, exist_ok=True)
     write_prepared(result.prepared, out / "prepared.npz")
     report = out / "prepare-report.json"
@@ -61,15 +71,15 @@ def find_sources(mocap: Path) -> list[tuple[Path, DataSet]]:
     """Which files hold which known data set, in the order of preparation.
 
     Raises:
-        SystemExit: nothing there, or nothing known.
+        PrepareError: nothing there, or nothing known.
     """
     if not mocap.exists():
-        raise SystemExit(f"prepare: expected a folder or archive of motion capture, '{mocap}' does not exist")
+        raise PrepareError(f"expected a folder or archive of motion capture, '{mocap}' does not exist")
     candidates = [mocap] if mocap.is_file() else [*sorted(mocap.iterdir()), mocap]
-    found = [(path, s) for s in DATA_SETS for path in candidates if re.fullmatch(s.files, path.name)]
+    found = [(path, s) for s in DATA_SETS for path in candidates if s.matches(path)]
     if not found:
         known = ", ".join(s.files.removesuffix(r"\b.*") for s in DATA_SETS)
-        raise SystemExit(f"prepare: expected files named {known} in '{mocap}', found none")
+        raise PrepareError(f"expected files named {known} in '{mocap}', found none")
     return found
 
 
@@ -138,10 +148,12 @@ def _cells(row: list[float]) -> list[str]:
 
 def _read(path: Path, data_set: DataSet, result: _Result, progress: Progress, task: TaskID) -> None:
     kept = dropped = 0
+    reading = True
     seconds = 0.0
 
     def advance(fraction: float) -> None:
         count = f"{kept} recordings, {seconds / 60:.1f} min, {dropped} dropped"
+        fraction = min(fraction, 0.99) if reading else 1.0
         progress.update(task, completed=fraction, count=count)
 
     for clip in data_set.read(path, advance):
@@ -154,4 +166,5 @@ def _read(path: Path, data_set: DataSet, result: _Result, progress: Progress, ta
                 result.prepared.append(part)
                 kept += 1
                 seconds += part.clip.seconds
+    reading = False
     advance(1.0)

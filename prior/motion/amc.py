@@ -9,14 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from prior.motion.clip import forward
+from prior.motion.clip import MotionError, forward
 
 INCH = 0.0254
 """Metres. An ASF gives lengths in inches times its ``length`` unit."""
-
-
-class AcclaimError(ValueError):
-    """The text is not an ASF or AMC file, or the two do not fit; the message says where."""
 
 
 @dataclass(frozen=True)
@@ -51,21 +47,21 @@ def read_asf(text: str) -> Asf:
     """Read an Acclaim skeleton.
 
     Raises:
-        AcclaimError: a section is missing or cannot be read.
+        MotionError: a section is missing or cannot be read.
     """
     sections = _sections(text)
     for name in ("units", "root", "bonedata", "hierarchy"):
         if name not in sections:
-            raise AcclaimError(f"expected a section ':{name}' in the skeleton, found {sorted(sections)}")
+            raise MotionError(f"expected a section ':{name}' in the skeleton, found {sorted(sections)}")
     units = _entries(sections["units"])
     root = _entries(sections["root"])
     if units.get("angle") != ["deg"]:
-        raise AcclaimError(f"expected angles in degrees, found {units.get('angle')}")
-    metres = INCH / float(units.get("length", ["1"])[0])
+        raise MotionError(f"expected angles in degrees, found {units.get('angle')}")
+    metres = INCH / _floats(units.get("length", ["1"]))[0]
     order = tuple(o.lower() for o in root.get("order", []))
     if sorted(order) != ["rx", "ry", "rz", "tx", "ty", "tz"]:
-        raise AcclaimError(f"expected a root with six freedoms, found {order}")
-    turned = [float(a) for a in root.get("orientation", ["0"] * 3)]
+        raise MotionError(f"expected a root with six freedoms, found {order}")
+    turned = _floats(root.get("orientation", ["0"] * 3))
     bones = {"root": _Bone(np.zeros(3), _axis(turned, root.get("axis", ["XYZ"])[0]), order)}
     bones |= _bones(sections["bonedata"], metres)
 
@@ -75,7 +71,7 @@ def read_asf(text: str) -> Asf:
         if parent in ("begin", "end"):
             continue
         if parent not in joints or not bones.keys() >= set(children):
-            raise AcclaimError(f"the hierarchy names a bone not known before it: '{line.strip()}'")
+            raise MotionError(f"the hierarchy names a bone not known before it: '{line.strip()}'")
         joints += children
         parents += [joints.index(parent)] * len(children)
     return Asf(
@@ -99,19 +95,19 @@ def read_amc(text: str, skeleton: Asf) -> NDArray[np.float64]:
         (T, J, 3) metres, the skeleton's axes (y up in CMU's).
 
     Raises:
-        AcclaimError: it is no AMC, or its bones are not the skeleton's.
+        MotionError: it is no AMC, or its bones are not the skeleton's.
     """
     angles = _frames(text)
     frames = len(angles["root"]) if "root" in angles else 0
     if not frames:
-        raise AcclaimError("expected frames that move 'root', found none")
+        raise MotionError("expected frames that move 'root', found none")
     count = len(skeleton.joints)
     steps = np.empty((frames, count, 3))
     local = np.empty((frames, count, 3, 3))
     for j, (name, freedoms) in enumerate(zip(skeleton.joints, skeleton.freedoms, strict=True)):
         values = angles.get(name, np.zeros((frames, 0)))
         if values.shape != (frames, len(freedoms)):
-            raise AcclaimError(f"bone '{name}': expected {len(freedoms)} angles a frame, got {values.shape[1]}")
+            raise MotionError(f"bone '{name}': expected {len(freedoms)} angles a frame, got {values.shape[1]}")
         at = {freedom: values[:, i] for i, freedom in enumerate(freedoms)}
         zero = np.zeros(frames)
         degrees = np.stack([at.get(f"r{a}", zero) for a in "xyz"], axis=-1)
@@ -142,6 +138,13 @@ def _entries(lines: list[str]) -> dict[str, list[str]]:
     return {words[0].lower(): words[1:] for line in lines if (words := line.split())}
 
 
+def _floats(words: list[str]) -> list[float]:
+    try:
+        return [float(w) for w in words]
+    except ValueError as error:
+        raise MotionError(f"expected numbers in the skeleton, found '{' '.join(words)}'") from error
+
+
 def _axis(degrees: list[float], order: str) -> NDArray[np.float64]:
     # 'XYZ' turns about the fixed x axis first: lower case in scipy.
     return Rotation.from_euler(order.lower(), degrees, degrees=True).as_matrix()
@@ -152,15 +155,15 @@ def _bones(lines: list[str], metres: float) -> dict[str, _Bone]:
     for block in "\n".join(lines).split("begin")[1:]:
         entry = _entries(block.splitlines())
         try:
-            direction = np.array([float(d) for d in entry["direction"]])
+            direction = np.array(_floats(entry["direction"]))
             *degrees, order = entry["axis"]
             bones[entry["name"][0]] = _Bone(
-                offset=direction * float(entry["length"][0]) * metres,
-                axis=_axis([float(d) for d in degrees], order),
+                offset=direction * _floats(entry["length"])[0] * metres,
+                axis=_axis(_floats(degrees), order),
                 freedoms=tuple(f.lower() for f in entry.get("dof", [])),
             )
         except (KeyError, ValueError, IndexError) as error:
-            raise AcclaimError(f"a bone cannot be read ({error}): '{' '.join(block.split())[:80]}'") from error
+            raise MotionError(f"a bone cannot be read ({error}): '{' '.join(block.split())[:80]}'") from error
     return bones
 
 
@@ -169,10 +172,10 @@ def _frames(text: str) -> Mapping[str, NDArray[np.float64]]:
     lines = [s for line in text.splitlines() if (s := line.strip()) and s[0] not in "#:"]
     starts = [i for i, line in enumerate(lines) if line.isdigit()]
     if not starts or starts[0] != 0:
-        raise AcclaimError("expected frames, each opened by its number")
+        raise MotionError("expected frames, each opened by its number")
     height = (starts[1] if len(starts) > 1 else len(lines)) - starts[0]
     if len(lines) != height * len(starts):
-        raise AcclaimError(f"expected {height - 1} bones in each of {len(starts)} frames; the file is cut or mixed")
+        raise MotionError(f"expected {height - 1} bones in each of {len(starts)} frames; the file is cut or mixed")
     return dict(_columns(lines, height))
 
 
@@ -181,8 +184,8 @@ def _columns(lines: list[str], height: int) -> Iterator[tuple[str, NDArray[np.fl
         words = [line.split() for line in lines[row::height]]
         name, width = words[0][0], len(words[0])
         if any(w[0] != name or len(w) != width for w in words):
-            raise AcclaimError(f"expected bone '{name}' in the same place in every frame")
+            raise MotionError(f"expected bone '{name}' in the same place in every frame")
         try:
             yield name, np.array([w[1:] for w in words], dtype=np.float64).reshape(len(words), width - 1)
         except ValueError as error:
-            raise AcclaimError(f"bone '{name}': {error}") from error
+            raise MotionError(f"bone '{name}': {error}") from error

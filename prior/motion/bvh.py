@@ -15,11 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from prior.motion.clip import forward
-
-
-class BvhError(ValueError):
-    """The text is not a BVH file; the message says where it stops being one."""
+from prior.motion.clip import MotionError, forward
 
 
 @dataclass
@@ -86,11 +82,11 @@ def read_bvh(text: str) -> Bvh:
     """Read a BVH file: any rotation order, position channels on any joint, several roots and end sites.
 
     Raises:
-        BvhError: it is not one, or its motion does not fit its hierarchy.
+        MotionError: it is not one, or its motion does not fit its hierarchy.
     """
     head, found, motion = text.partition("MOTION")
     if not found:
-        raise BvhError("expected HIERARCHY and MOTION sections, found no MOTION")
+        raise MotionError("expected HIERARCHY and MOTION sections, found no MOTION")
     nodes = _hierarchy(head.split())
     values, fps = _motion(motion, sum(len(n.channels) for n in nodes))
     return Bvh(
@@ -109,7 +105,7 @@ def _hierarchy(tokens: list[str]) -> list[_Node]:
     it = iter(tokens)
     try:
         if (first := next(it)) != "HIERARCHY":
-            raise BvhError(f"expected HIERARCHY at the start, found '{first}'")
+            raise MotionError(f"expected HIERARCHY at the start, found '{first}'")
         for token in it:
             if token in ("ROOT", "JOINT", "End"):
                 parent = open_joints[-1] if open_joints else -1
@@ -118,7 +114,7 @@ def _hierarchy(tokens: list[str]) -> list[_Node]:
                     ends = sum(n.parent == parent and not n.channels for n in nodes)
                     name = f"{nodes[parent].name}_end{ends + 1 if ends else ''}"
                 if (brace := next(it)) != "{":
-                    raise BvhError(f"expected '{{' after {token} {name}, found '{brace}'")
+                    raise MotionError(f"expected '{{' after {token} {name}, found '{brace}'")
                 open_joints.append(len(nodes))
                 nodes.append(_Node(name, parent, (0.0, 0.0, 0.0)))
             elif token == "OFFSET":
@@ -127,20 +123,20 @@ def _hierarchy(tokens: list[str]) -> list[_Node]:
                 channels = tuple(next(it) for _ in range(int(next(it))))
                 unknown = set(channels) - _POSITION.keys() - _ROTATION.keys()
                 if unknown:
-                    raise BvhError(f"joint {nodes[open_joints[-1]].name}: unknown channels {sorted(unknown)}")
+                    raise MotionError(f"joint {nodes[open_joints[-1]].name}: unknown channels {sorted(unknown)}")
                 nodes[open_joints[-1]].channels = channels
             elif token == "}":
                 open_joints.pop()
             else:
-                raise BvhError(f"expected ROOT, JOINT, End, OFFSET, CHANNELS or '}}', found '{token}'")
+                raise MotionError(f"expected ROOT, JOINT, End, OFFSET, CHANNELS or '}}', found '{token}'")
     except (StopIteration, IndexError) as error:
-        raise BvhError("the hierarchy is cut short or its braces do not match") from error
+        raise MotionError("the hierarchy is cut short or its braces do not match") from error
     except ValueError as error:
-        if isinstance(error, BvhError):
+        if isinstance(error, MotionError):
             raise
-        raise BvhError(f"a number in the hierarchy cannot be read: {error}") from error
+        raise MotionError(f"a number in the hierarchy cannot be read: {error}") from error
     if open_joints or not nodes:
-        raise BvhError("the hierarchy is cut short or its braces do not match")
+        raise MotionError("the hierarchy is cut short or its braces do not match")
     return nodes
 
 
@@ -148,14 +144,14 @@ def _motion(text: str, channels: int) -> tuple[NDArray[np.float64], float]:
     """Values (T, channels), and frames a second."""
     words = text.split(maxsplit=5)
     if len(words) < 5 or words[0] != "Frames:" or words[2:4] != ["Frame", "Time:"]:
-        raise BvhError(f"expected 'Frames: N' and 'Frame Time: S' after MOTION, found '{' '.join(words[:5])}'")
+        raise MotionError(f"expected 'Frames: N' and 'Frame Time: S' after MOTION, found '{' '.join(words[:5])}'")
     try:
         frames, seconds = int(words[1]), float(words[4])
         values = np.array(words[5].split() if len(words) > 5 else [], dtype=np.float64)
     except ValueError as error:
-        raise BvhError(f"a number in the motion cannot be read: {error}") from error
+        raise MotionError(f"a number in the motion cannot be read: {error}") from error
     if seconds <= 0:
-        raise BvhError(f"expected a frame time above zero, found {seconds}")
+        raise MotionError(f"expected a frame time above zero, found {seconds}")
     if len(values) != frames * channels:
-        raise BvhError(f"expected {frames} frames of {channels} numbers, found {len(values)} numbers")
+        raise MotionError(f"expected {frames} frames of {channels} numbers, found {len(values)} numbers")
     return values.reshape(frames, channels), 1.0 / seconds

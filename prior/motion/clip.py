@@ -14,6 +14,10 @@ Y_UP_TO_Z_UP: NDArray[np.float64] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0],
 """Turns a y-up frame into a z-up one by a quarter turn about x (both right-handed)."""
 
 
+class MotionError(ValueError):
+    """A motion file is not what it should be; the message says what was expected and what is there."""
+
+
 @dataclass(frozen=True)
 class Clip:
     """One recording of one person.
@@ -47,10 +51,10 @@ class Clip:
         """The same recording with the canonical joints.
 
         Raises:
-            ValueError: the skeleton's table leaves a canonical joint out; training needs complete bodies.
+            MotionError: the skeleton's table leaves a canonical joint out; training needs complete bodies.
         """
         if not self.skeleton.observable.all():
-            raise ValueError(f"{self.name}: the table of '{self.skeleton.name}' does not give all 22 joints")
+            raise MotionError(f"{self.name}: the table of '{self.skeleton.name}' does not give all 22 joints")
         return replace(self, skeleton=CANONICAL, positions=to_canonical(self.skeleton, self.positions)[0])
 
 

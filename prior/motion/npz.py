@@ -3,41 +3,67 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import IO
+from zipfile import BadZipFile
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from prior.motion.clip import forward
+from prior.motion.clip import MotionError, forward
 from prior.motion.tables import CMU_BVH, CMU_METRES
 from prior.skeletons import PARENTS, REST_OFFSETS
 
 
-def read_expmap(file: IO[bytes]) -> Iterator[tuple[str, float, NDArray[np.float64]]]:
+@contextmanager
+def open_npz(file: IO[bytes] | Path, *needs: str) -> Iterator[NpzFile]:
+    """Open an .npz that holds some arrays.
+
+    Raises:
+        MotionError: it is no .npz (or needs pickle, which can run code), or lacks an array.
+    """
+    try:
+        archive = np.load(file)
+    except (BadZipFile, ValueError, EOFError) as error:
+        raise MotionError(f"expected an .npz archive: {error}") from error
+    if not isinstance(archive, NpzFile):
+        raise MotionError("expected an .npz archive, got a single array")
+    with archive:
+        missing = set(needs) - set(archive.files)
+        if missing:
+            raise MotionError(f"expected arrays {', '.join(sorted(missing))}; the file has {archive.files[:6]}...")
+        yield archive
+
+
+def read_expmap(file: IO[bytes]) -> Iterator[tuple[float, str, float, NDArray[np.float64]]]:
     """CMU clips as root translations and exponential maps (``cmu_expmap.npz``).
 
     The archive's own positions are passed over: its offsets are those of the BVH conversion that has lost the
     thorax and a third of the forearm, which are put back here.
 
     Yields:
-        name, frames a second, and (T, J, 3) metres, y up, for the joints of the rig ``cmu_bvh``.
+        for each clip: which share of them is read, its name, frames a second, and (T, J, 3) metres, y up, for the
+        joints of the rig ``cmu_bvh``.
     """
-    with np.load(file) as archive:
+    with open_npz(file, "names", "parents", "offsets_m", "fps") as archive:
         joints = [str(n).replace("HeadEnd", "Head_end") for n in archive["names"]]
         parents = [int(p) for p in archive["parents"]]
         offsets, fps = archive["offsets_m"].copy(), float(archive["fps"])
         for joint, multiple in CMU_BVH.lost_bones.items():
             offsets[joints.index(joint)] = multiple * offsets[parents[joints.index(joint)]]
         wanted = [joints.index(j) for j in CMU_BVH.skeleton.joints]
-        for name in (n.removesuffix("/expmap") for n in archive.files if n.endswith("/expmap")):
+        names = [n.removesuffix("/expmap") for n in archive.files if n.endswith("/expmap")]
+        for done, name in enumerate(names, start=1):
             values = archive[f"{name}/expmap"].astype(np.float64)
             maps = values[:, 3:].reshape(-1, 3)
             # The file's convention is row vectors; the transpose serves columns.
             local = Rotation.from_rotvec(maps).inv().as_matrix().reshape(len(values), len(joints), 3, 3)
             steps = np.tile(offsets, (len(values), 1, 1))
             steps[:, 0] = values[:, :3] * CMU_METRES
-            yield name, fps, forward(parents, steps, local)[0][:, wanted]
+            yield done / len(names), name, fps, forward(parents, steps, local)[0][:, wanted]
 
 
 def read_amass(file: IO[bytes]) -> tuple[float, NDArray[np.float64]]:
@@ -51,16 +77,16 @@ def read_amass(file: IO[bytes]) -> tuple[float, NDArray[np.float64]]:
         frames a second, and (T, 22, 3) metres, canonical joints, z up.
 
     Raises:
-        ValueError: an array is missing or has another shape.
+        MotionError: an array is missing or has another shape.
     """
-    with np.load(file) as archive:
+    with open_npz(file, "poses", "trans") as archive:
         rate = next((k for k in ("mocap_framerate", "mocap_frame_rate") if k in archive), None)
-        if rate is None or not {"poses", "trans"} <= set(archive.files):
-            raise ValueError(f"expected 'poses', 'trans' and 'mocap_framerate', found {archive.files[:8]}")
+        if rate is None:
+            raise MotionError("expected an array mocap_framerate (or mocap_frame_rate, as SMPL-X' files name it)")
         fps, poses = float(archive[rate]), archive["poses"].astype(np.float64)
         trans = archive["trans"].astype(np.float64)
     if poses.ndim != 2 or poses.shape[1] < 3 * len(PARENTS) or trans.shape != (len(poses), 3):
-        raise ValueError(f"expected poses (T, 66 or more) and trans (T, 3), got {poses.shape} and {trans.shape}")
+        raise MotionError(f"expected poses (T, 66 or more) and trans (T, 3), got {poses.shape} and {trans.shape}")
     maps = poses[:, : 3 * len(PARENTS)].reshape(-1, 3)
     local = Rotation.from_rotvec(maps).as_matrix().reshape(len(poses), len(PARENTS), 3, 3)
     # SMPL's rest pose faces +z with y up; ours faces +x with z up.

@@ -70,6 +70,9 @@ class Prepared:
 def prepare_clip(clip: Clip, weights: WeightSet, split: Split) -> Iterator[Prepared | Dropped]:
     """Resample, find the floor, check and label a recording; yields its good parts and what was dropped, and why."""
     clip = clip.canonical()
+    if len(clip.positions) == 0:
+        yield Dropped(clip.name, clip.source, f"shorter than {MIN_SECONDS:.0f} s", "no frames")
+        return
     filled = fill_gaps(clip.positions, clip.fps)
     complete = np.asarray(finite_joints(filled).all(axis=1))
     if not complete.all():

@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from prior.motion.clip import Y_UP_TO_Z_UP, MotionError
+from prior.motion.npz import open_npz
 from prior.motion.plug_in_gait import calibrate, joint_centres
 
 TRAIN_SUBJECTS = ("s01", "s02", "s03", "s04", "s05", "s06")
@@ -20,7 +22,6 @@ VALIDATION_SUBJECTS = ("s07", "s08")
 
 _METRES_PER_COUNT = 1e-4
 _MISSING = -32768
-_Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -60,22 +61,20 @@ def load_pairs(path: Path, subjects: Collection[str]) -> list[KinectPair]:
         subjects: such as `TRAIN_SUBJECTS`.
 
     Raises:
-        ValueError: the file is not this archive, or lacks a subject.
+        MotionError: the file is not this archive, or lacks a subject.
     """
-    with np.load(path) as archive:
-        if "vicon_names" not in archive:
-            raise ValueError(f"{path}: expected ui_prmd.npz's arrays, got {', '.join(archive.files[:4])}, ...")
+    with open_npz(path, "fps", "vicon_names") as archive:
         marker_names = [str(n) for n in archive["vicon_names"]]
         fps = float(archive["fps"])
         names = (name.removesuffix("/kinect") for name in archive.files if name.endswith("/kinect"))
         split = sorted(((n.split("_")[1], n) for n in names), key=lambda pair: pair)
         missing = set(subjects) - {s for s, _ in split}
         if missing:
-            raise ValueError(f"{path}: no recordings of {', '.join(sorted(missing))}")
+            raise MotionError(f"{path}: no recordings of {', '.join(sorted(missing))}")
         pairs: list[KinectPair] = []
         for subject, group in groupby((p for p in split if p[0] in subjects), key=lambda pair: pair[0]):
             recordings = {
-                name: (_metres(archive[f"{name}/kinect"]) @ _Y_UP_TO_Z_UP.T, _metres(archive[f"{name}/vicon_markers"]))
+                name: (_metres(archive[f"{name}/kinect"]) @ Y_UP_TO_Z_UP.T, _metres(archive[f"{name}/vicon_markers"]))
                 for _, name in group
             }
             named = {
