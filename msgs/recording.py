@@ -36,7 +36,7 @@ CHUNK_NS = 500_000_000
 CHUNK_BYTES = 2**18
 
 # what the mcap package raises, somewhere, for bytes that are not MCAP
-_BROKEN = (McapError, ValueError, KeyError, EOFError, RuntimeError, OverflowError, MemoryError, struct.error)
+_BROKEN = (McapError, ValueError, KeyError, EOFError, OSError, RuntimeError, OverflowError, MemoryError, struct.error)
 
 
 class RecordingError(ValueError):
@@ -231,12 +231,15 @@ class RecordingReader:
     def messages(self, topics: Iterable[str] | None = None, *, start_ns: int | None = None) -> Iterator[Recorded]:
         """The messages on `topics`, from `start_ns` on, in the order of their stamps, then of recording.
 
-        Seeking reads only what comes at and after `start_ns`.
+        Seeking reads no more of the file than what comes at and after `start_ns`.
 
         Raises:
             RecordingError: on coming to bytes that are damaged.
+            ValueError: for a topic that does not exist.
         """
         wanted = set(TOPICS if topics is None else topics)
+        if unknown := wanted - TOPICS.keys():
+            raise ValueError(f"topics: expected of {', '.join(TOPICS)}, got {', '.join(sorted(unknown))}")
         names = wanted | {f"/{topic}" for topic in wanted}
         try:
             streams = [reader.iter_messages(names, starting_at=start_ns) for reader in self._readers]
@@ -316,7 +319,7 @@ class _Reader(SeekingReader):
         if self._index is None:
             try:
                 self._index = super().get_summary()
-            except (OSError, *_BROKEN):
+            except _BROKEN:
                 self._index = None
             if self._index is None or self._index.statistics is None:
                 self._index = self._scan()

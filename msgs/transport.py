@@ -200,7 +200,7 @@ class Subscriber:
             conflate: keep the newest message alone: for a picture or a control loop that wants the state, not the
                 history. For one topic and without a name, because ZeroMQ then keeps one message of each publisher,
                 and one subscription to it; open a subscriber for each topic.
-            high_water: messages held unread; beyond it the newest are lost.
+            high_water: messages held unread, beyond which the newest are lost; 0 holds all there is memory for.
             keys: for publishers that have them.
             name: what `Publisher.listeners` calls this subscriber; without one it is not among them.
 
@@ -228,8 +228,12 @@ class Subscriber:
         self.socket.setsockopt(zmq.RCVHWM, high_water)
         self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_FRAME)
         self.socket.setsockopt(zmq.LINGER, 0)
-        # a publisher whose machine vanished is noticed, and connected to again when it is back
-        self.socket.setsockopt(zmq.HEARTBEAT_IVL, 2000)
+        # A publisher whose machine vanished is noticed in 15 s, and connected to again when it is back. Not by
+        # ZeroMQ's heartbeats: they abort the process of a subscriber that is behind (libzmq issue 3937).
+        self.socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
+        self.socket.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 5)
+        self.socket.setsockopt(zmq.TCP_KEEPALIVE_INTVL, 5)
+        self.socket.setsockopt(zmq.TCP_KEEPALIVE_CNT, 2)
         if keys:
             self.socket.curve_publickey = keys.public
             self.socket.curve_secretkey = keys.secret

@@ -76,7 +76,7 @@ def test_what_went_in_comes_out_in_the_order_of_stamps(whole: Path):
 
 
 @given(st.lists(st.tuples(ANY, st.integers(0, 2**62)), min_size=1, max_size=8))
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=20)
 def test_any_message_at_any_stamp_is_kept(tmp_path_factory: pytest.TempPathFactory, given_: list):
     messages = [Recorded(topic, stamp, message) for (topic, message), stamp in given_]
     directory = record(tmp_path_factory.mktemp("any") / "recording", messages)
@@ -91,6 +91,8 @@ def test_the_same_messages_make_the_same_bytes(whole: Path, tmp_path: Path):
 def test_topics_can_be_chosen(whole: Path):
     with RecordingReader(whole) as reader:
         chosen = list(reader.messages([POSE_CLEAN, DIAGNOSTICS]))
+        with pytest.raises(ValueError, match=r"expected of pose/raw, .*, got pose/row"):
+            next(reader.messages(["pose/row"]))
     assert {recorded.topic for recorded in chosen} == {POSE_CLEAN, DIAGNOSTICS}
     assert len(chosen) == 86 + 3
 
@@ -239,7 +241,7 @@ def test_a_truncated_recording_gives_what_is_there(
 
 
 @given(data=st.data())
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=80)
 def test_a_damaged_recording_is_an_error_and_never_another_message(
     data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
 ):
@@ -266,9 +268,7 @@ def test_files_that_are_none_are_refused(content: bytes, tmp_path: Path):
 
 def test_a_place_without_a_recording_is_refused(tmp_path: Path):
     for path in (tmp_path, tmp_path / "missing"):
-        with pytest.raises(
-            RecordingError, match=r"expected a directory with \.mcap files, .*; found none"
-        ):
+        with pytest.raises(RecordingError, match=r"expected a directory with \.mcap files, .*; found none"):
             RecordingReader(path)
 
 

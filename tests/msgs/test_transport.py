@@ -1,13 +1,14 @@
 """Real sockets: what is published arrives, what is lost is counted, and nobody is stopped by anybody."""
 
 import dataclasses
-import resource
+import itertools
 import socket
 import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zmq
@@ -19,7 +20,7 @@ from msgs.keys import Keys, create_keys, load_keys
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from msgs.transport import MAX_FRAME, Publisher, Subscriber, TransportError
 
-SOON_S = 10.0
+SOON_S = 20.0
 """for what must happen; the machine may be busy"""
 NEVER_S = 0.3
 """for what must not happen"""
@@ -53,17 +54,19 @@ def address(publisher: zmq.Socket[bytes]) -> str:
     return publisher.get_string(zmq.LAST_ENDPOINT)
 
 
-def wait_until(condition: Callable[[], object]) -> None:
+def wait_until(condition: Callable[[], Any]) -> Any:
     deadline = time.monotonic() + SOON_S
-    while not condition():
+    while not (met := condition()):
         assert time.monotonic() < deadline, "waited in vain"
-        threading.Event().wait(0.001)
+    return met
 
 
-def drain(subscriber: Subscriber) -> list[int]:
-    """The stamps of all that is left."""
+def stamps_until(subscriber: Subscriber, last: int) -> list[int]:
+    """The stamps of what comes, up to that of `last`."""
     stamps = []
-    while received := subscriber.receive(NEVER_S):
+    while not stamps or stamps[-1] < last:
+        received = subscriber.receive(SOON_S)
+        assert received, f"{last} did not come after {stamps}"
         stamps.append(received[1].stamp_ns)
     return stamps
 
@@ -123,8 +126,10 @@ def test_publishers_of_one_topic_are_counted_apart(tmp_path: Path):
         for publisher in (first, first, second, first, second):
             publisher.publish(DIAGNOSTICS, diagnostics())
             publisher.publish(POSE_RAW, raw())
-        assert len(drain(subscriber)) == 10
+        for _ in range(10):
+            assert subscriber.receive(SOON_S)
         assert not subscriber.dropped
+        assert not subscriber.refused
 
 
 def test_listeners_come_and_go(endpoint: str):
@@ -139,15 +144,15 @@ def test_listeners_come_and_go(endpoint: str):
 
 def test_conflate_gives_the_newest_and_counts_the_others(endpoint: str):
     with Publisher(endpoint) as publisher, Subscriber(publisher.endpoint, POSE_RAW, conflate=True) as subscriber:
-        wait_until(lambda: publisher.publish(POSE_RAW, raw(0)) and subscriber.receive(0.01))
-        drain(subscriber)
-        dropped_before = subscriber.dropped[POSE_RAW]
-        for stamp in range(1, 100):
-            publisher.publish(POSE_RAW, raw(stamp))
-        stamps = drain(subscriber)
+        stamp = itertools.count()
+        first = wait_until(lambda: publisher.publish(POSE_RAW, raw(next(stamp))) and subscriber.receive(0.01))
+        last = next(stamp) + 1000
+        for later in range(last - 1000, last + 1):
+            publisher.publish(POSE_RAW, raw(later))
+        stamps = stamps_until(subscriber, last)
         assert stamps == sorted(set(stamps))
-        assert stamps[-1] == 99
-        assert len(stamps) + subscriber.dropped[POSE_RAW] - dropped_before == 99
+        assert len(stamps) + subscriber.dropped[POSE_RAW] == last - first[1].stamp_ns
+        assert subscriber.dropped[POSE_RAW] > 0
 
 
 def test_a_conflating_subscriber_that_never_reads_holds_up_no_lossless_publisher(endpoint: str):
@@ -169,32 +174,41 @@ def test_what_does_not_fit_is_lost_and_counted(endpoint: str):
         assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
         for stamp in range(300):
             publisher.publish(POSE_RAW, dataclasses.replace(BIG, stamp_ns=stamp))
-        stamps = drain(subscriber)
-        # a loss is seen when the next message comes
-        publisher.publish(POSE_RAW, raw(300))
-        stamps += drain(subscriber)
+        later = itertools.count(300)
+        stamps = []
+
+        def a_later_message_comes() -> bool:
+            publisher.publish(POSE_RAW, raw(next(later)))
+            if received := subscriber.receive(0.01):
+                stamps.append(received[1].stamp_ns)
+            return bool(stamps) and stamps[-1] >= 300
+
+        wait_until(a_later_message_comes)  # for a loss shows in what comes after it
         assert stamps == sorted(set(stamps))
-        assert stamps[-1] == 300
-        assert subscriber.dropped[POSE_RAW] == 301 - len(stamps) > 0
+        assert subscriber.dropped[POSE_RAW] == stamps[-1] + 1 - len(stamps) > 0
 
 
 @pytest.mark.usefixtures("small_buffers")
 def test_a_subscriber_that_never_reads_neither_blocks_nor_fills_its_publisher(endpoint: str):
-    with Publisher(endpoint) as publisher, Subscriber(publisher.endpoint, POSE_RAW, high_water=5, name="test"):
+    with (
+        Publisher(endpoint) as publisher,
+        Subscriber(publisher.endpoint, POSE_RAW, high_water=5, name="test") as subscriber,
+    ):
         assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
-        publisher.publish(POSE_RAW, BIG)
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
         def publish() -> None:
-            for _ in range(1500):
-                publisher.publish(POSE_RAW, BIG)
+            for stamp in range(1000):
+                publisher.publish(POSE_RAW, dataclasses.replace(BIG, stamp_ns=stamp))
 
         publishing = threading.Thread(target=publish, daemon=True)
         publishing.start()
         publishing.join(60)
         assert not publishing.is_alive(), "publish waits"
-        grown_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-        assert grown_kib < 50_000, "240 MB were published"
+        # 5 messages there, 5 here, and what the kernel holds on the way: not the 160 MB that were published
+        held = 0
+        while subscriber.receive(NEVER_S):
+            held += 1
+        assert held < 200
 
 
 @pytest.mark.usefixtures("small_buffers")
@@ -212,7 +226,7 @@ def test_lossless_waits_for_the_slowest(endpoint: str):
                 got = slow.receive(SOON_S)
                 assert got
                 received.append(got[1].stamp_ns)
-        received += drain(slow)
+        received += stamps_until(slow, 199)
         assert waits > 0
         assert received == list(range(200))
         assert not slow.dropped
@@ -303,7 +317,8 @@ def test_sequence_numbers_wrap(rogue: zmq.Socket[bytes]):
         assert rogue.poll(round(SOON_S * 1000))
         for sequence in (2**32 - 3, 2**32 - 1, 0, 4):
             rogue.send(frame(sequence))
-        assert len(drain(subscriber)) == 4
+        for _ in range(4):
+            assert subscriber.receive(SOON_S)
         assert subscriber.dropped == {POSE_RAW: 1 + 3}
 
 
