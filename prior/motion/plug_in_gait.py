@@ -44,8 +44,11 @@ MAX_PELVIS_WIDTH, MAX_PELVIS_DEPTH = 0.30, 0.22
 """Metres. Soft tissue carries the front markers of a heavy subject out and forward (46 by 27 cm on one of
 these subjects), where the regression, fitted to lean ones, would put the hips 32 cm apart."""
 
+MIN_BEND = 0.3
+"""Sine of the bend below which a limb is too straight to show the axis it bends about."""
+
 MIN_BEND_WEIGHT = 20.0
-"""Sum of sin(bend) over frames below which a limb was too straight to show its axis; the wand then stands."""
+"""Sum of sin(bend) over frames that a subject's axis must rest on; with less, the wand stands."""
 
 Markers = Mapping[str, NDArray[np.float64]]
 Array = NDArray[np.float64]
@@ -57,17 +60,15 @@ class _Hinge:
 
     marker: str
     wand: str
-    distal: tuple[str, ...]
     width: float
 
 
+_SIDES = (("left", "L"), ("right", "R"))
+
 _HINGES: Mapping[str, _Hinge] = {
-    f"{side}_{joint}": _Hinge(s + marker, s + wand, tuple(s + d for d in distal), width)
-    for side, s in (("left", "L"), ("right", "R"))
-    for joint, marker, wand, distal, width in (
-        ("knee", "KNE", "THI", ("ANK",), KNEE_WIDTH),
-        ("elbow", "ELB", "UPA", ("WRA", "WRB"), ELBOW_WIDTH),
-    )
+    f"{side}_{joint}": _Hinge(s + marker, s + wand, width)
+    for side, s in _SIDES
+    for joint, marker, wand, width in (("knee", "KNE", "THI", KNEE_WIDTH), ("elbow", "ELB", "UPA", ELBOW_WIDTH))
 }
 
 
@@ -138,6 +139,26 @@ def _chord(upper: Array, marker: Array, along: Array, lateral: Array, offset: fl
     return marker + offset * (cos * along - np.sqrt(1 - cos**2) * lateral)
 
 
+def _hinge_joint(upper: Array, m: Markers, hinge: _Hinge, axis: float) -> Array:
+    along, wand, third = _limb_axes(upper, m, hinge)
+    lateral = np.cos(axis) * wand + np.sin(axis) * third
+    return _chord(upper, m[hinge.marker], along, lateral, hinge.width / 2 + MARKER_RADIUS)
+
+
+def _ankle(knee: Array, m: Markers, s: str) -> tuple[Array, Array]:
+    """The ankle of side ``L`` or ``R``, and the unit vector of the foot that points to its sole."""
+    shank = _unit(knee - m[s + "ANK"])
+    forward = _unit(m[s + "TOE"] - m[s + "HEE"])
+    lateral = (1.0 if s == "L" else -1.0) * _unit(np.cross(shank, forward))
+    return _chord(knee, m[s + "ANK"], shank, lateral, ANKLE_WIDTH / 2 + MARKER_RADIUS), -_reject(shank, forward)
+
+
+def _below(joint: str, place: Array, m: Markers) -> Array:
+    """The ankle of a knee, the wrist of an elbow."""
+    s = "L" if joint.startswith("left") else "R"
+    return _ankle(place, m, s)[0] if joint.endswith("knee") else _mean(m, (s + "WRA", s + "WRB"))
+
+
 def calibrate(recordings: Iterable[Markers]) -> Calibration:
     """Measure a subject on all of its recordings.
 
@@ -163,20 +184,31 @@ def calibrate(recordings: Iterable[Markers]) -> Calibration:
         "left_elbow": left_shoulder,
         "right_elbow": right_shoulder,
     }
-    axis = {joint: _bend_axis(upper[joint], joined, hinge) for joint, hinge in _HINGES.items()}
+    axis = {joint: _bend_axis(joint, upper[joint], joined) for joint in _HINGES}
     return Calibration(measured.pelvis_width, measured.pelvis_depth, measured.acromia, axis)
 
 
-def _bend_axis(upper: Array, m: Markers, hinge: _Hinge) -> float:
-    """Angle (rad) from the wand to the axis of bending: a mean over frames, each weighted by its bend."""
-    along, wand, third = _limb_axes(upper, m, hinge)
-    lower = _unit(_mean(m, hinge.distal) - m[hinge.marker])
-    normal = np.cross(along, lower)  # as long as the sine of the bend
-    x, y = (normal * wand).sum(-1), (normal * third).sum(-1)
-    # The marker is lateral: of the normal's two directions, the one on the wand's side.
-    sign = np.where(x < 0, -1.0, 1.0)
-    x, y = np.nansum(x * sign), np.nansum(y * sign)
-    return float(np.arctan2(y, x)) if np.hypot(x, y) > MIN_BEND_WEIGHT else 0.0
+def _bend_axis(joint: str, upper: Array, m: Markers) -> float:
+    """Angle (rad) from the wand to the axis of bending, such that limb and axis are square, on the mean of frames.
+
+    The joint's centre, and with it the plane of the limb, depends on the axis: a few rounds settle it.
+    """
+    hinge = _HINGES[joint]
+    _, wand, third = _limb_axes(upper, m, hinge)
+    angle = 0.0
+    for _ in range(4):
+        place = _hinge_joint(upper, m, hinge, angle)
+        # As long as the sine of the bend, so that the mean trusts a frame as far as it shows the axis.
+        normal = np.cross(_unit(upper - place), _unit(_below(joint, place, m) - place))
+        x, y = (normal * wand).sum(-1), (normal * third).sum(-1)
+        bent = np.hypot(x, y) > MIN_BEND
+        # Of the normal's two directions, the one on the wand's side.
+        sign = np.where(x < 0, -1.0, 1.0)[bent]
+        x, y = (x[bent] * sign).sum(), (y[bent] * sign).sum()
+        if np.hypot(x, y) < MIN_BEND_WEIGHT:
+            return 0.0
+        angle = float(np.arctan2(y, x))
+    return angle
 
 
 def joint_centres(m: Markers, calibration: Calibration) -> NDArray[np.float64]:
@@ -194,16 +226,10 @@ def joint_centres(m: Markers, calibration: Calibration) -> NDArray[np.float64]:
     p["left_shoulder"], p["right_shoulder"] = _shoulders(m, calibration)
     for joint, hinge in _HINGES.items():
         upper = p[joint.replace("knee", "hip").replace("elbow", "shoulder")]
-        along, wand, third = _limb_axes(upper, m, hinge)
-        angle = calibration.axis[joint]
-        lateral = np.cos(angle) * wand + np.sin(angle) * third
-        p[joint] = _chord(upper, m[hinge.marker], along, lateral, hinge.width / 2 + MARKER_RADIUS)
-    for side, s, sign in (("left", "L", 1.0), ("right", "R", -1.0)):
-        shank = _unit(p[f"{side}_knee"] - m[s + "ANK"])
-        forward = _unit(m[s + "TOE"] - m[s + "HEE"])
-        lateral = sign * _unit(np.cross(shank, forward))
-        p[f"{side}_ankle"] = _chord(p[f"{side}_knee"], m[s + "ANK"], shank, lateral, ANKLE_WIDTH / 2 + MARKER_RADIUS)
-        p[f"{side}_foot"] = m[s + "TOE"] - TOE_DEPTH * _reject(shank, forward)
+        p[joint] = _hinge_joint(upper, m, hinge, calibration.axis[joint])
+    for side, s in _SIDES:
+        p[f"{side}_ankle"], sole = _ankle(p[f"{side}_knee"], m, s)
+        p[f"{side}_foot"] = m[s + "TOE"] + TOE_DEPTH * sole
         p[f"{side}_wrist"] = _mean(m, (s + "WRA", s + "WRB"))
     band = _mean(m, ("LFHD", "RFHD", "LBHD", "RBHD"))
     facing = _mean(m, ("LFHD", "RFHD")) - _mean(m, ("LBHD", "RBHD"))
@@ -214,6 +240,6 @@ def joint_centres(m: Markers, calibration: Calibration) -> NDArray[np.float64]:
     # The proportions of the rest skeleton, whose spine and collars no marker shows.
     p["spine1"] = p["pelvis"] + 0.37 * (p["spine3"] - p["pelvis"])
     p["spine2"] = p["pelvis"] + 0.80 * (p["spine3"] - p["pelvis"])
-    for side in ("left", "right"):
+    for side, _ in _SIDES:
         p[f"{side}_collar"] = 0.33 * p["spine3"] + 0.28 * p["neck"] + 0.39 * p[f"{side}_shoulder"]
     return np.stack([p[name] for name in JOINTS], axis=-2)
