@@ -28,6 +28,7 @@ class BonesSettings:
 
 
 _ENOUGH_JOINTS = 8
+_APPROACH = 0.1  # of the way to a renewed estimate, a frame: bones that jump would shake the whole limb
 _ENOUGH_SAMPLES = 4
 
 
@@ -35,7 +36,8 @@ class Bones:
     """Keeps each slot's ``window.offsets``: the median over frames sampled from the person's first ten seconds.
 
     The mean of a person's bone lengths would grow with the sensor's noise and follow its outliers. The estimate is
-    renewed each time the number of samples has doubled, so that it costs little and soon stands still.
+    renewed each time the number of samples has doubled, so that it costs little and soon stands still, and is
+    approached smoothly.
     """
 
     delay_frames = 0
@@ -43,6 +45,7 @@ class Bones:
     def __init__(self, settings: BonesSettings, slots: int) -> None:
         self._settings = settings
         self._samples = np.full((slots, settings.samples, 22, 3), np.nan)
+        self._target = np.zeros((slots, 22, 3))
         self._count = np.zeros(slots, dtype=np.int64)
         self._wait = np.zeros(slots, dtype=np.int64)
 
@@ -65,6 +68,10 @@ class Bones:
             self._wait[slot] = self._settings.every - 1
             count = self._count[slot]
             if count & (count - 1) == 0 or count == self._settings.samples:
-                window.offsets[slot] = estimate_offsets(self._samples[slot, :count])
+                self._target[slot] = estimate_offsets(self._samples[slot, :count])
                 window.measured[slot] = count >= _ENOUGH_SAMPLES
+                if count == 1:
+                    window.offsets[slot] = self._target[slot]
+        known = self._count > 0
+        window.offsets[known] += _APPROACH * (self._target[known] - window.offsets[known])
         return window

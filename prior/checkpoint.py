@@ -19,7 +19,7 @@ WEIGHTS = Path(__file__).parent / "weights"
 
 
 def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, Any]) -> None:
-    """Write weights with their configuration, and the card.
+    """Write weights, in half precision, with their configuration, and the card.
 
     Args:
         path: ends in ``.safetensors``; the card is written beside it as ``.md``.
@@ -28,7 +28,7 @@ def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: 
         card: heading to content: data, licence, seed, training command, results.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    tensors = {name: tensor.detach().half().contiguous() for name, tensor in model.state_dict().items()}
     _write_whole(path, save(tensors, metadata={"config": json.dumps(dict(config), sort_keys=True)}))
     lines = [f"# {path.stem}", ""]
     for heading, content in {**card, "Commit": _commit(), "Made on": f"{platform.machine()}, torch on CPU"}.items():
@@ -55,7 +55,7 @@ def load_weights(name: str, model: str) -> tuple[dict[str, Tensor], dict[str, An
         )
     with safe_open(path, framework="pt") as file:
         config = json.loads(file.metadata()["config"])
-        return {key: file.get_tensor(key) for key in file.keys()}, config  # noqa: SIM118 (not a mapping)
+        return {key: file.get_tensor(key).float() for key in file.keys()}, config  # noqa: SIM118 (not a mapping)
 
 
 def _write_whole(path: Path, content: bytes) -> None:

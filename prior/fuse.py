@@ -33,8 +33,8 @@ class FuseSettings:
     enabled: bool = True
     measurement_sigma: float = 0.02
     bias_sigma: float = 0.02
-    acceleration_density: float = 2.0
-    prior_sigma: float = 0.05
+    acceleration_density: float = 0.5
+    prior_sigma: float = 0.1
     prior_drift: float = 0.25
     fade: float = 3.0
 

@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from prior.skeletons import JOINTS, PARENTS, REST_OFFSETS, J, finite_joints
@@ -417,6 +418,25 @@ def yaw_matrix(angle: NDArray[np.floating] | float) -> Floats:
     """Rotation (..., 3, 3) about z by ``angle`` (...) radians."""
     angle = np.asarray(angle, dtype=np.float64)
     return _about(np.broadcast_to(_EYE[2], (*angle.shape, 3)), angle)
+
+
+def rigid_alignment(source: NDArray[np.floating], target: NDArray[np.floating]) -> tuple[Floats, Floats]:
+    """The rotation R (3, 3) and translation t (3,) with the least sum of |R source + t - target|².
+
+    Args:
+        source: (..., 3) metres; points not finite in either are left out.
+        target: the same shape.
+
+    Raises:
+        ValueError: fewer than three points are finite in both.
+    """
+    both = finite_joints(source) & finite_joints(target)
+    a, b = source[both], target[both]
+    if len(a) < 3:
+        raise ValueError(f"alignment: expected at least 3 points that both have, got {len(a)}")
+    centre_a, centre_b = a.mean(axis=0), b.mean(axis=0)
+    rotation = Rotation.align_vectors(b - centre_b, a - centre_a)[0].as_matrix()
+    return rotation, centre_b - rotation @ centre_a
 
 
 def label_contacts(positions: NDArray[np.floating], fps: float) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""The prior, stage by stage: adapt, gate, bones, solve, refine, fuse.
+"""The prior, stage by stage: adapt, gate, correct, bones, solve, refine, fuse.
 
 One object serves a stream: `PriorPipeline.process` takes ``pose/raw`` messages and gives the ``pose/clean`` messages
 they complete. All bodies go through each stage together, one slot a body. Nothing here reads a clock or draws a
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from msgs.types import CleanBody, PoseClean, PoseRaw, RawBody
 from prior.bones import Bones, BonesSettings
+from prior.correct import Correct, CorrectSettings
 from prior.fuse import Fuse, FuseSettings
 from prior.gate import Gate, GateSettings
 from prior.refine import Refine, RefineSettings
@@ -47,13 +48,14 @@ class PriorSettings:
         max_bodies: bodies followed at once.
         timeout: seconds without a sighting after which a body is dropped, and without a frame after which the
             stream starts anew.
-        gate, bones, refine, fuse: settings of the stages.
+        gate, correct, bones, refine, fuse: settings of the stages.
     """
 
     delay: int = 4
     max_bodies: int = 8
     timeout: float = 0.5
     gate: GateSettings = field(default_factory=GateSettings)
+    correct: CorrectSettings = field(default_factory=CorrectSettings)
     bones: BonesSettings = field(default_factory=BonesSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     fuse: FuseSettings = field(default_factory=FuseSettings)
@@ -87,6 +89,7 @@ class PriorPipeline:
         self._fuse = Fuse(settings.fuse, settings.delay, slots)
         self._stages: tuple[Stage, ...] = (
             Gate(settings.gate, slots, self.counters),
+            *([Correct(settings.correct, slots)] if settings.correct.sensor else []),
             Bones(settings.bones, slots),
             Solve(),
             refine,
@@ -205,6 +208,7 @@ class PriorPipeline:
         window.stamp_s.push((stamp_ns - self._origin_ns) * 1e-9)
         window.raw.push(positions)
         window.confidence.push(confidence)
+        window.sensor_position = _sensor(raw)[1]
         for stage in self._stages:
             window = stage.update(window)
         return [] if window.out is None else [self._message(window.out, self.delay_frames, raw)]

@@ -9,9 +9,9 @@ import torch
 
 
 def train(
-    model: Literal["hmvae", "trajectory"],
+    model: Literal["hmvae", "trajectory", "correction"],
     data: Path = Path("data/prepared.npz"),
-    weights: Literal["default", "research"] = "default",
+    weights: Literal["default", "research", "kinect_v2"] | None = None,
     runs: Path = Path("runs"),
     seed: int = 0,
     threads: int = 2,
@@ -23,9 +23,10 @@ def train(
     prior/weights.
 
     Args:
-        model: hmvae (refinement) or trajectory (root velocity and contacts).
-        data: what 'steadypose prepare' wrote.
-        weights: the set to train: 'default' takes only data free for products, 'research' all of it.
+        model: hmvae (refinement), trajectory (root velocity and contacts), or correction (a sensor's own error).
+        data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon.
+        weights: the set to train: 'default' takes only data free for products, 'research' all of it; a correction
+            is named after its sensor, kinect_v2.
         runs: where checkpoints and curves go.
         seed: for weights and sampling.
         threads: CPU threads.
@@ -33,6 +34,9 @@ def train(
     torch.set_num_threads(threads)
     if model == "hmvae":
         from prior.train_hmvae import train_hmvae as train_model
-    else:
+    elif model == "trajectory":
         from prior.train_trajectory import train_trajectory as train_model
-    print(f"weights: {train_model(data, runs, weights=weights, seed=seed)}")
+    else:
+        from prior.train_correction import train_correction as train_model
+    name = weights or ("kinect_v2" if model == "correction" else "default")
+    print(f"weights: {train_model(data, runs, weights=name, seed=seed)}")

@@ -40,6 +40,11 @@ class Ring:
         """The frame pushed last."""
         return self._data[(self._next - 1) % self._frames]
 
+    def replace(self, frame: NDArray[np.floating]) -> None:
+        """Write over the newest frame."""
+        last = (self._next - 1) % self._frames
+        self._data[last] = self._data[last + self._frames] = frame
+
     def clear(self, slot: NDArray[np.bool_]) -> None:
         """Refill these slots, the first axis of a frame, with the initial value in all frames."""
         self._data[:, slot] = self._fill
@@ -71,7 +76,8 @@ class Window:
         stamp_s: ring of capture times, seconds.
         raw: ring of (S, 22, 3) metres, the canonical joints that came in; NaN where unobserved.
         confidence: ring of (S, 22) in 0..1.
-        positions: ring of (S, 22, 3) metres after the gate; NaN where unobserved or refused.
+        positions: ring of (S, 22, 3) metres after gate and correction; NaN where unobserved or refused.
+        sensor_position: (3,) metres, where the sensor stands.
         rotations: ring of (S, 22, 3, 3) local, solved from the positions.
         present: (S,) which slots hold a body.
         offsets: (S, 22, 3) metres, each person's bones.
@@ -87,6 +93,7 @@ class Window:
         self.confidence = Ring(frames, (slots, 22), fill=0.0)
         self.positions = Ring(frames, (slots, 22, 3))
         self.rotations = Ring(frames, (slots, 22, 3, 3))
+        self.sensor_position = np.zeros(3)
         self.present = np.zeros(slots, dtype=bool)
         self.offsets = np.tile(REST_OFFSETS, (slots, 1, 1))
         self.measured = np.zeros(slots, dtype=bool)

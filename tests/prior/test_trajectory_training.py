@@ -98,18 +98,24 @@ def test_calibration_finds_the_size_of_the_errors(prepared: Path, monkeypatch: p
         assert config.correlation_s == pytest.approx((lasts, lasts), rel=0.25)
 
 
-def test_learns_resumes_and_writes_weights(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(training, "WEIGHTS", tmp_path / "weights")
-    runs = tmp_path / "runs"
-    first = training.train_trajectory(prepared, runs, iterations=3, batch=4)
-    curves = (runs / "trajectory-default" / "curves.json").read_text()
-    state, config = load_weights(str(first), "trajectory")
+    state, config = load_weights(str(training.train_trajectory(prepared, tmp_path / "a", iterations=4, batch=4)), "")
     TrajectoryNet(TrajectoryConfig.from_dict(config)).load_state_dict(state)
-    assert first.with_suffix(".md").read_text().startswith("# trajectory-default")
-    assert first.with_suffix(".png").stat().st_size > 0
+    assert (tmp_path / "weights/trajectory-default.md").read_text().startswith("# trajectory-default")
+    assert (tmp_path / "weights/trajectory-default.png").stat().st_size > 0
 
-    again = training.train_trajectory(prepared, runs, iterations=3, batch=4)
-    assert (runs / "trajectory-default" / "curves.json").read_text() == curves
-    resumed, _ = load_weights(str(again), "trajectory")
+    calls, loss = iter(range(10)), training._loss
+
+    def killed(*args):
+        if next(calls) == 2:
+            raise KeyboardInterrupt
+        return loss(*args)
+
+    monkeypatch.setattr(training, "_loss", killed)
+    with pytest.raises(KeyboardInterrupt):
+        training.train_trajectory(prepared, tmp_path / "b", iterations=4, batch=4)
+    resumed, _ = load_weights(str(training.train_trajectory(prepared, tmp_path / "b", iterations=4, batch=4)), "")
+    assert next(calls) == 5
     for name, tensor in state.items():
         torch.testing.assert_close(resumed[name], tensor, rtol=0, atol=0)

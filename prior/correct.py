@@ -1,0 +1,87 @@
+"""The correct stage: a known sensor's systematic error is taken out of what it shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from prior.checkpoint import load_weights
+from prior.correction_net import HISTORY, CorrectionConfig, CorrectionNet, features, trunk_frame
+from prior.filters import FixedLagRTS
+from prior.skeletons import finite_joints
+from prior.window import Ring, Window
+
+DENSITY = 1.0
+"""m²/s³, of the causal smoother before the network: its answer must not jitter with its input."""
+
+FADE = 0.9
+"""A frame's worth of a correction that can no longer be computed, because the trunk is hidden."""
+
+
+@dataclass(frozen=True)
+class CorrectSettings:
+    """Which sensor to correct.
+
+    Attributes:
+        sensor: ``kinect_v2``, or empty for a sensor whose error is not known. A property of the sensor, not of its
+            skeleton: another camera that speaks the same joints errs in other ways.
+    """
+
+    sensor: str = ""
+
+
+class Correct:
+    """Adds to each joint seen what `CorrectionNet` says is missing; it adds no delay."""
+
+    delay_frames = 0
+
+    def __init__(self, settings: CorrectSettings, slots: int) -> None:
+        state, config = load_weights(settings.sensor, "correction")
+        self._net = CorrectionNet(CorrectionConfig.from_dict(config))
+        self._net.load_state_dict(state)
+        self._net.eval()
+        self._smoother = FixedLagRTS(0, DENSITY)
+        self._history = Ring(HISTORY[-1] + 1, (slots, 22, 3))
+        self._correction = np.zeros((slots, 22, 3))
+
+    def reset(self, slot: NDArray[np.bool_]) -> None:
+        """Forget the bodies in these slots."""
+        if slot.all():
+            self._smoother.reset()  # a new stream: its stamps may be earlier
+        self._smoother.forget(np.repeat(slot[:, None], 22, axis=1))
+        self._history.clear(slot)
+        self._correction[slot] = 0.0
+
+    @torch.inference_mode()
+    def update(self, window: Window) -> Window:
+        """Correct the newest frame's positions, in place."""
+        newest = window.positions.newest
+        smoothed = self._smoother.update(newest, float(window.stamp_s.newest))
+        assert smoothed is not None  # a lag of 0 answers at once
+        self._history.push(np.where(finite_joints(newest)[..., None], smoothed.positions, np.nan))
+        slots = np.flatnonzero(window.present)
+        history = recall(self._history.all[:, slots])
+        frames = trunk_frame(history[0])
+        known = np.isfinite(frames).all(axis=(1, 2))
+        self._correction[slots[~known]] *= FADE
+        if known.any():
+            x = features(history[:, known], window.sensor_position)
+            answer = self._net(torch.from_numpy(x).float()).double().numpy()
+            self._correction[slots[known]] = answer @ frames[known].swapaxes(-1, -2)
+        newest += self._correction
+        window.positions.replace(newest)
+        return window
+
+
+def recall(frames: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(H, B, 22, 3) of the frames `HISTORY` ago among ``frames`` (T, B, 22, 3), the newest last.
+
+    A body younger than that is remembered as it was first seen.
+    """
+    seen = np.isfinite(frames[..., 0]).any(axis=-1)
+    first = np.where(seen.any(axis=0), seen.argmax(axis=0), len(frames) - 1)
+    rows = np.maximum(len(frames) - 1 - np.array(HISTORY)[:, None], first)
+    return frames[rows, np.arange(frames.shape[1])]

@@ -1,0 +1,5 @@
+"""Simulated people in front of a simulated depth camera, with the truth known.
+
+`scripts` stages motions from our own kinematic rules (`gait`, `motion`), `camera` films them, `noise` holds the
+error model that `fit` estimates from a real Kinect, and `streams` writes the recordings of ``sim_data/``.
+"""

@@ -1,0 +1,333 @@
+"""A depth camera with a body tracker, filming simulated people.
+
+Each joint's line of sight is followed through the flesh of all bodies (capsules). What is hidden is guessed or
+lost; what lies near a silhouette now and then takes the depth of what is behind or in front. Everything else that
+is wrong comes from the `noise` model; its quick part grows with the distance, along the ray with its square, as
+disparity has it, across it in proportion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtri
+
+from msgs.types import Pose, PoseRaw, RawBody
+from prior.sim.body import CAPSULES, REST_HEIGHT, stature
+from prior.sim.motion import Motion
+from prior.sim.noise import (
+    SWAP_GROUPS,
+    NoiseModel,
+    confidence_of,
+    draw_errors,
+    ray_axes,
+    stationary,
+    swapped,
+    travelled,
+)
+from prior.sim.sensors import Mount, mount
+from prior.skeletons import JOINTS, J
+
+Floats = NDArray[np.float64]
+
+REFERENCE_RANGE = 2.6
+"""Metres: the median distance at which the noise was measured."""
+
+FRAME_ID = "camera_optical_frame"
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where a camera is and how it films.
+
+    Attributes:
+        position: metres, world.
+        look_at: metres, world: the point in the middle of the image.
+        roll: radians about the line of sight, positive clockwise as seen in the image.
+        field_of_view: radians, horizontal and vertical.
+        near: metres in front of the camera within which it sees no depth.
+        background: metres along the line of sight to the wall behind the people.
+        fps: frames a second, nominally.
+        stamp_jitter: seconds, standard deviation of the frames' times about an even rhythm.
+        drop_rate: share of frames that never arrive.
+        skeleton: the joints its tracker gives.
+        calibrated: whether its place in the world is told; if not, only which way is up.
+    """
+
+    position: tuple[float, float, float]
+    look_at: tuple[float, float, float]
+    roll: float = 0.0
+    field_of_view: tuple[float, float] = (1.22, 1.05)
+    near: float = 0.5
+    background: float = 5.5
+    fps: float = 30.0
+    stamp_jitter: float = 0.002
+    drop_rate: float = 0.01
+    skeleton: str = "kinect22"
+    calibrated: bool = True
+
+    @property
+    def orientation(self) -> Floats:
+        """(3, 3) from the optical frame (x right, y down, z forward) to the world."""
+        forward = np.subtract(self.look_at, self.position)
+        forward = forward / np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        down = np.cross(forward, right)
+        c, s = np.cos(self.roll), np.sin(self.roll)
+        return np.stack([c * right + s * down, c * down - s * right, forward], axis=-1)
+
+    def told_pose(self) -> Pose:
+        """The pose that goes into its messages: the true one, or, uncalibrated, only which way is up."""
+        if self.calibrated:
+            return Pose(np.array(self.position), Rotation.from_matrix(self.orientation).as_quat())
+        forward = self.orientation[:, 2]
+        unturn = Rotation.from_euler("z", -np.arctan2(forward[1], forward[0])).as_matrix()
+        return Pose(np.zeros(3), Rotation.from_matrix(unturn @ self.orientation).as_quat())
+
+    def capture_times(self, duration: float, rng: np.random.Generator) -> Floats:
+        """Seconds at which frames were taken and arrive, within 0 to ``duration``."""
+        nominal = np.arange(0.1, duration - 0.1, 1.0 / self.fps)
+        jitter = np.clip(self.stamp_jitter * rng.standard_normal(len(nominal)), -0.3 / self.fps, 0.3 / self.fps)
+        # Frames are lost singly and in runs: a lost one takes the next along two times in five.
+        lost = rng.random(len(nominal)) < 0.6 * self.drop_rate
+        for k in range(1, len(lost)):
+            lost[k] |= lost[k - 1] and rng.random() < 0.4
+        return (nominal + jitter)[~lost]
+
+    def in_view(self, points: Floats) -> NDArray[np.bool_]:
+        """Which points (..., 3), optical frame, fall on the image and beyond `near`."""
+        x, y, z = np.moveaxis(points, -1, 0)
+        half = np.tan(np.array(self.field_of_view) / 2)
+        return (z > self.near) & (np.abs(x) < half[0] * z) & (np.abs(y) < half[1] * z)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Line of sight
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What stands between a camera and joints (T, J).
+
+    Attributes:
+        hidden: 0 free, 1 behind flesh, between at its edge.
+        in_front: metres of depth at which the hiding flesh lies; infinite where none does.
+        beside: metres of depth of the nearest other flesh that the ray all but touches; infinite where none does.
+    """
+
+    hidden: Floats
+    in_front: Floats
+    beside: Floats
+
+
+def sight(points: Floats, bodies: Sequence[Motion], position: Floats) -> Sight:
+    """Follow the ray to each of ``points`` (T, J, 3) through the capsules of all bodies.
+
+    A capsule that holds the point itself (a joint inside its own limb) hides nothing.
+    """
+    shape = points.shape[:-1]
+    hidden, in_front, beside = np.zeros(shape), np.full(shape, np.inf), np.full(shape, np.inf)
+    reach = np.linalg.norm(points - position, axis=-1)
+    for body in bodies:
+        scale = stature(body.offsets) / REST_HEIGHT
+        for first, second, radius in CAPSULES:
+            radius = radius * scale
+            a, b = body.positions[:, J[first], None], body.positions[:, J[second], None]
+            gap, along = segment_gap(np.broadcast_to(position, points.shape), points, a, b)
+            own = _to_segment(points, a, b) < 1.15 * radius
+            depth = along * reach
+            ahead = ~own & (depth < reach - 0.3 * radius)
+            cover = np.where(ahead, np.clip((radius - gap) / (0.35 * radius) + 0.5, 0.0, 1.0), 0.0)
+            surface = depth - np.sqrt(np.maximum(radius**2 - gap**2, 0.0))
+            in_front = np.where((cover > 0.5) & (surface < in_front), surface, in_front)
+            hidden = np.maximum(hidden, cover)
+            grazed = ~own & (gap < 1.6 * radius)
+            beside = np.where(grazed & (surface < beside), surface, beside)
+    return Sight(hidden, in_front, beside)
+
+
+def segment_gap(p: Floats, q: Floats, a: Floats, b: Floats) -> tuple[Floats, Floats]:
+    """Distance (...) between segments pq and ab (..., 3), and where on pq (0..1) they come nearest.
+
+    Ericson, Real-Time Collision Detection (2005), section 5.1.9.
+    """
+    d1, d2, r = q - p, b - a, p - a
+    aa, ee, f = (d1 * d1).sum(-1), (d2 * d2).sum(-1), (d2 * r).sum(-1)
+    c, bb = (d1 * r).sum(-1), (d1 * d2).sum(-1)
+    denominator = aa * ee - bb * bb
+    s = np.clip((bb * f - c * ee) / np.maximum(denominator, 1e-12), 0.0, 1.0)
+    t = np.clip((bb * s + f) / np.maximum(ee, 1e-12), 0.0, 1.0)
+    s = np.clip((bb * t - c) / np.maximum(aa, 1e-12), 0.0, 1.0)
+    return np.linalg.norm(p + s[..., None] * d1 - a - t[..., None] * d2, axis=-1), s
+
+
+def _to_segment(point: Floats, a: Floats, b: Floats) -> Floats:
+    along = b - a
+    t = np.clip(((point - a) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-12), 0.0, 1.0)
+    return np.linalg.norm(point - a - t[..., None] * along, axis=-1)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# The tracker
+
+_LIMB_ENDS = np.array([n.endswith(("elbow", "wrist", "ankle", "foot", "knee")) for n in JOINTS])
+_TRUNK = np.array([n.strip("123").endswith(("pelvis", "hip", "spine", "neck", "collar", "shoulder")) for n in JOINTS])
+_BLEED_RATE = 0.25  # a second: how often a limb's end takes the depth of the wall behind it
+_BLEED_BESIDE_RATE = 1.5  # a second: the same for a ray that grazes other flesh
+_BLEED_DURATION = 0.08  # seconds, mean
+_GUESS_STD = 0.07  # metres: what a tracker makes of a joint it cannot see
+_GUESS_MEMORY = 0.6  # seconds over which such a guess wanders
+_LOST_SHARE = 0.45  # of hidden joints, those the tracker gives up
+_LEAST_JOINTS = 0.4  # of a body's joints that must be seen for it to be reported
+_FIND_AFTER = 0.3  # seconds in view before a lost body is found again
+_FORGET_AFTER = 0.8  # seconds out of view after which it comes back under a new id
+
+
+def film(
+    people: Sequence[Motion], camera: Camera, noise: NoiseModel, rng: np.random.Generator, source: str, start_ns: int
+) -> list[PoseRaw]:
+    """What the camera's tracker reports of people, frame by frame.
+
+    Args:
+        people: motions that last equally long.
+        camera: the camera.
+        noise: how its tracker errs.
+        rng: source.
+        source: the name of the stream.
+        start_ns: stamp of second 0 of the motions.
+
+    Returns:
+        frames in the order of their stamps; ``sensor_pose`` as far as the camera is calibrated.
+    """
+    times = camera.capture_times(min(m.times[-1] for m in people), rng)
+    filmed = [m.at(times) for m in people]
+    tracks = [_track(k, filmed, camera, noise, times, rng) for k in range(len(filmed))]
+    ids = _ids([t.reported for t in tracks], times)
+    frames: list[PoseRaw] = []
+    for f, time in enumerate(times):
+        bodies = [
+            RawBody(int(ids[k][f]), track.positions[f], track.confidence[f])
+            for k, track in enumerate(tracks)
+            if track.reported[f]
+        ]
+        stamp = start_ns + round(time * 1e9)
+        frames.append(PoseRaw(stamp, FRAME_ID, source, camera.skeleton, camera.told_pose(), camera.calibrated, bodies))
+    return frames
+
+
+@dataclass(frozen=True)
+class _Track:
+    positions: Floats  # (T, J, 3) metres, optical frame, NaN where lost
+    confidence: Floats  # (T, J)
+    reported: NDArray[np.bool_]  # (T,)
+
+
+def _track(
+    which: int, people: Sequence[Motion], camera: Camera, noise: NoiseModel, times: Floats, rng: np.random.Generator
+) -> _Track:
+    person = people[which]
+    on_body = mount(camera.skeleton)
+    dt = np.diff(times, prepend=times[0] - 1.0 / camera.fps)
+    eye = np.array(camera.position)
+    truth = on_body.positions(person.positions, person.orientations, stature(person.offsets) / REST_HEIGHT)
+    view = sight(truth, people, eye)
+    hidden = as_tracked(view.hidden, on_body)
+    points = _exchanged(truth, on_body, swapped(dt, (), rng, _temptation(person, eye)))
+
+    reach = np.linalg.norm(points - eye, axis=-1)
+    drawn = draw_errors(travelled(person.positions), dt, rng, noise)
+    farther = (reach / REFERENCE_RANGE)[..., None]
+    error = drawn.steady[:, on_body.joint]
+    error = error + drawn.quick[:, on_body.joint] * np.concatenate([farther**2, farther, farther], axis=-1)
+    scale = drawn.scale[:, on_body.joint] * farther[..., 0]
+
+    # A hidden joint is a guess that wanders; whether the tracker gives it up wanders more slowly still.
+    joints = truth.shape[1]
+    guess = _GUESS_STD * stationary(dt, _GUESS_MEMORY, (joints, 3), rng)
+    error += hidden[..., None] * guess
+    scale = np.hypot(scale, _GUESS_STD * hidden)
+    mood = stationary(dt, 2.0, (joints, 1), rng)[..., 0]
+    given_up = (hidden > 0.5) & (mood > ndtri(1 - _LOST_SHARE))
+
+    # Depth read beside the joint instead of on it.
+    ends = _LIMB_ENDS[on_body.joint]
+    to_wall = _bursts(dt, ends * _BLEED_RATE * farther[..., 0], rng)
+    to_flesh = _bursts(dt, np.where(np.isfinite(view.beside), _BLEED_BESIDE_RATE, 0.0), rng)
+    share = rng.uniform(0.3, 1.0, reach.shape)
+    error[..., 0] += np.where(to_wall, 0.35 * share * np.maximum(camera.background - reach, 0.0), 0.0)
+    error[..., 0] += np.where(to_flesh & np.isfinite(view.beside), share * (np.minimum(view.beside, 1e3) - reach), 0.0)
+    # A tracker that reads the wrong depth does not always know it.
+    suspects = (to_wall | to_flesh) & (rng.random(reach.shape) < 0.6)
+    scale = np.where(suspects, np.maximum(scale, 0.12), scale)
+
+    seen = points + np.einsum("tjk,tjkx->tjx", error, ray_axes(points - eye))
+    optical = (seen - eye) @ camera.orientation
+    outside = ~camera.in_view((truth - eye) @ camera.orientation)
+    lost = given_up | outside | (optical[..., 2] < camera.near)
+    positions = np.where(lost[..., None], np.nan, optical)
+    confidence = np.where(lost, 0.0, confidence_of(scale, rng))
+    reported = _found((~outside & (hidden < 0.5)).mean(axis=1) >= _LEAST_JOINTS, times)
+    return _Track(positions, confidence, reported)
+
+
+def as_tracked(hidden: Floats, on_body: Mount) -> Floats:
+    """A trunk is tracked as a whole: an arm across it hides none of its joints, a body in front of it all."""
+    trunk = _TRUNK[on_body.joint]
+    return np.where(trunk, np.minimum(hidden, hidden[:, trunk].mean(axis=1, keepdims=True)), hidden)
+
+
+def _temptation(person: Motion, eye: Floats) -> Floats:
+    """(T,) 1 for a body that faces the camera, 10 for one that turns its side or back to it: sides then look alike."""
+    away = person.root - eye
+    away /= np.linalg.norm(away, axis=-1, keepdims=True)
+    facing = -(person.orientations[:, 0, :, 0] * away).sum(axis=-1)
+    return 1.0 + 9.0 * np.clip(1.0 - facing, 0.0, 1.0) ** 2
+
+
+def _exchanged(truth: Floats, on_body: Mount, when: dict[str, NDArray[np.bool_]]) -> Floats:
+    points = truth.copy()
+    for group, active in when.items():
+        columns = np.flatnonzero(np.isin(on_body.joint, SWAP_GROUPS[group]))
+        points[:, columns] = np.where(active[:, None, None], truth[:, on_body.mirror[columns]], truth[:, columns])
+    return points
+
+
+def _bursts(dt: Floats, rate: Floats, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """(T, J) on and off: bursts begin ``rate`` (T, J) times a second and last `_BLEED_DURATION` on average."""
+    begin = rng.random(rate.shape) < 1 - np.exp(-rate * dt[:, None])
+    end = rng.random(rate.shape) < 1 - np.exp(-dt[:, None] / _BLEED_DURATION)
+    on = np.zeros(rate.shape, dtype=bool)
+    for t in range(1, len(dt)):
+        on[t] = np.where(on[t - 1], ~end[t], begin[t])
+    return on
+
+
+def _found(visible: NDArray[np.bool_], times: Floats) -> NDArray[np.bool_]:
+    """A body is reported once it has been visible for a while, until it is not."""
+    since = np.where(visible, 0.0, np.inf)
+    began = times[0] - 1.0  # someone who is there from the start has been there before
+    for t in range(len(times)):
+        if visible[t]:
+            if t and not visible[t - 1]:
+                began = times[t]
+            since[t] = times[t] - began
+    return visible & (since >= _FIND_AFTER)
+
+
+def _ids(reported: Sequence[NDArray[np.bool_]], times: Floats) -> list[NDArray[np.int64]]:
+    """(T,) track ids of each body: counted up as bodies appear, a new one after a long absence."""
+    ids = [np.zeros(len(times), dtype=np.int64) for _ in reported]
+    current, last_seen, next_id = [0] * len(reported), [-np.inf] * len(reported), 1
+    for t, time in enumerate(times):
+        for k, there in enumerate(reported):
+            if there[t]:
+                if time - last_seen[k] > _FORGET_AFTER:
+                    current[k], next_id = next_id, next_id + 1
+                last_seen[k] = time
+                ids[k][t] = current[k]
+    return ids

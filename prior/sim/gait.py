@@ -1,0 +1,289 @@
+"""Where the body goes on the ground, and where and when its feet step.
+
+A plan moves the pelvis over the floor; the feet follow from it. Time is counted in strides (the *phase*): the left
+foot swings from 0.05 to 0.45 of each stride and the right from 0.55 to 0.95, so that stance lasts 60 % and both
+feet stand around each half stride, where a walk can begin or end. A foot is planted under the place the pelvis
+passes at the middle of its stance, whether the body walks, turns on the spot or does both, and does not move until
+its heel, then its toe, leaves the floor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from prior.kinematics import yaw_matrix
+from prior.sim.body import TOE_HEIGHT
+from prior.sim.timing import minimum_jerk
+from prior.skeletons import J
+
+Floats = NDArray[np.float64]
+
+RATE = 120
+"""Frames a second at which motions are made."""
+
+LIFT, LAND = 0.05, 0.45
+"""Phase at which the left foot's toe leaves the floor and its heel comes down; the right foot's is half a stride later."""
+HEEL_OFF_BEFORE_LIFT = 0.22
+FLAT_AFTER_LAND = 0.08
+UNDER_AFTER_LAND = 0.255
+"""The pelvis passes over the ankle a little before the middle of stance: the leg trails more than it leads."""
+
+_RAMP_S = 1.0  # from standing to full speed
+_REFERENCE_SPEED = 1.2  # m/s, at which an adult makes 0.9 strides a second
+_REFERENCE_CADENCE = 0.9
+_TURN_ARM = 0.8  # metres: a turn on the spot costs as many steps as walking this radius
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Stay for ``seconds``."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Walk a smooth curve through ``points`` (metres, world), at ``speed`` m/s once under way."""
+
+    points: Sequence[tuple[float, float]]
+    speed: float = 1.1
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Turn on the spot by ``angle`` radians (positive to the left) within ``seconds``."""
+
+    angle: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The pelvis over the floor.
+
+    Attributes:
+        times: (T,) seconds at `RATE`.
+        xy: (T, 2) metres, world.
+        yaw: (T,) radians, unwrapped.
+        phase: (T,) strides made.
+        speed: (T,) m/s along the path.
+        moves: for each walk or turn, the slice of frames it takes.
+    """
+
+    times: Floats
+    xy: Floats
+    yaw: Floats
+    phase: Floats
+    speed: Floats
+    moves: tuple[slice, ...]
+
+    def when(self, seconds: float) -> int:
+        """Index of the frame at a time."""
+        return min(round(seconds * RATE), len(self.times) - 1)
+
+
+def plan(start: tuple[float, float], yaw: float, parts: Sequence[Stand | Walk | Turn]) -> Plan:
+    """Lay out a plan from where the body starts, facing ``yaw`` radians, part after part."""
+    place, facing, strides = np.array(start, dtype=np.float64), float(yaw), 0.0
+    columns: list[tuple[Floats, Floats, Floats, Floats]] = []
+    moves: list[slice] = []
+    count = 0
+    for part in parts:
+        if isinstance(part, Stand):
+            n = round(part.seconds * RATE)
+            xy, heading = np.tile(place, (n, 1)), np.full(n, facing)
+            speed, phase = np.zeros(n), np.full(n, strides)
+        else:
+            xy, heading, speed = (
+                _walk(place, facing, part) if isinstance(part, Walk) else _turn(place, facing, part)
+            )
+            phase = _phase(strides, speed, heading)
+            moves.append(slice(count, count + len(xy)))
+            place, facing, strides = xy[-1], float(heading[-1]), float(phase[-1])
+        columns.append((xy, heading, speed, phase))
+        count += len(xy)
+    xy, heading, speed, phase = (np.concatenate(c) for c in zip(*columns, strict=True))
+    return Plan(np.arange(count) / RATE, xy, heading, phase, speed, tuple(moves))
+
+
+def _walk(start: Floats, facing: float, part: Walk) -> tuple[Floats, Floats, Floats]:
+    points = np.vstack([start, np.asarray(part.points, dtype=np.float64)])
+    chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    ahead = np.array([np.cos(facing), np.sin(facing)])
+    curve = CubicSpline(chord, points, bc_type=((1, ahead), (2, np.zeros(2))))
+    fine = np.linspace(0.0, chord[-1], max(50, int(400 * chord[-1])))
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(fine), axis=0), axis=1))])
+    ramp = min(_RAMP_S, length[-1] / part.speed)
+    duration = length[-1] / part.speed + ramp
+    n = round(duration * RATE)
+    t = (np.arange(n) + 1) / n * duration
+    speed = part.speed * (minimum_jerk(t / ramp) - minimum_jerk((t - duration + ramp) / ramp))
+    travelled = np.cumsum(speed)
+    at = CubicSpline(length, fine)(travelled / travelled[-1] * length[-1])
+    tangent = curve(at, 1)
+    heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    heading += 2 * np.pi * np.round((facing - heading[0]) / (2 * np.pi))
+    return curve(at), heading, speed
+
+
+def _turn(place: Floats, facing: float, part: Turn) -> tuple[Floats, Floats, Floats]:
+    n = round(part.seconds * RATE)
+    heading = facing + part.angle * minimum_jerk((np.arange(n) + 1) / n)
+    return np.tile(place, (n, 1)), heading, np.zeros(n)
+
+
+def _phase(before: float, speed: Floats, heading: Floats) -> Floats:
+    """Strides, from half stride to half stride; slow steps are short rather than rare."""
+    effort = np.hypot(speed, _TURN_ARM * np.gradient(heading) * RATE)
+    cadence = _REFERENCE_CADENCE * (effort / _REFERENCE_SPEED) ** 0.4
+    strides = np.cumsum(cadence) / RATE
+    halves = max(2, round(2 * float(strides[-1]) + 0.3))  # rather a short step than a long one
+    return before + strides / strides[-1] * halves / 2
+
+
+@dataclass(frozen=True)
+class FootTrack:
+    """One foot over time.
+
+    Attributes:
+        ankle: (T, 3) metres, world.
+        yaw: (T,) radians, where the foot points.
+        pitch: (T,) radians, positive with the toe down.
+        heel_planted: (T,) the ankle does not move.
+        toe_planted: (T,) the ball of the foot does not move.
+    """
+
+    ankle: Floats
+    yaw: Floats
+    pitch: Floats
+    heel_planted: NDArray[np.bool_]
+    toe_planted: NDArray[np.bool_]
+
+    @property
+    def rotation(self) -> Floats:
+        """(T, 3, 3) world orientation of the foot; identity is flat on the floor, facing +x."""
+        return yaw_matrix(self.yaw) @ pitch_matrix(self.pitch)
+
+
+def foot_track(plan: Plan, side: str, offsets: Floats) -> FootTrack:
+    """The steps of one foot that a plan asks for.
+
+    Args:
+        plan: the pelvis over the floor.
+        side: "left" or "right".
+        offsets: (22, 3) metres, the person's bones.
+    """
+    sign = 1.0 if side == "left" else -1.0
+    sole = offsets[J[f"{side}_foot"]]
+    hip = abs(offsets[J[f"{side}_hip"], 1])
+    toe_out = sign * np.radians(7.0)
+
+    def planted(frame: float, width: float) -> tuple[Floats, float]:
+        """Ankle and yaw of a foot that stands under the pelvis as it is at a frame (which may lie between two)."""
+        x, y, yaw = (
+            float(np.interp(frame, np.arange(len(plan.yaw)), v)) for v in (plan.xy[:, 0], plan.xy[:, 1], plan.yaw)
+        )
+        beside = yaw_matrix(yaw) @ np.array([-0.02, sign * width, 0.0])
+        return np.array([x, y, TOE_HEIGHT - sole[2]]) + beside, yaw + toe_out
+
+    standing, walking = 1.15 * hip, 0.8 * hip
+    place, yaw = planted(0.0, standing)
+    n = len(plan.times)
+    ankle, heading, pitch = np.tile(place, (n, 1)), np.full(n, yaw), np.zeros(n)
+    heel, toe = np.ones(n, dtype=bool), np.ones(n, dtype=bool)
+
+    for move in plan.moves:
+        frames = np.arange(move.start, move.stop, dtype=np.float64)
+        phase = plan.phase[move]
+        first = float(np.floor(phase[0] * 2 + 1e-9) / 2)
+        last = float(phase[-1])
+
+        def frame_at(p: float, phase: Floats = phase, frames: Floats = frames) -> float:
+            return float(np.interp(p, phase, frames))
+
+        offset = 0.0 if side == "left" else 0.5
+        lifts = np.arange(np.ceil(first - offset - 1e-9), last - offset) + offset + LIFT
+        lifts = lifts[lifts + (LAND - LIFT) < last]
+        for k, lift in enumerate(lifts):
+            land = lift + LAND - LIFT
+            ends = k == len(lifts) - 1
+            under = land + (0.37 if ends else UNDER_AFTER_LAND)  # the last steps close up to standing
+            to = planted(frame_at(min(under, last)), standing if ends else walking)
+            step = _Step(
+                heel_off=frame_at(max(first, lift - HEEL_OFF_BEFORE_LIFT)),
+                lift=frame_at(lift),
+                land=frame_at(land),
+                flat=frame_at(min(last, land + FLAT_AFTER_LAND)),
+                origin=(place, yaw),
+                target=to,
+                sole=sole,
+            )
+            here = np.arange(int(np.ceil(step.heel_off)), n)
+            ankle[here], heading[here], pitch[here] = step.at(here.astype(np.float64))
+            heel[(here[0]) : int(np.ceil(step.land))] = False
+            toe[int(np.ceil(step.lift)) : int(np.ceil(step.flat))] = False
+            place, yaw = to
+    return FootTrack(ankle, heading, pitch, heel, toe)
+
+
+def pitch_matrix(angle: Floats) -> Floats:
+    """Rotations (..., 3, 3) about y: a positive angle turns what faces +x towards the floor."""
+    c, s, zero, one = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
+    return np.stack(
+        [np.stack([c, zero, s], -1), np.stack([zero, one, zero], -1), np.stack([-s, zero, c], -1)], axis=-2
+    )
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One swing of a foot, from where its heel comes off to where it lies flat again; times in frames."""
+
+    heel_off: float
+    lift: float
+    land: float
+    flat: float
+    origin: tuple[Floats, float]
+    target: tuple[Floats, float]
+    sole: Floats
+
+    def pitch(self, t: Floats) -> Floats:
+        """The heel rises about the toe until it lifts, the toe is raised before the heel lands, then comes down."""
+        stride = float(np.linalg.norm(self.target[0][:2] - self.origin[0][:2]))
+        vigour = min(1.0, stride / 1.2)
+        swing = self.land - self.lift
+        rise = minimum_jerk((t - self.heel_off) / (self.lift + 0.10 * swing - self.heel_off))
+        fall = minimum_jerk((t - self.lift) / (0.65 * swing))
+        raise_toe = minimum_jerk((t - self.lift - 0.4 * swing) / (0.6 * swing))
+        lower_toe = minimum_jerk((t - self.land) / (self.flat - self.land))
+        return vigour * (np.radians(52.0) * (rise - fall) - np.radians(18.0) * (raise_toe - lower_toe))
+
+    def _pivot(self, t: Floats) -> Floats:
+        """Ankle while the toe stays: (T, 3)."""
+        place, yaw = self.origin
+        turned = yaw_matrix(yaw) @ (np.eye(3) - pitch_matrix(self.pitch(t))) @ self.sole
+        return place + turned
+
+    def at(self, t: Floats) -> tuple[Floats, Floats, Floats]:
+        """Ankle (T, 3), yaw (T,) and pitch (T,) from heel-off on."""
+        place, yaw = self.origin
+        goal, goal_yaw = self.target
+        duration = self.land - self.lift
+        u = np.clip((t - self.lift) / duration, 0.0, 1.0)[:, None]
+        eps = 1e-3
+        left = self._pivot(np.array([self.lift - eps, self.lift]))
+        velocity = (left[1] - left[0]) / eps * duration
+        swing = (
+            left[1] * (2 * u**3 - 3 * u**2 + 1) + velocity * (u**3 - 2 * u**2 + u) + goal * (3 * u**2 - 2 * u**3)
+        )
+        swing[:, 2:] += 0.035 * 16 * u**2 * (1 - u) ** 2
+        turn = (goal_yaw - yaw + np.pi) % (2 * np.pi) - np.pi
+        return (
+            np.where(t[:, None] < self.lift, self._pivot(t), swing),
+            yaw + turn * minimum_jerk(u[:, 0]),
+            self.pitch(t),
+        )

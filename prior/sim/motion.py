@@ -1,0 +1,353 @@
+"""From intentions to a whole body's motion: the pelvis follows the plan, limbs reach where they should by IK."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
+from scipy.spatial.transform import Rotation, Slerp
+
+from prior.kinematics import CONTACT_JOINTS, forward_kinematics, yaw_matrix
+from prior.sim.body import TOE_HEIGHT
+from prior.sim.gait import RATE, FootTrack, Plan, foot_track
+from prior.sim.timing import drift
+from prior.skeletons import JOINTS, J
+
+Floats = NDArray[np.float64]
+Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
+_SIGN: Mapping[Side, float] = {"left": 1.0, "right": -1.0}
+
+
+def pose_bones(rotations: Floats, offsets: Floats, root: Floats) -> tuple[Floats, Floats]:
+    """`forward_kinematics` for numpy: positions (..., 22, 3) and global rotations (..., 22, 3, 3)."""
+    positions, world = forward_kinematics(*(torch.from_numpy(np.ascontiguousarray(a)) for a in (rotations, offsets, root)))
+    return positions.numpy(), world.numpy()
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One person's motion, with nothing hidden.
+
+    Attributes:
+        times: (T,) seconds, evenly spaced.
+        offsets: (22, 3) metres, the bones.
+        root: (T, 3) metres, the pelvis in the world.
+        rotations: (T, 22, 3, 3) local rotations; that of the pelvis is its orientation in the world.
+        contacts: (T, 8) which of `CONTACT_JOINTS` rest on the floor.
+    """
+
+    times: Floats
+    offsets: Floats
+    root: Floats
+    rotations: Floats
+    contacts: NDArray[np.bool_]
+
+    @cached_property
+    def _posed(self) -> tuple[Floats, Floats]:
+        return pose_bones(self.rotations, self.offsets, self.root)
+
+    @property
+    def positions(self) -> Floats:
+        """(T, 22, 3) metres, world."""
+        return self._posed[0]
+
+    @property
+    def orientations(self) -> Floats:
+        """(T, 22, 3, 3) each joint's orientation in the world."""
+        return self._posed[1]
+
+    @property
+    def velocity(self) -> Floats:
+        """(T, 3) m/s of the pelvis, world."""
+        return np.gradient(self.root, self.times, axis=0)
+
+    def at(self, times: Floats) -> Motion:
+        """The motion at other times (S,) within its own: rotations slerped, so that bones keep their lengths."""
+        if times.min() < self.times[0] - 1e-9 or times.max() > self.times[-1] + 1e-9:
+            raise ValueError(
+                f"times {times.min():.3f} to {times.max():.3f} s leave the motion, which lasts from "
+                f"{self.times[0]:.3f} to {self.times[-1]:.3f} s"
+            )
+        times = np.clip(times, self.times[0], self.times[-1])
+        rotations = np.stack(
+            [Slerp(self.times, Rotation.from_matrix(self.rotations[:, j]))(times).as_matrix() for j in range(len(JOINTS))],
+            axis=1,
+        )
+        root = np.stack([np.interp(times, self.times, self.root[:, k]) for k in range(3)], axis=-1)
+        nearest = np.clip(np.searchsorted(self.times, times - 0.5 / RATE), 0, len(self.times) - 1)
+        return Motion(times, self.offsets, root, rotations, self.contacts[nearest])
+
+
+@dataclass(frozen=True)
+class ArmAction:
+    """Something an arm does beside hanging and swinging.
+
+    Attributes:
+        weight: (T,) 0 hangs and swings, 1 does this.
+        wrist: (T, 3) metres or (3,), in ``frame``.
+        pole: (T, 3) or (3,), in the chest's frame: where the elbow points.
+        frame: "world"; "pelvis": heading frame of the pelvis, origin at the pelvis; "shoulder": the chest's frame,
+            origin at this arm's shoulder, in arm lengths.
+    """
+
+    weight: Floats
+    wrist: Floats
+    pole: Floats
+    frame: Literal["world", "pelvis", "shoulder"]
+
+
+@dataclass
+class Intent:
+    """All that a script decides; what it leaves out is at rest.
+
+    Attributes:
+        plan: where the body goes.
+        shift: (T, 3) metres, pelvis relative to the plan in the heading frame; z relative to standing.
+        tilt: (T,) radians, pelvis bends forward.
+        torso: (T, 3) radians: roll (to the right positive), pitch (forward positive), yaw (to the left positive).
+        gaze: (T, 2) radians: yaw and pitch of the head beyond the torso's.
+        arms: what each arm does, in order; a later action takes over from an earlier one.
+    """
+
+    plan: Plan
+    shift: Floats = field(init=False)
+    tilt: Floats = field(init=False)
+    torso: Floats = field(init=False)
+    gaze: Floats = field(init=False)
+    arms: dict[Side, list[ArmAction]] = field(default_factory=lambda: {"left": [], "right": []})
+
+    def __post_init__(self) -> None:
+        n = len(self.plan.times)
+        self.shift, self.tilt = np.zeros((n, 3)), np.zeros(n)
+        self.torso, self.gaze = np.zeros((n, 3)), np.zeros((n, 2))
+
+
+def perform(intent: Intent, offsets: Floats, rng: np.random.Generator) -> Motion:
+    """Carry out an intent with a given body.
+
+    The pelvis sways, lists and turns with the steps and hangs as high as the legs allow; the chest turns against
+    it; the arms swing from the shoulders; standing still, the body drifts as people do. Feet follow `foot_track`.
+
+    Args:
+        intent: what to do.
+        offsets: (22, 3) metres, the person's bones.
+        rng: source of the idle drift.
+    """
+    plan = intent.plan
+    n = len(plan.times)
+    angle = 2 * np.pi * plan.phase
+    effort = plan.speed / 1.2
+    step, stride = np.sin(angle) * effort, np.cos(angle) * effort
+
+    # Idle drift dies away in walking, where it would fight the gait.
+    still = 1.0 / (1.0 + (4 * effort) ** 2)
+    idle_shift = drift(rng, plan.times, [0.006, 0.012], 12.0, 2.5) * still[:, None]
+    idle_torso = drift(rng, plan.times, np.radians([1.0, 1.0, 1.8]), 10.0, 2.0)
+    idle_gaze = drift(rng, plan.times, np.radians([6.0, 2.5]), 9.0, 2.0)
+
+    yaw = plan.yaw + np.radians(5.0) * stride
+    list_ = -np.radians(3.5) * step
+    pelvis = yaw_matrix(yaw) @ Rotation.from_euler("yx", np.stack([intent.tilt, list_], -1)).as_matrix()
+    shift = intent.shift.copy()
+    shift[:, :2] += idle_shift
+    shift[:, 1] -= 0.022 * step
+    root = np.concatenate([plan.xy, np.full((n, 1), _standing_height(offsets))], axis=1)
+    root += np.einsum("tij,tj->ti", yaw_matrix(plan.yaw), shift)
+    feet = {side: foot_track(plan, side, offsets) for side in SIDES}
+    root[:, 2] -= _lowering(root, pelvis, feet, offsets)
+
+    torso = intent.torso + idle_torso
+    torso[:, 2] -= np.radians(12.0) * stride
+    torso[:, 0] += 0.8 * -list_
+    torso[:, 1] += np.radians(3.0) * np.minimum(effort, 1.0)
+    rotations = np.broadcast_to(np.eye(3), (n, len(JOINTS), 3, 3)).copy()
+    rotations[:, 0] = pelvis
+    for joint in ("spine1", "spine2", "spine3"):
+        rotations[:, J[joint]] = _bend(torso / 3)
+    gaze = intent.gaze + idle_gaze
+    # The head stays more upright, and turns less, than the chest below it.
+    head = np.stack([-0.6 * torso[:, 0], gaze[:, 1] - 0.5 * (torso[:, 1] + intent.tilt), gaze[:, 0] - 0.6 * torso[:, 2]], -1)
+    for joint, share in (("neck", 0.45), ("head", 0.55)):
+        rotations[:, J[joint]] = _bend(share * head)
+
+    for side in SIDES:
+        _leg(rotations, root, offsets, side, feet[side], plan)
+        _arm(rotations, root, offsets, side, intent, _SIGN[side] * stride)
+
+    contacts = np.zeros((n, len(CONTACT_JOINTS)), dtype=bool)
+    for side in SIDES:
+        contacts[:, CONTACT_JOINTS.index(J[f"{side}_ankle"])] = feet[side].heel_planted
+        contacts[:, CONTACT_JOINTS.index(J[f"{side}_foot"])] = feet[side].toe_planted
+    return Motion(plan.times, offsets, root, rotations, contacts)
+
+
+def _bend(roll_pitch_yaw: Floats) -> Floats:
+    return Rotation.from_euler("ZYX", roll_pitch_yaw[:, ::-1]).as_matrix()
+
+
+def _standing_height(offsets: Floats) -> float:
+    """Metres of the pelvis above the floor, standing upright with knees all but straight."""
+    chain = [J["left_hip"], J["left_knee"], J["left_ankle"], J["left_foot"]]
+    return TOE_HEIGHT - float(offsets[chain, 2].sum()) - 0.008
+
+
+def _lowering(root: Floats, pelvis: Floats, feet: Mapping[Side, FootTrack], offsets: Floats) -> Floats:
+    """(T,) metres by which the pelvis must sink so that no leg is asked for more than its length, smoothly."""
+    need = np.zeros(len(root))
+    for side in SIDES:
+        hip = root + pelvis @ offsets[J[f"{side}_hip"]]
+        reach = 0.995 * _lengths(offsets, f"{side}_knee", f"{side}_ankle").sum()
+        across = np.linalg.norm(hip[:, :2] - feet[side].ankle[:, :2], axis=1)
+        allowed = feet[side].ankle[:, 2] + np.sqrt(np.maximum(reach**2 - across**2, 0.01))
+        need = np.maximum(need, hip[:, 2] - allowed)
+    # The maximum is taken over more than the Gaussian reaches, so the smoothed curve stays above the need.
+    half = round(0.07 * RATE)
+    return gaussian_filter1d(maximum_filter1d(need, 2 * half + 1, mode="nearest"), half / 2.5, mode="nearest", radius=half)
+
+
+def _lengths(offsets: Floats, middle: str, end: str) -> Floats:
+    return np.linalg.norm(offsets[[J[middle], J[end]]], axis=1)
+
+
+def two_bone(start: Floats, goal: Floats, pole: Floats, lengths: Floats) -> tuple[Floats, Floats, Floats]:
+    """Analytic two-bone IK.
+
+    A goal nearer than the limb can fold, or farther than 99.9 % of its length, is met as far as possible.
+
+    Args:
+        start: (T, 3) metres, the shoulder or hip.
+        goal: (T, 3) metres, where wrist or ankle should be.
+        pole: (T, 3) direction in which elbow or knee points.
+        lengths: (2,) metres of the two bones.
+
+    Returns:
+        directions of both bones (T, 3) each, and the hinge's axis (T, 3), about which the limb flexes.
+    """
+    upper, lower = lengths
+    along = goal - start
+    far = np.linalg.norm(along, axis=-1)
+    distance = np.clip(far, abs(upper - lower) + 0.15 * min(upper, lower), 0.999 * (upper + lower))
+    ahead = along / np.maximum(far, 1e-9)[:, None]
+    hinge = np.cross(pole, ahead)
+    hinge /= np.linalg.norm(hinge, axis=-1, keepdims=True)
+    outward = np.cross(ahead, hinge)
+    cosine = (upper**2 + distance**2 - lower**2) / (2 * upper * distance)
+    first = cosine[:, None] * ahead + np.sqrt(np.maximum(1 - cosine**2, 0.0))[:, None] * outward
+    second = distance[:, None] * ahead - upper * first
+    return first, second / np.linalg.norm(second, axis=-1, keepdims=True), hinge
+
+
+def _oriented(direction: Floats, hinge: Floats, rest_direction: Floats, rest_pole: Floats) -> Floats:
+    """World rotations (T, 3, 3) that take a bone and its hinge from the rest pose to where they should be."""
+    rest = rest_direction / np.linalg.norm(rest_direction)
+    rest_hinge = np.cross(rest_pole, rest)
+    rest_hinge /= np.linalg.norm(rest_hinge)
+    after = np.stack([direction, hinge, np.cross(direction, hinge)], axis=-1)
+    before = np.stack([rest, rest_hinge, np.cross(rest, rest_hinge)], axis=-1)
+    return after @ before.T
+
+
+def _limb(
+    rotations: Floats, side: Side, joints: tuple[str, str, str], parent: Floats, start: Floats, goal: Floats, pole: Floats,
+    offsets: Floats, rest_pole: Floats,
+) -> Floats:  # fmt: skip
+    """Set the local rotations of a limb's two upper joints; returns the lower bone's world rotation."""
+    base, middle, end = (J[f"{side}_{name}"] for name in joints)
+    first, second, hinge = two_bone(start, goal, pole, np.linalg.norm(offsets[[middle, end]], axis=1))
+    upper = _oriented(first, hinge, offsets[middle], rest_pole)
+    lower = _oriented(second, hinge, offsets[end], rest_pole)
+    rotations[:, base] = np.swapaxes(parent, -1, -2) @ upper
+    rotations[:, middle] = np.swapaxes(upper, -1, -2) @ lower
+    return lower
+
+
+def _leg(rotations: Floats, root: Floats, offsets: Floats, side: Side, foot: FootTrack, plan: Plan) -> None:
+    sign = _SIGN[side]
+    hip = root + rotations[:, 0] @ offsets[J[f"{side}_hip"]]
+    # The knee points half way between pelvis and foot, and a little outward.
+    lag = np.angle(np.exp(1j * (foot.yaw - plan.yaw)))
+    pole = yaw_matrix(plan.yaw + lag / 2) @ np.array([1.0, 0.08 * sign, 0.0])
+    shin = _limb(
+        rotations, side, ("hip", "knee", "ankle"), rotations[:, 0], hip, foot.ankle, pole, offsets, np.array([1.0, 0.0, 0.0])
+    )
+    rotations[:, J[f"{side}_ankle"]] = np.swapaxes(shin, -1, -2) @ foot.rotation
+
+
+def _arm(rotations: Floats, root: Floats, offsets: Floats, side: Side, intent: Intent, forward: Floats) -> None:
+    """Collar, shoulder and elbow; ``forward`` (T,) is the swing: 1 is as far forward as in a walk at 1.2 m/s."""
+    sign = _SIGN[side]
+    collar, shoulder = J[f"{side}_collar"], J[f"{side}_shoulder"]
+    lengths = _lengths(offsets, f"{side}_elbow", f"{side}_wrist")
+
+    def place() -> tuple[Floats, Floats, Floats]:
+        positions, world = pose_bones(rotations, offsets, root)
+        return positions[:, shoulder], world[:, collar], world[:, J["spine3"]]
+
+    at, _, chest = place()
+    level = _upright(chest)
+    wrist = at + np.einsum("tij,tj->ti", level, _hanging(forward, sign, lengths))
+    pole = chest @ np.array([-1.0, 0.25 * sign, -0.2])
+    heading = yaw_matrix(intent.plan.yaw)
+    for action in intent.arms[side]:
+        if action.frame == "world":
+            goal = action.wrist + np.zeros_like(at)
+        elif action.frame == "pelvis":
+            goal = root + _apply(heading, action.wrist)
+        else:
+            goal = at + _apply(chest, action.wrist * lengths.sum())
+        weight = action.weight[:, None]
+        wrist = wrist + weight * (goal - wrist)
+        pole = pole + weight * (_apply(chest, action.pole) - pole)
+    # The shoulder girdle helps an arm that is raised (scapulohumeral rhythm): above the horizontal it rises by a third.
+    raised = _apply(np.swapaxes(chest, -1, -2), wrist - at)
+    lift = np.radians(18.0) * _smooth_ramp((raised[:, 2] / lengths.sum() + 0.4) / 1.3)
+    rotations[:, collar] = Rotation.from_rotvec(np.multiply.outer(sign * lift, [1.0, 0.0, 0.0])).as_matrix()
+    at, girdle, _ = place()
+    wrist = at + _within_reach(wrist - at, lengths.sum())
+    _limb(
+        rotations, side, ("shoulder", "elbow", "wrist"), girdle, at, wrist, pole, offsets, np.array([-1.0, 0.0, 0.0])
+    )
+
+
+def _within_reach(vector: Floats, full: float) -> Floats:
+    """Vectors (T, 3) shortened, from 92 % of a limb's ``full`` length on ever more, so that it does not snap straight."""
+    far = np.linalg.norm(vector, axis=-1, keepdims=True)
+    free, room = 0.92 * full, 0.065 * full
+    soft = free + room * (1 - np.exp(-np.maximum(far - free, 0) / room))
+    return vector * np.where(far > free, soft / np.maximum(far, 1e-9), 1.0)
+
+
+def _apply(rotation: Floats, vector: Floats) -> Floats:
+    return np.einsum("tij,tj->ti", rotation, np.broadcast_to(vector, (len(rotation), 3)))
+
+
+def _smooth_ramp(u: Floats) -> Floats:
+    u = np.clip(u, 0.0, 1.0)
+    return u * u * (3 - 2 * u)
+
+
+def _upright(orientation: Floats) -> Floats:
+    """Only the heading of orientations (T, 3, 3): arms hang by gravity, however the chest leans."""
+    left = orientation[:, :, 1]
+    return yaw_matrix(np.arctan2(-left[:, 0], left[:, 1]))
+
+
+def _hanging(forward: Floats, sign: float, lengths: Floats) -> Floats:
+    """(T, 3) wrist from the shoulder, heading frame, of an arm that hangs and swings by ``forward`` (T,)."""
+    shoulder = np.radians(4.0) + np.radians(20.0) * forward
+    elbow = np.radians(16.0) + np.radians(10.0) * (forward + np.sqrt(forward**2 + 0.04))
+    spread = np.radians(9.0)
+    upper = np.stack([np.sin(shoulder), np.full_like(shoulder, sign * np.tan(spread)), -np.cos(shoulder)], axis=-1)
+    fore = np.stack(
+        [np.sin(shoulder + elbow), np.full_like(shoulder, sign * 0.5 * np.tan(spread)), -np.cos(shoulder + elbow)], axis=-1
+    )
+    unit = [v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (upper, fore)]
+    return lengths[0] * unit[0] + lengths[1] * unit[1]
+

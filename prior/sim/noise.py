@@ -1,0 +1,318 @@
+"""How a depth camera's body tracker errs, as a random process with parameters fitted to a real Kinect.
+
+What `prior.sim.fit` finds on UI-PRMD, and what the model therefore says, of each joint:
+
+- an **offset** that stays for a session, and a **bias** that wanders with the *distance the joint travels*, not
+  with time: a still joint keeps its error, whatever the frame rate;
+- **fast** noise that grows with the joint's speed and whose size itself swings over an order of magnitude
+  (log-normally, over half a second): the tails are heavy because the scale varies;
+- **jumps**: the joint sits elsewhere for a frame or for seconds (a wrong surface, the other limb), then returns;
+- **swaps** of left and right limbs for short bursts;
+- a part of all this that all joints of the body share.
+
+Errors are drawn in the frame of the camera's ray to the joint: along it, to its right, and up.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prior.skeletons import MIRROR, J
+
+Floats = NDArray[np.float64]
+
+KINECT_NOISE = Path(__file__).with_name("kinect_noise.json")
+"""The parameters fitted to UI-PRMD's Kinect, with their provenance."""
+
+SWAP_GROUPS: Mapping[str, tuple[int, ...]] = {
+    group: tuple(J[f"{side}_{part}"] for side in ("left", "right") for part in parts)
+    for group, parts in {"arms": ("elbow", "wrist"), "legs": ("knee", "ankle", "foot")}.items()
+}
+"""Joints whose sides are exchanged together."""
+
+
+SWAP_RATE: Mapping[str, float] = {"arms": 0.005, "legs": 0.01}
+SWAP_DURATION = 0.15
+"""Swaps a second and their seconds, assumed: in UI-PRMD people face the camera, and one frame in 47 minutes is swapped."""
+
+SPREAD_SPEED = 0.2
+"""m/s between a joint at rest and one in motion, as far as the spread of its fast noise goes."""
+
+FASTEST = 1.0
+"""m/s: the recordings that the noise is fitted to hold too little that is faster, so noise grows no further."""
+
+LONGEST_JUMP = 1.2
+"""Metres: farther off a tracker would not call it the same body."""
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Parameters, in SI units. Axes are along the ray, to its right, up.
+
+    Attributes:
+        offset: (22, 3) metres, standard deviation of the session's offset.
+        bias: (22, 3) metres, standard deviation of the wandering bias (median of its log-normal spread).
+        bias_length: metres of travel after which the bias is forgotten (1/e).
+        bias_inertia: seconds that the bias lags behind, so that a fast joint does not shake with it.
+        session_spread: standard deviation of the log of how bad a joint is in a session: offset, bias and fast noise
+            go with it, and the rate of jumps with its square.
+        fast: (22, 3) metres, standard deviation of the fast noise at 0.3 m/s (median over its spread).
+        fast_memory: seconds, correlation time of the fast noise.
+        speed_floor: m/s below which speed no longer matters.
+        speed_exponent: the fast noise goes with (speed_floor + speed) to this power.
+        fast_spread_still: standard deviation of the log of the fast noise's size, of a joint at rest.
+        fast_spread_moving: the same well above `SPREAD_SPEED`.
+        fast_spread_memory: seconds, correlation time of that size.
+        shared: share of the variance of bias and fast noise that all joints have in common.
+        jump_rate: (22,) jumps a second.
+        jump_least: metres, length of the shortest jumps.
+        jump_tail: exponent of the Pareto law of their lengths.
+        jump_short: seconds, mean duration of a short jump.
+        jump_long: seconds, mean duration of a long one.
+        jump_short_share: share of short ones.
+    """
+
+    offset: Floats
+    bias: Floats
+    bias_length: float
+    bias_inertia: float
+    session_spread: float
+    fast: Floats
+    fast_memory: float
+    speed_floor: float
+    speed_exponent: float
+    fast_spread_still: float
+    fast_spread_moving: float
+    fast_spread_memory: float
+    shared: float
+    jump_rate: Floats
+    jump_least: float
+    jump_tail: float
+    jump_short: float
+    jump_long: float
+    jump_short_share: float
+
+    @classmethod
+    def load(cls, path: Path = KINECT_NOISE) -> NoiseModel:
+        """Read the ``parameters`` of a JSON file that `save` wrote.
+
+        Raises:
+            ValueError: the file lacks a parameter or has one too many.
+        """
+        parameters = json.loads(path.read_text())["parameters"]
+        names = {f.name for f in fields(cls)}
+        if set(parameters) != names:
+            raise ValueError(f"{path}: expected parameters {sorted(names)}, got {sorted(parameters)}; fit it again")
+        return cls(**{k: np.array(v) if isinstance(v, list) else v for k, v in parameters.items()})
+
+    def save(self, path: Path, about: Mapping[str, object]) -> None:
+        """Write the parameters beside what is to be said ``about`` them (provenance, figures)."""
+
+        def plain(value: object) -> object:
+            if isinstance(value, np.ndarray):
+                return np.round(value, 6).tolist()
+            return round(value, 6) if isinstance(value, float) else value
+
+        parameters = {k: plain(v) for k, v in asdict(self).items()}
+        path.write_text(json.dumps({**about, "parameters": parameters}, indent=1) + "\n")
+
+
+@dataclass(frozen=True)
+class Errors:
+    """A draw of the process.
+
+    Attributes:
+        steady: (..., T, 22, 3) metres along the ray, to its right, up: offset and bias.
+        quick: the same of fast noise and jumps, which grow with the distance from the camera.
+        scale: (..., T, 22) metres, how large an error a tracker could know of: its fast noise's scale, half of a
+            jump, a tenth of what is steadily wrong.
+    """
+
+    steady: Floats
+    quick: Floats
+    scale: Floats
+
+
+def draw_errors(travel: Floats, dt: Floats, rng: np.random.Generator, model: NoiseModel) -> Errors:
+    """Draw the errors of a tracker (but for swaps), from stationary beginnings.
+
+    Args:
+        travel: (..., T, 22) metres each joint moved since the frame before.
+        dt: (T,) seconds since the frame before (the first serves for the joints' speed only).
+        rng: source.
+        model: parameters.
+    """
+    joint = (*travel.shape, 1)
+    vector = (*travel.shape, 3)
+    time = dt[:, None, None]
+    once = (*travel.shape[:-2], 1, travel.shape[-1], 1)
+
+    # Some sessions, and some joints in them, are worse than others in everything.
+    size = np.exp(model.session_spread * _bounded(_with_shared(rng, once, 0.5)))
+    offset = size * model.offset * _with_shared(rng, (*once[:-1], 3), model.shared)
+    wander = _recursion(np.exp(-travel[..., None] / model.bias_length), _with_shared(rng, vector, model.shared))
+    follow = np.exp(-time / model.bias_inertia)
+    bias = size * model.bias * _recursion(follow, wander, 1 - follow)
+
+    speed = np.minimum(travel[..., None] / time, FASTEST)
+    ease = ((model.speed_floor + speed) / (model.speed_floor + 0.3)) ** model.speed_exponent
+    swing = _recursion(np.exp(-time / model.fast_spread_memory), _with_shared(rng, joint, 0.5))
+    moving = speed / (speed + SPREAD_SPEED)
+    spread = model.fast_spread_still + (model.fast_spread_moving - model.fast_spread_still) * moving
+    level = size * ease * np.exp(spread * _bounded(swing))
+    white = _with_shared(rng, vector, model.shared)
+    fast = level * model.fast * _recursion(np.exp(-time / model.fast_memory), white)
+
+    often = size[..., 0, :, 0] ** 2
+    jump = _jumps(vector, dt, model.jump_rate * often / np.exp(2 * model.session_spread**2), rng, model)
+    steady = offset + bias
+    knowable = np.hypot(0.5 * np.linalg.norm(jump, axis=-1), 0.1 * np.linalg.norm(steady, axis=-1))
+    return Errors(steady, fast + jump, np.hypot(np.linalg.norm(level * model.fast, axis=-1), knowable))
+
+
+def _bounded(normal: Floats) -> Floats:
+    """Cut at two standard deviations: the log-normals' far tails are not in the data."""
+    return np.clip(normal, -2.0, 2.0)
+
+
+def _with_shared(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> Floats:
+    """Standard normal (..., 22, C), of which a ``share`` of the variance is the same for all joints."""
+    common = rng.standard_normal((*shape[:-2], 1, shape[-1]))
+    return np.sqrt(share) * common + np.sqrt(1 - share) * rng.standard_normal(shape)
+
+
+def _recursion(decay: Floats, source: Floats, gain: Floats | None = None) -> Floats:
+    """x[t] = a x[t-1] + g s[t] along axis -3, from x[0] = s[0].
+
+    With the gain left out, sqrt(1 - a²), white noise of unit variance gives a stationary process of unit variance.
+    """
+    steps = np.moveaxis(np.broadcast_to(decay, source.shape), -3, 0)
+    gains = np.sqrt(1 - steps**2) if gain is None else np.moveaxis(np.broadcast_to(gain, source.shape), -3, 0)
+    driven = np.moveaxis(source, -3, 0)
+    out = np.empty_like(driven)
+    out[0] = driven[0]
+    for t in range(1, len(driven)):
+        out[t] = steps[t] * out[t - 1] + gains[t] * driven[t]
+    return np.moveaxis(out, 0, -3)
+
+
+def stationary(dt: Floats, memory: float, shape: tuple[int, int], rng: np.random.Generator) -> Floats:
+    """Standard normal (T, *shape) with a correlation time of ``memory`` seconds."""
+    return _recursion(np.exp(-dt / memory)[:, None, None], rng.standard_normal((len(dt), *shape)))
+
+
+def _jumps(
+    shape: tuple[int, ...], dt: Floats, rate: Floats, rng: np.random.Generator, model: NoiseModel
+) -> Floats:
+    """Displacements (..., T, 22, 3) that last a while, ``rate`` (..., 22) times a second; zero most of the time."""
+    frames = shape[-3]
+    state = (*shape[:-3], shape[-2])
+    mean_duration = model.jump_short_share * model.jump_short + (1 - model.jump_short_share) * model.jump_long
+    busy = rate * mean_duration / (1 + rate * mean_duration)
+    displaced, stay = np.zeros((*state, 3)), np.ones(state)
+    out = np.empty((frames, *state, 3))
+    for t in range(frames):
+        # The first frame falls into a running jump as often as a frame does; long ones fill more of the time.
+        chance = busy if t == 0 else 1 - np.exp(-rate * dt[t])
+        short = model.jump_short_share * (model.jump_short / mean_duration if t == 0 else 1.0)
+        displaced[rng.random(state) > stay ** dt[t]] = 0.0
+        begin = rng.random(state) < chance
+        new = int(begin.sum())
+        if new:
+            direction = rng.standard_normal((new, 3))
+            direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+            length = np.minimum(model.jump_least * (1 - rng.random((new, 1))) ** (-1 / model.jump_tail), LONGEST_JUMP)
+            displaced[begin] = direction * length
+            mean = np.where(rng.random(new) < short, model.jump_short, model.jump_long)
+            stay[begin] = np.exp(-1.0 / mean)
+        out[t] = displaced
+    return np.moveaxis(out, 0, -3)
+
+
+def ray_axes(rays: Floats) -> Floats:
+    """(..., 3, 3) orthonormal axes of rays (..., 3), world z up: rows along the ray, to its right, up."""
+    along = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    right = np.cross(along, [0.0, 0.0, 1.0])
+    right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-9)
+    return np.stack([along, right, np.cross(right, along)], axis=-2)
+
+
+def travelled(positions: Floats) -> Floats:
+    """(..., T, 22) metres from the frame before; the first frame takes the second's."""
+    step = np.linalg.norm(np.diff(positions, axis=-3), axis=-1)
+    return np.concatenate([step[..., :1, :], step], axis=-2) if step.shape[-2] else np.zeros(positions.shape[:-1])
+
+
+def swapped(
+    dt: Floats, batch: tuple[int, ...], rng: np.random.Generator, temptation: Floats | float = 1.0
+) -> dict[str, NDArray[np.bool_]]:
+    """When left and right are exchanged: (T, *batch) for each of `SWAP_GROUPS`.
+
+    ``temptation`` (T, *batch) multiplies `SWAP_RATE`, as for a body seen from its side.
+    """
+    result: dict[str, NDArray[np.bool_]] = {}
+    for group in SWAP_GROUPS:
+        rate = np.broadcast_to(SWAP_RATE[group] * np.asarray(temptation), (len(dt), *batch))
+        active = np.empty((len(dt), *batch), dtype=bool)
+        on = rng.random(batch) < rate[0] * SWAP_DURATION
+        for t in range(len(dt)):
+            ends = rng.random(batch) < 1 - np.exp(-dt[t] / SWAP_DURATION)
+            begins = rng.random(batch) < 1 - np.exp(-rate[t] * dt[t])
+            on = np.where(on, ~ends, begins) if t else on
+            active[t] = on
+        result[group] = active
+    return result
+
+
+def exchange_sides(positions: Floats, when: Mapping[str, NDArray[np.bool_]]) -> Floats:
+    """Positions (..., T, 22, 3) with the limbs of `swapped` groups exchanged."""
+    out = positions.copy()
+    for group, active in when.items():
+        exchange = np.moveaxis(active, 0, -1)[..., None]
+        for joint in SWAP_GROUPS[group]:
+            out[..., joint, :] = np.where(exchange, positions[..., MIRROR[joint], :], positions[..., joint, :])
+    return out
+
+
+def confidence_of(scale: Floats, rng: np.random.Generator) -> Floats:
+    """What a tracker says of itself: falls with the error it knows of, a half at 4 cm, with noise of its own.
+
+    UI-PRMD keeps no confidences, so this is modelled on what trackers are like, not fitted: informative, and
+    sometimes wrong.
+    """
+    logit = 1.6 * np.log(0.04 / np.maximum(scale, 1e-4)) + 0.8 * rng.standard_normal(scale.shape)
+    return 1.0 / (1.0 + np.exp(-logit))
+
+
+def corrupt(
+    positions: Floats, rng: np.random.Generator, model: NoiseModel, fps: float = 30.0
+) -> tuple[Floats, Floats]:
+    """What a tracker would make of motion, without a scene: for training, thousands of windows a second.
+
+    Each window is seen by a camera somewhere around it at the person's height. Nothing is lost and nothing hides
+    behind anything: that needs a `camera`.
+
+    Args:
+        positions: (..., T, 22, 3) metres, z up.
+        rng: source.
+        model: parameters.
+        fps: frames a second.
+
+    Returns:
+        noisy positions (..., T, 22, 3) and confidences (..., T, 22).
+    """
+    dt = np.full(positions.shape[-3], 1.0 / fps)
+    batch = positions.shape[:-3]
+    azimuth = rng.uniform(0, 2 * np.pi, (*batch, 1, 1))
+    axes = ray_axes(np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=-1))
+    errors = draw_errors(travelled(positions), dt, rng, model)
+    noisy = exchange_sides(positions, swapped(dt, batch, rng)) + np.einsum(
+        "...k,...kx->...x", errors.steady + errors.quick, axes
+    )
+    return noisy, confidence_of(errors.scale, rng)

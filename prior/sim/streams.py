@@ -1,0 +1,169 @@
+"""The recordings of ``sim_data/``: a manifest says of each what is played, filmed how, and from which seed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from msgs.recording import RecordingWriter
+from msgs.topics import POSE_RAW, POSE_TRUTH
+from msgs.types import JointState, PoseRaw, PoseWorld, Tracking, WorldBody
+from prior.resample import PERIOD_NS
+from prior.sim.camera import Camera, as_tracked, film, sight
+from prior.sim.motion import Motion
+from prior.sim.noise import KINECT_NOISE, NoiseModel
+from prior.sim.scripts import SCRIPTS
+from prior.sim.sensors import mount
+
+START_NS = 1_750_000_000_000_000_000
+"""Stamp of a stream's second 0: any moment will do, as long as it is the same every time."""
+
+_SHORTEST_S = 2.0
+
+
+class ManifestError(ValueError):
+    """A manifest that cannot be followed. The text says where and why."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """How to make one stream.
+
+    Attributes:
+        name: of the stream and its directory.
+        what: one line for a person.
+        script: a key of `prior.sim.scripts.SCRIPTS`.
+        seed: of everything random: body, motion, noise.
+        camera: how it is filmed.
+        noise: file with the noise's parameters.
+        seconds: the first so many are kept; the whole script if None.
+    """
+
+    name: str
+    what: str
+    script: str
+    seed: int
+    camera: Camera
+    noise: Path = KINECT_NOISE
+    seconds: float | None = None
+
+
+def read_manifest(path: Path) -> dict[str, Stream]:
+    """The streams of a manifest by name.
+
+    Raises:
+        ManifestError: the file is missing, is not JSON, or an entry has an unknown key, script or value.
+    """
+    try:
+        entries = json.loads(path.read_text())["streams"]
+        return {name: _stream(name, entry, path.parent) for name, entry in entries.items()}
+    except OSError as error:
+        raise ManifestError(f"cannot read {path}: {error.strerror}") from error
+    except (KeyError, AttributeError, json.JSONDecodeError) as error:
+        raise ManifestError(f"{path}: expected JSON with an object 'streams', got {error!r}") from error
+
+
+def _stream(name: str, entry: Mapping[str, Any], folder: Path) -> Stream:
+    known = {f.name for f in fields(Stream)} - {"name"}
+    if unknown := set(entry) - known:
+        raise ManifestError(f"{name}: unknown keys {sorted(unknown)}; there are {sorted(known)}")
+    try:
+        camera = Camera(**{k: tuple(v) if isinstance(v, list) else v for k, v in entry["camera"].items()})
+        stream = Stream(
+            name,
+            entry["what"],
+            entry["script"],
+            int(entry["seed"]),
+            camera,
+            folder / entry["noise"] if "noise" in entry else KINECT_NOISE,
+            entry.get("seconds"),
+        )
+    except KeyError as error:
+        raise ManifestError(f"{name}: expected a key {error}") from error
+    except TypeError as error:
+        raise ManifestError(f"{name}: {error}") from error
+    if stream.script not in SCRIPTS:
+        raise ManifestError(f"{name}: no script '{stream.script}'; there are {', '.join(SCRIPTS)}")
+    if stream.seconds is not None and stream.seconds < _SHORTEST_S:
+        raise ManifestError(f"{name}: expected seconds of {_SHORTEST_S} or more, got {stream.seconds}")
+    return stream
+
+
+def make(stream: Stream) -> tuple[list[PoseRaw], list[PoseWorld]]:
+    """Play, film, and write down the truth: frames for ``pose/raw`` and ``pose/truth``.
+
+    The truth is on the 30 Hz grid that starts at the first raw frame, as the prior's output is. A joint's state says
+    whether the camera had it in view with a free line of sight (SEEN) or not (IMPUTED: whoever tells where it is
+    infers it).
+    """
+    playing, filming = (np.random.default_rng(s) for s in np.random.SeedSequence(stream.seed).spawn(2))
+    people = [_cut(m, stream.seconds) for m in SCRIPTS[stream.script](playing)]
+    frames = film(people, stream.camera, NoiseModel.load(stream.noise), filming, stream.name, START_NS)
+    return frames, _truth(people, stream, frames[0].stamp_ns, frames[-1].stamp_ns)
+
+
+def record(stream: Stream, directory: Path) -> None:
+    """Make a stream and record it to ``directory``.
+
+    Raises:
+        RecordingError: the directory is there already, or cannot be made.
+    """
+    raw, truth = make(stream)
+    with RecordingWriter(directory) as recording:
+        filed = [(m.stamp_ns, POSE_RAW, m) for m in raw] + [(m.stamp_ns, POSE_TRUTH, m) for m in truth]
+        for stamp, topic, message in sorted(filed, key=lambda f: f[:2]):
+            recording.write(topic, message, stamp)
+
+
+def _cut(motion: Motion, seconds: float | None) -> Motion:
+    keep = motion.times <= (motion.times[-1] if seconds is None else seconds)
+    return replace(
+        motion,
+        times=motion.times[keep],
+        root=motion.root[keep],
+        rotations=motion.rotations[keep],
+        contacts=motion.contacts[keep],
+    )
+
+
+def _truth(people: list[Motion], stream: Stream, first_ns: int, last_ns: int) -> list[PoseWorld]:
+    stamps = np.arange(first_ns, last_ns + 1, PERIOD_NS)
+    times = (stamps - START_NS) / 1e9
+    at = [m.at(times) for m in people]
+    seen = [_seen(m, at, stream.camera) for m in at]
+    quaternions = [Rotation.from_matrix(m.rotations.reshape(-1, 3, 3)).as_quat().reshape(-1, 22, 4) for m in at]
+    velocities = [np.stack([np.interp(times, m.times, v) for v in m.velocity.T], axis=-1) for m in people]
+    messages: list[PoseWorld] = []
+    for t, stamp in enumerate(stamps):
+        bodies = [
+            WorldBody(
+                id=k + 1,
+                root_position=m.root[t],
+                root_orientation=quaternions[k][t, 0],
+                root_velocity=velocities[k][t],
+                covariance=np.zeros((6, 6)),
+                positions=m.positions[t],
+                rotations=quaternions[k][t],
+                state=np.where(seen[k][t], JointState.SEEN, JointState.IMPUTED),
+                sigma=np.zeros(22),
+                contacts=m.contacts[t].astype(np.float32),
+                tracking=Tracking.OK,
+            )
+            for k, m in enumerate(at)
+        ]
+        messages.append(PoseWorld(int(stamp), "world", stream.name, np.array([0.0, 0.0, 1.0, 0.0]), bodies))
+    return messages
+
+
+def _seen(person: Motion, people: list[Motion], camera: Camera) -> NDArray[np.bool_]:
+    """(T, 22) whether a joint is in view and nothing hides it."""
+    eye = np.array(camera.position)
+    hidden = as_tracked(sight(person.positions, people, eye).hidden, mount("smpl22"))
+    return (hidden < 0.5) & camera.in_view((person.positions - eye) @ camera.orientation)

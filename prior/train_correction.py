@@ -1,0 +1,136 @@
+"""Training of a sensor's correction, on recordings of the sensor beside a reference (UI-PRMD: Kinect and Vicon)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from prior.checkpoint import WEIGHTS, save_weights
+from prior.correct import DENSITY, recall
+from prior.correction_net import HISTORY, CorrectionConfig, CorrectionNet, features, mirror_features, trunk_frame
+from prior.filters import FixedLagRTS
+from prior.kinematics import rigid_alignment
+from prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
+from prior.motion_windows import mirror_offsets
+from prior.skeletons import KINECT22, finite_joints, to_canonical
+from prior.training import TrainingRun, draw_curves
+
+HELD_BACK = TRAIN_SUBJECTS[-1]
+"""The person on whom the training is watched; the validation subjects of the benchmarks are not touched."""
+
+HIDE = 0.1
+"""Share of training frames with joints hidden, so that the network can do without some."""
+INPUT_NOISE = 0.03
+"""Standard deviations of noise on the inputs: six people are few."""
+
+
+def train_correction(
+    data: Path, runs: Path, weights: str = "kinect_v2", iterations: int = 4000, batch: int = 256, seed: int = 0
+) -> Path:
+    """Train the Kinect's correction and write weights, card and curves.
+
+    Args:
+        data: ``ui_prmd.npz``.
+        runs: folder of training runs; a killed run of the same name resumes there.
+        weights: the sensor's name.
+        iterations: optimiser steps.
+        batch: frames a step.
+        seed: of weights and sampling.
+
+    Returns:
+        The path of the weights.
+    """
+    torch.manual_seed(seed)
+    x, y = _examples(data, [s for s in TRAIN_SUBJECTS if s != HELD_BACK])
+    x_val, y_val = _examples(data, [HELD_BACK])
+    config = CorrectionConfig(sensor=weights)
+    net = CorrectionNet(config)
+    net.mean.copy_(x.nanmean(dim=0).nan_to_num())
+    net.scale.copy_((x - net.mean).square().nanmean(dim=0).sqrt().nan_to_num().clamp(min=1e-2))
+    optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3, weight_decay=1e-2)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=iterations)
+    run = TrainingRun(
+        runs / f"correction-{weights}",
+        {"net": net, "optimiser": optimiser, "schedule": schedule},
+        iterations,
+        every=max(iterations // 40, 1),
+    )
+    losses: dict[str, float] = {}
+
+    @torch.no_grad()
+    def evaluate() -> dict[str, float]:
+        net.eval()
+        return {**losses, "held back mm": 1000 * _error(net(x_val), y_val).item()}
+
+    for step in run.steps(evaluate):
+        net.train()
+        generator = np.random.default_rng((seed, step))
+        rows = torch.from_numpy(generator.integers(len(x), size=batch))
+        inputs, targets = _hide(x[rows], generator), y[rows]
+        half = batch // 2
+        inputs = torch.cat([mirror_features(inputs[:half]), inputs[half:]])
+        targets = torch.cat([mirror_offsets(targets[:half]), targets[half:]])
+        loss = _error(net(inputs + INPUT_NOISE * net.scale * torch.randn_like(inputs)), targets)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        losses["training mm"] = 1000 * loss.item()
+    path = WEIGHTS / f"correction-{weights}.safetensors"
+    people = f"{', '.join(s for s in TRAIN_SUBJECTS if s != HELD_BACK)}; watched on {HELD_BACK}"
+    save_weights(path, net, asdict(config), {
+        "Model": "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses (prior/correction_net.py)",
+        "Data": f"UI-PRMD, Kinect beside Vicon: {people}",
+        "Licence": "Apache-2.0; the data is in the public domain (PDDL 1.0)",
+        "Training": f"`steadypose train correction --data ui_prmd.npz`: {iterations} steps of {batch}, seed {seed}",
+        "Validation": ", ".join(f"{k} {v:.4g}" for k, v in run.curves[-1].items()),
+        "Curves": f"`correction-{weights}.png`",
+    })  # fmt: skip
+    draw_curves(run.curves, path.with_suffix(".png"))
+    return path
+
+
+def _examples(data: Path, subjects: Collection[str]) -> tuple[Tensor, Tensor]:
+    """Features (N, FEATURES) and the missing part (N, 22, 3) of every frame, metres in the trunk's frame."""
+    found = [_clip(pair) for pair in load_pairs(data, subjects)]
+    x, y = (np.concatenate(part) for part in zip(*found, strict=True))
+    usable = np.isfinite(x[:, 0])
+    return torch.from_numpy(x[usable]).float(), torch.from_numpy(y[usable]).float()
+
+
+def _clip(pair: KinectPair) -> tuple[np.ndarray, np.ndarray]:
+    seen, _ = to_canonical(KINECT22, pair.kinect)
+    smoother = FixedLagRTS(0, DENSITY)
+    answers = [smoother.update(frame, t / pair.fps) for t, frame in enumerate(seen)]
+    smoothed = np.stack([a.positions for a in answers if a is not None])
+    padded = np.concatenate([np.full((HISTORY[-1], 22, 3), np.nan), smoothed])
+    history = np.stack([recall(padded[t : t + HISTORY[-1] + 1, None])[:, 0] for t in range(len(smoothed))], axis=1)
+    shared = np.asarray((finite_joints(seen) & finite_joints(pair.vicon)).all(axis=0))
+    rotation, translation = rigid_alignment(pair.vicon[:, shared], seen[:, shared])
+    truth = pair.vicon @ rotation.T + translation
+    return features(history, np.zeros(3)), (truth - seen) @ trunk_frame(smoothed)
+
+
+def _hide(x: Tensor, generator: np.random.Generator) -> Tensor:
+    """Take a few joints away in some of the frames."""
+    hidden = (generator.random((len(x), 1)) < HIDE) & (generator.random((len(x), 22)) < 0.2)
+    mask = torch.from_numpy(hidden)
+    return torch.cat(
+        [
+            x[:, : 66 * len(HISTORY)].masked_fill(mask.repeat_interleave(3, dim=1).repeat(1, len(HISTORY)), torch.nan),
+            x[:, 66 * len(HISTORY) : -22],
+            x[:, -22:] * ~mask,
+        ],
+        dim=1,
+    )
+
+
+def _error(estimate: Tensor, truth: Tensor) -> Tensor:
+    """Mean distance over the joints that the reference has, metres."""
+    known = truth.isfinite().all(dim=-1)
+    return nn.functional.pairwise_distance(estimate[known], truth[known]).mean()

@@ -1,0 +1,187 @@
+"""From clean poses in the sensor's frame to poses in the world: root velocity, contacts, floor and their fusion.
+
+A body's place comes from three sources that fail at different times: the observed root, where there is one; the root
+velocity that the network reads from the body's own motion (HM-VAE, section 3.3); and the feet in contact, which stay
+where they are. A small Kalman filter weighs them, and its covariance grows while the root is hidden.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from msgs.types import PoseClean, PoseWorld, WorldBody
+from prior.checkpoint import load_weights
+from prior.ground import Ground
+from prior.kinematics import yaw_matrix
+from prior.trajectory_net import NewestFrame, TrajectoryConfig, TrajectoryNet
+from prior.trajectory_track import BodyTrack, Motion, Sighting, rotation
+
+Floats = NDArray[np.float64]
+
+WORLD = "world"
+"""The frame of everything published here."""
+
+
+@dataclass(frozen=True)
+class TrajectorySettings:
+    """What a launch file may set.
+
+    Attributes:
+        weights: the weight set, or a path to a ``.safetensors`` file.
+        network: whether the network's root velocity is used.
+        contacts: whether standing feet hold the root.
+        acceleration: m/s² over √Hz, how quickly the root may change its velocity.
+        lost_sigma: metres, the horizontal standard deviation beyond which a body counts as LOST.
+        timeout_s: seconds after which a body that no message mentions is forgotten.
+    """
+
+    weights: str = "default"
+    network: bool = True
+    contacts: bool = True
+    acceleration: float = 3.0
+    lost_sigma: float = 0.5
+    timeout_s: float = 1.0
+
+    @classmethod
+    def from_dict(cls, settings: Mapping[str, Any]) -> TrajectorySettings:
+        """From the table of a launch file.
+
+        Raises:
+            ValueError: an unknown key, a value of the wrong type, or a number that is not above 0.
+        """
+        kinds = {field.name: type(field.default) for field in fields(cls)}
+        values: dict[str, Any] = {}
+        for key, value in settings.items():
+            if key not in kinds:
+                raise ValueError(f"trajectory: unknown setting '{key}'; expected one of {', '.join(kinds)}")
+            if kinds[key] is float and type(value) is int:
+                value = float(value)
+            if type(value) is not kinds[key]:
+                raise ValueError(f"trajectory.{key}: expected a {kinds[key].__name__}, got {value!r}")
+            if kinds[key] is float and not 0.0 < value < math.inf:
+                raise ValueError(f"trajectory.{key}: expected a finite number above 0, got {value}")
+            values[key] = value
+        return cls(**values)
+
+
+class _Scene:
+    """What is known of one source: its floor and its bodies."""
+
+    def __init__(self, calibrated: bool) -> None:
+        self.ground = Ground(calibrated)
+        self.tracks: dict[int, BodyTrack] = {}
+        self.stamp_ns = -1
+
+
+class TrajectoryPipeline:
+    """Turns ``pose/clean`` into ``pose/world``, message by message; the same messages give the same answers.
+
+    Attributes:
+        counters: messages and bodies refused, by cause.
+    """
+
+    def __init__(self, settings: TrajectorySettings) -> None:
+        self.settings = settings
+        self.counters: Counter[str] = Counter()
+        self._reader = MotionReader(settings.weights)
+        self._scenes: dict[str, _Scene] = {}
+
+    def process(self, clean: PoseClean) -> list[PoseWorld]:
+        """The world at the message's moment: one message, or none if it was refused (see `counters`)."""
+        if clean.end_of_stream:
+            scene = self._scenes.pop(clean.source, None) or _Scene(clean.calibrated)
+            return [_message(clean, scene.ground, [])]
+        turn, place = rotation(clean.sensor_pose.orientation), clean.sensor_pose.position
+        if turn is None or not np.isfinite(place).all():
+            self.counters["sensor pose is not a pose"] += 1
+            return []
+        scene = self._scene(clean)
+        if scene is None:
+            return []
+        sightings: dict[int, Sighting] = {}
+        for body in clean.bodies:
+            if body.id in sightings:
+                self.counters["body id twice in a message"] += 1
+                continue
+            sighting = Sighting.of(body, turn, place)
+            if body.id in scene.tracks:
+                scene.tracks[body.id].advance(sighting, clean.stamp_ns)
+            elif sighting.root is not None:
+                scene.tracks[body.id] = BodyTrack(sighting, clean.stamp_ns, self._reader.context)
+            else:
+                self.counters["body without a root so far"] += 1
+                continue
+            sightings[body.id] = sighting
+        motions = self._reader.read([scene.tracks[i] for i in sightings])
+        s, bodies = self.settings, []
+        for (i, sighting), motion in zip(sightings.items(), motions, strict=True):
+            track = scene.tracks[i]
+            track.fuse(sighting, motion, scene.ground, s.acceleration, s.network, s.contacts)
+            bodies.append(track.publish(sighting, motion.contacts, s.lost_sigma))
+        return [_message(clean, scene.ground, bodies)]
+
+    def _scene(self, clean: PoseClean) -> _Scene | None:
+        """The scene of the message's source, without the bodies not heard of for long; None if it is out of order."""
+        scene = self._scenes.get(clean.source)
+        timeout_ns = round(self.settings.timeout_s * 1e9)
+        if scene is not None and clean.stamp_ns < scene.stamp_ns - timeout_ns:
+            self.counters["stamps went back: started anew"] += 1
+            scene = None
+        if scene is not None and clean.stamp_ns <= scene.stamp_ns:
+            self.counters["stamp is not after the last"] += 1
+            return None
+        if scene is None or scene.ground.calibrated != clean.calibrated:
+            scene = self._scenes[clean.source] = _Scene(clean.calibrated)
+        scene.stamp_ns = clean.stamp_ns
+        scene.tracks = {i: t for i, t in scene.tracks.items() if clean.stamp_ns - t.stamp_ns <= timeout_ns}
+        return scene
+
+
+class MotionReader:
+    """The network, asked about the newest frame of every body at once.
+
+    Args:
+        weights: the weight set, or a path to a ``.safetensors`` file.
+    """
+
+    def __init__(self, weights: str) -> None:
+        state, config = load_weights(weights, "trajectory")
+        self._config = TrajectoryConfig.from_dict(config)
+        net = TrajectoryNet(self._config)
+        net.load_state_dict(state)
+        self._net = NewestFrame(net).eval()
+        horizontal_first = [0, 0, 1]
+        self._scale = np.array(self._config.sigma_scale)[horizontal_first]
+        self._correlation_s = np.array(self._config.correlation_s)[horizontal_first]
+
+    @property
+    def context(self) -> int:
+        """Frames of motion that it looks at."""
+        return self._config.context
+
+    def read(self, tracks: Sequence[BodyTrack]) -> list[Motion]:
+        """What each track's body does, by its window of motion."""
+        if not tracks:
+            return []
+        with torch.inference_mode():
+            said = self._net(torch.from_numpy(np.stack([track.window() for track in tracks])).float())
+            contacts = torch.sigmoid(said.contact_logits[:, 0]).numpy()
+            velocity, variance = said.velocity[:, 0].numpy(), torch.exp(2.0 * said.log_sigma[:, 0]).numpy()
+        variance[:, :2] = variance[:, :2].mean(axis=1, keepdims=True)  # the filter's noise must not know the heading
+        sigma = np.sqrt(variance) * self._scale
+        return [
+            Motion(yaw_matrix(track.yaw) @ v, sd, sd * np.sqrt(self._correlation_s), c)
+            for track, v, sd, c in zip(tracks, velocity, sigma, contacts, strict=True)
+        ]
+
+
+def _message(clean: PoseClean, ground: Ground, bodies: list[WorldBody]) -> PoseWorld:
+    return PoseWorld(clean.stamp_ns, WORLD, clean.source, ground.plane, bodies, clean.end_of_stream)

@@ -1,0 +1,162 @@
+"""What the fusion is worth: motion whose truth is known, seen with noise, its root hidden for two seconds at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs.types import CleanBody, JointState, Pose, PoseClean
+from prior.kinematics import CONTACT_JOINTS
+from prior.trajectory import TrajectoryPipeline, TrajectorySettings
+from prior.trajectory_net import FRAME_S
+from prior.trajectory_track import FEET
+
+Floats = NDArray[np.float64]
+
+SEEN_FRAMES, HIDDEN_FRAMES = 36, 60
+"""Frames for which the root is seen, and then hidden, in turn."""
+
+ROOT_NOISE, JOINT_NOISE = 0.015, 0.01
+"""Metres, standard deviations of the root's error and of that of the joints against it."""
+
+MEMORY = 0.95
+"""Correlation of these errors from one frame to the next."""
+
+HORIZONS = (15, 30, 60)
+"""Frames after which the root hidden is compared with the truth."""
+
+METHODS: Mapping[str, TrajectorySettings] = {
+    "constant velocity": TrajectorySettings(network=False, contacts=False),
+    "network": TrajectorySettings(contacts=False),
+    "network and contacts": TrajectorySettings(),
+}
+"""The ways of going on without a root: a Kalman filter alone, with the network's velocity, and with standing feet."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """True motion at 30 Hz.
+
+    Attributes:
+        positions: (T, 22, 3) metres, world, floor at 0.
+        rotations: (T, 22, 4) xyzw, local.
+        contacts: (T, 8) labels.
+    """
+
+    positions: Floats
+    rotations: Floats
+    contacts: NDArray[np.bool_]
+
+    @property
+    def hidden(self) -> NDArray[np.bool_]:
+        """(T,) where `observe` hides the root."""
+        return np.arange(len(self.positions)) % (SEEN_FRAMES + HIDDEN_FRAMES) >= SEEN_FRAMES
+
+
+def _lasting_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
+    noise = rng.normal(size=shape)
+    for t in range(1, shape[0]):
+        noise[t] = MEMORY * noise[t - 1] + np.sqrt(1.0 - MEMORY**2) * noise[t]
+    return noise
+
+
+def observe(clip: Clip, rng: np.random.Generator) -> list[PoseClean]:
+    """What the prior might say of a clip: with noise, and without all of the trunk where `Clip.hidden`.
+
+    There the root stays where it was last seen, and the rest of the body with it: only its own motion is known.
+    """
+    count = len(clip.positions)
+    root = clip.positions[:, 0] + ROOT_NOISE * _lasting_noise((count, 3), rng)
+    local = clip.positions - clip.positions[:, :1]
+    local[:, 1:] += JOINT_NOISE * _lasting_noise((count, 21, 3), rng)
+    sigma = np.full(22, np.hypot(ROOT_NOISE, JOINT_NOISE))
+    sigma[0] = ROOT_NOISE
+    trunk = [j for j in range(22) if j not in (4, 5, 7, 8, 10, 11, 20, 21)]
+    messages = []
+    for t, hidden in enumerate(clip.hidden):
+        root[t] = root[t - 1] if hidden else root[t]
+        state = np.full(22, JointState.REFINED)
+        state[trunk] = JointState.IMPUTED if hidden else JointState.REFINED
+        positions = root[t] + local[t]
+        body = CleanBody(
+            id=0, positions=positions, rotations=clip.rotations[t], state=state, sigma=sigma, anomaly=0.0,
+            anomaly_flag=False, bone_lengths=np.zeros(22, np.float32), raw_positions=positions,
+            raw_confidence=np.ones(22, np.float32),
+        )  # fmt: skip
+        messages.append(PoseClean(round(t * FRAME_S * 1e9), "world", "clip", Pose.identity(), True, 0, [body]))
+    return messages
+
+
+@dataclass
+class Errors:
+    """What one method did, collected over clips; lists hold one number a frame or a span."""
+
+    seen_position: list[float] = field(default_factory=list)
+    seen_velocity: list[float] = field(default_factory=list)
+    seen_skate: list[float] = field(default_factory=list)
+    hidden_skate: list[float] = field(default_factory=list)
+    hidden_position: dict[int, list[float]] = field(default_factory=lambda: {h: [] for h in HORIZONS})
+    hidden_surprise: list[float] = field(default_factory=list)
+    hidden_path: list[float] = field(default_factory=list)
+
+    def add(self, clip: Clip, positions: Floats, velocity: Floats, sigma: Floats) -> None:
+        """Compare (T, 22, 3) metres, (T, 3) m/s and (T, 3) metres, the root's standard deviation, with the truth."""
+        hidden, truth = clip.hidden, clip.positions[:, 0]
+        off = positions[:, 0] - truth
+        true_velocity = np.gradient(truth, FRAME_S, axis=0)
+        settled = np.arange(len(hidden)) >= 10
+        self.seen_position += list(np.linalg.norm(off[~hidden & settled], axis=1))
+        self.seen_velocity += list(np.linalg.norm((velocity - true_velocity)[~hidden & settled], axis=1))
+        speed = np.linalg.norm(np.diff(positions[:, FEET, :2], axis=0), axis=2) / FRAME_S
+        labels = clip.contacts[:, [CONTACT_JOINTS.index(j) for j in FEET]]
+        stands = labels[1:] & labels[:-1] & settled[1:, None]
+        inside = hidden[1:] & hidden[:-1]
+        self.seen_skate += list(speed[stands & ~hidden[1:, None] & ~hidden[:-1, None]])
+        self.hidden_skate += list(speed[stands & inside[:, None]])
+        for start in range(SEEN_FRAMES, len(hidden) - HIDDEN_FRAMES, SEEN_FRAMES + HIDDEN_FRAMES):
+            for h in HORIZONS:
+                self.hidden_position[h].append(float(np.linalg.norm(off[start + h - 1, :2])))
+            end = start + HIDDEN_FRAMES - 1
+            self.hidden_surprise.append(float(np.mean((off[end, :2] / sigma[end, :2]) ** 2)))
+            self.hidden_path.append(float(np.linalg.norm(np.diff(truth[start : end + 1, :2], axis=0), axis=1).sum()))
+
+    def summary(self) -> dict[str, float]:
+        """Means and root mean squares, in the units that the keys name."""
+        last, path = np.array(self.hidden_position[HORIZONS[-1]]), np.array(self.hidden_path)
+        walked = path > 1.0
+        return {
+            "seen: root cm": 100 * _rms(self.seen_position),
+            "seen: velocity m/s": _rms(self.seen_velocity),
+            "seen: skate m/s": float(np.mean(self.seen_skate)),
+            "hidden: skate m/s": float(np.mean(self.hidden_skate)),
+            **{f"hidden {h * FRAME_S:g} s: root cm": 100 * _rms(e) for h, e in self.hidden_position.items()},
+            "hidden: m per 10 m walked": float(10 * last[walked].sum() / path[walked].sum()),
+            "hidden: squared error over variance": float(np.mean(self.hidden_surprise)),
+        }
+
+
+def _rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def evaluate_fusion(clips: list[Clip], methods: Mapping[str, TrajectorySettings], seed: int = 0) -> dict[str, Errors]:
+    """Run every method over every clip; "as observed" is what goes in, its velocity the difference of frames."""
+    errors = {name: Errors() for name in ("as observed", *methods)}
+    for number, clip in enumerate(clips):
+        messages = observe(clip, np.random.default_rng((seed, number)))
+        seen = np.stack([m.bodies[0].positions for m in messages]).astype(np.float64)
+        velocity = np.gradient(seen[:, 0], FRAME_S, axis=0)
+        errors["as observed"].add(clip, seen, velocity, np.full((len(seen), 3), ROOT_NOISE))
+        for name, settings in methods.items():
+            pipeline = TrajectoryPipeline(settings)
+            bodies = [pipeline.process(message)[0].bodies[0] for message in messages]
+            errors[name].add(
+                clip,
+                np.stack([b.positions for b in bodies]).astype(np.float64),
+                np.stack([b.root_velocity for b in bodies]),
+                np.sqrt(np.stack([np.diag(b.covariance)[:3] for b in bodies])),
+            )
+    return errors

@@ -1,0 +1,302 @@
+"""One body's way through the world: its recent motion, and the fusion of what tells where it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from msgs.types import CleanBody, JointState, Tracking, WorldBody
+from prior.ground import Ground
+from prior.kinematics import CONTACT_JOINTS, heading, yaw_matrix
+from prior.skeletons import PARENTS, REST_OFFSETS, J
+from prior.trajectory_filter import RootFilter
+from prior.trajectory_net import FRAME_S
+
+Floats = NDArray[np.float64]
+
+FEET: tuple[int, ...] = tuple(J[f"{side}_{part}"] for part in ("ankle", "foot") for side in ("left", "right"))
+"""The joints that may stand: heels and toes."""
+
+SOLE: Floats = np.array([0.08, 0.08, 0.025, 0.025])
+"""(4,) metres from the floor to each of `FEET` while it stands: medians over the contacts of the training motion."""
+
+SOLE_SIGMA = 0.02
+"""Metres, the standard deviation of that between people, shoes and sensors."""
+
+CONTACT_ON, CONTACT_OFF = 0.7, 0.4
+"""Probabilities at which a foot comes to stand, and stands no more."""
+
+FOOT_SLIP = 0.02
+"""Metres over √s that a standing foot rolls and slips, and that the error of its place relative to the root moves."""
+
+FRESH_SHARE = 0.3
+"""Of a joint's error that is new in each frame: the rest lasts, and moves as `FOOT_SLIP` says."""
+
+FOOT_SURPRISE = 4.0
+"""Standard deviations from its place at which a standing foot has evidently moved: it stands anew."""
+
+LEAST_SIGMA = 0.005
+"""Metres: no joint is taken to be known better, whatever the message says."""
+
+TORSO_SIGMA = 0.05
+"""Metres, added to a hidden root's standard deviation where the torso is seen: the prior placed one from the other."""
+
+IMPUTED_LEGS_SPEED = 0.5
+"""m/s, added to the velocity's standard deviation as the legs that it is read from are themselves inferred."""
+
+REACH_M = 2.0
+"""Metres: no joint is this far from its own root."""
+
+JUMP_SIGMAS, JUMP_M, JUMP_FRAMES = 5.0, 0.3, 6
+"""A root seen this many standard deviations and metres off is not believed, until it was so often in a row; one that
+comes back into sight is believed at once. Both start the filter anew."""
+
+LONGEST_GAP_S = 0.3
+"""Seconds without a message over which the motion between is drawn straight, and feet may go on standing."""
+
+FIRST_SPEED = 1.0
+"""m/s, the standard deviation of the velocity of a body just seen first."""
+
+_FOOT_CONTACTS = [CONTACT_JOINTS.index(joint) for joint in FEET]
+_PELVIS = [J[name] for name in ("pelvis", "left_hip", "right_hip")]
+_TORSO = [J[name] for name in ("spine1", "spine2", "spine3", "neck", "left_shoulder", "right_shoulder")]
+_LEGS = [J[f"{side}_{part}"] for part in ("knee", "ankle", "foot") for side in ("left", "right")]
+
+
+def _rest_pose() -> Floats:
+    pose = np.zeros_like(REST_OFFSETS)
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        pose[joint] = pose[parent] + REST_OFFSETS[joint]
+    return pose
+
+
+_REST_POSE = _rest_pose()
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A body of one message, turned to the world.
+
+    Attributes:
+        body: as it came.
+        positions: (22, 3) metres, world; NaN where there is none.
+        orientation: (4,) xyzw of the root in the world, or None if it is not a rotation.
+        seen: (22,) whether the sensor saw the joint.
+        sigma: (22,) metres, made finite and positive.
+    """
+
+    body: CleanBody
+    positions: Floats
+    orientation: Floats | None
+    seen: NDArray[np.bool_]
+    sigma: Floats
+
+    @classmethod
+    def of(cls, body: CleanBody, sensor: Rotation, place: Floats) -> Sighting:
+        """``body`` as seen by a sensor with this orientation and place in the world."""
+        positions = body.positions.astype(np.float64) @ sensor.as_matrix().T + place
+        known = np.isfinite(positions).all(axis=1) & (body.state != JointState.UNKNOWN)
+        known &= ~(np.linalg.norm(positions - positions[0], axis=1) > REACH_M)
+        positions[~known] = np.nan
+        orientation = rotation(body.rotations[0])
+        sigma = np.nan_to_num(body.sigma.astype(np.float64), nan=math.inf, posinf=math.inf)
+        return cls(
+            body=body,
+            positions=positions,
+            orientation=None if orientation is None else (sensor * orientation).as_quat(),
+            seen=known & ((body.state == JointState.SEEN) | (body.state == JointState.REFINED)),
+            sigma=np.clip(sigma, LEAST_SIGMA, 10.0),
+        )
+
+    @property
+    def root(self) -> Floats | None:
+        """(3,) metres, world; None if unknown."""
+        return None if np.isnan(self.positions[0, 0]) else self.positions[0]
+
+    @property
+    def root_sigma(self) -> float:
+        """Metres, the standard deviation of `root`; infinite where the message's own guess is all there is."""
+        if self.root_seen:
+            return float(self.sigma[0])
+        return math.hypot(self.sigma[0], TORSO_SIGMA) if self.seen[_TORSO].any() else math.inf
+
+    @property
+    def root_seen(self) -> bool:
+        """Whether the root, or a hip that it hangs by, was seen."""
+        return self.root is not None and bool(self.seen[_PELVIS].any())
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the network says of one body's newest frame, in the world, with the errors that validation measured.
+
+    Attributes:
+        velocity: (3,) m/s.
+        sigma: (3,) m/s, standard deviation of that.
+        drift: (3,) metres over √s by which a sum of such velocities strays.
+        contacts: (8,) probabilities.
+    """
+
+    velocity: Floats
+    sigma: Floats
+    drift: Floats
+    contacts: Floats
+
+
+class BodyTrack:
+    """A body's state between messages.
+
+    Args:
+        sighting: the first, with a root.
+        stamp_ns: of that.
+        context: frames of motion to remember.
+    """
+
+    def __init__(self, sighting: Sighting, stamp_ns: int, context: int) -> None:
+        assert sighting.root is not None
+        self.stamp_ns = stamp_ns
+        self._orientation = np.array([0.0, 0.0, 0.0, 1.0]) if sighting.orientation is None else sighting.orientation
+        self._window = np.repeat((_REST_POSE @ yaw_matrix(self.yaw).T)[None], context, axis=0)
+        self._window[:] = self._local(sighting)
+        self._window_ns = stamp_ns
+        self._filter = self._start(sighting, np.zeros(3))
+        self._dt = 0.0
+        self._jumps = 0
+        self._root_seen = sighting.root_seen
+
+    def _start(self, sighting: Sighting, velocity: Floats) -> RootFilter:
+        sigma = sighting.root_sigma if math.isfinite(sighting.root_sigma) else sighting.sigma[0]
+        return RootFilter(sighting.positions[0], sigma, velocity, FIRST_SPEED, len(FEET))
+
+    def _local(self, sighting: Sighting) -> Floats:
+        """(22, 3) metres from the root, world axes; a joint without a position stays where it last was."""
+        local = sighting.positions - sighting.positions[0]
+        return np.where(np.isfinite(local), local, self._window[-1])
+
+    @property
+    def yaw(self) -> float:
+        """Radians, the newest heading."""
+        return float(heading(Rotation.from_quat(self._orientation).as_matrix()))
+
+    def window(self) -> Floats:
+        """(context, 22, 3) metres from the root, turned so that the body now faces +x: the network's input."""
+        return self._window @ yaw_matrix(self.yaw)
+
+    def advance(self, sighting: Sighting, stamp_ns: int) -> None:
+        """Take in the pose of the next message, at ``stamp_ns``."""
+        self._dt = (stamp_ns - self.stamp_ns) * 1e-9
+        self.stamp_ns = stamp_ns
+        if sighting.orientation is not None:
+            self._orientation = sighting.orientation
+        local = self._local(sighting)
+        steps = round((stamp_ns - self._window_ns) * 1e-9 / FRAME_S)
+        if self._dt > LONGEST_GAP_S:
+            self._window[:] = local
+        else:
+            between = np.linspace(0.0, 1.0, steps + 1)[1:, None, None]
+            new = self._window[-1] + between * (local - self._window[-1])
+            self._window = np.concatenate([self._window, new])[-len(self._window) :]
+            self._window[-1] = local
+        if steps:
+            self._window_ns = stamp_ns
+
+    def fuse(
+        self, sighting: Sighting, motion: Motion, ground: Ground, acceleration: float, network: bool, hold: bool
+    ) -> None:
+        """Move on to the newest message and weigh what it tells.
+
+        Args:
+            sighting: the message's.
+            motion: what the network says of it.
+            ground: is asked, and told.
+            acceleration: m/s² over √Hz, how quickly the root may change its velocity.
+            network: whether to use the velocity of ``motion``.
+            hold: whether feet in contact hold the root.
+        """
+        filter_ = self._filter
+        inferred = 1.0 if sighting.root is None else 1.0 - float(sighting.seen[_LEGS].mean())
+        contacts = motion.contacts[_FOOT_CONTACTS]
+        contacts = np.where(hold & sighting.seen[list(FEET)] & (self._dt <= LONGEST_GAP_S), contacts, 0.0)
+        standing = filter_.standing
+        if self._dt > 0.0:
+            drifts = network and not standing.any()
+            filter_.predict(self._dt, acceleration, motion.drift if drifts else 0.0, FOOT_SLIP)
+        if network:
+            filter_.observe_velocity(motion.velocity, np.hypot(motion.sigma, inferred * IMPUTED_LEGS_SPEED))
+        self._observe_root(sighting)
+        for k, joint in enumerate(FEET):
+            if contacts[k] < (CONTACT_OFF if standing[k] else CONTACT_ON):
+                filter_.lift(k)
+                continue
+            from_root, sigma = (
+                sighting.positions[joint] - sighting.positions[0],
+                FRESH_SHARE * float(sighting.sigma[joint]),
+            )
+            if standing[k] and filter_.foot_surprise(k, from_root, sigma) < FOOT_SURPRISE:
+                filter_.observe_foot(k, from_root, sigma)
+            else:
+                filter_.plant(k, from_root, sigma)
+        self._meet_ground(sighting, ground)
+
+    def _observe_root(self, sighting: Sighting) -> None:
+        sigma = sighting.root_sigma
+        came_back, self._root_seen = sighting.root_seen and not self._root_seen, sighting.root_seen
+        if sighting.root is None or not math.isfinite(sigma):
+            return
+        off = np.abs(sighting.root - self._filter.position)
+        likely = JUMP_SIGMAS * np.hypot(self._filter.position_sigma, sigma)
+        self._jumps = self._jumps + 1 if np.any(off > np.maximum(likely, JUMP_M)) else 0
+        if not self._jumps:
+            self._filter.observe_position(sighting.root, sigma)
+        elif came_back or self._jumps == JUMP_FRAMES:
+            self._filter = self._start(sighting, self._filter.velocity if came_back else np.zeros(3))
+            self._jumps = 0
+
+    def _meet_ground(self, sighting: Sighting, ground: Ground) -> None:
+        """Tell the ground where feet stand while the root is seen, and be told it while it is not."""
+        feet = sighting.positions[list(FEET), 2] - SOLE
+        if not ground.known and sighting.seen[list(FEET)].any():
+            ground.guess(float(np.nanmin(feet)))
+        for k in np.flatnonzero(self._filter.standing):
+            if sighting.root_seen:
+                ground.observe(float(feet[k]), math.hypot(sighting.sigma[FEET[k]], SOLE_SIGMA), max(self._dt, FRAME_S))
+            elif ground.known:
+                sigma = math.hypot(ground.sigma, SOLE_SIGMA)
+                self._filter.observe_foot_height(int(k), ground.height + SOLE[k], sigma)
+
+    def publish(self, sighting: Sighting, contacts: NDArray[np.floating], lost_sigma: float) -> WorldBody:
+        """The body in the world, as of the newest message."""
+        place, spread = self._filter.position, self._filter.position_sigma
+        positions = sighting.positions if sighting.root is None else sighting.positions + (place - sighting.root)
+        positions = np.where(np.arange(len(positions))[:, None] == 0, place, positions)
+        rotations = sighting.body.rotations.copy()
+        rotations[0] = self._orientation
+        if math.hypot(*spread[:2]) > lost_sigma:
+            tracking = Tracking.LOST
+        else:
+            tracking = Tracking.OK if sighting.root_seen else Tracking.COASTING
+        return WorldBody(
+            id=sighting.body.id,
+            root_position=place,
+            root_orientation=self._orientation,
+            root_velocity=self._filter.velocity,
+            covariance=self._filter.covariance,
+            positions=positions,
+            rotations=rotations,
+            state=sighting.body.state,
+            sigma=np.hypot(sighting.sigma, math.sqrt(float(np.mean(spread**2)))),
+            contacts=contacts.astype(np.float32),
+            tracking=tracking,
+        )
+
+
+def rotation(quaternion: NDArray[np.floating]) -> Rotation | None:
+    """The rotation of a quaternion (4,) xyzw of any length; None if it is none."""
+    q = np.asarray(quaternion, dtype=np.float64)
+    if not np.isfinite(q).all() or np.linalg.norm(q) < 1e-6:
+        return None
+    return Rotation.from_quat(q)
