@@ -16,6 +16,6 @@ if [ ! -e "$stamp" ] || [ uv.lock -nt "$stamp" ] || [ pyproject.toml -nt "$stamp
         }
         .uv/bin/python -m pip install --quiet --disable-pip-version-check "uv==$UV_VERSION"
     fi
-    .uv/bin/uv sync --frozen --extra view --python "$python"
+    .uv/bin/uv sync --frozen --compile-bytecode --extra view --python "$python"
     touch "$stamp"
 fi
