@@ -153,11 +153,16 @@ def align_time(a: Floats, b: Floats) -> tuple[Floats, Floats]:
     for lag in np.arange(-MAX_LAG, MAX_LAG + 1e-9, 1 / 120):
         inside = (time + lag >= 0) & (time + lag <= (len(b) - 1) / FPS)
         shifted = spline(time[inside] + lag)
-        error = float(np.abs(bends(a[inside]) - bends(shifted)).mean())
+        error = float(np.abs(_evenly(bends(a[inside])) - _evenly(bends(shifted))).mean())
         if best is None or error < best[0]:
             best = error, a[inside], shifted
     assert best is not None
     return best[1], best[2]
+
+
+def _evenly(values: Floats) -> Floats:
+    """(T, 2) of elbows and knees, left and right together, so that the lag found does not depend on the side."""
+    return values.reshape(len(values), 2, 2).mean(axis=1)
 
 
 def directions(positions: Floats) -> Floats:
