@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import os
 import select
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import urllib.request
 from pathlib import Path
 from typing import Any
@@ -18,10 +20,12 @@ import pytest
 from synthetic_poses import CAMERA, messages, walker
 
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from msgs.transport import Publisher
 from msgs.types import Diagnostics, JointState, Level, Pose, PoseClean, PoseRaw, RawBody, Tracking
 from nodes import viewer
 from nodes.drawing import STATE_COLOURS
-from nodes.viewer import PoseView, ViewerError, ViewerServer
+from nodes.launch import Launch, TransportSettings
+from nodes.viewer import PoseView, ViewerError, ViewerNode, ViewerServer
 
 rr = pytest.importorskip("rerun", reason="the optional extra `view` is not installed")
 
@@ -32,6 +36,7 @@ class Log:
     def __init__(self) -> None:
         self.drawn: list[tuple[float, str, Any]] = []
         self.blueprints = 0
+        self.disconnected = False
         self._now = 0.0
 
     def set_time(self, timeline: str, *, duration: np.timedelta64) -> None:
@@ -43,6 +48,9 @@ class Log:
 
     def send_blueprint(self, blueprint: Any) -> None:
         self.blueprints += 1
+
+    def disconnect(self) -> None:
+        self.disconnected = True
 
     def last(self, path: str) -> Any:
         return next(what for _, found, what in reversed(self.drawn) if found == path)
@@ -234,6 +242,54 @@ def test_the_server_goes_with_a_node_that_is_killed() -> None:
     node.send_signal(signal.SIGKILL)
     node.wait()
     assert select.select([watch], [], [], 10.0)[0], "the server outlived its node"
+
+
+class Server:
+    """Stands in for `ViewerServer`: no process."""
+
+    url = "http://somewhere"
+    stopped = False
+
+    def __init__(self, port: int) -> None: ...
+
+    def __enter__(self) -> Server:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def check(self) -> None:
+        if self.stopped:
+            raise RuntimeError("stopped")
+
+
+def test_the_node_draws_what_is_published_and_ends_with_its_server(
+    tmp_path: Path, log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(viewer, "ViewerServer", Server)
+    monkeypatch.setattr(viewer, "connect", lambda server: log)
+    launch = Launch(transport=TransportSettings(directory=str(tmp_path)))
+    node = ViewerNode(launch)
+    raised: list[RuntimeError] = []
+
+    def run() -> None:
+        try:
+            node.run()
+        except RuntimeError as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    with Publisher(launch.transport.endpoint("prior")) as publisher:
+        thread.start()
+        for topic, message in only(itertools.islice(itertools.cycle(messages(1.0)), 20_000), POSE_CLEAN):
+            publisher.publish(topic, message)
+            thread.join(0.005)
+            if any(path.startswith("clean/") for _, path, _ in log.drawn):
+                break
+        monkeypatch.setattr(Server, "stopped", True)
+        thread.join(10.0)
+    assert log.last("clean/made-up/0/bones") is not None
+    assert raised, "with its server gone the node ends, to be started again"
+    assert log.disconnected
 
 
 def test_without_rerun_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
