@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 SEEN = np.flatnonzero(KINECT22.observable)
 """The canonical joints that this Kinect gives."""
 
-_ITERATIONS = 16
+_ITERATIONS = 20
 _EVERY = 4  # clips used while iterating: repetitions of a movement resemble each other
 _FAILED = ("m03", "s01")
 
@@ -84,18 +84,20 @@ def prepare(pairs: Sequence[KinectPair]) -> list[Clip]:
     kinect = [to_canonical(KINECT22, p.kinect)[0] for p in pairs]
     frames = _bone_frames(pairs)
     offset = np.zeros((len(JOINTS), 3))
+
+    def placed(pair: KinectPair, bones: Floats, seen: Floats) -> tuple[Floats, Floats, Floats]:
+        """Joints with the offset so far, joint centres, and bones' frames: all moved into the Kinect's frame."""
+        shifted = pair.vicon + np.einsum("tjab,jb->tja", bones, offset)
+        rotation, shift = align(shifted[:, SEEN].reshape(-1, 3), seen[:, SEEN].reshape(-1, 3))
+        return shifted @ rotation.T + shift, pair.vicon @ rotation.T + shift, rotation @ bones
+
     for _ in range(3):
-        truths = [p.vicon + np.einsum("tjab,jb->tja", g, offset) for p, g in zip(pairs, frames, strict=True)]
-        poses = [align(t[:, SEEN].reshape(-1, 3), k[:, SEEN].reshape(-1, 3)) for t, k in zip(truths, kinect, strict=True)]
-        local = [
-            np.einsum("tjba,tjb->tja", r @ g, k - (p.vicon @ r.T + s))
-            for p, g, k, (r, s) in zip(pairs, frames, kinect, poses, strict=True)
-        ]
+        local = []
+        for pair, bones, seen in zip(pairs, frames, kinect, strict=True):
+            _, centres, turned = placed(pair, bones, seen)
+            local.append(np.einsum("tjba,tjb->tja", turned, seen - centres))
         offset[SEEN] = np.nanmedian(np.concatenate(local)[:, SEEN], axis=0)
-    truths = [p.vicon + np.einsum("tjab,jb->tja", g, offset) for p, g in zip(pairs, frames, strict=True)]
-    return [
-        Clip(p.fps, t @ r.T + s, k) for p, t, k, (r, s) in zip(pairs, truths, kinect, poses, strict=True)
-    ]
+    return [Clip(p.fps, placed(p, g, k)[0], k) for p, g, k in zip(pairs, frames, kinect, strict=True)]
 
 
 def _bone_frames(pairs: Sequence[KinectPair]) -> list[Floats]:
@@ -223,11 +225,11 @@ def statistics(clips: Sequence[Clip]) -> Statistics:
 
 
 def _alike(values: Floats) -> Floats:
-    """Left and right (first axis: joints seen) as their mean: which side the subjects moved says nothing of the sensor."""
+    """Left and right (first axis: joints seen) as their mean: which side was moved says nothing of the sensor."""
     return (values + values[_OTHER_SIDE]) / 2
 
 
-_OTHER_SIDE = np.array([int(np.flatnonzero(SEEN == MIRROR[j])[0]) for j in SEEN])
+_OTHER_SIDE = np.array([int(np.flatnonzero(MIRROR[j] == SEEN)[0]) for j in SEEN])
 _SPEED_FLOOR = 0.03  # m/s: below it the Vicon's own noise dominates a joint's speed
 _JUMP = 0.08  # metres a frame
 
@@ -277,15 +279,15 @@ def _improved(model: NoiseModel, real: Statistics, simulated: Statistics) -> Noi
         offset=both * np.sqrt(1 - share**2),
         bias=both * share,
         bias_length=float(model.bias_length * ratio(simulated.bias_growth, real.bias_growth)),
-        bias_inertia=float(
-            np.clip(model.bias_inertia * np.exp(2 * (real.bias_lag1 - simulated.bias_lag1)), 0.01, 0.4)
-        ),
+        bias_inertia=float(np.clip(model.bias_inertia * np.exp(2 * (real.bias_lag1 - simulated.bias_lag1)), 0.01, 0.4)),
         session_spread=float(model.session_spread * ratio(np.log(real.total_tail), np.log(simulated.total_tail))),
         fast=seen(model.fast, ratio(real.fast, simulated.fast)),
         fast_memory=float(np.clip(model.fast_memory * np.exp(2 * (real.fast_lag1 - simulated.fast_lag1)), 0.003, 0.1)),
         speed_exponent=float(np.clip(model.speed_exponent + 0.7 * (real.fast_slope - simulated.fast_slope), 0.0, 1.5)),
         fast_spread_still=float(model.fast_spread_still * ratio(real.fast_spread_still, simulated.fast_spread_still)),
-        fast_spread_moving=float(model.fast_spread_moving * ratio(real.fast_spread_moving, simulated.fast_spread_moving)),
+        fast_spread_moving=float(
+            model.fast_spread_moving * ratio(real.fast_spread_moving, simulated.fast_spread_moving)
+        ),
         shared=float(np.clip(model.shared * ratio(real.shared, simulated.shared), 0.01, 0.9)),
         jump_rate=seen(model.jump_rate, ratio(real.jump_rate, simulated.jump_rate)),
     )

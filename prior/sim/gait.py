@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ RATE = 120
 """Frames a second at which motions are made."""
 
 LIFT, LAND = 0.05, 0.45
-"""Phase at which the left foot's toe leaves the floor and its heel comes down; the right foot's is half a stride later."""
+"""Phase at which the left foot's toe leaves the floor and its heel comes down; the right foot's is half a stride on."""
 HEEL_OFF_BEFORE_LIFT = 0.22
 FLAT_AFTER_LAND = 0.08
 UNDER_AFTER_LAND = 0.255
@@ -99,9 +100,7 @@ def plan(start: tuple[float, float], yaw: float, parts: Sequence[Stand | Walk | 
             xy, heading = np.tile(place, (n, 1)), np.full(n, facing)
             speed, phase = np.zeros(n), np.full(n, strides)
         else:
-            xy, heading, speed = (
-                _walk(place, facing, part) if isinstance(part, Walk) else _turn(place, facing, part)
-            )
+            xy, heading, speed = _walk(place, facing, part) if isinstance(part, Walk) else _turn(place, facing, part)
             phase = _phase(strides, speed, heading)
             moves.append(slice(count, count + len(xy)))
             place, facing, strides = xy[-1], float(heading[-1]), float(phase[-1])
@@ -115,7 +114,8 @@ def _walk(start: Floats, facing: float, part: Walk) -> tuple[Floats, Floats, Flo
     points = np.vstack([start, np.asarray(part.points, dtype=np.float64)])
     chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     ahead = np.array([np.cos(facing), np.sin(facing)])
-    curve = CubicSpline(chord, points, bc_type=((1, ahead), (2, np.zeros(2))))
+    ends: Any = ((1, ahead), (2, np.zeros(2)))  # sets out where the body faces, arrives without curving
+    curve = CubicSpline(chord, points, bc_type=ends)
     fine = np.linspace(0.0, chord[-1], max(50, int(400 * chord[-1])))
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(fine), axis=0), axis=1))])
     ramp = min(_RAMP_S, length[-1] / part.speed)
@@ -234,9 +234,7 @@ def foot_track(plan: Plan, side: str, offsets: Floats) -> FootTrack:
 def pitch_matrix(angle: Floats) -> Floats:
     """Rotations (..., 3, 3) about y: a positive angle turns what faces +x towards the floor."""
     c, s, zero, one = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
-    return np.stack(
-        [np.stack([c, zero, s], -1), np.stack([zero, one, zero], -1), np.stack([-s, zero, c], -1)], axis=-2
-    )
+    return np.stack([np.stack([c, zero, s], -1), np.stack([zero, one, zero], -1), np.stack([-s, zero, c], -1)], axis=-2)
 
 
 @dataclass(frozen=True)
@@ -270,16 +268,14 @@ class _Step:
 
     def at(self, t: Floats) -> tuple[Floats, Floats, Floats]:
         """Ankle (T, 3), yaw (T,) and pitch (T,) from heel-off on."""
-        place, yaw = self.origin
+        yaw = self.origin[1]
         goal, goal_yaw = self.target
         duration = self.land - self.lift
         u = np.clip((t - self.lift) / duration, 0.0, 1.0)[:, None]
         eps = 1e-3
         left = self._pivot(np.array([self.lift - eps, self.lift]))
         velocity = (left[1] - left[0]) / eps * duration
-        swing = (
-            left[1] * (2 * u**3 - 3 * u**2 + 1) + velocity * (u**3 - 2 * u**2 + u) + goal * (3 * u**2 - 2 * u**3)
-        )
+        swing = left[1] * (2 * u**3 - 3 * u**2 + 1) + velocity * (u**3 - 2 * u**2 + u) + goal * (3 * u**2 - 2 * u**3)
         swing[:, 2:] += 0.035 * 16 * u**2 * (1 - u) ** 2
         turn = (goal_yaw - yaw + np.pi) % (2 * np.pi) - np.pi
         return (

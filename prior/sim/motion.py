@@ -22,12 +22,14 @@ from prior.skeletons import JOINTS, J
 Floats = NDArray[np.float64]
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
-_SIGN: Mapping[Side, float] = {"left": 1.0, "right": -1.0}
+SIGN: Mapping[Side, float] = {"left": 1.0, "right": -1.0}
+"""Which way the body's left axis goes."""
 
 
 def pose_bones(rotations: Floats, offsets: Floats, root: Floats) -> tuple[Floats, Floats]:
     """`forward_kinematics` for numpy: positions (..., 22, 3) and global rotations (..., 22, 3, 3)."""
-    positions, world = forward_kinematics(*(torch.from_numpy(np.ascontiguousarray(a)) for a in (rotations, offsets, root)))
+    arrays = (torch.from_numpy(np.ascontiguousarray(a)) for a in (rotations, offsets, root))
+    positions, world = forward_kinematics(*arrays)
     return positions.numpy(), world.numpy()
 
 
@@ -76,10 +78,8 @@ class Motion:
                 f"{self.times[0]:.3f} to {self.times[-1]:.3f} s"
             )
         times = np.clip(times, self.times[0], self.times[-1])
-        rotations = np.stack(
-            [Slerp(self.times, Rotation.from_matrix(self.rotations[:, j]))(times).as_matrix() for j in range(len(JOINTS))],
-            axis=1,
-        )
+        turning = [Slerp(self.times, Rotation.from_matrix(self.rotations[:, j])) for j in range(len(JOINTS))]
+        rotations = np.stack([slerp(times).as_matrix() for slerp in turning], axis=1)
         root = np.stack([np.interp(times, self.times, self.root[:, k]) for k in range(3)], axis=-1)
         nearest = np.clip(np.searchsorted(self.times, times - 0.5 / RATE), 0, len(self.times) - 1)
         return Motion(times, self.offsets, root, rotations, self.contacts[nearest])
@@ -160,7 +160,7 @@ def perform(intent: Intent, offsets: Floats, rng: np.random.Generator) -> Motion
     shift[:, 1] -= 0.022 * step
     root = np.concatenate([plan.xy, np.full((n, 1), _standing_height(offsets))], axis=1)
     root += np.einsum("tij,tj->ti", yaw_matrix(plan.yaw), shift)
-    feet = {side: foot_track(plan, side, offsets) for side in SIDES}
+    feet: dict[Side, FootTrack] = {side: foot_track(plan, side, offsets) for side in SIDES}
     root[:, 2] -= _lowering(root, pelvis, feet, offsets)
 
     torso = intent.torso + idle_torso
@@ -173,13 +173,14 @@ def perform(intent: Intent, offsets: Floats, rng: np.random.Generator) -> Motion
         rotations[:, J[joint]] = _bend(torso / 3)
     gaze = intent.gaze + idle_gaze
     # The head stays more upright, and turns less, than the chest below it.
-    head = np.stack([-0.6 * torso[:, 0], gaze[:, 1] - 0.5 * (torso[:, 1] + intent.tilt), gaze[:, 0] - 0.6 * torso[:, 2]], -1)
+    nod = gaze[:, 1] - 0.5 * (torso[:, 1] + intent.tilt)
+    head = np.stack([-0.6 * torso[:, 0], nod, gaze[:, 0] - 0.6 * torso[:, 2]], axis=-1)
     for joint, share in (("neck", 0.45), ("head", 0.55)):
         rotations[:, J[joint]] = _bend(share * head)
 
     for side in SIDES:
         _leg(rotations, root, offsets, side, feet[side], plan)
-        _arm(rotations, root, offsets, side, intent, _SIGN[side] * stride)
+        _arm(rotations, root, offsets, side, intent, SIGN[side] * stride)
 
     contacts = np.zeros((n, len(CONTACT_JOINTS)), dtype=bool)
     for side in SIDES:
@@ -209,7 +210,8 @@ def _lowering(root: Floats, pelvis: Floats, feet: Mapping[Side, FootTrack], offs
         need = np.maximum(need, hip[:, 2] - allowed)
     # The maximum is taken over more than the Gaussian reaches, so the smoothed curve stays above the need.
     half = round(0.07 * RATE)
-    return gaussian_filter1d(maximum_filter1d(need, 2 * half + 1, mode="nearest"), half / 2.5, mode="nearest", radius=half)
+    highest = maximum_filter1d(need, 2 * half + 1, mode="nearest")
+    return gaussian_filter1d(highest, half / 2.5, mode="nearest", radius=half)
 
 
 def _lengths(offsets: Floats, middle: str, end: str) -> Floats:
@@ -254,35 +256,49 @@ def _oriented(direction: Floats, hinge: Floats, rest_direction: Floats, rest_pol
     return after @ before.T
 
 
+@dataclass(frozen=True)
+class _Limb:
+    joints: tuple[str, str, str]
+    rest_pole: Floats  # where elbow or knee points in the rest pose
+
+
+_LEG = _Limb(("hip", "knee", "ankle"), np.array([1.0, 0.0, 0.0]))
+_ARM = _Limb(("shoulder", "elbow", "wrist"), np.array([-1.0, 0.0, 0.0]))
+
+
 def _limb(
-    rotations: Floats, side: Side, joints: tuple[str, str, str], parent: Floats, start: Floats, goal: Floats, pole: Floats,
-    offsets: Floats, rest_pole: Floats,
-) -> Floats:  # fmt: skip
+    rotations: Floats,
+    side: Side,
+    limb: _Limb,
+    parent: Floats,
+    start: Floats,
+    goal: Floats,
+    pole: Floats,
+    offsets: Floats,
+) -> Floats:
     """Set the local rotations of a limb's two upper joints; returns the lower bone's world rotation."""
-    base, middle, end = (J[f"{side}_{name}"] for name in joints)
+    base, middle, end = (J[f"{side}_{name}"] for name in limb.joints)
     first, second, hinge = two_bone(start, goal, pole, np.linalg.norm(offsets[[middle, end]], axis=1))
-    upper = _oriented(first, hinge, offsets[middle], rest_pole)
-    lower = _oriented(second, hinge, offsets[end], rest_pole)
+    upper = _oriented(first, hinge, offsets[middle], limb.rest_pole)
+    lower = _oriented(second, hinge, offsets[end], limb.rest_pole)
     rotations[:, base] = np.swapaxes(parent, -1, -2) @ upper
     rotations[:, middle] = np.swapaxes(upper, -1, -2) @ lower
     return lower
 
 
 def _leg(rotations: Floats, root: Floats, offsets: Floats, side: Side, foot: FootTrack, plan: Plan) -> None:
-    sign = _SIGN[side]
+    sign = SIGN[side]
     hip = root + rotations[:, 0] @ offsets[J[f"{side}_hip"]]
     # The knee points half way between pelvis and foot, and a little outward.
     lag = np.angle(np.exp(1j * (foot.yaw - plan.yaw)))
     pole = yaw_matrix(plan.yaw + lag / 2) @ np.array([1.0, 0.08 * sign, 0.0])
-    shin = _limb(
-        rotations, side, ("hip", "knee", "ankle"), rotations[:, 0], hip, foot.ankle, pole, offsets, np.array([1.0, 0.0, 0.0])
-    )
+    shin = _limb(rotations, side, _LEG, rotations[:, 0], hip, foot.ankle, pole, offsets)
     rotations[:, J[f"{side}_ankle"]] = np.swapaxes(shin, -1, -2) @ foot.rotation
 
 
 def _arm(rotations: Floats, root: Floats, offsets: Floats, side: Side, intent: Intent, forward: Floats) -> None:
     """Collar, shoulder and elbow; ``forward`` (T,) is the swing: 1 is as far forward as in a walk at 1.2 m/s."""
-    sign = _SIGN[side]
+    sign = SIGN[side]
     collar, shoulder = J[f"{side}_collar"], J[f"{side}_shoulder"]
     lengths = _lengths(offsets, f"{side}_elbow", f"{side}_wrist")
 
@@ -311,13 +327,11 @@ def _arm(rotations: Floats, root: Floats, offsets: Floats, side: Side, intent: I
     rotations[:, collar] = Rotation.from_rotvec(np.multiply.outer(sign * lift, [1.0, 0.0, 0.0])).as_matrix()
     at, girdle, _ = place()
     wrist = at + _within_reach(wrist - at, lengths.sum())
-    _limb(
-        rotations, side, ("shoulder", "elbow", "wrist"), girdle, at, wrist, pole, offsets, np.array([-1.0, 0.0, 0.0])
-    )
+    _limb(rotations, side, _ARM, girdle, at, wrist, pole, offsets)
 
 
 def _within_reach(vector: Floats, full: float) -> Floats:
-    """Vectors (T, 3) shortened, from 92 % of a limb's ``full`` length on ever more, so that it does not snap straight."""
+    """Vectors (T, 3) shortened, from 92 % of a limb's ``full`` length on ever more: it does not snap straight."""
     far = np.linalg.norm(vector, axis=-1, keepdims=True)
     free, room = 0.92 * full, 0.065 * full
     soft = free + room * (1 - np.exp(-np.maximum(far - free, 0) / room))
@@ -343,11 +357,9 @@ def _hanging(forward: Floats, sign: float, lengths: Floats) -> Floats:
     """(T, 3) wrist from the shoulder, heading frame, of an arm that hangs and swings by ``forward`` (T,)."""
     shoulder = np.radians(4.0) + np.radians(20.0) * forward
     elbow = np.radians(16.0) + np.radians(10.0) * (forward + np.sqrt(forward**2 + 0.04))
-    spread = np.radians(9.0)
-    upper = np.stack([np.sin(shoulder), np.full_like(shoulder, sign * np.tan(spread)), -np.cos(shoulder)], axis=-1)
-    fore = np.stack(
-        [np.sin(shoulder + elbow), np.full_like(shoulder, sign * 0.5 * np.tan(spread)), -np.cos(shoulder + elbow)], axis=-1
-    )
-    unit = [v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (upper, fore)]
-    return lengths[0] * unit[0] + lengths[1] * unit[1]
 
+    def bone(flexion: Floats, outward: float) -> Floats:
+        along = np.stack([np.sin(flexion), np.full_like(flexion, sign * outward), -np.cos(flexion)], axis=-1)
+        return along / np.linalg.norm(along, axis=-1, keepdims=True)
+
+    return lengths[0] * bone(shoulder, 0.16) + lengths[1] * bone(shoulder + elbow, 0.08)

@@ -19,6 +19,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ SWAP_GROUPS: Mapping[str, tuple[int, ...]] = {
 
 SWAP_RATE: Mapping[str, float] = {"arms": 0.005, "legs": 0.01}
 SWAP_DURATION = 0.15
-"""Swaps a second and their seconds, assumed: in UI-PRMD people face the camera, and one frame in 47 minutes is swapped."""
+"""Swaps a second and their seconds, assumed: UI-PRMD's people face the camera, with one swapped frame in 47 minutes."""
 
 SPREAD_SPEED = 0.2
 """m/s between a joint at rest and one in motion, as far as the spread of its fast noise goes."""
@@ -109,7 +110,8 @@ class NoiseModel:
         names = {f.name for f in fields(cls)}
         if set(parameters) != names:
             raise ValueError(f"{path}: expected parameters {sorted(names)}, got {sorted(parameters)}; fit it again")
-        return cls(**{k: np.array(v) if isinstance(v, list) else v for k, v in parameters.items()})
+        arrays: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in parameters.items()}
+        return cls(**arrays)
 
     def save(self, path: Path, about: Mapping[str, object]) -> None:
         """Write the parameters beside what is to be said ``about`` them (provenance, figures)."""
@@ -207,9 +209,7 @@ def stationary(dt: Floats, memory: float, shape: tuple[int, int], rng: np.random
     return _recursion(np.exp(-dt / memory)[:, None, None], rng.standard_normal((len(dt), *shape)))
 
 
-def _jumps(
-    shape: tuple[int, ...], dt: Floats, rate: Floats, rng: np.random.Generator, model: NoiseModel
-) -> Floats:
+def _jumps(shape: tuple[int, ...], dt: Floats, rate: Floats, rng: np.random.Generator, model: NoiseModel) -> Floats:
     """Displacements (..., T, 22, 3) that last a while, ``rate`` (..., 22) times a second; zero most of the time."""
     frames = shape[-3]
     state = (*shape[:-3], shape[-2])
@@ -290,9 +290,7 @@ def confidence_of(scale: Floats, rng: np.random.Generator) -> Floats:
     return 1.0 / (1.0 + np.exp(-logit))
 
 
-def corrupt(
-    positions: Floats, rng: np.random.Generator, model: NoiseModel, fps: float = 30.0
-) -> tuple[Floats, Floats]:
+def corrupt(positions: Floats, rng: np.random.Generator, model: NoiseModel, fps: float = 30.0) -> tuple[Floats, Floats]:
     """What a tracker would make of motion, without a scene: for training, thousands of windows a second.
 
     Each window is seen by a camera somewhere around it at the person's height. Nothing is lost and nothing hides

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from prior.sim.body import random_offsets
 from prior.sim.gait import RATE, Plan, Stand, Turn, Walk, plan
-from prior.sim.motion import ArmAction, Intent, Motion, Side, perform
+from prior.sim.motion import SIDES, SIGN, ArmAction, Intent, Motion, Side, perform
 from prior.sim.timing import Key, minimum_jerk, track
 from prior.skeletons import J
 
@@ -39,9 +39,8 @@ def idle(rng: np.random.Generator) -> list[Motion]:
     to_one_leg = _during(t, 1.5, 6.5, 1.2) - _during(t, 8.0, 14.5, 1.4)
     intent.shift[:, 1] = 0.045 * to_one_leg
     intent.torso[:, 0] = np.radians(-3.0) * to_one_leg
-    intent.gaze = track(
-        t, [0.0, 0.0], [Key(1, 2, [0.6, 0.0]), Key(4, 5, [-0.4, 0.1]), Key(6.6, 7.4, [0.35, 0.45]), Key(9.6, 10.6, [0, 0])]
-    )
+    glances = [Key(1, 2, [0.6, 0.0]), Key(4, 5, [-0.4, 0.1]), Key(6.6, 7.4, [0.35, 0.45]), Key(9.6, 10.6, [0.0, 0.0])]
+    intent.gaze = track(t, [0.0, 0.0], glances)
     intent.arms["left"] = [
         ArmAction(_during(t, 6.5, 10.2, 1.1), np.array([0.48, -0.25, -0.35]), np.array([-0.2, 0.7, -1.0]), "shoulder")
     ]
@@ -92,7 +91,7 @@ def _reach_for(intent: Intent, offsets: Floats, side: Side, start: float, target
 
     What lies beyond the arm's length is reached by leaning, bending the knees and turning the trunk.
     """
-    sign = 1.0 if side == "left" else -1.0
+    sign = SIGN[side]
     weight = _during(t, start, start + 3.0, 1.0)
     # The trunk sets out a little before the hand and returns a little later.
     body = _during(t, start - 0.15, start + 3.15, 1.15)
@@ -107,7 +106,8 @@ def _reach_for(intent: Intent, offsets: Floats, side: Side, start: float, target
     intent.torso[:, 2] += body * across
     intent.torso[:, 0] += body * np.clip(-0.5 * (target[1] - shoulder[1]), -0.15, 0.15)
     intent.tilt += body * 0.8 * low
-    intent.shift += body[:, None] * np.array([0.05 * np.sign(target[0] - 0.2) - 0.10 * low, 0.25 * target[1] * beyond, -0.35 * low])
+    sway = [0.05 * np.sign(target[0] - 0.2) - 0.10 * low, 0.25 * target[1] * beyond, -0.35 * low]
+    intent.shift += body[:, None] * np.array(sway)
     gaze = np.array([np.arctan2(target[1], max(target[0], 0.3)), np.clip(-target[2] + 0.35, -0.4, 0.7)])
     intent.gaze += body[:, None] * gaze * 0.5
     # Targets are places in the room: fixed to the plan, which stands still, not to the pelvis, which leans.
@@ -123,14 +123,14 @@ def sit_rise(rng: np.random.Generator) -> list[Motion]:
     """Walk to a chair, turn, sit down, sit and shift, rise, sit again, rise and walk off."""
     seat = 0.45
     parts = [
-        Stand(0.6), Walk([(2.9, 0.5)], 0.9), Stand(0.2), Turn(np.radians(55), 1.3), Stand(12.2), Walk([(2.4, -0.5)], 0.8),
-        Stand(0.8),
+        Stand(0.6), Walk([(2.9, 0.5)], 0.9), Stand(0.2), Turn(np.radians(55), 1.3), Stand(12.2),
+        Walk([(2.4, -0.5)], 0.8), Stand(0.8),
     ]  # fmt: skip
     ground = plan((3.4, -0.8), np.radians(111.0), parts)
     offsets = _person(rng)
     intent = Intent(ground)
     t = ground.times
-    begin = t[ground.moves[1].stop]
+    begin = float(t[ground.moves[1].stop])
     legs = offsets[[J["left_hip"], J["left_knee"], J["left_ankle"], J["left_foot"]], 2].sum()
     hips_above_seat = 0.09
     drop = seat + hips_above_seat - float(offsets[J["left_hip"], 2]) + float(legs)
@@ -152,10 +152,11 @@ def sit_rise(rng: np.random.Generator) -> list[Motion]:
     intent.torso[:, 2] += 0.35 * fidget
     intent.gaze[:, 0] += 0.5 * fidget
     rest = minimum_jerk((seated - 0.45) / 0.5)
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        lap = np.array([0.27, sign * 0.13, 0.13])
-        intent.arms[side] = [ArmAction(rest, lap, np.array([-0.8, 0.45 * sign, -0.6]), "pelvis")]
-    intent.arms["left"].append(ArmAction(fidget * rest, np.array([0.42, 0.05, -0.25]), np.array([-0.2, 0.9, -0.7]), "shoulder"))
+    for side in SIDES:
+        lap, elbow = np.array([0.27, SIGN[side] * 0.13, 0.13]), np.array([-0.8, SIGN[side] * 0.45, -0.6])
+        intent.arms[side] = [ArmAction(rest, lap, elbow, "pelvis")]
+    chin = np.array([0.42, 0.05, -0.25])
+    intent.arms["left"].append(ArmAction(fidget * rest, chin, np.array([-0.2, 0.9, -0.7]), "shoulder"))
     return [perform(intent, offsets, rng)]
 
 

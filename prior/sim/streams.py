@@ -75,7 +75,8 @@ def _stream(name: str, entry: Mapping[str, Any], folder: Path) -> Stream:
     if unknown := set(entry) - known:
         raise ManifestError(f"{name}: unknown keys {sorted(unknown)}; there are {sorted(known)}")
     try:
-        camera = Camera(**{k: tuple(v) if isinstance(v, list) else v for k, v in entry["camera"].items()})
+        filmed: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in entry["camera"].items()}
+        camera = Camera(**filmed)
         stream = Stream(
             name,
             entry["what"],
