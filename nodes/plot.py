@@ -112,6 +112,10 @@ class _Story:
     """topic to (T,) seconds"""
     tracks: dict[str, dict[int, _Track]] = field(default_factory=dict)
     """topic and body to its track"""
+    calibrated: bool = True
+    """whether the camera's place in the world is known"""
+    reported: bool = False
+    """whether nodes told what they dropped and refused"""
     observable: NDArray[np.bool_] = field(default_factory=lambda: np.ones(len(JOINTS), bool))
     """(22,) the joints that the sensor has at all"""
     origin: str = ""
@@ -226,6 +230,7 @@ def _read(recording: Path) -> _Story:
             time = (stamp_ns - reader.start_ns) / 1e9
             stamps.setdefault(topic, []).append(time)
             sources[message.source] += 1
+            story.calibrated &= getattr(message, "calibrated", True)
             if isinstance(message, PoseRaw) and message.skeleton in SKELETONS:
                 skeletons[message.skeleton] += 1
                 observable |= SKELETONS[message.skeleton].observable
@@ -240,6 +245,7 @@ def _read(recording: Path) -> _Story:
         story.tracks.setdefault(topic, {})[body] = track
     if observable.any():
         story.observable = observable
+    story.reported = bool(troubles)
     story.origin = " · ".join([", ".join(sources), *skeletons])
     for node, values in troubles.items():
         counts = {key: value for key, value in values.items() if key.startswith(("dropped.", "refused."))}
@@ -414,7 +420,7 @@ def _errors(story: _Story, body: int) -> dict[str, _Error]:
         track = story.track(topic, body)
         if track is None or not truth:
             continue
-        joints = np.stack([_distances(track, person) for person in truth])
+        joints = np.stack([_distances(track, person, placed=story.calibrated) for person in truth])
         means = np.stack([_mean(distances, axis=1) for distances in joints])
         some = np.flatnonzero(np.isfinite(means).any(axis=0))
         if len(some):
@@ -424,16 +430,32 @@ def _errors(story: _Story, body: int) -> dict[str, _Error]:
     return found
 
 
-def _distances(track: _Track, truth: _Track) -> NDArray[np.float64]:
-    """(T, 22) metres from a track's joints to the true ones at the same moments; NaN where either is missing."""
+def _distances(track: _Track, truth: _Track, *, placed: bool) -> NDArray[np.float64]:
+    """(T, 22) metres from a track's joints to the true ones at the same moments; NaN where either is missing.
+
+    Args:
+        placed: whether the track's place in the world is known; if not, it is first put where it fits best.
+    """
     index = np.clip(np.searchsorted(truth.time, track.time), 1, len(truth.time) - 1)
     before, after = truth.time[index - 1], truth.time[index]
     share = np.clip((track.time - before) / np.maximum(after - before, 1e-9), 0, 1)[:, None, None]
     expected = truth.positions[index - 1] * (1 - share) + truth.positions[index] * share
     far = np.minimum(np.abs(track.time - before), np.abs(after - track.time)) > TRUTH_REACH_S
-    distances = np.linalg.norm(track.positions - expected, axis=2)
-    distances[far] = np.nan
-    return distances
+    expected[far] = np.nan
+    positions = track.positions if placed else _placed(track.positions, expected)
+    return np.linalg.norm(positions - expected, axis=2)
+
+
+def _placed(positions: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions (T, 22, 3), shifted and turned about the vertical, once for all, to where they fit the expected."""
+    both = np.isfinite(positions).all(axis=2) & np.isfinite(expected).all(axis=2)
+    if not both.any():
+        return positions
+    origin, target = positions[both].mean(axis=0), expected[both].mean(axis=0)
+    p, q = positions[both] - origin, expected[both] - target
+    turn = np.arctan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1]))
+    rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    return (positions - origin) @ rotation.T + target
 
 
 def _mean(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
@@ -584,6 +606,9 @@ def _draw_summary(ax: Axes, story: _Story, body: int, errors: dict[str, _Error])
     for topic, error in errors.items():
         mean, p95 = 100 * error.mean.mean(), 100 * np.percentile(error.mean, 95)
         lines.append(f"error {topic:<10} mean {mean:5.1f}  p95 {p95:5.1f} cm")
-    lines += ["", "dropped and refused:" if story.troubles else "nothing dropped or refused"]
+    if errors and not story.calibrated:
+        lines.append("(the camera's place is unknown: moved to where it fits best)")
+    silence = "nothing dropped or refused" if story.reported else "no diagnostics were recorded"
+    lines += ["", "dropped and refused:" if story.troubles else silence]
     lines += [f"  {count:>6}  {cause}" for cause, count in story.troubles.most_common(14)]
     ax.text(-0.2, 1, "\n".join(lines), va="top", family="monospace", fontsize=8, transform=ax.transAxes)

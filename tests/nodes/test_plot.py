@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from synthetic_poses import messages
 
 from msgs.recording import RecordingWriter
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
-from msgs.types import Diagnostics, Level, PoseClean, PoseRaw
+from msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw
 from nodes import plot as module
 from nodes.plot import PlotError, plot
 from prior.skeletons import J
@@ -91,6 +92,20 @@ def test_a_body_is_compared_with_the_person_who_stands_there(tmp_path: Path) -> 
             writer.write(topic, message, message.stamp_ns)
     story = module._read(tmp_path / "bag")
     assert module._errors(story, 7)[POSE_RAW].mean.max() < 0.1
+
+
+def test_a_camera_whose_place_is_unknown_is_put_where_it_fits(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "bag") as writer:
+        for topic, message in messages(3.0):
+            if isinstance(message, PoseRaw):
+                message.calibrated = False
+                turned = Rotation.from_euler("z", 50, degrees=True) * Rotation.from_quat(
+                    message.sensor_pose.orientation
+                )
+                message.sensor_pose = Pose(np.array([5.0, 6.0, 7.0]), turned.as_quat())
+            writer.write(topic, message, message.stamp_ns)
+    errors = module._errors(module._read(tmp_path / "bag"), 0)
+    assert errors[POSE_RAW].mean.mean() == pytest.approx(0.032, abs=0.004)
 
 
 def test_no_error_where_the_truth_is_silent(tmp_path: Path) -> None:
