@@ -111,7 +111,10 @@ class PoseInputNode(Node):
                 self._wait_for(message.stamp_ns)
             if self.stopping:
                 return
-            self.publish(topic, message)
+            try:
+                self.publish(topic, message)
+            except ValueError as error:  # a message that was recorded, and still cannot be sent
+                self.refuse(topic, error)
             self.report_if_due()
 
     def status(self) -> dict[str, str]:

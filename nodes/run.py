@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -43,6 +44,8 @@ def run(
 ) -> int:
     """Start the nodes of a launch file, watch them and show how they do, until the stream ends or Ctrl-C.
 
+    A node that crashes is started again. With `view` on a terminal, the picture stays when the stream has ended.
+
     Args:
         launch: a launch file, or the name of one of the project's own: replay, server.
         input: the recording or .npz to play in place of the launch file's.
@@ -69,13 +72,10 @@ def run(
     arguments = ["--launch", launch]
     for override in overrides:
         arguments += ["--set", override]
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     # a log file has no width, and a table cut to 80 columns says little
     console = Console(width=None if sys.stdout.isatty() else 140)
-    try:
-        return _Run(settled, arguments, console, SystemClock()).watch()
-    except KeyboardInterrupt:
-        return 0
+    return _Run(settled, arguments, console, SystemClock()).watch()
 
 
 def _check(launch: Launch) -> None:
@@ -99,35 +99,34 @@ class _Run:
         self._console = console
         self._clock = clock
         self._news: dict[str, Diagnostics] = {}
+        self._over = False
         self._moved_ns = clock.now_ns()
         self._lines_ns = clock.now_ns()
 
     def watch(self) -> int:
-        """Start the nodes and show their news until the stream has ended; returns the exit status."""
+        """Start the nodes and show their news until the stream has ended or Ctrl-C; returns the exit status."""
         transport = self._launch.transport
         transport.ipc_directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         keys = load_keys(transport.keys) if transport.keys else None
         endpoints = [transport.endpoint(name) for name in self._launch.nodes]
-        live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
+        terminal = self._console.is_terminal
         with (
             Subscriber(endpoints, DIAGNOSTICS, keys=keys) as subscriber,
+            Live(console=self._console, auto_refresh=False, transient=True) if terminal else nullcontext() as live,
             Supervisor(self._launch.nodes, self._arguments, self._clock, self._say) as supervisor,
         ):
-            if live:
-                live.start()
+            status = None
             try:
-                status = None
                 while status is None:
                     self._take(subscriber.receive(TURN_S))
                     supervisor.poll()
                     self._show(supervisor, live)
                     status = self._verdict(supervisor)
-                supervisor.stop()
-                while received := subscriber.receive(0):
-                    self._take(received)
-            finally:
-                if live:
-                    live.stop()
+            except KeyboardInterrupt:
+                status = 0
+            supervisor.stop()
+            while received := subscriber.receive(0):
+                self._take(received)
         self._console.print(table(self._launch.nodes, self._news, supervisor, summary=True))
         return status
 
@@ -159,7 +158,12 @@ class _Run:
             self._moved_ns = self._moved_ns if source else self._clock.now_ns()
             return None
         if self._drained():
-            return 0
+            if "viewer" not in self._launch.nodes or not self._console.is_terminal:
+                return 0
+            if not self._over:
+                self._over = True
+                self._say("the stream has ended; the picture stays until Ctrl-C")
+            return None
         if self._clock.now_ns() - self._moved_ns > STUCK_NS:
             self._say("the stream ended, but its end did not come through all nodes; see dropped and restarts")
             return 1

@@ -46,7 +46,7 @@ TURN_S = 0.1
 SAMPLES = 1000
 """latencies and compute times kept for the percentiles: half a minute at 30 Hz"""
 READ_AHEAD = 64
-"""messages a lossless node takes off its socket before it works on them"""
+"""messages a node takes off its socket before it works on one"""
 SUPERVISOR = "STEADYPOSE_SUPERVISOR"
 """environment: the process that started this node; without it, the node stops"""
 
@@ -126,7 +126,9 @@ class Inbox:
 
     def next(self, timeout_s: float) -> tuple[str, Message] | None:
         """The oldest message kept, or None if none comes in time."""
-        while self._limit is not None or len(self._waiting) < READ_AHEAD:
+        for _ in range(READ_AHEAD):
+            if self._limit is None and len(self._waiting) >= READ_AHEAD:
+                break
             received = self._subscriber.receive(0 if self._waiting else timeout_s)
             if received is None:
                 break
@@ -251,15 +253,19 @@ class Node(ABC):
         try:
             self.handle(topic, message)
         except Exception as error:
-            cause = f"refused.{type(error).__name__}"
-            if cause not in self.counts:
-                logger.exception("%s: a message of %s failed; more of these are only counted", self.name, topic)
-            self.counts[cause] += 1
+            self.refuse(topic, error)
         if not isinstance(message, Diagnostics):
             self._compute_ns.append(self.clock.now_ns() - started - self._blocked_ns)
             if message.end_of_stream:
                 self.note_end(topic)
         return True
+
+    def refuse(self, topic: str, error: Exception) -> None:
+        """Count a message that could not be worked on, and log the first of its kind."""
+        cause = f"refused.{type(error).__name__}"
+        if cause not in self.counts:
+            logger.error("%s: a message of %s failed; more are only counted", self.name, topic, exc_info=error)
+        self.counts[cause] += 1
 
     def publish(self, topic: str, message: Message, *, delay_ns: int = 0) -> bool:
         """Publish a message; if the launch is lossless, as soon as all who must hear it have room.

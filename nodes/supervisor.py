@@ -74,7 +74,7 @@ class Child:
                 self._process.wait()
         if self.state != "failed":
             self.state = "ended"
-        self._reader.join()
+        self._reader.join(STOP_S)  # what the node left behind may still hold its output open
 
     def _start(self) -> None:
         self._process = subprocess.Popen(

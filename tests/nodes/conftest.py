@@ -1,0 +1,142 @@
+"""What the tests of the nodes share: a clock that does not wait, streams made up on the spot, models of noise."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from synthetic_poses import walker
+
+from msgs.recording import RecordingWriter
+from msgs.topics import POSE_RAW
+from msgs.types import Pose, PoseRaw, RawBody
+from nodes.launch import Launch
+from nodes.runtime import Node
+from prior.checkpoint import save_weights
+from prior.hmvae import HMVAE, HMVAEConfig
+from prior.trajectory_net import TrajectoryConfig, TrajectoryNet
+
+START_NS = 1_700_000_000_000_000_000
+
+
+class VirtualClock:
+    """Time that passes only when somebody sleeps."""
+
+    def __init__(self) -> None:
+        self.time_ns = 5_000_000_000
+        self.slept_ns: list[int] = []
+
+    def now_ns(self) -> int:
+        return self.time_ns
+
+    def sleep(self, duration_ns: int) -> None:
+        self.slept_ns.append(duration_ns)
+        self.time_ns += duration_ns
+
+
+@pytest.fixture
+def clock() -> VirtualClock:
+    return VirtualClock()
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A folder with a short path: an ipc address has 107 bytes at most."""
+    path = Path(tempfile.mkdtemp(prefix="sp"))
+    yield path
+    shutil.rmtree(path)
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Untrained models, as overrides of a launch file: enough to see that messages go the right way."""
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("weights")
+    hmvae, trajectory = HMVAEConfig(), TrajectoryConfig()
+    save_weights(folder / "a.safetensors", HMVAE(hmvae), dataclasses.asdict(hmvae), {})
+    save_weights(folder / "b.safetensors", TrajectoryNet(trajectory), dataclasses.asdict(trajectory), {})
+    return {
+        "prior.refine.weights": str(folder / "a.safetensors"),
+        "trajectory.weights": str(folder / "b.safetensors"),
+    }
+
+
+@pytest.fixture
+def make_launch(folder: Path, tmp_path: Path) -> Callable[..., Launch]:
+    """A launch with its sockets in ``folder``; settings by their path, dots as ``__``."""
+
+    def make(settings: dict[str, str] | None = None, **more: object) -> Launch:
+        file = tmp_path / "test.toml"
+        file.write_text("")
+        overrides = [f"transport.directory={folder}"]
+        overrides += [f"{key}={value}" for key, value in (settings or {}).items()]
+        overrides += [f"{key.replace('__', '.')}={value}" for key, value in more.items()]
+        return Launch.read(file, overrides)
+
+    return make
+
+
+def raw(index: int, *bodies: RawBody, stamp_ns: int | None = None, skeleton: str = "smpl22") -> PoseRaw:
+    """Frame ``index`` of a 30 Hz stream."""
+    return PoseRaw(
+        stamp_ns=START_NS + index * 33_333_333 if stamp_ns is None else stamp_ns,
+        frame_id="camera",
+        source="test",
+        skeleton=skeleton,
+        sensor_pose=Pose.identity(),
+        calibrated=True,
+        bodies=list(bodies),
+    )
+
+
+def walking(index: int, body: int = 0) -> RawBody:
+    """A walker at frame ``index``, as a sensor with a centimetre of noise sees him."""
+    noise = np.random.default_rng((index, body)).normal(0.0, 0.01, (22, 3))
+    positions, _, _ = walker(index / 30, phase=1.5 * body)
+    return RawBody(id=body, positions=positions + noise, confidence=np.ones(22))
+
+
+def walk(frames: int, bodies: int = 1) -> list[PoseRaw]:
+    return [raw(i, *(walking(i, body) for body in range(bodies))) for i in range(frames)]
+
+
+def record(directory: Path, messages: list[PoseRaw]) -> Path:
+    with RecordingWriter(directory) as writer:
+        for message in messages:
+            writer.write(POSE_RAW, message, message.stamp_ns)
+    return directory
+
+
+@contextmanager
+def running(*nodes: Node) -> Iterator[list[threading.Thread]]:
+    """The nodes, each in a thread, stopped in the order given."""
+    threads = [threading.Thread(target=node.run) for node in nodes]
+    for thread in threads:
+        thread.start()
+    try:
+        yield threads
+    finally:
+        for node, thread in zip(nodes, threads, strict=True):
+            node.stop()
+            thread.join(20)
+        assert not any(thread.is_alive() for thread in threads)
+
+
+def until(condition: Callable[[], bool], *, timeout_s: float = 30.0) -> None:
+    """Look again and again whether something that other threads bring about has come."""
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        if condition():
+            return
+        threading.Event().wait(0.001)
+    raise AssertionError(f"did not come within {timeout_s:g} s")
