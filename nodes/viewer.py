@@ -65,7 +65,7 @@ MEMORY = "256MB"
 PATH_SECONDS = 10.0
 """how much of a body's way over the floor is drawn"""
 CONTACT_PROBABILITY = 0.5
-FOLLOW_SHARE = 0.05
+FOLLOW_SHARE = 0.1
 """of the way to the bodies that the eye goes with each message: slow enough not to shake with a raw pose"""
 FOLLOW_STEP = 0.1
 """metres: the most it goes, so that a joint 10 km away does not take it along"""
@@ -225,7 +225,7 @@ class PoseView:
         self._origin_ns: int | None = None
         self._last: dict[str, tuple[int, int]] = {}
         self._eye: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        self._calibrated = False
+        self._calibrated = True
         self._scored = False
         self._focus: dict[str, NDArray[np.float64]] = {}
         self._drawn: dict[str, set[str]] = {}
@@ -306,6 +306,8 @@ class PoseView:
     def _draw_world(self, message: PoseWorld, *, truth: bool) -> Iterator[tuple[str, NDArray[np.float64]]]:
         import rerun as rr
 
+        if truth and not self._calibrated:
+            return  # the poses have a world of their own, and where that lies in the true one is not known
         for body in message.bodies:
             positions = body.positions.astype(np.float64)
             if truth:
@@ -319,10 +321,11 @@ class PoseView:
             touching = body.contacts > CONTACT_PROBABILITY
             self._log(
                 f"{path}/contacts",
-                rr.Points3D(positions[CONTACT_INDICES[touching]], colors=_CONTACT_RGB, radii=0.045),
+                rr.Points3D(positions[CONTACT_INDICES[touching]], colors=_CONTACT_RGB, radii=0.035),
             )
             standing = "" if body.tracking == Tracking.OK else f" · {body.tracking.name.lower()}"
-            label = rr.Points3D(positions[[J["head"]]] + [0, 0, 0.28], labels=f"{body.id}{standing}", radii=0.0)
+            above = positions[[J["head"]]] + [0, 0, 0.28]
+            label = rr.Points3D(above, labels=f"{body.id}{standing}", colors=_PATH_RGB, radii=0.0)
             self._log(f"{path}/label", label)
             yield path, positions
 
@@ -452,9 +455,9 @@ class PoseView:
         return rrb.Blueprint(
             rrb.Vertical(
                 rrb.Horizontal(
-                    scene("raw", "raw: what the sensor says", distance=2.6, height=0.5, floor=floor),
-                    scene("clean", "clean: seen, refined, imputed", distance=2.6, height=0.5, floor=floor),
-                    scene("world", "world: path and contacts", distance=3.6, height=1.4, floor=True),
+                    scene("raw", "raw: what the sensor says", distance=2.3, height=0.4, floor=floor),
+                    scene("clean", "clean: seen, refined, imputed", distance=2.3, height=0.4, floor=floor),
+                    scene("world", "world: path and contacts", distance=3.2, height=1.3, floor=True),
                 ),
                 rrb.Horizontal(
                     *([plot("anomaly", "anomaly score")] if self._scored else []),

@@ -138,6 +138,15 @@ def test_truth_is_drawn_thin_and_draws_no_rate(view: PoseView, log: Log) -> None
     assert {path for _, path, _ in log.drawn} == {"world/truth/made-up/0/bones"}
 
 
+def test_truth_is_left_out_where_the_cameras_place_is_unknown(view: PoseView, log: Log) -> None:
+    for topic, message in only(messages(0.2), POSE_RAW, POSE_TRUTH):
+        if isinstance(message, PoseRaw):
+            message.calibrated = False
+        view.log(topic, message)
+    assert not log.times("world/truth/made-up/0/bones")
+    assert log.times("raw/made-up/0/bones")
+
+
 def test_rates_are_the_nodes_own(view: PoseView, log: Log) -> None:
     report = Diagnostics(0, "prior", Level.OK, "", {"rate.pose/clean": "29.97", "queue": "0"})
     view.log(DIAGNOSTICS, report)
