@@ -35,7 +35,7 @@ def length_variation(positions: Floats, bones: Sequence[tuple[int, int]]) -> flo
     return float(np.mean(np.nanstd(lengths, axis=0) / np.nanmean(lengths, axis=0)))
 
 
-def contact_speed(positions: Floats, contact: NDArray[np.bool_], fps: float) -> Floats:
+def contact_speed(positions: Floats, contact: NDArray[np.bool_], stamps_s: Floats) -> Floats:
     """Horizontal speed of joints from one frame to the next where both are in contact, m/s: (T-1, J), else NaN.
 
     Each foot counts for itself: its mean is the foot skate.
@@ -43,9 +43,9 @@ def contact_speed(positions: Floats, contact: NDArray[np.bool_], fps: float) -> 
     Args:
         positions: (T, J, 3) metres, z up.
         contact: (T, J).
-        fps: frames a second.
+        stamps_s: (T,) seconds.
     """
-    speed = np.linalg.norm(np.diff(positions[..., :2], axis=0), axis=-1) * fps
+    speed = np.linalg.norm(np.diff(positions[..., :2], axis=0), axis=-1) / np.diff(stamps_s)[:, None]
     return np.where(contact[1:] & contact[:-1], speed, np.nan)
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -60,13 +62,22 @@ def save(name: str, arguments: list[str], tables: list[Table], data: dict[str, A
     content = {"benchmark": name, "command": command, "machine": describe()}
     content |= {"tables": [asdict(t) for t in tables], **data}
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    path.write_text(json.dumps(_nan_to_null(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     return path
 
 
 def load(directory: Path = RESULTS) -> dict[str, dict[str, Any]]:
     """All results by the benchmark's name."""
     return {path.stem: json.loads(path.read_text()) for path in sorted(directory.glob("*.json"))}
+
+
+def _nan_to_null(value: Any) -> Any:
+    """The same with None for NaN, which JSON does not have."""
+    if isinstance(value, Mapping):
+        return {key: _nan_to_null(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_nan_to_null(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _portable(argument: str) -> str:

@@ -69,6 +69,8 @@ FOLLOW_SHARE = 0.1
 """of the way to the bodies that the eye goes with each message: slow enough not to shake with a raw pose"""
 FOLLOW_STEP = 0.1
 """metres: the most it goes, so that a joint 10 km away does not take it along"""
+BELOW_TRUNK = 0.25
+"""metres from the middle of the trunk down to the middle of somebody who stands"""
 BACK_JUMP_NS = 1_000_000_000
 """a stamp this far behind the last one starts the stream again"""
 
@@ -341,7 +343,7 @@ class PoseView:
             centers=positions[guessed],
             radii=sigma[guessed],
             colors=_STATE_RGB[state[guessed]],
-            line_radii=0.0012,
+            line_radii=0.0008,
             fill_mode="majorwireframe",
         )
         self._log(f"{path}/sigma", spheres)
@@ -398,7 +400,7 @@ class PoseView:
         trunks = trunks[np.isfinite(trunks).all(axis=1)]
         if not len(trunks):
             return
-        target = trunks.mean(axis=0)
+        target = trunks.mean(axis=0) - [0.0, 0.0, BELOW_TRUNK]
         focus = self._focus.get(topic, target)
         self._focus[topic] = focus + np.clip(FOLLOW_SHARE * (target - focus), -FOLLOW_STEP, FOLLOW_STEP)
         self._log(f"{topic.removeprefix('pose/')}/focus", rr.Points3D([self._focus[topic]], radii=0.0))
@@ -455,8 +457,8 @@ class PoseView:
         return rrb.Blueprint(
             rrb.Vertical(
                 rrb.Horizontal(
-                    scene("raw", "raw: what the sensor says", distance=2.3, height=0.4, floor=floor),
-                    scene("clean", "clean: seen, refined, imputed", distance=2.3, height=0.4, floor=floor),
+                    scene("raw", "raw: what the sensor says", distance=2.5, height=0.5, floor=floor),
+                    scene("clean", "clean: seen, refined, imputed", distance=2.5, height=0.5, floor=floor),
                     scene("world", "world: path and contacts", distance=3.2, height=1.3, floor=True),
                 ),
                 rrb.Horizontal(

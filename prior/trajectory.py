@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ from msgs.types import PoseClean, PoseWorld, WorldBody
 from prior.checkpoint import load_weights
 from prior.ground import Ground
 from prior.kinematics import yaw_matrix
+from prior.settings import build_settings
+from prior.trajectory_filter import RootNoise
 from prior.trajectory_net import NewestFrame, TrajectoryConfig, TrajectoryNet
 from prior.trajectory_track import BodyTrack, Motion, Sighting, rotation
 
@@ -38,7 +40,7 @@ class TrajectorySettings:
         weights: the weight set, or a path to a ``.safetensors`` file.
         network: whether the network's root velocity is used.
         contacts: whether standing feet hold the root.
-        acceleration: m/s² over √Hz, how quickly the root may change its velocity.
+        acceleration: m/s² over √Hz, how quickly a root may change its velocity.
         lost_sigma: metres, the horizontal standard deviation beyond which a body counts as LOST.
         timeout_s: seconds after which a body that no message mentions is forgotten.
     """
@@ -55,21 +57,14 @@ class TrajectorySettings:
         """From the table of a launch file.
 
         Raises:
-            ValueError: an unknown key, a value of the wrong type, or a number that is not above 0.
+            ValueError: a key that does not exist, a value of the wrong type, or a number that is not above 0.
         """
-        kinds = {field.name: type(field.default) for field in fields(cls)}
-        values: dict[str, Any] = {}
-        for key, value in settings.items():
-            if key not in kinds:
-                raise ValueError(f"trajectory: unknown setting '{key}'; expected one of {', '.join(kinds)}")
-            if kinds[key] is float and type(value) is int:
-                value = float(value)
-            if type(value) is not kinds[key]:
-                raise ValueError(f"trajectory.{key}: expected a {kinds[key].__name__}, got {value!r}")
-            if kinds[key] is float and not 0.0 < value < math.inf:
-                raise ValueError(f"trajectory.{key}: expected a finite number above 0, got {value}")
-            values[key] = value
-        return cls(**values)
+        return build_settings(cls, settings, "trajectory")
+
+    def __post_init__(self) -> None:
+        for name in ("acceleration", "lost_sigma", "timeout_s"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"[trajectory] {name}: expected a finite number above 0, got {getattr(self, name)}")
 
 
 class _Scene:
@@ -115,7 +110,9 @@ class TrajectoryPipeline:
             if body.id in scene.tracks:
                 scene.tracks[body.id].advance(sighting, clean.stamp_ns)
             elif sighting.root is not None:
-                scene.tracks[body.id] = BodyTrack(sighting, clean.stamp_ns, self._reader.context)
+                scene.tracks[body.id] = BodyTrack(
+                    sighting, clean.stamp_ns, self._reader.context, RootNoise(acceleration=self.settings.acceleration)
+                )
             else:
                 self.counters["body without a root so far"] += 1
                 continue
@@ -124,7 +121,7 @@ class TrajectoryPipeline:
         s, bodies = self.settings, []
         for (i, sighting), motion in zip(sightings.items(), motions, strict=True):
             track = scene.tracks[i]
-            track.fuse(sighting, motion, scene.ground, s.acceleration, s.network, s.contacts)
+            track.fuse(sighting, motion, scene.ground, s.network, s.contacts)
             bodies.append(track.publish(sighting, motion.contacts, s.lost_sigma))
         return [_message(clean, scene.ground, bodies)]
 

@@ -64,16 +64,17 @@ def _lasting_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
 
 
 def observe(clip: Clip, rng: np.random.Generator) -> list[PoseClean]:
-    """What the prior might say of a clip: with noise, and without all of the trunk where `Clip.hidden`.
+    """What a prior might say of a clip: with noise, and without the trunk where `Clip.hidden`.
 
-    There the root stays where it was last seen, and the rest of the body with it: only its own motion is known.
+    There the root stays where it was last seen, with an infinite standard deviation, and the rest of the body with
+    it: only the body's own motion is known, which is the task of HM-VAE's section 3.3.
     """
     count = len(clip.positions)
     root = clip.positions[:, 0] + ROOT_NOISE * _lasting_noise((count, 3), rng)
     local = clip.positions - clip.positions[:, :1]
     local[:, 1:] += JOINT_NOISE * _lasting_noise((count, 21, 3), rng)
-    sigma = np.full(22, np.hypot(ROOT_NOISE, JOINT_NOISE))
-    sigma[0] = ROOT_NOISE
+    sigma = np.full((count, 22), np.hypot(ROOT_NOISE, JOINT_NOISE))
+    sigma[:, 0] = np.where(clip.hidden, np.inf, ROOT_NOISE)
     trunk = [j for j in range(22) if j not in (4, 5, 7, 8, 10, 11, 20, 21)]
     messages = []
     for t, hidden in enumerate(clip.hidden):
@@ -82,7 +83,7 @@ def observe(clip: Clip, rng: np.random.Generator) -> list[PoseClean]:
         state[trunk] = JointState.IMPUTED if hidden else JointState.REFINED
         positions = root[t] + local[t]
         body = CleanBody(
-            id=0, positions=positions, rotations=clip.rotations[t], state=state, sigma=sigma, anomaly=0.0,
+            id=0, positions=positions, rotations=clip.rotations[t], state=state, sigma=sigma[t], anomaly=0.0,
             anomaly_flag=False, bone_lengths=np.zeros(22, np.float32), raw_positions=positions,
             raw_confidence=np.ones(22, np.float32),
         )  # fmt: skip

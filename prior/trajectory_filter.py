@@ -1,6 +1,7 @@
 """The Kalman filter behind a body's place in the world: root position and velocity, and where its feet stand.
 
-The state holds the places of the standing feet beside the root's, as contact-aided filters of legged robots do
+The state holds the sensor's slow error, so that a root seen for long is not taken to be known ever better, and the
+places of the standing feet, as contact-aided filters of legged robots do
 (Bloesch et al., "State Estimation for Legged Robots", RSS 2012). A foot on the ground stays where it is, so its
 place relative to the root measures how far the root has moved: the zero-velocity update and the anchor that keeps
 errors from adding up are one measurement, and the covariance knows that an anchor is no better placed than the root
@@ -12,34 +13,61 @@ arises, and the filter turns with the world.
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
-_POSITION, _VELOCITY, _FEET = 0, 1, 2
+_POSITION, _VELOCITY, _BIAS, _FEET = 0, 1, 2, 3
 _UNPLACED = 1e4
 """m², the variance of a foot's place before its first measurement: far more than any root's."""
 
 
+@dataclass(frozen=True)
+class RootNoise:
+    """How the root moves, and how what tells of it errs.
+
+    Attributes:
+        acceleration: density of the root's white-noise acceleration, m/s² over √Hz.
+        slip: density of the random walk of a standing foot, metres over √s.
+        memory_s: seconds for which the sensor's slow error lasts: the time constant of a Gauss-Markov process.
+        first_speed: m/s, the standard deviation of a root's first velocity.
+    """
+
+    acceleration: float = 3.0
+    slip: float = 0.02
+    memory_s: float = 0.65
+    first_speed: float = 1.0
+
+
 class RootFilter:
-    """Root position and velocity, with white-noise acceleration, and the places of ``feet`` feet.
+    """Root position and velocity, the sensor's slow error, and the places of ``feet`` points that may stand.
 
     Args:
+        noise: of all but the measurements.
         position: (3,) metres, where the root is first seen.
-        sigma: (3,) or a number, metres, the standard deviation of that.
-        velocity: (3,) m/s, what it is taken to do there.
-        speed: m/s, the standard deviation of that.
+        jitter: metres, the standard deviation of the sensor's error from frame to frame.
+        bias: metres, the standard deviation of its slow error.
+        velocity: (3,) m/s, what the root is taken to do there.
         feet: how many points of the feet may stand.
     """
 
-    def __init__(self, position: ArrayLike, sigma: ArrayLike, velocity: ArrayLike, speed: float, feet: int) -> None:
+    def __init__(
+        self, noise: RootNoise, position: ArrayLike, jitter: float, bias: float, velocity: ArrayLike, feet: int
+    ) -> None:
+        self._noise = noise
         size = _FEET + feet
         self._x = np.zeros((size, 3))
         self._x[_POSITION], self._x[_VELOCITY] = position, velocity
         self._p = np.zeros((3, size, size))
-        self._p[:, _POSITION, _POSITION] = np.square(sigma)
-        self._p[:, _VELOCITY, _VELOCITY] = speed**2
+        self._p[:, _POSITION, _POSITION] = jitter**2 + bias**2
+        self._p[:, _POSITION, _BIAS] = self._p[:, _BIAS, _POSITION] = -(bias**2)
+        self._p[:, _BIAS, _BIAS] = bias**2
+        self._p[:, _VELOCITY, _VELOCITY] = noise.first_speed**2
+        self._bias = bias
         self._standing = np.zeros(feet, dtype=bool)
 
     @property
@@ -57,7 +85,7 @@ class RootFilter:
         """(6, 6) of [position, velocity]: m², m²/s, m²/s²."""
         covariance = np.zeros((2, 3, 2, 3))
         axes = np.arange(3)
-        covariance[:, axes, :, axes] = self._p[:, :_FEET, :_FEET]
+        covariance[:, axes, :, axes] = self._p[:, :_BIAS, :_BIAS]
         return covariance.reshape(6, 6)
 
     @property
@@ -70,36 +98,43 @@ class RootFilter:
         """(feet,) which feet stand."""
         return self._standing.copy()
 
-    def predict(self, dt: float, acceleration: float, drift: ArrayLike, slip: float) -> None:
-        """Move on by ``dt`` seconds.
+    def predict(self, dt: float, drift: ArrayLike) -> None:
+        """Move on by ``dt`` seconds, above 0.
 
         Args:
-            dt: seconds, above 0.
-            acceleration: density of the white-noise acceleration, m/s² over √Hz.
-            drift: density of a random walk of the position, (3,) or a number, m over √s: what is left when velocity
-                measurements whose errors last are taken for independent ones.
-            slip: density of the random walk of a standing foot, m over √s.
+            dt: seconds.
+            drift: density of a random walk of the position, (3,) or a number, metres over √s: what is left when
+                velocity measurements whose errors last are taken for independent ones.
         """
-        x, p = self._x, self._p
+        x, p, noise = self._x, self._p, self._noise
         x[_POSITION] += dt * x[_VELOCITY]
         p[:, _POSITION] += dt * p[:, _VELOCITY]
         p[:, :, _POSITION] += dt * p[:, :, _VELOCITY]
-        q = acceleration**2
+        q = noise.acceleration**2
         p[:, _POSITION, _POSITION] += q * dt**3 / 3 + np.square(drift) * dt
         p[:, _POSITION, _VELOCITY] += q * dt**2 / 2
         p[:, _VELOCITY, _POSITION] += q * dt**2 / 2
         p[:, _VELOCITY, _VELOCITY] += q * dt
+        kept = math.exp(-dt / noise.memory_s)
+        x[_BIAS] *= kept
+        p[:, _BIAS] *= kept
+        p[:, :, _BIAS] *= kept
+        p[:, _BIAS, _BIAS] += (1.0 - kept**2) * self._bias**2
         feet = np.flatnonzero(self._standing) + _FEET
-        p[:, feet, feet] += slip**2 * dt
+        p[:, feet, feet] += noise.slip**2 * dt
 
-    def observe_position(self, position: Floats, sigma: ArrayLike) -> None:
-        """Take a measured root position (3,) in metres with its standard deviation, (3,) or a number.
+    def observe_position(self, position: Floats, jitter: float, bias: float) -> None:
+        """Take a root position (3,) in metres as the sensor sees it.
 
-        Infinite where an axis is not measured.
+        Args:
+            position: with both errors of the sensor.
+            jitter: metres, the standard deviation of its error from frame to frame.
+            bias: metres, that of its slow error from now on.
         """
+        self._bias = bias
         row = np.zeros(len(self._x))
-        row[_POSITION] = 1.0
-        self._correct(row, position, sigma)
+        row[_POSITION] = row[_BIAS] = 1.0
+        self._correct(row, position, jitter)
 
     def observe_velocity(self, velocity: Floats, sigma: ArrayLike) -> None:
         """Take a measured root velocity (3,) in m/s with its standard deviation, (3,) or a number."""

@@ -13,7 +13,7 @@ from msgs.types import CleanBody, JointState, Tracking, WorldBody
 from prior.ground import Ground
 from prior.kinematics import CONTACT_JOINTS, heading, yaw_matrix
 from prior.skeletons import PARENTS, REST_OFFSETS, J
-from prior.trajectory_filter import RootFilter
+from prior.trajectory_filter import RootFilter, RootNoise
 from prior.trajectory_net import FRAME_S
 
 Floats = NDArray[np.float64]
@@ -30,11 +30,11 @@ SOLE_SIGMA = 0.02
 CONTACT_ON, CONTACT_OFF = 0.7, 0.4
 """Probabilities at which a foot comes to stand, and stands no more."""
 
-FOOT_SLIP = 0.02
-"""Metres over √s that a standing foot rolls and slips, and that the error of its place relative to the root moves."""
+UNSEEN_SIGMA = 1.0
+"""Metres, the standard deviation of a first root that rests on nothing seen."""
 
-FRESH_SHARE = 0.3
-"""Of a joint's error that is new in each frame: the rest lasts, and moves as `FOOT_SLIP` says."""
+JITTER_SHARE = 0.3
+"""Of a joint's standard deviation, the error that is new in each frame; the rest lasts."""
 
 FOOT_SURPRISE = 4.0
 """Standard deviations from its place at which a standing foot has evidently moved: it stands anew."""
@@ -42,8 +42,8 @@ FOOT_SURPRISE = 4.0
 LEAST_SIGMA = 0.005
 """Metres: no joint is taken to be known better, whatever the message says."""
 
-TORSO_SIGMA = 0.05
-"""Metres, added to a hidden root's standard deviation where the torso is seen: the prior placed one from the other."""
+HUNG_SIGMA = 0.05
+"""Metres, added to a hidden root's standard deviation where other joints are seen: the prior hung it from them."""
 
 IMPUTED_LEGS_SPEED = 0.5
 """m/s, added to the velocity's standard deviation as the legs that it is read from are themselves inferred."""
@@ -58,12 +58,8 @@ comes back into sight is believed at once. Both start the filter anew."""
 LONGEST_GAP_S = 0.3
 """Seconds without a message over which the motion between is drawn straight, and feet may go on standing."""
 
-FIRST_SPEED = 1.0
-"""m/s, the standard deviation of the velocity of a body just seen first."""
-
 _FOOT_CONTACTS = [CONTACT_JOINTS.index(joint) for joint in FEET]
 _PELVIS = [J[name] for name in ("pelvis", "left_hip", "right_hip")]
-_TORSO = [J[name] for name in ("spine1", "spine2", "spine3", "neck", "left_shoulder", "right_shoulder")]
 _LEGS = [J[f"{side}_{part}"] for part in ("knee", "ankle", "foot") for side in ("left", "right")]
 
 
@@ -86,7 +82,7 @@ class Sighting:
         positions: (22, 3) metres, world; NaN where there is none.
         orientation: (4,) xyzw of the root in the world, or None if it is not a rotation.
         seen: (22,) whether the sensor saw the joint.
-        sigma: (22,) metres, made finite and positive.
+        sigma: (22,) metres, at least `LEAST_SIGMA`; infinite where the message has no number.
     """
 
     body: CleanBody
@@ -103,13 +99,13 @@ class Sighting:
         known &= ~(np.linalg.norm(positions - positions[0], axis=1) > REACH_M)
         positions[~known] = np.nan
         orientation = rotation(body.rotations[0])
-        sigma = np.nan_to_num(body.sigma.astype(np.float64), nan=math.inf, posinf=math.inf)
+        sigma = np.where(body.sigma >= 0.0, body.sigma.astype(np.float64), math.inf)
         return cls(
             body=body,
             positions=positions,
             orientation=None if orientation is None else (sensor * orientation).as_quat(),
             seen=known & ((body.state == JointState.SEEN) | (body.state == JointState.REFINED)),
-            sigma=np.clip(sigma, LEAST_SIGMA, 10.0),
+            sigma=np.maximum(sigma, LEAST_SIGMA),
         )
 
     @property
@@ -119,15 +115,15 @@ class Sighting:
 
     @property
     def root_sigma(self) -> float:
-        """Metres, the standard deviation of `root`; infinite where the message's own guess is all there is."""
-        if self.root_seen:
-            return float(self.sigma[0])
-        return math.hypot(self.sigma[0], TORSO_SIGMA) if self.seen[_TORSO].any() else math.inf
+        """Metres, the standard deviation of `root`; infinite if nothing was seen that tells where it is."""
+        if self.root is None or not self.seen.any():
+            return math.inf
+        return float(self.sigma[0]) if self.seen[_PELVIS].any() else math.hypot(self.sigma[0], HUNG_SIGMA)
 
     @property
     def root_seen(self) -> bool:
-        """Whether the root, or a hip that it hangs by, was seen."""
-        return self.root is not None and bool(self.seen[_PELVIS].any())
+        """Whether the place of `root` rests on observation."""
+        return math.isfinite(self.root_sigma)
 
 
 @dataclass(frozen=True)
@@ -154,23 +150,25 @@ class BodyTrack:
         sighting: the first, with a root.
         stamp_ns: of that.
         context: frames of motion to remember.
+        noise: of the root.
     """
 
-    def __init__(self, sighting: Sighting, stamp_ns: int, context: int) -> None:
+    def __init__(self, sighting: Sighting, stamp_ns: int, context: int, noise: RootNoise) -> None:
         assert sighting.root is not None
         self.stamp_ns = stamp_ns
         self._orientation = np.array([0.0, 0.0, 0.0, 1.0]) if sighting.orientation is None else sighting.orientation
         self._window = np.repeat((_REST_POSE @ yaw_matrix(self.yaw).T)[None], context, axis=0)
         self._window[:] = self._local(sighting)
         self._window_ns = stamp_ns
+        self._noise = noise
         self._filter = self._start(sighting, np.zeros(3))
         self._dt = 0.0
         self._jumps = 0
         self._root_seen = sighting.root_seen
 
     def _start(self, sighting: Sighting, velocity: Floats) -> RootFilter:
-        sigma = sighting.root_sigma if math.isfinite(sighting.root_sigma) else sighting.sigma[0]
-        return RootFilter(sighting.positions[0], sigma, velocity, FIRST_SPEED, len(FEET))
+        sigma = min(sighting.root_sigma, UNSEEN_SIGMA)
+        return RootFilter(self._noise, sighting.positions[0], *_split(sigma), velocity, len(FEET))
 
     def _local(self, sighting: Sighting) -> Floats:
         """(22, 3) metres from the root, world axes; a joint without a position stays where it last was."""
@@ -204,16 +202,13 @@ class BodyTrack:
         if steps:
             self._window_ns = stamp_ns
 
-    def fuse(
-        self, sighting: Sighting, motion: Motion, ground: Ground, acceleration: float, network: bool, hold: bool
-    ) -> None:
+    def fuse(self, sighting: Sighting, motion: Motion, ground: Ground, network: bool, hold: bool) -> None:
         """Move on to the newest message and weigh what it tells.
 
         Args:
             sighting: the message's.
             motion: what the network says of it.
             ground: is asked, and told.
-            acceleration: m/s² over √Hz, how quickly the root may change its velocity.
             network: whether to use the velocity of ``motion``.
             hold: whether feet in contact hold the root.
         """
@@ -224,7 +219,7 @@ class BodyTrack:
         standing = filter_.standing
         if self._dt > 0.0:
             drifts = network and not standing.any()
-            filter_.predict(self._dt, acceleration, motion.drift if drifts else 0.0, FOOT_SLIP)
+            filter_.predict(self._dt, motion.drift if drifts else 0.0)
         if network:
             filter_.observe_velocity(motion.velocity, np.hypot(motion.sigma, inferred * IMPUTED_LEGS_SPEED))
         self._observe_root(sighting)
@@ -232,10 +227,8 @@ class BodyTrack:
             if contacts[k] < (CONTACT_OFF if standing[k] else CONTACT_ON):
                 filter_.lift(k)
                 continue
-            from_root, sigma = (
-                sighting.positions[joint] - sighting.positions[0],
-                FRESH_SHARE * float(sighting.sigma[joint]),
-            )
+            from_root = sighting.positions[joint] - sighting.positions[0]
+            sigma, _ = _split(float(sighting.sigma[joint]))
             if standing[k] and filter_.foot_surprise(k, from_root, sigma) < FOOT_SURPRISE:
                 filter_.observe_foot(k, from_root, sigma)
             else:
@@ -243,15 +236,15 @@ class BodyTrack:
         self._meet_ground(sighting, ground)
 
     def _observe_root(self, sighting: Sighting) -> None:
-        sigma = sighting.root_sigma
         came_back, self._root_seen = sighting.root_seen and not self._root_seen, sighting.root_seen
-        if sighting.root is None or not math.isfinite(sigma):
+        if sighting.root is None or not sighting.root_seen:
             return
+        sigma = sighting.root_sigma
         off = np.abs(sighting.root - self._filter.position)
         likely = JUMP_SIGMAS * np.hypot(self._filter.position_sigma, sigma)
         self._jumps = self._jumps + 1 if np.any(off > np.maximum(likely, JUMP_M)) else 0
         if not self._jumps:
-            self._filter.observe_position(sighting.root, sigma)
+            self._filter.observe_position(sighting.root, *_split(sigma))
         elif came_back or self._jumps == JUMP_FRAMES:
             self._filter = self._start(sighting, self._filter.velocity if came_back else np.zeros(3))
             self._jumps = 0
@@ -292,6 +285,11 @@ class BodyTrack:
             contacts=contacts.astype(np.float32),
             tracking=tracking,
         )
+
+
+def _split(sigma: float) -> tuple[float, float]:
+    """The standard deviations of the jitter and of the slow error that make up ``sigma``."""
+    return JITTER_SHARE * sigma, math.sqrt(1.0 - JITTER_SHARE**2) * sigma
 
 
 def rotation(quaternion: NDArray[np.floating]) -> Rotation | None:

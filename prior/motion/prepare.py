@@ -22,7 +22,7 @@ FPS = 30.0
 """Frames a second of everything that is trained on."""
 
 CUTOFF = 12.0
-"""Hz. What is faster cannot be told apart at 30 Hz and is taken out before frames are."""
+"""Hz. 30 frames a second show motion up to 15 Hz; what is faster would come out as slower, and is taken out first."""
 
 MAX_GAP = 0.2
 """Seconds. A joint lost for no longer is interpolated; for longer, the recording is cut there."""
@@ -31,17 +31,18 @@ MIN_SECONDS = 1.0
 """Shorter recordings are dropped, as in HuMoR."""
 
 MAX_BONE_CHANGE = 0.10
-"""Metres that a bone may differ from its median in the recording. Skin markers move by 2 cm over soft tissue, a
-shoulder by 5 cm about the chest; a marker mistaken for another does by more."""
+"""Metres that a bone may differ from its median in the recording. Bones found from skin markers vary by 1 to 3 cm
+(standard deviation); a marker mistaken for another changes them by more than this."""
 
-MAX_SPEED = 15.0
-"""m/s. A thrown punch reaches 10, a hand that throws a ball 20 for a few milliseconds, which 30 Hz does not show."""
+MAX_ACCELERATION = 200.0
+"""m/s², second difference at 30 Hz. The hardest real motion of these recordings, a kicking foot, reaches 195; a joint
+that jumps to another place and back by 15 cm reaches 270."""
 
 TOE_HEIGHT = 0.015
 """Metres above the floor at which the forefoot's joint rests."""
 
 RAISED = 0.12
-"""Metres above the floor at which a toe that stands still stands on something else, or on its tip no longer."""
+"""Metres above the floor from which a lower toe that stands still must be standing on something else."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,14 @@ class Prepared:
 
 
 def prepare_clip(clip: Clip, weights: WeightSet, split: Split) -> Iterator[Prepared | Dropped]:
-    """Resample, find the floor, check and label a recording; yields its good parts and what was dropped, and why."""
+    """Resample, find the floor, check and label a recording.
+
+    Yields its good parts, and what is left out and why. A recording is cut where joints are lost or do what no body
+    does; a part of one is named by the second it begins at.
+    """
     clip = clip.canonical()
-    if len(clip.positions) == 0:
-        yield Dropped(clip.name, clip.source, f"shorter than {MIN_SECONDS:.0f} s", "no frames")
+    if clip.seconds < MIN_SECONDS:
+        yield _too_short(clip.name, clip.source, clip.seconds)
         return
     filled = fill_gaps(clip.positions, clip.fps)
     complete = np.asarray(finite_joints(filled).all(axis=1))
@@ -79,30 +84,42 @@ def prepare_clip(clip: Clip, weights: WeightSet, split: Split) -> Iterator[Prepa
         lost = [JOINTS[j] for j in np.flatnonzero(~finite_joints(filled).all(axis=0))]
         cause = f"{(~complete).sum() / clip.fps:.2f} s of {clip.seconds:.2f} s lack {', '.join(lost)}"
         yield Dropped(clip.name, clip.source, f"cut: joints lost for more than {MAX_GAP} s or at an end", cause)
-    parts = list(_runs(complete))
-    for number, (start, stop) in enumerate(parts):
-        name = clip.name if len(parts) == 1 else f"{clip.name}#{number}"
-        part = replace(clip, name=name, positions=filled[start:stop])
-        if part.seconds < MIN_SECONDS:
-            yield Dropped(name, clip.source, f"shorter than {MIN_SECONDS:.0f} s", f"{part.seconds:.2f} s long")
+    for start, stop in _runs(complete):
+        seconds = (stop - start) / clip.fps
+        if seconds < MIN_SECONDS:
+            yield _too_short(f"{clip.name}@{start / clip.fps:.1f}s", clip.source, seconds)
             continue
-        positions = resample(part.positions, part.fps)
+        positions = resample(filled[start:stop], clip.fps)
         positions[..., 2] -= floor_height(positions)
-        fault = find_fault(positions)
+        bad, fault = find_faults(positions)
         if fault:
-            yield Dropped(name, clip.source, "impossible motion", fault)
-            continue
-        offsets = estimate_offsets(positions)
-        rotations = Rotation.from_matrix(solve_rotations(positions, offsets).reshape(-1, 3, 3)).as_quat()
-        yield Prepared(
-            clip=replace(part, fps=FPS, positions=positions),
-            weights=weights,
-            split=split,
-            offsets=offsets,
-            rotations=rotations.reshape(*positions.shape[:2], 4),
-            contacts=label_contacts(positions, FPS),
-            flat=stays_on_floor(positions),
-        )
+            yield Dropped(clip.name, clip.source, "cut: impossible motion", fault)
+        for first, last in _runs(~bad):
+            whole = complete.all() and not fault
+            name = clip.name if whole else f"{clip.name}@{start / clip.fps + first / FPS:.1f}s"
+            if (last - first) / FPS < MIN_SECONDS:
+                yield _too_short(name, clip.source, (last - first) / FPS)
+            else:
+                part = replace(clip, name=name, fps=FPS, positions=positions[first:last])
+                yield _label(part, weights, split)
+
+
+def _too_short(name: str, source: str, seconds: float) -> Dropped:
+    return Dropped(name, source, f"shorter than {MIN_SECONDS:.0f} s", f"{seconds:.2f} s long")
+
+
+def _label(clip: Clip, weights: WeightSet, split: Split) -> Prepared:
+    offsets = estimate_offsets(clip.positions)
+    rotations = Rotation.from_matrix(solve_rotations(clip.positions, offsets).reshape(-1, 3, 3)).as_quat()
+    return Prepared(
+        clip=clip,
+        weights=weights,
+        split=split,
+        offsets=offsets,
+        rotations=rotations.reshape(*clip.positions.shape[:2], 4),
+        contacts=label_contacts(clip.positions, FPS),
+        flat=stays_on_floor(clip.positions),
+    )
 
 
 def fill_gaps(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
@@ -175,19 +192,28 @@ def _toes(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     return toes, np.linalg.norm(np.gradient(toes, 1 / FPS, axis=0), axis=-1)
 
 
-def find_fault(positions: NDArray[np.float64]) -> str | None:
-    """What is impossible about (T, 22, 3) positions at 30 Hz, in words; None if nothing is."""
+def find_faults(positions: NDArray[np.float64]) -> tuple[NDArray[np.bool_], str]:
+    """Frames (T,) of (T, 22, 3) positions at 30 Hz in which a body does what none can, and the worst of it in words.
+
+    The words are empty where there is nothing.
+    """
+    bad = np.zeros(len(positions), dtype=bool)
+    words: list[str] = []
     bones = np.linalg.norm(positions[:, 1:] - positions[:, list(PARENTS[1:])], axis=-1)
     change = np.abs(bones - np.median(bones, axis=0))
-    frame, bone = np.unravel_index(change.argmax(), change.shape)
-    if change[frame, bone] > MAX_BONE_CHANGE:
+    if change.max() > MAX_BONE_CHANGE:
+        frame, bone = np.unravel_index(change.argmax(), change.shape)
         off = f"{change[frame, bone] * 100:.0f} cm off its length at {frame / FPS:.1f} s"
-        return f"the bone to {JOINTS[bone + 1]} is {off}"
-    speed = np.linalg.norm(np.diff(positions, axis=0), axis=-1) * FPS
-    frame, joint = np.unravel_index(speed.argmax(), speed.shape)
-    if speed[frame, joint] > MAX_SPEED:
-        return f"{JOINTS[joint]} moves at {speed[frame, joint]:.0f} m/s at {frame / FPS:.1f} s"
-    return None
+        words.append(f"the bone to {JOINTS[bone + 1]} is {off}")
+        bad |= (change > MAX_BONE_CHANGE).any(axis=1)
+    acceleration = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=-1) * FPS**2
+    if acceleration.max() > MAX_ACCELERATION:
+        frame, joint = np.unravel_index(acceleration.argmax(), acceleration.shape)
+        words.append(f"{JOINTS[joint]} accelerates by {acceleration[frame, joint]:.0f} m/s² at {frame / FPS:.1f} s")
+        jerked = (acceleration > MAX_ACCELERATION).any(axis=1)
+        for shift in range(3):
+            bad[shift : shift + len(jerked)] |= jerked
+    return bad, "; ".join(words)
 
 
 def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:

@@ -144,7 +144,7 @@ class Statistics:
     """What is matched, each belonging to one parameter; S joints seen."""
 
     fast: Floats  # (S, 3) median |second difference|
-    fast_slope: float  # of log fast error on log speed
+    fast_slope: Floats  # (S,) of log fast error on log speed
     fast_spread_still: float  # standard deviation of log fast error about that line, below 0.1 m/s
     fast_spread_moving: float  # the same above 0.4 m/s
     fast_lag1: float  # autocorrelation of the clipped second difference
@@ -199,10 +199,10 @@ def statistics(clips: Sequence[Clip]) -> Statistics:
             sizes.append(size[t, j])
             ahead = np.linalg.norm(e[t + 2 : t + 5, j] - e[t, j], axis=-1)
             back.append(bool((ahead < 0.4 * size[t, j]).any()))
-    speeds, y = np.concatenate(log_speed), np.concatenate(log_size)
+    speeds, y = np.stack(log_speed), np.stack(log_size)
     y = y - y.mean(axis=0)
     x = speeds - speeds.mean(axis=0)
-    slope = float((x.ravel() @ y.ravel()) / (x.ravel() @ x.ravel()))
+    slope = _alike((x * y).sum(axis=0) / (x * x).sum(axis=0))
     c = np.concatenate(change)
     length = np.linalg.norm(np.concatenate(whole), axis=-1)
     common = np.concatenate(shared)
@@ -245,7 +245,7 @@ def _initial(real: Statistics) -> NoiseModel:
         fast=np.full((n, 3), 0.002),
         fast_memory=0.015,
         speed_floor=_SPEED_FLOOR,
-        speed_exponent=0.7,
+        speed_exponent=np.full(n, 0.7),
         fast_spread_still=1.2,
         fast_spread_moving=0.6,
         fast_spread_memory=0.5,
@@ -274,6 +274,8 @@ def _improved(model: NoiseModel, real: Statistics, simulated: Statistics) -> Noi
     # Offset and bias make up the error together; how it changes with travel says how they share it.
     both = seen(np.hypot(model.offset, model.bias), ratio(real.total, simulated.total))
     share = seen(model.bias / np.hypot(model.offset, model.bias), ratio(real.bias, simulated.bias)).clip(0.1, 0.95)
+    exponent = model.speed_exponent.copy()
+    exponent[SEEN] += 0.7 * (real.fast_slope - simulated.fast_slope)
     return replace(
         model,
         offset=both * np.sqrt(1 - share**2),
@@ -283,7 +285,7 @@ def _improved(model: NoiseModel, real: Statistics, simulated: Statistics) -> Noi
         session_spread=float(model.session_spread * ratio(np.log(real.total_tail), np.log(simulated.total_tail))),
         fast=seen(model.fast, ratio(real.fast, simulated.fast)),
         fast_memory=float(np.clip(model.fast_memory * np.exp(2 * (real.fast_lag1 - simulated.fast_lag1)), 0.003, 0.1)),
-        speed_exponent=float(np.clip(model.speed_exponent + 0.7 * (real.fast_slope - simulated.fast_slope), 0.0, 1.5)),
+        speed_exponent=_fill(np.clip(exponent, 0.0, 1.5)),
         fast_spread_still=float(model.fast_spread_still * ratio(real.fast_spread_still, simulated.fast_spread_still)),
         fast_spread_moving=float(
             model.fast_spread_moving * ratio(real.fast_spread_moving, simulated.fast_spread_moving)

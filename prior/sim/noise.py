@@ -66,7 +66,7 @@ class NoiseModel:
         fast: (22, 3) metres, standard deviation of the fast noise at 0.3 m/s (median over its spread).
         fast_memory: seconds, correlation time of the fast noise.
         speed_floor: m/s below which speed no longer matters.
-        speed_exponent: the fast noise goes with (speed_floor + speed) to this power.
+        speed_exponent: (22,) the fast noise goes with (speed_floor + speed) to this power.
         fast_spread_still: standard deviation of the log of the fast noise's size, of a joint at rest.
         fast_spread_moving: the same well above `SPREAD_SPEED`.
         fast_spread_memory: seconds, correlation time of that size.
@@ -87,7 +87,7 @@ class NoiseModel:
     fast: Floats
     fast_memory: float
     speed_floor: float
-    speed_exponent: float
+    speed_exponent: Floats
     fast_spread_still: float
     fast_spread_moving: float
     fast_spread_memory: float
@@ -163,7 +163,7 @@ def draw_errors(travel: Floats, dt: Floats, rng: np.random.Generator, model: Noi
     bias = size * model.bias * _recursion(follow, wander, 1 - follow)
 
     speed = np.minimum(travel[..., None] / time, FASTEST)
-    ease = ((model.speed_floor + speed) / (model.speed_floor + 0.3)) ** model.speed_exponent
+    ease = ((model.speed_floor + speed) / (model.speed_floor + 0.3)) ** model.speed_exponent[:, None]
     swing = _recursion(np.exp(-time / model.fast_spread_memory), _with_shared(rng, joint, 0.5))
     moving = speed / (speed + SPREAD_SPEED)
     spread = model.fast_spread_still + (model.fast_spread_moving - model.fast_spread_still) * moving

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.kinect_vicon import SCORED, Clip, learn_offset, run_filter, score
+from benchmarks.kinect_vicon import SCORED, Clip, align, learn_offset, run_filter, score
 from prior.filters import FixedLagRTS, OneEuroFilter
 
 REST = np.array(
@@ -33,10 +33,11 @@ def clip(seed: int, frames: int) -> Clip:
 
 def test_a_constant_offset_in_the_body_is_learned_on_one_subject_and_taken_from_another() -> None:
     train, validation = [clip(s, 40) for s in range(4)], [clip(s, 40) for s in range(10, 14)]
-    offset = learn_offset([c.centres for c in train], [c.raw for c in train])
-    truths, raws = [c.centres for c in validation], [c.raw for c in validation]
-    without = score(truths, raws, np.zeros_like(offset))
-    corrected = score(truths, raws, offset)
+    known, asked = [c.centres for c in train], [c.centres for c in validation]
+    offset = learn_offset(known, align(known, [c.raw for c in train]))
+    aligned = align(asked, [c.raw for c in validation])
+    without = score(asked, aligned, np.zeros_like(offset))
+    corrected = score(asked, aligned, offset)
     assert without.position.mean() > 0.03
     # The trunk's frame is that of the joints as seen, which an offset tilts a little.
     assert corrected.position.mean() < 0.2 * without.position.mean()
@@ -47,7 +48,8 @@ def test_scores_do_not_depend_on_where_the_sensor_stands() -> None:
     here = clip(1, 30)
     offset = np.random.default_rng(2).normal(0, 0.02, OFFSET.shape)
     turn = Rotation.random(rng=np.random.default_rng(9)).as_matrix()
-    a, b = (score([here.centres], [seen], offset) for seen in (here.raw, here.raw @ turn.T + 2.0))
+    truths = [here.centres]
+    a, b = (score(truths, align(truths, [seen]), offset) for seen in (here.raw, here.raw @ turn.T + 2.0))
     np.testing.assert_allclose(a.position, b.position, atol=1e-12)
     np.testing.assert_allclose(a.acceleration, b.acceleration, atol=1e-12)
     np.testing.assert_allclose(a.variation, b.variation, atol=1e-12)
@@ -57,7 +59,7 @@ def test_lost_markers_are_left_out() -> None:
     here = clip(3, 30)
     truth = here.centres.copy()
     truth[5:9, 3] = np.nan
-    result = score([truth], [here.raw], OFFSET)
+    result = score([truth], align([truth], [here.raw]), OFFSET)
     assert np.isfinite([result.position[0], result.acceleration[0], *result.joints]).all()
 
 

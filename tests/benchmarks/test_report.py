@@ -13,9 +13,9 @@ TEXT = "# Title\n<!-- results:speed -->\nold\n<!-- /results -->\ntail\n"
 
 
 def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tmp_path: Path) -> None:
-    save("latency", ["--quick", str(tmp_path / "input")], [TABLE], {"rows": [1]}, tmp_path)
+    save("latency", ["--quick", str(tmp_path / "input")], [TABLE], {"rows": [1, {"none": float("nan")}]}, tmp_path)
     results = load(tmp_path)
-    assert results["latency"]["rows"] == [1]
+    assert results["latency"]["rows"] == [1, {"none": None}]
     assert str(tmp_path) not in (tmp_path / "latency.json").read_text()
 
     readme = tmp_path / "README.md"

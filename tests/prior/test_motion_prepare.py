@@ -23,7 +23,7 @@ from prior.motion.prepare import (
     TOE_HEIGHT,
     Prepared,
     fill_gaps,
-    find_fault,
+    find_faults,
     floor_height,
     prepare_clip,
     resample,
@@ -114,15 +114,35 @@ def test_standing_on_something_is_not_staying_on_the_floor() -> None:
     assert stays_on_floor(body)
 
 
-def test_faults_are_named() -> None:
+def test_faults_are_found_where_they_are_and_named() -> None:
     body = standing(60)
-    assert find_fault(body) is None
+    bad, words = find_faults(body)
+    assert not bad.any()
+    assert words == ""
     stretched = body.copy()
-    stretched[10, J["left_wrist"], 1] += 0.2
-    assert "bone to left_wrist is 20 cm off its length at 0.3 s" in str(find_fault(stretched))
+    stretched[10:13, J["left_wrist"], 1] += 0.15 * np.array([1, 1.1, 1])
+    bad, words = find_faults(stretched)
+    assert "bone to left_wrist is 16 cm off its length at 0.4 s" in words
+    assert set(range(10, 13)) <= set(np.flatnonzero(bad)) <= set(range(8, 15))
     thrown = body.copy()
     thrown[30:] += [2.0, 0, 0]
-    assert "60 m/s" in str(find_fault(thrown))
+    bad, words = find_faults(thrown)
+    assert "accelerates by 1800 m/s²" in words
+    np.testing.assert_array_equal(np.flatnonzero(bad), [28, 29, 30, 31])
+
+
+def test_a_recording_is_cut_where_a_body_does_what_none_can() -> None:
+    positions = standing(150)
+    positions[60, J["head"], 0] += 0.5
+    positions[80:, J["head"], 0] += 1e-4  # no fault
+    cut, first, second = prepare_clip(a_clip(positions), "default", "train")
+    assert isinstance(cut, Dropped)
+    assert cut.kind == "cut: impossible motion"
+    assert isinstance(first, Prepared)
+    assert isinstance(second, Prepared)
+    assert (first.clip.name, second.clip.name) == ("clip@0.0s", "clip@2.1s")
+    assert (len(first.clip.positions), len(second.clip.positions)) == (58, 87)
+    assert find_faults(first.clip.positions)[1] == find_faults(second.clip.positions)[1] == ""
 
 
 def test_a_recording_with_a_long_gap_is_cut_there_and_says_so() -> None:
@@ -135,7 +155,7 @@ def test_a_recording_with_a_long_gap_is_cut_there_and_says_so() -> None:
     assert cut.cause == "0.50 s of 5.00 s lack left_wrist"
     assert isinstance(first, Prepared)
     assert isinstance(second, Prepared)
-    assert (first.clip.name, second.clip.name) == ("clip#0", "clip#1")
+    assert (first.clip.name, second.clip.name) == ("clip@0.0s", "clip@2.5s")
     assert (len(first.clip.positions), len(second.clip.positions)) == (60, 75)
     assert second.split == "val"
     # Standing: on the floor, feet in contact, rotations that lead back to the positions.

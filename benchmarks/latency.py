@@ -1,0 +1,309 @@
+"""What it costs: compute a frame, from capture to ``pose/world``, frames dropped, and memory over an hour of stream.
+
+The input is a recorded stream, set to exactly 30 Hz and played to and fro so that nobody jumps; a crowd is copies of
+its body, side by side. Compute is measured in this process, pinned to one core, one thread. The rest is measured on
+the node processes themselves, from outside: a subscriber here notes when each message arrives.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from numpy.typing import ArrayLike
+from rich.console import Console
+from rich.progress import Progress
+
+from benchmarks.machine import ROOT
+from benchmarks.results import RESULTS, Table, save, show
+from msgs.recording import RecordingReader, RecordingWriter
+from msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
+from msgs.transport import Subscriber
+from msgs.types import Diagnostics, Message, PoseRaw, RawBody
+from nodes.launch import POSE_NODES, Launch
+from nodes.runtime import FRAME_NS, SystemClock, Timeline
+from nodes.supervisor import Supervisor
+from prior.pipeline import PriorPipeline, PriorSettings
+from prior.trajectory import TrajectoryPipeline, TrajectorySettings
+
+CROWDS = (1, 4, 8)
+LIVE_CROWDS = (1, 4)
+SPACING = 0.8
+"""metres between the copies of a body"""
+WARM_UP = 60
+"""frames before times count: the first ones load code, and fill the window"""
+START_S = 60.0
+"""what the nodes get to come up"""
+SILENCE_S = 30.0
+"""no message for so long is a node that hangs"""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Compute, latency, drops and memory of the nodes, on this machine."""
+
+    recording: Path = ROOT / "sim_data" / "walk_turn"
+    """whose first body is played"""
+    seconds: float = 60.0
+    """of stream for each measurement of compute and latency"""
+    stream_hours: float = 1.0
+    """of stream for the measurement of memory"""
+    quick: bool = False
+    """10 s and 0.05 h, to see that it works; nothing is written unless --out says where"""
+    out: Path | None = None
+    """folder for the JSON file; benchmarks/results unless --quick"""
+
+
+def crowd(frames: list[PoseRaw], bodies: int) -> Iterator[PoseRaw]:
+    """An endless stream at exactly 30 Hz of copies of a recording's first body, side by side."""
+    seen = [frame for frame in frames if frame.bodies]
+    if len(seen) < 2:
+        raise ValueError(f"expected a recording with at least 2 frames that show a body, got {len(seen)}")
+    beside = np.linspace(-0.5, 0.5, bodies) * SPACING * (bodies - 1)
+    for index, frame in enumerate(cycle([*seen, *seen[-2:0:-1]])):
+        body = frame.bodies[0]
+        copies = [RawBody(i, body.positions + np.array([x, 0, 0]), body.confidence) for i, x in enumerate(beside)]
+        yield dataclasses.replace(frame, stamp_ns=seen[0].stamp_ns + round(index * FRAME_NS), bodies=copies)
+
+
+def compute(frames: list[PoseRaw], bodies: int, count: int, track: Callable[..., Iterator[int]]) -> dict[str, Any]:
+    """Milliseconds a frame of the prior, and of the trajectory on its answer: wall time and processor time."""
+    prior, trajectory = PriorPipeline(PriorSettings()), TrajectoryPipeline(TrajectorySettings())
+    spent: dict[str, list[tuple[float, float]]] = {"prior": [], "trajectory": []}
+    stream = crowd(frames, bodies)
+    with _one_core():
+        for index in track(range(count + WARM_UP), description=f"compute, {bodies} bodies"):
+            raw = next(stream)
+            times = [_now()]
+            cleaned = prior.process(raw)
+            times.append(_now())
+            for clean in cleaned:
+                trajectory.process(clean)
+            times.append(_now())
+            if index >= WARM_UP:
+                for name, start, end in zip(spent, times, times[1:], strict=False):
+                    spent[name].append((end[0] - start[0], end[1] - start[1]))
+    refused = prior.counters + trajectory.counters
+    return {
+        "bodies": bodies,
+        "frames": count,
+        "refused": dict(refused),
+        **{
+            f"{name}_{clock}_ms": percentiles(np.array(samples)[:, column] * 1e3)
+            for name, samples in spent.items()
+            for column, clock in enumerate(("wall", "cpu"))
+        },
+    }
+
+
+def live(recording: Path, warm_up_s: float, seconds: float, progress: Progress, title: str) -> dict[str, Any]:
+    """Milliseconds from capture to arrival of ``pose/world``, less the delay, in nodes that drop what is late."""
+    delay_ns = PriorSettings().delay * FRAME_NS
+    timeline: Timeline | None = None
+    late_ms: list[float] = []
+    news: dict[str, Diagnostics] = {}
+    sent_from = -1
+    bar = progress.add_task(title, total=seconds)
+    with running(recording, lossless=False) as (messages, clock):
+        for topic, message in messages:
+            now = clock.now_ns()
+            if isinstance(message, Diagnostics):
+                news[message.node] = message
+                if message.node == "pose_input":
+                    timeline = Timeline.from_values(message.values) or timeline
+            elif topic == POSE_WORLD and timeline and message.stamp_ns > timeline.stamp_ns + warm_up_s * 1e9:
+                sent_from = message.stamp_ns if sent_from < 0 else sent_from
+                late_ms.append((now - timeline.wall(message.stamp_ns) - delay_ns) / 1e6)
+                progress.update(bar, completed=(message.stamp_ns - sent_from) / 1e9)
+                if message.stamp_ns - sent_from >= seconds * 1e9:
+                    expected = round((message.stamp_ns - sent_from) / FRAME_NS) + 1
+                    break
+        else:
+            raise RuntimeError(f"{title}: expected pose/world for {seconds:g} s, got {len(late_ms)} messages")
+    dropped: Counter[str] = Counter()
+    for node, latest in news.items():
+        dropped.update(
+            {f"{node} {k}": int(n) for k, n in latest.values.items() if k.startswith(("dropped.", "refused."))}
+        )
+    return {
+        "seconds": seconds,
+        "expected": expected,
+        "arrived": len(late_ms),
+        "counted": dict(dropped),
+        "latency_ms": percentiles(late_ms),
+    }
+
+
+def memory(recording: Path, hours: float, progress: Progress) -> dict[str, Any]:
+    """Resident memory of each node while a stream is replayed, again and again, as fast as the nodes take it."""
+    samples: dict[str, list[tuple[float, float]]] = {name: [] for name in POSE_NODES}
+    first_ns: int | None = None
+    bar = progress.add_task(f"memory over {hours:g} h of stream", total=hours)
+    with running(recording, lossless=True, rate=0, loop=True) as (messages, _):
+        for _, message in messages:
+            if not isinstance(message, Diagnostics) or message.stamp_ns == 0:
+                continue
+            first_ns = message.stamp_ns if first_ns is None else first_ns
+            age = (message.stamp_ns - first_ns) / 3.6e12
+            samples[message.node].append((age, float(message.values["memory_mb"])))
+            progress.update(bar, completed=age)
+            if all(s and s[-1][0] >= hours for s in samples.values()):
+                break
+    return {"hours": hours, "nodes": {name: growth(s, hours) for name, s in samples.items()}}
+
+
+def growth(samples: list[tuple[float, float]], hours: float) -> dict[str, float]:
+    """What (age in hours, megabytes) samples say: first, last, most, and MB an hour after the first fifth."""
+    ages, sizes = np.array(samples).T
+    settled = ages >= 0.2 * hours
+    slope = np.polyfit(ages[settled], sizes[settled], 1)[0]
+    figures = {"first_mb": sizes[0], "last_mb": sizes[-1], "most_mb": sizes.max(), "slope_mb_per_hour": slope}
+    return {name: round(float(value), 2) for name, value in figures.items()} | {"samples": len(samples)}
+
+
+@contextmanager
+def running(
+    recording: Path, *, lossless: bool, rate: float = 1.0, loop: bool = False
+) -> Iterator[tuple[Iterator[tuple[str, Message]], SystemClock]]:
+    """The node processes at work on a recording; gives what they publish, ``pose/world`` and ``diagnostics``."""
+    console = Console(stderr=True)
+    clock = SystemClock()
+    with tempfile.TemporaryDirectory(prefix="steadypose-") as folder:
+        settings = [
+            f"nodes={json.dumps(POSE_NODES)}",
+            f"input.recording={json.dumps(str(recording))}",
+            f"input.rate={rate}",
+            f"input.loop={json.dumps(loop)}",
+            f"transport.directory={json.dumps(folder)}",
+            f"transport.lossless={json.dumps(lossless)}",
+        ]
+        arguments = ["--launch", "replay", *(word for setting in settings for word in ("--set", setting))]
+        transport = Launch.read("replay", settings).transport
+        endpoints = [transport.endpoint(name) for name in POSE_NODES]
+        with (
+            Subscriber(endpoints, [POSE_WORLD, DIAGNOSTICS]) as subscriber,
+            Supervisor(POSE_NODES, arguments, clock, lambda line: console.print(line, markup=False)) as supervisor,
+        ):
+            yield _received(subscriber, supervisor), clock
+
+
+def _received(subscriber: Subscriber, supervisor: Supervisor) -> Iterator[tuple[str, Message]]:
+    waited_s = START_S
+    while not supervisor.failed and (received := subscriber.receive(waited_s)):
+        waited_s = SILENCE_S
+        supervisor.poll()
+        yield received
+
+
+@contextmanager
+def _one_core() -> Iterator[None]:
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+def _now() -> tuple[float, float]:
+    return time.perf_counter(), time.thread_time()
+
+
+def percentiles(values: ArrayLike) -> dict[str, float]:
+    """p50, p95, p99 and the greatest."""
+    values = np.asarray(values, dtype=np.float64)
+    figures = dict(zip(("p50", "p95", "p99"), np.percentile(values, (50, 95, 99)).tolist(), strict=True))
+    return {name: round(value, 3) for name, value in (figures | {"max": float(values.max())}).items()}
+
+
+def main(args: Args) -> None:
+    """Measure, print, write."""
+    console = Console()
+    torch.set_num_threads(1)
+    seconds, hours = (10.0, 0.05) if args.quick else (args.seconds, args.stream_hours)
+    warm_up_s = 5.0
+    with RecordingReader(args.recording) as reader:
+        frames = [message for _, _, message in reader.messages([POSE_RAW]) if isinstance(message, PoseRaw)]
+    with Progress(console=console) as progress, tempfile.TemporaryDirectory() as folder:
+        computed = [compute(frames, bodies, round(seconds * 30), progress.track) for bodies in CROWDS]
+        lived = []
+        for bodies in LIVE_CROWDS:
+            path = Path(folder) / f"crowd_{bodies}"
+            with RecordingWriter(path) as writer:
+                # what the nodes need to come up is played to nobody
+                for raw in islice(crowd(frames, bodies), round((seconds + warm_up_s + START_S) * 30)):
+                    writer.write(POSE_RAW, raw, raw.stamp_ns)
+            lived.append({"bodies": bodies} | live(path, warm_up_s, seconds, progress, f"live, {bodies} bodies"))
+        remembered = memory(args.recording, hours, progress)
+    tables = [_compute_table(computed), _live_table(lived), _memory_table(remembered)]
+    for table in tables:
+        show(table, console)
+    if args.out or not args.quick:
+        data = {"compute": computed, "live": lived, "memory": remembered}
+        console.print(f"wrote {save('latency', sys.argv[1:], tables, data, args.out or RESULTS)}")
+
+
+def _compute_table(results: list[dict[str, Any]]) -> Table:
+    clocks = ("prior_wall_ms", "prior_cpu_ms", "trajectory_wall_ms")
+    return Table(
+        name="compute",
+        title="Compute a frame on one core, ms",
+        columns=[
+            "bodies",
+            *(f"{c.removesuffix('_ms').replace('_', ', ')}, {p}" for c in clocks for p in ("p50", "p99")),
+        ],
+        rows=[[str(r["bodies"]), *(f"{r[c][p]:.2f}" for c in clocks for p in ("p50", "p99"))] for r in results],
+        note=f"{results[0]['frames']} frames; cpu: the thread's processor time, which other processes do not lengthen.",
+    )
+
+
+def _live_table(results: list[dict[str, Any]]) -> Table:
+    return Table(
+        name="live",
+        title="From capture to pose/world at 30 Hz, less the delay, ms",
+        columns=["bodies", "p50", "p95", "p99", "longest", "frames", "dropped"],
+        rows=[
+            [
+                str(r["bodies"]),
+                *(f"{r['latency_ms'][p]:.1f}" for p in ("p50", "p95", "p99", "max")),
+                str(r["expected"]),
+                str(r["expected"] - r["arrived"]),
+            ]
+            for r in results
+        ],
+        note="Three node processes and this subscriber, live transport: a node that is late drops its oldest frames.",
+    )
+
+
+def _memory_table(result: dict[str, Any]) -> Table:
+    return Table(
+        name="memory",
+        title=f"Resident memory over {result['hours']:g} h of stream replayed fast, MB",
+        columns=["node", "first", "last", "most", "MB an hour"],
+        rows=[
+            [name, *(f"{n[k]:.0f}" for k in ("first_mb", "last_mb", "most_mb")), f"{n['slope_mb_per_hour']:+.1f}"]
+            for name, n in result["nodes"].items()
+        ],
+        note="MB an hour: the slope of a line through all but the first fifth.",
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

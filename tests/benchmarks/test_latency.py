@@ -1,0 +1,53 @@
+import dataclasses
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from benchmarks.latency import SPACING, crowd, growth, percentiles
+from msgs.types import Pose, PoseRaw, RawBody
+
+
+def frames(count: int) -> list[PoseRaw]:
+    return [
+        PoseRaw(
+            stamp_ns=10**9 + i * 41_000_000,
+            frame_id="camera",
+            source="sim",
+            skeleton="smpl22",
+            sensor_pose=Pose.from_up("z"),
+            calibrated=True,
+            bodies=[RawBody(5, np.full((22, 3), float(i)), np.ones(22))],
+        )
+        for i in range(count)
+    ]
+
+
+def test_a_crowd_is_at_30_hz_side_by_side_and_never_jumps() -> None:
+    empty = dataclasses.replace(frames(1)[0], bodies=[])
+    stream = list(islice(crowd([empty, *frames(4), empty], 3), 14))
+    steps = np.diff([frame.stamp_ns for frame in stream])
+    assert set(steps.tolist()) <= {33_333_333, 33_333_334}
+    assert [[body.id for body in frame.bodies] for frame in stream] == [[0, 1, 2]] * 14
+    first = np.array([frame.bodies[1].positions[0, 2] for frame in stream])
+    np.testing.assert_array_equal(first, [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2, 1, 0, 1])
+    apart = stream[0].bodies[1].positions - stream[0].bodies[0].positions
+    np.testing.assert_allclose(apart, np.tile([SPACING, 0.0, 0.0], (22, 1)), atol=1e-6)
+
+
+def test_a_crowd_needs_a_body() -> None:
+    with pytest.raises(ValueError, match="at least 2 frames"):
+        next(crowd([dataclasses.replace(f, bodies=[]) for f in frames(5)], 1))
+
+
+def test_growth_is_the_slope_after_the_start() -> None:
+    ages = np.linspace(0, 2, 200)
+    leak = 100 + 30 * np.minimum(ages, 0.3) / 0.3 + 5 * ages
+    found = growth(list(zip(ages.tolist(), leak.tolist(), strict=True)), 2.0)
+    assert found["slope_mb_per_hour"] == pytest.approx(5.0, abs=0.01)
+    assert found["first_mb"] == 100.0
+    assert found["last_mb"] == found["most_mb"] == pytest.approx(140.0)
+
+
+def test_percentiles() -> None:
+    assert percentiles(range(101)) == {"p50": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
