@@ -17,6 +17,7 @@ import numpy as np
 import roma
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from msgs.types import CleanBody, PoseClean, PoseRaw, RawBody
 from prior.bones import Bones, BonesSettings
@@ -34,6 +35,8 @@ MAX_DISTANCE = 30.0
 """Metres from the sensor beyond which a joint is no sighting."""
 MIN_JOINTS = 6
 """Canonical joints that must be seen for a body to be taken up."""
+UNIT_TOLERANCE = 0.01
+"""How far from 1 the norm of a sensor pose's quaternion may be."""
 BACKWARDS_NS = 1_000_000_000
 """A stamp this far before the last starts a new stream; one nearer is a frame out of order."""
 
@@ -112,6 +115,10 @@ class PriorPipeline:
         skeleton = SKELETONS.get(raw.skeleton)
         if skeleton is None:
             self.counters["unknown_skeleton"] += 1
+            return []
+        pose = raw.sensor_pose
+        if not (np.isfinite(pose.position).all() and abs(np.linalg.norm(pose.orientation) - 1) < UNIT_TOLERANCE):
+            self.counters["sensor_pose_invalid"] += 1
             return []
         flushed: list[PoseClean] = []
         if self._last is not None:
@@ -263,7 +270,7 @@ class PriorPipeline:
 
 @lru_cache(maxsize=8)
 def _rotation(quaternion: bytes) -> NDArray[np.float64]:
-    return roma.unitquat_to_rotmat(torch.from_numpy(np.frombuffer(quaternion).copy())).numpy()
+    return Rotation.from_quat(np.frombuffer(quaternion)).as_matrix()
 
 
 def _sensor(raw: PoseRaw) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
