@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.simulated import FEET, Track, hold_last, measure, read_tracks, sigma_ratio, smooth
 from msgs.topics import POSE_RAW, POSE_TRUTH
 from msgs.types import Message, Pose, PoseRaw, PoseWorld, RawBody, WorldBody
-from prior.skeletons import CANONICAL, REST_OFFSETS, J
+from prior.skeletons import CANONICAL, PARENTS, REST_OFFSETS, J
 
 PERIOD_NS = 33_333_333
 
@@ -15,7 +15,9 @@ PERIOD_NS = 33_333_333
 def standing(frames: int) -> np.ndarray:
     """(T, 22, 3) a body without pose that sways, 1 m up."""
     sway = 0.05 * np.sin(np.arange(frames) / 9.0)
-    body = np.cumsum(REST_OFFSETS, axis=0) + [0.0, 0.0, 1.0]
+    body = REST_OFFSETS + [0.0, 0.0, 1.0]
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        body[joint] = body[parent] + REST_OFFSETS[joint]
     return body + sway[:, None, None] * np.array([0.0, 1.0, 0.0])
 
 
