@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import itertools
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -40,13 +39,12 @@ from benchmarks.metrics import (
     rigid_alignment,
 )
 from benchmarks.results import RESULTS, Table, save, show
-from nodes.clean import stream
-from nodes.npz import NpzCollector, NpzSource
+from msgs.types import Pose, PoseRaw, RawBody
+from prior.correct import CorrectSettings
 from prior.filters import FixedLagRTS, OneEuroFilter
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.skeletons import KINECT22, J, to_canonical
-from prior.trajectory import TrajectoryPipeline, TrajectorySettings
 
 Floats = NDArray[np.float64]
 Parameters = dict[str, float]
@@ -70,7 +68,6 @@ MARKERS = {
 }
 """The skin markers nearest to each joint: a second truth, to compare with work that did not find joint centres."""
 
-Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 FILTER_DELAYS = (0, 2, 4, 8)
 STEADYPOSE_DELAYS = (0, 2, 4)
 MEASUREMENT_SIGMA = 0.02
@@ -161,18 +158,44 @@ def run_filter(clips: Sequence[Clip], make: Callable[[], OneEuroFilter | FixedLa
     return [np.stack([answer[i] for answer in answers[: len(clip.raw)]]) for i, clip in enumerate(clips)]
 
 
-def run_steadypose(clips: Sequence[Clip], delay: int) -> Iterator[Floats]:
-    """What ``steadypose clean --delay K`` makes of each clip, given as the ``.npz`` of a user: (T, 13, 3) metres."""
+def run_steadypose(clips: Sequence[Clip], delay: int, sensor: str) -> Iterator[Floats]:
+    """What the prior of ``steadypose clean --delay K`` makes of each clip: (T, 13, 3) metres.
+
+    Eight clips go through it side by side, as the bodies of one stream: bodies do not touch each other
+    (tests/prior/test_pipeline.py), and it takes a fifth of the time.
+    """
     scored = [J[name] for name in SCORED]
-    prior, trajectory = PriorPipeline(PriorSettings(delay=delay)), TrajectoryPipeline(TrajectorySettings())
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "kinect.npz"
-        for clip in clips:
-            np.savez(path, positions=clip.kinect @ Y_UP_TO_Z_UP, skeleton="kinect22", fps=clip.fps, up="y")
-            source, collector = NpzSource(path), NpzCollector()
-            for _, message in stream(source, prior, trajectory):
-                collector.add(message)
-            yield collector.arrays(source.stamps_ns)["positions"][:, scored].astype(np.float64)
+    settings = PriorSettings(delay=delay, correct=CorrectSettings(sensor=sensor))
+    prior = PriorPipeline(settings)
+    for start in range(0, len(clips), settings.max_bodies):
+        group = clips[start : start + settings.max_bodies]
+        answers: list[list[Floats]] = [[] for _ in group]
+        cleaned = [
+            clean
+            for frame in range(max(len(clip.kinect) for clip in group))
+            for clean in prior.process(_message(group, frame))
+        ]
+        for clean in (*cleaned, *prior.flush()):
+            for body in clean.bodies:
+                answers[body.id].append(body.positions[scored].astype(np.float64))
+        for clip, answer in zip(group, answers, strict=True):
+            yield np.stack(answer[: len(clip.kinect)])
+
+
+def _message(clips: Sequence[Clip], frame: int) -> PoseRaw:
+    return PoseRaw(
+        stamp_ns=round(frame * 1e9 / clips[0].fps),
+        frame_id="kinect",
+        source="ui_prmd",
+        skeleton="kinect22",
+        sensor_pose=Pose.identity(),
+        calibrated=False,
+        bodies=[
+            RawBody(number, clip.kinect[frame], np.ones(22))
+            for number, clip in enumerate(clips)
+            if frame < len(clip.kinect)
+        ],
+    )
 
 
 def learn_offset(truths: Sequence[Floats], aligned: Sequence[Floats]) -> Floats:
@@ -272,7 +295,11 @@ def main(args: Args) -> None:
     with Progress(console=console) as progress:
         filters, tuning = tuned_filters(train, progress, args.quick)
         raw = Method("raw", 0, lambda clips: [clip.raw for clip in clips])
-        steadypose = [Method("steadypose", k, partial(run_steadypose, delay=k)) for k in STEADYPOSE_DELAYS]
+        steadypose = [
+            Method(name, k, partial(run_steadypose, delay=k, sensor=sensor))
+            for name, sensor in (("steadypose", ""), ("steadypose, sensor = kinect_v2", "kinect_v2"))
+            for k in STEADYPOSE_DELAYS
+        ]
         for method in [raw, *filters, *([] if args.filters_only else steadypose)]:
             title = f"{method.name}, delay {method.delay}"
             clips = [*train, *validation]
@@ -284,7 +311,7 @@ def main(args: Args) -> None:
                 result = score(asked, align(asked, held), learn_offset(known, align(known, fitted)))
                 row[f"against_{truth}"] = summary(validation, result)
             scores[method.name, method.delay] = result
-            if method.name == "steadypose":
+            if method in steadypose:
                 peer = scores["RTS", method.delay]
                 row["ratio_to_rts"] = {
                     "position": bootstrap_ratio(result.position, peer.position),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from msgs.keys import create_keys
+from nodes.launch import LaunchError
 
 
 def keys(directory: Path) -> None:
@@ -16,7 +17,10 @@ def keys(directory: Path) -> None:
     Args:
         directory: where the keys go; own.key_secret never leaves it.
     """
-    create_keys(directory)
+    try:
+        create_keys(directory)
+    except ValueError as error:
+        raise LaunchError(str(error)) from error
     print(f"{directory}/own.key: to hand out")
     print(f"{directory}/own.key_secret: to keep")
     print(f"{directory}/clients/: the keys of those who may listen")

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from msgs.keys import Keys, load_keys
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
 from prior.settings import build_settings
 
@@ -91,6 +92,17 @@ class TransportSettings:
         if node in self.endpoints:
             return self.endpoints[node]
         return f"ipc://{self.ipc_directory / node}"
+
+    def curve_keys(self) -> Keys | None:
+        """The CurveZMQ keys asked for, or None.
+
+        Raises:
+            LaunchError: they are not there, or not safe.
+        """
+        try:
+            return load_keys(self.keys) if self.keys else None
+        except ValueError as error:
+            raise LaunchError(str(error)) from error
 
     @property
     def ipc_directory(self) -> Path:

@@ -15,7 +15,6 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from msgs.keys import load_keys
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from msgs.transport import Subscriber
 from msgs.types import Diagnostics, Level
@@ -107,7 +106,7 @@ class _Run:
         """Start the nodes and show their news until the stream has ended or Ctrl-C; returns the exit status."""
         transport = self._launch.transport
         transport.ipc_directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        keys = load_keys(transport.keys) if transport.keys else None
+        keys = transport.curve_keys()
         endpoints = [transport.endpoint(name) for name in self._launch.nodes]
         terminal = self._console.is_terminal
         with (

@@ -30,7 +30,6 @@ from typing import ClassVar, Protocol, Self
 
 import numpy as np
 
-from msgs.keys import load_keys
 from msgs.topics import DIAGNOSTICS
 from msgs.transport import Publisher, Subscriber
 from msgs.types import Diagnostics, Level, Message
@@ -202,10 +201,10 @@ class Node(ABC):
 
         Raises:
             TransportError: an address cannot be bound.
-            ValueError: keys are asked for and cannot be used.
+            LaunchError: keys are asked for and cannot be used.
         """
         transport = self.launch.transport
-        keys = load_keys(transport.keys) if transport.keys else None
+        keys = transport.curve_keys()
         transport.ipc_directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         with ExitStack() as stack:
             self._publisher = stack.enter_context(
