@@ -87,7 +87,7 @@ def test_jumps_come_as_often_as_said_and_end() -> None:
 
 
 def test_noise_has_heavy_tails_and_memory() -> None:
-    motion = np.stack([SCRIPTS["reach"](np.random.default_rng(s))[0].positions[::4] for s in range(4)])
+    motion = np.stack([SCRIPTS["reach"](np.random.default_rng(s))[0].positions[::4] for s in range(2)])
     noisy, _ = corrupt(motion, np.random.default_rng(3), MODEL)
     error = noisy - motion
     size = np.linalg.norm(error, axis=-1)
@@ -104,7 +104,9 @@ def test_confidence_tells_something_but_not_all() -> None:
     assert confidence.max() <= 1
     relation = spearmanr(confidence.ravel(), np.linalg.norm(noisy - motion, axis=-1).ravel()).statistic  # type: ignore[union-attr]
     assert -0.85 < relation < -0.25
-    assert confidence_of(np.array([0.01, 0.04, 0.3]), np.random.default_rng(0)).shape == (3,)
+    small, large = (confidence_of(np.full(1000, s), np.random.default_rng(0)).mean() for s in (0.01, 0.3))
+    assert small > 0.8
+    assert large < 0.2
 
 
 def test_windows_may_come_in_any_batch_and_as_short_as_one_frame() -> None:
@@ -165,7 +167,7 @@ def test_a_file_of_another_making_is_refused(tmp_path: Path) -> None:
 def own_clips(count: int) -> list[Clip]:
     clips = []
     for seed in range(count):
-        truth = SCRIPTS["reach"](np.random.default_rng(seed))[0].positions[::4][:300] - [0.0, 0.0, 1.0]
+        truth = SCRIPTS["walk_turn"](np.random.default_rng(seed))[0].positions[::4][:300] - [0.0, 0.0, 1.0]
         clips.append(Clip(30.0, truth, truth))
     return clips
 
@@ -184,7 +186,7 @@ def test_alignment_is_not_turned_by_wild_joints() -> None:
 
 
 def test_statistics_follow_the_parameters_they_stand_for() -> None:
-    clips = own_clips(6)
+    clips = own_clips(3)
     base = statistics(simulate_clips(clips, NO_JUMPS, np.random.default_rng(0)))
     louder = statistics(simulate_clips(clips, replace(NO_JUMPS, fast=2 * MODEL.fast), np.random.default_rng(0)))
     farther = statistics(
