@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import cycle, islice
@@ -80,7 +80,7 @@ def crowd(frames: list[PoseRaw], bodies: int) -> Iterator[PoseRaw]:
         yield dataclasses.replace(frame, stamp_ns=seen[0].stamp_ns + round(index * FRAME_NS), bodies=copies)
 
 
-def compute(frames: list[PoseRaw], bodies: int, count: int, track: Callable[..., Iterator[int]]) -> dict[str, Any]:
+def compute(frames: list[PoseRaw], bodies: int, count: int, track: Callable[..., Iterable[int]]) -> dict[str, Any]:
     """Milliseconds a frame of the prior, and of the trajectory on its answer: wall time and processor time."""
     prior, trajectory = PriorPipeline(PriorSettings()), TrajectoryPipeline(TrajectorySettings())
     spent: dict[str, list[tuple[float, float]]] = {"prior": [], "trajectory": []}

@@ -9,7 +9,7 @@ where it was last seen; the fixed-lag RTS smoother coasts, and is tuned on these
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -237,7 +237,7 @@ def _mean(values: NDArray[np.floating]) -> float:
 
 
 def tune(
-    streams: Sequence[Sequence[Track]], delay: int, track: Callable[..., Iterator[float]]
+    streams: Sequence[Sequence[Track]], delay: int, track: Callable[..., Iterable[float]]
 ) -> list[dict[str, float]]:
     """The smoother's mean errors over the streams for each density."""
     tried = []

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, Protocol
 
 import numpy as np
-import torch
 import tyro
 from rich.console import Console
 from rich.progress import Progress
@@ -20,8 +19,7 @@ from msgs.types import Message, PoseClean, PoseRaw, PoseWorld
 from nodes.launch import LaunchError, apply_override
 from nodes.npz import NpzCollector
 from nodes.pose_input import open_source, with_end
-from nodes.prior import make_prior
-from nodes.trajectory import make_trajectory
+from nodes.recorder import Filing
 
 
 class Cleaner(Protocol):
@@ -81,11 +79,18 @@ def clean(
     if not out.resolve().parent.is_dir():
         raise LaunchError(f"{out}: expected its folder {out.resolve().parent} to exist; make it first")
     frames = open_source(source)
+    # these bring torch, which takes seconds: not before it is known that there is something to do
+    import torch
+
+    from nodes.prior import make_prior
+    from nodes.trajectory import make_trajectory
+
     torch.set_num_threads(1)  # the models are too small to gain from more
     prior, trajectory = make_prior(table["prior"]), make_trajectory(table["trajectory"])
     collector = NpzCollector() if out.suffix == ".npz" else None
     stamps_ns: list[int] = []
     answers = 0
+    filing = Filing()
     started = time.perf_counter()
     console = Console(stderr=True)
     with ExitStack() as stack:
@@ -94,7 +99,7 @@ def clean(
         bar = progress.add_task(source.name, total=len(frames))
         for topic, message in stream(frames, prior, trajectory):
             if writer:
-                writer.write(topic, message, message.stamp_ns)
+                writer.write(topic, message, filing.stamp(topic, message.stamp_ns))
             elif collector:
                 collector.add(message)
             if isinstance(message, PoseRaw) and not message.end_of_stream:
@@ -102,6 +107,8 @@ def clean(
                 progress.advance(bar)
             elif isinstance(message, PoseClean):
                 answers += len(message.bodies)
+    if not stamps_ns:
+        raise LaunchError(f"{source}: expected frames, but none of {len(frames)} could be read")
     if collector:
         _save(out, collector.arrays(np.array(stamps_ns, np.int64)))
     spent = time.perf_counter() - started

@@ -14,12 +14,23 @@ QUIET_S = 0.3
 """nothing came for so long: all that was on its way is here"""
 
 
-class RecorderNode(Node):
-    """Writes what is published, loses nothing, and completes the recording when it is stopped.
+class Filing:
+    """Under which stamps messages are filed, so that a recording plays in the order in which it came.
 
-    A message is found under its stamp of capture, or where stamps went back, under the highest before: so a
-    recording plays in the order in which it came.
+    That is the stamp of capture, or where a topic's stamps went back, the highest before.
     """
+
+    def __init__(self) -> None:
+        self._highest_ns: dict[str, int] = {}
+
+    def stamp(self, topic: str, stamp_ns: int) -> int:
+        """Where the topic's next message belongs, whose own stamp is ``stamp_ns``."""
+        self._highest_ns[topic] = max(stamp_ns, self._highest_ns.get(topic, 0))
+        return self._highest_ns[topic]
+
+
+class RecorderNode(Node):
+    """Writes what is published, loses nothing, and completes the recording when it is stopped."""
 
     name = "recorder"
 
@@ -29,7 +40,7 @@ class RecorderNode(Node):
             raise LaunchError("[recorder] directory: expected the recording to make, got none; give --record")
         self._directory = Path(launch.recorder.directory)
         self._topics = frozenset(launch.recorder.topics)
-        self._filed_ns: dict[str, int] = {}
+        self._filing = Filing()
         self._early: list[Diagnostics] = []
         self._pose_ns: int | None = None
         self._written = 0
@@ -56,11 +67,11 @@ class RecorderNode(Node):
         early, self._early = self._early, []
         for diagnostics in early:
             self._write(DIAGNOSTICS, diagnostics, message.stamp_ns)
-        self._write(topic, message, max(message.stamp_ns, 0 if topic != DIAGNOSTICS else self._pose_ns or 0))
+        # a node that has not seen a pose yet reports at no time
+        self._write(topic, message, message.stamp_ns or self._pose_ns or 0)
 
     def _write(self, topic: str, message: Message, stamp_ns: int) -> None:
-        self._filed_ns[topic] = max(stamp_ns, self._filed_ns.get(topic, 0))
-        self._writer.write(topic, message, self._filed_ns[topic])
+        self._writer.write(topic, message, self._filing.stamp(topic, stamp_ns))
         self._written += 1
 
     def status(self) -> dict[str, str]:

@@ -87,6 +87,7 @@ class TrajectoryPipeline:
         self.settings = settings
         self.counters: Counter[str] = Counter()
         self._reader = MotionReader(settings.weights)
+        self._noise = RootNoise(settings.acceleration, network_memory_s=self._reader.memory_s)
         self._scenes: dict[str, _Scene] = {}
 
     def process(self, clean: PoseClean) -> list[PoseWorld]:
@@ -110,9 +111,7 @@ class TrajectoryPipeline:
             if body.id in scene.tracks:
                 scene.tracks[body.id].advance(sighting, clean.stamp_ns)
             elif sighting.root is not None:
-                scene.tracks[body.id] = BodyTrack(
-                    sighting, clean.stamp_ns, self._reader.context, RootNoise(acceleration=self.settings.acceleration)
-                )
+                scene.tracks[body.id] = BodyTrack(sighting, clean.stamp_ns, self._reader.context, self._noise)
             else:
                 self.counters["body without a root so far"] += 1
                 continue
@@ -147,6 +146,9 @@ class MotionReader:
 
     Args:
         weights: the weight set, or a path to a ``.safetensors`` file.
+
+    Attributes:
+        memory_s: (3,) the time constants of the velocity's errors.
     """
 
     def __init__(self, weights: str) -> None:
@@ -157,7 +159,7 @@ class MotionReader:
         self._net = NewestFrame(net).eval()
         horizontal_first = [0, 0, 1]
         self._scale = np.array(self._config.sigma_scale)[horizontal_first]
-        self._correlation_s = np.array(self._config.correlation_s)[horizontal_first]
+        self.memory_s = np.array(self._config.correlation_s)[horizontal_first] / 2.0
 
     @property
     def context(self) -> int:
@@ -175,7 +177,7 @@ class MotionReader:
         variance[:, :2] = variance[:, :2].mean(axis=1, keepdims=True)  # the filter's noise must not know the heading
         sigma = np.sqrt(variance) * self._scale
         return [
-            Motion(yaw_matrix(track.yaw) @ v, sd, sd * np.sqrt(self._correlation_s), c)
+            Motion(yaw_matrix(track.yaw) @ v, sd, c)
             for track, v, sd, c in zip(tracks, velocity, sigma, contacts, strict=True)
         ]
 

@@ -1,11 +1,11 @@
 """The Kalman filter behind a body's place in the world: root position and velocity, and where its feet stand.
 
-The state holds the sensor's slow error, so that a root seen for long is not taken to be known ever better, and the
-places of the standing feet, as contact-aided filters of legged robots do
-(Bloesch et al., "State Estimation for Legged Robots", RSS 2012). A foot on the ground stays where it is, so its
-place relative to the root measures how far the root has moved: the zero-velocity update and the anchor that keeps
-errors from adding up are one measurement, and the covariance knows that an anchor is no better placed than the root
-was when the foot came down.
+Neither what the sensor nor what the network says errs independently from frame to frame, so both slow errors are in
+the state: a root seen for long is not taken to be known ever better, and one that coasts strays as errors that last
+make it. So are the places of the standing feet, as in contact-aided filters of legged robots (Bloesch et al., "State
+Estimation for Legged Robots", RSS 2012). A foot on the ground stays where it is, so its place relative to the root
+measures how far the root has moved: the zero-velocity update and the anchor that keeps errors from adding up are one
+measurement, and the covariance knows that an anchor is no better placed than the root was when the foot came down.
 
 The axes are independent: the noise is the same in both horizontal directions, so no correlation between axes
 arises, and the filter turns with the world.
@@ -13,7 +13,7 @@ arises, and the filter turns with the world.
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,30 +21,33 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
-_POSITION, _VELOCITY, _BIAS, _FEET = 0, 1, 2, 3
+_POSITION, _VELOCITY, _SENSOR, _NETWORK, _FEET = 0, 1, 2, 3, 4
+"""Of the state. The slow errors of sensor and network are in units of their present standard deviations."""
 _UNPLACED = 1e4
 """m², the variance of a foot's place before its first measurement: far more than any root's."""
 
 
 @dataclass(frozen=True)
 class RootNoise:
-    """How the root moves, and how what tells of it errs.
+    """How the root moves, and for how long what tells of it errs.
 
     Attributes:
         acceleration: density of the root's white-noise acceleration, m/s² over √Hz.
         slip: density of the random walk of a standing foot, metres over √s.
-        memory_s: seconds for which the sensor's slow error lasts: the time constant of a Gauss-Markov process.
+        sensor_memory_s: the time constant of the sensor's slow error, a Gauss-Markov process.
+        network_memory_s: (3,) or a number, that of the network's.
         first_speed: m/s, the standard deviation of a root's first velocity.
     """
 
     acceleration: float = 3.0
     slip: float = 0.02
-    memory_s: float = 0.65
+    sensor_memory_s: float = 0.65
+    network_memory_s: ArrayLike = 0.15
     first_speed: float = 1.0
 
 
 class RootFilter:
-    """Root position and velocity, the sensor's slow error, and the places of ``feet`` points that may stand.
+    """Root position and velocity, slow errors, and the places of ``feet`` points that may stand.
 
     Args:
         noise: of all but the measurements.
@@ -64,10 +67,9 @@ class RootFilter:
         self._x[_POSITION], self._x[_VELOCITY] = position, velocity
         self._p = np.zeros((3, size, size))
         self._p[:, _POSITION, _POSITION] = jitter**2 + bias**2
-        self._p[:, _POSITION, _BIAS] = self._p[:, _BIAS, _POSITION] = -(bias**2)
-        self._p[:, _BIAS, _BIAS] = bias**2
+        self._p[:, _POSITION, _SENSOR] = self._p[:, _SENSOR, _POSITION] = -bias
+        self._p[:, _SENSOR, _SENSOR] = self._p[:, _NETWORK, _NETWORK] = 1.0
         self._p[:, _VELOCITY, _VELOCITY] = noise.first_speed**2
-        self._bias = bias
         self._standing = np.zeros(feet, dtype=bool)
 
     @property
@@ -85,7 +87,7 @@ class RootFilter:
         """(6, 6) of [position, velocity]: m², m²/s, m²/s²."""
         covariance = np.zeros((2, 3, 2, 3))
         axes = np.arange(3)
-        covariance[:, axes, :, axes] = self._p[:, :_BIAS, :_BIAS]
+        covariance[:, axes, :, axes] = self._p[:, :_SENSOR, :_SENSOR]
         return covariance.reshape(6, 6)
 
     @property
@@ -98,28 +100,23 @@ class RootFilter:
         """(feet,) which feet stand."""
         return self._standing.copy()
 
-    def predict(self, dt: float, drift: ArrayLike) -> None:
-        """Move on by ``dt`` seconds, above 0.
-
-        Args:
-            dt: seconds.
-            drift: density of a random walk of the position, (3,) or a number, metres over √s: what is left when
-                velocity measurements whose errors last are taken for independent ones.
-        """
+    def predict(self, dt: float) -> None:
+        """Move on by ``dt`` seconds, above 0."""
         x, p, noise = self._x, self._p, self._noise
         x[_POSITION] += dt * x[_VELOCITY]
         p[:, _POSITION] += dt * p[:, _VELOCITY]
         p[:, :, _POSITION] += dt * p[:, :, _VELOCITY]
         q = noise.acceleration**2
-        p[:, _POSITION, _POSITION] += q * dt**3 / 3 + np.square(drift) * dt
+        p[:, _POSITION, _POSITION] += q * dt**3 / 3
         p[:, _POSITION, _VELOCITY] += q * dt**2 / 2
         p[:, _VELOCITY, _POSITION] += q * dt**2 / 2
         p[:, _VELOCITY, _VELOCITY] += q * dt
-        kept = math.exp(-dt / noise.memory_s)
-        x[_BIAS] *= kept
-        p[:, _BIAS] *= kept
-        p[:, :, _BIAS] *= kept
-        p[:, _BIAS, _BIAS] += (1.0 - kept**2) * self._bias**2
+        for error, memory_s in ((_SENSOR, noise.sensor_memory_s), (_NETWORK, noise.network_memory_s)):
+            kept = np.broadcast_to(np.exp(-dt / np.asarray(memory_s)), 3)
+            x[error] *= kept
+            p[:, error] *= kept[:, None]
+            p[:, :, error] *= kept[:, None]
+            p[:, error, error] += 1.0 - kept**2
         feet = np.flatnonzero(self._standing) + _FEET
         p[:, feet, feet] += noise.slip**2 * dt
 
@@ -129,18 +126,19 @@ class RootFilter:
         Args:
             position: with both errors of the sensor.
             jitter: metres, the standard deviation of its error from frame to frame.
-            bias: metres, that of its slow error from now on.
+            bias: metres, that of its slow error.
         """
-        self._bias = bias
-        row = np.zeros(len(self._x))
-        row[_POSITION] = row[_BIAS] = 1.0
-        self._correct(row, position, jitter)
+        self._correct(self._row({_POSITION: 1.0, _SENSOR: bias}), position, jitter)
 
-    def observe_velocity(self, velocity: Floats, sigma: ArrayLike) -> None:
-        """Take a measured root velocity (3,) in m/s with its standard deviation, (3,) or a number."""
-        row = np.zeros(len(self._x))
-        row[_VELOCITY] = 1.0
-        self._correct(row, velocity, sigma)
+    def observe_velocity(self, velocity: Floats, jitter: ArrayLike, bias: ArrayLike) -> None:
+        """Take a root velocity (3,) in m/s as the network says it.
+
+        Args:
+            velocity: with both errors of the network.
+            jitter: (3,) or a number, m/s, the standard deviation of its error from frame to frame.
+            bias: (3,) or a number, m/s, that of its slow error.
+        """
+        self._correct(self._row({_VELOCITY: 1.0, _NETWORK: bias}), velocity, jitter)
 
     def plant(self, foot: int, from_root: Floats, sigma: float) -> None:
         """Let a foot stand from now on, (3,) metres ``from_root`` with the standard deviation of that."""
@@ -159,27 +157,31 @@ class RootFilter:
     def foot_surprise(self, foot: int, from_root: Floats, sigma: float) -> float:
         """How many standard deviations a standing foot is from where it should be, along the worst axis."""
         row = self._foot_row(foot)
-        variance = np.einsum("i,aij,j->a", row, self._p, row) + sigma**2
-        return float(np.max(np.abs(from_root - row @ self._x) / np.sqrt(variance)))
+        variance = np.einsum("ai,aij,aj->a", row, self._p, row) + sigma**2
+        return float(np.max(np.abs(from_root - np.einsum("ai,ia->a", row, self._x)) / np.sqrt(variance)))
 
     def observe_foot_height(self, foot: int, height: float, sigma: float) -> None:
         """Take the height in metres, world, of a standing foot, with its standard deviation."""
-        row = np.zeros(len(self._x))
-        row[_FEET + foot] = 1.0
-        self._correct(row, np.array([0.0, 0.0, height]), np.array([np.inf, np.inf, sigma]))
+        self._correct(self._row({_FEET + foot: 1.0}), np.array([0.0, 0.0, height]), np.array([np.inf, np.inf, sigma]))
 
     def lift(self, foot: int) -> None:
         """Let a foot stand no more."""
         self._standing[foot] = False
 
     def _foot_row(self, foot: int) -> Floats:
-        row = np.zeros(len(self._x))
-        row[_FEET + foot], row[_POSITION] = 1.0, -1.0
+        return self._row({_FEET + foot: 1.0, _POSITION: -1.0})
+
+    def _row(self, entries: Mapping[int, ArrayLike]) -> Floats:
+        """(3, size) how a measurement depends on the state, along each axis."""
+        row = np.zeros((3, len(self._x)))
+        for place, value in entries.items():
+            row[:, place] = value
         return row
 
     def _correct(self, row: Floats, measured: Floats, sigma: ArrayLike) -> None:
         """The Kalman update with one scalar measurement an axis: measured = row · x + noise."""
-        cross = self._p @ row
-        gain = cross / (cross @ row + np.square(sigma))[:, None]
-        self._x += (gain * (measured - row @ self._x)[:, None]).T
+        cross = np.einsum("aij,aj->ai", self._p, row)
+        variance = np.einsum("ai,ai->a", cross, row) + np.square(sigma)
+        gain = cross / variance[:, None]
+        self._x += (gain * (measured - np.einsum("ai,ia->a", row, self._x))[:, None]).T
         self._p -= gain[:, :, None] * cross[:, None, :]

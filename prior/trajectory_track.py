@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from prior.trajectory_filter import RootFilter, RootNoise
 from prior.trajectory_net import FRAME_S
 
 Floats = NDArray[np.float64]
+Sigma = TypeVar("Sigma", float, NDArray[np.float64])
 
 FEET: tuple[int, ...] = tuple(J[f"{side}_{part}"] for part in ("ankle", "foot") for side in ("left", "right"))
 """The joints that may stand: heels and toes."""
@@ -34,7 +36,7 @@ UNSEEN_SIGMA = 1.0
 """Metres, the standard deviation of a first root that rests on nothing seen."""
 
 JITTER_SHARE = 0.3
-"""Of a joint's standard deviation, the error that is new in each frame; the rest lasts."""
+"""Of the standard deviation of a joint or velocity, the error that is new in each frame; the rest lasts."""
 
 FOOT_SURPRISE = 4.0
 """Standard deviations from its place at which a standing foot has evidently moved: it stands anew."""
@@ -133,13 +135,11 @@ class Motion:
     Attributes:
         velocity: (3,) m/s.
         sigma: (3,) m/s, standard deviation of that.
-        drift: (3,) metres over √s by which a sum of such velocities strays.
         contacts: (8,) probabilities.
     """
 
     velocity: Floats
     sigma: Floats
-    drift: Floats
     contacts: Floats
 
 
@@ -215,20 +215,20 @@ class BodyTrack:
         filter_ = self._filter
         inferred = 1.0 if sighting.root is None else 1.0 - float(sighting.seen[_LEGS].mean())
         contacts = motion.contacts[_FOOT_CONTACTS]
-        contacts = np.where(hold & sighting.seen[list(FEET)] & (self._dt <= LONGEST_GAP_S), contacts, 0.0)
+        held = hold and sighting.root is not None and self._dt <= LONGEST_GAP_S
+        contacts = np.where(held & sighting.seen[list(FEET)], contacts, 0.0)
         standing = filter_.standing
         if self._dt > 0.0:
-            drifts = network and not standing.any()
-            filter_.predict(self._dt, motion.drift if drifts else 0.0)
+            filter_.predict(self._dt)
         if network:
-            filter_.observe_velocity(motion.velocity, np.hypot(motion.sigma, inferred * IMPUTED_LEGS_SPEED))
+            filter_.observe_velocity(motion.velocity, *_split(np.hypot(motion.sigma, inferred * IMPUTED_LEGS_SPEED)))
         self._observe_root(sighting)
         for k, joint in enumerate(FEET):
             if contacts[k] < (CONTACT_OFF if standing[k] else CONTACT_ON):
                 filter_.lift(k)
                 continue
             from_root = sighting.positions[joint] - sighting.positions[0]
-            sigma, _ = _split(float(sighting.sigma[joint]))
+            sigma = JITTER_SHARE * float(sighting.sigma[joint])
             if standing[k] and filter_.foot_surprise(k, from_root, sigma) < FOOT_SURPRISE:
                 filter_.observe_foot(k, from_root, sigma)
             else:
@@ -287,7 +287,7 @@ class BodyTrack:
         )
 
 
-def _split(sigma: float) -> tuple[float, float]:
+def _split(sigma: Sigma) -> tuple[Sigma, Sigma]:
     """The standard deviations of the jitter and of the slow error that make up ``sigma``."""
     return JITTER_SHARE * sigma, math.sqrt(1.0 - JITTER_SHARE**2) * sigma
 

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.simulated import FEET, Track, hold_last, measure, read_tracks, sigma_ratio, smooth
 from msgs.topics import POSE_RAW, POSE_TRUTH
-from msgs.types import Message, Pose, PoseRaw, PoseWorld, RawBody, WorldBody
+from msgs.types import Message, Pose, PoseRaw, PoseWorld, RawBody, Tracking, WorldBody
 from prior.skeletons import CANONICAL, PARENTS, REST_OFFSETS, J
 
 PERIOD_NS = 33_333_333
@@ -102,7 +102,7 @@ def test_tracks_of_a_recording_lie_in_the_world_at_the_sensors_stamps() -> None:
             state=np.ones(22),
             sigma=np.zeros(22),
             contacts=np.array([0, 0, 1, 1, 1, 0, 0, 0]),
-            tracking=0,
+            tracking=Tracking.OK,
         )
         other = replace(world, id=8, positions=body + [1.0, 0.0, 0.0])
         messages.append((POSE_TRUTH, PoseWorld(stamp, "world", "sim", np.array([0.0, 0, 1, 0]), [other, world])))

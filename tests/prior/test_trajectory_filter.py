@@ -18,12 +18,12 @@ def at_origin(noise: RootNoise, jitter: float, bias: float = 0.0) -> RootFilter:
 
 
 class Textbook:
-    """All three axes in one state of (3 + feet) * 3, with dense matrices and a vector update."""
+    """All three axes in one state of (4 + feet) * 3, with dense matrices and a vector update."""
 
     def __init__(self, noise, position, jitter, bias, velocity, feet):
-        self.noise, self.bias, self.size, self.standing = noise, bias, 3 + feet, set()
-        self.x = np.r_[position, velocity, np.zeros(3 + 3 * feet)]
-        self.p = self.block({(0, 0): jitter**2 + bias**2, (0, 2): -(bias**2), (2, 0): -(bias**2), (2, 2): bias**2})
+        self.noise, self.size, self.standing = noise, 4 + feet, set()
+        self.x = np.r_[position, velocity, np.zeros(6 + 3 * feet)]
+        self.p = self.block({(0, 0): jitter**2 + bias**2, (0, 2): -bias, (2, 0): -bias, (2, 2): 1.0, (3, 3): 1.0})
         self.p += self.block({(1, 1): noise.first_speed**2})
 
     def block(self, entries):
@@ -32,20 +32,20 @@ class Textbook:
             m[place] = value
         return np.kron(m, np.eye(3))
 
-    def predict(self, dt, drift):
-        n, kept = self.noise, np.exp(-dt / self.noise.memory_s)
-        f = np.eye(3 * self.size) + self.block({(0, 1): dt, (2, 2): kept - 1})
+    def predict(self, dt):
+        n = self.noise
+        sensor, network = np.exp(-dt / n.sensor_memory_s), np.exp(-dt / n.network_memory_s)
+        f = np.eye(3 * self.size) + self.block({(0, 1): dt, (2, 2): sensor - 1, (3, 3): network - 1})
         a = n.acceleration**2
-        q = self.block({(0, 0): a * dt**3 / 3 + drift**2 * dt, (0, 1): a * dt**2 / 2, (1, 0): a * dt**2 / 2})
-        q += self.block({(1, 1): a * dt, (2, 2): (1 - kept**2) * self.bias**2})
-        q += self.block({(3 + k, 3 + k): n.slip**2 * dt for k in self.standing})
+        q = self.block({(0, 0): a * dt**3 / 3, (0, 1): a * dt**2 / 2, (1, 0): a * dt**2 / 2, (1, 1): a * dt})
+        q += self.block({(2, 2): 1 - sensor**2, (3, 3): 1 - network**2})
+        q += self.block({(4 + k, 4 + k): n.slip**2 * dt for k in self.standing})
         self.x, self.p = f @ self.x, f @ self.p @ f.T + q
 
-    def correct(self, signs, z, sigma):
-        row = np.zeros((1, self.size))
-        for k, sign in signs.items():
-            row[0, k] = sign
-        h = np.kron(row, np.eye(3))
+    def correct(self, entries, z, sigma):
+        h = np.zeros((3, 3 * self.size))
+        for k, value in entries.items():
+            h[:, 3 * k : 3 * k + 3] = np.diag(np.broadcast_to(value, 3))
         s = h @ self.p @ h.T + np.diag(np.broadcast_to(sigma, 3) ** 2.0)
         k = self.p @ h.T @ np.linalg.inv(s)
         self.x = self.x + k @ (z - h @ self.x)
@@ -53,7 +53,7 @@ class Textbook:
 
     def plant(self, k, from_root, sigma):
         """A foot seen once stands where the root is, plus an error of its own: the limit of a vague prior."""
-        block = slice(9 + 3 * k, 12 + 3 * k)
+        block = slice(12 + 3 * k, 15 + 3 * k)
         self.x[block] = self.x[:3] + from_root
         self.p[block], self.p[:, block] = self.p[:3], self.p[:, :3]
         self.p[block, block] = self.p[:3, :3] + sigma**2 * np.eye(3)
@@ -62,32 +62,35 @@ class Textbook:
 
 def test_agrees_with_a_textbook_filter():
     rng = np.random.default_rng(0)
-    start, noise = rng.normal(size=3), RootNoise(3.0, 0.01, 0.5, 1.0)
-    ours, theirs = (kind(noise, start, 0.02, 0.05, [1.0, 0.0, 0.0], feet=2) for kind in (RootFilter, Textbook))
+    start, noise = rng.normal(size=3), RootNoise(3.0, 0.01, sensor_memory_s=0.5, network_memory_s=0.2)
+    velocity = np.array([1.0, 0.0, 0.0])
+    ours = RootFilter(noise, start, 0.02, 0.05, velocity, feet=2)
+    theirs = Textbook(noise, start, 0.02, 0.05, velocity, feet=2)
     for step in range(60):
         for each in (ours, theirs):
-            each.predict(DT, 0.02)
+            each.predict(DT)
         velocity, position, foot = rng.normal(size=(3, 3))
-        ours.observe_velocity(velocity, np.array([0.1, 0.1, 0.05]))
-        theirs.correct({1: 1}, velocity, np.array([0.1, 0.1, 0.05]))
+        jitter, bias = np.array([0.1, 0.1, 0.05]), np.array([0.3, 0.3, 0.1])
+        ours.observe_velocity(velocity, jitter, bias)
+        theirs.correct({1: 1.0, 3: bias}, velocity, jitter)
         if step % 3 == 0:
             ours.observe_position(position, 0.02, bias=0.05)
-            theirs.correct({0: 1, 2: 1}, position, 0.02)
+            theirs.correct({0: 1.0, 2: 0.05}, position, 0.02)
         if step == 5:
             ours.plant(1, foot, 0.02)
             theirs.plant(1, foot, 0.02)
         if step > 5:
             ours.observe_foot(1, foot, 0.03)
-            theirs.correct({4: 1, 0: -1}, foot, 0.03)
+            theirs.correct({5: 1.0, 0: -1.0}, foot, 0.03)
     np.testing.assert_allclose(np.r_[ours.position, ours.velocity], theirs.x[:6], atol=1e-6)
     np.testing.assert_allclose(ours.covariance, theirs.p[:6, :6], atol=1e-7)
 
 
 def test_a_slow_error_is_not_averaged_away():
     """A root seen a hundred times is no better known than the sensor's slow error allows."""
-    f = at_origin(RootNoise(acceleration=0.01, memory_s=100.0), jitter=0.02, bias=0.05)
+    f = at_origin(RootNoise(acceleration=0.01, sensor_memory_s=100.0), jitter=0.02, bias=0.05)
     for _ in range(100):
-        f.predict(DT, 0.0)
+        f.predict(DT)
         f.observe_position(np.zeros(3), 0.02, bias=0.05)
     assert (f.position_sigma > 0.045).all()
 
@@ -96,7 +99,7 @@ def test_covariance_grows_while_nothing_is_measured():
     f = at_origin(RootNoise(), jitter=0.01)
     spreads = []
     for _ in range(30):
-        f.predict(DT, 0.0)
+        f.predict(DT)
         spreads.append(f.position_sigma)
     assert (np.diff(spreads, axis=0) > 0).all()
 
@@ -106,8 +109,8 @@ def test_standing_foot_holds_the_root_and_stops_it():
     foot = np.array([0.1, 0.2, -0.9])
     f.plant(0, foot, 0.003)
     for _ in range(60):
-        f.predict(DT, 0.0)
-        f.observe_velocity(np.array([0.3, 0.0, 0.0]), 0.3)  # a network that is wrong
+        f.predict(DT)
+        f.observe_velocity(np.array([0.3, 0.0, 0.0]), 0.1, bias=0.3)  # a network that is wrong
         f.observe_foot(0, foot, 0.003)
     assert np.linalg.norm(f.position) < 0.03
     assert np.linalg.norm(f.velocity) < 0.1
@@ -118,7 +121,7 @@ def test_standing_foot_carries_the_root_over_it():
     f = at_origin(RootNoise(), jitter=0.01)
     f.plant(0, np.array([0.3, 0.0, -0.9]), 0.01)
     for step in range(1, 19):
-        f.predict(DT, 0.0)
+        f.predict(DT)
         f.observe_foot(0, np.array([0.3 - step * DT, 0.0, -0.9]), 0.01)
     assert f.position[0] == pytest.approx(18 * DT, abs=0.02)
     assert f.velocity[0] == pytest.approx(1.0, abs=0.1)
@@ -157,8 +160,8 @@ def test_turns_with_the_world(yaw: float, seed: int):
         f = RootFilter(RootNoise(), r @ rng.normal(size=3), 0.1, 0.05, r @ rng.normal(size=3), feet=1)
         f.plant(0, r @ rng.normal(size=3), 0.02)
         for _ in range(10):
-            f.predict(DT, 0.01)
-            f.observe_velocity(r @ rng.normal(size=3), np.array([0.2, 0.2, 0.1]))
+            f.predict(DT)
+            f.observe_velocity(r @ rng.normal(size=3), 0.1, bias=np.array([0.2, 0.2, 0.1]))
             f.observe_foot(0, r @ rng.normal(size=3), 0.02)
         ends.append(np.stack([f.position, f.velocity]))
     np.testing.assert_allclose(ends[1], ends[0] @ turn.T, atol=1e-9)
