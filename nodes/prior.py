@@ -13,6 +13,9 @@ from nodes.launch import Launch, LaunchError
 from nodes.runtime import FRAME_NS, Clock, Node
 from prior.pipeline import PriorPipeline, PriorSettings
 
+GATED = ("joints_refused", "limbs_exchanged")
+"""counts of what the gate found in the sensor's joints: its daily work, and no fault of a message"""
+
 
 def make_prior(settings: Mapping[str, Any]) -> PriorPipeline:
     """The prior as ``[prior]`` of a launch file wants it.
@@ -48,8 +51,11 @@ class PriorNode(Node):
             self.publish(POSE_CLEAN, clean, delay_ns=round(clean.delay_frames * FRAME_NS))
 
     def status(self) -> dict[str, str]:
-        return {
+        counts = {
+            f"{'gate' if cause in GATED else 'refused'}.{cause}": str(n) for cause, n in self._pipeline.counters.items()
+        }
+        return counts | {
             "bodies": str(self._bodies),
             "anomalies": str(self._anomalies),
             "delay_frames": str(self._pipeline.delay_frames),
-        } | {f"refused.{cause}": str(n) for cause, n in self._pipeline.counters.items()}
+        }

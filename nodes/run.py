@@ -209,6 +209,7 @@ def table(nodes: list[str], news: dict[str, Diagnostics], supervisor: Supervisor
                 "compute ms\np50/p99": _pair(values, "compute_ms"),
                 "delay\nms": f"{int(delay) * FRAME_MS:.0f}" if delay else "",
                 "bodies": values.get("bodies", ""),
+                "joints\ngated": values.get("gate.joints_refused", "0"),
                 "flagged": values.get("anomalies", "0"),
                 "queue": values.get("queue", ""),
                 "dropped": str(_sum(values, "dropped.")),
