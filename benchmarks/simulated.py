@@ -41,7 +41,7 @@ GAP_S = 0.5
 """a body that was away for longer is met anew"""
 SHORTEST = 15
 """frames, of a track that is scored"""
-DENSITIES = tuple(float(q) for q in np.round(np.geomspace(0.05, 50, 10), 3))
+DENSITIES = tuple(float(q) for q in np.round(np.geomspace(0.002, 20, 13), 4))
 """m²/s³, tried for the smoother"""
 MEASUREMENT_SIGMA = 0.02
 
