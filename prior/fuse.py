@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from msgs.types import JointState
 from prior.filters import FixedLagRTS, Smoothed
-from prior.kinematics import forward_kinematics, solve_pose
+from prior.pose_solver import place_joints, solve_pose
 from prior.skeletons import JOINTS, PARENTS
 from prior.window import FPS, Estimate, Ring, Window
 
@@ -82,7 +81,7 @@ class Fuse:
         prior_weight = 1 / (s.prior_sigma**2 + (s.prior_drift * np.minimum(held_s, s.fade)) ** 2)
         known = seen_weight > 0
         observed = np.where(known[..., None], smoothed.positions[slots], 0.0)
-        body = forward_kinematics(torch.from_numpy(decoded), torch.from_numpy(offsets))[0].numpy()
+        body = place_joints(decoded, offsets)
         # The pelvis goes where it brings the decoded body nearest to all joints seen, not only to itself.
         weight = (seen_weight * prior_weight / (seen_weight + prior_weight))[..., None]
         total = weight.sum(axis=1, keepdims=True)

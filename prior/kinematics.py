@@ -1,8 +1,7 @@
-"""Kinematics of the canonical skeleton: forward, from positions to rotations, and a person's bones.
+"""Kinematics of the canonical skeleton: forward (differentiable), a person's bones, headings and contacts.
 
 Rotations are local (child in parent's frame), the root's is its orientation in the frame of the positions. The
-identity everywhere is a T-pose facing +x, left +y, up +z. Forward kinematics is torch (differentiable, used in
-losses and in the live path); the solver is numpy (it runs on one frame, or on a whole recording, at once).
+identity everywhere is a T-pose facing +x, left +y, up +z. From positions to rotations: `prior.pose_solver`.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from prior.pose_solver import solve_rotations
 from prior.skeletons import JOINTS, PARENTS, REST_OFFSETS, J, finite_joints
 
 Floats = NDArray[np.float64]
@@ -30,10 +30,6 @@ def _levels() -> list[slice]:
 
 LEVELS: list[slice] = _levels()
 """Joints by depth: those of one level depend only on the level above and are handled together."""
-
-_CHILDREN: tuple[tuple[int, ...], ...] = tuple(
-    tuple(c for c, p in enumerate(PARENTS) if p == joint) for joint in range(len(PARENTS))
-)
 
 CONTACT_JOINTS: tuple[int, ...] = tuple(
     J[f"{side}_{part}"] for part in ("knee", "ankle", "foot", "wrist") for side in ("left", "right")
@@ -75,263 +71,6 @@ def forward_kinematics(rotations: Tensor, offsets: Tensor, root: Tensor | None =
         positions.append(positions[-1][..., parents, :] + (orientation @ offsets[..., level, :, :]).squeeze(-1))
         orientations.append(orientation @ rotations[..., level, :, :])
     return torch.cat(positions, dim=-2), torch.cat(orientations, dim=-3)
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# From positions to rotations
-
-
-# The live node solves one frame thirty times a second for each body: these few helpers replace np.cross and einsum,
-# whose set-up alone would cost several times the arithmetic.
-
-_LEVI_CIVITA: Floats = np.zeros((3, 9))
-for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _LEVI_CIVITA[_i, 3 * _j + _k], _LEVI_CIVITA[_i, 3 * _k + _j] = -1.0, 1.0
-_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
-_EYE: Floats = np.eye(3)
-
-
-def _skew(v: Floats) -> Floats:
-    """(..., 3, 3) such that ``_skew(v) @ u == cross(v, u)``."""
-    return (v @ _LEVI_CIVITA).reshape(*v.shape, 3)
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    return a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]
-
-
-def _dot(a: Floats, b: Floats) -> Floats:
-    return (a * b).sum(axis=-1, keepdims=True)
-
-
-def _apply(matrix: Floats, vector: Floats) -> Floats:
-    return (matrix @ vector[..., None])[..., 0]
-
-
-def _normalised(v: Floats) -> Floats:
-    return v / np.maximum(np.sqrt(_dot(v, v)), 1e-9)
-
-
-def _frame(left: Floats, up: Floats) -> Floats:
-    """(..., 3, 3) right-handed frame, columns forward, left, up: y along ``left``, z in the plane of ``up``."""
-    y = _normalised(left)
-    x = _normalised(_cross(y, up))
-    return np.stack([x, y, _cross(x, y)], axis=-1)
-
-
-def _against(a: Floats) -> Floats:
-    """(..., 4, 3) such that times a vector v it is cross(a, v) and a · v: all that turning unit ``a`` to v needs."""
-    return np.concatenate([_skew(a), a[..., None, :]], axis=-2)
-
-
-def _swing(against: Floats, b: Floats) -> Floats:
-    """The smallest rotations (..., 3, 3) that turn unit vectors, given by `_against`, into the directions ``b``."""
-    products = _apply(against, b) / np.maximum(np.sqrt(_dot(b, b)), 1e-9)
-    axis, cosine = products[..., :3], products[..., 3:]
-    # Rodrigues without the angle. Opposite directions have no smallest rotation: any half turn will do.
-    scaled = axis / np.maximum(1 + cosine, 1e-9)
-    rotation = cosine[..., None] * _EYE + _skew(axis) + axis[..., :, None] * scaled[..., None, :]
-    opposite = cosine[..., 0] < -1 + 1e-8
-    if opposite.any():
-        a = against[..., 3, :]
-        normal = _normalised(_cross(a, np.where(np.abs(a[..., :1]) < 0.9, _EYE[0], _EYE[1])))
-        half_turn = 2 * normal[..., :, None] * normal[..., None, :] - _EYE
-        rotation = np.where(opposite[..., None, None], half_turn, rotation)
-    return rotation
-
-
-def swing(a: Floats, b: Floats) -> Floats:
-    """The smallest rotation that turns direction ``a`` (..., 3) into ``b`` (..., 3), as (..., 3, 3) matrices."""
-    return _swing(_against(_normalised(a)), b)
-
-
-def _about(axis: Floats, angle: Floats) -> Floats:
-    """Rotation matrices (..., 3, 3) about unit ``axis`` (..., 3) by ``angle`` (...) radians."""
-    k = _skew(axis)
-    angle = np.asarray(angle)[..., None, None]
-    return _EYE + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
-
-
-# The hinge axes in the rest pose, about which elbows and knees flex (right-hand rule, flexion positive).
-_HINGE: dict[int, tuple[float, float, float]] = {
-    J["left_hip"]: (0.0, 1.0, 0.0),
-    J["right_hip"]: (0.0, 1.0, 0.0),
-    J["left_shoulder"]: (0.0, 0.0, -1.0),
-    J["right_shoulder"]: (0.0, 0.0, 1.0),
-}
-# The sine of the bend below which the plane of a limb says nothing of its twist, and above which it says all.
-_BEND_NONE, _BEND_FULL = 0.1, 0.35
-
-# What shows the frame of pelvis and chest, best first: a left-right pair, and a place above (a mean of joints).
-_TRUNK_LEFT: dict[int, list[tuple[int, int]]] = {
-    J["pelvis"]: [(J["left_hip"], J["right_hip"]), (J["left_shoulder"], J["right_shoulder"])],
-    J["spine3"]: [(J["left_shoulder"], J["right_shoulder"]), (J["left_collar"], J["right_collar"])],
-}
-_TRUNK_UP: dict[int, list[tuple[int, ...]]] = {
-    J["pelvis"]: [(J["spine3"],), (J["spine2"],), (J["neck"],), (J["left_shoulder"], J["right_shoulder"])],
-    J["spine3"]: [(J["neck"],), (J["head"],)],
-}
-
-
-def _below(joint: int) -> list[int]:
-    """The joints below to aim at, nearest first, as far as the chain does not branch."""
-    chain: list[int] = []
-    while len(_CHILDREN[joint]) == 1:
-        joint = _CHILDREN[joint][0]
-        chain.append(joint)
-    return chain
-
-
-# (22, 4) joints to aim at, nearest first; a joint that aims at nothing (trunk, leaf) names itself, unseen.
-_AIM: NDArray[np.intp] = np.array(
-    [
-        (below := [] if j in _TRUNK_UP else _below(j)) + [below[-1] if below else j] * (4 - len(below))
-        for j in range(len(PARENTS))
-    ]
-)
-_AIMS: NDArray[np.bool_] = np.array([j not in _TRUNK_UP and bool(_below(j)) for j in range(len(PARENTS))])
-
-
-def solve_rotations(
-    positions: NDArray[np.floating], offsets: NDArray[np.floating], fallback: NDArray[np.floating] | None = None
-) -> Floats:
-    """Local rotations from joint positions: swing from the bones' directions, twist from elbows and knees.
-
-    The pelvis and the chest take the frame spanned by hips (shoulders) and spine (neck). Every other joint swings
-    its bone from where forward kinematics has put it towards the next joint seen below, so that an error is not
-    handed down the chain; a shoulder or hip also twists so that the limb bends in the plane seen, as far as it is
-    bent enough to show one. The twist of neck, head, wrists and feet cannot be seen in 22 positions: identity.
-    With the hips hidden, the pelvis is taken to be upright below the shoulders.
-
-    Args:
-        positions: (..., 22, 3) metres, z up; NaN where unobserved.
-        offsets: (22, 3) or (..., 22, 3) metres, the person's bones.
-        fallback: (..., 22, 3, 3) local rotations for what cannot be solved (the last frame's, say); identity
-            if left out.
-
-    Returns:
-        (..., 22, 3, 3) local rotation matrices, float64.
-    """
-    return solve_pose(positions, offsets, fallback)[0]
-
-
-def solve_pose(
-    positions: NDArray[np.floating], offsets: NDArray[np.floating], fallback: NDArray[np.floating] | None = None
-) -> tuple[Floats, Floats]:
-    """`solve_rotations`, and the positions (..., 22, 3) where those rotations put the joints on these bones."""
-    p = np.asarray(positions, dtype=np.float64)
-    batch, joints = p.shape[:-2], len(PARENTS)
-    offsets = np.asarray(offsets, dtype=np.float64)
-    rest = _rest_positions(offsets)
-    seen = finite_joints(p)
-    p = np.where(seen[..., None], p, 0.0)
-    local = np.empty((*batch, joints, 3, 3))
-    local[...] = _EYE if fallback is None else fallback
-
-    first = seen[..., _AIM].argmax(axis=-1)
-    target = _AIM[np.arange(joints), first]
-    aimed = np.take_along_axis(seen, target, axis=-1) & _AIMS
-    place = np.take_along_axis(p, target[..., None], axis=-2)
-    at_rest = np.take_along_axis(np.broadcast_to(rest, p.shape), target[..., None], axis=-2) - rest
-    at_rest[~aimed] = _EYE[0]
-    against = _against(_normalised(at_rest))
-
-    orientations: list[Floats] = []
-    reached: list[Floats] = []
-    for depth, level in enumerate(LEVELS):
-        if depth == 0:
-            above = np.broadcast_to(_EYE, (*batch, 1, 3, 3))
-            here = _pelvis(p, seen, rest)
-        else:
-            parents = [q - LEVELS[depth - 1].start for q in PARENTS[level]]
-            above = orientations[-1][..., parents, :, :]
-            here = reached[-1][..., parents, :] + _apply(above, offsets[..., level, :])
-        back = above.swapaxes(-1, -2)
-        if _AIMS[level].any():
-            known = aimed[..., level]
-            direction = _apply(back, place[..., level, :] - here)
-            direction[~known] = _EYE[0]
-            turn = _swing(against[..., level, :, :], direction)
-            hinges = [j for j in range(level.start, level.stop) if j in _HINGE]
-            if hinges:
-                k = slice(hinges[0] - level.start, hinges[-1] + 1 - level.start)
-                turn[..., k, :, :] = (
-                    _twist(hinges, p, seen, back[..., k, :, :], turn[..., k, :, :], direction[..., k, :])
-                    @ turn[..., k, :, :]
-                )
-            local[..., level, :, :] = np.where(known[..., None, None], turn, local[..., level, :, :])
-        for joint in _TRUNK_UP:
-            if level.start <= joint < level.stop:
-                k = joint - level.start
-                solved, world = _solve_trunk(joint, p, seen, rest, here[..., k, :])
-                local[..., joint, :, :] = np.where(
-                    solved[..., None, None], back[..., k, :, :] @ world, local[..., joint, :, :]
-                )
-        reached.append(here)
-        orientations.append(above @ local[..., level, :, :])
-    return local, np.concatenate(reached, axis=-2)
-
-
-def _pelvis(p: Floats, seen: NDArray[np.bool_], rest: Floats) -> Floats:
-    """(..., 1, 3) the pelvis: seen, between the hips, or upright below the highest part of the trunk seen."""
-    hips, shoulders = [J["left_hip"], J["right_hip"]], [J["left_shoulder"], J["right_shoulder"]]
-    place = p[..., :1, :]
-    unseen = ~seen[..., 0]
-    for group in (hips, [J["spine3"]], [J["neck"]], shoulders):
-        if not unseen.any():
-            break
-        usable = unseen & seen[..., group].all(axis=-1)
-        centre = p[..., group, :].mean(axis=-2) - rest[..., group, :].mean(axis=-2) * _EYE[2]
-        place = np.where(usable[..., None, None], centre[..., None, :], place)
-        unseen = unseen & ~usable
-    return place
-
-
-def _solve_trunk(
-    joint: int, p: Floats, seen: NDArray[np.bool_], rest: Floats, here: Floats
-) -> tuple[NDArray[np.bool_], Floats]:
-    """Which frames show the frame of pelvis or chest, and its rotation in the frame of the positions."""
-    frame = np.broadcast_to(_EYE, (*p.shape[:-2], 3, 3))
-    solved = np.zeros(p.shape[:-2], dtype=bool)
-    for left, right in _TRUNK_LEFT[joint]:
-        for above in _TRUNK_UP[joint]:
-            group = list(above)
-            usable = seen[..., left] & seen[..., right] & seen[..., group].all(axis=-1) & ~solved
-            if not usable.any():
-                continue
-            left_right = np.where(usable[..., None], p[..., left, :] - p[..., right, :], _EYE[1])
-            up = np.where(usable[..., None], p[..., group, :].mean(axis=-2) - here, _EYE[2])
-            rest_up = rest[..., group, :].mean(axis=-2) - rest[..., joint, :]
-            rest_frame = _frame(rest[..., left, :] - rest[..., right, :], rest_up)
-            turned = _frame(left_right, up) @ rest_frame.swapaxes(-1, -2)
-            frame = np.where(usable[..., None, None], turned, frame)
-            solved |= usable
-            if solved.all():
-                return solved, frame
-    return solved, frame
-
-
-def _twist(
-    joints: list[int], p: Floats, seen: NDArray[np.bool_], to_parent: Floats, swung: Floats, bone: Floats
-) -> Floats:
-    """The rotation about ``bone`` (parent's frame) that puts the hinge below into the plane of the bent limb."""
-    middle = [_CHILDREN[j][0] for j in joints]
-    end = [_CHILDREN[m][0] for m in middle]
-    visible = seen[..., middle] & seen[..., end]
-    bone = _normalised(bone)
-    normal = _cross(bone, _normalised(_apply(to_parent, p[..., end, :] - p[..., middle, :])))
-    bend = np.sqrt(_dot(normal, normal))[..., 0]
-    hinge = _apply(swung, np.array([_HINGE[j] for j in joints]))
-    angle = np.arctan2(_dot(_cross(hinge, normal), bone)[..., 0], _dot(hinge, normal)[..., 0])
-    trust = np.clip((bend - _BEND_NONE) / (_BEND_FULL - _BEND_NONE), 0.0, 1.0)
-    return _about(bone, np.where(visible, angle * trust * trust * (3 - 2 * trust), 0.0))
-
-
-def _rest_positions(offsets: Floats) -> Floats:
-    rest = np.zeros_like(offsets)
-    for level in LEVELS[1:]:
-        rest[..., level, :] = rest[..., list(PARENTS[level]), :] + offsets[..., level, :]
-    return rest
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -417,7 +156,12 @@ def heading(root_rotation: NDArray[np.floating]) -> Floats:
 def yaw_matrix(angle: NDArray[np.floating] | float) -> Floats:
     """Rotation (..., 3, 3) about z by ``angle`` (...) radians."""
     angle = np.asarray(angle, dtype=np.float64)
-    return _about(np.broadcast_to(_EYE[2], (*angle.shape, 3)), angle)
+    matrix = np.zeros((*angle.shape, 3, 3))
+    matrix[..., 0, 0] = matrix[..., 1, 1] = np.cos(angle)
+    matrix[..., 1, 0] = np.sin(angle)
+    matrix[..., 0, 1] = -matrix[..., 1, 0]
+    matrix[..., 2, 2] = 1.0
+    return matrix
 
 
 def rigid_alignment(source: NDArray[np.floating], target: NDArray[np.floating]) -> tuple[Floats, Floats]:

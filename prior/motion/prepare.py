@@ -13,9 +13,10 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from prior.kinematics import CONTACT_SPEED, estimate_offsets, label_contacts, solve_rotations
+from prior.kinematics import CONTACT_SPEED, estimate_offsets, label_contacts
 from prior.motion.clip import Clip
 from prior.motion.datasets import Dropped, Split, WeightSet
+from prior.pose_solver import solve_rotations
 from prior.skeletons import JOINTS, PARENTS, J, finite_joints
 
 FPS = 30.0

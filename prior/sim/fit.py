@@ -22,8 +22,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from prior.kinematics import estimate_offsets, global_rotations, solve_rotations
+from prior.kinematics import estimate_offsets, global_rotations
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
+from prior.pose_solver import solve_rotations
 from prior.sim.noise import KINECT_NOISE, NoiseModel, draw_errors, ray_axes, travelled
 from prior.skeletons import JOINTS, KINECT22, MIRROR, PARENTS, J, to_canonical
 

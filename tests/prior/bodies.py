@@ -11,6 +11,22 @@ from prior.kinematics import forward_kinematics
 from prior.skeletons import REST_OFFSETS, J
 
 PERIOD_NS = 33_333_333
+LEAVES = [J[n] for n in ("left_foot", "right_foot", "head", "left_wrist", "right_wrist")]
+
+
+def random_pose(rng: np.random.Generator, frames: int, spread: float = 0.35) -> np.ndarray:
+    """Local rotations that the solver can recover: leaves at rest, elbows and knees hinges, limbs well bent."""
+    vectors = rng.normal(size=(frames, 22, 3)) * spread
+    vectors[:, LEAVES] = 0
+    vectors[:, [J["spine1"], J["spine2"], J["spine3"], J["neck"]]] *= 0.2
+    for joint, axis in (("left_elbow", (0, 0, -1)), ("right_elbow", (0, 0, 1)), ("left_knee", (0, 1, 0)),
+                        ("right_knee", (0, 1, 0))):  # fmt: skip
+        vectors[:, J[joint]] = rng.uniform(0.6, 1.8, size=(frames, 1)) * np.array(axis)
+    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(frames, 22, 3, 3)
+
+
+def fk(rotations: np.ndarray, offsets: np.ndarray = REST_OFFSETS) -> np.ndarray:
+    return forward_kinematics(torch.from_numpy(rotations), torch.from_numpy(offsets))[0].numpy()
 
 
 def waving(frames: int, scale: float = 1.0, speed: float = 1.0) -> np.ndarray:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from prior.checkpoint import WEIGHTS, load_weights
 from prior.hmvae import HMVAE, HMVAEConfig, Posterior, from_6d, to_6d
-from prior.kinematics import forward_kinematics, solve_rotations
+from prior.kinematics import forward_kinematics
 from prior.motion_windows import (
     MotionSet,
     mirror_offsets,
@@ -16,6 +16,7 @@ from prior.motion_windows import (
     remove_heading,
     yaw_rotation,
 )
+from prior.pose_solver import solve_rotations
 from prior.skeletons import REST_OFFSETS
 from prior.train_hmvae import train_hmvae
 from tests.prior.bodies import waving

@@ -1,0 +1,299 @@
+"""From joint positions to local rotations and back, on one person's bones, frame by frame.
+
+Swing comes from the directions of the bones, twist from the bend of elbows and knees. The loops are compiled by numba:
+the live node solves two poses a body thirty times a second, where an array operation a step would cost ten times the
+arithmetic. Rotations are local (child in parent's frame); the root's is its orientation in the frame of the positions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from prior.skeletons import PARENTS, J, finite_joints
+
+Floats = NDArray[np.float64]
+
+_CHILDREN: tuple[tuple[int, ...], ...] = tuple(
+    tuple(c for c, p in enumerate(PARENTS) if p == joint) for joint in range(len(PARENTS))
+)
+_PARENT = np.array(PARENTS)
+
+# What shows the frame of pelvis and chest, best first: a left-right pair, and a place above, the middle of two joints.
+_TRUNK = np.array([J["pelvis"], J["spine3"]])
+_TRUNK_LEFT = np.array(
+    [
+        [(J["left_hip"], J["right_hip"]), (J["left_shoulder"], J["right_shoulder"])],
+        [(J["left_shoulder"], J["right_shoulder"]), (J["left_collar"], J["right_collar"])],
+    ]
+)
+_SHOULDERS = (J["left_shoulder"], J["right_shoulder"])
+_TRUNK_UP = np.array(
+    [
+        [(J["spine3"],) * 2, (J["spine2"],) * 2, (J["neck"],) * 2, _SHOULDERS],
+        [(J["neck"],) * 2, (J["head"],) * 2, (J["head"],) * 2, (J["head"],) * 2],
+    ]
+)
+# Where the pelvis is upright below, when it is hidden itself: the middle of two joints, best first.
+_BELOW = np.array([(J["left_hip"], J["right_hip"]), (J["spine3"],) * 2, (J["neck"],) * 2, _SHOULDERS])
+
+
+def _aims() -> NDArray[np.intp]:
+    """(22, 4) joints to aim at, nearest first, as far as the chain below does not branch; -1 for none."""
+    aims = np.full((len(PARENTS), 4), -1)
+    for joint in set(range(len(PARENTS))) - set(_TRUNK.tolist()):
+        below = joint
+        for k in range(4):
+            if len(_CHILDREN[below]) != 1:
+                break
+            below = _CHILDREN[below][0]
+            aims[joint, k] = below
+    return aims
+
+
+_AIM = _aims()
+
+# The hinge axes in the rest pose, about which elbows and knees flex (right-hand rule, flexion positive).
+_HINGE = np.zeros((len(PARENTS), 3))
+_HINGE[[J["left_hip"], J["right_hip"]]] = (0.0, 1.0, 0.0)
+_HINGE[J["left_shoulder"]] = (0.0, 0.0, -1.0)
+_HINGE[J["right_shoulder"]] = (0.0, 0.0, 1.0)
+# The sine of the bend below which the plane of a limb says nothing of its twist, and above which it says all.
+_BEND_NONE, _BEND_FULL = 0.1, 0.35
+
+
+def solve_rotations(
+    positions: NDArray[np.floating], offsets: NDArray[np.floating], fallback: NDArray[np.floating] | None = None
+) -> Floats:
+    """Local rotations from joint positions.
+
+    The pelvis and the chest take the frame spanned by hips (shoulders) and spine (neck). Every other joint swings
+    its bone from where forward kinematics has put it towards the next joint seen below, so that an error is not
+    handed down the chain; a shoulder or hip also twists so that the limb bends in the plane seen, as far as it is
+    bent enough to show one. The twist of neck, head, wrists and feet cannot be seen in 22 positions: identity.
+    With the hips hidden, the pelvis is taken to be upright below the shoulders.
+
+    Args:
+        positions: (..., 22, 3) metres, z up; NaN where unobserved.
+        offsets: (22, 3) or (..., 22, 3) metres, the person's bones.
+        fallback: (..., 22, 3, 3) local rotations for what cannot be solved (the last frame's, say); identity
+            if left out.
+
+    Returns:
+        (..., 22, 3, 3) local rotation matrices, float64.
+    """
+    return solve_pose(positions, offsets, fallback)[0]
+
+
+def solve_pose(
+    positions: NDArray[np.floating], offsets: NDArray[np.floating], fallback: NDArray[np.floating] | None = None
+) -> tuple[Floats, Floats]:
+    """`solve_rotations`, and the positions (..., 22, 3) where those rotations put the joints on these bones."""
+    shape = np.shape(positions)
+    p, bones = _frames(positions, shape), _frames(offsets, shape)
+    local = np.empty((*p.shape, 3))
+    local[...] = np.eye(3) if fallback is None else np.reshape(fallback, local.shape)
+    placed = np.empty_like(p)
+    _solve(p, np.asarray(finite_joints(p)), bones, local, placed)
+    return local.reshape(*shape, 3), placed.reshape(shape)
+
+
+def place_joints(rotations: NDArray[np.floating], offsets: NDArray[np.floating]) -> Floats:
+    """Forward kinematics without gradients: positions (..., 22, 3) metres, the root at the origin.
+
+    Args:
+        rotations: (..., 22, 3, 3) local.
+        offsets: (22, 3) or (..., 22, 3) metres.
+    """
+    shape = np.shape(rotations)[:-1]
+    bones = _frames(offsets, shape)
+    placed = np.empty_like(bones)
+    _place(np.array(rotations, dtype=np.float64, order="C").reshape(*bones.shape, 3), bones, placed)
+    return placed.reshape(shape)
+
+
+def _frames(values: NDArray[np.floating], shape: tuple[int, ...]) -> Floats:
+    """(B, 22, 3) float64 of values that broadcast to ``shape``; a copy, as compiled code takes no read-only arrays."""
+    return np.array(np.broadcast_to(values, shape), dtype=np.float64, order="C").reshape(-1, *shape[-2:])
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Vectors (3,) and matrices (3, 3)
+
+
+@njit(cache=True)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def _cross(a, b):
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@njit(cache=True)
+def _normalised(v):
+    return v / max(np.sqrt(_dot(v, v)), 1e-9)
+
+
+@njit(cache=True)
+def _product(a, b):
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+    return out
+
+
+@njit(cache=True)
+def _turned(m, v):
+    return np.array([_dot(m[0], v), _dot(m[1], v), _dot(m[2], v)])
+
+
+@njit(cache=True)
+def _turned_back(m, v):
+    return m[0] * v[0] + m[1] * v[1] + m[2] * v[2]
+
+
+@njit(cache=True)
+def _frame(left, up):
+    """Right-handed frame, columns forward, left, up: y along ``left``, z in the plane of ``up``."""
+    y = _normalised(left)
+    x = _normalised(_cross(y, up))
+    z = _cross(x, y)
+    out = np.empty((3, 3))
+    out[:, 0], out[:, 1], out[:, 2] = x, y, z
+    return out
+
+
+@njit(cache=True)
+def _about(axis, angle):
+    """The rotation about unit ``axis`` by ``angle`` radians."""
+    s, c = np.sin(angle), np.cos(angle)
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = (1.0 - c) * axis[i] * axis[j]
+        out[i, i] += c
+    out[0, 1] -= s * axis[2]
+    out[0, 2] += s * axis[1]
+    out[1, 0] += s * axis[2]
+    out[1, 2] -= s * axis[0]
+    out[2, 0] -= s * axis[1]
+    out[2, 1] += s * axis[0]
+    return out
+
+
+@njit(cache=True)
+def swing(a, b):
+    """The smallest rotation (3, 3) that turns direction ``a`` (3,) into ``b`` (3,)."""
+    a, b = _normalised(a), _normalised(b)
+    axis, cosine = _cross(a, b), _dot(a, b)
+    if cosine < -1.0 + 1e-8:  # opposite directions have no smallest rotation: any half turn will do
+        other = np.array([1.0, 0.0, 0.0]) if abs(a[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+        return _about(_normalised(_cross(a, other)), np.pi)
+    out = np.empty((3, 3))
+    for i in range(3):  # Rodrigues without the angle
+        for j in range(3):
+            out[i, j] = axis[i] * axis[j] / (1.0 + cosine)
+        out[i, i] += cosine
+    out[0, 1] -= axis[2]
+    out[0, 2] += axis[1]
+    out[1, 0] += axis[2]
+    out[1, 2] -= axis[0]
+    out[2, 0] -= axis[1]
+    out[2, 1] += axis[0]
+    return out
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# A frame
+
+
+@njit(cache=True)
+def _pelvis(p, seen, rest):
+    """The pelvis: seen, between the hips, or upright below the highest part of the trunk seen."""
+    if not seen[0]:
+        for a, b in _BELOW:
+            if seen[a] and seen[b]:
+                place = (p[a] + p[b]) / 2.0
+                place[2] -= (rest[a, 2] + rest[b, 2]) / 2.0
+                return place
+    return np.where(np.isfinite(p[0]), p[0], 0.0)
+
+
+@njit(cache=True)
+def _trunk(which, p, seen, rest, here):
+    """Whether the frame shows pelvis (0) or chest (1), and its rotation in the frame of the positions."""
+    joint = _TRUNK[which]
+    for left, right in _TRUNK_LEFT[which]:
+        for a, b in _TRUNK_UP[which]:
+            if seen[left] and seen[right] and seen[a] and seen[b]:
+                shown = _frame(p[left] - p[right], (p[a] + p[b]) / 2.0 - here)
+                at_rest = _frame(rest[left] - rest[right], (rest[a] + rest[b]) / 2.0 - rest[joint])
+                return True, _product(shown, at_rest.T)
+    return False, np.eye(3)
+
+
+@njit(cache=True)
+def _twist(joint, p, seen, above, turn, bone):
+    """``turn``, twisted about ``bone`` (parent's frame) so that the hinge below lies in the plane of the bent limb."""
+    middle = _AIM[joint, 0]
+    end = _AIM[joint, 1]
+    if not (seen[middle] and seen[end]):
+        return turn
+    bone = _normalised(bone)
+    normal = _cross(bone, _normalised(_turned_back(above, p[end] - p[middle])))
+    trust = (np.sqrt(_dot(normal, normal)) - _BEND_NONE) / (_BEND_FULL - _BEND_NONE)
+    trust = min(max(trust, 0.0), 1.0)
+    hinge = _turned(turn, _HINGE[joint])
+    angle = np.arctan2(_dot(_cross(hinge, normal), bone), _dot(hinge, normal))
+    return _product(_about(bone, angle * trust * trust * (3.0 - 2.0 * trust)), turn)
+
+
+@njit("(f8[:,:,::1], b1[:,::1], f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1])", cache=True)
+def _solve(positions, observed, offsets, local, placed):
+    """Of B frames: writes ``placed`` (B, 22, 3), and into ``local`` (B, 22, 3, 3) what can be solved."""
+    joints = len(_PARENT)
+    rest = np.empty((joints, 3))
+    world = np.empty((joints, 3, 3))
+    for frame in range(len(positions)):
+        p, seen, bones = positions[frame], observed[frame], offsets[frame]
+        rest[0] = 0.0
+        for joint in range(1, joints):
+            rest[joint] = rest[_PARENT[joint]] + bones[joint]
+        for joint in range(joints):
+            if joint == 0:
+                above, here = np.eye(3), _pelvis(p, seen, rest)
+            else:
+                above = world[_PARENT[joint]]
+                here = placed[frame, _PARENT[joint]] + _turned(above, bones[joint])
+            placed[frame, joint] = here
+            for which in range(len(_TRUNK)):
+                if joint == _TRUNK[which]:
+                    solved, orientation = _trunk(which, p, seen, rest, here)
+                    if solved:
+                        local[frame, joint] = _product(above.T, orientation)
+            for target in _AIM[joint]:
+                if target >= 0 and seen[target]:
+                    direction = _turned_back(above, p[target] - here)
+                    turn = swing(rest[target] - rest[joint], direction)
+                    if _HINGE[joint].any():
+                        turn = _twist(joint, p, seen, above, turn, direction)
+                    local[frame, joint] = turn
+                    break
+            world[joint] = _product(above, local[frame, joint])
+
+
+@njit("(f8[:,:,:,::1], f8[:,:,::1], f8[:,:,::1])", cache=True)
+def _place(local, offsets, placed):
+    """Of B frames: writes ``placed`` (B, 22, 3)."""
+    world = np.empty((len(_PARENT), 3, 3))
+    for frame in range(len(local)):
+        placed[frame, 0] = 0.0
+        world[0] = local[frame, 0]
+        for joint in range(1, len(_PARENT)):
+            above = world[_PARENT[joint]]
+            placed[frame, joint] = placed[frame, _PARENT[joint]] + _turned(above, offsets[frame, joint])
+            world[joint] = _product(above, local[frame, joint])
