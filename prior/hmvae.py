@@ -22,6 +22,9 @@ from prior.skeletons import PARENTS
 ROTATION_FEATURES = 6
 """A joint's features: the first two columns of its local rotation."""
 
+SLOPE = 0.2
+"""of the LeakyReLU"""
+
 
 @dataclass(frozen=True)
 class HMVAEConfig:
@@ -87,7 +90,7 @@ class HMVAE(nn.Module):
             if steps[-1] % stride:
                 raise ValueError(f"a window of {config.window} frames cannot be strided by {config.strides}")
             steps.append(steps[-1] // stride)
-        self._steps = steps
+        self.steps = steps
         c = self.CHANNELS
         self.encoder = nn.ModuleList(
             nn.ModuleList(
@@ -120,15 +123,15 @@ class HMVAE(nn.Module):
         local = features
         for k, block in enumerate(self.encoder):
             conv, pool = block  # type: ignore[misc]  (a ModuleList of two)
-            features = F.leaky_relu(pool(conv(features)), 0.2)
+            features = F.leaky_relu(pool(conv(features)), SLOPE)
             if k == 0:
                 local = features
         return Posterior(*self.to_local(local).chunk(2, dim=-1), *self.to_global(features).chunk(2, dim=-1))
 
     def decode(self, local: Tensor, deep: Tensor) -> Tensor:
         """Windows (B, T, 22, 6) of z_l (B, E1, d) and z_g (B, E4, d)."""
-        features = self.from_global(deep).reshape(deep.shape[0], -1, self._steps[4])
-        local_features = self.from_local(local).reshape(local.shape[0], -1, self._steps[1])
+        features = self.from_global(deep).reshape(deep.shape[0], -1, self.steps[4])
+        local_features = self.from_local(local).reshape(local.shape[0], -1, self.steps[1])
         for k, block in zip(reversed(range(4)), self.decoder, strict=True):
             unpool, conv = block  # type: ignore[misc]
             if k == 0:
@@ -137,7 +140,7 @@ class HMVAE(nn.Module):
                 features = F.interpolate(features, scale_factor=self.config.strides[k], mode="linear")
             features = conv(unpool(features))
             if k > 0:
-                features = F.leaky_relu(features, 0.2)
+                features = F.leaky_relu(features, SLOPE)
         return features.transpose(1, 2).reshape(len(features), self.config.window, -1, ROTATION_FEATURES)
 
     def reconstruct(self, x: Tensor) -> Tensor:

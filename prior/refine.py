@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from prior.checkpoint import load_weights
 from prior.hmvae import HMVAE, HMVAEConfig, from_6d, to_6d
+from prior.hmvae_live import LiveHMVAE
 from prior.motion_windows import remove_heading
 from prior.window import Window
 
@@ -39,10 +40,10 @@ class Refine:
     def __init__(self, settings: RefineSettings, delay_frames: int) -> None:
         self._enabled = settings.enabled
         state, config = load_weights(settings.weights, "hmvae")
-        self._model = HMVAE(HMVAEConfig.from_dict(config))
-        self._model.load_state_dict(state)
-        self._model.eval()
-        self.window = self._model.config.window
+        model = HMVAE(HMVAEConfig.from_dict(config))
+        model.load_state_dict(state)
+        self._reconstruct = LiveHMVAE(model)
+        self.window = model.config.window
         if not 0 <= delay_frames <= self.window // 2:
             raise ValueError(
                 f"delay: expected 0 to {self.window // 2} frames (half of the model's window), got {delay_frames}"
@@ -65,7 +66,7 @@ class Refine:
             return window
         rotations = torch.from_numpy(frames).float().transpose(0, 1)
         turned, back = remove_heading(rotations, self.window // 2 - 1)
-        decoded = from_6d(self._model.reconstruct(to_6d(turned)))
+        decoded = from_6d(self._reconstruct(to_6d(turned)))
         decoded[:, :, 0] = back[:, None] @ decoded[:, :, 0]
         window.decoded[:, slots] = decoded.transpose(0, 1).double().numpy()
         return window

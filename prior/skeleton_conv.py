@@ -92,7 +92,7 @@ class SkeletonConv(nn.Module):
         super().__init__()
         edges = len(neighbours)
         self.stride, self.padding = stride, padding
-        self._pad = (kernel - 1, 0) if padding == "causal" else ((kernel - 1) // 2, (kernel - 1) // 2)
+        self.pad = (kernel - 1, 0) if padding == "causal" else ((kernel - 1) // 2, (kernel - 1) // 2)
         sees = torch.zeros(edges, edges)
         for edge, near in enumerate(neighbours):
             sees[edge, list(near)] = 1.0
@@ -108,7 +108,7 @@ class SkeletonConv(nn.Module):
         # Masked weights start at zero and the mask stops their gradient, so they stay zero: once trained, the
         # live path need not multiply.
         weight = self.weight * self.mask if self.training else self.weight
-        x = F.pad(x, self._pad, mode="replicate" if self.padding == "causal" else "reflect")
+        x = F.pad(x, self.pad, mode="replicate" if self.padding == "causal" else "reflect")
         # One product over unfolded windows: at these lengths half the time of torch's convolution on a CPU.
         windows = x.unfold(2, weight.shape[2], self.stride).transpose(1, 2).flatten(2)
         return F.linear(windows, weight.flatten(1), self.bias).transpose(1, 2)

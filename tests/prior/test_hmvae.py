@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from prior.checkpoint import WEIGHTS, load_weights
 from prior.hmvae import HMVAE, HMVAEConfig, Posterior, from_6d, to_6d
+from prior.hmvae_live import LiveHMVAE
 from prior.kinematics import forward_kinematics
 from prior.motion_windows import (
     MotionSet,
@@ -17,6 +18,7 @@ from prior.motion_windows import (
     yaw_rotation,
 )
 from prior.pose_solver import solve_rotations
+from prior.skeleton_conv import SkeletonConv
 from prior.skeletons import REST_OFFSETS
 from prior.train_hmvae import train_hmvae
 from tests.prior.bodies import waving
@@ -49,6 +51,18 @@ def test_the_papers_two_window_lengths_have_the_official_latents(config, local, 
     assert posterior.local_mean.shape == local
     assert posterior.global_mean.shape == deep
     assert model.decode(*posterior.sample()).shape == x.shape
+
+
+@pytest.mark.parametrize("config", [HMVAEConfig(), HMVAEConfig(64, 15, (2, 2, 2, 2), 12, 24)])
+def test_the_live_model_reconstructs_as_the_trained_one(config) -> None:
+    model = HMVAE(config).eval()
+    for parameter in model.parameters():  # biases start at zero, where a slip in folding them would not show
+        torch.nn.init.normal_(parameter, std=0.05)
+    x = torch.randn(3, config.window, 22, 6)
+    for module in model.modules():
+        if isinstance(module, SkeletonConv):
+            module.weight.data *= module.mask
+    assert torch.allclose(LiveHMVAE(model)(x), model.reconstruct(x), rtol=1e-4, atol=1e-4)
 
 
 def test_a_window_that_the_strides_do_not_divide_is_refused() -> None:
