@@ -14,8 +14,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import roma
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -232,28 +230,26 @@ class PriorPipeline:
         """The estimate of the frame ``back`` before the newest, in the frame of the message that completed it."""
         window = self._window
         to_world, origin = _sensor(raw)
-        to_sensor = to_world.T
-        rotations = estimate.rotations.copy()
-        rotations[:, 0] = to_sensor @ rotations[:, 0]
-        quaternions = roma.rotmat_to_unitquat(torch.from_numpy(rotations)).numpy()
-        positions = (estimate.positions - origin) @ to_world
-        raw_positions = (window.raw.all[-1 - back] - origin) @ to_world
-        bodies = [
-            CleanBody(
-                id=body_id,
-                positions=positions[slot],
-                rotations=quaternions[slot],
-                state=estimate.state[slot],
-                sigma=estimate.sigma[slot],
-                anomaly=np.nan,
-                anomaly_flag=False,
-                bone_lengths=np.linalg.norm(window.offsets[slot], axis=-1),
-                raw_positions=raw_positions[slot],
-                raw_confidence=window.confidence.all[-1 - back][slot],
+        bodies = []
+        for slot, body_id in enumerate(self._ids):
+            if body_id is None or not np.isfinite(estimate.positions[slot, 0, 0]):
+                continue
+            rotations = estimate.rotations[slot].copy()
+            rotations[0] = to_world.T @ rotations[0]
+            bodies.append(
+                CleanBody(
+                    id=body_id,
+                    positions=(estimate.positions[slot] - origin) @ to_world,
+                    rotations=Rotation.from_matrix(rotations, assume_valid=True).as_quat(),
+                    state=estimate.state[slot],
+                    sigma=estimate.sigma[slot],
+                    anomaly=np.nan,
+                    anomaly_flag=False,
+                    bone_lengths=np.sqrt((window.offsets[slot] ** 2).sum(axis=-1)),
+                    raw_positions=(window.raw.all[-1 - back][slot] - origin) @ to_world,
+                    raw_confidence=window.confidence.all[-1 - back][slot],
+                )
             )
-            for slot, body_id in enumerate(self._ids)
-            if body_id is not None and np.isfinite(estimate.positions[slot, 0, 0])
-        ]
         return self._clean(self._origin_ns + round(estimate.stamp_s * 1e9), raw, bodies)
 
     def _clean(self, stamp_ns: int, raw: PoseRaw, bodies: list[CleanBody]) -> PoseClean:
