@@ -86,6 +86,12 @@ def test_a_bug_keeps_its_traceback(monkeypatch) -> None:
         main(["keys", "somewhere"])
 
 
+def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+    command = f"{sys.executable} -m nodes.cli --help | true"
+    done = subprocess.run(["bash", "-o", "pipefail", "-c", command], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_keys_are_made_once(capsys, tmp_path: Path) -> None:
     assert main(["keys", str(tmp_path / "keys")]) == 0
     secret = tmp_path / "keys" / "own.key_secret"
