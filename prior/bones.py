@@ -1,4 +1,4 @@
-"""This person's bones: a robust running estimate, frozen once sure."""
+"""This person's bones: what was measured, weighed against human proportions, frozen once sure."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.kinematics import estimate_offsets
-from prior.skeletons import finite_joints
+from prior.kinematics import global_rotations, solve_rotations
+from prior.skeletons import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, finite_joints
 from prior.window import Window
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -27,17 +29,32 @@ class BonesSettings:
     every: int = 5
 
 
+STATURE_SPREAD = 0.1
+"""Standard deviation of the log of a person's size against the generic adult's."""
+
+LIMB_SPREAD, TRUNK_SPREAD = 0.05, 0.12
+"""Standard deviations of the log of a bone's length about the person's size: 2 to 7 % for the arms and legs of 22
+people measured by motion capture; more in trunk, head and feet, where sensors mean different places by one name."""
+
+TRUNK_PLACE_SPREAD = 0.05
+"""Metres along each axis, by which sensors differ in where hips, neck and shoulders leave the trunk."""
+
+LENGTH_SIGMA = 0.06
+"""Metres: how wrong a single sample of a bone is at least, most of it an error that its neighbours share."""
+
+LIKE_SAMPLES = 12
+"""So many samples in a row, two seconds, err alike and tell as much as one."""
+
 _ENOUGH_JOINTS = 8
 _APPROACH = 0.1  # of the way to a renewed estimate, a frame: bones that jump would shake the whole limb
 _ENOUGH_SAMPLES = 4
 
 
 class Bones:
-    """Keeps each slot's ``window.offsets``: the median over frames sampled from the person's first ten seconds.
+    """Keeps each slot's ``window.offsets``: `estimate_bones` over frames sampled from the person's first ten seconds.
 
-    The mean of a person's bone lengths would grow with the sensor's noise and follow its outliers. The estimate is
-    renewed each time the number of samples has doubled, so that it costs little and soon stands still, and is
-    approached smoothly.
+    The estimate is renewed each time the number of samples has doubled, so that it costs little and soon stands
+    still, and is approached smoothly.
     """
 
     delay_frames = 0
@@ -68,10 +85,102 @@ class Bones:
             self._wait[slot] = self._settings.every - 1
             count = self._count[slot]
             if count & (count - 1) == 0 or count == self._settings.samples:
-                self._target[slot] = estimate_offsets(self._samples[slot, :count])
+                self._target[slot] = estimate_bones(self._samples[slot, :count])
                 window.measured[slot] = count >= _ENOUGH_SAMPLES
                 if count == 1:
                     window.offsets[slot] = self._target[slot]
         known = self._count > 0
         window.offsets[known] += _APPROACH * (self._target[known] - window.offsets[known])
         return window
+
+
+def estimate_bones(positions: Floats) -> Floats:
+    """This person's bones, the same on both sides, from a few poses in a row.
+
+    Lengths are the posterior mean of a log-normal model: a person's size varies about the generic adult's, each bone
+    about the person's size, and the median length over the samples of both sides about the bone, the less the more
+    samples there are. A body first seen from the side, with the far limbs guessed, so starts with human proportions.
+    A joint never seen is placed by scaling the rest pose between its neighbours seen. Bones that leave pelvis and
+    chest rigidly (hips, neck, collars) go the way of the median vector in the trunk's frame, weighed likewise.
+
+    Args:
+        positions: (T, 22, 3) metres, NaN where unobserved; samples of about 6 Hz.
+
+    Returns:
+        (22, 3) metres, each joint in its parent's frame.
+    """
+    same = 1.0 + len(positions) / LIKE_SAMPLES
+    seen = np.asarray(finite_joints(positions).any(axis=0))
+    seen |= seen[MIRROR]
+    bones = _bones(seen)
+    log_ratio, sigma = np.zeros(len(bones)), np.full(len(bones), np.inf)
+    for k, paths in enumerate(bones):
+        generic = float(np.linalg.norm(REST_OFFSETS[paths[0]].sum(axis=0)))
+        ends = [(path[0], max(PARENTS[path[-1]], 0)) for path in paths]
+        lengths = np.concatenate([np.linalg.norm(positions[:, a] - positions[:, b], axis=-1) for a, b in ends])
+        lengths = lengths[np.isfinite(lengths)]
+        if len(lengths):
+            median = np.median(lengths)
+            deviation = 1.4826 * np.median(np.abs(lengths - median))
+            log_ratio[k] = np.log(max(median, 0.1 * generic) / generic)
+            sigma[k] = max(deviation, LENGTH_SIGMA) / generic / np.sqrt(same)
+    spread = np.array([LIMB_SPREAD if paths[0][0] in _LIMBS else TRUNK_SPREAD for paths in bones])
+    weight = 1.0 / (spread**2 + sigma**2)
+    size = (weight * log_ratio).sum() / (weight.sum() + STATURE_SPREAD**-2)
+    own = spread**2 * weight * (log_ratio - size)
+    offsets = REST_OFFSETS * np.exp(size)
+    for paths, factor in zip(bones, np.exp(own), strict=True):
+        offsets[np.concatenate(paths)] *= factor
+    return _place_on_trunk(
+        positions, seen, offsets, TRUNK_PLACE_SPREAD**2 / (TRUNK_PLACE_SPREAD**2 + LENGTH_SIGMA**2 / same)
+    )
+
+
+_LIMBS = frozenset(j for j, name in enumerate(JOINTS) if name.endswith(("knee", "ankle", "elbow", "wrist")))
+_TRUNKS = ((J["pelvis"], (J["left_hip"],)), (J["spine3"], (J["neck"], J["left_collar"])))
+_COLLAR_TO_SHOULDER = J["left_shoulder"] - J["left_collar"]
+
+
+def _bones(seen: NDArray[np.bool_]) -> list[list[list[int]]]:
+    """What can be measured: for each, the one or two (left and right) paths of joints up to, not with, one seen.
+
+    Args:
+        seen: (22,) which joints ever are, on either side.
+    """
+    measurable: list[list[list[int]]] = []
+    for joint in range(1, len(PARENTS)):
+        if not seen[joint]:
+            continue
+        path = [joint]
+        while PARENTS[path[-1]] > 0 and not seen[PARENTS[path[-1]]]:
+            path.append(PARENTS[path[-1]])
+        if not seen[PARENTS[path[-1]]]:
+            continue
+        mirrored = MIRROR[path].tolist()
+        twin = next((paths for paths in measurable if paths[0] == mirrored), None)
+        if twin is None:
+            measurable.append([path])
+        else:
+            twin.append(path)
+    return measurable
+
+
+def _place_on_trunk(positions: Floats, seen: NDArray[np.bool_], offsets: Floats, trust: float) -> Floats:
+    """Offsets (22, 3) with hips, neck and collars moved by ``trust`` towards where the samples (T, 22, 3) have them."""
+    placed = offsets.copy()
+    world = global_rotations(solve_rotations(positions, offsets))
+    for trunk, children in _TRUNKS:
+        for joint in children:
+            both = []
+            for end, side in ((joint, 1.0), (int(MIRROR[joint]), -1.0)):
+                beyond = 0 if seen[end] or joint != J["left_collar"] else _COLLAR_TO_SHOULDER
+                vectors = np.einsum("tji,tj->ti", world[:, trunk], positions[:, end + beyond] - positions[:, trunk])
+                vectors -= offsets[end + beyond] if beyond else 0.0
+                both.append(vectors[finite_joints(vectors)] * [1.0, side, 1.0])
+            vectors = np.concatenate(both)
+            if len(vectors):
+                moved = offsets[joint] + trust * (np.median(vectors, axis=0) - offsets[joint])
+                if MIRROR[joint] == joint:
+                    moved[1] = 0.0
+                placed[joint], placed[MIRROR[joint]] = moved, moved * [1.0, -1.0, 1.0]
+    return placed
