@@ -34,13 +34,14 @@ class MotionSet:
     clip_start: NDArray[np.int64]
 
     @classmethod
-    def load(cls, path: Path, weights: str, split: str) -> MotionSet:
+    def load(cls, path: Path, weights: str, split: str, *, flat: bool = False) -> MotionSet:
         """Read ``steadypose prepare``'s output.
 
         Args:
             path: ``prepared.npz``.
             weights: ``default`` takes the clips free for products; ``research`` takes the others too.
             split: ``train`` or ``val``.
+            flat: leave out the clips in which somebody climbs onto things: contacts up there are not labelled.
 
         Raises:
             FileNotFoundError: no such file.
@@ -51,6 +52,8 @@ class MotionSet:
         data = np.load(path)
         starts = data["clip_start"]
         wanted = (data["split"] == split) & ((data["set"] == "default") | (weights == "research"))
+        if flat:
+            wanted &= data["flat"]
         if not wanted.any():
             raise ValueError(f"{path} has no clip of split '{split}' for the '{weights}' weights")
         frames = np.concatenate([np.arange(starts[c], starts[c + 1]) for c in np.flatnonzero(wanted)])

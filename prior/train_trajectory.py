@@ -97,8 +97,8 @@ def train_trajectory(
         The path of the weights.
     """
     torch.manual_seed(seed)
-    train = MotionSet.load(data, weights, "train")
-    val = MotionSet.load(data, weights, "val")
+    train = MotionSet.load(data, weights, "train", flat=True)
+    val = MotionSet.load(data, weights, "val", flat=True)
     starts, chances = _chances(train)
     model = TrajectoryNet(TrajectoryConfig())
     optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)

@@ -51,8 +51,14 @@ def prepared(tmp_path: Path) -> Path:
         clip_start=np.arange(7) * count,
         split=np.array(["train"] * 4 + ["val"] * 2),
         set=np.array(["default"] * 6),
+        flat=np.array([True, True, True, False, True, True]),
     )
     return path
+
+
+def test_where_somebody_climbs_contacts_are_not_learned(prepared: Path):
+    clips = {flat: len(MotionSet.load(prepared, "default", "train", flat=flat).clip_start) - 1 for flat in (True, False)}
+    assert clips == {True: 3, False: 4}
 
 
 def test_windows_show_the_body_facing_forward(prepared: Path):
