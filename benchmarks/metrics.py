@@ -69,6 +69,73 @@ def rigid_alignment(source: Floats, target: Floats) -> tuple[Floats, Floats]:
     return rotation, b.mean(axis=0) - rotation @ a.mean(axis=0)
 
 
+def procrustes(source: Floats, target: Floats) -> Floats:
+    """``source`` (..., J, 3), every frame turned, moved and scaled to lie nearest to ``target``: for PA-MPJPE.
+
+    A joint that is not finite in either takes no part in the fit. (Umeyama 1991.)
+    """
+    both = (np.isfinite(source) & np.isfinite(target)).all(axis=-1, keepdims=True)
+    count = np.maximum(both.sum(axis=-2, keepdims=True), 1)
+    a, b = np.where(both, source, 0.0), np.where(both, target, 0.0)
+    middle_a, middle_b = a.sum(axis=-2, keepdims=True) / count, b.sum(axis=-2, keepdims=True) / count
+    a, b = np.where(both, a - middle_a, 0.0), np.where(both, b - middle_b, 0.0)
+    u, values, vt = np.linalg.svd(a.swapaxes(-1, -2) @ b)
+    mirrored = np.linalg.det(u @ vt) < 0
+    signs = np.stack([np.ones_like(mirrored), np.ones_like(mirrored), np.where(mirrored, -1, 1)], axis=-1)
+    rotation = (u * signs[..., None, :]) @ vt  # acts from the right
+    scale = (values * signs).sum(axis=-1) / np.maximum((a**2).sum(axis=(-1, -2)), 1e-12)
+    return scale[..., None, None] * ((source - middle_a) @ rotation) + middle_b
+
+
+def found_delay(estimate: Floats, truth: Floats, most: int) -> float:
+    """Frames by which ``estimate`` (T, ..., 3) lags behind ``truth``: where their velocities correlate best.
+
+    Correlated are all coordinates together; between frames, a parabola through the best three.
+
+    Args:
+        most: frames, the longest lag looked at; as many of lead are looked at too.
+    """
+    a, b = (np.diff(x.reshape(len(x), -1), axis=0) for x in (estimate, truth))
+    whole = np.isfinite(a).all(axis=0)
+    a, b = a[:, whole], b[:, whole]
+    lags = np.arange(-most, most + 1)
+    inner = slice(most, len(a) - most)
+    correlation = np.array(
+        [(a[most + lag : len(a) - most + lag] * b[inner]).sum() / np.linalg.norm(a[most + lag : len(a) - most + lag])
+         for lag in lags]
+    )  # fmt: skip
+    best = int(np.clip(correlation.argmax(), 1, len(lags) - 2))
+    left, centre, right = correlation[best - 1 : best + 2]
+    bend = left - 2 * centre + right
+    return float(lags[best] + (0.5 * (left - right) / bend if bend < 0 else 0.0))
+
+
+def sigma_ratio(error: Floats, sigma: Floats) -> float:
+    """Error found by standard deviation stated, root mean squares of the ratio along an axis; 1 is honest.
+
+    Args:
+        error: (...) metres, distances in space.
+        sigma: (...) metres, along an axis; where it is infinite or the error NaN, nothing was stated.
+    """
+    ratio = error / sigma / np.sqrt(3)
+    known = np.isfinite(ratio) & np.isfinite(sigma)
+    return float(np.sqrt(np.mean(ratio[known] ** 2))) if known.any() else float("nan")
+
+
+def reliability(error: Floats, sigma: Floats, bins: int = 10) -> list[tuple[float, float, int]]:
+    """(stated, found, count) of ``bins`` equal parts of the joints by their stated standard deviation, metres, along
+    an axis, root mean squares. Arguments as for `sigma_ratio`."""
+    known = np.isfinite(error) & np.isfinite(sigma)
+    order = np.argsort(sigma[known], kind="stable")
+    return [
+        (float(np.sqrt(np.mean(stated**2))), float(np.sqrt(np.mean(found**2) / 3)), len(stated))
+        for stated, found in zip(
+            np.array_split(sigma[known][order], bins), np.array_split(error[known][order], bins), strict=True
+        )
+        if len(stated)
+    ]
+
+
 def body_frame(left_hip: Floats, right_hip: Floats, left_shoulder: Floats, right_shoulder: Floats) -> Floats:
     """Axes forward, left, up of the trunk as columns: (..., 3, 3). Up runs from the hips to the shoulders.
 

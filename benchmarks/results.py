@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -47,17 +47,25 @@ def show(table: Table, console: Console) -> None:
     console.print(rich)
 
 
-def save(name: str, arguments: list[str], tables: list[Table], data: dict[str, Any], directory: Path = RESULTS) -> Path:
+def save(
+    name: str,
+    arguments: list[str],
+    tables: list[Table],
+    data: dict[str, Any],
+    directory: Path = RESULTS,
+    program: Sequence[str] = (),
+) -> Path:
     """Write ``NAME.json``: the command, the machine, the tables, and ``data``, whatever the benchmark found.
 
     Args:
-        name: of the benchmark, as in ``python -m benchmarks.NAME``.
+        name: of the benchmark.
         arguments: of the command; folders are cut to their last part.
         tables: for the README.
         data: figures; JSON types.
         directory: where to.
+        program: what makes it; ``python -m benchmarks.NAME`` if left out.
     """
-    command = shlex.join(["python", "-m", f"benchmarks.{name}", *(_portable(a) for a in arguments)])
+    command = shlex.join([*(program or ("python", "-m", f"benchmarks.{name}")), *(_portable(a) for a in arguments)])
     path = directory / f"{name}.json"
     content = {"benchmark": name, "command": command, "machine": describe()}
     content |= {"tables": [asdict(t) for t in tables], **data}

@@ -23,6 +23,7 @@ COMMANDS = {
     "plot": ("nodes.plot:plot", "what happened in a recording, as pictures"),
     "prepare": ("nodes.prepare:prepare", "motion capture into training data"),
     "train": ("prior.train:train", "train a model of the prior"),
+    "evaluate": ("nodes.evaluate:evaluate", "measure the prior against its tuned peers, by protocol"),
     "simulate": ("nodes.simulate:simulate", "make streams as a depth camera would see them, with their truth"),
     "doctor": ("nodes.doctor:doctor", "what is missing on this machine, and how to get it"),
     "keys": ("nodes.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),

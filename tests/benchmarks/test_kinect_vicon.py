@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.kinect_vicon import SCORED, Clip, align, learn_offset, run_filter, score
-from prior.filters import FixedLagRTS, OneEuroFilter
+from benchmarks.peers import constant_velocity, gaussian_hampel, one_euro
+from benchmarks.protocols.kinect_vicon import SCORED, Clip, align, learn_offset, run_filter, score
 
 REST = np.array(
     [[0.0, 0.0, 1.6]]
@@ -28,7 +28,7 @@ def person(seed: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
 
 def clip(seed: int, frames: int) -> Clip:
     truth, seen = person(seed, frames)
-    return Clip("m01_s07_e01", "s07", 30.0, np.zeros((frames, 22, 3)), seen, truth, truth)
+    return Clip("m01_s07_e01", "s07", np.zeros((frames, 22, 3)), seen, truth, truth)
 
 
 def test_a_constant_offset_in_the_body_is_learned_on_one_subject_and_taken_from_another() -> None:
@@ -63,17 +63,24 @@ def test_lost_markers_are_left_out() -> None:
     assert np.isfinite([result.position[0], result.acceleration[0], *result.joints]).all()
 
 
-@pytest.mark.parametrize("make", [partial(FixedLagRTS, 3, 1.0), partial(OneEuroFilter, 1.0, 2.0)])
-def test_clips_side_by_side_are_filtered_as_if_alone(make: partial) -> None:
+@pytest.mark.parametrize(
+    "run",
+    [
+        partial(constant_velocity, delay=3, density=1.0),
+        partial(one_euro, delay=0, min_cutoff_hz=1.0, beta=2.0),
+        partial(gaussian_hampel, delay=3, sigma_s=0.05, threshold=3.0),
+    ],
+)
+def test_clips_side_by_side_are_filtered_as_if_alone(run: partial) -> None:
     clips = [clip(0, 12), clip(1, 2), clip(2, 30)]
-    together = run_filter(clips, make)
+    together = run_filter(clips, run)
     for one, answer in zip(clips, together, strict=True):
         assert answer.shape == one.raw.shape
-        np.testing.assert_allclose(answer, run_filter([one], make)[0], atol=1e-12)
+        np.testing.assert_allclose(answer, run_filter([one], run)[0], atol=1e-12)
 
 
 def test_a_delay_of_zero_knows_nothing_of_later_frames() -> None:
     here = clip(4, 20)
     cut = here._replace(raw=here.raw[:11])
-    make = partial(FixedLagRTS, 0, 1.0)
-    np.testing.assert_array_equal(run_filter([here], make)[0][:11], run_filter([cut], make)[0])
+    run = partial(constant_velocity, delay=0, density=1.0)
+    np.testing.assert_array_equal(run_filter([here], run)[0][:11], run_filter([cut], run)[0])

@@ -1,0 +1,192 @@
+"""What every protocol has in common: its surroundings, its result, and peers and ours run over clips."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import Progress
+
+from benchmarks import ours, smoothnet
+from benchmarks.motion import MotionClips, prepared_clips, simulated_clips
+from benchmarks.peers import PEERS, Peer
+from benchmarks.results import Table
+from benchmarks.tuning import Tuned, search
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+DELAYS = (0, 2, 4, 8)
+"""Frames at 30 Hz at which methods are compared."""
+SEEDS = (0, 1, 2)
+"""Of networks trained here, and of what is drawn at random."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Where a protocol runs.
+
+    Attributes:
+        quick: fewer clips, points and steps, to see that all works.
+        mocap: folder with ui_prmd.npz, or None.
+        data: prepared.npz; where it does not exist, people of the project's own generator take its place.
+        progress: bars.
+    """
+
+    quick: bool
+    mocap: Path | None
+    data: Path
+    progress: Progress
+
+    @property
+    def delays(self) -> tuple[int, ...]:
+        return (0, 4) if self.quick else DELAYS
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        return SEEDS[:1] if self.quick else SEEDS
+
+    @property
+    def budget(self) -> int:
+        """Evaluations that each peer's search may spend, for each delay."""
+        return 6 if self.quick else 18
+
+    def clips(self, frames: int = 90, most: int = 96) -> MotionClips:
+        """Validation motion."""
+        return self._motion("val", frames, min(most, 12) if self.quick else most)
+
+    def training_clips(self) -> MotionClips:
+        """Training motion, of other people, for the peers that learn."""
+        return self._motion("train", 90, 60 if self.quick else 1000)
+
+    def _motion(self, split: str, frames: int, most: int) -> MotionClips:
+        if self.data.is_file():
+            return prepared_clips(self.data, split, frames, most)
+        return simulated_clips(frames, min(most, 60), seed=0 if split == "val" else 1)
+
+    @cached_property
+    def smoothnets(self) -> list[smoothnet.SmoothNet]:
+        """One of each seed, trained here and now."""
+        motion = self.training_clips()
+        steps = 150 if self.quick else 1500
+        return [
+            smoothnet.train(motion, steps, seed, partial(self.progress.track, description=f"SmoothNet, seed {seed}"))
+            for seed in self.seeds
+        ]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a protocol found.
+
+    Attributes:
+        tables: for people; the first is printed first.
+        data: for programs.
+        figures: by name of the file.
+    """
+
+    tables: list[Table]
+    data: dict[str, Any]
+    figures: Mapping[str, Figure] = field(default_factory=dict)
+
+
+class Answer(NamedTuple):
+    """Of one method at one delay."""
+
+    method: str
+    delay: int
+    stamps_s: Floats  # (T',): those of the frames, or where a method has a grid of its own, of that
+    positions: Floats  # (T', C, 22, 3)
+    parameters: Mapping[str, float]
+    sigma: Floats | None = None  # (T', C, 22)
+
+
+def peers_of(bench: Bench, peers: Sequence[Peer] = PEERS) -> Iterator[tuple[Peer, int]]:
+    """Every peer with every delay that it has."""
+    for peer in peers:
+        for delay in bench.delays if peer.delays is None else peer.delays:
+            yield peer, delay
+
+
+def answers(
+    bench: Bench,
+    seen: Floats,
+    stamps_s: Floats,
+    tuned: Mapping[tuple[str, int], Tuned],
+    title: str,
+    peers: Sequence[Peer] = PEERS,
+) -> Iterator[Answer]:
+    """All methods over clips (T, C, 22, 3), each with the parameters found for it; a network once for each seed."""
+
+    def peer_job(peer: Peer, delay: int) -> Answer:
+        parameters = tuned[peer.name, delay].parameters
+        return Answer(peer.name, delay, stamps_s, peer.run(seen, stamps_s, delay, **parameters), parameters)
+
+    def smoothnet_job(seed: int, delay: int) -> Answer:
+        net = bench.smoothnets[bench.seeds.index(seed)]
+        return Answer("SmoothNet-style", delay, stamps_s, smoothnet.smooth(net, seen, delay), {})
+
+    def our_job(name: str, delay: int) -> Answer:
+        cleaned = ours.run(ours.OURS[name], seen, stamps_s, delay)
+        return Answer(name, delay, cleaned.stamps_s, cleaned.positions, {}, cleaned.sigma)
+
+    jobs: list[Callable[[], Answer]] = [partial(peer_job, peer, delay) for peer, delay in peers_of(bench, peers)]
+    jobs += [partial(smoothnet_job, seed, delay) for delay in bench.delays for seed in bench.seeds]
+    jobs += [
+        partial(our_job, name, delay)
+        for name, settings in ours.OURS.items()
+        for delay in bench.delays
+        if ours.available(settings, delay)
+    ]
+    for job in bench.progress.track(jobs, description=title):
+        yield job()
+
+
+def tune(
+    bench: Bench,
+    evaluate: Callable[[Peer, int, Mapping[str, float]], dict[str, float]],
+    title: str,
+    peers: Sequence[Peer] = PEERS,
+) -> dict[tuple[str, int], Tuned]:
+    """The same search for every peer at every delay; ``evaluate`` gives the figures of a peer's parameters."""
+    return {
+        (peer.name, delay): search(peer.space, partial(evaluate, peer, delay), bench.budget)
+        for peer, delay in bench.progress.track(list(peers_of(bench, peers)), description=f"tuning: {title}")
+        if peer.space
+    } | {(peer.name, delay): Tuned({}, []) for peer, delay in peers_of(bench, peers) if not peer.space}
+
+
+def tuning_log(tuned: Mapping[tuple[str, int], Tuned]) -> list[dict[str, Any]]:
+    """What was tried, for the results file."""
+    return [
+        {"method": name, "delay": delay, "best": found.parameters, "tried": found.tried}
+        for (name, delay), found in tuned.items()
+        if found.tried
+    ]
+
+
+def over_seeds(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Records of one method, delay and condition but several seeds made one: numbers averaged, and their spread."""
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for record in records:
+        key = (record["method"], record["delay"], record.get("condition"))
+        groups.setdefault(key, []).append(record)
+    return [group[0] if len(group) == 1 else _averaged(group) for group in groups.values()]
+
+
+def _averaged(group: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    merged = {
+        name: round(float(np.mean([record[name] for record in group])), 4)
+        if isinstance(value, float) and all(name in record for record in group)
+        else value
+        for name, value in group[0].items()
+    }
+    positions = [record["position_mm"] for record in group]
+    return {**merged, "seeds": len(group), "position_sd_over_seeds_mm": round(float(np.std(positions, ddof=1)), 3)}

@@ -1,0 +1,102 @@
+"""How protocols spoil true joints: noise, and joints hidden. Every function takes and gives (T, C, J, 3) metres.
+
+A hidden joint is NaN. The functions draw from the generator that they are given and change nothing in place.
+"""
+
+from __future__ import annotations
+
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prior.sim.camera import segment_gap
+from prior.skeletons import MIRROR, J
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LIMBS: tuple[NDArray[np.intp], ...] = tuple(
+    np.array([J[f"{side}_{joint}"] for joint in joints])
+    for joints in (("elbow", "wrist"), ("knee", "ankle", "foot"))
+    for side in ("left", "right")
+)
+"""What a detector loses, or takes for the other side's: lower arms and legs."""
+
+
+def gaussian(truth: Floats, sigma: float, rng: np.random.Generator) -> Floats:
+    """Independent noise, ``sigma`` metres along each axis (HuMoR's protocol has 0.04)."""
+    return truth + rng.normal(0.0, sigma, truth.shape)
+
+
+def correlated(truth: Floats, sigma: float, rng: np.random.Generator, memory: float = 0.9) -> Floats:
+    """Stationary AR(1) noise of ``sigma`` metres, with correlation ``memory`` from a frame to the next: what a depth
+    camera's errors look like, and what no low-pass filter can tell from motion."""
+    noise = rng.normal(0.0, sigma, truth.shape)
+    for t in range(1, len(noise)):
+        noise[t] = memory * noise[t - 1] + np.sqrt(1 - memory**2) * noise[t]
+    return truth + noise
+
+
+def spiked(seen: Floats, rng: np.random.Generator, share: float = 0.01, size: float = 0.30) -> Floats:
+    """One sighting in a hundred lies 30 cm off, in any direction."""
+    direction = rng.normal(size=seen.shape)
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    hit = rng.random(seen.shape[:-1]) < share
+    return np.where(hit[..., None], seen + size * direction, seen)
+
+
+def swapped(seen: Floats, rng: np.random.Generator, rate: float = 0.02, mean_frames: float = 3.0) -> Floats:
+    """Left and right lower arms, or legs, are exchanged for a few frames; ``rate``: swaps that begin, a frame."""
+    frames, clips = seen.shape[:2]
+    out = seen.copy()
+    for left, right in zip(LIMBS[::2], LIMBS[1::2], strict=True):
+        on = np.zeros((frames, clips), dtype=bool)
+        begins = rng.random((frames, clips)) < rate
+        lasts = rng.geometric(1 / mean_frames, (frames, clips))
+        for t, c in zip(*np.nonzero(begins), strict=True):
+            on[t : t + lasts[t, c], c] = True
+        joints = np.concatenate([left, right])
+        out[:, :, joints] = np.where(on[..., None, None], seen[:, :, MIRROR[joints]], seen[:, :, joints])
+    return out
+
+
+def below(truth: Floats, height: float = 0.9) -> Mask:
+    """(T, C, J) the joints lower than ``height`` metres (HuMoR's occlusion)."""
+    return truth[..., 2] < height
+
+
+def arm_behind(truth: Floats, radius: float = 0.16) -> Mask:
+    """(T, C, J) elbows and wrists that the trunk hides from a camera 3 m to the body's left, 1.2 m up.
+
+    The trunk is a capsule of ``radius`` metres from pelvis to neck. The camera stands where the middle of the clip
+    puts it.
+    """
+    middle = truth[len(truth) // 2]
+    left = middle[:, J["left_hip"]] - middle[:, J["right_hip"]]
+    left[:, 2] = 0.0
+    camera = middle[:, J["pelvis"]] + 3.0 * left / np.linalg.norm(left, axis=-1, keepdims=True)
+    camera[:, 2] = 1.2
+    arms = list(chain(LIMBS[0], LIMBS[1]))
+    points = truth[:, :, arms]
+    trunk = (truth[:, :, J[end], None] for end in ("pelvis", "neck"))
+    gap, along = segment_gap(np.broadcast_to(camera[:, None], points.shape), points, *trunk)
+    hidden = np.zeros(truth.shape[:-1], dtype=bool)
+    hidden[..., arms] = (gap < radius) & (along < 1.0)
+    return hidden
+
+
+def bursts(shape: tuple[int, int, int], frames: int, first: int, rng: np.random.Generator) -> Mask:
+    """(T, C, J) one limb of every clip away for ``frames`` frames, at some time from frame ``first`` on and so that
+    a third of a second is left to find it again."""
+    hidden = np.zeros(shape, dtype=bool)
+    starts = rng.integers(first, shape[0] - frames - 10, endpoint=True, size=shape[1])
+    limbs = rng.integers(len(LIMBS), size=shape[1])
+    for clip, (start, limb) in enumerate(zip(starts, limbs, strict=True)):
+        hidden[start : start + frames, clip, LIMBS[limb]] = True
+    return hidden
+
+
+def hide(seen: Floats, hidden: Mask) -> Floats:
+    """NaN where hidden."""
+    return np.where(hidden[..., None], np.nan, seen)

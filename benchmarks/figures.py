@@ -1,0 +1,82 @@
+"""Pictures of results: curves of error against delay, noise or gap, and reliability plots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from matplotlib.figure import Figure
+
+COLOURS = {
+    "raw": "#888888",
+    "hold last": "#aaaaaa",
+    "linear interpolation": "#b8a04a",
+    "One-Euro": "#4c78a8",
+    "Kalman, constant velocity": "#72b7b2",
+    "Kalman, constant acceleration": "#54a24b",
+    "Gaussian + Hampel": "#b279a2",
+    "Butterworth, offline": "#9d755d",
+    "SmoothNet-style": "#f58518",
+    "ridge regression": "#eeca3b",
+    "temporal convolution": "#ff9da6",
+    "HM-VAE": "#f2a5a5",
+    "steadypose": "#e45756",
+}
+"""One colour a method in every picture; one not named here takes matplotlib's next."""
+
+
+def curves(
+    records: Sequence[Mapping[str, Any]], x: str, panels: Mapping[str, str], label: str, title: str, log: bool = False
+) -> Figure:
+    """A panel for each figure, a line for each method.
+
+    Args:
+        records: with ``method``, ``x`` and the panels' keys.
+        x: the key across.
+        panels: keys upwards, with the text of their axis.
+        label: text of the axis across.
+        title: above.
+        log: whether both axes are logarithmic.
+    """
+    figure = Figure(figsize=(4.6 * len(panels) + 1.8, 3.9), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, (key, text) in zip(axes, panels.items(), strict=True):
+        for method in dict.fromkeys(record["method"] for record in records):
+            mine = [r for r in records if r["method"] == method and r.get(x) is not None and r.get(key) is not None]
+            points = sorted((r[x], r[key]) for r in mine)
+            if points:
+                ours = method.startswith(("steadypose", "HM-VAE"))
+                axis.plot(
+                    *zip(*points, strict=True), label=method, color=COLOURS.get(method), marker="o", ms=4,
+                    lw=2.2 if ours else 1.2, zorder=3 if ours else 2,
+                )  # fmt: skip
+        axis.set(xlabel=label, ylabel=text)
+        if log:
+            axis.set(xscale="log", yscale="log")
+        axis.grid(alpha=0.3, which="both")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", fontsize=8, frameon=False)
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def reliability(bins: Mapping[str, Sequence[tuple[float, float, int]]], title: str) -> Figure:
+    """Error found against standard deviation stated, both root mean squares along an axis; the diagonal is honest.
+
+    Args:
+        bins: by group, (stated, found, count) in metres.
+        title: above.
+    """
+    figure = Figure(figsize=(4.8, 4.4), layout="constrained")
+    axis = figure.subplots()
+    values = [v * 100 for rows in bins.values() for stated, found, _ in rows for v in (stated, found)]
+    span = [0.8 * min(values), 1.25 * max(values)]
+    axis.plot(span, span, color="#444444", lw=1, ls="--")
+    axis.fill_between(span, [0.8 * v for v in span], [1.2 * v for v in span], color="#444444", alpha=0.1, lw=0)
+    for name, rows in bins.items():
+        axis.plot([100 * s for s, _, _ in rows], [100 * f for _, f, _ in rows], marker="o", ms=4, label=name)
+    axis.set(xscale="log", yscale="log", xlim=span, ylim=span, xlabel="stated, cm", ylabel="found, cm")
+    axis.set_title(title, fontsize=10)
+    axis.grid(alpha=0.3, which="both")
+    axis.legend(fontsize=8, frameon=False)
+    return figure

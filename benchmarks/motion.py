@@ -1,0 +1,110 @@
+"""The true motion that protocols spoil and score: validation clips of prepared motion, or simulated people."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prior.motion_windows import MotionSet
+from prior.sim.motion import Motion
+from prior.sim.scripts import SCRIPTS
+from prior.window import FPS
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MotionClips:
+    """Clips of equal length at 30 Hz, side by side.
+
+    Attributes:
+        positions: (T, C, 22, 3) metres, world, z up, floor at 0.
+        rotations: (T, C, 22, 3, 3) local.
+        offsets: (C, 22, 3) metres, each person's bones.
+        contacts: (T, C, 8) of `CONTACT_JOINTS`.
+        source: what these are, for the results file.
+    """
+
+    positions: Floats
+    rotations: Floats
+    offsets: Floats
+    contacts: NDArray[np.bool_]
+    source: dict[str, Any]
+
+    @property
+    def stamps_s(self) -> Floats:
+        """(T,) seconds."""
+        return np.arange(len(self.positions)) / FPS
+
+    def every(self, step: int) -> MotionClips:
+        """Every n-th clip."""
+        return replace(
+            self,
+            positions=self.positions[:, ::step],
+            rotations=self.rotations[:, ::step],
+            offsets=self.offsets[::step],
+            contacts=self.contacts[:, ::step],
+        )
+
+
+def prepared_clips(path: Path, split: str, frames: int, most: int) -> MotionClips:
+    """Clips that do not overlap, at most ``most`` of them, spread evenly over the split, from ``prepared.npz``."""
+    motion = _load(path, split)
+    rows = motion.all_windows(frames, frames)
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))].T
+    return MotionClips(
+        positions=motion.positions[rows].numpy().astype(np.float64),
+        rotations=motion.rotations[rows].numpy().astype(np.float64),
+        offsets=motion.offsets[rows[0]].numpy().astype(np.float64),
+        contacts=motion.contacts[rows].numpy().astype(bool),
+        source={"file": path.name, "sha256": _digest(path), "split": split, "clips": rows.shape[1], "frames": frames},
+    )
+
+
+@lru_cache(maxsize=2)
+def _load(path: Path, split: str) -> MotionSet:
+    return MotionSet.load(path, "default", split)
+
+
+@lru_cache(maxsize=2)
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+def simulated_clips(frames: int, most: int, seed: int) -> MotionClips:
+    """The same of people of the project's own generator, for machines without prepared motion."""
+    parts = []
+    for motion in _people(seed):
+        step = round(1 / (motion.times[1] - motion.times[0]) / FPS)
+        count = len(motion.times) // (step * frames)
+        kept = slice(0, count * step * frames, step)
+        for k in range(count):
+            rows = slice(k * frames, (k + 1) * frames)
+            parts.append((motion.positions[kept][rows], motion.rotations[kept][rows], motion.offsets,
+                          motion.contacts[kept][rows]))  # fmt: skip
+        if len(parts) >= most:
+            break
+    positions, rotations, offsets, contacts = zip(*parts[:most], strict=True)
+    return MotionClips(
+        positions=np.stack(positions, axis=1),
+        rotations=np.stack(rotations, axis=1),
+        offsets=np.stack(offsets),
+        contacts=np.stack(contacts, axis=1),
+        source={"simulated people": True, "seed": seed, "clips": len(positions), "frames": frames},
+    )
+
+
+def _people(seed: int) -> Iterator[Motion]:
+    """Everybody of every scene, again and again with other bodies and paths."""
+    rng = np.random.default_rng(seed)
+    while True:
+        for script in SCRIPTS.values():
+            yield from script(rng)

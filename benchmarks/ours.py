@@ -1,0 +1,99 @@
+"""steadypose in the bench: its variants, and clips through them, side by side as bodies of one stream."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.peers import missing
+from msgs.types import Pose, PoseClean, PoseRaw, RawBody
+from prior.correct import CorrectSettings
+from prior.fuse import FuseSettings
+from prior.pipeline import PriorPipeline, PriorSettings
+
+Floats = NDArray[np.float64]
+
+OURS: Mapping[str, PriorSettings] = {
+    "HM-VAE": PriorSettings(fuse=FuseSettings(enabled=False)),
+    "steadypose": PriorSettings(),
+}
+"""Every variant that each protocol runs; one line adds one. HM-VAE is the paper's refinement alone, unfused."""
+
+OURS_KINECT: Mapping[str, PriorSettings] = {
+    "steadypose, sensor = kinect_v2": PriorSettings(correct=CorrectSettings(sensor="kinect_v2")),
+}
+"""Those that know the sensor, for the protocol with that sensor."""
+
+SIDE_BY_SIDE = 64
+"""Clips in one stream: bodies do not touch each other, and many together take a fraction of the time."""
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """What ``pose/clean`` said.
+
+    Attributes:
+        stamps_s: (T',) seconds, of the prior's own 30 Hz grid.
+        positions: (T', C, 22, 3) metres; NaN where there was no answer.
+        sigma: (T', C, 22) metres, the standard deviation stated, along an axis.
+    """
+
+    stamps_s: Floats
+    positions: Floats
+    sigma: Floats
+
+
+@lru_cache(maxsize=64)
+def available(settings: PriorSettings, delay: int) -> bool:
+    """Whether this variant can be run at this delay (HM-VAE's window of 8 frames allows up to 4)."""
+    try:
+        PriorPipeline(replace(settings, delay=delay))
+    except ValueError:
+        return False
+    return True
+
+
+def run(settings: PriorSettings, seen: Floats, stamps_s: Floats, delay: int, skeleton: str = "smpl22") -> Cleaned:
+    """Clips through ``PriorPipeline``.
+
+    Args:
+        settings: the variant; its delay is overridden.
+        seen: (T, C, J, 3) metres, z up, NaN where missing. A clip is over after the last frame with a joint; a frame
+            without any joint in any clip is one that was lost.
+        stamps_s: (T,) seconds of capture.
+        delay: frames.
+        skeleton: of the J joints.
+    """
+    prior = PriorPipeline(replace(settings, delay=delay, max_bodies=min(SIDE_BY_SIDE, seen.shape[1])))
+    parts = [
+        list(stream(prior, seen[:, start : start + SIDE_BY_SIDE], stamps_s, skeleton))
+        for start in range(0, seen.shape[1], SIDE_BY_SIDE)
+    ]
+    grid = np.unique([message.stamp_ns for messages in parts for message in messages])
+    positions = np.full((len(grid), seen.shape[1], 22, 3), np.nan)
+    sigma = np.full(positions.shape[:-1], np.inf)
+    for number, messages in enumerate(parts):
+        for message in messages:
+            row = np.searchsorted(grid, message.stamp_ns)
+            for body in message.bodies:
+                positions[row, number * SIDE_BY_SIDE + body.id] = body.positions
+                sigma[row, number * SIDE_BY_SIDE + body.id] = body.sigma
+    return Cleaned(grid * 1e-9, positions, sigma)
+
+
+def stream(
+    prior: PriorPipeline, seen: Floats, stamps_s: Floats, skeleton: str = "smpl22", calibrated: bool = False
+) -> Iterator[PoseClean]:
+    """What the prior answers to clips (T, C, J, 3) side by side, as the bodies 0 to C - 1 of one stream."""
+    joints = ~missing(seen)
+    any_seen = np.asarray(joints.any(axis=2))
+    frames = len(seen) - any_seen[::-1].argmax(axis=0)
+    for t in np.flatnonzero(any_seen.any(axis=1)):
+        bodies = [RawBody(int(c), seen[t, c], joints[t, c].astype(float)) for c in np.flatnonzero(t < frames)]
+        stamp_ns = round(stamps_s[t] * 1e9)
+        yield from prior.process(PoseRaw(stamp_ns, "world", "bench", skeleton, Pose.identity(), calibrated, bodies))
+    yield from prior.flush()

@@ -1,0 +1,13 @@
+"""The protocols of ``steadypose evaluate``, one module each, by name."""
+
+from __future__ import annotations
+
+PROTOCOLS: dict[str, str] = {
+    "kinect_vicon": "real Kinect against Vicon, by subject",
+    "noisy_joints": "independent and correlated noise, spikes, exchanged limbs",
+    "hidden_joints": "joints below 0.9 m, an arm behind the body, limbs away for 0.2 to 2 s",
+    "reconstruction": "windows through the refinement model (HM-VAE, table 3)",
+    "world": "root drift and foot skate",
+    "streaming": "delay found, jitter at matched delay, recovery, lost frames, jittering stamps",
+}
+"""Module in this package: what it measures."""

@@ -1,0 +1,86 @@
+"""Hidden joints: below 0.9 m (HuMoR's occlusion), an arm behind the trunk, and limbs away for 0.2 to 2 seconds.
+
+Seen joints carry 1 cm of noise. Each clip begins with half a second in which everything is seen: a joint that has
+never been seen is no question to ask a filter. HuMoR scores 43 points on the body's surface; these are 22 joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks import figures
+from benchmarks.bench import Bench, Result
+from benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
+from benchmarks.protocols.spoiled import HOW, Condition, reliability_bins, run_conditions
+from benchmarks.results import Table
+from benchmarks.scores import pivot
+from prior.window import FPS
+
+Floats = NDArray[np.float64]
+
+NOISE = 0.01
+"""Metres."""
+SEEN_FIRST = 15
+"""Frames."""
+BURSTS_S = (0.2, 0.5, 1.0, 2.0)
+
+
+def _masked(
+    truth: Floats, rng: np.random.Generator, mask: Callable[[Floats, np.random.Generator], NDArray[np.bool_]]
+) -> Floats:
+    hidden = mask(truth, rng)
+    hidden[:SEEN_FIRST] = False
+    return hide(gaussian(truth, NOISE, rng), hidden)
+
+
+def _burst(truth: Floats, rng: np.random.Generator, seconds: float) -> NDArray[np.bool_]:
+    frames, clips, joints, _ = truth.shape
+    return bursts((frames, clips, joints), round(seconds * FPS), SEEN_FIRST, rng)
+
+
+CONDITIONS: dict[str, Condition] = {
+    "below 0.9 m": partial(_masked, mask=lambda truth, _: below(truth)),
+    "arm behind": partial(_masked, mask=lambda truth, _: arm_behind(truth)),
+    **{f"{s:g} s": partial(_masked, mask=partial(_burst, seconds=s)) for s in BURSTS_S},
+}
+
+
+def run(bench: Bench) -> Result:
+    """Every method in every condition."""
+    clips = bench.clips()
+    kept = ("arm behind", "0.5 s") if bench.quick else tuple(CONDITIONS)
+    data = run_conditions(bench, clips, {name: CONDITIONS[name] for name in kept})
+    records = data["records"]
+    note = (
+        f"{clips.positions.shape[1]} clips of {len(clips.positions)} frames, 22 joints, 1 cm of noise on those seen; "
+        f"the first {SEEN_FIRST} frames of a clip are seen in full. A duration: one lower arm or leg is away for so "
+        f"long. {HOW}"
+    )
+    groups = (("hidden", "hidden joints"), ("seen", "seen joints"))
+    tables: list[Table] = [
+        pivot(records, "condition", f"{group}_mm", "hidden_joints" if group == "hidden" else "hidden_joints-seen",
+              f"Hidden joints: error of {text}, mm", note)
+        for group, text in groups
+    ]  # fmt: skip
+    tables.append(
+        pivot(records, "condition", "acceleration_mm", "hidden_joints-acceleration",
+              "Hidden joints: acceleration error of all joints, mm/frame²", note, digits=2)
+    )  # fmt: skip
+    timed = [
+        {**r, "seconds": float(r["condition"].removesuffix(" s"))} for r in records if r["condition"].endswith(" s")
+    ]
+    pictures = {
+        "hidden_bursts": figures.curves(
+            [r for r in timed if r["delay"] == 4 or r["method"] in ("hold last", "One-Euro")], "seconds",
+            {"hidden_mm": "error of hidden joints, mm", "seen_mm": "error of seen joints, mm"},
+            "a limb is away for, s", "Bursts, delay of at most 4 frames",
+        )
+    }  # fmt: skip
+    bins = reliability_bins(data["calibration"], "steadypose", 4)
+    if bins:
+        pictures["hidden_reliability"] = figures.reliability(bins, "steadypose, delay 4: hidden joints")
+    return Result(tables, {"data": clips.source, **data}, pictures)

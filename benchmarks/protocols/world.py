@@ -1,0 +1,150 @@
+"""The body in the world: how far its root drifts when it cannot be seen, and whether standing feet stand.
+
+Two questions. Seen through noise that lasts (2 cm), the floor known, where is the body, and do its feet skate? Each
+foot counts for itself: a measure that asks for both to be still at once (RoHM's) forgives any walk. And when the
+trunk is hidden for two seconds at a time, how far has the root gone astray, by 10 m of path
+(`prior.trajectory_eval`)?
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+
+from benchmarks import ours
+from benchmarks.bench import Bench, Result, peers_of, tune, tuning_log
+from benchmarks.corruption import correlated
+from benchmarks.metrics import contact_speed, position_error
+from benchmarks.motion import MotionClips
+from benchmarks.peers import FILTERS, OFFLINE, Peer, missing
+from benchmarks.results import Table
+from benchmarks.scores import figures, interval, score
+from prior.kinematics import CONTACT_JOINTS
+from prior.pipeline import PriorPipeline
+from prior.skeletons import JOINTS
+from prior.trajectory import TrajectoryPipeline, TrajectorySettings
+from prior.trajectory_eval import METHODS, Clip, evaluate_fusion
+
+Floats = NDArray[np.float64]
+
+NOISE = 0.02
+"""Metres, with a correlation of 0.9 from a frame to the next."""
+DELAY = 4
+SKATING = 0.10
+"""m/s: a foot in contact that is faster skates."""
+FRAMES = 192
+"""Of a clip: two times 36 seen and 60 hidden."""
+
+
+def run(bench: Bench) -> Result:
+    """The whole chain beside filters, then the fusion without a root."""
+    clips = bench.clips(FRAMES, 48)
+    if bench.quick:
+        clips = clips.every(3)
+    some = clips.every(3)
+    told = correlated(some.positions, NOISE, np.random.default_rng(1))
+    seen = correlated(clips.positions, NOISE, np.random.default_rng(0))
+    peers = tuple(peer for peer in FILTERS if peer.delays != (OFFLINE,))
+
+    def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
+        answer = peer.run(told, clips.stamps_s, delay, **parameters)
+        found = figures(score(answer, some.positions, missing(told), align=False))
+        return {key: found[key] for key in ("position_mm", "acceleration_mm")}
+
+    tuned = tune(bench, evaluate, "world", peers)
+    records: list[dict[str, Any]] = [{"method": "truth", "delay": 0, **measure(clips, clips.positions)}]
+    for peer, delay in peers_of(bench, peers):
+        answer = peer.run(seen, clips.stamps_s, delay, **tuned[peer.name, delay].parameters)
+        records.append({"method": peer.name, "delay": delay, **measure(clips, answer)})
+    for name, settings in bench.progress.track(ours.OURS.items(), description="world"):
+        clean, world = chain(settings, seen, clips.stamps_s)
+        records.append({"method": f"{name}: pose/clean", "delay": DELAY, **measure(clips, clean)})
+        records.append({"method": f"{name}: pose/world", "delay": DELAY, **measure(clips, world)})
+    quaternions = roma.rotmat_to_unitquat(torch.from_numpy(clips.rotations)).numpy()
+    hidden = {
+        name: {key: round(value, 4) for key, value in errors.summary().items()}
+        for name, errors in evaluate_fusion(
+            [Clip(clips.positions[:, c], quaternions[:, c], clips.contacts[:, c]) for c in range(len(clips.offsets))],
+            METHODS,
+        ).items()
+        if name != "as observed"
+    }
+    source = {**clips.source, "scored clips": len(clips.offsets)}
+    return Result(
+        [_table(records, len(clips.offsets)), _hidden_table(hidden)],
+        {"data": source, "records": records, "root hidden": hidden, "tuning": tuning_log(tuned)},
+    )
+
+
+def chain(settings: ours.PriorSettings, seen: Floats, stamps_s: Floats) -> tuple[Floats, Floats]:
+    """Clips (T, C, 22, 3) through prior and trajectory, calibrated: pose/clean and pose/world, (T, C, 22, 3)."""
+    count = seen.shape[1]
+    prior = PriorPipeline(replace(settings, delay=DELAY, max_bodies=count))
+    trajectory = TrajectoryPipeline(TrajectorySettings())
+    clean, world = np.full(seen.shape, np.nan), np.full(seen.shape, np.nan)
+    for row, message in enumerate(ours.stream(prior, seen, stamps_s, calibrated=True)):
+        for body in message.bodies:
+            clean[row, body.id] = body.positions
+        for answer in trajectory.process(message):
+            for body in answer.bodies:
+                world[row, body.id] = body.positions
+    return clean, world
+
+
+def measure(clips: MotionClips, answer: Floats) -> dict[str, Any]:
+    """Place and pose in the world (mm), and the feet: mean speed in contact (m/s), share of frames that skate (%)."""
+    found = figures(score(answer, clips.positions, missing(clips.positions), align=False))
+    root = position_error(answer[:, :, 0], clips.positions[:, :, 0])
+    result = {key: found[key] for key in ("position_mm", "position_ci_mm", "acceleration_mm")}
+    result["root_mm"] = round(float(np.nanmean(root)) * 1e3, 2)
+    result["root_ci_mm"] = interval(np.nanmean(root, axis=0))
+    for side in ("left", "right"):
+        joints = [j for j in CONTACT_JOINTS if JOINTS[j] in (f"{side}_ankle", f"{side}_foot")]
+        labels = clips.contacts[:, :, [CONTACT_JOINTS.index(j) for j in joints]]
+        speed = np.concatenate(
+            [contact_speed(answer[:, c, joints], labels[:, c], clips.stamps_s).ravel() for c in range(answer.shape[1])]
+        )
+        speed = speed[np.isfinite(speed)]
+        result[f"{side}_skate_m_s"] = round(float(speed.mean()), 4)
+        result[f"{side}_skating_percent"] = round(100 * float((speed > SKATING).mean()), 2)
+    return result
+
+
+def _table(records: list[dict[str, Any]], clips: int) -> Table:
+    keys = {
+        "position_mm": ("joints, mm", 1), "root_mm": ("root, mm", 1),
+        "acceleration_mm": ("acceleration error, mm/frame²", 2), "left_skate_m_s": ("left foot, m/s", 3),
+        "right_skate_m_s": ("right foot, m/s", 3), "left_skating_percent": ("left skates, %", 1),
+        "right_skating_percent": ("right skates, %", 1),
+    }  # fmt: skip
+    return Table(
+        name="world",
+        title="In the world, through noise of 2 cm that lasts: place, pose and standing feet",
+        columns=["method", "delay, frames", *(text for text, _ in keys.values())],
+        rows=[
+            [r["method"], str(r["delay"]), *(f"{r[key]:.{digits}f}" for key, (_, digits) in keys.items())]
+            for r in records
+        ],
+        note=(
+            f"{clips} clips of {FRAMES} frames, floor known, no alignment. Feet: mean horizontal speed of ankle and "
+            f"toe in frames in which they stand in truth; skating: faster than {SKATING:.2f} m/s. Peers tuned on every "
+            "third clip with other noise."
+        ),
+    )
+
+
+def _hidden_table(hidden: Mapping[str, Mapping[str, float]]) -> Table:
+    keys = [key for key in next(iter(hidden.values())) if key.startswith("hidden")]
+    return Table(
+        name="world-hidden",
+        title="Without a root: the trunk hidden for two seconds at a time",
+        columns=["method", *(key.removeprefix("hidden ").removeprefix("hidden: ") for key in keys)],
+        rows=[[name, *(f"{found[key]:.2f}" for key in keys)] for name, found in hidden.items()],
+        note="Root: horizontal error after so long. Squared error over variance: 1 is honest.",
+    )

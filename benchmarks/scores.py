@@ -1,0 +1,135 @@
+"""Scores of a method over clips: one number a clip, then means with their intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.metrics import acceleration_error, bootstrap, length_variation, position_error, procrustes
+from benchmarks.results import Table
+from prior.skeletons import JOINTS, PARENTS
+from prior.window import FPS
+
+Floats = NDArray[np.float64]
+
+LIMBS: Mapping[str, NDArray[np.intp]] = {
+    limb: np.array([j for j, name in enumerate(JOINTS) if name.rpartition("_")[2] in parts])
+    for limb, parts in {
+        "trunk": {"pelvis", "spine1", "spine2", "spine3", "neck", "head", "collar"},
+        "arms": {"shoulder", "elbow", "wrist"},
+        "legs": {"hip", "knee", "ankle", "foot"},
+    }.items()
+}
+_BONES = tuple((joint, parent) for joint, parent in enumerate(PARENTS) if parent >= 0)
+
+MPS2 = FPS**2 * 1e-3
+"""m/s² in a mm/frame²."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """One number a clip, (C,), NaN where a clip has nothing of the kind."""
+
+    position: Floats  # metres: MPJPE
+    seen: Floats  # metres, of the joints that were given
+    hidden: Floats  # metres, of those that were not
+    aligned: Floats  # metres: PA-MPJPE, every frame turned, moved and scaled
+    acceleration: Floats  # metres/frame²
+    acceleration_error: Floats  # metres/frame²
+    variation: Floats  # of bone lengths, relative
+    answered: Floats  # share of the hidden joints for which there was an answer
+    limbs: Mapping[str, Floats]  # metres
+
+
+def score(answer: Floats, truth: Floats, hidden: NDArray[np.bool_], align: bool = True) -> Scores:
+    """Compare (T, C, 22, 3) metres; ``hidden`` (T, C, 22). Without ``align``, PA-MPJPE and bones are left out."""
+    error = position_error(answer, truth)
+    unknown = np.full(answer.shape[1], np.nan)
+    return Scores(
+        position=_mean(error),
+        seen=_mean(np.where(hidden, np.nan, error)),
+        hidden=_mean(np.where(hidden, error, np.nan)),
+        aligned=_mean(position_error(procrustes(answer, truth), truth)) if align else unknown,
+        acceleration=_mean(np.linalg.norm(np.diff(answer, n=2, axis=0), axis=-1)),
+        acceleration_error=_mean(acceleration_error(answer, truth)),
+        variation=np.array([length_variation(clip, _BONES) for clip in answer.swapaxes(0, 1)]) if align else unknown,
+        answered=_mean(np.where(hidden, np.isfinite(error).astype(float), np.nan)),
+        limbs={limb: _mean(error[..., joints]) for limb, joints in LIMBS.items()},
+    )  # fmt: skip
+
+
+def figures(scores: Scores) -> dict[str, Any]:
+    """Means over clips, and the 95 % intervals of those that decide: mm, mm/frame², m/s², per cent."""
+    result: dict[str, Any] = {
+        "position_mm": _mm(scores.position),
+        "position_ci_mm": interval(scores.position),
+        "seen_mm": _mm(scores.seen),
+        "hidden_mm": _mm(scores.hidden),
+        "hidden_ci_mm": interval(scores.hidden),
+        "hidden_answered_percent": _percent(scores.answered),
+        "pa_mm": _mm(scores.aligned),
+        "acceleration_mm": _mm(scores.acceleration_error),
+        "acceleration_ci_mm": interval(scores.acceleration_error),
+        "acceleration_m_s2": round(_mm(scores.acceleration_error) * MPS2, 3),
+        "own_acceleration_mm": _mm(scores.acceleration),
+        "bone_variation_percent": _percent(scores.variation),
+        "limbs_mm": {limb: _mm(values) for limb, values in scores.limbs.items()},
+    }
+    return {name: value for name, value in result.items() if not (isinstance(value, float) and np.isnan(value))}
+
+
+def interval(values: Floats) -> list[float] | None:
+    """95 % interval of the mean over clips, mm."""
+    known = values[np.isfinite(values)]
+    return [round(v * 1e3, 3) for v in bootstrap(known)] if len(known) else None
+
+
+def pivot(
+    records: Sequence[Mapping[str, Any]], column: str, figure: str, name: str, title: str, note: str, digits: int = 1
+) -> Table:
+    """A table with a row for each method and delay, and a column for each value of ``column``."""
+    columns = list(dict.fromkeys(record[column] for record in records))
+    rows: dict[tuple[str, int], dict[str, str]] = {}
+    for record in records:
+        value = record.get(figure)
+        cell = "–" if value is None else f"{value:.{digits}f}"
+        rows.setdefault((record["method"], record["delay"]), {})[record[column]] = cell
+    return Table(
+        name=name,
+        title=title,
+        columns=["method", "delay, frames", *columns],
+        rows=[
+            [method, "offline" if delay < 0 else str(delay), *(cells.get(c, "–") for c in columns)]
+            for (method, delay), cells in sorted(rows.items(), key=lambda item: _order(records, item[0]))
+        ],
+        note=note,
+    )
+
+
+def _order(records: Sequence[Mapping[str, Any]], row: tuple[str, int]) -> tuple[int, int]:
+    """Methods as they were run, each by delay."""
+    return list(dict.fromkeys(record["method"] for record in records)).index(row[0]), row[1]
+
+
+def _mean(values: Floats) -> Floats:
+    """Mean over the frames and joints of every clip: (T, C, J) to (C,)."""
+    known = np.isfinite(values)
+    total, count = np.where(known, values, 0.0).sum(axis=(0, 2)), known.sum(axis=(0, 2))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _mm(values: Floats) -> float:
+    return round(_over_clips(values) * 1e3, 3)
+
+
+def _percent(values: Floats) -> float:
+    return round(_over_clips(values) * 1e2, 3)
+
+
+def _over_clips(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else float("nan")
