@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from msgs.types import JointState
 from prior.filters import FixedLagRTS, Smoothed
-from prior.pose_solver import place_joints, solve_pose
+from prior.pose_solver import fit_pose, place_joints
 from prior.skeletons import JOINTS, PARENTS
 from prior.window import FPS, Estimate, Ring, Window
 
@@ -89,7 +89,7 @@ class Fuse:
         if s.enabled:
             share = (seen_weight / (seen_weight + prior_weight))[..., None]
             mean = body + share * (observed - body)
-            rotations, body = solve_pose(mean, offsets, decoded)
+            rotations, body = fit_pose(mean, offsets, 1 / (seen_weight + prior_weight), decoded)
         else:
             rotations = decoded
         placed = total[:, 0, 0] > 0

@@ -35,6 +35,18 @@ _TRUNK_UP = np.array(
         [(J["neck"],) * 2, (J["head"],) * 2, (J["head"],) * 2, (J["head"],) * 2],
     ]
 )
+# What is rigid on constant bones: every bone, and what pelvis and chest carry. The frame of each is in its first three.
+_PELVIS_GROUP = (J["left_hip"], J["right_hip"], J["spine1"], J["pelvis"])
+_CHEST_GROUP = (J["left_collar"], J["right_collar"], J["neck"], J["spine3"])
+_RIGID = np.array(
+    sorted(
+        {(joint, parent) for joint, parent in enumerate(PARENTS) if parent >= 0}
+        | {(max(a, b), min(a, b)) for group in (_PELVIS_GROUP, _CHEST_GROUP) for a in group for b in group if a != b}
+    )
+)
+_RIGID_FRAME = np.array([_PELVIS_GROUP[:3], _CHEST_GROUP[:3]])
+_SWEEPS = 20
+
 # Where the pelvis is upright below, when it is hidden itself: the middle of two joints, best first.
 _BELOW = np.array([(J["left_hip"], J["right_hip"]), (J["spine3"],) * 2, (J["neck"],) * 2, _SHOULDERS])
 
@@ -92,10 +104,38 @@ def solve_pose(
     """`solve_rotations`, and the positions (..., 22, 3) where those rotations put the joints on these bones."""
     shape = np.shape(positions)
     p, bones = _frames(positions, shape), _frames(offsets, shape)
-    local = np.empty((*p.shape, 3))
-    local[...] = np.eye(3) if fallback is None else np.reshape(fallback, local.shape)
-    placed = np.empty_like(p)
-    _solve(p, np.asarray(finite_joints(p)), bones, local, placed)
+    local, placed = _initial(fallback, p), np.empty_like(p)
+    _solve(p, np.asarray(finite_joints(p)), bones, False, local, placed)
+    return local.reshape(*shape, 3), placed.reshape(shape)
+
+
+def fit_pose(
+    positions: NDArray[np.floating],
+    offsets: NDArray[np.floating],
+    mobility: NDArray[np.floating],
+    fallback: NDArray[np.floating] | None = None,
+) -> tuple[Floats, Floats]:
+    """Rotations and positions of the pose on these bones that is nearest to the positions.
+
+    `solve_pose` follows the chain: where a bone seems too long or short, all of that goes to its end, and on to what
+    hangs from it. Here every bone and every rigid part of the trunk pulls at both its ends until the lengths are
+    right, by sweeps of Gauss-Newton over the distances (position-based dynamics, Müller et al. 2007); what comes out
+    is solved, which moves it by less than a millimetre.
+
+    Args:
+        positions: (..., 22, 3) metres, all of them finite.
+        offsets: (22, 3) or (..., 22, 3) metres, the person's bones.
+        mobility: (..., 22) how easily each joint yields: its variance, in any unit.
+        fallback: (..., 22, 3, 3) local rotations of the leaves, which no position shows; identity if left out.
+
+    Returns:
+        local rotations (..., 22, 3, 3), and the positions (..., 22, 3) where they put the joints, metres.
+    """
+    shape = np.shape(positions)
+    p, bones = _frames(positions, shape), _frames(offsets, shape)
+    _constrain(p, bones, np.array(np.broadcast_to(mobility, shape[:-1]), order="C").reshape(p.shape[:-1]))
+    local, placed = _initial(fallback, p), np.empty_like(p)
+    _solve(p, np.ones(p.shape[:-1], dtype=bool), bones, True, local, placed)
     return local.reshape(*shape, 3), placed.reshape(shape)
 
 
@@ -111,6 +151,13 @@ def place_joints(rotations: NDArray[np.floating], offsets: NDArray[np.floating])
     placed = np.empty_like(bones)
     _place(np.array(rotations, dtype=np.float64, order="C").reshape(*bones.shape, 3), bones, placed)
     return placed.reshape(shape)
+
+
+def _initial(fallback: NDArray[np.floating] | None, positions: Floats) -> Floats:
+    """(B, 22, 3, 3) local rotations to start from."""
+    local = np.empty((*positions.shape, 3))
+    local[...] = np.eye(3) if fallback is None else np.reshape(fallback, local.shape)
+    return local
 
 
 def _frames(values: NDArray[np.floating], shape: tuple[int, ...]) -> Floats:
@@ -237,6 +284,41 @@ def _trunk(which, p, seen, rest, here):
 
 
 @njit(cache=True)
+def _rigid_trunk(which, p, rest, here):
+    """The rotation of pelvis (0) or chest (1) in the frame of the positions, from the joints it carries."""
+    left, right, up = _RIGID_FRAME[which]
+    at_rest = _frame(rest[left] - rest[right], rest[up] - rest[_TRUNK[which]])
+    return _product(_frame(p[left] - p[right], p[up] - here), at_rest.T)
+
+
+@njit("(f8[:,:,::1], f8[:,:,::1], f8[:,::1])", cache=True)
+def _constrain(positions, offsets, mobility):
+    """Of B frames: moves ``positions`` (B, 22, 3) until what is rigid has its lengths."""
+    rest = np.empty((len(_PARENT), 3))
+    length = np.empty(len(_RIGID))
+    for frame in range(len(positions)):
+        p, yields = positions[frame], mobility[frame]
+        rest[0] = 0.0
+        for joint in range(1, len(_PARENT)):
+            rest[joint] = rest[_PARENT[joint]] + offsets[frame, joint]
+        for k in range(len(_RIGID)):
+            bone = rest[_RIGID[k, 0]] - rest[_RIGID[k, 1]]
+            length[k] = np.sqrt(_dot(bone, bone))
+        for _ in range(_SWEEPS):
+            for k in range(len(_RIGID)):
+                a, b = _RIGID[k]
+                squared = 0.0
+                for i in range(3):  # no vectors here: in the innermost loop, making them would take most of the time
+                    squared += (p[a, i] - p[b, i]) ** 2
+                now = max(np.sqrt(squared), 1e-9)
+                share = (now - length[k]) / now / (yields[a] + yields[b])
+                for i in range(3):
+                    along = share * (p[a, i] - p[b, i])
+                    p[a, i] -= yields[a] * along
+                    p[b, i] += yields[b] * along
+
+
+@njit(cache=True)
 def _twist(joint, p, seen, above, turn, bone):
     """``turn``, twisted about ``bone`` (parent's frame) so that the hinge below lies in the plane of the bent limb."""
     middle = _AIM[joint, 0]
@@ -252,9 +334,13 @@ def _twist(joint, p, seen, above, turn, bone):
     return _product(_about(bone, angle * trust * trust * (3.0 - 2.0 * trust)), turn)
 
 
-@njit("(f8[:,:,::1], b1[:,::1], f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1])", cache=True)
-def _solve(positions, observed, offsets, local, placed):
-    """Of B frames: writes ``placed`` (B, 22, 3), and into ``local`` (B, 22, 3, 3) what can be solved."""
+@njit("(f8[:,:,::1], b1[:,::1], f8[:,:,::1], b1, f8[:,:,:,::1], f8[:,:,::1])", cache=True)
+def _solve(positions, observed, offsets, rigid, local, placed):
+    """Of B frames: writes ``placed`` (B, 22, 3), and into ``local`` (B, 22, 3, 3) what can be solved.
+
+    ``rigid``: the positions lie on these bones, so the joints next to pelvis and chest show their frames. Measured
+    ones do not, and those further apart show them better.
+    """
     joints = len(_PARENT)
     rest = np.empty((joints, 3))
     world = np.empty((joints, 3, 3))
@@ -272,7 +358,10 @@ def _solve(positions, observed, offsets, local, placed):
             placed[frame, joint] = here
             for which in range(len(_TRUNK)):
                 if joint == _TRUNK[which]:
-                    solved, orientation = _trunk(which, p, seen, rest, here)
+                    if rigid:
+                        solved, orientation = True, _rigid_trunk(which, p, rest, here)
+                    else:
+                        solved, orientation = _trunk(which, p, seen, rest, here)
                     if solved:
                         local[frame, joint] = _product(above.T, orientation)
             for target in _AIM[joint]:

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from prior.kinematics import forward_kinematics, heading, yaw_matrix
-from prior.pose_solver import place_joints, solve_pose, solve_rotations, swing
+from prior.pose_solver import fit_pose, place_joints, solve_pose, solve_rotations, swing
 from prior.skeletons import JOINTS, REST_OFFSETS, J
 from tests.prior.bodies import fk, random_pose
 
@@ -102,3 +102,35 @@ def test_with_the_legs_hidden_the_body_still_faces_where_its_shoulders_do() -> N
 
 def test_nothing_seen_gives_the_fallback() -> None:
     assert np.allclose(solve_rotations(np.full((2, 22, 3), np.nan), REST_OFFSETS), np.eye(3))
+
+
+def test_a_pose_on_the_bones_is_its_own_fit() -> None:
+    positions = fk(random_pose(np.random.default_rng(8), 20))
+    rotations, placed = fit_pose(positions, REST_OFFSETS, np.ones(22))
+    assert np.allclose(placed, positions, atol=1e-9)
+    assert np.allclose(fk(rotations) + positions[:, :1], positions, atol=1e-9)
+
+
+def test_the_fit_lies_on_the_bones_and_nearer_to_the_truth_than_what_was_measured() -> None:
+    rng = np.random.default_rng(9)
+    truth = fk(random_pose(rng, 200))
+    measured = truth + rng.normal(size=truth.shape) * 0.02
+    rotations, placed = fit_pose(measured, REST_OFFSETS, np.ones(22))
+    assert np.allclose(placed - placed[:, :1], fk(rotations), atol=1e-9)
+
+    def error(p: np.ndarray) -> float:
+        return float(np.linalg.norm(p - truth, axis=-1).mean())
+
+    assert error(placed) < 0.8 * error(measured)
+    assert error(placed) < 0.8 * error(solve_pose(measured, REST_OFFSETS)[1])
+
+
+def test_the_fit_moves_the_joints_that_yield() -> None:
+    rng = np.random.default_rng(10)
+    truth = fk(random_pose(rng, 100))
+    wrist = J["left_wrist"]
+    off = truth.copy()
+    off[:, wrist] += rng.normal(size=(100, 3)) * 0.1
+    mobility = np.where(np.arange(22) == wrist, 1.0, 1e-3)
+    placed = fit_pose(off, REST_OFFSETS, mobility)[1]
+    assert np.abs(np.delete(placed - truth, wrist, axis=1)).max() < 0.01
