@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from msgs.types import JointState
 from prior.filters import FixedLagRTS, Smoothed
-from prior.pose_solver import fit_pose, place_joints
+from prior.pose_solver import fit_pose, place_joints, solve_pose
 from prior.skeletons import JOINTS, PARENTS
 from prior.window import FPS, Estimate, Ring, Window
 
@@ -38,12 +38,18 @@ class FuseSettings:
     fade: float = 3.0
 
 
-class Fuse:
-    """Joins a fixed-lag smoother of what was seen with forward kinematics of what the prior decoded.
+_MOST_MOBILE = 3.0
+"""Times the variance of the best-known joint, at most, by which the fit to the bones lets a joint yield: one that
+yields without resistance no longer says where it was, and the fit needs many more sweeps."""
 
-    Each joint is the mean of the two, weighted by their precisions: one well seen stays near the observation,
-    one hidden follows the prior as the smoother's uncertainty grows. The mean is then put on the person's bones by
-    solving rotations for it, so that lengths are constant, and positions and rotations agree.
+
+class Fuse:
+    """Joins a fixed-lag smoother of what was seen with the rotations that the prior decoded for the rest.
+
+    The prior's body is solved from the joints well seen; others hang from these in the rotations decoded. Each joint
+    is the mean of smoother and body, weighted by their precisions: one well seen stays near the observation, one
+    hidden follows the prior as the smoother's uncertainty grows. Of the poses on the person's bones, the one nearest
+    to that mean is the answer: lengths are constant, and positions and rotations agree.
     """
 
     def __init__(self, settings: FuseSettings, delay_frames: int, slots: int) -> None:
@@ -81,18 +87,18 @@ class Fuse:
         prior_weight = 1 / (s.prior_sigma**2 + (s.prior_drift * np.minimum(held_s, s.fade)) ** 2)
         known = seen_weight > 0
         observed = np.where(known[..., None], smoothed.positions[slots], 0.0)
-        body = place_joints(decoded, offsets)
-        # The pelvis goes where it brings the decoded body nearest to all joints seen, not only to itself.
-        weight = (seen_weight * prior_weight / (seen_weight + prior_weight))[..., None]
-        total = weight.sum(axis=1, keepdims=True)
-        body += (weight * (observed - body)).sum(axis=1, keepdims=True) / np.maximum(total, 1e-12)
+        share = (seen_weight / (seen_weight + prior_weight))[..., None]
         if s.enabled:
-            share = (seen_weight / (seen_weight + prior_weight))[..., None]
-            mean = body + share * (observed - body)
-            rotations, body = fit_pose(mean, offsets, 1 / (seen_weight + prior_weight), decoded)
+            # What is not seen hangs from what is, in the prior's rotations.
+            body = solve_pose(np.where(share > 0.5, observed, np.nan), offsets, decoded)[1]
+            variance = 1 / (seen_weight + prior_weight)
+            mobility = np.minimum(variance, _MOST_MOBILE * variance.min(axis=1, keepdims=True))
+            rotations, body = fit_pose(body + share * (observed - body), offsets, mobility, decoded)
         else:
-            rotations = decoded
-        placed = total[:, 0, 0] > 0
+            rotations, body = decoded, place_joints(decoded, offsets)
+            # The pelvis goes where it brings the decoded body nearest to all joints seen, not only to itself.
+            body += (share * (observed - body)).sum(axis=1, keepdims=True) / np.maximum(share.sum(axis=1), 1e-12)
+        placed = known.any(axis=1)
         state = _states(unseen_s, held_s, s.fade)
         sigma = 1 / np.sqrt(seen_weight + prior_weight)
         return Estimate(
