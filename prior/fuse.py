@@ -97,7 +97,8 @@ class Fuse:
         else:
             rotations, body = decoded, place_joints(decoded, offsets)
             # The pelvis goes where it brings the decoded body nearest to all joints seen, not only to itself.
-            body += (share * (observed - body)).sum(axis=1, keepdims=True) / np.maximum(share.sum(axis=1), 1e-12)
+            total = np.maximum(share.sum(axis=1, keepdims=True), 1e-12)
+            body += (share * (observed - body)).sum(axis=1, keepdims=True) / total
         placed = known.any(axis=1)
         state = _states(unseen_s, held_s, s.fade)
         sigma = 1 / np.sqrt(seen_weight + prior_weight)
