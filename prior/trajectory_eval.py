@@ -134,7 +134,9 @@ class Errors:
             "seen: skate m/s": float(np.mean(self.seen_skate)),
             "hidden: skate m/s": float(np.mean(self.hidden_skate)),
             **{f"hidden {h * FRAME_S:g} s: root cm": 100 * _rms(e) for h, e in self.hidden_position.items()},
-            "hidden: m per 10 m walked": float(10 * last[walked].sum() / path[walked].sum()),
+            "hidden: m per 10 m walked": float(10 * last[walked].sum() / path[walked].sum())
+            if walked.any()
+            else np.nan,
             "hidden: squared error over variance": float(np.mean(self.hidden_surprise)),
         }
 

@@ -33,15 +33,17 @@ class RootNoise:
 
     Attributes:
         acceleration: density of the root's white-noise acceleration, m/s² over √Hz.
-        slip: density of the random walk of a standing foot, metres over √s.
-        sensor_memory_s: the time constant of the sensor's slow error, a Gauss-Markov process.
+        slip: density of the random walk of a standing foot, metres over √s: less of it the foot than its image.
+        sensor_memory_s: the time constant of the sensor's slow error, a Gauss-Markov process, of a root at rest.
+        sensor_memory_m: metres of travel after which a moving root's is forgotten as well, as a camera's error is.
         network_memory_s: (3,) or a number, that of the network's.
         first_speed: m/s, the standard deviation of a root's first velocity.
     """
 
-    acceleration: float = 3.0
-    slip: float = 0.02
+    acceleration: float = 1.5
+    slip: float = 0.1
     sensor_memory_s: float = 0.65
+    sensor_memory_m: float = 0.03
     network_memory_s: ArrayLike = 0.15
     first_speed: float = 1.0
 
@@ -111,7 +113,9 @@ class RootFilter:
         p[:, _POSITION, _VELOCITY] += q * dt**2 / 2
         p[:, _VELOCITY, _POSITION] += q * dt**2 / 2
         p[:, _VELOCITY, _VELOCITY] += q * dt
-        for error, memory_s in ((_SENSOR, noise.sensor_memory_s), (_NETWORK, noise.network_memory_s)):
+        speed = float(np.linalg.norm(x[_VELOCITY, :2]))  # not the height, which the floor has a say in
+        sensor_memory_s = 1.0 / (1.0 / noise.sensor_memory_s + speed / noise.sensor_memory_m)
+        for error, memory_s in ((_SENSOR, sensor_memory_s), (_NETWORK, noise.network_memory_s)):
             kept = np.broadcast_to(np.exp(-dt / np.asarray(memory_s)), 3)
             x[error] *= kept
             p[:, error] *= kept[:, None]

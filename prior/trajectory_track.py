@@ -23,13 +23,14 @@ Sigma = TypeVar("Sigma", float, NDArray[np.float64])
 FEET: tuple[int, ...] = tuple(J[f"{side}_{part}"] for part in ("ankle", "foot") for side in ("left", "right"))
 """The joints that may stand: heels and toes."""
 
-SOLE: Floats = np.array([0.08, 0.08, 0.025, 0.025])
-"""(4,) metres from the floor to each of `FEET` while it stands: medians over the contacts of the training motion."""
+SOLE: Floats = np.array([0.07, 0.07, 0.022, 0.022])
+"""(4,) metres from the floor to each of `FEET` while it stands: the median over labelled contacts of the training
+motion, the mean over its five sources."""
 
 SOLE_SIGMA = 0.02
-"""Metres, the standard deviation of that between people, shoes and sensors."""
+"""Metres, the standard deviation of that between sources and people."""
 
-CONTACT_ON, CONTACT_OFF = 0.7, 0.4
+CONTACT_ON, CONTACT_OFF = 0.6, 0.3
 """Probabilities at which a foot comes to stand, and stands no more."""
 
 UNSEEN_SIGMA = 1.0
@@ -56,6 +57,13 @@ REACH_M = 2.0
 JUMP_SIGMAS, JUMP_M, JUMP_FRAMES = 5.0, 0.3, 6
 """A root seen this many standard deviations and metres off is not believed, until it was so often in a row; one that
 comes back into sight is believed at once. Both start the filter anew."""
+
+AT_ODDS_SIGMAS, AT_ODDS_MEMORY_S = 2.0, 0.2
+"""A root seen so many standard deviations off, in the mean over about so long, is carried along by what it stands on:
+what the legs say of the motion, by feet and network, is not the motion in the world."""
+
+AT_ONE_SPEED = 0.3
+"""m/s: where the legs say again what is seen, to this much, they are believed again."""
 
 LONGEST_GAP_S = 0.3
 """Seconds without a message over which the motion between is drawn straight, and feet may go on standing."""
@@ -165,6 +173,8 @@ class BodyTrack:
         self._dt = 0.0
         self._jumps = 0
         self._root_seen = sighting.root_seen
+        self._odds = np.zeros(2)
+        self._carried = False
 
     def _start(self, sighting: Sighting, velocity: Floats) -> RootFilter:
         sigma = min(sighting.root_sigma, UNSEEN_SIGMA)
@@ -216,24 +226,37 @@ class BodyTrack:
         inferred = 1.0 if sighting.root is None else 1.0 - float(sighting.seen[_LEGS].mean())
         contacts = motion.contacts[_FOOT_CONTACTS]
         held = hold and sighting.root is not None and self._dt <= LONGEST_GAP_S
-        contacts = np.where(held & sighting.seen[list(FEET)], contacts, 0.0)
         standing = filter_.standing
         if self._dt > 0.0:
             filter_.predict(self._dt)
-        if network:
+        self._weigh_legs(sighting, motion)
+        if network and not self._carried:
             filter_.observe_velocity(motion.velocity, *_split(np.hypot(motion.sigma, inferred * IMPUTED_LEGS_SPEED)))
+        contacts = np.where(held and not self._carried, contacts * sighting.seen[list(FEET)], 0.0)
         self._observe_root(sighting)
         for k, joint in enumerate(FEET):
             if contacts[k] < (CONTACT_OFF if standing[k] else CONTACT_ON):
                 filter_.lift(k)
                 continue
             from_root = sighting.positions[joint] - sighting.positions[0]
-            sigma = JITTER_SHARE * float(sighting.sigma[joint])
+            sigma = float(sighting.sigma[joint])
             if standing[k] and filter_.foot_surprise(k, from_root, sigma) < FOOT_SURPRISE:
                 filter_.observe_foot(k, from_root, sigma)
             else:
                 filter_.plant(k, from_root, sigma)
         self._meet_ground(sighting, ground)
+
+    def _weigh_legs(self, sighting: Sighting, motion: Motion) -> None:
+        """Find out whether what the legs say of the motion can be reconciled with the root seen, horizontally."""
+        if sighting.root is None or not sighting.root_seen:
+            self._odds[:], self._carried = 0.0, False
+            return
+        off = (sighting.root - self._filter.position)[:2]
+        likely = np.hypot(self._filter.position_sigma[:2], sighting.root_sigma)
+        self._odds += (1.0 - math.exp(-self._dt / AT_ODDS_MEMORY_S)) * (off / likely - self._odds)
+        at_odds = float(np.linalg.norm(self._odds))
+        disagreement = float(np.linalg.norm((self._filter.velocity - motion.velocity)[:2]))
+        self._carried = at_odds > AT_ODDS_SIGMAS or (self._carried and disagreement > AT_ONE_SPEED)
 
     def _observe_root(self, sighting: Sighting) -> None:
         came_back, self._root_seen = sighting.root_seen and not self._root_seen, sighting.root_seen

@@ -34,7 +34,9 @@ class Textbook:
 
     def predict(self, dt):
         n = self.noise
-        sensor, network = np.exp(-dt / n.sensor_memory_s), np.exp(-dt / n.network_memory_s)
+        speed = np.linalg.norm(self.x[3:5])
+        sensor = np.exp(-dt * (1 / n.sensor_memory_s + speed / n.sensor_memory_m))
+        network = np.exp(-dt / n.network_memory_s)
         f = np.eye(3 * self.size) + self.block({(0, 1): dt, (2, 2): sensor - 1, (3, 3): network - 1})
         a = n.acceleration**2
         q = self.block({(0, 0): a * dt**3 / 3, (0, 1): a * dt**2 / 2, (1, 0): a * dt**2 / 2, (1, 1): a * dt})
