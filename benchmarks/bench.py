@@ -75,7 +75,7 @@ class Bench:
     def smoothnets(self) -> list[smoothnet.SmoothNet]:
         """One of each seed, trained here and now."""
         motion = self.training_clips()
-        steps = 150 if self.quick else 1500
+        steps = 100 if self.quick else 3000
         return [
             smoothnet.train(motion, steps, seed, partial(self.progress.track, description=f"SmoothNet, seed {seed}"))
             for seed in self.seeds

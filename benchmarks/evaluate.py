@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 import time
 from pathlib import Path
 
@@ -22,24 +21,30 @@ def evaluate(protocol: str, *, quick: bool, mocap: Path | None, data: Path, out:
         raise FileNotFoundError("kinect_vicon: expected --mocap DIR, the folder that holds ui_prmd.npz")
     torch.set_num_threads(1)
     console = Console()
-    for name in PROTOCOLS if protocol == "all" else (protocol,):
-        if name == "kinect_vicon" and mocap is None:
-            console.print("kinect_vicon: left out, it needs --mocap", highlight=False)
-            continue
-        started = time.perf_counter()
-        with Progress(console=console, transient=True) as progress:
-            result: Result = importlib.import_module(f"benchmarks.protocols.{name}").run(
-                Bench(quick=quick, mocap=mocap, data=data, progress=progress)
-            )
-        seconds = time.perf_counter() - started
-        for table in result.tables:
-            show(table, console)
-        console.print(f"{name}: {seconds:.0f} s", highlight=False)
-        directory = out or (None if quick else RESULTS)
-        if directory is not None:
-            arguments = [*sys.argv[sys.argv.index(protocol) :]] if protocol in sys.argv else [name]
-            content = {"quick": quick, "seconds": round(seconds, 1), **result.data}
-            path = save(name, arguments, result.tables, content, directory, program=("steadypose", "evaluate"))
-            for stem, figure in result.figures.items():
-                figure.savefig(directory / f"{stem}.png", dpi=110)
-            console.print(f"wrote {path}", highlight=False)
+    with Progress(console=console, transient=True) as progress:
+        bench = Bench(quick=quick, mocap=mocap, data=data, progress=progress)
+        for name in PROTOCOLS if protocol == "all" else (protocol,):
+            if name == "kinect_vicon" and mocap is None:
+                console.print("kinect_vicon: left out, it needs --mocap", highlight=False)
+                continue
+            started = time.perf_counter()
+            result: Result = importlib.import_module(f"benchmarks.protocols.{name}").run(bench)
+            seconds = time.perf_counter() - started
+            for task in progress.task_ids:
+                progress.remove_task(task)
+            for table in result.tables:
+                show(table, console)
+            console.print(f"{name}: {seconds:.0f} s", highlight=False)
+            if out is not None or not quick:
+                console.print(f"wrote {_file(name, bench, result, seconds, out or RESULTS)}", highlight=False)
+
+
+def _file(name: str, bench: Bench, result: Result, seconds: float, directory: Path) -> Path:
+    options = [name, *(["--quick"] if bench.quick else [])]
+    if name == "kinect_vicon":
+        options += ["--mocap", "mocap"]
+    content = {"quick": bench.quick, "seeds": bench.seeds, "seconds": round(seconds, 1), **result.data}
+    path = save(name, options, result.tables, content, directory, program=("steadypose", "evaluate"))
+    for stem, figure in result.figures.items():
+        figure.savefig(directory / f"{stem}.png", dpi=110)
+    return path

@@ -49,27 +49,43 @@ def fixed_lag(
     frames = len(seen)
     z = seen.reshape(frames, -1, 3)
     known = np.asarray(np.isfinite(z).all(axis=-1))
-    state = np.zeros((z.shape[1], order, 3))
-    covariance = np.broadcast_to(np.diag(np.square(_UNKNOWN[:order])), (z.shape[1], order, order)).copy()
-    filtered, predicted, gains = [], [], []
+    # Covariances depend on when a joint was seen, not on where: joints seen at the same times share them.
+    patterns, which = np.unique(known, axis=1, return_inverse=True)
+    steps = np.diff(stamps_s)
+    gains, backward = _gains(patterns, steps, order, density, measurement_sigma)
+    state = np.zeros((order, z.shape[1], 3))
+    filtered, predicted = np.empty((frames, *state.shape)), np.empty((frames, *state.shape))
     for t in range(frames):
         if t:
-            step = stamps_s[t] - stamps_s[t - 1]
-            f = transition(order, step)
-            before = covariance
-            covariance = f @ before @ f.T + density * process_noise(order, step)
-            gains.append(before @ f.T @ np.linalg.inv(covariance))
-            state = f @ state
-        predicted.append(state)
-        gain = covariance[:, :, 0] / (covariance[:, :1, 0] + measurement_sigma**2) * known[t, :, None]
-        innovation = np.where(known[t, :, None], z[t] - state[:, 0], 0.0)
-        state = state + gain[:, :, None] * innovation[:, None]
-        covariance = covariance - gain[:, :, None] * covariance[:, None, 0]
-        filtered.append(state)
-    first, ahead = np.stack(filtered), np.stack(predicted)
-    smoothed = first
+            state = np.tensordot(transition(order, steps[t - 1]), state, axes=1)
+        predicted[t] = state
+        innovation = np.where(known[t, :, None], z[t] - state[0], 0.0)
+        filtered[t] = state = state + gains[t].T[:, which, None] * innovation
+    smoothed = filtered
     for _ in range(min(delay, frames - 1)):
-        moved = first[:-1] + np.stack(gains) @ (smoothed[1:] - ahead[1:])
-        smoothed = np.concatenate([moved, first[-1:]])
+        correction = smoothed[1:] - predicted[1:]
+        moved = [
+            filtered[:-1, i] + sum(backward[:, which, i, j, None] * correction[:, j] for j in range(order))
+            for i in range(order)
+        ]
+        smoothed = np.concatenate([np.stack(moved, axis=1), filtered[-1:]])
     by_then = np.maximum.accumulate(known)[np.minimum(np.arange(frames) + delay, frames - 1)]
-    return np.where(by_then[..., None], smoothed[:, :, 0], np.nan).reshape(seen.shape)
+    return np.where(by_then[..., None], smoothed[:, 0], np.nan).reshape(seen.shape)
+
+
+def _gains(
+    known: NDArray[np.bool_], steps: Floats, order: int, density: float, measurement_sigma: float
+) -> tuple[Floats, Floats]:
+    """Kalman gains (T, P, n) and RTS gains (T-1, P, n, n) of joints that are seen when ``known`` (T, P) says."""
+    covariance = np.broadcast_to(np.diag(np.square(_UNKNOWN[:order])), (known.shape[1], order, order)).copy()
+    gains, backward = [], []
+    for t, seen in enumerate(known):
+        if t:
+            f = transition(order, steps[t - 1])
+            before = covariance
+            covariance = f @ before @ f.T + density * process_noise(order, steps[t - 1])
+            backward.append(before @ f.T @ np.linalg.inv(covariance))
+        gain = covariance[:, :, 0] / (covariance[:, :1, 0] + measurement_sigma**2) * seen[:, None]
+        covariance = covariance - gain[:, :, None] * covariance[:, None, 0]
+        gains.append(gain)
+    return np.stack(gains), np.stack(backward) if backward else np.empty((0, known.shape[1], order, order))

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 OFFLINE = -1
 """The delay of a method that needs the whole recording."""
 
-_HAMPEL_PAST = 7  # frames
+_HAMPEL_HALF = 5  # frames to either side, as far as they are known by then
 _HAMPEL_FLOOR = 0.005  # metres: in a still body, a spread of nothing would make every sighting an outlier
 _GAUSSIAN_PAST = 12  # frames
 
@@ -149,7 +149,7 @@ def _overlap(frames: int, shift: int) -> tuple[slice, slice]:
 
 
 def _hampel(seen: Floats, delay: int, threshold: float) -> Floats:
-    shifts = range(-_HAMPEL_PAST, delay + 1)
+    shifts = range(-_HAMPEL_HALF, min(delay, _HAMPEL_HALF) + 1)
     around = np.full((len(shifts), *seen.shape), np.nan)
     for row, shift in enumerate(shifts):
         frames, others = _overlap(len(seen), shift)

@@ -25,7 +25,7 @@ WINDOW = 32
 """Frames."""
 _WIDTH, _BLOCKS = 128, 3
 _SCALE = 10.0  # a metre in the network's unit
-_BATCH = 32  # windows of whole bodies
+_BATCH = 16  # windows of whole bodies
 
 
 class SmoothNet(nn.Module):
@@ -55,8 +55,8 @@ def train(
     torch.manual_seed(seed)
     rng = np.random.default_rng((seed, 1))
     net = SmoothNet()
-    optimiser = torch.optim.Adam(net.parameters(), lr=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
+    optimiser = torch.optim.Adam(net.parameters())
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 1e-2, total_steps=steps)
     frames, clips = motion.positions.shape[:2]
     for _ in track(range(steps)):
         rows = rng.integers(frames - WINDOW, endpoint=True, size=_BATCH) + np.arange(WINDOW)[:, None]

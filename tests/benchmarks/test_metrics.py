@@ -10,9 +10,13 @@ from benchmarks.metrics import (
     bootstrap,
     bootstrap_ratio,
     contact_speed,
+    found_delay,
     length_variation,
     position_error,
+    procrustes,
+    reliability,
     rigid_alignment,
+    sigma_ratio,
 )
 
 
@@ -121,3 +125,48 @@ def test_a_paired_ratio_is_surer_than_its_parts() -> None:
     baseline = np.random.default_rng(6).uniform(1.0, 10.0, 100)
     ratio, low, high = bootstrap_ratio(0.8 * baseline, baseline)
     assert (ratio, low, high) == pytest.approx((0.8, 0.8, 0.8))
+
+
+def test_procrustes_undoes_turn_size_and_place_of_every_frame_but_no_mirror() -> None:
+    truth = walk(3)
+    turns = Rotation.random(len(truth), rng=np.random.default_rng(1)).as_matrix()
+    seen = 1.7 * np.einsum("tab,tjb->tja", turns, truth) + np.arange(len(truth))[:, None, None]
+    np.testing.assert_allclose(procrustes(seen, truth), truth, atol=1e-9)
+    mirrored = truth * [1.0, 1.0, -1.0]
+    assert position_error(procrustes(mirrored, truth), truth).mean() > 0.01
+
+
+def test_procrustes_leaves_what_is_missing_out_of_the_fit() -> None:
+    truth = walk(4)
+    seen = truth + [1.0, 2.0, 3.0]
+    seen[2, 3] = np.nan
+    placed = procrustes(seen, truth)
+    assert np.isnan(placed[2, 3]).all()
+    np.testing.assert_allclose(np.delete(placed[2], 3, axis=0), np.delete(truth[2], 3, axis=0), atol=1e-9)
+
+
+@pytest.mark.parametrize("lag", [-1.0, 0.0, 0.4, 3.0])
+def test_a_delay_is_found_between_frames(lag: float) -> None:
+    rng = np.random.default_rng(0)
+    rates, phases = rng.uniform(0.05, 0.4, (2, 8, 3)) * [[[1.0]], [[20.0]]]
+
+    def pose(times: np.ndarray) -> np.ndarray:
+        return np.sin(rates * times[:, None, None] + phases)
+
+    times = np.arange(90.0)
+    noise = rng.normal(0, 0.02, (90, 8, 3))
+    assert found_delay(pose(times - lag) + noise, pose(times), most=8) == pytest.approx(lag, abs=0.1)
+
+
+def test_stated_and_found_deviations() -> None:
+    rng = np.random.default_rng(0)
+    sigma = rng.uniform(0.01, 0.05, 20_000)
+    error = np.linalg.norm(rng.normal(size=(20_000, 3)) * sigma[:, None], axis=1)
+    assert sigma_ratio(error, sigma) == pytest.approx(1.0, rel=0.02)
+    assert sigma_ratio(2 * error, sigma) == pytest.approx(2.0, rel=0.02)
+    sigma[:100], error[100:200] = np.inf, np.nan
+    bins = reliability(error, sigma, bins=5)
+    assert sum(count for *_, count in bins) == 19_800
+    for stated, found, _ in bins:
+        assert found == pytest.approx(stated, rel=0.05)
+    assert [stated for stated, *_ in bins] == sorted(stated for stated, *_ in bins)

@@ -1,0 +1,178 @@
+"""A small part of the bench, as a check against regression: wide tolerances, people of our own simulator."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from rich.progress import Progress
+
+from benchmarks import figures, ours, smoothnet
+from benchmarks.bench import Bench, over_seeds
+from benchmarks.corruption import gaussian, hide
+from benchmarks.metrics import position_error
+from benchmarks.motion import MotionClips, simulated_clips
+from benchmarks.peers import OFFLINE, Peer, missing
+from benchmarks.protocols import PROTOCOLS
+from benchmarks.protocols.reconstruction import slide
+from benchmarks.protocols.spoiled import against_best, run_conditions
+from benchmarks.protocols.streaming import recovery
+from benchmarks.scores import figures as figures_of
+from benchmarks.scores import pivot, score
+from nodes.evaluate import evaluate
+from prior.checkpoint import load_weights
+from prior.hmvae import HMVAE, HMVAEConfig
+from prior.skeletons import J
+
+
+@pytest.fixture(scope="module")
+def clips() -> MotionClips:
+    return simulated_clips(frames=45, most=6, seed=0)
+
+
+def test_simulated_clips_are_bodies_on_a_floor(clips: MotionClips) -> None:
+    assert clips.positions.shape == (45, 6, 22, 3)
+    assert clips.contacts.shape == (45, 6, 8)
+    assert clips.positions[..., 2].min() > -0.05
+    length = np.linalg.norm(clips.positions[:, :, J["left_knee"]] - clips.positions[:, :, J["left_hip"]], axis=-1)
+    np.testing.assert_allclose(
+        length, np.tile(np.linalg.norm(clips.offsets[:, J["left_knee"]], axis=-1), (45, 1)), rtol=0.01
+    )
+
+
+def test_steadypose_takes_noise_away_and_answers_for_hidden_joints(clips: MotionClips) -> None:
+    rng = np.random.default_rng(0)
+    hidden = np.zeros(clips.positions.shape[:-1], dtype=bool)
+    hidden[20:35, ::2, [J["left_elbow"], J["left_wrist"]]] = True
+    seen = hide(gaussian(clips.positions, 0.02, rng), hidden)
+    cleaned = ours.run(ours.OURS["steadypose"], seen, clips.stamps_s, 4)
+    np.testing.assert_allclose(cleaned.stamps_s, clips.stamps_s, atol=1e-6)
+    scores = score(cleaned.positions, clips.positions, hidden)
+    raw = score(seen, clips.positions, hidden)
+    assert scores.seen.mean() < 0.9 * raw.seen.mean()
+    assert scores.acceleration_error.mean() < 0.15 * raw.acceleration_error.mean()
+    assert np.nanmean(scores.answered) == 1.0
+    assert np.nanmean(scores.hidden) < 0.15
+    assert scores.variation.mean() < 0.05
+    error = position_error(cleaned.positions, clips.positions) / cleaned.sigma / np.sqrt(3)
+    assert 0.3 < np.sqrt(np.nanmean(error[~hidden] ** 2)) < 3.0
+
+
+def test_clips_side_by_side_are_cleaned_as_if_alone(clips: MotionClips) -> None:
+    seen, stamps = gaussian(clips.positions[:20, :3], 0.01, np.random.default_rng(1)), clips.stamps_s[:20]
+    together = ours.run(ours.OURS["steadypose"], seen, stamps, 2)
+    alone = ours.run(ours.OURS["steadypose"], seen[:, 1:2], stamps, 2)
+    np.testing.assert_allclose(together.positions[:, 1], alone.positions[:, 0], atol=1e-3)
+
+
+def test_a_delay_beyond_the_models_window_is_not_available() -> None:
+    assert ours.available(ours.OURS["steadypose"], 4)
+    assert not ours.available(ours.OURS["steadypose"], 80)
+
+
+def test_an_undisturbed_answer_scores_zero_and_groups_are_told_apart(clips: MotionClips) -> None:
+    hidden = np.zeros(clips.positions.shape[:-1], dtype=bool)
+    hidden[:, 0, J["left_wrist"]] = True
+    perfect = figures_of(score(clips.positions, clips.positions, hidden))
+    assert perfect["position_mm"] == perfect["acceleration_mm"] == perfect["pa_mm"] == 0.0
+    moved = clips.positions + [0.0, 0.03, 0.0]
+    moved[:, 0, J["left_wrist"]] += [0.0, 0.07, 0.0]
+    found = figures_of(score(moved, clips.positions, hidden))
+    assert (found["seen_mm"], found["hidden_mm"]) == pytest.approx((30.0, 100.0))
+    assert found["limbs_mm"]["legs"] == pytest.approx(30.0)
+    assert found["limbs_mm"]["arms"] > 31.0
+
+
+def test_a_short_training_of_the_temporal_network_already_smooths(clips: MotionClips) -> None:
+    net = smoothnet.train(simulated_clips(frames=45, most=20, seed=1), steps=60, seed=0)
+    seen = gaussian(clips.positions, 0.04, np.random.default_rng(0))
+    answer = smoothnet.smooth(net, seen, 4)
+    assert position_error(answer, clips.positions).mean() < 0.85 * position_error(seen, clips.positions).mean()
+    other = seen.copy()
+    other[30:] += 1.0
+    np.testing.assert_array_equal(answer[:26], smoothnet.smooth(net, other, 4)[:26])
+
+
+def test_recovery_counts_from_the_first_frame_in_sight(clips: MotionClips) -> None:
+    hidden = np.zeros(clips.positions.shape[:-1], dtype=bool)
+    limb = [J["left_elbow"], J["left_wrist"]]
+    hidden[10:20, :, limb] = True
+    answer = clips.positions + [0.01, 0.0, 0.0]
+    answer[10:26, 0, limb] += 0.1
+    answer[10:, 1, limb] += 0.1
+    np.testing.assert_allclose(recovery(answer, clips.positions, hidden)[:3], np.array([6, 25, 0]) / 30.0)
+
+
+def test_sliding_windows_keep_every_frame(clips: MotionClips) -> None:
+    import torch
+
+    state, config = load_weights("default", "hmvae")
+    model = HMVAE(HMVAEConfig.from_dict(config))
+    model.load_state_dict(state)
+    rotations = torch.from_numpy(clips.rotations[:24]).float().transpose(0, 1)
+    decoded = slide(model.eval(), rotations)
+    assert decoded.shape == rotations.shape
+    error = torch.linalg.matrix_norm(decoded - rotations).mean()
+    assert error < 0.5 * torch.linalg.matrix_norm(rotations - torch.eye(3)).mean()
+
+
+def test_conditions_give_records_that_tables_and_pictures_are_made_of(clips: MotionClips, monkeypatch) -> None:
+    monkeypatch.setattr(ours, "OURS", {"steadypose": ours.OURS["steadypose"]})
+    with Progress(disable=True) as progress:
+        bench = Bench(quick=True, mocap=None, data=Path("nowhere.npz"), progress=progress)
+        monkeypatch.setitem(bench.__dict__, "smoothnets", [smoothnet.SmoothNet()])
+        peers = (Peer("raw", lambda seen, _, delay: seen, (0,)),)
+        data = run_conditions(bench, clips, {"4 cm": lambda truth, rng: gaussian(truth, 0.04, rng)}, peers)
+    records = {(r["method"], r["delay"]): r for r in data["records"]}
+    assert set(records) == {("raw", 0), *((m, k) for m in ("SmoothNet-style", "steadypose") for k in (0, 4))}
+    assert records["raw", 0]["position_mm"] == pytest.approx(40 * np.sqrt(8 / np.pi), rel=0.02)
+    ratio, low, high = records["steadypose", 4]["against_best_peer"]["position"]["ratio"]
+    assert low < ratio < high
+    assert ratio < 0.95
+    assert 0.2 < data["calibration"]["4 cm, steadypose, delay 4"]["seen"]["ratio"] < 4.0
+    table = pivot(data["records"], "condition", "position_mm", "noise", "Noise", "")
+    assert table.rows[0][:2] == ["raw", "0"]
+    assert isinstance(figures.curves(data["records"], "delay", {"position_mm": "mm"}, "frames", "title"), Figure)
+
+
+def test_the_best_peer_is_another_for_each_error(clips: MotionClips) -> None:
+    from benchmarks.bench import Answer
+
+    hidden = missing(clips.positions)
+    answers = {
+        name: Answer(name, delay, clips.stamps_s, clips.positions + move, {})
+        for name, delay, move in (
+            ("still", 0, 0.03 + np.random.default_rng(1).normal(0, 1e-4, clips.positions.shape)),
+            ("shaking", 0, np.random.default_rng(0).normal(0, 0.01, clips.positions.shape)),
+            ("late", 8, np.array([0.001, 0.0, 0.0])),
+            ("all", OFFLINE, np.zeros(3)),
+        )
+    }
+    mine = Answer("steadypose", 4, clips.stamps_s, clips.positions + [0.02, 0.0, 0.0], {})
+    scored = [(a, score(a.positions, clips.positions, hidden)) for a in (*answers.values(), mine)]
+    found = against_best(mine, scored[-1][1], scored)
+    assert found["position"]["peer"] == "shaking, delay 0"
+    assert found["acceleration_error"]["peer"] == "still, delay 0"
+
+
+def test_seeds_are_averaged_and_their_spread_kept() -> None:
+    one = {"method": "a", "delay": 0, "condition": "x", "position_mm": 10.0, "hidden_mm": 4.0}
+    (merged,) = over_seeds([one, {**one, "position_mm": 12.0}])
+    assert merged["position_mm"] == 11.0
+    assert merged["position_sd_over_seeds_mm"] == pytest.approx(1.414, abs=1e-3)
+    assert merged["seeds"] == 2
+
+
+def test_the_command_knows_every_protocol_and_asks_for_what_it_needs() -> None:
+    from typing import get_args, get_type_hints
+
+    assert set(get_args(get_type_hints(evaluate)["protocol"])) == {"all", *PROTOCOLS}
+    with pytest.raises(FileNotFoundError, match="mocap"):
+        evaluate("kinect_vicon")
+
+
+def test_quick_writes_only_where_it_is_told(tmp_path: Path, capsys) -> None:
+    evaluate("reconstruction", quick=True, data=tmp_path / "nowhere.npz")
+    evaluate("reconstruction", quick=True, data=tmp_path / "nowhere.npz", out=tmp_path / "out")
+    assert capsys.readouterr().out.count("wrote") == 1
+    assert (tmp_path / "out" / "reconstruction.json").is_file()

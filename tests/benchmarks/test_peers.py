@@ -1,0 +1,122 @@
+from functools import partial
+
+import numpy as np
+import pytest
+
+from benchmarks.kalman import fixed_lag, process_noise, transition
+from benchmarks.peers import (
+    FILTERS,
+    OFFLINE,
+    PEERS,
+    butterworth,
+    constant_velocity,
+    gaussian_hampel,
+    hold_last,
+    interpolate,
+)
+from prior.filters import FixedLagRTS
+
+STAMPS = np.arange(40) / 30.0
+NAN = float("nan")
+
+
+def motion(rng: np.random.Generator, frames: int = 40) -> np.ndarray:
+    """(T, 3, 2, 3) joints of three clips that move smoothly, with 1 cm of noise."""
+    start, speed = rng.normal(size=(2, 3, 2, 3))
+    return start + speed * STAMPS[:frames, None, None, None] + rng.normal(0, 0.01, (frames, 3, 2, 3))
+
+
+def line(values: list[float]) -> np.ndarray:
+    """(T, 1, 3) a joint that moves along the diagonal."""
+    return np.repeat(np.array(values)[:, None, None], 3, axis=-1)
+
+
+def test_constant_velocity_agrees_with_the_products_own_smoother() -> None:
+    seen = motion(np.random.default_rng(0))
+    stamps = STAMPS + np.random.default_rng(1).uniform(-0.01, 0.01, len(STAMPS))
+    seen[10:14, 1, 0] = np.nan
+    seen[20:, 2, 1] = np.nan
+    for delay in (0, 3):
+        smoother = FixedLagRTS(delay, 0.7, measurement_sigma=0.02)
+        held = [smoother.update(frame, stamp) for frame, stamp in zip(seen, stamps, strict=True)]
+        expected = np.stack([answer.positions for answer in (*held, *smoother.flush()) if answer])
+        np.testing.assert_allclose(fixed_lag(seen, stamps, delay, 2, 0.7), expected, atol=1e-6)
+
+
+def test_constant_acceleration_is_the_smoother_of_its_model() -> None:
+    """Against the batch solution: the mean of the joint Gaussian of all states, given all measurements so far."""
+    rng = np.random.default_rng(2)
+    frames, delay, density, sigma = 7, 2, 30.0, 0.02
+    stamps = np.cumsum(rng.uniform(0.02, 0.05, frames))
+    seen = rng.normal(0, 0.1, (frames, 1, 3))
+    seen[3] = np.nan
+    answer = fixed_lag(seen, stamps, delay, 3, density, sigma)
+    prior = np.diag([1e3, 1.0, 5.0]) ** 2
+    blocks = [[prior]]
+    for t, step in enumerate(np.diff(stamps)):
+        f = transition(3, step)
+        row = [f @ block for block in blocks[t]]
+        blocks.append([*row, f @ blocks[t][t] @ f.T + density * process_noise(3, step)])
+    covariance = np.block(
+        [[blocks[max(a, b)][min(a, b)] if a >= b else blocks[b][a].T for b in range(frames)] for a in range(frames)]
+    )[::3, ::3]
+    for t in range(frames):
+        known = [k for k in range(min(t + delay + 1, frames)) if k != 3]
+        gain = covariance[t, known] @ np.linalg.inv(covariance[np.ix_(known, known)] + sigma**2 * np.eye(len(known)))
+        np.testing.assert_allclose(answer[t, 0], gain @ seen[known, 0], atol=1e-5)
+
+
+def test_a_gap_is_bridged_only_when_its_end_is_known() -> None:
+    seen = line([0.0, 1.0, NAN, NAN, 4.0, NAN, 6.0])
+    stamps = np.arange(7.0)
+    np.testing.assert_allclose(hold_last(seen, stamps, 0)[:, 0, 0], [0, 1, 1, 1, 4, 4, 6])
+    np.testing.assert_allclose(interpolate(seen, stamps, 0)[:, 0, 0], [0, 1, 1, 1, 4, 4, 6])
+    np.testing.assert_allclose(interpolate(seen, stamps, 1)[:, 0, 0], [0, 1, 1, 3, 4, 5, 6])
+    np.testing.assert_allclose(interpolate(seen, stamps, 2)[:, 0, 0], [0, 1, 2, 3, 4, 5, 6])
+    open_end = line([NAN, 1.0, NAN, NAN])
+    np.testing.assert_allclose(interpolate(open_end, np.arange(4.0), OFFLINE)[:, 0, 0], [NAN, 1, 1, 1])
+
+
+def test_a_spike_is_taken_out_before_the_mean() -> None:
+    seen = np.random.default_rng(3).normal(0, 0.01, (40, 3, 2, 3))
+    struck = seen.copy()
+    struck[20, 1, 1] += 0.3
+    run = partial(gaussian_hampel, stamps_s=STAMPS, delay=4, sigma_s=0.05)
+    clean = run(seen, threshold=8.0)
+    assert np.abs(run(struck, threshold=8.0) - clean).max() < 0.03
+    assert np.abs(run(struck, threshold=1e6) - run(seen, threshold=1e6)).max() > 0.03
+
+
+def test_butterworth_has_no_lag_and_bridges_gaps() -> None:
+    stamps = np.arange(120) / 30.0
+    truth = np.sin(2 * np.pi * 0.5 * stamps)[:, None, None] * np.ones((1, 1, 3))
+    seen = truth.copy()
+    seen[50:53] = np.nan
+    answer = butterworth(seen, stamps, OFFLINE, cutoff_hz=4.0)
+    assert np.abs(answer - truth)[20:100].max() < 0.02
+
+
+@pytest.mark.parametrize("peer", PEERS, ids=lambda peer: peer.name)
+def test_no_answer_knows_more_than_its_delay(peer) -> None:
+    if peer.delays == (OFFLINE,):
+        pytest.skip("offline")
+    delay = 0 if peer.delays else 3
+    seen = motion(np.random.default_rng(4))
+    seen[12:16, 0] = np.nan
+    parameters = {name: float(np.sqrt(low * high)) for name, (low, high) in peer.space.items()}
+    whole = peer.run(seen, STAMPS, delay, **parameters)
+    other = seen.copy()
+    other[25:] += 1.0
+    np.testing.assert_array_equal(
+        whole[: 25 - delay], peer.run(other, STAMPS, delay, **parameters)[: 25 - delay], err_msg=peer.name
+    )
+    assert whole.shape == seen.shape
+
+
+def test_tuned_filters_beat_raw_on_noise_that_they_are_made_for() -> None:
+    rng = np.random.default_rng(5)
+    truth = np.broadcast_to(np.sin(3 * STAMPS)[:, None, None, None], (40, 3, 2, 3))
+    seen = truth + rng.normal(0, 0.04, truth.shape)
+    error = np.abs(seen - truth).mean()
+    assert np.abs(constant_velocity(seen, STAMPS, 4, 1.0) - truth).mean() < 0.5 * error
+    assert {peer.name for peer in PEERS} - {peer.name for peer in FILTERS} == {"hold last", "linear interpolation"}
