@@ -54,7 +54,7 @@ class TrajectorySettings:
     weights: str = "default"
     network: bool = True
     contacts: bool = True
-    acceleration: float = 1.5
+    acceleration: float = 3.0
     lost_sigma: float = 0.5
     timeout_s: float = 1.0
 

@@ -40,7 +40,7 @@ class RootNoise:
         first_speed: m/s, the standard deviation of a root's first velocity.
     """
 
-    acceleration: float = 1.5
+    acceleration: float = 3.0
     slip: float = 0.1
     sensor_memory_s: float = 0.65
     sensor_memory_m: float = 0.03
