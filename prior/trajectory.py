@@ -32,7 +32,7 @@ WORLD = "world"
 """The frame of everything published here."""
 
 
-CAMERA_ERROR, CAMERA_MEMORY_S = 3.0, 0.6
+CAMERA_ERROR, CAMERA_MEMORY_S = 2.0, 0.3
 """On poses from a camera the velocity that the network reads errs so many times as much as validation on motion capture
 found, and for at least so many seconds: on simulated streams 0.2 m/s where 0.1 was stated, half of it still there after
 0.5 s, and not the same in all streams."""
