@@ -91,12 +91,12 @@ def interval(values: Floats) -> list[float] | None:
 def pivot(
     records: Sequence[Mapping[str, Any]], column: str, figure: str, name: str, title: str, note: str, digits: int = 1
 ) -> Table:
-    """A table with a row for each method and delay, and a column for each value of ``column``."""
+    """A table with a row for each method and delay, and a column for each value of ``column``; text stays as it is."""
     columns = list(dict.fromkeys(record[column] for record in records))
     rows: dict[tuple[str, int], dict[str, str]] = {}
     for record in records:
         value = record.get(figure)
-        cell = "–" if value is None else f"{value:.{digits}f}"
+        cell = "–" if value is None else value if isinstance(value, str) else f"{value:.{digits}f}"
         rows.setdefault((record["method"], record["delay"]), {})[record[column]] = cell
     return Table(
         name=name,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from benchmarks import figures
 from benchmarks.bench import Bench, Result
 from benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
-from benchmarks.protocols.spoiled import HOW, Condition, reliability_bins, run_conditions
+from benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
 from benchmarks.results import Table
 from benchmarks.scores import pivot
 from prior.window import FPS
@@ -70,6 +70,7 @@ def run(bench: Bench) -> Result:
         pivot(records, "condition", "acceleration_mm", "hidden_joints-acceleration",
               "Hidden joints: acceleration error of all joints, mm/frame²", note, digits=2)
     )  # fmt: skip
+    tables.append(calibration_table(data["calibration"], "hidden_joints-calibration"))
     timed = [
         {**r, "seconds": float(r["condition"].removesuffix(" s"))} for r in records if r["condition"].endswith(" s")
     ]

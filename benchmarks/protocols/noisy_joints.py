@@ -15,7 +15,7 @@ from benchmarks import figures
 from benchmarks.bench import Bench, Result
 from benchmarks.corruption import correlated, gaussian, spiked, swapped
 from benchmarks.peers import FILTERS
-from benchmarks.protocols.spoiled import HOW, Condition, reliability_bins, run_conditions
+from benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
 from benchmarks.scores import pivot
 
 Floats = NDArray[np.float64]
@@ -65,12 +65,17 @@ def run(bench: Bench) -> Result:
         pivot(records, "condition", "acceleration_mm", "noisy_joints-acceleration",
               "Noisy joints: acceleration error, mm/frame² (times 0.9: m/s²)", note, digits=2),
     ]  # fmt: skip
-    levels = [{**r, "level": float(r["condition"].split()[0])} for r in records if r["condition"].endswith(" cm")
-              and r["condition"][0].isdigit()]  # fmt: skip
+    tables.append(calibration_table(data["calibration"], "noisy_joints-calibration"))
+    levels = [
+        {**record, "level": level}
+        for record in records
+        for level in LEVELS_CM
+        if record["condition"] == f"{level} cm" and record["delay"] in (0, 4)
+    ]
     panels = {"position_mm": "MPJPE, mm", "acceleration_mm": "acceleration error, mm/frame²"}
     pictures = {
         "noise_levels": figures.curves(
-            [r for r in levels if r["delay"] in (0, 4)and (r["delay"] == 4 or r["method"] in ("raw", "One-Euro"))],
+            [r for r in levels if r["delay"] == 4 or r["method"] in ("raw", "One-Euro")],
             "level", panels, "noise, cm", "Noisy joints, delay of at most 4 frames", log=True,
         ),
         "noise_delays": figures.curves(

@@ -13,7 +13,8 @@ from benchmarks.metrics import bootstrap_ratio, position_error, reliability, sig
 from benchmarks.motion import MotionClips
 from benchmarks.ours import OURS
 from benchmarks.peers import OFFLINE, PEERS, Peer, missing
-from benchmarks.scores import Scores, figures, score
+from benchmarks.results import Table
+from benchmarks.scores import Scores, figures, pivot, score
 
 Floats = NDArray[np.float64]
 Condition = Callable[[Floats, np.random.Generator], Floats]
@@ -38,7 +39,7 @@ def run_conditions(
     also the ratio of their errors to those of the best such peer.
     """
     records: list[dict[str, Any]] = []
-    calibration: dict[str, Any] = {}
+    calibration: list[dict[str, Any]] = []
     tried: dict[str, Any] = {}
     for number, (name, spoil) in enumerate(conditions.items()):
         some = clips.every(TUNED_ON)
@@ -60,9 +61,8 @@ def run_conditions(
             scored.append((answer, score(answer.positions, clips.positions, hidden)))
             if answer.sigma is not None:
                 error = position_error(answer.positions, clips.positions)
-                calibration[f"{name}, {answer.method}, delay {answer.delay}"] = _calibration(
-                    error, answer.sigma, hidden
-                )
+                row = {"condition": name, "method": answer.method, "delay": answer.delay}
+                calibration.append({**row, **_calibration(error, answer.sigma, hidden)})
         records += over_seeds([_record(name, *one, scored) for one in scored])
     return {"records": records, "calibration": calibration, "tuning": tried}
 
@@ -112,12 +112,29 @@ def _calibration(error: Floats, sigma: Floats, hidden: NDArray[np.bool_]) -> dic
     }
 
 
-def reliability_bins(calibration: Mapping[str, Any], method: str, delay: int) -> dict[str, Any]:
+def reliability_bins(calibration: Sequence[Mapping[str, Any]], method: str, delay: int) -> dict[str, Any]:
     """Of one method, the points of the reliability plot by condition and group."""
-    suffix = f", {method}, delay {delay}"
     return {
-        f"{name.removesuffix(suffix)}, {group}": found["bins_m"]
-        for name, groups in calibration.items()
-        if name.endswith(suffix)
-        for group, found in groups.items()
+        f"{row['condition']}, {group}": row[group]["bins_m"]
+        for row in calibration
+        if (row["method"], row["delay"]) == (method, delay)
+        for group in ("seen", "hidden")
+        if group in row
     }
+
+
+def calibration_table(calibration: Sequence[Mapping[str, Any]], name: str) -> Table:
+    """Error found by standard deviation stated: of seen joints, and after a stroke of hidden ones, by condition."""
+    records = [
+        {**row, "cell": " / ".join(f"{row[group]['ratio']:.2f}" for group in ("seen", "hidden") if group in row)}
+        for row in calibration
+    ]
+    hidden = any("hidden" in row for row in calibration)
+    return pivot(
+        records,
+        "condition",
+        "cell",
+        name,
+        "Error found by standard deviation stated" + (": seen / hidden joints" if hidden else ""),
+        "Root mean square of their ratio along an axis: 1 is honest, above is too sure of itself.",
+    )

@@ -15,7 +15,7 @@ from benchmarks.motion import MotionClips, simulated_clips
 from benchmarks.peers import OFFLINE, Peer, missing
 from benchmarks.protocols import PROTOCOLS
 from benchmarks.protocols.reconstruction import slide
-from benchmarks.protocols.spoiled import against_best, run_conditions
+from benchmarks.protocols.spoiled import against_best, calibration_table, reliability_bins, run_conditions
 from benchmarks.protocols.streaming import recovery
 from benchmarks.scores import figures as figures_of
 from benchmarks.scores import pivot, score
@@ -129,7 +129,9 @@ def test_conditions_give_records_that_tables_and_pictures_are_made_of(clips: Mot
     ratio, low, high = records["steadypose", 4]["against_best_peer"]["position"]["ratio"]
     assert low < ratio < high
     assert ratio < 0.95
-    assert 0.2 < data["calibration"]["4 cm, steadypose, delay 4"]["seen"]["ratio"] < 4.0
+    assert [0.2 < row["seen"]["ratio"] < 4.0 for row in data["calibration"]] == [True, True]
+    assert len(reliability_bins(data["calibration"], "steadypose", 4)["4 cm, seen"]) == 10
+    assert len(calibration_table(data["calibration"], "calibration").rows) == 2
     table = pivot(data["records"], "condition", "position_mm", "noise", "Noise", "")
     assert table.rows[0][:2] == ["raw", "0"]
     assert isinstance(figures.curves(data["records"], "delay", {"position_mm": "mm"}, "frames", "title"), Figure)
