@@ -125,28 +125,31 @@ def answers(
 ) -> Iterator[Answer]:
     """All methods over clips (T, C, 22, 3), each with the parameters found for it; a network once for each seed."""
 
-    def peer_job(peer: Peer, delay: int) -> Answer:
+    def by_peer(peer: Peer, delay: int) -> list[Answer]:
         parameters = tuned[peer.name, delay].parameters
-        return Answer(peer.name, delay, stamps_s, peer.run(seen, stamps_s, delay, **parameters), parameters)
+        return [Answer(peer.name, delay, stamps_s, peer.run(seen, stamps_s, delay, **parameters), parameters)]
 
-    def smoothnet_job(seed: int, delay: int) -> Answer:
-        net = bench.smoothnets[bench.seeds.index(seed)]
-        return Answer("SmoothNet-style", delay, stamps_s, smoothnet.smooth(net, seen, delay), {})
+    def by_network(number: int) -> list[Answer]:
+        found = smoothnet.smooth(bench.smoothnets[number], seen, bench.delays)
+        return [
+            Answer("SmoothNet-style", delay, stamps_s, positions, {})
+            for delay, positions in zip(bench.delays, found, strict=True)
+        ]
 
-    def our_job(name: str, delay: int) -> Answer:
+    def by_us(name: str, delay: int) -> list[Answer]:
         cleaned = ours.run(ours.OURS[name], seen, stamps_s, delay)
-        return Answer(name, delay, cleaned.stamps_s, cleaned.positions, {}, cleaned.sigma)
+        return [Answer(name, delay, cleaned.stamps_s, cleaned.positions, {}, cleaned.sigma)]
 
-    jobs: list[Callable[[], Answer]] = [partial(peer_job, peer, delay) for peer, delay in peers_of(bench, peers)]
-    jobs += [partial(smoothnet_job, seed, delay) for delay in bench.delays for seed in bench.seeds]
+    jobs: list[Callable[[], list[Answer]]] = [partial(by_peer, *one) for one in peers_of(bench, peers)]
+    jobs += [partial(by_network, number) for number in range(len(bench.seeds))]
     jobs += [
-        partial(our_job, name, delay)
+        partial(by_us, name, delay)
         for name, settings in ours.OURS.items()
         for delay in bench.delays
         if ours.available(settings, delay)
     ]
     for job in bench.progress.track(jobs, description=title):
-        yield job()
+        yield from job()
 
 
 def tune(

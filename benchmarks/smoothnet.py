@@ -8,7 +8,7 @@ every delay: of the 32 frames that a window gives, a delay of k keeps the one k 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import torch
@@ -74,16 +74,18 @@ def train(
 
 
 @torch.inference_mode()
-def smooth(net: SmoothNet, seen: Floats, delay: int) -> Floats:
-    """Answers (T, ..., 3) of clips (T, ..., 3) at this delay."""
-    frames = len(seen)
+def smooth(net: SmoothNet, seen: Floats, delays: Sequence[int]) -> list[Floats]:
+    """Answers (T, ..., 3) of clips (T, ..., 3) at each delay, all of them from the same windows."""
+    last = len(seen) - 1
     lead = np.broadcast_to(seen[:1], (WINDOW - 1, *seen.shape[1:]))  # a clip younger than the window repeats its start
     held, gone = _inputs(np.concatenate([lead, seen]))
-    answers = np.empty(seen.shape)
-    for t in range(frames):
-        newest = min(t + delay, frames - 1)
-        window = slice(newest, newest + WINDOW)
-        answers[t] = net(held[..., window], gone[..., window])[..., WINDOW - 1 - (newest - t)].numpy()
+    answers = [np.empty(seen.shape) for _ in delays]
+    for newest in range(len(seen)):
+        window = net(held[..., newest : newest + WINDOW], gone[..., newest : newest + WINDOW]).numpy()
+        for answer, delay in zip(answers, delays, strict=True):
+            for back in range(delay + 1) if newest == last else (delay,):
+                if back <= newest:
+                    answer[newest - back] = window[..., WINDOW - 1 - back]
     return answers
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -200,8 +200,9 @@ class Learners:
     """The peers that learn from the Kinect beside Vicon; their training clips, smoothed once for each delay."""
 
     def __init__(self, bench: Bench, clips: Sequence[Clip], densities: Mapping[int, float]) -> None:
-        self._bench, self._clips, self._densities = bench, clips, densities
+        self._bench, self._densities = bench, densities
         self._truths = [clip.centres for clip in clips]
+        self._lesson = lru_cache(maxsize=1)(partial(self.smoothed, clips))
 
     def smoothed(self, clips: Sequence[Clip], delay: int, ahead: int) -> list[kinect_regression.Smoothed]:
         """Clips as the regressions read them, smoothed as was found best for this delay."""
@@ -210,7 +211,7 @@ class Learners:
 
     def ridge(self, delay: int, on: Sequence[Clip]) -> tuple[Method, Tuned]:
         """The ridge regression, its penalty searched for like any peer's parameters, on clips ``on``."""
-        train, asked = self.smoothed(self._clips, delay, 0), self.smoothed(on, delay, 0)
+        train, asked = self._lesson(delay, 0), self.smoothed(on, delay, 0)
 
         def evaluate(parameters: Mapping[str, float]) -> dict[str, float]:
             answer = kinect_regression.ridge(train, self._truths, **parameters)
@@ -228,7 +229,7 @@ class Learners:
         """The temporal convolution, trained at once."""
         ahead = kinect_regression.look_ahead(delay)
         answer = kinect_regression.temporal_convolution(
-            self.smoothed(self._clips, delay, ahead),
+            self._lesson(delay, ahead),
             self._truths,
             ahead,
             steps=60 if self._bench.quick else 500,
@@ -276,8 +277,8 @@ def run(bench: Bench) -> Result:
     """Tune, run, score."""
     assert bench.mocap is not None
     path = bench.mocap / "ui_prmd.npz"
-    train = read_clips(path, TRAIN_SUBJECTS, 40 if bench.quick else 10)
     taught = read_clips(path, TRAIN_SUBJECTS, 20 if bench.quick else 2)
+    train = taught[:: 2 if bench.quick else 5]
     validation = read_clips(path, VALIDATION_SUBJECTS, 9 if bench.quick else 1)
     methods, tuning = _methods(bench, taught, validation[:: 1 if bench.quick else 5])
     records: list[dict[str, Any]] = []
@@ -346,7 +347,7 @@ def _methods(bench: Bench, taught: Sequence[Clip], on: Sequence[Clip]) -> tuple[
             methods.append(Method(peer.name, delay, one, parameters))
     for delay in bench.delays:
         for net in bench.smoothnets:
-            one = partial(_filtered, run=lambda seen, _, net=net, delay=delay: smoothnet.smooth(net, seen, delay))
+            one = partial(_filtered, run=lambda seen, _, net=net, delay=delay: smoothnet.smooth(net, seen, (delay,))[0])
             methods.append(Method("SmoothNet-style", delay, one))
     densities = {delay: tuned["Kalman, constant velocity", delay].parameters["density"] for delay in bench.delays}
     learners = Learners(bench, taught, densities)
@@ -380,8 +381,8 @@ def _ratios(method: Method, result: Scores, scored: Sequence[tuple[Method, Score
     rivals = [best, *((m, s) for m, s in here if m.name in (RIDGE, TCN) and m.delay == method.delay)]
     return {
         f"{rival.name}, delay {rival.delay}": {
-            "position": bootstrap_ratio(result.position, scores.position),
-            "acceleration": bootstrap_ratio(result.acceleration, scores.acceleration),
+            "position": [round(v, 4) for v in bootstrap_ratio(result.position, scores.position)],
+            "acceleration": [round(v, 4) for v in bootstrap_ratio(result.acceleration, scores.acceleration)],
         }
         for rival, scores in rivals
     }
