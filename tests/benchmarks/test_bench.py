@@ -13,13 +13,11 @@ from benchmarks.corruption import gaussian, hide
 from benchmarks.metrics import position_error
 from benchmarks.motion import MotionClips, simulated_clips
 from benchmarks.peers import OFFLINE, Peer, missing
-from benchmarks.protocols import PROTOCOLS
 from benchmarks.protocols.reconstruction import slide
 from benchmarks.protocols.spoiled import against_best, calibration_table, reliability_bins, run_conditions
 from benchmarks.protocols.streaming import recovery
 from benchmarks.scores import figures as figures_of
 from benchmarks.scores import pivot, score
-from nodes.evaluate import evaluate
 from prior.checkpoint import load_weights
 from prior.hmvae import HMVAE, HMVAEConfig
 from prior.skeletons import J
@@ -164,18 +162,3 @@ def test_seeds_are_averaged_and_their_spread_kept() -> None:
     assert merged["position_mm"] == 11.0
     assert merged["position_sd_over_seeds_mm"] == pytest.approx(1.414, abs=1e-3)
     assert merged["seeds"] == 2
-
-
-def test_the_command_knows_every_protocol_and_asks_for_what_it_needs() -> None:
-    from typing import get_args, get_type_hints
-
-    assert set(get_args(get_type_hints(evaluate)["protocol"])) == {"all", *PROTOCOLS}
-    with pytest.raises(FileNotFoundError, match="mocap"):
-        evaluate("kinect_vicon")
-
-
-def test_quick_writes_only_where_it_is_told(tmp_path: Path, capsys) -> None:
-    evaluate("reconstruction", quick=True, data=tmp_path / "nowhere.npz")
-    evaluate("reconstruction", quick=True, data=tmp_path / "nowhere.npz", out=tmp_path / "out")
-    assert capsys.readouterr().out.count("wrote") == 1
-    assert (tmp_path / "out" / "reconstruction.json").is_file()
