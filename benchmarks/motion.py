@@ -45,12 +45,20 @@ class MotionClips:
 
     def every(self, step: int) -> MotionClips:
         """Every n-th clip."""
+        return self._take(np.arange(0, len(self.offsets), step))
+
+    def farthest(self, count: int) -> MotionClips:
+        """The clips in which the pelvis travels the longest paths over the floor."""
+        paths = np.linalg.norm(np.diff(self.positions[:, :, 0, :2], axis=0), axis=-1).sum(axis=0)
+        return self._take(np.sort(np.argsort(-paths, kind="stable")[:count]))
+
+    def _take(self, clips: NDArray[np.intp]) -> MotionClips:
         return replace(
             self,
-            positions=self.positions[:, ::step],
-            rotations=self.rotations[:, ::step],
-            offsets=self.offsets[::step],
-            contacts=self.contacts[:, ::step],
+            positions=self.positions[:, clips],
+            rotations=self.rotations[:, clips],
+            offsets=self.offsets[clips],
+            contacts=self.contacts[:, clips],
         )
 
 

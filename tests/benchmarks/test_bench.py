@@ -38,6 +38,12 @@ def test_simulated_clips_are_bodies_on_a_floor(clips: MotionClips) -> None:
     )
 
 
+def test_the_clips_that_travel_farthest_are_kept_in_order(clips: MotionClips) -> None:
+    paths = [np.linalg.norm(np.diff(clip[:, 0, :2], axis=0), axis=-1).sum() for clip in clips.positions.swapaxes(0, 1)]
+    kept = sorted(sorted(range(6), key=lambda c: -paths[c])[:2])
+    np.testing.assert_array_equal(clips.farthest(2).positions, clips.positions[:, kept])
+
+
 def test_steadypose_takes_noise_away_and_answers_for_hidden_joints(clips: MotionClips) -> None:
     rng = np.random.default_rng(0)
     hidden = np.zeros(clips.positions.shape[:-1], dtype=bool)
