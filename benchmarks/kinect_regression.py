@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 
 _FRAMES, _MOST_AHEAD = 24, 4
 _BATCH = 256
+_SCALE = 0.2  # metres
 _CORNERS = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
 
 
@@ -95,8 +96,8 @@ class TemporalConvolution(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Conv1d(66, 64, 8), nn.ReLU(), nn.Dropout(0.2),
-            nn.Conv1d(64, 64, 8), nn.ReLU(), nn.Dropout(0.2),
+            nn.Dropout(0.2), nn.Conv1d(66, 64, 8), nn.ReLU(), nn.Dropout(0.5),
+            nn.Conv1d(64, 64, 8), nn.ReLU(), nn.Dropout(0.5),
             nn.Conv1d(64, 39, 10),
         )  # fmt: skip
 
@@ -119,13 +120,13 @@ def temporal_convolution(
     y = np.concatenate([clip.missing(truth) for clip, truth in zip(train, truths, strict=True)])
     known = np.flatnonzero(np.isfinite(y).all(axis=1))
     targets = torch.from_numpy(y).float()
-    mean, scale = x[known].mean(dim=(0, 1)), x[known].std(dim=(0, 1)).clamp(min=1e-2)
+    mean = x[known].mean(dim=(0, 1))
     net = TemporalConvolution()
     optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
     for _ in track(range(steps)):
         rows = torch.from_numpy(rng.choice(known, _BATCH))
-        loss = (net((x[rows] - mean) / scale) - targets[rows]).square().mean()
+        loss = (net((x[rows] - mean) / _SCALE) - targets[rows]).square().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -134,7 +135,7 @@ def temporal_convolution(
 
     @torch.inference_mode()
     def answer(clip: Smoothed) -> Floats:
-        return clip.corrected(net((_windows(clip, ahead) - mean) / scale).double().numpy())
+        return clip.corrected(net((_windows(clip, ahead) - mean) / _SCALE).double().numpy())
 
     return answer
 

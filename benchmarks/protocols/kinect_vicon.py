@@ -232,7 +232,7 @@ class Learners:
             self._lesson(delay, ahead),
             self._truths,
             ahead,
-            steps=60 if self._bench.quick else 500,
+            steps=60 if self._bench.quick else 150,
             seed=seed,
         )
 
