@@ -63,7 +63,7 @@ def clean(
         source: a recording, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps.
         out: the recording to make, or .npz with one row for each row of the input.
         weights: weight set of the models: 'default', unless given, or 'research'.
-        delay: frames at 30 Hz to wait for, 0 to 4; more is smoother. 4 unless given.
+        delay: frames at 30 Hz to wait for, 0 to 16; more is smoother. 4 unless given.
         settings: any setting of [prior], such as gate.enabled=false, or of [trajectory], such as
             trajectory.contacts=false. May be given again.
     """

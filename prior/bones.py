@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.kinematics import global_rotations, solve_rotations
+from prior.kinematics import global_rotations
+from prior.pose_solver import solve_rotations
 from prior.skeletons import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, finite_joints
 from prior.window import Window
 
@@ -39,13 +40,16 @@ people measured by motion capture; more in trunk, head and feet, where sensors m
 TRUNK_PLACE_SPREAD = 0.05
 """Metres along each axis, by which sensors differ in where hips, neck and shoulders leave the trunk."""
 
-LENGTH_SIGMA = 0.06
-"""Metres: how wrong a single sample of a bone is at least, most of it an error that its neighbours share."""
+LENGTH_BIASES = 3.0
+"""Times the sensor's bias: how wrong a single sample of a bone is at least, most of it an error that its neighbours
+share."""
 
 LIKE_SAMPLES = 12
 """So many samples in a row, two seconds, err alike and tell as much as one."""
 
 _ENOUGH_JOINTS = 8
+_RENEWAL = 1.5
+_SURE = 0.05  # metres: a joint whose place is known less well, hidden for a while, measures no bone
 _APPROACH = 0.1  # of the way to a renewed estimate, a frame: bones that jump would shake the whole limb
 _ENOUGH_SAMPLES = 4
 
@@ -53,39 +57,45 @@ _ENOUGH_SAMPLES = 4
 class Bones:
     """Keeps each slot's ``window.offsets``: `estimate_bones` over frames sampled from the person's first ten seconds.
 
-    The estimate is renewed each time the number of samples has doubled, so that it costs little and soon stands
+    The estimate is renewed each time there are half as many samples more, so that it costs little and soon stands
     still, and is approached smoothly.
     """
 
     delay_frames = 0
 
-    def __init__(self, settings: BonesSettings, slots: int) -> None:
-        self._settings = settings
+    def __init__(self, settings: BonesSettings, bias_sigma: float, slots: int) -> None:
+        self._settings, self._bias_sigma = settings, bias_sigma
         self._samples = np.full((slots, settings.samples, 22, 3), np.nan)
         self._target = np.zeros((slots, 22, 3))
         self._count = np.zeros(slots, dtype=np.int64)
+        self._used = np.zeros(slots, dtype=np.int64)
         self._wait = np.zeros(slots, dtype=np.int64)
 
     def reset(self, slot: NDArray[np.bool_]) -> None:
         """Forget the people in these slots."""
         self._samples[slot] = np.nan
-        self._count[slot] = 0
+        self._count[slot] = self._used[slot] = 0
         self._wait[slot] = 0
 
     def update(self, window: Window) -> Window:
-        """Sample the newest frame, where it is due, and renew the estimate."""
-        if not self._settings.enabled:
+        """Sample the smoother's newest frame, where it is due, and renew the estimate."""
+        if not self._settings.enabled or window.smoothed is None:
             return window
-        enough = finite_joints(window.positions.newest).sum(axis=1) >= _ENOUGH_JOINTS
+        # Smoothed, for noise makes bones longer.
+        sure = window.smoothed.sigma < _SURE
+        positions = np.where(sure[..., None], window.smoothed.positions, np.nan)
+        enough = sure.sum(axis=1) >= _ENOUGH_JOINTS
         self._wait -= 1
         due = window.present & enough & (self._wait < 0) & (self._count < self._settings.samples)
         for slot in np.flatnonzero(due):
-            self._samples[slot, self._count[slot]] = window.positions.newest[slot]
+            self._samples[slot, self._count[slot]] = positions[slot]
             self._count[slot] += 1
             self._wait[slot] = self._settings.every - 1
             count = self._count[slot]
-            if count & (count - 1) == 0 or count == self._settings.samples:
-                self._target[slot] = estimate_bones(self._samples[slot, :count])
+            if count >= _RENEWAL * self._used[slot] or count == self._settings.samples:
+                self._used[slot] = count
+                noise = float(np.median(window.smoothed.sigma[slot, sure[slot]]))
+                self._target[slot] = estimate_bones(self._samples[slot, :count], self._bias_sigma, noise)
                 window.measured[slot] = count >= _ENOUGH_SAMPLES
                 if count == 1:
                     window.offsets[slot] = self._target[slot]
@@ -94,7 +104,7 @@ class Bones:
         return window
 
 
-def estimate_bones(positions: Floats) -> Floats:
+def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float) -> Floats:
     """This person's bones, the same on both sides, from a few poses in a row.
 
     Lengths are the posterior mean of a log-normal model: a person's size varies about the generic adult's, each bone
@@ -105,11 +115,14 @@ def estimate_bones(positions: Floats) -> Floats:
 
     Args:
         positions: (T, 22, 3) metres, NaN where unobserved; samples of about 6 Hz.
+        bias_sigma: metres along an axis, the sensor's slow error.
+        noise_sigma: metres along an axis, the positions' other error.
 
     Returns:
         (22, 3) metres, each joint in its parent's frame.
     """
     same = 1.0 + len(positions) / LIKE_SAMPLES
+    bias, noise = LENGTH_BIASES * bias_sigma, np.sqrt(2.0) * noise_sigma
     seen = np.asarray(finite_joints(positions).any(axis=0))
     seen |= seen[MIRROR]
     bones = _bones(seen)
@@ -123,7 +136,9 @@ def estimate_bones(positions: Floats) -> Floats:
             median = np.median(lengths)
             deviation = 1.4826 * np.median(np.abs(lengths - median))
             log_ratio[k] = np.log(max(median, 0.1 * generic) / generic)
-            sigma[k] = max(deviation, LENGTH_SIGMA) / generic / np.sqrt(same)
+            # What noise does not explain of the deviation is as lasting as the bias.
+            lasting = max(deviation**2 - noise**2, bias**2)
+            sigma[k] = np.sqrt(lasting / same + noise**2 / len(lengths)) / generic
     spread = np.array([LIMB_SPREAD if paths[0][0] in _LIMBS else TRUNK_SPREAD for paths in bones])
     weight = 1.0 / (spread**2 + sigma**2)
     size = (weight * log_ratio).sum() / (weight.sum() + STATURE_SPREAD**-2)
@@ -131,9 +146,8 @@ def estimate_bones(positions: Floats) -> Floats:
     offsets = REST_OFFSETS * np.exp(size)
     for paths, factor in zip(bones, np.exp(own), strict=True):
         offsets[np.concatenate(paths)] *= factor
-    return _place_on_trunk(
-        positions, seen, offsets, TRUNK_PLACE_SPREAD**2 / (TRUNK_PLACE_SPREAD**2 + LENGTH_SIGMA**2 / same)
-    )
+    doubt = bias**2 / same + noise**2 / len(positions)
+    return _place_on_trunk(positions, seen, offsets, TRUNK_PLACE_SPREAD**2 / (TRUNK_PLACE_SPREAD**2 + doubt))
 
 
 _LIMBS = frozenset(j for j, name in enumerate(JOINTS) if name.endswith(("knee", "ankle", "elbow", "wrist")))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs.types import JointState
-from prior.filters import FixedLagRTS, Smoothed
+from prior.filters import Smoothed
 from prior.pose_solver import fit_pose, place_joints, solve_pose
 from prior.skeletons import JOINTS, PARENTS
 from prior.window import FPS, Estimate, Ring, Window
@@ -21,18 +21,12 @@ class FuseSettings:
 
     Attributes:
         enabled: whether to; off, the body stands as the refinement model decoded it, where its pelvis was seen.
-        measurement_sigma: metres, the fast noise of a joint seen with full confidence.
-        bias_sigma: metres, the sensor's slow error, which no filter averages out.
-        acceleration_density: m²/s³, how freely joints accelerate (of the fixed-lag smoother).
         prior_sigma: metres, of a joint placed by the refinement model, when its body is well seen.
         prior_drift: m/s, how fast that grows for a joint that is not seen.
         fade: seconds after which a joint not seen is unknown.
     """
 
     enabled: bool = True
-    measurement_sigma: float = 0.02
-    bias_sigma: float = 0.02
-    acceleration_density: float = 0.5
     prior_sigma: float = 0.1
     prior_drift: float = 0.25
     fade: float = 3.0
@@ -52,38 +46,30 @@ class Fuse:
     to that mean is the answer: lengths are constant, and positions and rotations agree.
     """
 
-    def __init__(self, settings: FuseSettings, delay_frames: int, slots: int) -> None:
-        self._settings = settings
+    def __init__(self, settings: FuseSettings, bias_sigma: float, delay_frames: int, slots: int) -> None:
+        self._settings, self._bias_sigma = settings, bias_sigma
         self.delay_frames = delay_frames
-        self._smoother = FixedLagRTS(delay_frames, settings.acceleration_density, settings.measurement_sigma)
         self._unseen_s = Ring(delay_frames + 1, (slots, len(JOINTS)), fill=np.inf)
 
     def reset(self, slot: NDArray[np.bool_]) -> None:
         """Forget the bodies in these slots."""
-        self._smoother.forget(np.repeat(slot[:, None], len(JOINTS), axis=1))
         self._unseen_s.clear(slot)
 
     def update(self, window: Window) -> Window:
         """Write the estimate of the frame ``delay_frames`` before the newest, once there is one."""
         positions = window.positions.newest
         self._unseen_s.push(np.where(np.isfinite(positions[..., 0]), 0.0, self._unseen_s.newest + 1 / FPS))
-        sigma = self._settings.measurement_sigma / np.clip(window.confidence.newest, 0.1, 1.0)
-        smoothed = self._smoother.update(positions, float(window.stamp_s.newest), sigma)
-        window.out = None if smoothed is None else self._estimate(window, smoothed, self.delay_frames)
+        window.out = None if window.smoothed is None else self.estimate(window, window.smoothed, self.delay_frames)
         return window
 
-    def flush(self, window: Window) -> list[Estimate]:
-        """The estimates of the last ``delay_frames`` frames (fewer if there were fewer), oldest first."""
-        held = self._smoother.flush()
-        return [self._estimate(window, smoothed, len(held) - 1 - k) for k, smoothed in enumerate(held)]
-
-    def _estimate(self, window: Window, smoothed: Smoothed, back: int) -> Estimate:
+    def estimate(self, window: Window, smoothed: Smoothed, back: int) -> Estimate:
+        """The estimate of the frame ``back`` before the newest, from what the smoother made of it."""
         s = self._settings
         slots = np.flatnonzero(window.present)
         offsets, decoded = window.offsets[slots], window.decoded[-1 - back][slots]
         unseen_s = self._unseen_s.all[-1 - back][slots]
         held_s = _least_below(unseen_s)
-        seen_weight = 1 / (smoothed.sigma[slots] ** 2 + s.bias_sigma**2)
+        seen_weight = 1 / (smoothed.sigma[slots] ** 2 + self._bias_sigma**2)
         prior_weight = 1 / (s.prior_sigma**2 + (s.prior_drift * np.minimum(held_s, s.fade)) ** 2)
         known = seen_weight > 0
         observed = np.where(known[..., None], smoothed.positions[slots], 0.0)

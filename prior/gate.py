@@ -26,8 +26,8 @@ class GateSettings:
     """
 
     enabled: bool = True
-    jump: float = 0.12
-    bone: float = 0.5
+    jump: float = 0.18
+    bone: float = 1.0
     patience: float = 0.3
     min_confidence: float = 0.1
 
@@ -39,6 +39,10 @@ _LIMBS = tuple(
 )
 _SWAP_APART = 0.15  # metres between expected and seen, mean of a limb's joints, below which no exchange is suspected
 _SWAP_BETTER = 0.4  # an exchange must bring the joints this much nearer to where they were expected
+_JUMP_NOISES = 7.0  # times the noise: one sighting in a thousand is further from where it was expected
+_LEAST_BONE, _BONE_NOISES = 0.1, 4.0  # metres, and times the noise, by which even a short bone may differ
+_NOISE_MEMORY = 15  # frames
+_DISTANCE_OF_NOISE = 2.6  # median distance to the expectation of white noise of 1 along each axis, by this filter
 _BODY_JUMP = 0.5  # if more of the joints jump at once, the body did (a new track, a gap), not the joints
 
 
@@ -57,6 +61,7 @@ class Gate:
         self._filter = FixedLagRTS(0, acceleration_density=8.0, measurement_sigma=0.015)
         self._refused = np.zeros((slots, 22))
         self._swapped = np.zeros((slots, len(_LIMBS)))
+        self._frames = np.zeros(slots, dtype=np.int64)
 
     def reset(self, slot: NDArray[np.bool_]) -> None:
         """Forget the bodies in these slots."""
@@ -65,6 +70,7 @@ class Gate:
         self._filter.forget(np.repeat(slot[:, None], 22, axis=1))
         self._refused[slot] = 0
         self._swapped[slot] = 0
+        self._frames[slot] = 0
 
     def update(self, window: Window) -> Window:
         """Write the newest frame's positions from its raw ones, NaN where refused."""
@@ -73,12 +79,15 @@ class Gate:
         positions = window.raw.newest.copy()
         positions[window.confidence.newest < s.min_confidence] = np.nan
         expected = self._filter.predict(stamp)
+        if expected is not None:
+            self._measure_noise(window, positions, expected.positions)
         if expected is not None and s.enabled:
             known = np.isfinite(expected.positions[..., 0])
             self._exchange(positions, expected.positions, known)
             seen = np.isfinite(positions[..., 0])
             distance = np.sqrt(((positions - expected.positions) ** 2).sum(axis=-1))
-            jumped = seen & known & (distance > s.jump + 3 * expected.sigma)
+            least = np.maximum(s.jump, _JUMP_NOISES * window.noise)[:, None]
+            jumped = seen & known & (distance > least + 3 * expected.sigma)
             everywhere = jumped.sum(axis=1) > _BODY_JUMP * np.maximum((seen & known).sum(axis=1), 1)
             self._believe(everywhere[:, None] & jumped)
             jumped &= ~everywhere[:, None]
@@ -94,6 +103,18 @@ class Gate:
         self._filter.update(positions, stamp)
         window.positions.push(positions)
         return window
+
+    def _measure_noise(self, window: Window, positions: NDArray[np.float64], expected: NDArray[np.float64]) -> None:
+        """Keep ``window.noise``, from how far the middle one of a body's joints comes from where it was expected.
+
+        The middle one, so that a limb thrown about, or a joint that jumps, says nothing about the sensor. Noise that
+        lasts over frames is not seen here; it belongs to the sensor's bias.
+        """
+        distance = np.sqrt(((positions - expected) ** 2).sum(axis=-1))
+        for slot in np.flatnonzero(np.isfinite(distance).any(axis=1)):
+            self._frames[slot] += 1
+            noise = np.nanmedian(distance[slot]) / _DISTANCE_OF_NOISE
+            window.noise[slot] += (noise - window.noise[slot]) / min(self._frames[slot], _NOISE_MEMORY)
 
     def _believe(self, joints: NDArray[np.bool_]) -> None:
         if joints.any():
@@ -128,7 +149,9 @@ class Gate:
         own = np.linalg.norm(window.offsets, axis=-1)
         length = np.linalg.norm(positions - positions[:, _PARENT], axis=-1)
         with np.errstate(invalid="ignore"):
-            bad = np.abs(length - own) > np.maximum(self._settings.bone * own, 0.10)
+            bad = np.abs(length - own) > np.maximum(
+                self._settings.bone * own, _LEAST_BONE + _BONE_NOISES * window.noise[:, None]
+            )
         bad[:, 0] = False
         # A bad bone does not say which end is wrong: where the next bone is bad too, it is the joint between.
         bad[:, _LEAF] &= ~bad[:, _PARENT][:, _LEAF]

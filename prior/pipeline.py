@@ -1,4 +1,4 @@
-"""The prior, stage by stage: adapt, gate, correct, bones, solve, refine, fuse.
+"""The prior, stage by stage: adapt, gate, correct, smooth, bones, solve, refine, fuse.
 
 One object serves a stream: `PriorPipeline.process` takes ``pose/raw`` messages and gives the ``pose/clean`` messages
 they complete. All bodies go through each stage together, one slot a body. Nothing here reads a clock or draws a
@@ -26,6 +26,7 @@ from prior.refine import Refine, RefineSettings
 from prior.resample import Resampler
 from prior.settings import build_settings
 from prior.skeletons import SKELETONS, Skeleton, finite_joints, to_canonical
+from prior.smooth import Smooth, SmoothSettings
 from prior.solve import Solve
 from prior.window import Estimate, Stage, Window
 
@@ -44,19 +45,24 @@ class PriorSettings:
     """Settings of the prior: ``[prior]`` of a launch file.
 
     Attributes:
-        delay: frames at 30 Hz to wait for before answering, 0 to half the model's window (4, the default, is the
-            paper's centre-frame refinement).
+        delay: frames at 30 Hz to wait for before answering, 0 to twice the model's window (4, the default, half of
+            it, is the paper's centre-frame refinement).
         max_bodies: bodies followed at once.
         timeout: seconds without a sighting after which a body is dropped, and without a frame after which the
             stream starts anew.
-        gate, correct, bones, refine, fuse: settings of the stages.
+        bias_sigma: metres along an axis, the sensor's slow error, which no filter averages out: the less of it, the
+            more bones are measured rather than taken from human proportions, and the surer joints are said to be.
+            Depth cameras have 2 cm or more, marker-based motion capture next to none.
+        gate, correct, smooth, bones, refine, fuse: settings of the stages.
     """
 
     delay: int = 4
     max_bodies: int = 8
     timeout: float = 0.5
+    bias_sigma: float = 0.02
     gate: GateSettings = field(default_factory=GateSettings)
     correct: CorrectSettings = field(default_factory=CorrectSettings)
+    smooth: SmoothSettings = field(default_factory=SmoothSettings)
     bones: BonesSettings = field(default_factory=BonesSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     fuse: FuseSettings = field(default_factory=FuseSettings)
@@ -86,12 +92,14 @@ class PriorPipeline:
         slots = settings.max_bodies
         refine = Refine(settings.refine, settings.delay)
         self._resampler = Resampler(slots)
-        self._window = Window(refine.window, slots)
-        self._fuse = Fuse(settings.fuse, settings.delay, slots)
+        self._window = Window(max(refine.window, settings.delay + 1), slots)
+        self._smooth = Smooth(settings.smooth, settings.delay, slots)
+        self._fuse = Fuse(settings.fuse, settings.bias_sigma, settings.delay, slots)
         self._stages: tuple[Stage, ...] = (
             Gate(settings.gate, slots, self.counters),
             *([Correct(settings.correct, slots)] if settings.correct.sensor else []),
-            Bones(settings.bones, slots),
+            self._smooth,
+            Bones(settings.bones, settings.bias_sigma, slots),
             Solve(),
             refine,
             self._fuse,
@@ -141,9 +149,9 @@ class PriorPipeline:
         last = self._last
         cleaned = []
         if last is not None:
-            estimates = self._fuse.flush(self._window)
-            for back, estimate in zip(reversed(range(len(estimates))), estimates, strict=True):
-                cleaned.append(self._message(estimate, back, last))
+            held = self._smooth.flush(self._window)
+            for back, smoothed in zip(reversed(range(len(held))), held, strict=True):
+                cleaned.append(self._message(self._fuse.estimate(self._window, smoothed, back), back, last))
         self._drop(np.ones(self.settings.max_bodies, dtype=bool))
         self._resampler.reset()
         self._last = None

@@ -33,8 +33,9 @@ class Refine:
 
     A window N_1 … N_T goes through the posterior's mean and the decoder, and its frame ``T - 1 - delay`` (counted
     from 0) is kept by the fusion that follows. With the default delay T / 2 that is index T / 2 - 1, the paper's
-    M_{T/2} of equation 12. Smaller delays keep later frames of the same windows, down to 0, the newest. At the start
-    of a stream, windows are filled up with the first frame.
+    M_{T/2} of equation 12. Smaller delays keep later frames of the same windows, down to 0, the newest; with larger
+    ones, which other stages may ask for, a frame keeps what it was as the centre. At the start of a stream, windows
+    are filled up with the first frame.
     """
 
     def __init__(self, settings: RefineSettings, delay_frames: int) -> None:
@@ -44,9 +45,9 @@ class Refine:
         model.load_state_dict(state)
         self._reconstruct = LiveHMVAE(model)
         self.window = model.config.window
-        if not 0 <= delay_frames <= self.window // 2:
+        if not 0 <= delay_frames <= 2 * self.window:
             raise ValueError(
-                f"delay: expected 0 to {self.window // 2} frames (half of the model's window), got {delay_frames}"
+                f"delay: expected 0 to {2 * self.window} frames (twice the model's window), got {delay_frames}"
             )
         self.delay_frames = delay_frames
 
@@ -57,16 +58,18 @@ class Refine:
     def update(self, window: Window) -> Window:
         """Write ``window.decoded`` for every body present, all of them in one batch."""
         slots = np.flatnonzero(window.present)
-        frames = window.rotations.all[:, slots]
+        frames = window.rotations.all[-self.window :, slots]
+        kept = self.window // 2 + 1  # from the centre on; before it, a frame stays as it was decoded
+        window.decoded[:-1] = window.decoded[1:]
         missing = np.isnan(frames[..., 0, 0, 0]).sum(axis=0)  # a body younger than the window repeats its first frame
         order = np.maximum(np.arange(self.window)[:, None], missing)
         frames = frames[order, np.arange(len(slots))]
         if not self._enabled or not len(slots):
-            window.decoded[:, slots] = frames
+            window.decoded[-kept:, slots] = frames[-kept:]
             return window
         rotations = torch.from_numpy(frames).float().transpose(0, 1)
         turned, back = remove_heading(rotations, self.window // 2 - 1)
         decoded = from_6d(self._reconstruct(to_6d(turned)))
         decoded[:, :, 0] = back[:, None] @ decoded[:, :, 0]
-        window.decoded[:, slots] = decoded.transpose(0, 1).double().numpy()
+        window.decoded[-kept:, slots] = decoded[:, -kept:].transpose(0, 1).double().numpy()
         return window

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from prior.filters import Smoothed
 from prior.skeletons import REST_OFFSETS
 
 FPS = 30.0
@@ -78,6 +79,9 @@ class Window:
         confidence: ring of (S, 22) in 0..1.
         positions: ring of (S, 22, 3) metres after gate and correction; NaN where unobserved or refused.
         sensor_position: (3,) metres, where the sensor stands.
+        noise: (S,) metres along an axis, how much each body's joints jump about from frame to frame.
+        smoothed: the fixed-lag smoother's estimate of the frame ``delay`` before the newest, or None while there is
+            none.
         rotations: ring of (S, 22, 3, 3) local, solved from the positions.
         present: (S,) which slots hold a body.
         offsets: (S, 22, 3) metres, each person's bones.
@@ -94,6 +98,8 @@ class Window:
         self.positions = Ring(frames, (slots, 22, 3))
         self.rotations = Ring(frames, (slots, 22, 3, 3))
         self.sensor_position = np.zeros(3)
+        self.noise = np.zeros(slots)
+        self.smoothed: Smoothed | None = None
         self.present = np.zeros(slots, dtype=bool)
         self.offsets = np.tile(REST_OFFSETS, (slots, 1, 1))
         self.measured = np.zeros(slots, dtype=bool)
@@ -106,6 +112,7 @@ class Window:
             ring.clear(slot)
         self.present &= ~slot
         self.measured &= ~slot
+        self.noise[slot] = 0.0
         self.offsets[slot] = REST_OFFSETS
         self.decoded[:, slot] = np.eye(3)
 

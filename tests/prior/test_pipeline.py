@@ -27,7 +27,7 @@ def noisy(frames: int, sigma: float = 0.02) -> np.ndarray:
     return waving(frames) + np.random.default_rng(0).normal(size=(frames, 22, 3)) * sigma
 
 
-@pytest.mark.parametrize("delay", [0, 1, 4])
+@pytest.mark.parametrize("delay", [0, 1, 4, 12])
 @pytest.mark.parametrize("frames", [1, 3, 8, 30])
 def test_every_frame_is_answered_once_in_order_however_short_the_stream(delay: int, frames: int) -> None:
     messages = stream(waving(frames))
@@ -37,7 +37,7 @@ def test_every_frame_is_answered_once_in_order_however_short_the_stream(delay: i
     assert all(c.delay_frames == delay for c in cleaned)
 
 
-@pytest.mark.parametrize("delay", [0, 2, 4])
+@pytest.mark.parametrize("delay", [0, 2, 4, 8])
 def test_an_answer_leaves_exactly_its_delay_after_its_frame(delay: int) -> None:
     pipeline = PriorPipeline(PriorSettings(delay=delay))
     for k, message in enumerate(stream(waving(20))):
@@ -46,9 +46,17 @@ def test_an_answer_leaves_exactly_its_delay_after_its_frame(delay: int) -> None:
         )
 
 
-def test_a_delay_beyond_half_the_window_is_refused() -> None:
-    with pytest.raises(ValueError, match="0 to 4 frames"):
-        PriorPipeline(PriorSettings(delay=5))
+def test_a_delay_beyond_twice_the_window_is_refused() -> None:
+    with pytest.raises(ValueError, match="0 to 16 frames"):
+        PriorPipeline(PriorSettings(delay=17))
+
+
+def test_with_a_longer_delay_a_frame_keeps_what_it_was_decoded_to_as_the_centre() -> None:
+    settings = {"fuse": {"enabled": False}, "bones": {"enabled": False}}
+    messages = stream(waving(30))
+    centre, late = (clean(messages, delay=delay, **settings)[0] for delay in (4, 10))
+    for a, b in list(zip(centre, late, strict=True))[:20]:
+        assert np.allclose(a.bodies[0].rotations, b.bodies[0].rotations, atol=1e-6)
 
 
 def test_the_same_stream_gives_the_same_bytes() -> None:
