@@ -51,7 +51,7 @@ class Cleaned:
 
 @lru_cache(maxsize=64)
 def available(settings: PriorSettings, delay: int) -> bool:
-    """Whether this variant can be run at this delay (HM-VAE's window of 8 frames allows up to 4)."""
+    """Whether this variant can be run at this delay (up to twice HM-VAE's window)."""
     try:
         PriorPipeline(replace(settings, delay=delay))
     except ValueError:
