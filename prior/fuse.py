@@ -74,17 +74,18 @@ class Fuse:
         known = seen_weight > 0
         observed = np.where(known[..., None], smoothed.positions[slots], 0.0)
         share = (seen_weight / (seen_weight + prior_weight))[..., None]
+        body = place_joints(decoded, offsets)
+        # The pelvis goes where it brings the body nearest to all joints seen, not only to itself.
+        body += _weighted_mean(observed - body, share)
+        rotations = decoded
         if s.enabled:
             # What is not seen hangs from what is, in the prior's rotations.
-            body = solve_pose(np.where(share > 0.5, observed, np.nan), offsets, decoded)[1]
+            well = share > 0.5
+            hung = solve_pose(np.where(well, observed, np.nan), offsets, decoded)[1]
+            body = np.where(well[:, :1], hung, body)
             variance = 1 / (seen_weight + prior_weight)
             mobility = np.minimum(variance, _MOST_MOBILE * variance.min(axis=1, keepdims=True))
             rotations, body = fit_pose(body + share * (observed - body), offsets, mobility, decoded)
-        else:
-            rotations, body = decoded, place_joints(decoded, offsets)
-            # The pelvis goes where it brings the decoded body nearest to all joints seen, not only to itself.
-            total = np.maximum(share.sum(axis=1, keepdims=True), 1e-12)
-            body += (share * (observed - body)).sum(axis=1, keepdims=True) / total
         placed = known.any(axis=1)
         state = _states(unseen_s, held_s, s.fade)
         sigma = 1 / np.sqrt(seen_weight + prior_weight)
@@ -95,6 +96,11 @@ class Fuse:
             sigma=_scatter(window.slots, slots[placed], sigma[placed], np.inf),
             state=_scatter(window.slots, slots[placed], state[placed], JointState.UNKNOWN).astype(np.uint8),
         )
+
+
+def _weighted_mean(vectors: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(S, 1, 3) mean over the joints of (S, 22, 3) by weights (S, 22, 1)."""
+    return (weight * vectors).sum(axis=1, keepdims=True) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
 
 
 def _scatter(slots: int, rows: NDArray[np.intp], values: NDArray[Any], fill: float) -> NDArray[Any]:

@@ -44,7 +44,7 @@ def train_correction(
     """
     torch.manual_seed(seed)
     # All six people: with one held back to watch, the other five teach measurably less (docs/experiments.md). The
-    # length of the training was chosen that way once; `steadypose evaluate kinect_vicon` measures it on people never seen.
+    # length of the training was chosen that way once; `steadypose evaluate kinect_vicon` has people never seen.
     x, y = _examples(data, TRAIN_SUBJECTS)
     config = CorrectionConfig(sensor=weights)
     net = CorrectionNet(config)

@@ -250,3 +250,12 @@ def test_settings_are_read_strictly() -> None:
         PriorSettings.from_dict({"delay": "four"})
     with pytest.raises(ValueError, match="expected float"):
         PriorSettings.from_dict({"timeout": True})
+
+
+def test_a_body_wholly_hidden_for_a_moment_stays_about_where_it_was() -> None:
+    truth = waving(60) + [3.0, -2.0, 0.0]
+    seen = truth.copy()
+    seen[30:42] = np.nan
+    cleaned, _ = clean(stream(seen))
+    error = np.linalg.norm(positions(cleaned) - truth[: len(cleaned)], axis=-1)
+    assert error[30:42].max() < 0.4
