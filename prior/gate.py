@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.filters import FixedLagRTS
+from prior.filters import FixedLagRTS, Smoothed
 from prior.skeletons import MIRROR, PARENTS, J
 from prior.window import FPS, Window
 
@@ -80,40 +80,53 @@ class Gate:
         positions[window.confidence.newest < s.min_confidence] = np.nan
         expected = self._filter.predict(stamp)
         if expected is not None:
-            self._measure_noise(window, positions, expected.positions)
-        if expected is not None and s.enabled:
-            known = np.isfinite(expected.positions[..., 0])
-            self._exchange(positions, expected.positions, known)
-            seen = np.isfinite(positions[..., 0])
             distance = np.sqrt(((positions - expected.positions) ** 2).sum(axis=-1))
-            least = np.maximum(s.jump, _JUMP_NOISES * window.noise)[:, None]
-            jumped = seen & known & (distance > least + 3 * expected.sigma)
-            everywhere = jumped.sum(axis=1) > _BODY_JUMP * np.maximum((seen & known).sum(axis=1), 1)
-            self._believe(everywhere[:, None] & jumped)
-            jumped &= ~everywhere[:, None]
-            refused = jumped | (self._bad_bones(window, positions) & ~everywhere[:, None])
-            self._refused = np.where(refused, self._refused + 1, 0)
-            overruled = self._refused > s.patience * FPS
-            self._believe(overruled)
-            refused &= ~overruled
-            self._refused[overruled] = 0
-            if refused.any():
-                self._counters["joints_refused"] += int(refused.sum())
-                positions[refused] = np.nan
+            self._measure_noise(window, distance)
+            if s.enabled:
+                self._judge(window, positions, expected, distance)
         self._filter.update(positions, stamp)
         window.positions.push(positions)
         return window
 
-    def _measure_noise(self, window: Window, positions: NDArray[np.float64], expected: NDArray[np.float64]) -> None:
-        """Keep ``window.noise``, from how far the middle one of a body's joints comes from where it was expected.
+    def _judge(
+        self,
+        window: Window,
+        positions: NDArray[np.float64],
+        expected: Smoothed,
+        distance: NDArray[np.float64],
+    ) -> None:
+        """Put exchanged limbs back, and make NaN what is refused, in place."""
+        s = self._settings
+        known = np.isfinite(expected.positions[..., 0])
+        if (distance > _SWAP_APART).any() or self._swapped.any():
+            self._exchange(positions, expected.positions, known)
+            distance = np.sqrt(((positions - expected.positions) ** 2).sum(axis=-1))
+        seen = np.isfinite(positions[..., 0])
+        least = np.maximum(s.jump, _JUMP_NOISES * window.noise)[:, None]
+        jumped = seen & known & (distance > least + 3 * expected.sigma)
+        everywhere = jumped.sum(axis=1) > _BODY_JUMP * np.maximum((seen & known).sum(axis=1), 1)
+        self._believe(everywhere[:, None] & jumped)
+        jumped &= ~everywhere[:, None]
+        refused = jumped | (self._bad_bones(window, positions) & ~everywhere[:, None])
+        self._refused = np.where(refused, self._refused + 1, 0)
+        overruled = self._refused > s.patience * FPS
+        self._believe(overruled)
+        refused &= ~overruled
+        self._refused[overruled] = 0
+        if refused.any():
+            self._counters["joints_refused"] += int(refused.sum())
+            positions[refused] = np.nan
+
+    def _measure_noise(self, window: Window, distance: NDArray[np.float64]) -> None:
+        """Keep ``window.noise``, from how far (S, 22) the middle one of a body's joints comes from where expected.
 
         The middle one, so that a limb thrown about, or a joint that jumps, says nothing about the sensor. Noise that
         lasts over frames is not seen here; it belongs to the sensor's bias.
         """
-        distance = np.sqrt(((positions - expected) ** 2).sum(axis=-1))
-        for slot in np.flatnonzero(np.isfinite(distance).any(axis=1)):
+        known = np.isfinite(distance)
+        for slot in np.flatnonzero(known.any(axis=1)):
             self._frames[slot] += 1
-            noise = np.nanmedian(distance[slot]) / _DISTANCE_OF_NOISE
+            noise = np.median(distance[slot, known[slot]]) / _DISTANCE_OF_NOISE
             window.noise[slot] += (noise - window.noise[slot]) / min(self._frames[slot], _NOISE_MEMORY)
 
     def _believe(self, joints: NDArray[np.bool_]) -> None:

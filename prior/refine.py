@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from prior.checkpoint import load_weights
-from prior.hmvae import HMVAE, HMVAEConfig, from_6d, to_6d
+from prior.hmvae import HMVAE, HMVAEConfig, from_6d
 from prior.hmvae_live import LiveHMVAE
-from prior.motion_windows import remove_heading
+from prior.kinematics import heading, yaw_matrix
 from prior.window import Window
 
 
@@ -67,9 +67,14 @@ class Refine:
         if not self._enabled or not len(slots):
             window.decoded[-kept:, slots] = frames[-kept:]
             return window
-        rotations = torch.from_numpy(frames).float().transpose(0, 1)
-        turned, back = remove_heading(rotations, self.window // 2 - 1)
-        decoded = from_6d(self._reconstruct(to_6d(turned)))
+        # The body faces +x in the centre frame, as in training; only the root's rotation knows.
+        back = yaw_matrix(heading(frames[self.window // 2 - 1, :, 0]))
+        root = back.swapaxes(-1, -2) @ frames[:, :, 0]
+        x = np.empty((len(slots), self.window, 22, 6), dtype=np.float32)
+        for k in range(2):  # the first two columns of each rotation, as `to_6d`
+            x[..., 3 * k : 3 * k + 3] = frames[..., k].swapaxes(0, 1)
+            x[:, :, 0, 3 * k : 3 * k + 3] = root[..., k].swapaxes(0, 1)
+        decoded = from_6d(self._reconstruct(torch.from_numpy(x))[:, -kept:]).numpy().astype(np.float64)
         decoded[:, :, 0] = back[:, None] @ decoded[:, :, 0]
-        window.decoded[-kept:, slots] = decoded[:, -kept:].transpose(0, 1).double().numpy()
+        window.decoded[-kept:, slots] = decoded.swapaxes(0, 1)
         return window
