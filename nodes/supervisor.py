@@ -46,6 +46,7 @@ class Child:
         if self.state == "crashed" and self._clock.now_ns() >= self._due_ns:
             self.restarts += 1
             self._start()
+            return
         if self.state != "running" or (status := self._process.poll()) is None:
             return
         if self._clock.now_ns() - self._started_ns > STEADY_S * 1e9:

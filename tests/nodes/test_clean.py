@@ -90,7 +90,7 @@ def test_a_recording_and_its_npz_give_the_same_numbers(tmp_path: Path, options: 
 def test_settings_reach_the_stages(tmp_path: Path, options: tuple[str, ...]) -> None:
     source = write_npz(tmp_path / "in.npz")
     clean(source, tmp_path / "a.npz", settings=options)
-    clean(source, tmp_path / "b.npz", settings=(*options, "refine.enabled=false"))
+    clean(source, tmp_path / "b.npz", settings=(*options, "bones.enabled=false"))
     clean(source, tmp_path / "c.npz", delay=0, settings=options)
     a, b, c = (load(tmp_path / f"{name}.npz")["positions"] for name in "abc")
     assert np.abs(a - b).max() > 1e-3
@@ -103,7 +103,7 @@ def test_settings_reach_the_stages(tmp_path: Path, options: tuple[str, ...]) -> 
         ({"settings": ("refine.enabeld=false",)}, "did you mean 'enabled'"),
         ({"settings": ("trajectory.contact=false",)}, "contacts"),
         ({"settings": ("delay",)}, "expected section.key=value"),
-        ({"delay": 99}, "expected 0 to 4 frames"),
+        ({"delay": 99}, "expected 0 to 16 frames"),
         ({"weights": "nothing"}, "no weights 'nothing'"),
         ({"out": Path("in.npz")}, "another path"),
         ({"out": Path("nowhere/out.npz")}, "to exist"),
