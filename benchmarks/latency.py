@@ -1,4 +1,4 @@
-"""What it costs: compute a frame, from capture to ``pose/world``, frames dropped, and memory over an hour of stream.
+"""What it costs in time: compute a frame, from capture to ``pose/world``, and frames dropped.
 
 The input is a recorded stream, set to exactly 30 Hz and played to and fro so that nobody jumps; a crowd is copies of
 its body, side by side. Compute is measured in this process, pinned to one core, one thread. The rest is measured on
@@ -8,7 +8,6 @@ the node processes themselves, from outside: a subscriber here notes when each m
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import sys
 import tempfile
@@ -30,13 +29,11 @@ from rich.progress import Progress
 
 from benchmarks.machine import ROOT
 from benchmarks.results import RESULTS, Table, save, show
+from benchmarks.running import START_S, running
 from msgs.recording import RecordingReader, RecordingWriter
-from msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
-from msgs.transport import Subscriber
-from msgs.types import Diagnostics, Message, PoseRaw, RawBody
-from nodes.launch import POSE_NODES, Launch
-from nodes.runtime import FRAME_NS, SystemClock, Timeline
-from nodes.supervisor import Supervisor
+from msgs.topics import POSE_RAW, POSE_WORLD
+from msgs.types import Diagnostics, PoseRaw, RawBody
+from nodes.runtime import FRAME_NS, Timeline
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings
 
@@ -46,24 +43,18 @@ SPACING = 0.8
 """metres between the copies of a body"""
 WARM_UP = 60
 """frames before times count: the first ones load code, and fill the window"""
-START_S = 60.0
-"""what the nodes get to come up"""
-SILENCE_S = 30.0
-"""no message for so long is a node that hangs"""
 
 
 @dataclass(frozen=True)
 class Args:
-    """Compute, latency, drops and memory of the nodes, on this machine."""
+    """Compute, latency and drops of the nodes, on this machine."""
 
     recording: Path = ROOT / "sim_data" / "walk_turn"
     """whose first body is played"""
     seconds: float = 60.0
     """of stream for each measurement of compute and latency"""
-    stream_hours: float = 1.0
-    """of stream for the measurement of memory"""
     quick: bool = False
-    """10 s and 0.05 h, to see that it works; nothing is written unless --out says where"""
+    """10 s, to see that it works; nothing is written unless --out says where"""
     out: Path | None = None
     """folder for the JSON file; benchmarks/results unless --quick"""
 
@@ -148,67 +139,6 @@ def live(recording: Path, warm_up_s: float, seconds: float, progress: Progress, 
     }
 
 
-def memory(recording: Path, hours: float, progress: Progress) -> dict[str, Any]:
-    """Resident memory of each node while a stream is replayed, again and again, as fast as the nodes take it."""
-    samples: dict[str, list[tuple[float, float]]] = {name: [] for name in POSE_NODES}
-    first_ns: int | None = None
-    bar = progress.add_task(f"memory over {hours:g} h of stream", total=hours)
-    with running(recording, lossless=True, rate=0, loop=True) as (messages, _):
-        for _, message in messages:
-            if not isinstance(message, Diagnostics) or message.stamp_ns == 0:
-                continue
-            first_ns = message.stamp_ns if first_ns is None else first_ns
-            age = (message.stamp_ns - first_ns) / 3.6e12
-            samples[message.node].append((age, float(message.values["memory_mb"])))
-            progress.update(bar, completed=age)
-            if all(s and s[-1][0] >= hours for s in samples.values()):
-                break
-    return {"hours": hours, "nodes": {name: growth(s, hours) for name, s in samples.items()}}
-
-
-def growth(samples: list[tuple[float, float]], hours: float) -> dict[str, float]:
-    """What (age in hours, megabytes) samples say: first, last, most, and MB an hour after the first fifth."""
-    ages, sizes = np.array(samples).T
-    settled = ages >= 0.2 * hours
-    slope = np.polyfit(ages[settled], sizes[settled], 1)[0]
-    figures = {"first_mb": sizes[0], "last_mb": sizes[-1], "most_mb": sizes.max(), "slope_mb_per_hour": slope}
-    return {name: round(float(value), 2) for name, value in figures.items()} | {"samples": len(samples)}
-
-
-@contextmanager
-def running(
-    recording: Path, *, lossless: bool, rate: float = 1.0, loop: bool = False
-) -> Iterator[tuple[Iterator[tuple[str, Message]], SystemClock]]:
-    """The node processes at work on a recording; gives what they publish, ``pose/world`` and ``diagnostics``."""
-    console = Console(stderr=True)
-    clock = SystemClock()
-    with tempfile.TemporaryDirectory(prefix="steadypose-") as folder:
-        settings = [
-            f"nodes={json.dumps(POSE_NODES)}",
-            f"input.recording={json.dumps(str(recording))}",
-            f"input.rate={rate}",
-            f"input.loop={json.dumps(loop)}",
-            f"transport.directory={json.dumps(folder)}",
-            f"transport.lossless={json.dumps(lossless)}",
-        ]
-        arguments = ["--launch", "replay", *(word for setting in settings for word in ("--set", setting))]
-        transport = Launch.read("replay", settings).transport
-        endpoints = [transport.endpoint(name) for name in POSE_NODES]
-        with (
-            Subscriber(endpoints, [POSE_WORLD, DIAGNOSTICS]) as subscriber,
-            Supervisor(POSE_NODES, arguments, clock, lambda line: console.print(line, markup=False)) as supervisor,
-        ):
-            yield _received(subscriber, supervisor), clock
-
-
-def _received(subscriber: Subscriber, supervisor: Supervisor) -> Iterator[tuple[str, Message]]:
-    waited_s = START_S
-    while not supervisor.failed and (received := subscriber.receive(waited_s)):
-        waited_s = SILENCE_S
-        supervisor.poll()
-        yield received
-
-
 @contextmanager
 def _one_core() -> Iterator[None]:
     if not hasattr(os, "sched_setaffinity"):
@@ -237,7 +167,7 @@ def main(args: Args) -> None:
     """Measure, print, write."""
     console = Console()
     torch.set_num_threads(1)
-    seconds, hours = (10.0, 0.05) if args.quick else (args.seconds, args.stream_hours)
+    seconds = 10.0 if args.quick else args.seconds
     warm_up_s = 5.0
     with RecordingReader(args.recording) as reader:
         frames = [message for _, _, message in reader.messages([POSE_RAW]) if isinstance(message, PoseRaw)]
@@ -251,12 +181,11 @@ def main(args: Args) -> None:
                 for raw in islice(crowd(frames, bodies), round((seconds + warm_up_s + START_S) * 30)):
                     writer.write(POSE_RAW, raw, raw.stamp_ns)
             lived.append({"bodies": bodies} | live(path, warm_up_s, seconds, progress, f"live, {bodies} bodies"))
-        remembered = memory(args.recording, hours, progress)
-    tables = [_compute_table(computed), _live_table(lived), _memory_table(remembered)]
+    tables = [_compute_table(computed), _live_table(lived)]
     for table in tables:
         show(table, console)
     if args.out or not args.quick:
-        data = {"compute": computed, "live": lived, "memory": remembered}
+        data = {"compute": computed, "live": lived}
         console.print(f"wrote {save('latency', sys.argv[1:], tables, data, args.out or RESULTS)}")
 
 
@@ -289,19 +218,6 @@ def _live_table(results: list[dict[str, Any]]) -> Table:
             for r in results
         ],
         note="Three node processes and this subscriber, live transport: a node that is late drops its oldest frames.",
-    )
-
-
-def _memory_table(result: dict[str, Any]) -> Table:
-    return Table(
-        name="memory",
-        title=f"Resident memory over {result['hours']:g} h of stream replayed fast, MB",
-        columns=["node", "first", "last", "most", "MB an hour"],
-        rows=[
-            [name, *(f"{n[k]:.0f}" for k in ("first_mb", "last_mb", "most_mb")), f"{n['slope_mb_per_hour']:+.1f}"]
-            for name, n in result["nodes"].items()
-        ],
-        note="MB an hour: the slope of a line through all but the first fifth.",
     )
 
 

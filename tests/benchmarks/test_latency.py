@@ -4,7 +4,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from benchmarks.latency import SPACING, crowd, growth, percentiles
+from benchmarks.latency import SPACING, crowd, percentiles
+from benchmarks.memory import growth
 from msgs.types import Pose, PoseRaw, RawBody
 
 

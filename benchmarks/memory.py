@@ -1,0 +1,88 @@
+"""What it costs in memory: every node while an hour of stream is replayed as fast as the nodes take it."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+
+from benchmarks.machine import ROOT
+from benchmarks.results import RESULTS, Table, save, show
+from benchmarks.running import running
+from msgs.types import Diagnostics
+from nodes.launch import POSE_NODES
+
+
+@dataclass(frozen=True)
+class Args:
+    """Memory of the nodes over an hour of stream, on this machine."""
+
+    recording: Path = ROOT / "sim_data" / "walk_turn"
+    """what is played, again and again"""
+    hours: float = 1.0
+    """of stream"""
+    quick: bool = False
+    """0.05 h, to see that it works; nothing is written unless --out says where"""
+    out: Path | None = None
+    """folder for the JSON file; benchmarks/results unless --quick"""
+
+
+def memory(recording: Path, hours: float, progress: Progress) -> dict[str, Any]:
+    """Resident memory of each node while a stream is replayed, again and again, as fast as the nodes take it."""
+    samples: dict[str, list[tuple[float, float]]] = {name: [] for name in POSE_NODES}
+    first_ns: int | None = None
+    bar = progress.add_task(f"memory over {hours:g} h of stream", total=hours)
+    with running(recording, lossless=True, rate=0, loop=True) as (messages, _):
+        for _, message in messages:
+            if not isinstance(message, Diagnostics) or message.stamp_ns == 0:
+                continue
+            first_ns = message.stamp_ns if first_ns is None else first_ns
+            age = (message.stamp_ns - first_ns) / 3.6e12
+            samples[message.node].append((age, float(message.values["memory_mb"])))
+            progress.update(bar, completed=age)
+            if all(s and s[-1][0] >= hours for s in samples.values()):
+                break
+    return {"hours": hours, "nodes": {name: growth(s, hours) for name, s in samples.items()}}
+
+
+def growth(samples: list[tuple[float, float]], hours: float) -> dict[str, float]:
+    """What (age in hours, megabytes) samples say: first, last, most, and MB an hour after the first fifth."""
+    ages, sizes = np.array(samples).T
+    settled = ages >= 0.2 * hours
+    slope = np.polyfit(ages[settled], sizes[settled], 1)[0]
+    figures = {"first_mb": sizes[0], "last_mb": sizes[-1], "most_mb": sizes.max(), "slope_mb_per_hour": slope}
+    return {name: round(float(value), 2) for name, value in figures.items()} | {"samples": len(samples)}
+
+
+def main(args: Args) -> None:
+    """Measure, print, write."""
+    console = Console()
+    with Progress(console=console) as progress:
+        result = memory(args.recording, 0.05 if args.quick else args.hours, progress)
+    table = _table(result)
+    show(table, console)
+    if args.out or not args.quick:
+        console.print(f"wrote {save('memory', sys.argv[1:], [table], {'memory': result}, args.out or RESULTS)}")
+
+
+def _table(result: dict[str, Any]) -> Table:
+    return Table(
+        name="memory",
+        title=f"Resident memory over {result['hours']:g} h of stream replayed fast, MB",
+        columns=["node", "first", "last", "most", "MB an hour"],
+        rows=[
+            [name, *(f"{n[k]:.0f}" for k in ("first_mb", "last_mb", "most_mb")), f"{n['slope_mb_per_hour']:+.1f}"]
+            for name, n in result["nodes"].items()
+        ],
+        note="MB an hour: the slope of a line through all but the first fifth.",
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

@@ -1,0 +1,57 @@
+"""The node processes at work, watched from outside."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+
+from msgs.topics import DIAGNOSTICS, POSE_WORLD
+from msgs.transport import Subscriber
+from msgs.types import Message
+from nodes.launch import POSE_NODES, Launch
+from nodes.runtime import SystemClock
+from nodes.supervisor import Supervisor
+
+START_S = 60.0
+"""what the nodes get to come up"""
+SILENCE_S = 30.0
+"""no message for so long is a node that hangs"""
+
+
+@contextmanager
+def running(
+    recording: Path, *, lossless: bool, rate: float = 1.0, loop: bool = False
+) -> Iterator[tuple[Iterator[tuple[str, Message]], SystemClock]]:
+    """The node processes at work on a recording; gives what they publish, ``pose/world`` and ``diagnostics``."""
+    console = Console(stderr=True)
+    clock = SystemClock()
+    with tempfile.TemporaryDirectory(prefix="steadypose-") as folder:
+        settings = [
+            f"nodes={json.dumps(POSE_NODES)}",
+            f"input.recording={json.dumps(str(recording))}",
+            f"input.rate={rate}",
+            f"input.loop={json.dumps(loop)}",
+            f"transport.directory={json.dumps(folder)}",
+            f"transport.lossless={json.dumps(lossless)}",
+        ]
+        arguments = ["--launch", "replay", *(word for setting in settings for word in ("--set", setting))]
+        transport = Launch.read("replay", settings).transport
+        endpoints = [transport.endpoint(name) for name in POSE_NODES]
+        with (
+            Subscriber(endpoints, [POSE_WORLD, DIAGNOSTICS]) as subscriber,
+            Supervisor(POSE_NODES, arguments, clock, lambda line: console.print(line, markup=False)) as supervisor,
+        ):
+            yield _received(subscriber, supervisor), clock
+
+
+def _received(subscriber: Subscriber, supervisor: Supervisor) -> Iterator[tuple[str, Message]]:
+    waited_s = START_S
+    while not supervisor.failed and (received := subscriber.receive(waited_s)):
+        waited_s = SILENCE_S
+        supervisor.poll()
+        yield received
