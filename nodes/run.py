@@ -71,7 +71,8 @@ def run(
     arguments = ["--launch", launch]
     for override in overrides:
         arguments += ["--set", override]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for request in (signal.SIGTERM, signal.SIGINT):  # a shell that starts this in the background ignores the latter
+        signal.signal(request, signal.default_int_handler)
     # a log file has no width, and a table cut to 80 columns says little
     console = Console(width=None if sys.stdout.isatty() else 140)
     return _Run(settled, arguments, console, SystemClock()).watch()
