@@ -35,8 +35,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.interpolate import CubicSpline
 
-from benchmarks.metrics import rigid_alignment
 from benchmarks.results import RESULTS, Table, save, show
+from prior.kinematics import rigid_alignment
 from prior.motion.clip import Y_UP_TO_Z_UP, MotionError
 from prior.motion.datasets import CMU_FPS, REPEATS, amc_motions, bvh_motion, members
 from prior.motion.npz import read_expmap

@@ -17,7 +17,8 @@ from sklearn.linear_model import Ridge
 from torch import Tensor, nn
 
 from benchmarks.kalman import fixed_lag
-from benchmarks.metrics import body_frame, rigid_alignment
+from benchmarks.metrics import body_frame
+from prior.kinematics import rigid_alignment
 from prior.skeletons import KINECT22, J, to_canonical
 from prior.window import FPS
 

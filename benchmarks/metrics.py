@@ -49,26 +49,6 @@ def contact_speed(positions: Floats, contact: NDArray[np.bool_], stamps_s: Float
     return np.where(contact[1:] & contact[:-1], speed, np.nan)
 
 
-def rigid_alignment(source: Floats, target: Floats) -> tuple[Floats, Floats]:
-    """The rotation R (3, 3) and translation t (3,) with the least sum of |R source + t - target|² (Kabsch 1976).
-
-    Args:
-        source: (..., 3) metres; points not finite in either are left out.
-        target: the same shape.
-
-    Raises:
-        ValueError: fewer than three points are finite in both.
-    """
-    both = np.isfinite(source).all(axis=-1) & np.isfinite(target).all(axis=-1)
-    a, b = source[both], target[both]
-    if len(a) < 3:
-        raise ValueError(f"alignment: expected at least 3 points that both have, got {len(a)}")
-    u, _, vt = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u @ mirror @ vt).T
-    return rotation, b.mean(axis=0) - rotation @ a.mean(axis=0)
-
-
 def procrustes(source: Floats, target: Floats) -> Floats:
     """``source`` (..., J, 3), every frame turned, moved and scaled to lie nearest to ``target``: for PA-MPJPE.
 

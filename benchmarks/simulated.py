@@ -23,13 +23,14 @@ from rich.progress import Progress
 from scipy.spatial.transform import Rotation
 
 from benchmarks.machine import ROOT
-from benchmarks.metrics import acceleration_error, contact_speed, length_variation, position_error, rigid_alignment
+from benchmarks.metrics import acceleration_error, contact_speed, length_variation, position_error
 from benchmarks.results import RESULTS, Table, save, show
 from msgs.types import CONTACTS, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from nodes.clean import stream
 from nodes.npz import NpzCollector
 from nodes.pose_input import RecordingSource
 from prior.filters import FixedLagRTS
+from prior.kinematics import rigid_alignment
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.skeletons import PARENTS, SKELETONS, J, to_canonical
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings

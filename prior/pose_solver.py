@@ -120,7 +120,7 @@ def fit_pose(
     `solve_pose` follows the chain: where a bone seems too long or short, all of that goes to its end, and on to what
     hangs from it. Here every bone and every rigid part of the trunk pulls at both its ends until the lengths are
     right, by sweeps of Gauss-Newton over the distances (position-based dynamics, Müller et al. 2007); what comes out
-    is solved, which moves it by less than a millimetre.
+    is solved, which moves it by about a millimetre.
 
     Args:
         positions: (..., 22, 3) metres, all of them finite.

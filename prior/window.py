@@ -91,7 +91,7 @@ class Window:
     """
 
     def __init__(self, frames: int, slots: int) -> None:
-        self.frames, self.slots = frames, slots
+        self.slots = slots
         self.stamp_s = Ring(frames, ())
         self.raw = Ring(frames, (slots, 22, 3))
         self.confidence = Ring(frames, (slots, 22), fill=0.0)

@@ -32,12 +32,12 @@ from benchmarks.metrics import (
     length_variation,
     position_error,
     reliability,
-    rigid_alignment,
     sigma_ratio,
 )
 from benchmarks.peers import FILTERS, OFFLINE, Peer
 from benchmarks.results import Table
 from benchmarks.tuning import Tuned, loss, search
+from prior.kinematics import rigid_alignment
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
 from prior.skeletons import KINECT22, J, to_canonical
 from prior.window import FPS

@@ -15,9 +15,9 @@ from benchmarks.metrics import (
     position_error,
     procrustes,
     reliability,
-    rigid_alignment,
     sigma_ratio,
 )
+from prior.kinematics import rigid_alignment
 
 
 def walk(seed: int, frames: int = 12, joints: int = 5) -> np.ndarray:
