@@ -14,12 +14,14 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from prior.distributed import writes
+
 WEIGHTS = Path(__file__).parent / "weights"
 """Where the weights lie: ``MODEL-SET.safetensors``, each with ``MODEL-SET.md``, its card."""
 
 
 def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, Any]) -> None:
-    """Write weights, in half precision, with their configuration, and the card.
+    """Write weights, in half precision, with their configuration, and the card; on the first process of torchrun.
 
     Args:
         path: ends in ``.safetensors``; the card is written beside it as ``.md``.
@@ -27,6 +29,8 @@ def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: 
         config: what rebuilds the model, as JSON in the file's metadata.
         card: heading to content: data, licence, seed, training command, results.
     """
+    if not writes():
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {name: tensor.detach().half().contiguous() for name, tensor in model.state_dict().items()}
     _write_whole(path, save(tensors, metadata={"config": json.dumps(dict(config), sort_keys=True)}))

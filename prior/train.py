@@ -7,6 +7,8 @@ from typing import Literal
 
 import torch
 
+from prior.distributed import join, neighbours, writes
+
 
 def train(
     model: Literal["hmvae", "trajectory", "correction"],
@@ -17,6 +19,9 @@ def train(
     threads: int = 2,
 ) -> None:
     """Train a model of the prior on prepared motion.
+
+    With torchrun, several processes or machines share each batch; the first of them writes:
+    `torchrun --nproc-per-node 2 -m nodes.cli train hmvae`.
 
     Takes under an hour on two cores, shows its progress, draws its curves as it goes, and resumes where it was if
     it is killed and started again. The weights, with a card that says how they were made, replace those in
@@ -29,9 +34,10 @@ def train(
             is named after its sensor, kinect_v2.
         runs: where checkpoints and curves go.
         seed: for weights and sampling.
-        threads: CPU threads.
+        threads: CPU threads; under torchrun, of all processes of a machine together.
     """
-    torch.set_num_threads(threads)
+    join()
+    torch.set_num_threads(max(threads // neighbours(), 1))
     if model == "hmvae":
         from prior.train_hmvae import train_hmvae as train_model
     elif model == "trajectory":
@@ -39,4 +45,6 @@ def train(
     else:
         from prior.train_correction import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")
-    print(f"weights: {train_model(data, runs, weights=name, seed=seed)}")
+    path = train_model(data, runs, weights=name, seed=seed)
+    if writes():
+        print(f"weights: {path}")

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from prior.checkpoint import WEIGHTS, save_weights
 from prior.correct import DENSITY, recall
 from prior.correction_net import HISTORY, CorrectionConfig, CorrectionNet, features, mirror_features, trunk_frame
+from prior.distributed import share
 from prior.filters import FixedLagRTS
 from prior.kinematics import rigid_alignment
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
@@ -60,11 +61,11 @@ def train_correction(
     )
     losses: list[float] = []
 
-    for step in run.steps(lambda: {"training mm": float(np.mean(losses[-run.every :]))}):
-        generator = np.random.default_rng((seed, step))
-        rows = torch.from_numpy(generator.integers(len(x), size=batch))
+    for _ in run.steps(lambda: {"training mm": float(np.mean(losses[-run.every :]))}):
+        generator = run.random(seed)
+        rows = torch.from_numpy(generator.integers(len(x), size=share(batch)))
         inputs, targets = _hide(x[rows], generator), y[rows]
-        half = batch // 2
+        half = len(rows) // 2
         inputs = torch.cat([mirror_features(inputs[:half]), inputs[half:]])
         targets = torch.cat([mirror_offsets(targets[:half]), targets[half:]])
         loss = _error(net(inputs + INPUT_NOISE * net.scale * torch.randn_like(inputs)), targets)

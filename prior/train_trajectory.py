@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from prior.checkpoint import WEIGHTS, save_weights
+from prior.distributed import share
 from prior.kinematics import CONTACT_JOINTS
 from prior.motion_windows import MotionSet, yaw_rotation
 from prior.skeletons import MIRROR, J
@@ -110,9 +111,9 @@ def train_trajectory(
     def evaluate() -> dict[str, float]:
         return {**losses, **evaluate_trajectory(model, val)}
 
-    for step in run.steps(evaluate):
+    for _ in run.steps(evaluate):
         model.train()
-        windows = _sample(train, starts, chances, batch, np.random.default_rng((seed, step)))
+        windows = _sample(train, starts, chances, share(batch), run.random(seed))
         loss, terms = _loss(model(windows.joints), windows)
         losses.update(terms)
         optimiser.zero_grad()

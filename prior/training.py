@@ -8,12 +8,19 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch.optim import Optimizer
+
+from prior.distributed import average_gradients, from_first, processes, rank, writes
 
 
 class TrainingRun:
     """A training that survives being killed: its state lies in ``directory/checkpoint.pt``.
+
+    Under torchrun, all processes start from the state of the first, which alone writes and evaluates, and the
+    gradients of every optimiser in ``state`` are averaged before it steps.
 
     Args:
         directory: where checkpoints, ``curves.json`` and ``curves.png`` go; a checkpoint there is resumed.
@@ -28,12 +35,24 @@ class TrainingRun:
         self.curves: list[dict[str, float]] = []
         self._checkpoint = directory / "checkpoint.pt"
         directory.mkdir(parents=True, exist_ok=True)
-        if self._checkpoint.exists():
-            saved = torch.load(self._checkpoint, weights_only=True)
+        saved = torch.load(self._checkpoint, weights_only=True) if writes() and self._checkpoint.exists() else None
+        if processes() > 1:
+            saved = from_first(saved or self._states())
+        if saved:
             for name, part in state.items():
                 part.load_state_dict(saved[name])
             self.step, self.curves = saved["step"], saved["curves"]
             torch.set_rng_state(saved["rng"])
+        if rank():
+            # the same noise on every process would be noise that does not average out
+            torch.manual_seed(torch.initial_seed() + rank() + processes() * self.step)
+        for part in state.values():
+            if isinstance(part, Optimizer):
+                average_gradients(part)
+
+    def random(self, seed: int) -> np.random.Generator:
+        """Random numbers for the step at hand, another stream on each process of torchrun."""
+        return np.random.default_rng((seed, self.step, rank()))
 
     def steps(self, evaluate: Callable[[], dict[str, float]]) -> Iterator[int]:
         """Yield the number of each step still to do; evaluate, checkpoint and draw every so often and at the end."""
@@ -41,7 +60,7 @@ class TrainingRun:
             TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
             TimeRemainingColumn(), TextColumn("{task.fields[result]}"),
         )  # fmt: skip
-        with Progress(*columns) as progress:
+        with Progress(*columns, disable=not writes()) as progress:
             task = progress.add_task(
                 self.directory.name, total=self.iterations, completed=self.step, result=self._latest()
             )
@@ -49,8 +68,9 @@ class TrainingRun:
                 yield self.step
                 self.step += 1
                 if self.step % self.every == 0 or self.step == self.iterations:
-                    self.curves.append({"step": self.step, **evaluate()})
-                    self._save()
+                    self.curves.append(from_first({"step": self.step, **(evaluate() if writes() else {})}))
+                    if writes():
+                        self._save()
                 progress.update(task, completed=self.step, result=self._latest())
 
     def _latest(self) -> str:
@@ -58,15 +78,20 @@ class TrainingRun:
 
     def _save(self) -> None:
         part = self._checkpoint.with_suffix(".part")
-        states = {name: part_.state_dict() for name, part_ in self.state.items()}
-        torch.save({**states, "step": self.step, "curves": self.curves, "rng": torch.get_rng_state()}, part)
+        torch.save(self._states(), part)
         os.replace(part, self._checkpoint)
         (self.directory / "curves.json").write_text(json.dumps(self.curves, indent=1))
         draw_curves(self.curves, self.directory / "curves.png")
 
+    def _states(self) -> dict[str, Any]:
+        states = {name: part.state_dict() for name, part in self.state.items()}
+        return {**states, "step": self.step, "curves": self.curves, "rng": torch.get_rng_state()}
+
 
 def draw_curves(curves: list[dict[str, float]], path: Path) -> None:
-    """Draw every quantity of ``curves`` against the step, one panel each."""
+    """Draw every quantity of ``curves`` against the step, one panel each, on the first process of torchrun."""
+    if not writes():
+        return
     from matplotlib.figure import Figure
 
     names = [name for name in curves[-1] if name != "step"]
