@@ -26,7 +26,7 @@ from benchmarks.machine import ROOT
 from benchmarks.metrics import acceleration_error, contact_speed, length_variation, position_error
 from benchmarks.results import RESULTS, Table, save, show
 from msgs.types import CONTACTS, Message, Pose, PoseClean, PoseRaw, PoseWorld
-from nodes.clean import stream
+from nodes.cleaning import stream
 from nodes.npz import NpzCollector
 from nodes.pose_input import RecordingSource
 from prior.filters import FixedLagRTS

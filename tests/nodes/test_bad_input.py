@@ -15,7 +15,8 @@ from conftest import raw, record, running, until, walking
 from msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
 from msgs.transport import Publisher, Subscriber
 from msgs.types import Diagnostics, Pose, PoseClean, PoseRaw, PoseWorld, RawBody
-from nodes.clean import clean, stream
+from nodes.clean import clean
+from nodes.cleaning import stream
 from nodes.launch import Launch
 from nodes.prior import PriorNode, make_prior
 from nodes.trajectory import TrajectoryNode, make_trajectory

@@ -1,0 +1,295 @@
+"""A folder of recordings, cleaned many at once: on the cores at hand, or on a Ray cluster.
+
+A manifest in the output folder has a line for each recording that was tried, written when it is done. What it says
+is done is not done again, unless the recording or the settings have changed: so a run that was stopped goes on where
+it was, and one with new recordings does these.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import multiprocessing
+import os
+import signal
+import traceback
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnContext
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import Progress
+
+from nodes.cleaning import clean_recording
+from nodes.launch import LaunchError
+
+MANIFEST = "manifest.jsonl"
+FILES = (".npz",)
+"""endings of files of poses that are cleaned into an .npz each"""
+
+Settings = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A recording to clean, and where to."""
+
+    source: Path
+    out: Path
+
+
+def is_folder_of_recordings(path: Path) -> bool:
+    """Whether this is a folder for recordings rather than one recording, which is a folder too."""
+    return path.is_dir() and not _is_recording(path)
+
+
+def _is_recording(folder: Path) -> bool:
+    # the metadata is missing where the recorder was killed
+    return (folder / "metadata.yaml").exists() or (len(list(folder.glob("*.mcap"))) == 1 and not _files(folder))
+
+
+def _files(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.is_file() and path.suffix in FILES]
+
+
+def find_recordings(folder: Path) -> list[Path]:
+    """The recordings and files of poses in a folder at any depth, hidden ones apart, in alphabetical order."""
+    found = [*_files(folder), *folder.glob("*.mcap")]
+    for inner in folder.iterdir():
+        if inner.is_dir() and not inner.is_symlink() and not inner.name.startswith("."):
+            found += [inner] if _is_recording(inner) else find_recordings(inner)
+    return sorted(path for path in found if not path.name.startswith("."))
+
+
+def plan(folder: Path, out: Path) -> list[Job]:
+    """A job for each recording; recordings stay recordings, files of poses become .npz, names and folders stay.
+
+    Raises:
+        LaunchError: there are none, or two of them would come to the same output.
+    """
+    jobs: dict[Path, Job] = {}
+    for source in find_recordings(folder):
+        target = out / source.relative_to(folder)
+        if source.suffix in FILES:
+            target = target.with_suffix(".npz")
+        elif source.is_file():
+            target = target.with_suffix("")
+        if target in jobs:
+            raise LaunchError(f"{jobs[target].source} and {source} would both become {target}: rename one of them")
+        jobs[target] = Job(source, target)
+    if not jobs:
+        raise LaunchError(
+            f"{folder}: expected recordings (rosbag2 directories, .mcap or {', '.join(FILES)}), found none"
+        )
+    return list(jobs.values())
+
+
+def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, ray: bool, console: Console) -> int:
+    """Clean all recordings of a folder that are not cleaned yet.
+
+    Args:
+        folder: of recordings, at any depth.
+        out: the folder to make, or one that an earlier call made.
+        settings: ``[prior]`` and ``[trajectory]`` of a launch file.
+        jobs: how many at once; as many as there are cores if None.
+        ray: on a Ray cluster rather than in processes of this machine.
+        console: for progress and what went wrong.
+
+    Returns:
+        the exit status: 1 if one could not be cleaned.
+
+    Raises:
+        LaunchError: nothing can be done at all.
+    """
+    folder, out = folder.resolve(), out.resolve()
+    if out.is_relative_to(folder) or folder.is_relative_to(out):
+        raise LaunchError(f"{out}: expected a folder apart from {folder}; else results would be cleaned in their turn")
+    if jobs is not None and (ray or jobs < 1):
+        raise LaunchError("--jobs: " + ("Ray decides how many" if ray else f"expected 1 or more, got {jobs}"))
+    found = plan(folder, out)
+    _check(settings)
+    manifest = Manifest(out, folder, settings)
+    waiting = [job for job in found if not manifest.is_done(job)]
+    if known := len(found) - len(waiting):
+        console.print(f"{known} of {len(found)} are done already; see {manifest.path}", highlight=False)
+    cleaning = on_ray(waiting, settings) if ray else on_cores(waiting, settings, jobs or _cores())
+    failed = 0
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        bar = progress.add_task(folder.name, total=len(found), completed=known)
+        for job, result in cleaning:
+            manifest.add(job, result)
+            progress.advance(bar)
+            if result["state"] == "failed":
+                failed += 1
+                console.print(f"{job.source}: {result['error']}", style="red", markup=False, highlight=False)
+            elif not result["poses"]:
+                console.print(f"{job.source}: no body was recognised", markup=False, highlight=False)
+    console.print(f"{out}: {len(found) - failed} of {len(found)} recordings are clean", highlight=False)
+    return 1 if failed else 0
+
+
+class Manifest:
+    """What became of each recording: ``manifest.jsonl`` in the output folder, a JSON object a line, the last counts.
+
+    Args:
+        out: the output folder; made if it is not there.
+        folder: of the recordings.
+        settings: with which they are cleaned.
+
+    Raises:
+        LaunchError: the output folder holds something else.
+    """
+
+    def __init__(self, out: Path, folder: Path, settings: Settings) -> None:
+        self.path = out / MANIFEST
+        self._out, self._folder, self._settings = out, folder, settings
+        self._known: dict[str, dict[str, Any]] = {}
+        if self.path.exists():
+            text = self.path.read_text(encoding="utf-8", errors="replace")
+            if not text.endswith("\n"):  # cut short by whatever stopped the run that wrote it
+                self.path.write_text(text + "\n", encoding="utf-8")
+            for line in text.splitlines():
+                try:
+                    entry = json.loads(line)
+                    self._known[entry["input"]] = entry
+                except (ValueError, KeyError, TypeError):
+                    continue
+        elif out.exists() and any(out.iterdir()):
+            raise LaunchError(f"{out}: expected a new folder, or one with the {MANIFEST} of an earlier call")
+        out.mkdir(exist_ok=True)
+
+    def is_done(self, job: Job) -> bool:
+        """Whether this recording, as it is now, was cleaned with these settings."""
+        entry = self._known.get(str(job.source.relative_to(self._folder)), {})
+        return entry.get("state") == "done" and job.out.exists() and entry.items() >= self._signature(job).items()
+
+    def add(self, job: Job, result: dict[str, Any]) -> None:
+        """Note what became of a recording."""
+        entry = self._signature(job) | result
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
+
+    def _signature(self, job: Job) -> dict[str, Any]:
+        """What a result belongs to: the recording, by size and time of change, and the settings."""
+        files = sorted(job.source.rglob("*")) if job.source.is_dir() else [job.source]
+        status = [file.stat() for file in files if file.exists()]
+        return {
+            "input": str(job.source.relative_to(self._folder)),
+            "bytes": sum(s.st_size for s in status),
+            "changed_ns": max((s.st_mtime_ns for s in status), default=0),
+            "settings": json.loads(json.dumps(self._settings)),
+            "output": str(job.out.relative_to(self._out)),
+        }
+
+
+def work(job: Job, settings: Settings) -> dict[str, Any]:
+    """Clean one recording; whatever goes wrong is the result."""
+    try:
+        return {"state": "done"} | asdict(clean_recording(job.source, job.out, settings, replace=True))
+    except Exception as error:  # any file may hold what nobody thought of, and the others wait
+        return _failed("".join(traceback.format_exception_only(error)).strip())
+
+
+def _failed(error: str) -> dict[str, Any]:
+    return {"state": "failed", "error": error}
+
+
+def on_cores(jobs: Iterable[Job], settings: Settings, cores: int) -> Iterator[tuple[Job, dict[str, Any]]]:
+    """Clean recordings in processes of this machine; gives each result as it comes.
+
+    A process that dies, for want of memory or by a fault in a library, takes one recording with it, not the rest.
+    """
+    context = multiprocessing.get_context("spawn")
+    waiting = deque(jobs)
+    idle: list[_Worker] = []
+    busy: dict[Connection, _Worker] = {}
+    try:
+        while waiting or busy:
+            while waiting and len(busy) < cores:
+                worker = idle.pop() if idle else _Worker(context, settings)
+                worker.give(waiting.popleft())
+                busy[worker.connection] = worker
+            for connection in wait(list(busy)):
+                worker = busy.pop(connection)  # type: ignore[index]  (all that is waited for are connections)
+                result = worker.take()
+                if worker.process.is_alive():
+                    idle.append(worker)
+                yield worker.job, result
+    finally:
+        for worker in [*idle, *busy.values()]:
+            worker.process.kill()  # whatever it writes is not in its place before it is whole
+
+
+class _Worker:
+    """A process that cleans one recording after the other."""
+
+    job: Job
+
+    def __init__(self, context: SpawnContext, settings: Settings) -> None:
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs, settings), daemon=True)
+        self.process.start()
+        theirs.close()  # so that its end closes with the process
+
+    def give(self, job: Job) -> None:
+        self.job = job
+        self.connection.send(job)
+
+    def take(self) -> dict[str, Any]:
+        try:
+            return self.connection.recv()
+        except (EOFError, OSError):
+            self.process.join()
+            return _failed(f"the process that cleaned it ended with status {self.process.exitcode}")
+
+
+def _serve(connection: Connection, settings: Settings) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one, which ends it
+    while True:
+        try:
+            job = connection.recv()
+        except EOFError:
+            return
+        connection.send(work(job, settings))
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def on_ray(jobs: Iterable[Job], settings: Settings) -> Iterator[tuple[Job, dict[str, Any]]]:
+    """Clean recordings on a Ray cluster, one a core; gives each result as it comes.
+
+    Raises:
+        LaunchError: Ray is not installed.
+    """
+    if importlib.util.find_spec("ray") is None:
+        raise LaunchError(
+            "--ray needs ray, which is not installed: run `uv sync --inexact --extra ray` in the checkout, "
+            "or `pip install 'steadypose[ray]'`; without --ray, all cores of this machine are used"
+        )
+    import ray  # pyright: ignore[reportMissingImports]
+
+    ray.init(ignore_reinit_error=True, log_to_driver=False)
+    remote = ray.remote(num_cpus=1, max_retries=0)(work)
+    pending = {remote.remote(job, settings): job for job in jobs}
+    while pending:
+        for reference in ray.wait(list(pending))[0]:
+            try:
+                result = ray.get(reference)
+            except ray.exceptions.RayError as error:
+                result = _failed(str(error))
+            yield pending.pop(reference), result
+
+
+def _check(settings: Settings) -> None:
+    """Find here what every recording would stumble over."""
+    from nodes.prior import make_prior
+    from nodes.trajectory import make_trajectory
+
+    make_prior(settings["prior"])
+    make_trajectory(settings["trajectory"])

@@ -1,0 +1,149 @@
+"""How one recording is cleaned offline: the nodes' own pipelines over it, as fast as they go."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from msgs.recording import RecordingWriter
+from msgs.topics import POSE_CLEAN, POSE_WORLD
+from msgs.types import Message, PoseClean, PoseRaw, PoseWorld
+from nodes.launch import LaunchError
+from nodes.npz import NpzCollector
+from nodes.pose_input import open_source, with_end
+from nodes.recorder import Filing
+
+
+class Cleaner(Protocol):
+    """What `stream` needs of a `PriorPipeline`."""
+
+    def process(self, raw: PoseRaw) -> list[PoseClean]: ...
+
+
+class Placer(Protocol):
+    """What `stream` needs of a `TrajectoryPipeline`."""
+
+    def process(self, clean: PoseClean) -> list[PoseWorld]: ...
+
+
+def stream(
+    messages: Iterable[tuple[str, Message]], prior: Cleaner, trajectory: Placer
+) -> Iterator[tuple[str, Message]]:
+    """All that the nodes publish when the input node publishes ``messages``: these, and the answers to each.
+
+    Both pipelines are new, or have seen the end of their last stream.
+    """
+    for topic, message in with_end(messages):
+        yield topic, message
+        if isinstance(message, PoseRaw):
+            for clean in prior.process(message):
+                yield POSE_CLEAN, clean
+                for world in trajectory.process(clean):
+                    yield POSE_WORLD, world
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """What cleaning one recording came to.
+
+    Attributes:
+        frames: of the input.
+        duration_s: from its first stamp to its last.
+        spent_s: what it took.
+        poses: of bodies, given in answer; none if no body was recognised.
+        refused: what was refused or dropped, by cause.
+    """
+
+    frames: int
+    duration_s: float
+    spent_s: float
+    poses: int
+    refused: dict[str, int]
+
+
+def clean_recording(
+    source: Path,
+    out: Path,
+    settings: Mapping[str, Mapping[str, Any]],
+    *,
+    replace: bool = False,
+    began: Callable[[int], None] = lambda frames: None,
+    advanced: Callable[[], None] = lambda: None,
+) -> Cleaned:
+    """Clean one recording. The output is there whole, or not at all.
+
+    Args:
+        source: a recording or file of poses.
+        out: the recording to make, or .npz.
+        settings: ``[prior]`` and ``[trajectory]`` of a launch file.
+        replace: whether a recording that is already at ``out`` may be replaced; an .npz is.
+        began: called with the number of frames.
+        advanced: called after each.
+
+    Raises:
+        LaunchError, RecordingError, NpzError: the input cannot be used, or the output not be made.
+    """
+    to_npz = out.suffix == ".npz"
+    if out.exists() and not (replace or to_npz):
+        raise LaunchError(f"{out} exists: expected a new directory to write the recording to")
+    frames = open_source(source)
+    # these bring torch, which takes seconds: not before it is known that there is something to do
+    import torch
+
+    from nodes.prior import make_prior
+    from nodes.trajectory import make_trajectory
+
+    torch.set_num_threads(1)  # the models are too small to gain from more
+    prior, trajectory = make_prior(settings["prior"]), make_trajectory(settings["trajectory"])
+    began(len(frames))
+    collector = NpzCollector()
+    stamps_ns: list[int] = []
+    poses = 0
+    filing = Filing()
+    started = time.perf_counter()
+    with _unfinished(out) as part:
+        with nullcontext() if to_npz else RecordingWriter(part) as writer:
+            for topic, message in stream(frames, prior, trajectory):
+                if writer:
+                    writer.write(topic, message, filing.stamp(topic, message.stamp_ns))
+                else:
+                    collector.add(message)
+                if isinstance(message, PoseRaw) and not message.end_of_stream:
+                    stamps_ns.append(message.stamp_ns)
+                    advanced()
+                elif isinstance(message, PoseClean):
+                    poses += len(message.bodies)
+        if not stamps_ns:
+            raise LaunchError(f"{source}: expected frames, but none of {len(frames)} could be read")
+        if to_npz:
+            arrays: dict[str, Any] = collector.arrays(np.array(stamps_ns, np.int64))
+            np.savez(part, **arrays)
+        elif out.exists():
+            shutil.rmtree(out)
+        part.replace(out)
+    return Cleaned(
+        frames=len(stamps_ns),
+        duration_s=(max(stamps_ns) - min(stamps_ns)) / 1e9,
+        spent_s=time.perf_counter() - started,
+        poses=poses,
+        refused={cause: n for cause, n in (frames.refused + prior.counters + trajectory.counters).items() if n},
+    )
+
+
+@contextmanager
+def _unfinished(out: Path) -> Iterator[Path]:
+    """Where to write what becomes ``out``: beside it, under the same name, because a recording's file has its name."""
+    folder = out.with_name(f".{out.name}.part")
+    shutil.rmtree(folder, ignore_errors=True)  # of somebody who was killed
+    try:
+        folder.mkdir(parents=True)
+        yield folder / out.name
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
