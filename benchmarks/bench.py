@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -12,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from benchmarks import ours, smoothnet
-from benchmarks.motion import MotionClips, prepared_clips, simulated_clips
+from benchmarks import ours, smoothnet, window_vaes
+from benchmarks.machine import ROOT
+from benchmarks.motion import MotionClips, as_set, digest, prepared_clips, prepared_set, simulated_clips
 from benchmarks.peers import PEERS, Peer
 from benchmarks.results import Table
 from benchmarks.tuning import Tuned, search
+from prior.hmvae import MotionVAE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,6 +68,20 @@ class Bench:
     def training_clips(self) -> MotionClips:
         """Training motion, of other people, for the peers that learn."""
         return self._motion("train", 90, 60 if self.quick else 1000)
+
+    def window_vae(self, name: str, frames: int) -> MotionVAE:
+        """A model of `window_vaes.MODELS`, trained on training motion, or found in ``runs`` from an earlier call."""
+        self.progress.stop()  # training draws a bar of its own
+        try:
+            if self.quick or not self.data.is_file():
+                train, val = as_set(self.training_clips()), as_set(self.clips())
+                with tempfile.TemporaryDirectory() as runs:
+                    return window_vaes.trained(name, frames, train, val, Path(runs), steps=3)
+            train, val = (prepared_set(self.data, split) for split in ("train", "val"))
+            runs = ROOT / "runs" / f"reconstruction-{digest(self.data)}"
+            return window_vaes.trained(name, frames, train, val, runs, window_vaes.STEPS[frames])
+        finally:
+            self.progress.start()
 
     def _motion(self, split: str, frames: int, most: int) -> MotionClips:
         if self.data.is_file():

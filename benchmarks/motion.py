@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from prior.motion_windows import MotionSet
@@ -64,7 +65,7 @@ class MotionClips:
 
 def prepared_clips(path: Path, split: str, frames: int, most: int) -> MotionClips:
     """Clips that do not overlap, at most ``most`` of them, spread evenly over the split, from ``prepared.npz``."""
-    motion = _load(path, split)
+    motion = prepared_set(path, split)
     rows = motion.all_windows(frames, frames)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))].T
     return MotionClips(
@@ -72,17 +73,35 @@ def prepared_clips(path: Path, split: str, frames: int, most: int) -> MotionClip
         rotations=motion.rotations[rows].numpy().astype(np.float64),
         offsets=motion.offsets[rows[0]].numpy().astype(np.float64),
         contacts=motion.contacts[rows].numpy().astype(bool),
-        source={"file": path.name, "sha256": _digest(path), "split": split, "clips": rows.shape[1], "frames": frames},
+        source={"file": path.name, "sha256": digest(path), "split": split, "clips": rows.shape[1], "frames": frames},
     )
 
 
 @lru_cache(maxsize=2)
-def _load(path: Path, split: str) -> MotionSet:
+def prepared_set(path: Path, split: str) -> MotionSet:
+    """All clips of ``prepared.npz`` that are free for products."""
     return MotionSet.load(path, "default", split)
 
 
+def as_set(clips: MotionClips) -> MotionSet:
+    """Clips as training reads them, one after the other."""
+    frames, count = clips.positions.shape[:2]
+
+    def in_a_row(values: NDArray[Any]) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values.swapaxes(0, 1).reshape(frames * count, *values.shape[2:])))
+
+    return MotionSet(
+        rotations=in_a_row(clips.rotations).float(),
+        positions=in_a_row(clips.positions).float(),
+        offsets=torch.from_numpy(np.repeat(clips.offsets, frames, axis=0)).float(),
+        contacts=in_a_row(clips.contacts),
+        clip_start=np.arange(count + 1) * frames,
+    )
+
+
 @lru_cache(maxsize=2)
-def _digest(path: Path) -> str:
+def digest(path: Path) -> str:
+    """The first 16 hexadecimal digits of a file's SHA-256."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 

@@ -11,18 +11,31 @@ from numpy.typing import NDArray
 
 from benchmarks.peers import missing
 from msgs.types import Pose, PoseClean, PoseRaw, RawBody
+from prior.checkpoint import WEIGHTS
 from prior.correct import CorrectSettings
 from prior.fuse import FuseSettings
 from prior.pipeline import PriorPipeline, PriorSettings
+from prior.refine import RefineSettings
 
 Floats = NDArray[np.float64]
+
+
+def weight_sets(model: str) -> list[str]:
+    """The sets of weights that there are for a model: ``default``, free for products, and ``research``."""
+    return [name for name in ("default", "research") if (WEIGHTS / f"{model}-{name}.safetensors").is_file()]
+
 
 OURS: Mapping[str, PriorSettings] = {
     "HM-VAE": PriorSettings(fuse=FuseSettings(enabled=False)),
     "steadypose": PriorSettings(),
     "steadypose, bias_sigma = 0.002": PriorSettings(bias_sigma=0.002),
+    **{
+        f"steadypose, {weights} weights": PriorSettings(refine=RefineSettings(weights=weights))
+        for weights in weight_sets("hmvae")
+        if weights != RefineSettings().weights
+    },
 }
-"""Every variant that each protocol runs; one line adds one. HM-VAE is the paper's refinement alone, unfused. The last
+"""Every variant that each protocol runs; one line adds one. HM-VAE is the paper's refinement alone, unfused. The third
 is told what holds for motion capture and for independent noise, not for cameras: that the sensor has no slow error."""
 
 OURS_KINECT: Mapping[str, PriorSettings] = {

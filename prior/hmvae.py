@@ -9,6 +9,7 @@ official code for windows of 8 (and 64) frames; the pooling comes from our 22-jo
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -76,13 +77,38 @@ def _kl(mean: Tensor, log_var: Tensor) -> Tensor:
     return (0.5 * (mean.square() + log_var.exp() - 1.0 - log_var).sum(dim=-1)).mean()
 
 
-class HMVAE(nn.Module):
-    """Encoder and decoder of windows (B, T, 22, 6) of local 6D rotations (the root's is its orientation)."""
+class MotionVAE(nn.Module, ABC):
+    """A VAE of windows (B, T, 22, 6) of local 6D rotations (the root's is its orientation).
+
+    Args:
+        window: frames T.
+    """
+
+    def __init__(self, window: int) -> None:
+        super().__init__()
+        self.window = window
+
+    @abstractmethod
+    def encode(self, x: Tensor) -> Posterior:
+        """The posterior of windows x (B, T, 22, 6)."""
+
+    @abstractmethod
+    def decode(self, local: Tensor, deep: Tensor) -> Tensor:
+        """Windows (B, T, 22, 6) of z_l (B, edges, d) and z_g (B, edges, d)."""
+
+    def reconstruct(self, x: Tensor) -> Tensor:
+        """Decode the posterior's mean: what refinement does with each window (equations 10 and 11)."""
+        posterior = self.encode(x)
+        return self.decode(posterior.local_mean, posterior.global_mean)
+
+
+class HMVAE(MotionVAE):
+    """The hierarchical one: skeleton convolutions, a local and a global latent."""
 
     CHANNELS = (ROTATION_FEATURES, 12, 24, 48, 96)
 
     def __init__(self, config: HMVAEConfig) -> None:
-        super().__init__()
+        super().__init__(config.window)
         self.config = config
         self.levels = pooling_levels(PARENTS)
         steps = [config.window]
@@ -142,11 +168,6 @@ class HMVAE(nn.Module):
             if k > 0:
                 features = F.leaky_relu(features, SLOPE)
         return features.transpose(1, 2).reshape(len(features), self.config.window, -1, ROTATION_FEATURES)
-
-    def reconstruct(self, x: Tensor) -> Tensor:
-        """Decode the posterior's mean: what refinement does with each window (equations 10 and 11)."""
-        posterior = self.encode(x)
-        return self.decode(posterior.local_mean, posterior.global_mean)
 
 
 def _join_edges(a: Tensor, b: Tensor, channels: int) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from prior.checkpoint import WEIGHTS, save_weights
-from prior.hmvae import HMVAE, HMVAEConfig, from_6d, to_6d
+from prior.hmvae import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
 from prior.kinematics import forward_kinematics
 from prior.motion_windows import MotionSet, mirror_offsets, mirror_rotations, remove_heading
 from prior.training import TrainingRun, draw_curves
@@ -67,27 +68,7 @@ def train_hmvae(
     val = MotionSet.load(data, weights, "val")
     config = HMVAEConfig()
     model = HMVAE(config)
-    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.MultiStepLR(optimiser, [int(iterations * f) for f in (0.6, 0.85)], gamma=0.3)
-    state = {"model": model, "optimiser": optimiser, "schedule": schedule}
-    run = TrainingRun(runs / f"hmvae-{weights}", state, iterations, every=max(iterations // 48, 1))
-    losses: dict[str, float] = {}
-
-    def evaluate() -> dict[str, float]:
-        return {**losses, **evaluate_hmvae(model, val)}
-
-    for step in run.steps(evaluate):
-        model.train()
-        rows = train.sample(batch, config.window, STRIDES, np.random.default_rng((seed, step)))
-        rotations, offsets = _augment(train.rotations[rows], train.offsets[rows[:, 0]])
-        rotations, _ = remove_heading(rotations, config.window // 2 - 1)
-        local_weight = (step / iterations - GLOBAL_FIRST) / LOCAL_WARM_UP
-        loss, terms = _loss(model, rotations, offsets, local_weight)
-        losses.update(terms)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        schedule.step()
+    run = fit(model, train, val, runs / f"hmvae-{weights}", iterations, batch, learning_rate, STRIDES, seed)
     path = WEIGHTS / f"hmvae-{weights}.safetensors"
     hours = {split: len(s.rotations) / 30 / 3600 for split, s in (("train", train), ("val", val))}
     save_weights(path, model, asdict(config), {
@@ -105,6 +86,57 @@ def train_hmvae(
     return path
 
 
+def fit(
+    model: MotionVAE,
+    train: MotionSet,
+    val: MotionSet,
+    directory: Path,
+    iterations: int,
+    batch: int,
+    learning_rate: float,
+    strides: Sequence[int],
+    seed: int,
+) -> TrainingRun:
+    """Train a VAE of windows as HM-VAE is trained, with equations 3 and 5 to 8.
+
+    Args:
+        model: changed in place.
+        train: what it learns.
+        val: what it is evaluated on as it goes.
+        directory: of the run's checkpoint and curves; a checkpoint there is resumed.
+        iterations: optimiser steps.
+        batch: windows a step.
+        learning_rate: of Adam at the start; it falls to a third twice.
+        strides: frame rates, as frames from one to the next, each as likely as it stands there.
+        seed: of sampling.
+
+    Returns:
+        The finished run, with its curves.
+    """
+    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.MultiStepLR(optimiser, [int(iterations * f) for f in (0.6, 0.85)], gamma=0.3)
+    state = {"model": model, "optimiser": optimiser, "schedule": schedule}
+    run = TrainingRun(directory, state, iterations, every=max(iterations // 48, 1))
+    losses: dict[str, float] = {}
+
+    def evaluate() -> dict[str, float]:
+        return {**losses, **evaluate_hmvae(model, val)}
+
+    for step in run.steps(evaluate):
+        model.train()
+        rows = train.sample(batch, model.window, strides, np.random.default_rng((seed, step)))
+        rotations, offsets = _augment(train.rotations[rows], train.offsets[rows[:, 0]])
+        rotations, _ = remove_heading(rotations, model.window // 2 - 1)
+        local_weight = (step / iterations - GLOBAL_FIRST) / LOCAL_WARM_UP
+        loss, terms = _loss(model, rotations, offsets, local_weight)
+        losses.update(terms)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return run
+
+
 def _augment(rotations: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     """Mirror half of the windows; tilt all a little, since no camera is levelled perfectly.
 
@@ -119,7 +151,7 @@ def _augment(rotations: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     return rotations, offsets
 
 
-def _loss(model: HMVAE, rotations: Tensor, offsets: Tensor, local_weight: float) -> tuple[Tensor, dict[str, float]]:
+def _loss(model: MotionVAE, rotations: Tensor, offsets: Tensor, local_weight: float) -> tuple[Tensor, dict[str, float]]:
     """Equations 3 and 5 to 8, every term a mean; ``local_weight`` is z_l's share of beta, below 0 it is detached."""
     x = to_6d(rotations)
     posterior = model.encode(x)
@@ -141,16 +173,16 @@ def _loss(model: HMVAE, rotations: Tensor, offsets: Tensor, local_weight: float)
 
 
 @torch.no_grad()
-def evaluate_hmvae(model: HMVAE, motion: MotionSet, windows: int = 2048) -> dict[str, float]:
+def evaluate_hmvae(model: MotionVAE, motion: MotionSet, frames: int = 16_384) -> dict[str, float]:
     """Reconstruction from the posterior's mean on unseen people.
 
     Returns:
         ``val MPJPE mm`` over whole windows, root-centred, and ``val centre mm``, of the frame that refinement keeps.
     """
     model.eval()
-    window = model.config.window
+    window = model.window
     rows = motion.all_windows(window, step=1)
-    rows = rows[:: max(len(rows) // windows, 1)]
+    rows = rows[:: max(len(rows) * window // frames, 1)]
     centre = window // 2 - 1
     rotations, _ = remove_heading(motion.rotations[rows], centre)
     decoded = from_6d(model.reconstruct(to_6d(rotations)))
