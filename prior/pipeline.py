@@ -22,6 +22,7 @@ from prior.bones import Bones, BonesSettings
 from prior.correct import Correct, CorrectSettings
 from prior.fuse import Fuse, FuseSettings
 from prior.gate import Gate, GateSettings
+from prior.identify import Identify, IdentifySettings
 from prior.refine import Refine, RefineSettings
 from prior.resample import Resampler
 from prior.settings import build_settings
@@ -53,6 +54,7 @@ class PriorSettings:
         bias_sigma: metres along an axis, the sensor's slow error, which no filter averages out: the less of it, the
             more bones are measured rather than taken from human proportions, and the surer joints are said to be.
             Depth cameras have 2 cm or more, marker-based motion capture next to none.
+        identify: who tells bodies apart: the source (the default), or the prior.
         gate, correct, smooth, bones, refine, fuse: settings of the stages.
     """
 
@@ -60,6 +62,7 @@ class PriorSettings:
     max_bodies: int = 8
     timeout: float = 0.5
     bias_sigma: float = 0.02
+    identify: IdentifySettings = field(default_factory=IdentifySettings)
     gate: GateSettings = field(default_factory=GateSettings)
     correct: CorrectSettings = field(default_factory=CorrectSettings)
     smooth: SmoothSettings = field(default_factory=SmoothSettings)
@@ -91,6 +94,7 @@ class PriorPipeline:
         self.delay_frames = settings.delay
         slots = settings.max_bodies
         refine = Refine(settings.refine, settings.delay)
+        self._identify = Identify(settings.identify, 2 * slots, self.counters) if settings.identify.enabled else None
         self._resampler = Resampler(slots)
         self._window = Window(max(refine.window, settings.delay + 1), slots)
         self._smooth = Smooth(settings.smooth, settings.delay, slots)
@@ -117,6 +121,8 @@ class PriorPipeline:
         if raw.end_of_stream:
             ended = self._clean(raw.stamp_ns, raw, [])
             ended.end_of_stream = True
+            if self._identify:
+                self._identify.reset()
             return [*self.flush(), ended]
         skeleton = SKELETONS.get(raw.skeleton)
         if skeleton is None:
@@ -162,22 +168,29 @@ class PriorPipeline:
         slots = self.settings.max_bodies
         positions = np.full((slots, 22, 3), np.nan)
         confidence = np.zeros((slots, 22))
-        taken: set[int] = set()
+        sightings: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         to_world, origin = _sensor(raw)
-        for body in raw.bodies:
+        for index, body in enumerate(raw.bodies):
             if len(body.positions) != len(skeleton.joints):
                 self.counters["wrong_joint_count"] += 1
                 continue
-            if body.id in taken:
+            body_id = index if self._identify else body.id
+            if body_id in sightings:
                 self.counters["body_id_repeated"] += 1
                 continue
-            taken.add(body.id)
             joints, trust = self._sighting(body, skeleton)
-            slot = self._slot(body.id, seen=int(np.isfinite(joints[:, 0]).sum()))
-            if slot is None:
+            sightings[body_id] = joints @ to_world.T + origin, trust
+        ids: list[int | None] = [*sightings]
+        if self._identify:
+            joints = np.array([joints for joints, _ in sightings.values()]).reshape(-1, 22, 3)
+            trust = np.array([trust for _, trust in sightings.values()]).reshape(-1, 22)
+            ids = self._identify.update(raw.stamp_ns, joints, trust)
+        for body_id, (joints, trust) in zip(ids, sightings.values(), strict=True):
+            if body_id is None:
                 continue
-            positions[slot] = joints @ to_world.T + origin
-            confidence[slot] = trust
+            slot = self._slot(body_id, seen=int(np.isfinite(joints[:, 0]).sum()))
+            if slot is not None:
+                positions[slot], confidence[slot] = joints, trust
         return positions, confidence
 
     def _sighting(self, body: RawBody, skeleton: Skeleton) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -210,6 +210,27 @@ def crossing(rng: np.random.Generator) -> list[Motion]:
     return [m.at(times) for m in motions]
 
 
+def hidden_crossing(rng: np.random.Generator) -> list[Motion]:
+    """One stops in the middle of the view; another walks up behind, stays hidden for a second, and walks on or back."""
+    near, far = rng.uniform(1.9, 2.3), rng.uniform(2.8, 3.3)
+    side, other = rng.choice([-1.0, 1.0], size=2)
+    turns_back = rng.random() < 0.3
+
+    def visit(x: float, y: float, wait: float, stay: float, back: bool) -> Plan:
+        pace = rng.uniform(0.8, 1.2)
+        parts: list[Stand | Walk | Turn] = [Stand(wait), Walk([(x, 0.0)], pace), Stand(stay)]
+        parts += [Turn(np.pi, 1.6)] if back else []
+        return plan((x, y), -np.sign(y) * np.pi / 2, [*parts, Walk([(x, y if back else -y)], pace), Stand(3.0)])
+
+    plans = [
+        visit(near, side * rng.uniform(0.8, 1.0), 0.5, rng.uniform(3.5, 4.5), back=False),
+        visit(far, other * rng.uniform(1.2, 1.5), rng.uniform(1.0, 1.5), rng.uniform(0.0, 0.4), turns_back),
+    ]
+    motions = [perform(Intent(p), _person(rng), rng) for p in plans]
+    times = np.arange(int(min(m.times[-1] for m in motions) * RATE) + 1) / RATE
+    return [m.at(times) for m in motions]
+
+
 def leave_reenter(rng: np.random.Generator) -> list[Motion]:
     """Walk out of view to one side, come back, come too near, back off, leave to the other side and return."""
     parts = [
@@ -223,6 +244,6 @@ def leave_reenter(rng: np.random.Generator) -> list[Motion]:
 
 
 SCRIPTS: Mapping[str, Callable[[np.random.Generator], list[Motion]]] = {
-    f.__name__: f for f in (walk_turn, reach, sit_rise, wave_hidden_arm, crossing, leave_reenter, idle)
+    f.__name__: f for f in (walk_turn, reach, sit_rise, wave_hidden_arm, crossing, hidden_crossing, leave_reenter, idle)
 }
 """Every scene by name."""

@@ -1,0 +1,237 @@
+"""Whether people keep their ids when they cross and hide each other: what `prior.identify` makes of unnumbered bodies.
+
+Streams are made from seeds by the project's simulator; their tracker knows who is who, so each sighting's person is
+known. The methods get the bodies of each frame in random order and without ids.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from scipy.spatial.transform import Rotation
+
+from benchmarks.machine import ROOT
+from benchmarks.results import RESULTS, Table, save, show
+from msgs.types import PoseRaw, PoseWorld
+from prior.identify import Identify, IdentifySettings
+from prior.sim.streams import Stream, make, read_manifest
+from prior.skeletons import get_skeleton, to_canonical
+
+MANIFEST = ROOT / "sim_data" / "manifest.json"
+ROWS = 16
+HIDDEN_S = 1.0
+"""the least time for which the one who is hidden is not seen"""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Id switches where people cross and hide each other."""
+
+    crossings: int = 10
+    """generated, beside the crossing stream of sim_data"""
+    seed: int = 0
+    """of the first one; the others follow"""
+    out: Path = RESULTS
+    """folder for the JSON file"""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The bodies of a frame, and who they are.
+
+    Attributes:
+        stamp_ns: capture.
+        bodies: (N, 22, 3) metres, world.
+        confidence: (N, 22).
+        people: (N,) who is seen.
+        source_ids: (N,) what the tracker of the source calls them.
+    """
+
+    stamp_ns: int
+    bodies: NDArray[np.float64]
+    confidence: NDArray[np.float64]
+    people: list[int]
+    source_ids: list[int]
+
+
+Method = Callable[[Frame], list[int | None]]
+
+
+def watch(stream: Stream) -> list[Frame]:
+    """A stream's frames, with bodies in random order; whoever goes out of sight does so for `HIDDEN_S` at least."""
+    rng = np.random.default_rng(stream.seed)
+    raw, truth = make(stream)
+    people = _people(raw, truth)
+    skeleton, turn, eye = get_skeleton(stream.camera.skeleton), stream.camera.orientation, stream.camera.position
+    last_ns: dict[int, int] = {}
+    back_ns: dict[int, int] = {}
+    frames = []
+    for message in raw:
+        seen = []
+        for body in message.bodies:
+            who = people[body.id]
+            if who in last_ns and message.stamp_ns - last_ns[who] > 0.15e9:
+                back_ns[who] = last_ns[who] + round(HIDDEN_S * 1e9)
+            last_ns[who] = message.stamp_ns
+            if message.stamp_ns >= back_ns.get(who, 0):
+                seen.append((body, who))
+        order = rng.permutation(len(seen))
+        joints = [to_canonical(skeleton, seen[k][0].positions.astype(float), seen[k][0].confidence) for k in order]
+        frames.append(
+            Frame(
+                message.stamp_ns,
+                np.array([p for p, _ in joints]).reshape(-1, 22, 3) @ turn.T + np.array(eye),
+                np.array([c for _, c in joints]).reshape(-1, 22),
+                [seen[k][1] for k in order],
+                [seen[k][0].id for k in order],
+            )
+        )
+    return frames
+
+
+def all_hidden(frames: list[Frame]) -> list[Frame]:
+    """The same with everybody out of sight for `HIDDEN_S` around the moment at which the first one reappears."""
+    stamps = {who: [f.stamp_ns for f in frames if who in f.people] for who in {p for f in frames for p in f.people}}
+    gaps = [(b - a, b) for s in stamps.values() for a, b in pairwise(s) if b - a > 0.5e9]
+    if not gaps:
+        return frames
+    end = max(gaps)[1]
+    hidden = range(end - round(0.5 * HIDDEN_S * 1e9), end + round(0.5 * HIDDEN_S * 1e9))
+    return [dataclasses.replace(f, **_nobody()) if f.stamp_ns in hidden else f for f in frames]
+
+
+def _nobody() -> dict[str, Any]:
+    return {"bodies": np.zeros((0, 22, 3)), "confidence": np.zeros((0, 22)), "people": [], "source_ids": []}
+
+
+def _people(raw: list[PoseRaw], truth: list[PoseWorld]) -> dict[int, int]:
+    """Who each id of the source is: the tracker of a simulated camera mistakes nobody for another."""
+    roots = {body.id: np.array([m.bodies[k].root_position for m in truth]) for k, body in enumerate(truth[0].bodies)}
+    stamps = np.array([m.stamp_ns for m in truth])
+    away: dict[int, Counter[int]] = {}
+    for message in raw:
+        place = message.sensor_pose
+        turn = Rotation.from_quat(place.orientation).as_matrix()
+        now = int(np.abs(stamps - message.stamp_ns).argmin())
+        for body in message.bodies:
+            middle = turn @ np.nanmedian(body.positions, axis=0) + place.position
+            nearest = min(roots, key=lambda who: float(np.linalg.norm((roots[who][now] - middle)[:2])))
+            away.setdefault(body.id, Counter())[nearest] += 1
+    return {i: votes.most_common(1)[0][0] for i, votes in away.items()}
+
+
+def source(frame: Frame) -> list[int | None]:
+    """The tracker's own ids."""
+    return [*frame.source_ids]
+
+
+def nearest() -> Method:
+    """Each body gets the id of the nearest one of the last second within a metre."""
+    known: dict[int, tuple[int, NDArray[np.float64]]] = {}
+
+    def identify(frame: Frame) -> list[int | None]:
+        ids: list[int | None] = []
+        for body in frame.bodies:
+            place = np.nanmedian(body, axis=0)
+            away = {
+                i: float(np.linalg.norm(at - place))
+                for i, (stamp_ns, at) in known.items()
+                if i not in ids and frame.stamp_ns - stamp_ns < 1.2e9
+            }
+            best = min(away, key=lambda i: away[i], default=None)
+            ids.append(best if best is not None and away[best] < 1.0 else len(known) + 1)
+            known[ids[-1] or 0] = frame.stamp_ns, place
+        return ids
+
+    return identify
+
+
+def identified(settings: IdentifySettings) -> Method:
+    """What this project makes of it."""
+    stage = Identify(settings, ROWS, Counter())
+    return lambda frame: stage.update(frame.stamp_ns, frame.bodies, frame.confidence)
+
+
+METHODS: dict[str, Callable[[], Method]] = {
+    "the source's own ids": lambda: source,
+    "nearest within 1 m": nearest,
+    "steadypose": lambda: identified(IdentifySettings(enabled=True)),
+}
+
+
+def score(frames: list[Frame], method: Method) -> dict[str, float]:
+    """Id switches as CLEAR MOT counts them (Bernardin and Stiefelhagen 2008), and how much was given an id at all.
+
+    A switch is a sighting of a person under another id than this person's last. ``mistaken`` are those under an id
+    that was another person's; the others are people taken to be new.
+    """
+    last: dict[int, int] = {}
+    owner: dict[int, int] = {}
+    figures = Counter(switches=0, mistaken=0, sightings=0, named=0)
+    for frame in frames:
+        ids = method(frame)
+        for who, i in zip(frame.people, ids, strict=True):
+            figures["sightings"] += 1
+            if i is None:
+                continue
+            figures["named"] += 1
+            if last.setdefault(who, i) != i:
+                figures["switches"] += 1
+                figures["mistaken"] += owner.get(i, who) != who
+            last[who] = i
+            owner.setdefault(i, who)
+    return dict(figures)
+
+
+def _streams(args: Args) -> Iterator[tuple[str, str, list[Frame]]]:
+    filmed = read_manifest(MANIFEST)["crossing"]
+    yield "crossing of sim_data", filmed.name, watch(filmed)
+    for seed in range(args.seed, args.seed + args.crossings):
+        frames = watch(dataclasses.replace(filmed, script="hidden_crossing", seed=seed))
+        yield "one hidden", f"hidden_crossing, seed {seed}", frames
+        yield "both hidden at once", f"hidden_crossing, seed {seed}", all_hidden(frames)
+
+
+def main(args: Args) -> None:
+    """Measure, print, write."""
+    results: list[dict[str, Any]] = []
+    for scene, name, frames in track(_streams(args), total=1 + 2 * args.crossings, description="crossings"):
+        for method, start in METHODS.items():
+            results.append({"scene": scene, "stream": name, "method": method} | score(frames, start()))
+    console = Console()
+    table = _table(results)
+    show(table, console)
+    console.print(f"wrote {save('identity', sys.argv[1:], [table], {'streams': results}, args.out)}")
+
+
+def _table(results: list[dict[str, Any]]) -> Table:
+    rows = []
+    for scene in dict.fromkeys(r["scene"] for r in results):
+        for method in METHODS:
+            chosen = [r for r in results if (r["scene"], r["method"]) == (scene, method)]
+            total = {k: sum(r[k] for r in chosen) for k in ("switches", "mistaken", "sightings", "named")}
+            share = f"{total['named'] / total['sightings']:.1%}"
+            rows.append([f"{scene}: {method}", str(len(chosen)), str(total["switches"]), str(total["mistaken"]), share])
+    return Table(
+        name="identity",
+        title="Id switches where two people cross and hide each other",
+        columns=["scene and method", "streams", "switches", "of these, mistaken for the other", "sightings with an id"],
+        rows=rows,
+        note=f"Whoever goes out of sight does for {HIDDEN_S:g} s at least. Both hidden: nobody seen as one reappears.",
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

@@ -1,0 +1,299 @@
+"""Stable ids: which body of this frame is whose, from where it was expected and how long its bones are.
+
+For sources that number the bodies of each frame anew (detectors), or give a person who was hidden a new number.
+Multi-target tracking by a sequence of best assignments; scores are log-likelihood ratios of "the same person" against
+"somebody else", as in multiple-hypothesis tracking (Blackman, "Multiple Hypothesis Tracking For Multiple Target
+Tracking", IEEE AES Magazine 19(1), 2004, section II.C), and pairs with a score below 0 are not made.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from prior.filters import FixedLagRTS
+from prior.skeletons import J, finite_joints
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class IdentifySettings:
+    """Who tells bodies apart.
+
+    Attributes:
+        enabled: whether ids are made here and the source's ignored; off, the source's are passed on.
+        birth: seconds for which a body nobody knows must be seen before it gets an id.
+        death: seconds without a sighting after which a person is forgotten, and comes back as somebody new.
+    """
+
+    enabled: bool = False
+    birth: float = 0.25
+    death: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name in ("birth", "death"):
+            if not 0.0 <= getattr(self, name) < 60.0:
+                raise ValueError(f"[prior.identify] {name}: expected 0 to 60 seconds, got {getattr(self, name)}")
+
+
+RECENT_S = 0.25
+"""A body seen within so long goes on from frame to frame; unseen for longer, it must be recognised."""
+ACCELERATION = 1.0
+"""m²/s³, how freely a body in sight accelerates."""
+SPEED, SPEED_MEMORY_S = 0.6, 1.0
+"""m/s and seconds: out of sight, the velocity of a body is an Ornstein-Uhlenbeck process, which forgets which way one
+walked, so that who stops behind a pillar is not expected in the next room."""
+PLACE_SIGMA, HEIGHT_SIGMA = 0.1, 0.3
+"""Metres along an axis: how well one frame tells where a body is; the most by which its height changes unseen."""
+NEWCOMERS = 0.01
+"""Newcomers in a m³ (of a room of 20 m², a tenth) for one person that comes back into sight there."""
+LENGTH_SIGMA, LENGTH_MEMORY_S = 0.05, 1.0
+"""Metres by which a bone is seen too long or short, and the seconds for which that error lasts."""
+LENGTH_SPREAD = 0.1
+"""Of a bone's length, its standard deviation between people."""
+LENGTH_DOUBT = 3.0
+"""The most that one bone says against a person: that it was seen wrong is never less likely than that."""
+SURE = 3.0
+"""A score this much above all others (20 to 1) needs no more frames."""
+APART = 0.25
+"""Metres: two bodies nearer than this to each other are one, seen twice."""
+MIN_CONFIDENCE = 0.3
+"""Of a bone's joints, for its length to count."""
+MIN_JOINTS = 6
+"""Joints that must be seen for a body to be taken for one."""
+
+_FREE, _NAMELESS = 0, -1
+"""In place of an id: ids are 1 and up."""
+
+_TRUNK = np.array(
+    [J[n] for n in ("pelvis", "left_hip", "right_hip", "spine3", "neck", "left_shoulder", "right_shoulder")]
+)
+_BONES: tuple[tuple[tuple[str, str], ...], ...] = (
+    (("left_hip", "left_knee"), ("right_hip", "right_knee")),
+    (("left_knee", "left_ankle"), ("right_knee", "right_ankle")),
+    (("left_shoulder", "left_elbow"), ("right_shoulder", "right_elbow")),
+    (("left_elbow", "left_wrist"), ("right_elbow", "right_wrist")),
+    (("left_shoulder", "right_shoulder"),),
+    (("pelvis", "neck"),),
+)
+
+
+class Identify:
+    """Gives each body of a frame its id.
+
+    A row holds a person, or a body seen too shortly to be one. Frames follow each other through a constant-velocity
+    Kalman filter of each body's place: bodies seen a moment ago are matched first, by place. What is left becomes a
+    row without a name, which after ``birth`` seconds, or as soon as there is no doubt, is recognised as a person out
+    of sight or becomes a new one: several frames tell bones better than one.
+
+    Args:
+        settings: of this stage.
+        rows: people followed at once: seen, out of sight, and not yet named.
+        counters: gets ``too_many_bodies``.
+    """
+
+    def __init__(self, settings: IdentifySettings, rows: int, counters: Counter[str]) -> None:
+        self._settings, self._rows, self._counters = settings, rows, counters
+        self._next_id = 1
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everybody; no id is given a second time."""
+        rows = self._rows
+        self._origin_ns = self._last_ns = -1
+        self._filter = FixedLagRTS(0, ACCELERATION, PLACE_SIGMA)
+        self._id = np.full(rows, _FREE)
+        self._place = np.full((rows, 3), np.nan)
+        self._pose = np.full((rows, 22, 3), np.nan)
+        self._first_s = np.zeros(rows)
+        self._seen_s = np.zeros(rows)
+        self._lengths = np.zeros((rows, len(_BONES)))
+        self._lengths_s = np.zeros((rows, len(_BONES)))
+
+    def update(self, stamp_ns: int, bodies: Floats, confidence: Floats) -> list[int | None]:
+        """The id of each body of a frame; None for one that has none yet.
+
+        Args:
+            stamp_ns: capture, later than the last; earlier, or much later, it starts a new stream.
+            bodies: (N, 22, 3) metres, world-aligned; NaN where unobserved.
+            confidence: (N, 22).
+        """
+        if self._origin_ns < 0 or not 0 < stamp_ns - self._last_ns <= self._settings.death * 1e9:
+            self.reset()
+            self._origin_ns = self._last_ns = stamp_ns
+        step = (stamp_ns - self._last_ns) * 1e-9
+        now = (stamp_ns - self._origin_ns) * 1e-9
+        self._last_ns = stamp_ns
+        count = len(bodies)
+        self._counters["too_many_bodies"] += max(count - self._rows, 0)
+        bodies, confidence = bodies[: self._rows], confidence[: self._rows]
+        unseen_s = now - self._seen_s
+        self._forget((unseen_s > self._settings.death) | ((self._id == _NAMELESS) & (unseen_s > RECENT_S)))
+        row_of, places, score = self._follow(bodies, now)
+        self._take_up(bodies, row_of, places, now)
+        seen = np.flatnonzero(row_of >= 0)
+        lengths = _bone_lengths(bodies, confidence)
+        self._see(row_of[seen], bodies[seen], places[seen], lengths[seen], now, step)
+        self._name(row_of, places, score, now)
+        return [int(self._id[row]) if row >= 0 and self._id[row] > 0 else None for row in row_of] + [None] * (
+            count - len(row_of)
+        )
+
+    def _follow(self, bodies: Floats, now: float) -> tuple[NDArray[np.intp], Floats, Floats]:
+        """Match bodies to rows seen a moment ago.
+
+        Returns:
+            (N,) the row of each body or -1, (N, 3) its place in metres, and (rows, N) the score of all by place.
+        """
+        row_of, places = np.full(len(bodies), -1), np.full((len(bodies), 3), np.nan)
+        score = np.full((self._rows, len(bodies)), -np.inf)
+        expected = self._filter.predict(now)
+        rows = np.flatnonzero(self._id != _FREE)
+        if expected is None or not len(rows) or not len(bodies):
+            return row_of, places, score
+        # A body is where it moves the joints of its last pose to, in the middle.
+        place = _median(bodies[None] - self._pose[rows, None])
+        unseen_s = now - self._seen_s[rows]
+        there, sigma = _out_of_sight(self._place[rows], expected.positions[rows], expected.sigma[rows], unseen_s)
+        score[rows] = _place_score(place - there[:, None], sigma[:, None])
+        recent = np.flatnonzero(unseen_s <= RECENT_S)
+        for k, body in _best(score[rows[recent]]):
+            row_of[body], places[body] = rows[recent[k]], place[recent[k], body]
+        return row_of, places, score
+
+    def _take_up(self, bodies: Floats, row_of: NDArray[np.intp], places: Floats, now: float) -> None:
+        """Give bodies that nobody expected a row, in place, as long as there are any."""
+        free = iter(np.flatnonzero(self._id == _FREE))
+        for body in np.flatnonzero((row_of < 0) & (finite_joints(bodies).sum(axis=1) >= MIN_JOINTS)):
+            row = next(free, None)
+            if row is None:
+                self._counters["too_many_bodies"] += 1
+                return
+            row_of[body], places[body] = row, _middle(bodies[body])
+            self._id[row], self._first_s[row] = _NAMELESS, now
+
+    def _see(
+        self, rows: NDArray[np.intp], bodies: Floats, places: Floats, lengths: Floats, now: float, step: float
+    ) -> None:
+        """Let rows see their bodies at these places, with bones of these lengths (N, B)."""
+        measured = np.full((self._rows, 3), np.nan)
+        measured[rows] = places
+        estimate = self._filter.update(measured, now)
+        assert estimate is not None, "a filter without delay always answers"
+        self._place[rows] = estimate.positions[rows]
+        pose = bodies - places[:, None]
+        self._pose[rows] = np.where(np.isfinite(pose), pose, self._pose[rows])
+        self._seen_s[rows] = now
+        weight = np.isfinite(lengths) * np.clip(step, _LEAST_STEP_S, RECENT_S)
+        self._lengths_s[rows] += weight
+        share = weight / np.maximum(self._lengths_s[rows], _LEAST_STEP_S)
+        self._lengths[rows] += share * (np.nan_to_num(lengths) - self._lengths[rows])
+
+    def _name(self, row_of: NDArray[np.intp], places: Floats, place_score: Floats, now: float) -> None:
+        """Recognise bodies without a name as people out of sight, or call them new."""
+        seen = np.flatnonzero(row_of >= 0)
+        nameless = seen[self._id[row_of[seen]] == _NAMELESS]
+        if not len(nameless):
+            return
+        old_enough = now - self._first_s[row_of[nameless]] >= self._settings.birth
+        away = np.setdiff1d(np.flatnonzero(self._id > 0), row_of)
+        score = place_score[np.ix_(away, nameless)].T + self._length_score(row_of[nameless], away)
+        waiting = ~old_enough
+        for k, person in _best(score):
+            others = np.r_[0.0, np.delete(score[k], person), np.delete(score[:, person], k)]
+            if old_enough[k] or score[k, person] - others.max() > SURE:
+                self._become(int(row_of[nameless[k]]), int(away[person]))
+            waiting[k] = True
+        for k in np.flatnonzero(~waiting):
+            named = seen[self._id[row_of[seen]] > 0]
+            if (np.linalg.norm(places[named] - places[nameless[k]], axis=1) > APART).all():
+                self._id[row_of[nameless[k]]] = self._next_id
+                self._next_id += 1
+
+    def _length_score(self, rows: NDArray[np.intp], people: NDArray[np.intp]) -> Floats:
+        """(rows, people) log-likelihood ratio of having the same bones by chance or by being the same."""
+        doubt = [LENGTH_SIGMA**2 / np.maximum(self._lengths_s[who] / LENGTH_MEMORY_S, 1.0) for who in (rows, people)]
+        both = (self._lengths_s[rows, None] > 0) & (self._lengths_s[people] > 0)
+        apart = self._lengths[rows, None] - self._lengths[people]
+        same = doubt[0][:, None] + doubt[1]
+        other = same + 2 * (LENGTH_SPREAD * _GENERIC_LENGTHS) ** 2
+        ratio = 0.5 * (np.log(other / same) - apart**2 * (1 / same - 1 / other))
+        return np.where(both, np.maximum(ratio, -LENGTH_DOUBT), 0.0).sum(axis=-1)
+
+    def _become(self, row: int, person: int) -> None:
+        """Recognise the body in a row as a person out of sight."""
+        self._id[row] = self._id[person]
+        total = np.maximum(self._lengths_s[row] + self._lengths_s[person], _LEAST_STEP_S)
+        self._lengths[row] += self._lengths_s[person] / total * (self._lengths[person] - self._lengths[row])
+        self._lengths_s[row] += self._lengths_s[person]
+        self._forget(np.arange(self._rows) == person)
+
+    def _forget(self, rows: Bools) -> None:
+        if rows.any():
+            self._filter.forget(rows)
+            self._id[rows] = _FREE
+            self._pose[rows] = np.nan
+            self._lengths[rows] = self._lengths_s[rows] = 0.0
+
+
+_LEAST_STEP_S = 1e-3
+
+_ENDS = np.array([[[J[end] for end in bone] for bone in (sides[0], sides[-1])] for sides in _BONES])
+"""(B, 2, 2) the joints at both ends of each bone, on either side of the body."""
+_GENERIC_LENGTHS = np.array([0.415, 0.41, 0.275, 0.25, 0.36, 0.50])
+"""(B,) metres, those of the generic adult."""
+
+
+def _bone_lengths(bodies: Floats, confidence: Floats) -> Floats:
+    """(N, B) metres of bodies (N, 22, 3), the mean of both sides; NaN where neither was well seen."""
+    ends = np.where((confidence >= MIN_CONFIDENCE)[..., None], bodies, np.nan)[:, _ENDS]
+    lengths = np.linalg.norm(ends[..., 0, :] - ends[..., 1, :], axis=-1)
+    seen = np.isfinite(lengths) & (lengths < 2 * _GENERIC_LENGTHS[:, None])
+    sides = seen.sum(axis=-1)
+    return np.where(sides > 0, np.where(seen, lengths, 0.0).sum(axis=-1) / np.maximum(sides, 1), np.nan)
+
+
+def _middle(body: Floats) -> Floats:
+    """(3,) metres, the middle of a body's trunk, or of all of it (22, 3) where no joint of the trunk is seen."""
+    trunk = _median(body[_TRUNK])
+    return trunk if np.isfinite(trunk).all() else _median(body)
+
+
+def _median(points: Floats) -> Floats:
+    """(..., 3) median of points (..., K, 3) that are not NaN; NaN where all are."""
+    ordered = np.sort(points, axis=-2)  # NaN last
+    count = np.isfinite(ordered[..., 0]).sum(axis=-1)[..., None, None]
+    middle = [np.take_along_axis(ordered, np.maximum(place, 0), axis=-2) for place in ((count - 1) // 2, count // 2)]
+    return np.where(count[..., 0] > 0, 0.5 * (middle[0] + middle[1])[..., 0, :], np.nan)
+
+
+def _out_of_sight(last: Floats, coasting: Floats, sigma: Floats, unseen_s: Floats) -> tuple[Floats, Floats]:
+    """Where bodies (R, 3) are that were at ``last`` ``unseen_s`` ago and move on straight to ``coasting`` +- ``sigma``.
+
+    Returns:
+        (R, 3) metres, and the standard deviation along an axis (R,).
+    """
+    age = np.maximum(unseen_s / SPEED_MEMORY_S, 1e-6)
+    forgotten = 1.0 - np.exp(-age)
+    strayed = SPEED * SPEED_MEMORY_S * np.sqrt(2.0 * (age - forgotten))
+    return last + (forgotten / age)[:, None] * (coasting - last), np.minimum(sigma, np.hypot(PLACE_SIGMA, strayed))
+
+
+def _place_score(away: Floats, sigma: Floats) -> Floats:
+    """Log-likelihood ratio of bodies (..., 3) metres from where a person was expected being that person."""
+    horizontal, vertical = sigma**2 + PLACE_SIGMA**2, np.minimum(sigma, HEIGHT_SIGMA) ** 2 + PLACE_SIGMA**2
+    surprise = (away[..., :2] ** 2).sum(axis=-1) / horizontal + away[..., 2] ** 2 / vertical
+    score = -0.5 * (surprise + np.log((2 * np.pi) ** 3 * horizontal**2 * vertical)) - np.log(NEWCOMERS)
+    return np.where(np.isfinite(score), score, -np.inf)
+
+
+def _best(score: Floats) -> list[tuple[int, int]]:
+    """Pairs (row, column) of the assignment with the greatest sum of scores (R, C), none below 0."""
+    pairs = zip(*linear_sum_assignment(np.maximum(score, 0.0), maximize=True), strict=True)
+    return [(int(r), int(c)) for r, c in pairs if score[r, c] > 0]
