@@ -1,0 +1,347 @@
+"""Key points of a colour image, lifted to 3D by a depth image that is aligned to it.
+
+Depth from stereo is wrong where it matters: at the edge of a limb a pixel shows the wall behind, or something between
+the two. And a depth camera sees skin, a skeleton has joint centres. So the depth of a joint is
+
+1. that of the nearest surface in a small neighbourhood on which enough pixels agree,
+2. within the reach of the bone that leads to it, from the trunk outwards, so that neither the wall nor what passes in
+   front of the body takes a joint,
+3. moved along the ray from the skin to the joint's centre.
+
+The root is anchored at the middle of the hips, where the trunk fills the neighbourhood. How far the hips lie behind
+the skin depends on how far the trunk is turned, and a trunk seen from the side hides one hip: that one's place then
+follows from the width of the hips, and from which arm and leg are nearer. Any other joint of which the depth is absent,
+at odds with the body, or another joint's is unobserved: NaN.
+
+Key points are those of COCO-17 (`prior.skeletons.COCO17`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from prior.skeletons import COCO17
+
+Floats = NDArray[np.float64]
+
+LEAST_CONFIDENCE = 0.3
+"""of a key point; below it a detector guesses"""
+
+_K = {name: index for index, name in enumerate(COCO17.joints)}
+_JOINTS = len(COCO17.joints)
+_SHOULDERS = (_K["left_shoulder"], _K["right_shoulder"])
+_HIPS = (_K["left_hip"], _K["right_hip"])
+_TRUNK = (*_SHOULDERS, *_HIPS)
+_HEAD = tuple(_K[name] for name in ("nose", "left_eye", "right_eye", "left_ear", "right_ear"))
+
+# Metres from the skin that a camera sees to the joint's centre: half the limb's thickness. Nose and eyes lie on the
+# skin, ears beside the middle of the head.
+_THICKNESS = {"ear": 0.05, "shoulder": 0.07, "elbow": 0.045, "wrist": 0.04, "hip": 0.12, "knee": 0.065, "ankle": 0.055}
+_TO_CENTRE = np.array([_THICKNESS.get(name.split("_")[-1], 0.0) for name in COCO17.joints])
+
+# The trunk at the hips, cut level: an ellipse of these half axes in metres.
+_HALF_DEPTH, _HALF_BREADTH = 0.12, 0.18
+# Hips and shoulders, joint to joint, for a trunk (middle of the shoulders to middle of the hips) of length 1, and
+# the trunk's usual length in metres and those that are believed.
+_HIP_WIDTH, _SHOULDER_WIDTH = 0.35, 0.70
+_TRUNK_LENGTH, _TRUNK_LENGTHS = 0.51, (0.42, 0.60)
+_TURNED = np.cos(np.radians(50))
+"""beyond 50 degrees the far hip is hidden, and its depth cannot be read"""
+_HIP_SLACK = 0.03
+"""metres by which a hip's depth may be at odds with the width of the hips"""
+_SEEN_WIDTH = 0.65
+"""of the shoulders' width: nearer to each other, one of them is hidden"""
+_TURN_EVIDENCE = 0.10
+"""metres by which one side's arm and leg are nearer, when there is no doubt which side that is"""
+_CONFIDENCE_EVIDENCE = 0.05
+"""by which a detector is less sure of the far side's arm and leg"""
+
+_TRUNK_REACH, _HEAD_REACH = 0.40, 0.50
+"""metres: from the trunk's depth to a shoulder or a hip; from the middle of the shoulders to the face"""
+_ARM, _LEG = (0.45, 0.40), (0.60, 0.60)
+"""metres: the longest bones that are believed"""
+_LIMBS = [
+    ([_K[f"{side}_{joint}"] for joint in joints], lengths)
+    for side in ("left", "right")
+    for joints, lengths in ((("shoulder", "elbow", "wrist"), _ARM), (("hip", "knee", "ankle"), _LEG))
+]
+_LIMB_ENDS = [[_K[f"{side}_{joint}"] for joint in ("elbow", "wrist", "knee", "ankle")] for side in ("left", "right")]
+_APART = {"ear": 0.08, "elbow": 0.06, "wrist": 0.06, "knee": 0.06, "ankle": 0.05}
+"""metres: a left and a right joint nearer to each other are one that was seen twice"""
+
+# The neighbourhood of a key point: a disc of this radius in metres at the body, and how it is sampled.
+_RADIUS = 0.03
+_LEAST_PIXELS, _MOST_PIXELS = 2.0, 16.0
+_GRID = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), axis=-1).reshape(-1, 2)
+_DISC = _GRID[np.hypot(*_GRID.T) <= 1.0]
+_ALONG = np.linspace(0.1, 0.9, 9)
+"""where lines between joints are sampled"""
+# What counts as one surface: depths that differ by this much; the noise of stereo grows with the distance's square.
+_BAND, _BAND_GROWTH = 0.04, 0.005
+_SHARE = 0.25
+"""of its neighbourhood that a surface must fill"""
+_TRUNK_SHARE = 0.5
+"""the same at the hips, which a hand may hide in part"""
+_TRUNK_BAND = 0.25
+"""metres of depth over which a trunk's skin extends, leaning or turned"""
+
+
+def lift(
+    keypoints: Floats, confidence: Floats, depth: NDArray[Any], intrinsics: Floats
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Give the key points of the bodies in an image their depth.
+
+    Args:
+        keypoints: (B, 17, 2) pixels of the depth image, x right and y down; NaN where missing.
+        confidence: (B, 17) 0 to 1.
+        depth: (H, W) along the optical axis: metres if floating, millimetres if integer (REP 118); 0 or NaN is a hole.
+        intrinsics: (3, 3) of the image, which has no distortion.
+
+    Returns:
+        positions (B, 17, 3) metres in the optical frame (x right, y down, z forward), NaN where unobserved, and
+        confidence (B, 17), 0 where unobserved.
+
+    Raises:
+        ValueError: shapes that do not fit together.
+    """
+    keypoints, confidence = np.asarray(keypoints, np.float64), np.asarray(confidence, np.float64)
+    if keypoints.ndim != 3 or keypoints.shape[1:] != (_JOINTS, 2) or confidence.shape != keypoints.shape[:2]:
+        raise ValueError(
+            f"keypoints and confidence: expected shapes (B, {_JOINTS}, 2) and (B, {_JOINTS}), got {keypoints.shape} "
+            f"and {confidence.shape}"
+        )
+    if depth.ndim != 2 or np.shape(intrinsics) != (3, 3):
+        raise ValueError(
+            f"depth and intrinsics: expected shapes (H, W) and (3, 3), got {depth.shape} and {np.shape(intrinsics)}"
+        )
+    intrinsics = np.asarray(intrinsics, np.float64)
+    view = _View(depth, intrinsics, np.linalg.inv(intrinsics).astype(np.float64))
+    height, width = depth.shape
+    with np.errstate(invalid="ignore"):
+        x, y = keypoints[..., 0], keypoints[..., 1]
+        inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+        known = inside & (confidence >= LEAST_CONFIDENCE)
+    positions = np.full((*confidence.shape, 3), np.nan)
+    for body in range(len(keypoints)):
+        positions[body] = _lift_body(np.where(known[body, :, None], keypoints[body], np.nan), confidence[body], view)
+    seen = np.isfinite(positions).all(axis=-1)
+    return positions.astype(np.float32), np.where(seen, np.minimum(confidence, 1.0), 0.0).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class _View:
+    """A depth image and its camera."""
+
+    depth: NDArray[Any]
+    intrinsics: Floats
+    unprojection: Floats
+    """(3, 3) the inverse of the intrinsics"""
+
+    def sample(self, pixels: Floats) -> Floats:
+        """Metres of depth at the pixels (..., 2) nearest to these; NaN in holes, outside, and at NaN."""
+        height, width = self.depth.shape
+        nearest = np.rint(pixels)
+        x, y = nearest[..., 0], nearest[..., 1]
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        at = np.where(inside[..., None], nearest, 0).astype(np.intp)
+        metres = self.depth[at[..., 1], at[..., 0]].astype(np.float64)
+        if self.depth.dtype.kind in "iu":
+            metres /= 1000
+        return np.where(inside & (metres > 0) & (metres < np.inf), metres, np.nan)
+
+    def rays(self, pixels: Floats) -> Floats:
+        """(..., 3) unit vectors through pixels (..., 2), optical frame."""
+        rays = pixels @ self.unprojection[:, :2].T + self.unprojection[:, 2]
+        return rays / np.sqrt((rays * rays).sum(axis=-1, keepdims=True))
+
+
+def _lift_body(pixels: Floats, confidence: Floats, view: _View) -> Floats:
+    """(17, 3) metres from key points (17, 2), NaN where unobserved."""
+    positions = np.full((_JOINTS, 3), np.nan)
+    trunk = _trunk_depth(pixels, view)
+    if not np.isfinite(trunk):
+        return positions
+    rays = view.rays(pixels)
+    radius = np.clip(_RADIUS * view.intrinsics[0, 0] / trunk, _LEAST_PIXELS, _MOST_PIXELS)
+    samples = view.sample(pixels[:, None] + radius * _DISC)
+
+    for joint in _TRUNK:
+        skin = _surface(samples[joint], trunk - _TRUNK_REACH, trunk + _TRUNK_REACH)
+        positions[joint] = _behind(rays[joint], skin, _TO_CENTRE[joint])
+    chest = _mean(positions, _SHOULDERS)
+    hips = _Hips.find(pixels, positions, chest, trunk, radius, view)
+    if hips:
+        positions[list(_HIPS)] = hips.middle
+
+    def follow(joints: Sequence[int], lengths: Sequence[float], origin: Floats) -> None:
+        """Place the joints of a chain, each in reach of the last one seen."""
+        reach = 0.0
+        for joint, length in zip(joints, lengths, strict=True):
+            reach += length
+            skin = _surface(samples[joint], *_skin_in_reach(rays[joint], origin, reach, _TO_CENTRE[joint]))
+            if np.isfinite(skin):
+                positions[joint] = origin = _behind(rays[joint], skin, _TO_CENTRE[joint])
+                reach = 0.0
+
+    middle = _mean(positions, _TRUNK)
+    for joint in _HEAD:
+        follow([joint], [_HEAD_REACH], chest if np.isfinite(chest).all() else middle)
+    for (start, *joints), lengths in _LIMBS:
+        if np.isfinite(positions[start]).all():
+            follow(joints, lengths, positions[start])
+        else:
+            follow(joints, [lengths[0] + _TRUNK_REACH, *lengths[1:]], middle)
+    turn = _turn(positions, confidence)
+    if hips:
+        positions[list(_HIPS)] = hips.places(turn)
+    _drop_doubles(positions, confidence, turn, _SHOULDER_WIDTH * (hips.trunk if hips else _TRUNK_LENGTH))
+    return positions
+
+
+@dataclass(frozen=True)
+class _Hips:
+    """The root: the middle of the hips, from which both follow."""
+
+    middle: Floats
+    """(3,) metres"""
+    trunk: float
+    """metres, middle of the shoulders to middle of the hips"""
+    rays: Floats
+    """(2, 3) through the left and the right hip"""
+    beside: float
+    """metres from hip to hip across the line of sight"""
+    measured: float
+    """metres by which the left hip's skin is farther; NaN where either is not seen"""
+
+    @classmethod
+    def find(
+        cls, pixels: Floats, positions: Floats, chest: Floats, trunk: float, radius: float, view: _View
+    ) -> _Hips | None:
+        """From key points (17, 2) and what is known of the hips' skin and the chest (3,)."""
+        both = pixels[list(_HIPS)]
+        centre = both.mean(axis=0)
+        samples = view.sample((both[0] + _ALONG[::2, None] * (both[1] - both[0]))[:, None] + radius * _DISC[::2])
+        skin = _surface(samples, trunk - _TRUNK_REACH, trunk + _TRUNK_REACH, share=_TRUNK_SHARE)
+        if not np.isfinite(skin):
+            return None
+        rays = view.rays(both)
+        flat = rays * (skin / rays[:, 2:])
+        beside = float(np.linalg.norm(flat[0] - flat[1]))
+        ray = view.rays(centre)
+        length = np.linalg.norm(chest - _behind(ray, skin, _HALF_DEPTH))
+        length = float(np.clip(length, *_TRUNK_LENGTHS)) if np.isfinite(length) else _TRUNK_LENGTH
+        # an ellipse's radius along the line of sight
+        cosine = min(beside / (_HIP_WIDTH * length), 1.0)
+        sine = np.sqrt(1 - cosine**2)
+        thickness = _HALF_DEPTH * _HALF_BREADTH / np.hypot(_HALF_BREADTH * cosine, _HALF_DEPTH * sine)
+        left, right = positions[list(_HIPS), 2]
+        return cls(_behind(ray, skin, float(thickness)), length, rays, beside, float(left - right))
+
+    def places(self, turn: float) -> Floats:
+        """(2, 3) metres: both hips, on their rays. ``turn`` as from `_turn`."""
+        width = _HIP_WIDTH * self.trunk
+        apart = np.sqrt(max(width**2 - self.beside**2, 0.0))
+        if self.beside >= _TURNED * width and np.isfinite(self.measured):
+            farther = float(np.clip(self.measured, -apart - _HIP_SLACK, apart + _HIP_SLACK))
+        else:
+            farther = turn * apart
+        depths = self.middle[2] + np.array([farther, -farther]) / 2
+        return self.rays * (depths / self.rays[:, 2])[:, None]
+
+
+def _trunk_depth(pixels: Floats, view: _View) -> float:
+    """Metres to the trunk's skin: the surface that fills most of the lines between shoulders and hips.
+
+    Where fewer than two of them are known, the key points that are stand for the trunk.
+    """
+    known = [joint for joint in _TRUNK if np.isfinite(pixels[joint]).all()]
+    ends = list(combinations(known, 2)) or [(joint, joint) for joint in range(_JOINTS)]
+    first, second = pixels[[a for a, _ in ends]], pixels[[b for _, b in ends]]
+    samples = view.sample(first[:, None] + _ALONG[:, None] * (second - first)[:, None])
+    samples = np.sort(samples[np.isfinite(samples)])
+    if not len(samples):
+        return np.nan
+    last = np.searchsorted(samples, samples + _TRUNK_BAND, side="right")
+    start = int(np.argmax(last - np.arange(len(samples))))
+    return float(samples[(start + last[start]) // 2])
+
+
+def _surface(samples: Floats, low: float, high: float, share: float = _SHARE) -> float:
+    """Depth of the nearest surface from ``low`` to ``high`` that fills a share of samples (S,), or NaN."""
+    return _nearest_surface(samples.ravel(), low, high, max(share * samples.size, 3.0))
+
+
+@njit(cache=True)
+def _nearest_surface(samples: Floats, low: float, high: float, least: float) -> float:
+    depths = np.sort(samples[(samples >= low) & (samples <= high)])
+    if len(depths) < least:
+        return np.nan
+    band = _BAND + _BAND_GROWTH * depths[0] ** 2
+    best, best_count, until = 0, 0, np.inf
+    last = 0
+    for first in range(len(depths)):
+        if depths[first] > until:
+            break
+        while last < len(depths) and depths[last] <= depths[first] + band:
+            last += 1
+        if last - first >= least and until == np.inf:
+            # pixels that mix two depths lie in front of a surface: its place is where most agree
+            until = depths[first] + band
+        if until < np.inf and last - first > best_count:
+            best, best_count = first, last - first
+    return depths[best + best_count // 2] if best_count else np.nan
+
+
+def _skin_in_reach(ray: Floats, origin: Floats, reach: float, to_centre: float) -> tuple[float, float]:
+    """Depths between which a joint's skin lies if the joint is on ``ray`` (3,) and in reach of ``origin`` (3,)."""
+    along = float(ray @ origin)
+    beside = float(origin @ origin) - along**2
+    if not beside <= reach**2:
+        return np.inf, -np.inf  # the ray passes out of reach
+    half = math.sqrt(reach**2 - beside)
+    return (along - half - to_centre) * float(ray[2]), (along + half - to_centre) * float(ray[2])
+
+
+def _behind(ray: Floats, skin: float, to_centre: float) -> Floats:
+    """(3,) the point on a ray (3,) that lies ``to_centre`` metres behind the skin at this depth."""
+    return ray * (skin / ray[2] + to_centre)
+
+
+def _turn(positions: Floats, confidence: Floats) -> float:
+    """Which side of a body seen from the side is farther: 1 the left, -1 the right, 0 unknown, between if unsure.
+
+    By the depth of its arms and legs; where these hide each other, by the detector, which is surer of what it sees.
+    """
+    left, right = positions[_LIMB_ENDS[0]], positions[_LIMB_ENDS[1]]
+    distinct = np.linalg.norm(left - right, axis=-1) > max(_APART.values())
+    if distinct.any():
+        evidence = float((left - right)[distinct, 2].mean())
+        if abs(evidence) > _TURN_EVIDENCE / 3:
+            return float(np.clip(evidence / _TURN_EVIDENCE, -1, 1))
+    doubt = float((confidence[_LIMB_ENDS[1]] - confidence[_LIMB_ENDS[0]]).mean())
+    return float(np.sign(doubt)) if abs(doubt) > _CONFIDENCE_EVIDENCE else 0.0
+
+
+def _drop_doubles(positions: Floats, confidence: Floats, turn: float, shoulder_width: float) -> None:
+    """Of a left and a right joint at one place, the hidden one goes: that of the far side, or the less sure one."""
+    apart = _APART | {"shoulder": _SEEN_WIDTH * shoulder_width}
+    for name, least in apart.items():
+        left, right = _K[f"left_{name}"], _K[f"right_{name}"]
+        if np.linalg.norm(positions[left] - positions[right]) < least:
+            left_goes = turn > 0 if abs(turn) > 0.5 else confidence[left] < confidence[right]
+            positions[left if left_goes else right] = np.nan
+
+
+def _mean(positions: Floats, joints: Sequence[int]) -> Floats:
+    """(3,) middle of those of the joints that are known; NaN if none is."""
+    chosen = positions[list(joints)]
+    known = np.isfinite(chosen).all(axis=-1)
+    return chosen[known].mean(axis=0) if known.any() else np.full(3, np.nan)

@@ -1,0 +1,156 @@
+"""What a stereo depth camera sees of simulated people: their flesh, the room behind it, and how stereo errs.
+
+Errors are made on disparity, as a stereo matcher makes them, and grow with the distance as disparity has it: noise
+that neighbours share, steps of a fraction of a pixel, edges that bleed (the matcher's window spans both sides), what
+only one of the two cameras sees, and holes where nothing could be matched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, grey_dilation, uniform_filter
+
+from prior.sim.body import CAPSULES, REST_HEIGHT, stature
+from prior.skeletons import J
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Stereo:
+    """A depth camera and its errors.
+
+    Attributes:
+        width, height: pixels of the depth image.
+        focal: pixels.
+        baseline: metres between the two cameras.
+        noise: pixels of disparity, standard deviation.
+        step: pixels of disparity, the least it can tell.
+        window: pixels that the matcher compares at once.
+        holes: share of the image in which nothing is matched.
+    """
+
+    width: int = 640
+    height: int = 400
+    focal: float = 455.0
+    baseline: float = 0.075
+    noise: float = 0.12
+    step: float = 1 / 8
+    window: int = 7
+    holes: float = 0.03
+
+    @property
+    def intrinsics(self) -> Floats:
+        """(3, 3), without distortion."""
+        centre = (self.width - 1) / 2, (self.height - 1) / 2
+        return np.array([[self.focal, 0.0, centre[0]], [0.0, self.focal, centre[1]], [0.0, 0.0, 1.0]])
+
+    def project(self, points: Floats) -> Floats:
+        """(..., 2) pixels of points (..., 3) in the optical frame."""
+        image = points @ self.intrinsics.T
+        return image[..., :2] / image[..., 2:]
+
+
+def room(camera: Stereo, height: float, pitch: float, wall: float) -> Floats:
+    """(H, W) metres of depth of an empty room.
+
+    Args:
+        camera: the camera.
+        height: metres of the camera above the floor.
+        pitch: radians by which it looks down.
+        wall: metres from the camera to the wall that it faces.
+    """
+    rays = _rays(camera)
+    ahead = np.array([0.0, -np.sin(pitch), np.cos(pitch)])  # level, optical frame
+    down = np.array([0.0, np.cos(pitch), np.sin(pitch)])
+    with np.errstate(divide="ignore"):
+        depths = [wall / (rays @ ahead), height / (rays @ down)]
+    return np.min([np.where(d > 0, d, np.inf) for d in depths], axis=0)
+
+
+def render(people: Sequence[tuple[Floats, Floats]], camera: Stereo, background: Floats) -> Floats:
+    """Depth of people in front of a background, without errors.
+
+    Args:
+        people: of each, joints (22, 3) metres in the optical frame, and bones (22, 3), which say how stout the limbs.
+        camera: the camera.
+        background: (H, W) metres.
+
+    Returns:
+        (H, W) metres along the optical axis.
+    """
+    depth = background.copy()
+    rays = _rays(camera)
+    for joints, offsets in people:
+        scale = stature(offsets) / REST_HEIGHT
+        for first, second, radius in CAPSULES:
+            ends = joints[[J[first], J[second]]]
+            start, end = ends
+            if ends[:, 2].min() < 0.2:
+                continue
+            reach = camera.focal * radius * scale / (ends[:, 2].min() - radius * scale) + 2
+            box = camera.project(ends)
+            x0, y0 = np.maximum(np.floor(box.min(axis=0) - reach), 0).astype(int)
+            x1, y1 = np.ceil(box.max(axis=0) + reach).astype(int)
+            part = np.s_[y0 : max(y1, 0), x0 : max(x1, 0)]
+            depth[part] = np.minimum(depth[part], _capsule(rays[part], start, end, radius * scale))
+    return depth
+
+
+def spoil(depth: Floats, camera: Stereo, rng: np.random.Generator) -> NDArray[np.uint16]:
+    """(H, W) millimetres as a stereo camera gives them, 0 where it has none, from depth (H, W) in metres."""
+    disparity = camera.focal * camera.baseline / depth
+    # the matcher's window takes the nearer side here, both sides there
+    fat = grey_dilation(disparity, size=(camera.window // 2 + 1,) * 2)
+    mixed = uniform_filter(disparity, size=camera.window // 2)
+    mood = _texture(depth.shape, 4.0, rng)
+    seen = np.where(mood > 0.3, fat, np.where(mood < -0.6, mixed, disparity))
+    seen += camera.noise * (0.8 * _texture(depth.shape, 2.0, rng) + 0.6 * rng.standard_normal(depth.shape))
+    seen = np.round(seen / camera.step) * camera.step
+    # seen by the left camera only: something to its right hides it from the right one
+    column = np.arange(camera.width) - disparity
+    ahead = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
+    hidden = np.zeros(depth.shape, bool)
+    hidden[:, :-1] = ahead[:, 1:] <= column[:, :-1]
+    unmatched = _texture(depth.shape, 3.0, rng)
+    hidden |= unmatched > np.quantile(unmatched, 1 - camera.holes)
+    with np.errstate(divide="ignore"):
+        metres = camera.focal * camera.baseline / seen
+    return np.where(hidden | (seen <= 0), 0, np.clip(1000 * metres, 0, 65535)).astype(np.uint16)
+
+
+def _rays(camera: Stereo) -> Floats:
+    """(H, W, 3) with z = 1."""
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return pixels @ np.linalg.inv(camera.intrinsics).T
+
+
+def _texture(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Floats:
+    """Noise of unit variance that pixels within about ``size`` share."""
+    noise = gaussian_filter(rng.standard_normal(shape), size, mode="wrap")
+    return noise / noise.std()
+
+
+def _capsule(rays: Floats, start: Floats, end: Floats, radius: float) -> Floats:
+    """Depth (...) at which rays (..., 3), from the origin and with z = 1, enter a capsule; infinite where they miss."""
+    axis = end - start
+    along, length = rays @ axis, axis @ axis
+    best = np.full(rays.shape[:-1], np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # the cylinder: what is left of ray and centre across the axis
+        a = (rays * rays).sum(-1) * length - along**2
+        b = length * (rays @ -start) - along * (axis @ -start)
+        c = length * (start @ start) - (axis @ -start) ** 2 - radius**2 * length
+        t = (-b - np.sqrt(b * b - a * c)) / a
+        share = (t * along - axis @ start) / length
+        best = np.where((share > 0) & (share < 1), t, best)
+        for centre in (start, end):
+            a, b = (rays * rays).sum(-1), rays @ centre
+            t = (b - np.sqrt(b * b - a * (centre @ centre - radius**2))) / a
+            best = np.where(np.isfinite(t), np.minimum(best, t), best)
+    return np.where(np.isfinite(best), best, np.inf)
