@@ -26,6 +26,11 @@ LISTENS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "pose_input": {},
     "prior": {"pose_input": (POSE_RAW, DIAGNOSTICS)},
     "trajectory": {"prior": (POSE_CLEAN,), "pose_input": (DIAGNOSTICS,)},
+    "ros2_bridge": {
+        "trajectory": (POSE_WORLD, DIAGNOSTICS),
+        "prior": (DIAGNOSTICS,),
+        "pose_input": (DIAGNOSTICS,),
+    },
     "recorder": {
         "pose_input": (POSE_RAW, POSE_TRUTH, DIAGNOSTICS),
         "prior": (POSE_CLEAN, DIAGNOSTICS),

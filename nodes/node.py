@@ -16,6 +16,7 @@ CLASSES = {
     "pose_input": "nodes.pose_input:PoseInputNode",
     "prior": "nodes.prior:PriorNode",
     "trajectory": "nodes.trajectory:TrajectoryNode",
+    "ros2_bridge": "nodes.ros2_bridge:Ros2BridgeNode",
     "recorder": "nodes.recorder:RecorderNode",
     "viewer": "nodes.viewer:ViewerNode",
 }
@@ -29,7 +30,7 @@ def node(
     """Run one node of a launch file until it is stopped, with SIGTERM or Ctrl-C.
 
     Args:
-        name: pose_input, prior, trajectory, recorder or viewer.
+        name: pose_input, prior, trajectory, ros2_bridge, recorder or viewer.
         launch: a launch file, or the name of one of the project's own.
         settings: any setting of the launch file, over what it says. May be given again.
     """

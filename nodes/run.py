@@ -88,6 +88,10 @@ def _check(launch: Launch) -> None:
         from nodes.viewer import require_rerun
 
         require_rerun()
+    if "ros2_bridge" in launch.nodes:
+        from nodes.ros2_bridge import require_ros2
+
+        require_ros2()
 
 
 class _Run:

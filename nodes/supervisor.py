@@ -19,7 +19,7 @@ STOP_S = 5.0
 """what a node gets to end by itself"""
 USAGE_ERROR = 2
 """exit status of a node that cannot do what its launch file says: it will not the next time either"""
-ORDER = ("pose_input", "prior", "trajectory", "viewer", "recorder")
+ORDER = ("pose_input", "prior", "trajectory", "ros2_bridge", "viewer", "recorder")
 """of stopping: with the stream, so that what is on its way arrives, and the recorder has it"""
 
 
