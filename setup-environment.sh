@@ -17,7 +17,7 @@ if [ ! -e "$stamp" ] || [ uv.lock -nt "$stamp" ] || [ pyproject.toml -nt "$stamp
         .uv/bin/python -m pip install --quiet --disable-pip-version-check "uv==$UV_VERSION"
     fi
     .uv/bin/uv sync --frozen --compile-bytecode --extra view --python "$python"
-    # numba compiles the pose solver once; else the first stream would wait for it
-    .venv/bin/python -c "import prior.pose_solver"
+    # numba compiles its loops once; else the first stream would wait for it
+    .venv/bin/python -c "import prior.pose_solver, prior.trajectory_filter"
     touch "$stamp"
 fi

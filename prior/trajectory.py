@@ -17,14 +17,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs.types import PoseClean, PoseWorld, WorldBody
+from msgs.types import CleanBody, PoseClean, PoseWorld, WorldBody
 from prior.checkpoint import load_weights
 from prior.ground import Ground
 from prior.kinematics import yaw_matrix
 from prior.settings import build_settings
 from prior.trajectory_filter import RootNoise
 from prior.trajectory_net import NewestFrame, TrajectoryConfig, TrajectoryNet
-from prior.trajectory_track import BodyTrack, Motion, Sighting, rotation
+from prior.trajectory_track import BodyTrack, Motion, Sighting, rotation, sightings
 
 Floats = NDArray[np.float64]
 
@@ -108,24 +108,27 @@ class TrajectoryPipeline:
         scene = self._scene(clean)
         if scene is None:
             return []
-        sightings: dict[int, Sighting] = {}
+        named: dict[int, CleanBody] = {}
         for body in clean.bodies:
-            if body.id in sightings:
+            if body.id in named:
                 self.counters["body id twice in a message"] += 1
-                continue
-            sighting = Sighting.of(body, turn, place)
-            if body.id in scene.tracks:
-                scene.tracks[body.id].advance(sighting, clean.stamp_ns)
+            else:
+                named[body.id] = body
+        followed: list[tuple[BodyTrack, Sighting]] = []
+        for sighting in sightings([*named.values()], turn, place):
+            track = scene.tracks.get(sighting.body.id)
+            if track is not None:
+                track.advance(sighting, clean.stamp_ns)
             elif sighting.root is not None:
-                scene.tracks[body.id] = BodyTrack(sighting, clean.stamp_ns, self._reader.context, self._noise)
+                track = BodyTrack(sighting, clean.stamp_ns, self._reader.context, self._noise)
+                scene.tracks[sighting.body.id] = track
             else:
                 self.counters["body without a root so far"] += 1
                 continue
-            sightings[body.id] = sighting
-        motions = self._reader.read([scene.tracks[i] for i in sightings])
+            followed.append((track, sighting))
+        motions = self._reader.read([track for track, _ in followed])
         s, bodies = self.settings, []
-        for (i, sighting), motion in zip(sightings.items(), motions, strict=True):
-            track = scene.tracks[i]
+        for (track, sighting), motion in zip(followed, motions, strict=True):
             track.fuse(sighting, motion, scene.ground, s.network, s.contacts)
             bodies.append(track.publish(sighting, motion.contacts, s.lost_sigma))
         return [_message(clean, scene.ground, bodies)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from msgs.types import CleanBody, JointState, Tracking, WorldBody
 from prior.ground import Ground
-from prior.kinematics import CONTACT_JOINTS, heading, yaw_matrix
+from prior.kinematics import CONTACT_JOINTS, yaw_matrix
 from prior.skeletons import PARENTS, REST_OFFSETS, J
 from prior.trajectory_filter import RootFilter, RootNoise
 from prior.trajectory_net import FRAME_S
@@ -68,6 +69,9 @@ AT_ONE_SPEED = 0.3
 LONGEST_GAP_S = 0.3
 """Seconds without a message over which the motion between is drawn straight, and feet may go on standing."""
 
+_LEAST_NORM = 1e-6
+"""Of a quaternion that is to mean a rotation."""
+
 _FOOT_CONTACTS = [CONTACT_JOINTS.index(joint) for joint in FEET]
 _PELVIS = [J[name] for name in ("pelvis", "left_hip", "right_hip")]
 _LEGS = [J[f"{side}_{part}"] for part in ("knee", "ankle", "foot") for side in ("left", "right")]
@@ -93,6 +97,8 @@ class Sighting:
         orientation: (4,) xyzw of the root in the world, or None if it is not a rotation.
         seen: (22,) whether the sensor saw the joint.
         sigma: (22,) metres, at least `LEAST_SIGMA`; infinite where the message has no number.
+        root: (3,) metres, world; None if unknown.
+        root_sigma: metres, the standard deviation of `root`; infinite if nothing was seen that tells where it is.
     """
 
     body: CleanBody
@@ -100,40 +106,53 @@ class Sighting:
     orientation: Floats | None
     seen: NDArray[np.bool_]
     sigma: Floats
-
-    @classmethod
-    def of(cls, body: CleanBody, sensor: Rotation, place: Floats) -> Sighting:
-        """``body`` as seen by a sensor with this orientation and place in the world."""
-        positions = body.positions.astype(np.float64) @ sensor.as_matrix().T + place
-        known = np.isfinite(positions).all(axis=1) & (body.state != JointState.UNKNOWN)
-        known &= ~(np.linalg.norm(positions - positions[0], axis=1) > REACH_M)
-        positions[~known] = np.nan
-        orientation = rotation(body.rotations[0])
-        sigma = np.where(body.sigma >= 0.0, body.sigma.astype(np.float64), math.inf)
-        return cls(
-            body=body,
-            positions=positions,
-            orientation=None if orientation is None else (sensor * orientation).as_quat(),
-            seen=known & ((body.state == JointState.SEEN) | (body.state == JointState.REFINED)),
-            sigma=np.maximum(sigma, LEAST_SIGMA),
-        )
-
-    @property
-    def root(self) -> Floats | None:
-        """(3,) metres, world; None if unknown."""
-        return None if np.isnan(self.positions[0, 0]) else self.positions[0]
-
-    @property
-    def root_sigma(self) -> float:
-        """Metres, the standard deviation of `root`; infinite if nothing was seen that tells where it is."""
-        if self.root is None or not self.seen.any():
-            return math.inf
-        return float(self.sigma[0]) if self.seen[_PELVIS].any() else math.hypot(self.sigma[0], HUNG_SIGMA)
+    root: Floats | None
+    root_sigma: float
 
     @property
     def root_seen(self) -> bool:
         """Whether the place of `root` rests on observation."""
         return math.isfinite(self.root_sigma)
+
+
+def sightings(bodies: Sequence[CleanBody], sensor: Rotation, place: Floats) -> list[Sighting]:
+    """What the bodies of a message are, as seen by a sensor with this orientation and place (3,) in the world."""
+    if not bodies:
+        return []
+    positions = np.array([body.positions for body in bodies], dtype=np.float64)
+    positions = np.where(np.isfinite(positions), positions, np.nan) @ sensor.as_matrix().T + place
+    state = np.array([body.state for body in bodies])
+    known = np.isfinite(positions).all(axis=-1) & (state != JointState.UNKNOWN)
+    known &= ~(np.linalg.norm(positions - positions[:, :1], axis=-1) > REACH_M)
+    positions[~known] = np.nan
+    seen = known & ((state == JointState.SEEN) | (state == JointState.REFINED))
+    sigma = np.array([body.sigma for body in bodies], dtype=np.float64)
+    sigma = np.maximum(np.where(sigma >= 0.0, sigma, math.inf), LEAST_SIGMA)
+    # A root of which no joint near is seen was hung by the prior from those that are.
+    root_sigma = np.where(seen[:, _PELVIS].any(axis=1), sigma[:, 0], np.hypot(sigma[:, 0], HUNG_SIGMA))
+    root_sigma = np.where(known[:, 0] & seen.any(axis=1), root_sigma, math.inf)
+    turned, turns = _orientations(np.array([body.rotations[0] for body in bodies], dtype=np.float64), sensor)
+    return [
+        Sighting(
+            body=body,
+            positions=positions[k],
+            orientation=turned[k] if turns[k] else None,
+            seen=seen[k],
+            sigma=sigma[k],
+            root=positions[k, 0] if known[k, 0] else None,
+            root_sigma=float(root_sigma[k]),
+        )
+        for k, body in enumerate(bodies)
+    ]
+
+
+def _orientations(quaternions: Floats, sensor: Rotation) -> tuple[Floats, NDArray[np.bool_]]:
+    """Quaternions (N, 4) of any length turned from the sensor's frame to the world, and which of them are rotations."""
+    with np.errstate(invalid="ignore"):
+        turns = np.linalg.norm(quaternions, axis=1) >= _LEAST_NORM
+        turns &= np.isfinite(quaternions).all(axis=1)
+    quaternions[~turns] = [0.0, 0.0, 0.0, 1.0]
+    return (sensor * Rotation.from_quat(quaternions)).as_quat(), turns
 
 
 @dataclass(frozen=True)
@@ -188,7 +207,7 @@ class BodyTrack:
     @property
     def yaw(self) -> float:
         """Radians, the newest heading."""
-        return float(heading(Rotation.from_quat(self._orientation).as_matrix()))
+        return _heading(self._orientation)
 
     def window(self) -> Floats:
         """(context, 22, 3) metres from the root, turned so that the body now faces +x: the network's input."""
@@ -310,6 +329,12 @@ class BodyTrack:
         )
 
 
+def _heading(orientation: Floats) -> float:
+    """`kinematics.heading` of a unit quaternion (4,) xyzw: where the body's left axis, R (0, 1, 0), says it looks."""
+    x, y, z, w = orientation.tolist()
+    return math.atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (x * x + z * z))
+
+
 def _split(sigma: Sigma) -> tuple[Sigma, Sigma]:
     """The standard deviations of the jitter and of the slow error that make up ``sigma``."""
     return JITTER_SHARE * sigma, math.sqrt(1.0 - JITTER_SHARE**2) * sigma
@@ -318,6 +343,6 @@ def _split(sigma: Sigma) -> tuple[Sigma, Sigma]:
 def rotation(quaternion: NDArray[np.floating]) -> Rotation | None:
     """The rotation of a quaternion (4,) xyzw of any length; None if it is none."""
     q = np.asarray(quaternion, dtype=np.float64)
-    if not np.isfinite(q).all() or np.linalg.norm(q) < 1e-6:
+    if not np.isfinite(q).all() or np.linalg.norm(q) < _LEAST_NORM:
         return None
     return Rotation.from_quat(q)
