@@ -91,15 +91,18 @@ class Bones:
             self._samples[slot, self._count[slot]] = positions[slot]
             self._count[slot] += 1
             self._wait[slot] = self._settings.every - 1
-            count = self._count[slot]
-            if count >= _RENEWAL * self._used[slot] or count == self._settings.samples:
-                self._used[slot] = count
-                noise = float(np.median(window.smoothed.sigma[slot, sure[slot]]))
-                self._target[slot] = estimate_bones(self._samples[slot, :count], self._bias_sigma, noise)
-                window.measured[slot] = count >= _ENOUGH_SAMPLES
-                if count == 1:
-                    window.offsets[slot] = self._target[slot]
-        known = self._count > 0
+        full = self._count == self._settings.samples
+        renew = (self._count >= _RENEWAL * self._used) | (full & (self._count > self._used))
+        # People who came together would all be due in the same frame: after the first estimate, one at a time.
+        stale = np.flatnonzero(renew & (self._count > 0) & window.present & enough)
+        for slot in [*stale[self._used[stale] == 0], *stale[self._used[stale] > 0][:1]]:
+            count = self._used[slot] = self._count[slot]
+            noise = float(np.median(window.smoothed.sigma[slot, sure[slot]]))
+            self._target[slot] = estimate_bones(self._samples[slot, :count], self._bias_sigma, noise)
+            window.measured[slot] = count >= _ENOUGH_SAMPLES
+            if count == 1:
+                window.offsets[slot] = self._target[slot]
+        known = self._used > 0
         window.offsets[known] += _APPROACH * (self._target[known] - window.offsets[known])
         return window
 
