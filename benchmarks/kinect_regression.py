@@ -7,7 +7,7 @@ scored joints of that smoother's answer: a ridge regression on one frame (66 inp
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +25,14 @@ from prior.window import FPS
 Floats = NDArray[np.float64]
 
 _FRAMES, _MOST_AHEAD = 24, 4
-_BATCH = 256
-_SCALE = 0.2  # metres
+_BATCH = 128
+_LEAST_SCALE = 0.01  # metres
+_INPUT_NOISE = 0.1  # standard deviations
+_SIDES = str.maketrans("LR", "RL")
+_OTHER_SIDE = [
+    KINECT22.joints.index(name[0].translate(_SIDES) + name[1:] if name[1].isupper() else name)
+    for name in KINECT22.joints
+]
 _CORNERS = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
 
 
@@ -92,13 +98,13 @@ def ridge(train: Sequence[Smoothed], truths: Sequence[Floats], penalty: float) -
 
 
 class TemporalConvolution(nn.Module):
-    """(B, 24, 66) poses to (B, 39), what is missing at one of them."""
+    """(B, 24, 66) standardised poses to (B, 39), what is missing at one of them, standardised."""
 
     def __init__(self) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Dropout(0.2), nn.Conv1d(66, 64, 8), nn.ReLU(), nn.Dropout(0.5),
-            nn.Conv1d(64, 64, 8), nn.ReLU(), nn.Dropout(0.5),
+            nn.Dropout(0.15), nn.Conv1d(66, 64, 8), nn.ReLU(), nn.Dropout(0.3),
+            nn.Conv1d(64, 64, 8), nn.ReLU(), nn.Dropout(0.3),
             nn.Conv1d(64, 39, 10),
         )  # fmt: skip
 
@@ -109,25 +115,45 @@ class TemporalConvolution(nn.Module):
 def temporal_convolution(
     train: Sequence[Smoothed],
     truths: Sequence[Floats],
+    mirror: Sequence[int],
     ahead: int,
     steps: int,
     seed: int,
-    track: Callable[[Iterable[int]], Iterable[int]] = lambda x: x,
 ) -> Callable[[Smoothed], Floats]:
-    """The same by a network; ``ahead`` frames of the window are later than the one that is answered."""
+    """The same by a network.
+
+    Six people are few: half of each batch is mirrored, and a window's joints all lie a little elsewhere.
+
+    Args:
+        train: clips.
+        truths: of them, (T, 13, 3).
+        mirror: for each of the 13 joints, which of them is the other side's.
+        ahead: frames of the window that are later than the one that is answered.
+        steps: of training.
+        seed: of weights and sampling.
+    """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
-    x = torch.cat([_windows(clip, ahead) for clip in train])
-    y = np.concatenate([clip.missing(truth) for clip, truth in zip(train, truths, strict=True)])
-    known = np.flatnonzero(np.isfinite(y).all(axis=1))
-    targets = torch.from_numpy(y).float()
-    mean = x[known].mean(dim=(0, 1))
+    windows = torch.cat([_windows(clip, ahead) for clip in train])
+    gaps = np.concatenate([clip.missing(truth) for clip, truth in zip(train, truths, strict=True)])
+    known = np.flatnonzero(np.isfinite(gaps).all(axis=1))
+    targets = torch.from_numpy(gaps).float()
+    # Both sides count, for standardised poses to be mirrored as poses are.
+    poses, errors = windows[known, -1 - ahead], targets[known]
+    poses, errors = torch.cat([poses, _mirrored(poses, _OTHER_SIDE)]), torch.cat([errors, _mirrored(errors, mirror)])
+    mean, scale = poses.mean(dim=0), poses.std(dim=0).clamp(min=_LEAST_SCALE)
+    error_mean, error_scale = errors.mean(dim=0), errors.std(dim=0)
     net = TemporalConvolution()
     optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
-    for _ in track(range(steps)):
+    for _ in range(steps):
         rows = torch.from_numpy(rng.choice(known, _BATCH))
-        loss = (net((x[rows] - mean) / _SCALE) - targets[rows]).square().mean()
+        x, y = windows[rows], targets[rows]
+        half = _BATCH // 2
+        x = torch.cat([_mirrored(x[:half], _OTHER_SIDE), x[half:]])
+        y = torch.cat([_mirrored(y[:half], mirror), y[half:]])
+        found = net((x - mean) / scale + _INPUT_NOISE * torch.randn(_BATCH, 1, x.shape[2]))
+        loss = (found * error_scale + error_mean - y).unflatten(1, (-1, 3)).norm(dim=-1).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -136,7 +162,8 @@ def temporal_convolution(
 
     @torch.inference_mode()
     def answer(clip: Smoothed) -> Floats:
-        return clip.corrected(net((_windows(clip, ahead) - mean) / _SCALE).double().numpy())
+        missing = net((_windows(clip, ahead) - mean) / scale) * error_scale + error_mean
+        return clip.corrected(missing.double().numpy())
 
     return answer
 
@@ -151,3 +178,9 @@ def _windows(clip: Smoothed, ahead: int) -> Tensor:
     x = torch.from_numpy(clip.inputs).float()
     before = x[:1].expand(_FRAMES - 1 - ahead, -1)
     return torch.cat([before, x, x[-1:].expand(ahead, -1)]).unfold(0, _FRAMES, 1).transpose(1, 2)
+
+
+def _mirrored(vectors: Tensor, other_side: Sequence[int]) -> Tensor:
+    """Vectors (..., 3 J) in the trunk's frame as a mirror across its xz plane shows them."""
+    joints = vectors.unflatten(-1, (-1, 3))[..., list(other_side), :]
+    return (joints * joints.new_tensor([1.0, -1.0, 1.0])).flatten(-2)

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 import roma
 import torch
 from torch import Tensor
 
 from prior.checkpoint import WEIGHTS, save_weights
+from prior.distributed import share
 from prior.hmvae import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
 from prior.kinematics import forward_kinematics
 from prior.motion_windows import MotionSet, mirror_offsets, mirror_rotations, remove_heading
@@ -122,12 +122,12 @@ def fit(
     def evaluate() -> dict[str, float]:
         return {**losses, **evaluate_hmvae(model, val)}
 
-    for step in run.steps(evaluate):
+    for _ in run.steps(evaluate):
         model.train()
-        rows = train.sample(batch, model.window, strides, np.random.default_rng((seed, step)))
+        rows = train.sample(share(batch), model.window, strides, run.random(seed))
         rotations, offsets = _augment(train.rotations[rows], train.offsets[rows[:, 0]])
         rotations, _ = remove_heading(rotations, model.window // 2 - 1)
-        local_weight = (step / iterations - GLOBAL_FIRST) / LOCAL_WARM_UP
+        local_weight = (run.step / iterations - GLOBAL_FIRST) / LOCAL_WARM_UP
         loss, terms = _loss(model, rotations, offsets, local_weight)
         losses.update(terms)
         optimiser.zero_grad()

@@ -39,7 +39,7 @@ from benchmarks.results import Table
 from benchmarks.tuning import Tuned, loss, search
 from prior.kinematics import rigid_alignment
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
-from prior.skeletons import KINECT22, J, to_canonical
+from prior.skeletons import JOINTS, KINECT22, MIRROR, J, to_canonical
 from prior.window import FPS
 
 Floats = NDArray[np.float64]
@@ -47,6 +47,7 @@ Floats = NDArray[np.float64]
 SIDED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 SCORED = ("head", *(f"{side}_{joint}" for joint in SIDED for side in ("left", "right")))
 """The 13 joints that are scored: those that both systems have and that are points of the body."""
+OTHER_SIDE = tuple(SCORED.index(JOINTS[MIRROR[J[name]]]) for name in SCORED)
 BONES = tuple(
     (SCORED.index(f"{side}_{a}"), SCORED.index(f"{side}_{b}"))
     for side in ("left", "right")
@@ -231,8 +232,9 @@ class Learners:
         answer = kinect_regression.temporal_convolution(
             self._lesson(delay, ahead),
             self._truths,
+            OTHER_SIDE,
             ahead,
-            steps=60 if self._bench.quick else 150,
+            steps=60 if self._bench.quick else 1000,
             seed=seed,
         )
 
