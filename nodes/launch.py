@@ -46,7 +46,14 @@ LISTENS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
 #: The publishers that carry poses; what a listener from outside the graph (echo, hz, viewer) connects to.
 POSE_NODES = ("pose_input", "prior", "trajectory")
 
-_PATHS = (("input", "recording"), ("recorder", "directory"), ("transport", "keys"), ("transport", "directory"))
+_PATHS = (
+    ("input", "recording"),
+    ("input", "oak", "archive"),
+    ("input", "webcam", "model"),
+    ("recorder", "directory"),
+    ("transport", "keys"),
+    ("transport", "directory"),
+)
 """settings that are paths: relative ones in a launch file start at that file"""
 
 
@@ -55,15 +62,44 @@ class LaunchError(ValueError):
 
 
 @dataclass(frozen=True)
+class OakSettings:
+    """``[input.oak]``: an OAK camera."""
+
+    device: str = ""
+    """its id or, of one on the network, its address; empty: the first that is found"""
+    model: str = ""
+    """pose network of Luxonis' model zoo, COCO-17 key points; empty: the YOLO pose that suits the camera"""
+    archive: str = ""
+    """a pose network in a file (NN archive, .tar.xz) instead of the zoo's; a relative path starts at the launch file"""
+    fps: float = 0.0
+    """frames a second; 0: what the camera's own network does"""
+    confidence: float = 0.5
+    """of a person, below which it is none"""
+
+
+SOURCES = ("recording", "oak", "webcam")
+
+
+@dataclass(frozen=True)
 class InputSettings:
     """``[input]``: where skeletons come from."""
 
+    source: str = "recording"
+    """recording, oak or webcam"""
     recording: str = ""
-    """rosbag2 directory or .npz to play; a relative path starts at the launch file"""
+    """rosbag2 directory, .npz or .csv to play; a relative path starts at the launch file"""
     rate: float = 1.0
     """times real time; 0 is as fast as the listeners take it"""
     loop: bool = False
     """start again at the end, with stamps that go on rising"""
+    oak: OakSettings = field(default_factory=OakSettings)
+
+    def __post_init__(self) -> None:
+        if self.source not in SOURCES:
+            raise LaunchError(
+                f"[input] source: expected {', '.join(SOURCES[:-1])} or {SOURCES[-1]}, got {self.source!r}"
+                f"{nearest(self.source, SOURCES)}"
+            )
 
 
 @dataclass(frozen=True)
@@ -174,8 +210,10 @@ class Launch:
             table = tomllib.loads(file.read_text(encoding="utf-8"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise LaunchError(f"{file} is not TOML: {error}") from error
-        for section, key in _PATHS:
-            values = table.get(section)
+        for *sections, key in _PATHS:
+            values = table
+            for section in sections:
+                values = values.get(section) if isinstance(values, dict) else None
             if isinstance(values, dict) and isinstance(text := values.get(key), str) and text:
                 values[key] = str(file.parent / Path(text).expanduser())
         for override in overrides:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Protocol
 
 from msgs.recording import RecordingError, RecordingReader
 from msgs.topics import POSE_RAW, POSE_TRUTH
 from msgs.types import Diagnostics, Message, PoseRaw
-from nodes.launch import Launch, LaunchError
+from nodes.launch import InputSettings, Launch, LaunchError
 from nodes.npz import NpzSource
 from nodes.runtime import TURN_S, Clock, Node, Timeline
 
@@ -28,6 +30,22 @@ class Source(Protocol):
     """what could not be read, by cause"""
 
     def __iter__(self) -> Iterator[tuple[str, Message]]: ...
+
+
+class LiveSource(ABC):
+    """A camera: skeletons when they come, stamped with the wall time of their capture."""
+
+    def __init__(self) -> None:
+        self.refused: Counter[str] = Counter()
+        """what went wrong, by cause"""
+
+    @abstractmethod
+    def frames(self) -> Generator[PoseRaw | None, None, None]:
+        """Skeletons without end; None where a moment passed without one, so that the node can look up."""
+
+    @abstractmethod
+    def status(self) -> dict[str, str]:
+        """What `diagnostics` should say of it; under ``camera``, what it is doing."""
 
 
 class RecordingSource:
@@ -76,6 +94,20 @@ def open_source(path: str | Path) -> RecordingSource | NpzSource:
     return NpzSource(path) if path.suffix == ".npz" else RecordingSource(path)
 
 
+def open_input(settings: InputSettings, clock: Clock) -> Source | LiveSource:
+    """What ``[input]`` names: a recording, or a camera, which is looked for when its frames are asked for.
+
+    Raises:
+        LaunchError, RecordingError, NpzError: a setting, or the recording, cannot be used.
+    """
+    if settings.source == "recording":
+        return open_source(settings.recording)
+    # these bring libraries that a replay does without
+    from nodes.oak import OakSource
+
+    return OakSource(settings.oak, clock)
+
+
 def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:
     """The messages, and after the last the mark that the stream ends there."""
     last: PoseRaw | None = None
@@ -92,12 +124,12 @@ class PoseInputNode(Node):
 
     name = "pose_input"
 
-    def __init__(self, launch: Launch, clock: Clock | None = None, source: Source | None = None) -> None:
+    def __init__(self, launch: Launch, clock: Clock | None = None, source: Source | LiveSource | None = None) -> None:
         super().__init__(launch, clock)
         settings = launch.input
         if settings.rate < 0:
             raise LaunchError(f"[input] rate: expected 0 (as fast as possible) or more, got {settings.rate:g}")
-        self._source = source or open_source(settings.recording)
+        self._source = source or open_input(settings, self.clock)
         self._rate = settings.rate
         self._loop = settings.loop
         self._last_ns: int | None = None
@@ -106,7 +138,26 @@ class PoseInputNode(Node):
         raise AssertionError("the input node listens to none")
 
     def work(self) -> None:
-        for topic, message in with_end(self._messages()):
+        if isinstance(self._source, LiveSource):
+            self._relay(self._source)
+        else:
+            self._play(self._source)
+
+    def _relay(self, source: LiveSource) -> None:
+        """Pass a camera's skeletons on as they come."""
+        with closing(source.frames()) as frames:
+            for frame in frames:
+                if self.stopping:
+                    return
+                if frame:
+                    if self.timeline is None:
+                        self.timeline = Timeline(frame.stamp_ns, frame.stamp_ns, 1.0)
+                        self.report()
+                    self.publish(POSE_RAW, frame)
+                self.report_if_due()
+
+    def _play(self, source: Source) -> None:
+        for topic, message in with_end(self._messages(source)):
             if message.stamp_ns != self._last_ns:
                 self._wait_for(message.stamp_ns)
             if self.stopping:
@@ -119,14 +170,15 @@ class PoseInputNode(Node):
 
     def status(self) -> dict[str, str]:
         refused = {f"refused.{cause}": str(n) for cause, n in self._source.refused.items() if n}
-        return refused | (self.timeline.values() if self.timeline else {})
+        camera = self._source.status() if isinstance(self._source, LiveSource) else {}
+        return camera | refused | (self.timeline.values() if self.timeline else {})
 
-    def _messages(self) -> Iterator[tuple[str, Message]]:
+    def _messages(self, source: Source) -> Iterator[tuple[str, Message]]:
         shift_ns = 0
         while True:
             newest_ns = 0
             first_ns: int | None = None
-            for topic, message in self._source:
+            for topic, message in source:
                 first_ns = message.stamp_ns if first_ns is None else first_ns
                 newest_ns = max(newest_ns, message.stamp_ns)
                 yield topic, dataclasses.replace(message, stamp_ns=message.stamp_ns + shift_ns) if shift_ns else message

@@ -19,7 +19,7 @@ from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from msgs.transport import Subscriber
 from msgs.types import Diagnostics, Level
 from nodes.launch import LISTENS, Launch, LaunchError
-from nodes.pose_input import open_source
+from nodes.pose_input import open_input
 from nodes.runtime import Clock, SystemClock
 from nodes.supervisor import Supervisor
 
@@ -56,7 +56,7 @@ def run(
     """
     overrides = list(settings)
     if input is not None:
-        overrides.append(f"input.recording={json.dumps(str(input.resolve()))}")
+        overrides += ['input.source="recording"', f"input.recording={json.dumps(str(input.resolve()))}"]
     if rate is not None:
         overrides.append(f"input.rate={rate}")
     if loop:
@@ -81,7 +81,7 @@ def run(
 def _check(launch: Launch) -> None:
     """Find here, before any process starts, what every one of them would stumble over."""
     if "pose_input" in launch.nodes:
-        open_source(launch.input.recording)
+        open_input(launch.input, SystemClock())
     if "recorder" in launch.nodes and Path(launch.recorder.directory).exists():
         raise LaunchError(f"{launch.recorder.directory} exists: expected a new directory to record to")
     if "viewer" in launch.nodes:

@@ -1,0 +1,310 @@
+"""OAK cameras (depthai 3): persons found on the camera, lifted to 3D on this machine.
+
+On the camera run colour, a pose network, stereo depth aligned to colour, and the IMU. What it sends is one object for
+the rest of the program (`Host`), made of nodes that run on this machine; tests feed the same nodes from a pipeline that
+has no camera.
+"""
+
+# without `from __future__ import annotations`: depthai reads those of `process` to know what an input takes
+import queue
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from datetime import timedelta
+from pathlib import Path
+
+import depthai as dai
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs.types import PoseRaw, RawBody
+from nodes.launch import LaunchError, OakSettings
+from nodes.pose_input import LiveSource
+from nodes.runtime import TURN_S, Clock
+from prior.level import Level
+from prior.lift import lift
+from prior.skeletons import COCO17
+
+Floats = NDArray[np.float64]
+
+FRAME_ID = "oak_rgb_camera_optical_frame"
+MODELS = {
+    "RVC2": ("luxonis/yolov8-nano-pose-estimation:coco-512x288", 12.0),
+    "RVC4": ("luxonis/yolov8-large-pose-estimation:coco-640x352", 30.0),
+}
+"""by platform: the pose network of Luxonis' model zoo that it runs, and the frames a second it does"""
+DEPTH_SIZE = (640, 400)
+IMU_HZ = 100
+MOST_BODIES = 8
+QUEUE = 4
+"""frames kept for the program when it is late; then the oldest goes"""
+PAUSES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
+"""before each try in a row to find the camera again; the last goes on"""
+SILENT_S = 5.0
+"""without a frame, after which a camera that claims to run is given up"""
+STARTUP_S = 30.0
+"""the same before its first frame"""
+
+
+def _nanoseconds(time: timedelta) -> int:
+    return time // timedelta(microseconds=1) * 1000
+
+
+class Skeletons(dai.node.HostNode):
+    """Detections with key points, and the depth image of the same moment, to skeletons.
+
+    Attributes:
+        found: skeletons not yet taken.
+        counts: frames that were dropped or refused, by cause.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: queue.Queue[PoseRaw] = queue.Queue()
+        self.counts: Counter[str] = Counter()
+        self._level = Level()
+        self._source = ""
+        self._epoch_ns = 0
+
+    def build(
+        self, detections: dai.Node.Output, depth: dai.Node.Output, level: Level, source: str, epoch_ns: int
+    ) -> "Skeletons":
+        """Link the node.
+
+        Args:
+            detections: of ``ImgDetections`` with key points.
+            depth: of ``ImgFrame``, millimetres, aligned to the image of the detections.
+            level: the camera's, which says its pose.
+            source: the camera's name, for the messages.
+            epoch_ns: wall time, nanoseconds since 1970, of zero on depthai's clock.
+        """
+        self.link_args(detections, depth)
+        self._level, self._source, self._epoch_ns = level, source, epoch_ns
+        return self
+
+    def process(self, detections: dai.ImgDetections, depth: dai.ImgFrame) -> None:
+        """Work on what was captured at one moment; what it cannot use it counts."""
+        try:
+            frame = self._lifted(detections, depth)
+        except Exception as error:  # whatever the camera sends, the next frame may be good
+            self.counts[f"frame: {type(error).__name__}"] += 1
+            return
+        while self.found.qsize() >= QUEUE:
+            self.found.get_nowait()
+            self.counts["late"] += 1
+        self.found.put(frame)
+
+    def _lifted(self, detections: dai.ImgDetections, depth: dai.ImgFrame) -> PoseRaw:
+        view = depth.getTransformation()
+        image = depth.getFrame()
+        height, width = image.shape
+        found = detections.transformTo(view).detections if detections.getTransformation() else detections.detections
+        found = sorted(found, key=lambda detection: -detection.confidence)
+        people = [p for p in (detection.getKeypoints() for detection in found) if len(p) == len(COCO17.joints)]
+        people = people[:MOST_BODIES]
+        points = np.array([[(k.imageCoordinates.x, k.imageCoordinates.y, k.confidence) for k in p] for p in people])
+        points = points.reshape(len(people), len(COCO17.joints), 3)
+        positions, confidence = lift(
+            points[..., :2] * (width, height), points[..., 2], image, np.array(view.getIntrinsicMatrix())
+        )
+        return PoseRaw(
+            stamp_ns=self._epoch_ns + _nanoseconds(detections.getTimestamp()),
+            frame_id=FRAME_ID,
+            source=self._source,
+            skeleton=COCO17.name,
+            sensor_pose=self._level.pose,
+            calibrated=False,
+            bodies=[RawBody(id, *body) for id, body in enumerate(zip(positions, confidence, strict=True))],
+        )
+
+
+class Gravity(dai.node.HostNode):
+    """Readings of the IMU, in the camera's frame, to its level."""
+
+    def build(self, readings: dai.Node.Output, level: Level, imu_to_camera: Floats) -> "Gravity":
+        """Link the node; ``imu_to_camera`` (3, 3) turns from the IMU's frame to the camera's optical one."""
+        self.link_args(readings)
+        self._level, self._turn = level, imu_to_camera
+        return self
+
+    def process(self, readings: dai.IMUData) -> None:
+        for packet in readings.packets:
+            felt = packet.acceleroMeter
+            stamp_ns = _nanoseconds(felt.getTimestamp())
+            self._level.update(self._turn @ np.array([felt.x, felt.y, felt.z]), stamp_ns)
+
+
+class Host:
+    """What runs on this machine for one camera: takes the outputs of its nodes and gives skeletons.
+
+    Args:
+        pipeline: that of the outputs, not yet started.
+        detections, depth: outputs as `Skeletons.build` takes them.
+        readings: of the IMU and the rotation (3, 3) from its frame to the camera's; None without one.
+        source: the camera's name.
+        clock: what stamps are told in.
+    """
+
+    def __init__(
+        self,
+        pipeline: dai.Pipeline,
+        detections: dai.Node.Output,
+        depth: dai.Node.Output,
+        readings: tuple[dai.Node.Output, Floats] | None,
+        source: str,
+        clock: Clock,
+    ) -> None:
+        self.source = source
+        self.level = Level()
+        self._pipeline = pipeline
+        self._clock = clock
+        epoch_ns = clock.now_ns() - _nanoseconds(dai.Clock.now())  # pyright: ignore[reportCallIssue] (static)
+        self._skeletons = pipeline.create(Skeletons).build(detections, depth, self.level, source, epoch_ns)
+        if readings:
+            pipeline.create(Gravity).build(readings[0], self.level, readings[1])
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Frames dropped or refused, by cause."""
+        return self._skeletons.counts
+
+    def frames(self) -> Generator[PoseRaw | None, None, None]:
+        """Skeletons as they come, None where none came for a while; ends when the camera does."""
+        heard_ns, patience_s = self._clock.now_ns(), STARTUP_S
+        while self._pipeline.isRunning():
+            try:
+                yield self._skeletons.found.get(timeout=TURN_S)
+                heard_ns, patience_s = self._clock.now_ns(), SILENT_S
+            except queue.Empty:
+                if self._clock.now_ns() - heard_ns > patience_s * 1e9:
+                    return
+                yield None
+
+
+Connect = Callable[[OakSettings, Clock], AbstractContextManager[Host]]
+
+
+@contextmanager
+def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
+    """Open the camera and run the whole pipeline on it.
+
+    Raises:
+        RuntimeError: there is no such camera, it cannot be opened, or the model cannot be had; depthai says which.
+    """
+    if not settings.device and not dai.Device.getAllAvailableDevices():
+        raise RuntimeError("no camera found; `steadypose doctor` says whether one is plugged in")
+    device = dai.Device(dai.DeviceInfo(settings.device)) if settings.device else dai.Device()
+    with device:
+        device.setMaxReconnectionAttempts(0)  # this program does that, and says so
+        platform = device.getPlatformAsString()
+        zoo, usual_fps = MODELS.get(platform, MODELS["RVC2"])
+        fps = settings.fps or usual_fps
+        with dai.Pipeline(device) as pipeline:
+            colour = pipeline.create(dai.node.Camera).build(dai.CameraBoardSocket.CAM_A, sensorFps=fps)
+            model = (
+                dai.NNArchive(Path(settings.archive))
+                if settings.archive
+                else dai.NNModelDescription(settings.model or zoo)
+            )
+            network = pipeline.create(dai.node.DetectionNetwork).build(colour, model, fps)
+            network.setConfidenceThreshold(settings.confidence)
+            depth = _aligned_depth(pipeline, colour, fps, platform)
+            imu = _imu(pipeline, device)
+            host = Host(pipeline, network.out, depth, imu, f"oak-{device.getDeviceId()}", clock)
+            pipeline.start()
+            yield host
+
+
+def _aligned_depth(pipeline: dai.Pipeline, colour: dai.node.Camera, fps: float, platform: str) -> dai.Node.Output:
+    """Stereo depth in the view of the colour camera, without distortion."""
+    stereo = pipeline.create(dai.node.StereoDepth).build(
+        autoCreateCameras=True, presetMode=dai.node.StereoDepth.PresetMode.DEFAULT, size=DEPTH_SIZE, fps=fps
+    )
+    stereo.setLeftRightCheck(True)
+    stereo.setSubpixel(True)
+    view = colour.requestOutput(DEPTH_SIZE, fps=fps, enableUndistortion=True)
+    if platform == "RVC4":  # has no alignment in its stereo block
+        align = pipeline.create(dai.node.ImageAlign)
+        stereo.depth.link(align.input)
+        view.link(align.inputAlignTo)
+        return align.outputAligned
+    view.link(stereo.inputAlignTo)
+    return stereo.depth
+
+
+def _imu(pipeline: dai.Pipeline, device: dai.Device) -> tuple[dai.Node.Output, Floats] | None:
+    """The accelerometer's readings and how it is mounted; None for a camera that lacks it, or was not calibrated."""
+    if device.getConnectedIMU() in ("", "NONE"):
+        return None
+    try:
+        turn = np.array(device.readCalibration().getImuToCameraExtrinsics(dai.CameraBoardSocket.CAM_A))[:3, :3]
+    except RuntimeError:
+        return None
+    imu = pipeline.create(dai.node.IMU)
+    imu.enableIMUSensor(dai.IMUSensor.ACCELEROMETER_RAW, IMU_HZ)
+    imu.setBatchReportThreshold(1)
+    imu.setMaxBatchReports(10)
+    return imu.out, turn
+
+
+class OakSource(LiveSource):
+    """The skeletons of an OAK camera; when it is unplugged, waits for it and goes on.
+
+    Raises:
+        LaunchError: a setting cannot be used.
+    """
+
+    def __init__(self, settings: OakSettings, clock: Clock, opener: Connect = connect) -> None:
+        super().__init__()
+        if settings.archive and not (settings.archive.endswith(".tar.xz") and Path(settings.archive).is_file()):
+            raise LaunchError(
+                f"[input.oak] archive: expected a file that is an NN archive (.tar.xz), got {settings.archive}; "
+                "Luxonis' hub has some, their modelconverter makes others"
+            )
+        if settings.fps < 0 or not 0 < settings.confidence < 1:
+            raise LaunchError(
+                "[input.oak] expected fps of 0 (as the camera can) or more and confidence between 0 and 1, got "
+                f"{settings.fps:g} and {settings.confidence:g}"
+            )
+        self._settings, self._clock, self._open = settings, clock, opener
+        self._state = "looking for a camera"
+        self._host: Host | None = None
+        self._connections = 0
+
+    def frames(self) -> Generator[PoseRaw | None, None, None]:
+        tries = 0
+        while True:
+            try:
+                with self._open(self._settings, self._clock) as self._host:
+                    self._connections += 1
+                    self._state = "waiting for the first frame"
+                    for frame in self._host.frames():
+                        if frame:
+                            self._state, tries = "streaming", 0
+                        yield frame
+                trouble = "camera lost"
+                self.refused[trouble] += 1
+            except RuntimeError as error:  # depthai has no other
+                trouble = str(error)
+            self._close()
+            pause_s = PAUSES_S[min(tries, len(PAUSES_S) - 1)]
+            tries += 1
+            self._state = f"waiting for a camera: {trouble}; next try in {pause_s:g} s"
+            again_ns = self._clock.now_ns() + round(pause_s * 1e9)
+            while self._clock.now_ns() < again_ns:
+                yield None
+                self._clock.sleep(round(TURN_S * 1e9))
+
+    def status(self) -> dict[str, str]:
+        values = {"camera": self._state, "camera.connections": str(self._connections)}
+        if self._host:
+            values["camera.name"] = self._host.source
+            values["camera.level"] = "measured" if self._host.level.measured else "taken for level"
+            values |= {f"dropped.camera {cause}": str(n) for cause, n in self._host.counts.items()}
+        return values
+
+    def _close(self) -> None:
+        """Keep what the last connection counted."""
+        if self._host:
+            self.refused.update({f"camera {cause}": n for cause, n in self._host.counts.items()})
+        self._host = None

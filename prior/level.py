@@ -1,0 +1,70 @@
+"""Which way is up: the pose of a camera's frame from what its accelerometer feels.
+
+Gravity gives two of the three angles. The third, where north is, nobody knows: a levelled camera looks along the
+world's +y, as `msgs.types.Pose.from_up` has it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from msgs.types import Pose
+
+Floats = NDArray[np.float64]
+
+GRAVITY = 9.81
+"""m/s²"""
+STILL = 0.7
+"""m/s²: a reading further from gravity is of a camera that is being moved"""
+MEMORY_S = 1.0
+"""over which readings are averaged"""
+TURNED = np.radians(1.0)
+"""the level is told anew when it has changed by so much: a world that shakes with the accelerometer is of no use"""
+
+
+def level_pose(up: Floats) -> Pose:
+    """The pose, at the origin, of an optical frame in which ``up`` (3,) points up; its z axis looks along +y.
+
+    Raises:
+        ValueError: ``up`` is no direction.
+    """
+    up = np.asarray(up, np.float64)
+    length = np.linalg.norm(up)
+    if up.shape != (3,) or not np.isfinite(length) or length == 0:
+        raise ValueError(f"up: expected a direction of shape (3,), got {up!r}")
+    up = up / length
+    # a camera that looks straight up or down has its image's top or bottom ahead
+    forward = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
+    forward = forward - (forward @ up) * up
+    forward /= np.linalg.norm(forward)
+    return Pose(np.zeros(3), Rotation.from_matrix(np.stack([np.cross(forward, up), forward, up])).as_quat())
+
+
+class Level:
+    """Which way is up, from an accelerometer's readings; a level camera until there are any.
+
+    Attributes:
+        pose: of the camera's frame in the world.
+        measured: whether it rests on readings.
+    """
+
+    def __init__(self) -> None:
+        self.pose = Pose.from_up("-y")
+        self.measured = False
+        self._felt = self._told = np.array([0.0, -1.0, 0.0])
+        self._last_ns = 0
+
+    def update(self, acceleration: Floats, stamp_ns: int) -> None:
+        """Take a reading: acceleration (3,) m/s² in the camera's frame, gravity included (9.81 up at rest)."""
+        strength = np.linalg.norm(acceleration)
+        if not abs(strength - GRAVITY) < STILL:
+            return
+        up = acceleration / strength
+        elapsed_s, self._last_ns = (stamp_ns - self._last_ns) / 1e9, stamp_ns
+        share = 1 - np.exp(-np.clip(elapsed_s, 0.0, MEMORY_S) / MEMORY_S) if self.measured else 1.0
+        self._felt = self._felt + share * (up - self._felt)
+        felt = self._felt / np.linalg.norm(self._felt)
+        if not self.measured or felt @ self._told < np.cos(TURNED):
+            self.pose, self._told, self.measured = level_pose(felt), felt, True
