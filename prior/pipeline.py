@@ -124,13 +124,8 @@ class PriorPipeline:
             if self._identify:
                 self._identify.reset()
             return [*self.flush(), ended]
-        skeleton = SKELETONS.get(raw.skeleton)
+        skeleton = self._skeleton(raw)
         if skeleton is None:
-            self.counters["unknown_skeleton"] += 1
-            return []
-        pose = raw.sensor_pose
-        if not (np.isfinite(pose.position).all() and abs(np.linalg.norm(pose.orientation) - 1) < UNIT_TOLERANCE):
-            self.counters["sensor_pose_invalid"] += 1
             return []
         flushed: list[PoseClean] = []
         if self._last is not None:
@@ -149,6 +144,18 @@ class PriorPipeline:
         for stamp_ns, tick_positions, tick_confidence in self._resampler.update(raw.stamp_ns, positions, confidence):
             cleaned += self._step(stamp_ns, tick_positions, tick_confidence, raw)
         return flushed + cleaned
+
+    def _skeleton(self, raw: PoseRaw) -> Skeleton | None:
+        """The skeleton of a message, or None if the message cannot be used."""
+        skeleton = SKELETONS.get(raw.skeleton)
+        if skeleton is None:
+            self.counters["unknown_skeleton"] += 1
+            return None
+        pose = raw.sensor_pose
+        if not (np.isfinite(pose.position).all() and abs(np.linalg.norm(pose.orientation) - 1) < UNIT_TOLERANCE):
+            self.counters["sensor_pose_invalid"] += 1
+            return None
+        return skeleton
 
     def flush(self) -> list[PoseClean]:
         """Give the frames that the delay still holds, and forget the stream."""

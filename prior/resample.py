@@ -20,10 +20,14 @@ class Resampler:
     Between two sightings of a joint positions are interpolated linearly and the lesser confidence holds. A grid
     time is given out as soon as a frame is no more than 10 ms older: a stream of 30 Hz whose stamps jitter by a
     few milliseconds then costs no extra frame of delay.
+
+    Args:
+        slots: bodies at most.
+        aligned: whether the grid lies at whole multiples of its period, rather than at the first frame.
     """
 
-    def __init__(self, slots: int) -> None:
-        self._slots = slots
+    def __init__(self, slots: int, *, aligned: bool = False) -> None:
+        self._slots, self._aligned = slots, aligned
         self.reset()
 
     def reset(self) -> None:
@@ -53,7 +57,8 @@ class Resampler:
             (stamp_ns, positions, confidence) of each grid time reached, oldest first.
         """
         if self._anchor is None:
-            self._anchor = stamp_ns
+            first = -(-(stamp_ns - LOOK_AHEAD_NS) // PERIOD_NS) * PERIOD_NS  # rounded up
+            self._anchor = first if self._aligned else stamp_ns
         seen = np.isfinite(positions[..., 0])
         # Row 1 is each joint's last sighting, row 0 the one before.
         for store, value in (
