@@ -109,7 +109,11 @@ class StreamBatch(PriorPipeline):
 
     def flush(self) -> list[PoseClean]:
         """Give the frames that the delay still holds, and forget all streams."""
-        cleaned = [part for joint in super().flush() for part in self._split(joint)]
+        ids = {name: stream.ids for name, stream in self._streams.items()}
+        held = super().flush()
+        for name, stream in self._streams.items():
+            stream.ids = ids[name]  # bodies are gone, and still in what was held
+        cleaned = [part for joint in held for part in self._split(joint)]
         for name, stream in list(self._streams.items()):
             if stream.last.end_of_stream:
                 cleaned.append(self._end(stream))
