@@ -28,7 +28,7 @@ from nodes.cleaning import clean_recording
 from nodes.launch import LaunchError
 
 MANIFEST = "manifest.jsonl"
-FILES = (".npz",)
+FILES = (".npz", ".csv")
 """endings of files of poses that are cleaned into an .npz each"""
 
 Settings = Mapping[str, Mapping[str, Any]]

@@ -13,6 +13,7 @@ from typing import Protocol
 from msgs.recording import RecordingError, RecordingReader
 from msgs.topics import POSE_RAW, POSE_TRUTH
 from msgs.types import Diagnostics, Message, PoseRaw
+from nodes.csv_poses import CsvSource
 from nodes.launch import InputSettings, Launch, LaunchError
 from nodes.npz import NpzSource
 from nodes.runtime import TURN_S, Clock, Node, Timeline
@@ -79,26 +80,26 @@ class RecordingSource:
             self.refused.update({f"undecodable {topic}": n for topic, n in recording.refused.items()})
 
 
-def open_source(path: str | Path) -> RecordingSource | NpzSource:
-    """The recording at ``path``: a rosbag2 directory, an ``.mcap``, or an ``.npz``.
+def open_source(path: str | Path) -> RecordingSource | NpzSource | CsvSource:
+    """The recording at ``path``: a rosbag2 directory, an ``.mcap``, an ``.npz`` or a ``.csv``.
 
     Raises:
         LaunchError: there is nothing at the path.
-        RecordingError, NpzError: what is there holds no skeletons. All are ValueErrors that say what to do.
+        RecordingError, NpzError, CsvError: what is there holds no skeletons. All are ValueErrors that say what to do.
     """
     if not str(path):
-        raise LaunchError("[input] recording: expected a recording or .npz to play, got none; give --input")
+        raise LaunchError("[input] recording: expected a recording, .npz or .csv to play, got none; give --input")
     path = Path(path)
     if not path.exists():
-        raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap or an .npz")
-    return NpzSource(path) if path.suffix == ".npz" else RecordingSource(path)
+        raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, an .npz or a .csv")
+    return {".npz": NpzSource, ".csv": CsvSource}.get(path.suffix, RecordingSource)(path)
 
 
 def open_input(settings: InputSettings, clock: Clock) -> Source | LiveSource:
     """What ``[input]`` names: a recording, or a camera, which is looked for when its frames are asked for.
 
     Raises:
-        LaunchError, RecordingError, NpzError: a setting, or the recording, cannot be used.
+        LaunchError, RecordingError, NpzError, CsvError: a setting, or the recording, cannot be used.
     """
     if settings.source == "recording":
         return open_source(settings.recording)

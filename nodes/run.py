@@ -47,7 +47,7 @@ def run(
 
     Args:
         launch: a launch file, or the name of one of the project's own: replay, server.
-        input: the recording or .npz to play in place of the launch file's.
+        input: the recording, .npz or .csv to play in place of the launch file's.
         rate: times real time; 0 is as fast as it goes.
         loop: play it again and again.
         record: a recording to make of all topics.

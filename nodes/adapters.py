@@ -1,0 +1,173 @@
+"""What other trackers give, as ``pose/raw``: ``from_...`` for each.
+
+Nothing of theirs is imported: an object with the right attributes will do. Each function says which axis of its frame
+points up; where the camera is calibrated, set ``sensor_pose`` and ``calibrated`` of the answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs.types import Pose, PoseRaw, RawBody
+from prior.skeletons import AZURE_KINECT32, BLAZEPOSE33, COCO17, ZED38, Skeleton, finite_joints
+
+Floats = NDArray[np.float64]
+
+ZED_BODY_38 = 2
+"""``body_format`` of ZED's ROS message for the skeleton of 38 key points"""
+AZURE_IDS = 100
+"""the driver's marker id is body · 100 + joint"""
+LEAST_POINTS = 6
+"""key points of an image by which a body can be placed"""
+
+
+def from_mediapipe(
+    result: Any, stamp_ns: int, image_size: tuple[int, int], intrinsics: Floats, source: str = "mediapipe"
+) -> PoseRaw:
+    """World landmarks of MediaPipe's pose landmarker.
+
+    They have the middle of the hips as their origin; the body is put where, seen by the camera, they fall on the
+    landmarks of the image.
+
+    Args:
+        result: ``PoseLandmarkerResult`` with ``pose_world_landmarks`` and ``pose_landmarks``.
+        stamp_ns: of capture, nanoseconds.
+        image_size: width and height in pixels.
+        intrinsics: (3, 3) of the camera. If it is not calibrated, a guess (`pinhole`) shifts the distance only.
+        source: the camera's name.
+
+    Returns:
+        bodies in the camera's optical frame (x right, y down, z forward), of a camera taken for level.
+    """
+    bodies = []
+    for number, (world, image) in enumerate(zip(result.pose_world_landmarks, result.pose_landmarks, strict=True)):
+        joints = _table(BLAZEPOSE33, [(p.x, p.y, p.z) for p in world], "pose_world_landmarks")
+        pixels = np.array([(p.x, p.y) for p in image], np.float64) * image_size
+        confidence = np.array([p.visibility for p in world], np.float64)
+        place = _placed(joints, pixels, confidence, np.asarray(intrinsics, np.float64))
+        bodies.append(RawBody(number, joints + place, np.clip(confidence, 0.0, 1.0)))
+    return _message(stamp_ns, "camera_optical_frame", source, BLAZEPOSE33, "-y", bodies)
+
+
+def from_zed(message: Any, source: str = "zed") -> PoseRaw:
+    """``ObjectsStamped`` of the ZED ROS 2 wrapper (``body_trk/skeletons``), in its frame, of which z points up.
+
+    Args:
+        message: with skeletons of 38 key points; set ``body_format: BODY_38`` in the wrapper's configuration.
+        source: the camera's name.
+
+    Raises:
+        ValueError: skeletons of another format.
+    """
+    bodies = []
+    for person in message.objects:
+        if not person.skeleton_available:
+            continue
+        if person.body_format != ZED_BODY_38:
+            raise ValueError(
+                f"ZED body_format: expected {ZED_BODY_38} (38 key points), got {person.body_format}; set "
+                "body_tracking.body_format to BODY_38"
+            )
+        points = [point.kp for point in person.skeleton_3d.keypoints][: len(ZED38.joints)]
+        joints = _table(ZED38, points, "skeleton_3d.keypoints")
+        # one number a body, 1 to 99
+        confidence = finite_joints(joints) * np.clip(person.confidence / 100, 0.0, 1.0)
+        bodies.append(RawBody(person.label_id, joints, confidence))
+    return _message(_stamp_ns(message.header), message.header.frame_id, source, ZED38, "z", bodies)
+
+
+def from_azure_kinect(markers: Any, source: str = "azure_kinect") -> PoseRaw | None:
+    """``MarkerArray`` of the Azure Kinect ROS driver (``body_tracking_data``), in the depth camera's optical frame.
+
+    Returns:
+        None for an array without markers, which has no stamp either: nobody is there.
+    """
+    found: dict[int, Floats] = {}
+    for marker in markers.markers:
+        body, joint = divmod(marker.id, AZURE_IDS)
+        if joint >= len(AZURE_KINECT32.joints):
+            raise ValueError(f"Azure Kinect marker id: expected body * 100 + joint, got {marker.id}")
+        at = marker.pose.position
+        found.setdefault(body, np.full((len(AZURE_KINECT32.joints), 3), np.nan))[joint] = at.x, at.y, at.z
+    if not found:
+        return None
+    bodies = [RawBody(id, joints, finite_joints(joints)) for id, joints in found.items()]
+    header = markers.markers[0].header
+    return _message(_stamp_ns(header), header.frame_id, source, AZURE_KINECT32, "-y", bodies)
+
+
+def from_coco(
+    detections: Sequence[Mapping[str, Any]],
+    depth: NDArray[Any],
+    intrinsics: Floats,
+    stamp_ns: int,
+    source: str = "coco",
+) -> PoseRaw:
+    """Key points in COCO's format and a depth image of the same moment.
+
+    Args:
+        detections: each with ``keypoints``, 17 times x, y in pixels of the depth image and a confidence from 0 to 1.
+        depth: (H, W) metres if floating, millimetres if integer, aligned to the image of the key points.
+        intrinsics: (3, 3) of that image, which has no distortion.
+        stamp_ns: of capture, nanoseconds.
+        source: the camera's name.
+
+    Returns:
+        bodies in the camera's optical frame, of a camera taken for level.
+    """
+    from prior.lift import lift  # compiles: not for those who have no depth image
+
+    joints = len(COCO17.joints)
+    points = np.array([detection["keypoints"] for detection in detections], np.float64)
+    if points.size != len(detections) * joints * 3:
+        raise ValueError(f"keypoints: expected {joints} times x, y, confidence, got an array of shape {points.shape}")
+    points = points.reshape(len(detections), joints, 3)
+    lifted = zip(*lift(points[..., :2], points[..., 2], depth, intrinsics), strict=True)
+    bodies = [RawBody(number, *body) for number, body in enumerate(lifted)]
+    return _message(stamp_ns, "camera_optical_frame", source, COCO17, "-y", bodies)
+
+
+def pinhole(image_size: tuple[int, int], field_of_view: float) -> Floats:
+    """(3, 3) intrinsics of a camera of which only the horizontal field of view, in radians, is known."""
+    width, height = image_size
+    focal = width / 2 / math.tan(field_of_view / 2)
+    return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+
+
+def _placed(joints: Floats, pixels: Floats, confidence: Floats, intrinsics: Floats) -> Floats:
+    """(3,) where joints (J, 3) have to be moved to so that they fall on pixels (J, 2): linear least squares.
+
+    A joint at p + t is seen at (u, v, 1) · depth: x + tx = u (z + tz), y + ty = v (z + tz). Zeros if it cannot be told.
+    """
+    seen = (confidence > 0.5) & finite_joints(joints) & finite_joints(pixels)
+    if seen.sum() < LEAST_POINTS:
+        return np.zeros(3)
+    rays = np.concatenate([pixels[seen], np.ones((int(seen.sum()), 1))], axis=1) @ np.linalg.inv(intrinsics).T
+    x, y, z = joints[seen].T
+    u, v = rays[:, 0], rays[:, 1]
+    one, none = np.ones_like(u), np.zeros_like(u)
+    equations = np.concatenate([np.stack([one, none, -u], axis=1), np.stack([none, one, -v], axis=1)])
+    place, *_ = np.linalg.lstsq(equations, np.concatenate([u * z - x, v * z - y]), rcond=None)
+    return np.asarray(place, np.float64) if place[2] > 0 else np.zeros(3)
+
+
+def _table(skeleton: Skeleton, points: Sequence[Any], name: str) -> Floats:
+    """(J, 3) of as many points as the skeleton has joints."""
+    table = np.array(points, np.float64)
+    if table.shape != (len(skeleton.joints), 3):
+        raise ValueError(f"{name}: expected {len(skeleton.joints)} points of 3 numbers, got shape {table.shape}")
+    return table
+
+
+def _message(stamp_ns: int, frame_id: str, source: str, skeleton: Skeleton, up: str, bodies: list[RawBody]) -> PoseRaw:
+    return PoseRaw(stamp_ns, frame_id, source, skeleton.name, Pose.from_up(up), False, bodies)
+
+
+def _stamp_ns(header: Any) -> int:
+    """Nanoseconds of a ROS 2 header."""
+    return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
