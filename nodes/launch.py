@@ -151,6 +151,14 @@ class TransportSettings:
 
 
 @dataclass(frozen=True)
+class ServerSettings:
+    """``[server]``: one prior for several kiosks, whose input nodes run elsewhere."""
+
+    kiosks: list[str] = field(default_factory=list)
+    """addresses of their input nodes (``tcp://192.168.1.21:7101``), listened to in place of an own one"""
+
+
+@dataclass(frozen=True)
 class RecorderSettings:
     """``[recorder]``: what is written, where."""
 
@@ -184,6 +192,7 @@ class Launch:
     prior: dict[str, Any] = field(default_factory=dict)
     trajectory: dict[str, Any] = field(default_factory=dict)
     transport: TransportSettings = field(default_factory=TransportSettings)
+    server: ServerSettings = field(default_factory=ServerSettings)
     recorder: RecorderSettings = field(default_factory=RecorderSettings)
     viewer: ViewerSettings = field(default_factory=ViewerSettings)
 
@@ -193,13 +202,17 @@ class Launch:
                 raise LaunchError(
                     f"nodes names {node!r}, which is no node{nearest(node, LISTENS)}; there are {', '.join(LISTENS)}"
                 )
+        if self.server.kiosks and "pose_input" in self.nodes:
+            raise LaunchError("[server] kiosks have their own pose_input: expected nodes without it, such as prior")
+        if self.server.kiosks and self.transport.lossless:
+            raise LaunchError("[server] kiosks do not wait: expected [transport] lossless = false")
 
     @classmethod
     def read(cls, path: str | Path, overrides: Iterable[str] = ()) -> Launch:
         """Read a launch file.
 
         Args:
-            path: a file, or the name of one of the project's own (``replay``, ``server``).
+            path: a file, or the name of one of the project's own (``replay``, ``oak``).
             overrides: ``section.key=value`` each, over what the file says; the value is TOML, or else plain text.
 
         Raises:
@@ -224,6 +237,12 @@ class Launch:
             raise
         except ValueError as error:
             raise LaunchError(str(error)) from error
+
+    def addresses(self, node: str) -> list[str]:
+        """Where to hear what ``node`` publishes: one address, or those of all kiosks."""
+        if node == "pose_input" and self.server.kiosks:
+            return self.server.kiosks
+        return [self.transport.endpoint(node)]
 
     def listeners(self, node: str) -> frozenset[str]:
         """The nodes that must not miss a pose of ``node``: those of this launch that work on it or record it."""

@@ -12,19 +12,21 @@ from msgs.types import Message, PoseRaw
 from nodes.launch import Launch, LaunchError
 from nodes.runtime import FRAME_NS, Clock, Node
 from prior.pipeline import PriorPipeline, PriorSettings
+from prior.streams import StreamBatch
 
 GATED = ("joints_refused", "limbs_exchanged")
 """counts of what the gate found in the sensor's joints: its daily work, and no fault of a message"""
 
 
-def make_prior(settings: Mapping[str, Any]) -> PriorPipeline:
-    """The prior as ``[prior]`` of a launch file wants it.
+def make_prior(settings: Mapping[str, Any], kiosks: int = 0) -> PriorPipeline:
+    """The prior as ``[prior]`` of a launch file wants it: of one stream, or of several kiosks.
 
     Raises:
         LaunchError: an unknown setting, a value that cannot be, or weights that are not there.
     """
     try:
-        return PriorPipeline(PriorSettings.from_dict(settings))
+        wanted = PriorSettings.from_dict(settings)
+        return StreamBatch(wanted, kiosks) if kiosks else PriorPipeline(wanted)
     except (ValueError, FileNotFoundError) as error:
         raise LaunchError(str(error)) from error
 
@@ -38,14 +40,18 @@ class PriorNode(Node):
         super().__init__(launch, clock)
         # two threads that share the cores with other nodes wait for each other: a p99 of 100 ms
         torch.set_num_threads(1)
-        self._pipeline = make_prior(launch.prior)
+        self._pipeline = make_prior(launch.prior, len(launch.server.kiosks))
         self._bodies = 0
         self._anomalies = 0
 
     def handle(self, topic: str, message: Message) -> None:
         if not isinstance(message, PoseRaw):
             return
-        for clean in self._pipeline.process(message):
+        if isinstance(self._pipeline, StreamBatch):
+            cleaned = self._pipeline.process_at(message, self.clock.now_ns())
+        else:
+            cleaned = self._pipeline.process(message)
+        for clean in cleaned:
             self._bodies = len(clean.bodies)
             self._anomalies += sum(body.anomaly_flag for body in clean.bodies)
             self.publish(POSE_CLEAN, clean, delay_ns=round(clean.delay_frames * FRAME_NS))
@@ -54,6 +60,8 @@ class PriorNode(Node):
         counts = {
             f"{'gate' if cause in GATED else 'refused'}.{cause}": str(n) for cause, n in self._pipeline.counters.items()
         }
+        if isinstance(self._pipeline, StreamBatch):
+            counts["streams"] = str(self._pipeline.streams)
         return counts | {
             "bodies": str(self._bodies),
             "anomalies": str(self._anomalies),

@@ -216,7 +216,7 @@ class Node(ABC):
             if listens:
                 self._subscriber = stack.enter_context(
                     Subscriber(
-                        [transport.endpoint(node) for node in listens],
+                        [address for node in listens for address in self.launch.addresses(node)],
                         sorted({topic for topics in listens.values() for topic in topics}),
                         keys=keys,
                         name=self.name,
@@ -244,7 +244,8 @@ class Node(ABC):
         self._queue = max(self._queue, len(self._inbox))
         topic, message = received
         if isinstance(message, Diagnostics):
-            if message.node == "pose_input":
+            # of several kiosks each has its own
+            if message.node == "pose_input" and not self.launch.server.kiosks:
                 self.timeline = Timeline.from_values(message.values)
         else:
             self._stamp_ns = message.stamp_ns

@@ -35,6 +35,7 @@ class TrajectoryNode(Node):
         super().__init__(launch, clock)
         torch.set_num_threads(1)  # as in the prior node
         self._pipeline = make_trajectory(launch.trajectory)
+        self._of_kiosks: dict[str, TrajectoryPipeline] = {}
         self._delay_frames = 0
         self._bodies = 0
 
@@ -42,11 +43,23 @@ class TrajectoryNode(Node):
         if not isinstance(message, PoseClean):
             return
         self._delay_frames = message.delay_frames
-        for world in self._pipeline.process(message):
+        for world in self._pipeline_of(message.source).process(message):
             self._bodies = len(world.bodies)
             self.publish(POSE_WORLD, world, delay_ns=round(message.delay_frames * FRAME_NS))
 
+    def _pipeline_of(self, source: str) -> TrajectoryPipeline:
+        """The trajectory of a stream; each kiosk has one of its own, by its source."""
+        kiosks = len(self.launch.server.kiosks)
+        if not kiosks:
+            return self._pipeline
+        pipeline = self._of_kiosks.pop(source, None) or make_trajectory(self.launch.trajectory)
+        self._of_kiosks[source] = pipeline
+        if len(self._of_kiosks) > kiosks:  # one came back under another name
+            del self._of_kiosks[next(iter(self._of_kiosks))]
+        return pipeline
+
     def status(self) -> dict[str, str]:
+        counters = sum((p.counters for p in self._of_kiosks.values()), self._pipeline.counters)
         return {"bodies": str(self._bodies), "delay_frames": str(self._delay_frames)} | {
-            f"refused.{cause}": str(n) for cause, n in self._pipeline.counters.items()
+            f"refused.{cause}": str(n) for cause, n in counters.items()
         }

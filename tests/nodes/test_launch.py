@@ -26,7 +26,7 @@ def test_an_empty_file_is_a_launch(write) -> None:
     assert launch.transport.endpoint("prior").startswith("ipc://")
 
 
-@pytest.mark.parametrize("name", ["replay", "server"])
+@pytest.mark.parametrize("name", ["replay", "kiosk"])
 def test_the_projects_own_files_are_found_by_name(name: str) -> None:
     launch = Launch.read(name)
     assert Path(launch.input.recording).parent.resolve() == checkout("sim_data")
