@@ -101,6 +101,26 @@ def from_azure_kinect(markers: Any, source: str = "azure_kinect") -> PoseRaw | N
     return _message(_stamp_ns(header), header.frame_id, source, AZURE_KINECT32, "-y", bodies)
 
 
+def from_pose_array(poses: Any, skeleton: Skeleton, up: str, source: str = "pose_array") -> PoseRaw:
+    """``geometry_msgs/PoseArray`` with the joints of one body after the other, NaN where a joint is missing.
+
+    Args:
+        poses: the message; of its poses only the positions are read. The bridge's own ``steadypose/poses`` is one.
+        skeleton: its joints.
+        up: the axis of its frame that points up: ``z``, ``y`` or ``-y``.
+        source: the tracker's name.
+
+    Raises:
+        ValueError: not a whole number of bodies.
+    """
+    joints = len(skeleton.joints)
+    points = np.array([(p.position.x, p.position.y, p.position.z) for p in poses.poses], np.float64).reshape(-1, 3)
+    if len(points) % joints:
+        raise ValueError(f"PoseArray: expected a multiple of the {joints} joints of {skeleton.name}, got {len(points)}")
+    bodies = [RawBody(id, body, finite_joints(body)) for id, body in enumerate(points.reshape(-1, joints, 3))]
+    return _message(_stamp_ns(poses.header), poses.header.frame_id, source, skeleton, up, bodies)
+
+
 def from_coco(
     detections: Sequence[Mapping[str, Any]],
     depth: NDArray[Any],

@@ -1,0 +1,131 @@
+"""Skeletons from ROS 2 topics, published by a real ROS 2 node in another process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import running, until
+from synthetic_poses import walker
+
+from msgs.topics import POSE_RAW
+from msgs.transport import Subscriber
+from msgs.types import PoseRaw
+from nodes.adapters import from_pose_array
+from nodes.launch import Launch, LaunchError
+from nodes.pose_input import PoseInputNode
+from nodes.ros2_bridge import PACKAGES
+from prior.skeletons import COCO17, SKELETONS
+
+DOMAIN = str(1 + (os.getpid() + 100) % 200)
+
+PUBLISHER = """
+import sys
+import numpy as np, rclpy
+from geometry_msgs.msg import Point, Pose, PoseArray
+from rclpy.time import Time
+from visualization_msgs.msg import Marker, MarkerArray
+
+rclpy.init()
+node = rclpy.create_node("tracker")
+joints = np.load(sys.argv[1]).tolist()
+def pose(x, y, z):
+    return Pose(position=Point(x=x, y=y, z=z))
+if sys.argv[2] == "PoseArray":
+    publisher = node.create_publisher(PoseArray, "/skeletons", 10)
+    message = PoseArray(poses=[pose(*joint) for body in joints for joint in body])
+    headers = [message.header]
+    wrong = PoseArray(poses=message.poses[:5])
+else:
+    publisher = node.create_publisher(MarkerArray, "/skeletons", 10)
+    numbered = [(100 * (3 + b) + j, joint) for b, body in enumerate(joints) for j, joint in enumerate(body)]
+    message = MarkerArray(markers=[Marker(id=number, pose=pose(*joint)) for number, joint in numbered])
+    headers = [marker.header for marker in message.markers]
+    wrong = MarkerArray(markers=[Marker(id=99)])
+for k in range(1, 1000):
+    for header in headers:
+        header.stamp = Time(nanoseconds=k * 33_333_333).to_msg()
+        header.frame_id = "depth"
+    publisher.publish(wrong)
+    publisher.publish(message)
+    rclpy.spin_once(node, timeout_sec=0.03)
+"""
+
+
+@pytest.fixture
+def ros(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ROS 2, if it is installed, in a domain of this test's own."""
+    for package in PACKAGES:
+        pytest.importorskip(package, reason="the extra 'ros2' is not installed")
+    monkeypatch.setenv("ROS_DOMAIN_ID", DOMAIN)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+@pytest.mark.usefixtures("ros")
+@pytest.mark.parametrize(("kind", "skeleton"), [("PoseArray", "smpl22"), ("MarkerArray", "azure_kinect32")])
+def test_a_topic_becomes_pose_raw(make_launch: Callable[..., Launch], tmp_path: Path, kind: str, skeleton: str) -> None:
+    joints = np.random.default_rng(0).normal(size=(2, len(SKELETONS[skeleton].joints), 3))
+    joints[:, :22] += walker(0.5)[0]
+    joints[1, 4] = np.nan
+    np.save(tmp_path / "joints.npy", joints)
+    (tmp_path / "publisher.py").write_text(PUBLISHER)
+    launch = make_launch(
+        nodes='["pose_input"]', input__source="ros2", input__ros2__topic="/skeletons", input__ros2__type=kind,
+        transport__lossless="false",
+    )  # fmt: skip
+    source = PoseInputNode(launch)
+    heard: list[PoseRaw] = []
+    tracker = subprocess.Popen([sys.executable, tmp_path / "publisher.py", tmp_path / "joints.npy", kind])
+    with running(source), Subscriber(launch.transport.endpoint("pose_input"), POSE_RAW) as subscriber:
+
+        def enough() -> bool:
+            while received := subscriber.receive(0):
+                assert isinstance(received[1], PoseRaw)
+                heard.append(received[1])
+            return len(heard) >= 3 and any("not a" in cause for cause in source.status())
+
+        until(enough, timeout_s=60)
+    tracker.kill()
+    tracker.wait()
+    message = heard[-1]
+    assert (message.skeleton, message.frame_id, message.source) == (skeleton, "depth", "/skeletons")
+    assert message.stamp_ns % 33_333_333 == 0
+    assert [body.id for body in message.bodies] == ([0, 1] if kind == "PoseArray" else [3, 4])
+    for body, expected in zip(message.bodies, joints, strict=True):
+        np.testing.assert_array_equal(body.positions, expected.astype(np.float32))
+    assert message.bodies[1].confidence[4] == 0
+    assert source.status()["camera"].startswith("/skeletons, ")
+
+
+def pose_array(count: int) -> Any:
+    points = [SimpleNamespace(position=SimpleNamespace(x=float(k), y=0.0, z=1.0)) for k in range(count)]
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=2, nanosec=5), frame_id="world")
+    return SimpleNamespace(header=header, poses=points)
+
+
+def test_pose_arrays_hold_whole_bodies() -> None:
+    message = from_pose_array(pose_array(34), COCO17, "y")
+    assert (message.stamp_ns, message.skeleton, len(message.bodies)) == (2_000_000_005, "coco17", 2)
+    assert message.bodies[1].positions[0, 0] == 17
+    assert not from_pose_array(pose_array(0), COCO17, "y").bodies
+    with pytest.raises(ValueError, match="multiple of the 17 joints of coco17, got 20"):
+        from_pose_array(pose_array(20), COCO17, "y")
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ({"input__ros2__type": "Image"}, "expected MarkerArray or PoseArray, got 'Image'"),
+        ({"input__ros2__up": "x"}, "expected z, y or -y"),
+    ],
+)
+def test_settings_that_cannot_be(make_launch: Callable[..., Launch], setting: dict[str, str], expected: str) -> None:
+    with pytest.raises(LaunchError, match=expected):
+        make_launch(**setting)
