@@ -9,6 +9,7 @@ the nearest one that does. Every section may be left out; the defaults play noth
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import tempfile
 import tomllib
@@ -17,8 +18,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from msgs.keys import Keys, load_keys
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
+from msgs.types import Pose
 from prior.settings import build_settings
 
 #: The graph: each node, and for every node it listens to the topics it takes from there.
@@ -77,7 +81,79 @@ class OakSettings:
     """of a person, below which it is none"""
 
 
-SOURCES = ("recording", "oak", "webcam")
+@dataclass(frozen=True)
+class WebcamSettings:
+    """``[input.webcam]``: any camera that the system knows, and MediaPipe."""
+
+    camera: int = 0
+    """its number: 0 is /dev/video0"""
+    model: str = ""
+    """MediaPipe's pose landmarker, a .task file; a relative path starts at the launch file"""
+    bodies: int = 1
+    """most bodies to look for"""
+    field_of_view: float = 1.05
+    """radians, of the image's width: scales how far away bodies seem"""
+
+
+@dataclass(frozen=True)
+class Ros2Settings:
+    """``[input.ros2]``: a ROS 2 topic with skeletons."""
+
+    topic: str = "/body_tracking_data"
+    type: str = "MarkerArray"
+    """MarkerArray, as the driver of the Azure Kinect has it; or PoseArray, the joints of one body after the other"""
+    skeleton: str = "smpl22"
+    """of a PoseArray: the joints and their order"""
+    up: str = "z"
+    """of a PoseArray: the axis of its frame that points up: z, y or -y"""
+
+    def __post_init__(self) -> None:
+        if self.type not in ("MarkerArray", "PoseArray"):
+            raise LaunchError(f"[input.ros2] type: expected MarkerArray or PoseArray, got {self.type!r}")
+        if self.up not in ("z", "y", "-y"):
+            raise LaunchError(f"[input.ros2] up: expected z, y or -y, got {self.up!r}")
+
+
+SOURCES = ("recording", "oak", "webcam", "ros2")
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """``[input.calibration]``: the camera's lens and place, as ``steadypose calibrate`` writes them."""
+
+    size: list[int] = field(default_factory=list)
+    """pixels, width and height of the pictures that the lens is told for"""
+    focal: list[float] = field(default_factory=list)
+    """fx, fy in pixels"""
+    centre: list[float] = field(default_factory=list)
+    """cx, cy in pixels"""
+    distortion: list[float] = field(default_factory=list)
+    """k1, k2, p1, p2, k3, as OpenCV has them"""
+    position: list[float] = field(default_factory=list)
+    """metres, world"""
+    orientation: list[float] = field(default_factory=list)
+    """xyzw, from the camera's optical frame to the world"""
+
+    def __post_init__(self) -> None:
+        lengths = {"size": (2,), "focal": (2,), "centre": (2,), "position": (3,), "orientation": (4,)}
+        for name, allowed in (lengths | {"distortion": (4, 5)}).items():
+            values = getattr(self, name)
+            numbers = all(isinstance(v, int | float) and math.isfinite(v) for v in values)
+            if values and not (numbers and len(values) in allowed):
+                raise LaunchError(
+                    f"[input.calibration] {name}: expected {' or '.join(map(str, allowed))} numbers, got {values}"
+                )
+        if bool(self.position) != bool(self.orientation):
+            raise LaunchError("[input.calibration] expected position and orientation, or neither")
+        if self.orientation and abs(math.hypot(*self.orientation) - 1.0) > 0.01:
+            raise LaunchError(f"[input.calibration] orientation: expected a unit quaternion, got {self.orientation}")
+        if bool(self.size) != bool(self.focal) or bool(self.size) != bool(self.centre):
+            raise LaunchError("[input.calibration] expected size, focal and centre of a lens, or none of them")
+
+    @property
+    def pose(self) -> Pose | None:
+        """Of the camera in the world, if it is calibrated."""
+        return Pose(np.array(self.position), np.array(self.orientation)) if self.position else None
 
 
 @dataclass(frozen=True)
@@ -85,14 +161,17 @@ class InputSettings:
     """``[input]``: where skeletons come from."""
 
     source: str = "recording"
-    """recording, oak or webcam"""
+    """recording, oak, webcam or ros2"""
     recording: str = ""
     """rosbag2 directory, .npz or .csv to play; a relative path starts at the launch file"""
     rate: float = 1.0
     """times real time; 0 is as fast as the listeners take it"""
     loop: bool = False
     """start again at the end, with stamps that go on rising"""
+    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     oak: OakSettings = field(default_factory=OakSettings)
+    ros2: Ros2Settings = field(default_factory=Ros2Settings)
+    webcam: WebcamSettings = field(default_factory=WebcamSettings)
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:

@@ -8,7 +8,7 @@ has no camera.
 # without `from __future__ import annotations`: depthai reads those of `process` to know what an input takes
 import queue
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from datetime import timedelta
 from pathlib import Path
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from msgs.types import PoseRaw, RawBody
 from nodes.launch import LaunchError, OakSettings
-from nodes.pose_input import LiveSource
+from nodes.live import CameraError, CameraSource
 from nodes.runtime import TURN_S, Clock
 from prior.level import Level
 from prior.lift import lift
@@ -38,8 +38,6 @@ IMU_HZ = 100
 MOST_BODIES = 8
 QUEUE = 4
 """frames kept for the program when it is late; then the oldest goes"""
-PAUSES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
-"""before each try in a row to find the camera again; the last goes on"""
 SILENT_S = 5.0
 """without a frame, after which a camera that claims to run is given up"""
 STARTUP_S = 30.0
@@ -154,7 +152,7 @@ class Host:
         source: str,
         clock: Clock,
     ) -> None:
-        self.source = source
+        self.name = source
         self.level = Level()
         self._pipeline = pipeline
         self._clock = clock
@@ -163,12 +161,15 @@ class Host:
         if readings:
             pipeline.create(Gravity).build(readings[0], self.level, readings[1])
 
+    def status(self) -> dict[str, str]:
+        return {"camera.level": "measured" if self.level.measured else "taken for level"}
+
     @property
     def counts(self) -> Counter[str]:
         """Frames dropped or refused, by cause."""
         return self._skeletons.counts
 
-    def frames(self) -> Generator[PoseRaw | None, None, None]:
+    def frames(self) -> Iterator[PoseRaw | None]:
         """Skeletons as they come, None where none came for a while; ends when the camera does."""
         heard_ns, patience_s = self._clock.now_ns(), STARTUP_S
         while self._pipeline.isRunning():
@@ -192,7 +193,7 @@ def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
         RuntimeError: there is no such camera, it cannot be opened, or the model cannot be had; depthai says which.
     """
     if not settings.device and not dai.Device.getAllAvailableDevices():
-        raise RuntimeError("no camera found; `steadypose doctor` says whether one is plugged in")
+        raise CameraError("no camera found; `steadypose doctor` says whether one is plugged in")
     device = dai.Device(dai.DeviceInfo(settings.device)) if settings.device else dai.Device()
     with device:
         device.setMaxReconnectionAttempts(0)  # this program does that, and says so
@@ -247,15 +248,15 @@ def _imu(pipeline: dai.Pipeline, device: dai.Device) -> tuple[dai.Node.Output, F
     return imu.out, turn
 
 
-class OakSource(LiveSource):
-    """The skeletons of an OAK camera; when it is unplugged, waits for it and goes on.
+class OakSource(CameraSource):
+    """The skeletons of an OAK camera.
 
     Raises:
         LaunchError: a setting cannot be used.
     """
 
     def __init__(self, settings: OakSettings, clock: Clock, opener: Connect = connect) -> None:
-        super().__init__()
+        super().__init__(clock)
         if settings.archive and not (settings.archive.endswith(".tar.xz") and Path(settings.archive).is_file()):
             raise LaunchError(
                 f"[input.oak] archive: expected a file that is an NN archive (.tar.xz), got {settings.archive}; "
@@ -266,45 +267,7 @@ class OakSource(LiveSource):
                 "[input.oak] expected fps of 0 (as the camera can) or more and confidence between 0 and 1, got "
                 f"{settings.fps:g} and {settings.confidence:g}"
             )
-        self._settings, self._clock, self._open = settings, clock, opener
-        self._state = "looking for a camera"
-        self._host: Host | None = None
-        self._connections = 0
+        self._settings, self._open = settings, opener
 
-    def frames(self) -> Generator[PoseRaw | None, None, None]:
-        tries = 0
-        while True:
-            try:
-                with self._open(self._settings, self._clock) as self._host:
-                    self._connections += 1
-                    self._state = "waiting for the first frame"
-                    for frame in self._host.frames():
-                        if frame:
-                            self._state, tries = "streaming", 0
-                        yield frame
-                trouble = "camera lost"
-                self.refused[trouble] += 1
-            except RuntimeError as error:  # depthai has no other
-                trouble = str(error)
-            self._close()
-            pause_s = PAUSES_S[min(tries, len(PAUSES_S) - 1)]
-            tries += 1
-            self._state = f"waiting for a camera: {trouble}; next try in {pause_s:g} s"
-            again_ns = self._clock.now_ns() + round(pause_s * 1e9)
-            while self._clock.now_ns() < again_ns:
-                yield None
-                self._clock.sleep(round(TURN_S * 1e9))
-
-    def status(self) -> dict[str, str]:
-        values = {"camera": self._state, "camera.connections": str(self._connections)}
-        if self._host:
-            values["camera.name"] = self._host.source
-            values["camera.level"] = "measured" if self._host.level.measured else "taken for level"
-            values |= {f"dropped.camera {cause}": str(n) for cause, n in self._host.counts.items()}
-        return values
-
-    def _close(self) -> None:
-        """Keep what the last connection counted."""
-        if self._host:
-            self.refused.update({f"camera {cause}": n for cause, n in self._host.counts.items()})
-        self._host = None
+    def connect(self) -> AbstractContextManager[Host]:
+        return self._open(self._settings, self._clock)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Protocol
@@ -15,6 +14,7 @@ from msgs.topics import POSE_RAW, POSE_TRUTH
 from msgs.types import Diagnostics, Message, PoseRaw
 from nodes.csv_poses import CsvSource
 from nodes.launch import InputSettings, Launch, LaunchError
+from nodes.live import LiveSource
 from nodes.npz import NpzSource
 from nodes.runtime import TURN_S, Clock, Node, Timeline
 
@@ -31,22 +31,6 @@ class Source(Protocol):
     """what could not be read, by cause"""
 
     def __iter__(self) -> Iterator[tuple[str, Message]]: ...
-
-
-class LiveSource(ABC):
-    """A camera: skeletons when they come, stamped with the wall time of their capture."""
-
-    def __init__(self) -> None:
-        self.refused: Counter[str] = Counter()
-        """what went wrong, by cause"""
-
-    @abstractmethod
-    def frames(self) -> Generator[PoseRaw | None, None, None]:
-        """Skeletons without end; None where a moment passed without one, so that the node can look up."""
-
-    @abstractmethod
-    def status(self) -> dict[str, str]:
-        """What `diagnostics` should say of it; under ``camera``, what it is doing."""
 
 
 class RecordingSource:
@@ -104,9 +88,17 @@ def open_input(settings: InputSettings, clock: Clock) -> Source | LiveSource:
     if settings.source == "recording":
         return open_source(settings.recording)
     # these bring libraries that a replay does without
-    from nodes.oak import OakSource
+    if settings.source == "oak":
+        from nodes.oak import OakSource
 
-    return OakSource(settings.oak, clock)
+        return OakSource(settings.oak, clock)
+    if settings.source == "ros2":
+        from nodes.ros2_source import Ros2Source
+
+        return Ros2Source(settings.ros2)
+    from nodes.webcam import WebcamSource
+
+    return WebcamSource(settings.webcam, clock)
 
 
 def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:
@@ -133,6 +125,7 @@ class PoseInputNode(Node):
         self._source = source or open_input(settings, self.clock)
         self._rate = settings.rate
         self._loop = settings.loop
+        self._pose = settings.calibration.pose
         self._last_ns: int | None = None
 
     def handle(self, topic: str, message: Message) -> None:
@@ -154,7 +147,7 @@ class PoseInputNode(Node):
                     if self.timeline is None:
                         self.timeline = Timeline(frame.stamp_ns, frame.stamp_ns, 1.0)
                         self.report()
-                    self.publish(POSE_RAW, frame)
+                    self.publish(POSE_RAW, self._placed(frame))
                 self.report_if_due()
 
     def _play(self, source: Source) -> None:
@@ -164,7 +157,7 @@ class PoseInputNode(Node):
             if self.stopping:
                 return
             try:
-                self.publish(topic, message)
+                self.publish(topic, self._placed(message))
             except ValueError as error:  # a message that was recorded, and still cannot be sent
                 self.refuse(topic, error)
             self.report_if_due()
@@ -173,6 +166,12 @@ class PoseInputNode(Node):
         refused = {f"refused.{cause}": str(n) for cause, n in self._source.refused.items() if n}
         camera = self._source.status() if isinstance(self._source, LiveSource) else {}
         return camera | refused | (self.timeline.values() if self.timeline else {})
+
+    def _placed(self, message: Message) -> Message:
+        """The message with the pose that its camera was calibrated to, unless it knows its own."""
+        if self._pose and isinstance(message, PoseRaw) and not message.calibrated:
+            return dataclasses.replace(message, sensor_pose=self._pose, calibrated=True)
+        return message
 
     def _messages(self, source: Source) -> Iterator[tuple[str, Message]]:
         shift_ns = 0

@@ -279,7 +279,7 @@ def _surface(samples: Floats, low: float, high: float, share: float = _SHARE) ->
     return _nearest_surface(samples.ravel(), low, high, max(share * samples.size, 3.0))
 
 
-@njit(cache=True)
+@njit("f8(f8[::1], f8, f8, f8)", cache=True)
 def _nearest_surface(samples: Floats, low: float, high: float, least: float) -> float:
     depths = np.sort(samples[(samples >= low) & (samples <= high)])
     if len(depths) < least:
