@@ -142,6 +142,11 @@ class FixedLagRTS:
         self._count += 1
         return self._at(self._count - 1 - self.delay) if self._count > self.delay else None
 
+    @property
+    def velocity(self) -> Array:
+        """(..., 3) m/s at the newest frame; 0 for a joint not seen so far."""
+        return self._velocity
+
     def predict(self, stamp_s: float) -> Smoothed | None:
         """Where the joints are expected at `stamp_s`, before they are seen; None before the first frame."""
         if self._count == 0:
@@ -213,6 +218,39 @@ class FixedLagRTS:
         sigma = np.sqrt(np.maximum(self._variance[slot], 0.0))
         sigma[np.isnan(positions[..., 0])] = np.inf
         return Smoothed(float(self._stamps[slot]), positions, sigma)
+
+
+class Follower:
+    """Moves after an estimate as a body would, steered by accelerations (a critically damped alpha-beta tracker).
+
+    A filter that answers at once hands every new measurement's noise on as a jump. What follows it closes the gap to
+    it in place and velocity gently, and falls behind only where it accelerates.
+    """
+
+    def __init__(self, memory: float) -> None:
+        """`memory`: share of a gap that is left after a frame, 0 to 1."""
+        if not 0 <= memory < 1:
+            raise ValueError(f"follower: expected a memory of 0 to 1, got {memory}")
+        # Both eigenvalues of the gap's dynamics are `memory`.
+        self._place_gain = (1 - memory) ** 2
+        self._velocity_gain = 1 - memory**2 - self._place_gain / 2
+        self._place = self._velocity = np.empty(0)
+
+    def update(self, place: Array, velocity: Array, steered: NDArray[np.bool_]) -> Array:
+        """Take an estimate and give what follows it, (..., 3).
+
+        place: metres, NaN where there is none. velocity: metres a frame. steered: (...) which joints to steer; the
+        others are put on the estimate.
+        """
+        if self._place.shape != place.shape:
+            self._place, self._velocity = place.copy(), velocity.copy()
+            return place
+        ahead = self._place + self._velocity
+        push = self._place_gain * (place - ahead) + self._velocity_gain * (velocity - self._velocity)
+        smooth = (steered & _seen(ahead))[..., None]
+        self._place = np.where(smooth, ahead + push / 2, place)
+        self._velocity = np.where(smooth, self._velocity + push, velocity)
+        return self._place.copy()
 
 
 def _seen(measured: Array) -> NDArray[np.bool_]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.filters import FixedLagRTS, Smoothed
-from prior.window import Window
+from prior.filters import FixedLagRTS, Follower, Smoothed
+from prior.window import FPS, Window
 
 
 @dataclass(frozen=True)
@@ -24,28 +24,56 @@ class SmoothSettings:
     acceleration_density: float = 0.5
 
 
+_MEMORY = (0.25, 0.4, 0.5)
+"""Of what follows the smoother, by delay in frames: an answer without later frames jumps with the newest measurement.
+At a Kinect it takes 29 % of the jitter for 3 % of the position error at once, 7 % for nothing two frames later."""
+
+_LONG = 5
+"""Frames. With a longer delay, a longer memory costs no lag."""
+
+_SURE = 0.05
+"""Metres: a joint whose place is known less well coasts unseen."""
+
+
 class Smooth:
     """Gives ``window.smoothed``, the fixed-lag smoother's estimate of the frame ``delay_frames`` before the newest."""
 
     def __init__(self, settings: SmoothSettings, delay_frames: int, slots: int) -> None:
         self._settings = settings
         self.delay_frames = delay_frames
-        self._smoother = FixedLagRTS(delay_frames, settings.acceleration_density, settings.measurement_sigma)
+        # The time constant goes with the fourth root of the density: here, with the square root of the delay.
+        density = settings.acceleration_density * min(1.0, (_LONG / max(delay_frames, 1)) ** 2)
+        self._smoother = FixedLagRTS(delay_frames, density, settings.measurement_sigma)
+        self._follower = Follower(_MEMORY[delay_frames]) if delay_frames < len(_MEMORY) else None
+        self._last = np.full((slots, 22, 3), np.nan)
 
     def reset(self, slot: NDArray[np.bool_]) -> None:
         """Forget the bodies in these slots."""
         self._smoother.forget(np.repeat(slot[:, None], 22, axis=1))
+        self._last[slot] = np.nan
 
     def update(self, window: Window) -> Window:
         """Take the newest frame's positions in."""
         sigma = self._settings.measurement_sigma / np.clip(window.confidence.newest, 0.1, 1.0)
         smoothed = self._smoother.update(window.positions.newest, float(window.stamp_s.newest), sigma)
-        window.smoothed = None if smoothed is None else self._honest(smoothed, window)
+        window.smoothed = None if smoothed is None else self._honest(self._followed(smoothed), window)
         return window
 
     def flush(self, window: Window) -> list[Smoothed]:
         """The estimates of the last ``delay_frames`` frames (fewer if there were fewer), oldest first."""
-        return [self._honest(smoothed, window) for smoothed in self._smoother.flush()]
+        held = [self._honest(self._followed(smoothed), window) for smoothed in self._smoother.flush()]
+        self._last[:] = np.nan
+        return held
+
+    def _followed(self, smoothed: Smoothed) -> Smoothed:
+        """What follows the estimate, if its delay is short; where it is new, or coasts unseen, the estimate."""
+        if self._follower is None:
+            return smoothed
+        known = np.isfinite(self._last[..., 0]) & (smoothed.sigma < _SURE)
+        step = self._smoother.velocity / FPS if self.delay_frames == 0 else smoothed.positions - self._last
+        step = np.where(np.isfinite(self._last), step, 0.0)
+        self._last = smoothed.positions
+        return smoothed._replace(positions=self._follower.update(smoothed.positions, step, known))
 
     def _honest(self, smoothed: Smoothed, window: Window) -> Smoothed:
         """With the standard deviation that the noise found makes of it.
