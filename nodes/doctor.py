@@ -22,6 +22,14 @@ if TYPE_CHECKING:
 
 INSTALL = "in the checkout: rm -f .venv/.installed && ./steadypose doctor"
 """installs whatever is missing, then looks again"""
+INSTALL_EXTRA = "in the checkout: .uv/bin/uv sync --frozen --inexact --extra"
+EXTRAS = {
+    "ray": "steadypose clean --ray, on a cluster",
+    "ros2": "the ROS 2 bridge, and skeletons from ROS 2 topics",
+    "view": "the picture in the browser",
+    "webcam": "a webcam as the source",
+}
+"""what is optional, by the extra that it takes"""
 MODELS = ("hmvae", "trajectory")
 FRAMES = 100
 FRAME_NS = 1_000_000_000 / 30
@@ -36,6 +44,9 @@ UDEV_RULE = (
     f"""echo 'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{LUXONIS_USB}", MODE="0666"' | """
     "sudo tee /etc/udev/rules.d/80-movidius.rules && sudo udevadm control --reload-rules && sudo udevadm trigger"
 )
+
+DEVICES = Path("/dev")
+VIDEO_GROUP = 'sudo usermod -aG video "$USER", then log out and in again'
 
 
 class Verdict(Enum):
@@ -113,21 +124,21 @@ def check_packages() -> Iterator[Finding]:
     except PackageNotFoundError:
         yield Finding("packages", Verdict.BAD, "steadypose itself is not installed", INSTALL)
         return
-    missing = []
+    missing: list[str] = []
+    lacking: dict[str, list[str]] = {}
     for requirement in wanted:
-        optional = requirement.marker is not None and "extra" in str(requirement.marker)
         try:
             installed = version(requirement.name)
         except PackageNotFoundError:
             installed = ""
         if installed and requirement.specifier.contains(installed, prereleases=True):
             continue
-        found = f"{installed or 'not installed'}, expected {requirement.specifier}"
-        if optional:
-            extra = str(requirement.marker).split('"')[1]
-            yield Finding(f"{requirement.name} (optional: {extra})", Verdict.NOTE, found, INSTALL)
+        found = f"{requirement.name} {installed or 'not installed'}, expected {requirement.specifier}"
+        marker = str(requirement.marker)
+        if "extra" in marker:
+            lacking.setdefault(marker.split('"')[1], []).append(found)
         else:
-            missing.append(f"{requirement.name} {found}")
+            missing.append(found)
     told = ("torch", "numpy", "rosbags", "pyzmq", "depthai", "rerun-sdk")
     names = [name for name in told if any(r.name == name for r in wanted) and not any(name in m for m in missing)]
     versions = []
@@ -140,6 +151,10 @@ def check_packages() -> Iterator[Finding]:
         yield Finding("packages", Verdict.BAD, "; ".join(missing), INSTALL)
     else:
         yield Finding("packages", Verdict.GOOD, ", ".join(versions))
+    for extra, absent in sorted(lacking.items()):
+        what = f"optional: {extra}"
+        found = f"{EXTRAS.get(extra, extra)}: {'; '.join(absent)}"
+        yield Finding(what, Verdict.NOTE, found, f"{INSTALL_EXTRA} {extra}")
 
 
 def check_processor() -> Iterator[Finding]:
@@ -336,6 +351,16 @@ def check_camera() -> Iterator[Finding]:
         yield Finding("OAK cameras", Verdict.GOOD, f"none; depthai {depthai.__version__} is ready for one")
 
 
+def check_webcam() -> Iterator[Finding]:
+    """Cameras that the system knows: none is fine."""
+    cameras = sorted(DEVICES.glob("video*"))
+    closed = [camera.name for camera in cameras if not os.access(camera, os.R_OK | os.W_OK)]
+    if closed:
+        yield Finding("webcams", Verdict.NOTE, f"{', '.join(closed)} may not be used by you", VIDEO_GROUP)
+    else:
+        yield Finding("webcams", Verdict.GOOD, ", ".join(camera.name for camera in cameras) or "none")
+
+
 def _reads(file: Path, text: str) -> bool:
     try:
         return file.read_text().strip() == text
@@ -354,4 +379,5 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     check_models,
     check_streams,
     check_camera,
+    check_webcam,
 )

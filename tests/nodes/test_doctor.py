@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.metadata
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace as Made
 
 import pytest
 
@@ -34,7 +36,7 @@ def test_exit_status_says_whether_the_main_job_can_run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fine = Finding("Python", Verdict.GOOD, "3.11.7")
-    note = Finding("rerun-sdk (optional: view)", Verdict.NOTE, "not installed", "install [this]")
+    note = Finding("optional: view", Verdict.NOTE, "not installed", "install [this]")
     with_checks(monkeypatch, fine, note)
     assert doctor() == 0
     assert "install [this]" in capsys.readouterr().out
@@ -74,12 +76,20 @@ def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(module, "version", lacking)
     findings = {finding.what: finding for finding in module.check_packages()}
-    assert findings["rerun-sdk (optional: view)"].verdict is Verdict.NOTE
+    extra = findings["optional: view"]
+    assert extra.verdict is Verdict.NOTE
+    assert extra.found.startswith("the picture in the browser: rerun-sdk not installed, expected >=")
+    assert extra.fix.endswith("uv sync --frozen --inexact --extra view")
     packages = findings["packages"]
     assert packages.verdict is Verdict.BAD
     assert "pyzmq not installed, expected >=27" in packages.found
     assert "numpy 0.0.1, expected >=1.26" in packages.found
     assert packages.fix == INSTALL
+
+
+def test_every_extra_is_told_what_for() -> None:
+    project = tomllib.loads((Path(module.__file__).parents[1] / "pyproject.toml").read_text())
+    assert set(project["project"]["optional-dependencies"]) == set(module.EXTRAS)
 
 
 def test_another_python_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,6 +172,30 @@ def test_missing_streams_say_what_to_play_instead(monkeypatch: pytest.MonkeyPatc
 
 def test_no_camera_is_fine() -> None:
     assert only(module.check_camera).verdict is Verdict.GOOD
+
+
+def test_an_oak_without_usb_rights_gets_its_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+    import depthai
+
+    monkeypatch.setattr(depthai.Device, "getAllAvailableDevices", staticmethod(list))
+    monkeypatch.setattr(module, "Path", lambda _: Made(glob=lambda _: [Made(read_text=lambda: "03e7\n")]))
+    finding = only(module.check_camera)
+    assert finding.verdict is Verdict.NOTE
+    assert finding.found == "1 plugged in that cannot be opened"
+    assert "/etc/udev/rules.d" in finding.fix
+    monkeypatch.setattr(depthai.Device, "getAllAvailableDevices", lambda: [Made(getDeviceId=lambda: "14442C")])
+    assert only(module.check_camera).found == "14442C"
+
+
+def test_webcams_that_may_not_be_used_name_the_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(module, "DEVICES", tmp_path)
+    assert only(module.check_webcam).found == "none"
+    (tmp_path / "video0").write_text("")
+    assert (only(module.check_webcam).verdict, only(module.check_webcam).found) == (Verdict.GOOD, "video0")
+    monkeypatch.setattr(module.os, "access", lambda *_: False)
+    finding = only(module.check_webcam)
+    assert finding.verdict is Verdict.NOTE
+    assert "usermod -aG video" in finding.fix
 
 
 def test_it_needs_nothing_that_it_looks_for() -> None:
