@@ -1,0 +1,146 @@
+"""What one core carries: streams a core of a server, and hours of recordings cleaned an hour.
+
+A server's kiosks are copies of one recorded body, each with a clock of its own and captured at another time of the
+frame's period. Times are the thread's processor time, which other processes of the machine do not lengthen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+
+from benchmarks.latency import WARM_UP, crowd, percentiles
+from benchmarks.machine import ROOT
+from benchmarks.results import RESULTS, Table, save, show
+from msgs.recording import RecordingReader
+from msgs.topics import POSE_RAW
+from msgs.types import PoseRaw
+from nodes.cleaning import clean_recording
+from nodes.runtime import FRAME_NS
+from prior.pipeline import PriorSettings
+from prior.streams import StreamBatch
+from prior.trajectory import TrajectoryPipeline, TrajectorySettings
+
+KIOSKS = (1, 2, 4, 8, 12, 16, 24)
+NETWORK_NS = 3_000_000
+"""what a message travels"""
+PERIOD_MS = FRAME_NS / 1e6
+
+
+@dataclass(frozen=True)
+class Args:
+    """Streams a core, and recordings cleaned an hour, on this machine."""
+
+    recording: Path = ROOT / "sim_data" / "walk_turn"
+    """whose first body is played"""
+    seconds: float = 10.0
+    """of stream for each number of kiosks"""
+    quick: bool = False
+    """2 s, to see that it works; nothing is written unless --out says where"""
+    out: Path | None = None
+    """folder for the JSON file; benchmarks/results unless --quick"""
+
+
+def serve(frames: list[PoseRaw], kiosks: int, periods: int, track: Callable[..., Iterable[int]]) -> dict[str, Any]:
+    """Milliseconds of a 30 Hz period that the prior, and the trajectories, of so many kiosks take."""
+    prior = StreamBatch(PriorSettings(max_bodies=kiosks), kiosks)
+    trajectories = [TrajectoryPipeline(TrajectorySettings()) for _ in range(kiosks)]
+    names = [f"kiosk {k}" for k in range(kiosks)]
+    spent: dict[str, list[float]] = {"prior": [], "trajectory": []}
+    answers = 0
+    for period, raw in zip(track(range(periods + WARM_UP), description=f"{kiosks} kiosks"), crowd(frames, 1)):  # noqa: B905
+        cost = {"prior": 0.0, "trajectory": 0.0}
+        for k, name in enumerate(names):
+            captured_ns = raw.stamp_ns + round(k * FRAME_NS / kiosks)
+            # hours apart, as clocks that nobody set
+            message = dataclasses.replace(raw, source=name, stamp_ns=captured_ns + k * 3_600_000_000_000)
+            started = time.thread_time()
+            cleaned = prior.process_at(message, captured_ns + NETWORK_NS)
+            between = time.thread_time()
+            for clean in cleaned:
+                answers += bool(clean.bodies)
+                trajectories[names.index(clean.source)].process(clean)
+            cost["prior"] += (between - started) * 1e3
+            cost["trajectory"] += (time.thread_time() - between) * 1e3
+        if period >= WARM_UP:
+            for node, samples in spent.items():
+                samples.append(cost[node])
+    return {
+        "kiosks": kiosks,
+        "periods": periods,
+        "answered": answers / (kiosks * (periods + WARM_UP)),
+        "refused": {cause: n for cause, n in prior.counters.items() if n},
+        **{f"{node}_ms": percentiles(samples) for node, samples in spent.items()},
+    }
+
+
+def clean_rate(recording: Path) -> dict[str, float]:
+    """Seconds of a recorded stream that one core cleans in a second."""
+    with tempfile.TemporaryDirectory() as folder:
+        settings: dict[str, dict[str, Any]] = {"prior": {}, "trajectory": {}}
+        started = time.process_time()
+        done = clean_recording(recording, Path(folder) / "out", settings)
+        spent = time.process_time() - started
+    return {"stream_s": round(done.duration_s, 2), "cpu_s": round(spent, 2), "rate": round(done.duration_s / spent, 2)}
+
+
+def main(args: Args) -> None:
+    """Measure, print, write."""
+    console = Console()
+    torch.set_num_threads(1)
+    periods = round((2.0 if args.quick else args.seconds) * 30)
+    with RecordingReader(args.recording) as reader:
+        frames = [m for _, _, m in islice(reader.messages([POSE_RAW]), 600) if isinstance(m, PoseRaw)]
+    with Progress(console=console) as progress:
+        served = [serve(frames, kiosks, periods, progress.track) for kiosks in KIOSKS]
+    cleaned = clean_rate(args.recording)
+    table = _table(served, cleaned)
+    show(table, console)
+    if args.out or not args.quick:
+        data = {"served": served, "cleaned": cleaned, "streams_a_core": _streams_a_core(served)}
+        console.print(f"wrote {save('scale', sys.argv[1:], [table], data, args.out or RESULTS)}")
+
+
+def _streams_a_core(served: list[dict[str, Any]]) -> dict[str, int]:
+    """The most kiosks measured that a node can serve on one core: 99 of 100 periods end in time."""
+    return {
+        node: max((s["kiosks"] for s in served if s[f"{node}_ms"]["p99"] < PERIOD_MS), default=0)
+        for node in ("prior", "trajectory")
+    }
+
+
+def _table(served: list[dict[str, Any]], cleaned: dict[str, float]) -> Table:
+    most = _streams_a_core(served)
+    return Table(
+        name="scale",
+        title="A server's processor time a period of 33.3 ms, ms",
+        columns=["kiosks", "prior, p50", "prior, p99", "prior, a kiosk", "trajectory, p50", "trajectory, p99"],
+        rows=[
+            [
+                str(s["kiosks"]),
+                *(f"{s['prior_ms'][p]:.1f}" for p in ("p50", "p99")),
+                f"{s['prior_ms']['p50'] / s['kiosks']:.2f}",
+                *(f"{s['trajectory_ms'][p]:.1f}" for p in ("p50", "p99")),
+            ]
+            for s in served
+        ],
+        note=f"One body a kiosk. In time 99 of 100 periods, one core each: {most['prior']} kiosks for the prior, "
+        f"{most['trajectory']} for the trajectory, which is not batched. `clean` does {cleaned['rate']:.1f} s of a "
+        "stream of one body a second and core.",
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
