@@ -61,7 +61,7 @@ class Bench:
         """Evaluations that each peer's search may spend, for each delay."""
         return 6 if self.quick else 18
 
-    def clips(self, frames: int = 90, most: int = 96) -> MotionClips:
+    def clips(self, frames: int = 90, most: int = 32) -> MotionClips:
         """Validation motion."""
         return self._motion("val", frames, min(most, 12) if self.quick else most)
 

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from benchmarks.peers import missing
 from msgs.types import Pose, PoseClean, PoseRaw, RawBody
+from prior.anomaly import ScoreSettings
 from prior.checkpoint import WEIGHTS
 from prior.correct import CorrectSettings
 from prior.fuse import FuseSettings
+from prior.impute import ImputeSettings
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.refine import RefineSettings
 
@@ -26,7 +28,9 @@ def weight_sets(model: str) -> list[str]:
 
 
 OURS: Mapping[str, PriorSettings] = {
-    "HM-VAE": PriorSettings(fuse=FuseSettings(enabled=False)),
+    "HM-VAE": PriorSettings(
+        score=ScoreSettings(enabled=False), impute=ImputeSettings(enabled=False), fuse=FuseSettings(enabled=False)
+    ),
     "steadypose": PriorSettings(),
     "steadypose, bias_sigma = 0.002": PriorSettings(bias_sigma=0.002),
     **{

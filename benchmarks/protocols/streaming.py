@@ -45,7 +45,7 @@ CONDITIONS = ("steady", *(f"{share:.0%} lost" for share in LOSSES), "stamps ±10
 
 def run(bench: Bench) -> Result:
     """Every method in every condition."""
-    clips = bench.clips(most=64)
+    clips = bench.clips()
     truth_at = CubicSpline(clips.stamps_s, clips.positions)
     some = clips.every(3)
     told = gaussian(some.positions, NOISE, np.random.default_rng(1))

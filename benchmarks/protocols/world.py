@@ -44,7 +44,7 @@ FRAMES = 192
 
 def run(bench: Bench) -> Result:
     """The whole chain beside filters, then the fusion without a root."""
-    clips = bench.clips(FRAMES, 400).farthest(4 if bench.quick else 48)
+    clips = bench.clips(FRAMES, 400).farthest(4 if bench.quick else 24)
     some = clips.every(3)
     told = correlated(some.positions, NOISE, np.random.default_rng(1))
     seen = correlated(clips.positions, NOISE, np.random.default_rng(0))
