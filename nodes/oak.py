@@ -34,6 +34,9 @@ MODELS = {
 }
 """by platform: the pose network of Luxonis' model zoo that it runs, and the frames a second it does"""
 DEPTH_SIZE = (640, 400)
+DEPTH_FPS = 30.0
+APART = timedelta(seconds=0.5 / DEPTH_FPS)
+"""between colour and depth of the same moment, at most: their sensors run at their own pace"""
 IMU_HZ = 100
 MOST_BODIES = 8
 QUEUE = 4
@@ -49,7 +52,7 @@ def _nanoseconds(time: timedelta) -> int:
 
 
 class Skeletons(dai.node.HostNode):
-    """Detections with key points, and the depth image of the same moment, to skeletons.
+    """Detections with key points and the depth image of the same moment, in pairs, to skeletons.
 
     Attributes:
         found: skeletons not yet taken.
@@ -64,25 +67,26 @@ class Skeletons(dai.node.HostNode):
         self._source = ""
         self._epoch_ns = 0
 
-    def build(
-        self, detections: dai.Node.Output, depth: dai.Node.Output, level: Level, source: str, epoch_ns: int
-    ) -> "Skeletons":
+    def build(self, pairs: dai.Node.Output, level: Level, source: str, epoch_ns: int) -> "Skeletons":
         """Link the node.
 
         Args:
-            detections: of ``ImgDetections`` with key points.
-            depth: of ``ImgFrame``, millimetres, aligned to the image of the detections.
+            pairs: of ``detections`` (``ImgDetections`` with key points) and ``depth`` (``ImgFrame``, millimetres,
+                aligned to the image of the detections).
             level: the camera's, which says its pose.
             source: the camera's name, for the messages.
             epoch_ns: wall time, nanoseconds since 1970, of zero on depthai's clock.
         """
-        self.link_args(detections, depth)
+        self.link_args(pairs)
         self._level, self._source, self._epoch_ns = level, source, epoch_ns
         return self
 
-    def process(self, detections: dai.ImgDetections, depth: dai.ImgFrame) -> None:
+    def process(self, pair: dai.MessageGroup) -> None:
         """Work on what was captured at one moment; what it cannot use it counts."""
         try:
+            detections, depth = pair["detections"], pair["depth"]
+            assert isinstance(detections, dai.ImgDetections)
+            assert isinstance(depth, dai.ImgFrame)
             frame = self._lifted(detections, depth)
         except Exception as error:  # whatever the camera sends, the next frame may be good
             self.counts[f"frame: {type(error).__name__}"] += 1
@@ -137,7 +141,7 @@ class Host:
 
     Args:
         pipeline: that of the outputs, not yet started.
-        detections, depth: outputs as `Skeletons.build` takes them.
+        detections, depth: what `Skeletons.build` takes pairs of.
         readings: of the IMU and the rotation (3, 3) from its frame to the camera's; None without one.
         source: the camera's name.
         clock: what stamps are told in.
@@ -157,7 +161,13 @@ class Host:
         self._pipeline = pipeline
         self._clock = clock
         epoch_ns = clock.now_ns() - _nanoseconds(dai.Clock.now())  # pyright: ignore[reportCallIssue] (static)
-        self._skeletons = pipeline.create(Skeletons).build(detections, depth, self.level, source, epoch_ns)
+        # a host node's own pairing wants both within 10 ms, and would wait for ever
+        sync = pipeline.create(dai.node.Sync)
+        sync.setRunOnHost(True)
+        sync.setSyncThreshold(APART)
+        detections.link(sync.inputs["detections"])
+        depth.link(sync.inputs["depth"])
+        self._skeletons = pipeline.create(Skeletons).build(sync.out, self.level, source, epoch_ns)
         if readings:
             pipeline.create(Gravity).build(readings[0], self.level, readings[1])
 
@@ -209,21 +219,21 @@ def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
             )
             network = pipeline.create(dai.node.DetectionNetwork).build(colour, model, fps)
             network.setConfidenceThreshold(settings.confidence)
-            depth = _aligned_depth(pipeline, colour, fps, platform)
+            depth = _aligned_depth(pipeline, colour, platform)
             imu = _imu(pipeline, device)
             host = Host(pipeline, network.out, depth, imu, f"oak-{device.getDeviceId()}", clock)
             pipeline.start()
             yield host
 
 
-def _aligned_depth(pipeline: dai.Pipeline, colour: dai.node.Camera, fps: float, platform: str) -> dai.Node.Output:
+def _aligned_depth(pipeline: dai.Pipeline, colour: dai.node.Camera, platform: str) -> dai.Node.Output:
     """Stereo depth in the view of the colour camera, without distortion."""
     stereo = pipeline.create(dai.node.StereoDepth).build(
-        autoCreateCameras=True, presetMode=dai.node.StereoDepth.PresetMode.DEFAULT, size=DEPTH_SIZE, fps=fps
+        autoCreateCameras=True, presetMode=dai.node.StereoDepth.PresetMode.DEFAULT, size=DEPTH_SIZE, fps=DEPTH_FPS
     )
     stereo.setLeftRightCheck(True)
     stereo.setSubpixel(True)
-    view = colour.requestOutput(DEPTH_SIZE, fps=fps, enableUndistortion=True)
+    view = colour.requestOutput(DEPTH_SIZE, enableUndistortion=True)
     if platform == "RVC4":  # has no alignment in its stereo block
         align = pipeline.create(dai.node.ImageAlign)
         stereo.depth.link(align.input)

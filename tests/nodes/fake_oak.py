@@ -134,13 +134,22 @@ class Player(dai.node.ThreadedHostNode):
         self.done.set()
 
 
-def script(moments: Sequence[Moment], up: Sequence[float] | None = None) -> list[tuple[str, dai.Buffer]]:
-    """The messages of a recording of ``moments``, a thirtieth of a second apart, the first of them now."""
+def script(
+    moments: Sequence[Moment], up: Sequence[float] | None = None, depth_late: datetime.timedelta = datetime.timedelta(0)
+) -> list[tuple[str, dai.Buffer]]:
+    """The messages of a recording of ``moments``, a thirtieth of a second apart, the first of them now.
+
+    Depth images are captured ``depth_late`` after the pictures they belong to.
+    """
     start = dai.Clock.now()  # pyright: ignore[reportCallIssue] (static)
     messages: list[tuple[str, dai.Buffer]] = [("imu", readings(up))] if up is not None else []
     for index, one in enumerate(moments):
-        for name, message in (("detections", detections(one)), ("depth", depth_frame(one))):
-            message.setTimestamp(start + index * PERIOD)
+        captured = start + index * PERIOD
+        for name, message, at in (
+            ("detections", detections(one), captured),
+            ("depth", depth_frame(one), captured + depth_late),
+        ):
+            message.setTimestamp(at)
             message.setSequenceNum(index)
             messages.append((name, message))
     return messages

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 
 import depthai as dai
 import numpy as np
@@ -64,6 +65,13 @@ def test_stamps_are_of_capture(walk: list[Moment]) -> None:
     with plugged(messages, SystemClock()) as host:
         stamps = [frame.stamp_ns for frame in take(host, len(walk))]
     assert before - 5_000_000 < stamps[0] < after + 5_000_000, "wall time at which the first frame was made"
+    np.testing.assert_allclose(np.diff(stamps) / 1e9, 1 / 30, atol=1e-5)
+
+
+@pytest.mark.parametrize("milliseconds", [-15, 12, 16])
+def test_colour_and_depth_need_not_be_captured_together(walk: list[Moment], milliseconds: int) -> None:
+    with plugged(script(walk, depth_late=timedelta(milliseconds=milliseconds)), SystemClock()) as host:
+        stamps = [frame.stamp_ns for frame in take(host, len(walk) - 1)]
     np.testing.assert_allclose(np.diff(stamps) / 1e9, 1 / 30, atol=1e-5)
 
 
