@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from conftest import VirtualClock, running, until, walk
 
+from msgs.keys import create_keys
 from msgs.topics import POSE_RAW, POSE_WORLD
 from msgs.transport import Publisher, Subscriber
 from msgs.types import PoseRaw, PoseWorld
@@ -25,26 +27,28 @@ def kiosk(name: str, bodies: int, ahead_ns: int) -> list[PoseRaw]:
     return [dataclasses.replace(m, source=name, stamp_ns=m.stamp_ns + ahead_ns) for m in walk(FRAMES, bodies)]
 
 
+@pytest.mark.parametrize("secret", [False, True])
 def test_two_kiosks_and_a_server(
-    make_launch: Callable[..., Launch], folder: Path, weights: dict[str, str], clock: VirtualClock
+    make_launch: Callable[..., Launch], tmp_path: Path, weights: dict[str, str], clock: VirtualClock, secret: bool
 ) -> None:
     streams = {"door": kiosk("door", 1, 0), "desk": kiosk("desk", 2, 3_600_000_000_000)}
-    addresses = {name: f"ipc://{folder}/{name}" for name in streams}
-    launch = make_launch(
-        weights,
-        nodes='["prior", "trajectory"]',
-        server__kiosks=str(list(addresses.values())),
-        transport__lossless="false",
-        transport__queue=100,
-    )
-    prior, trajectory = PriorNode(launch, clock), TrajectoryNode(launch, clock)
+    # kiosks and server have the same keys
+    keys = create_keys(tmp_path / "keys") if secret else None
     answers: dict[str, list[PoseWorld]] = defaultdict(list)
-    with (
-        Publisher(addresses["door"]) as door,
-        Publisher(addresses["desk"]) as desk,
-        running(prior, trajectory),
-        Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD, name="test") as subscriber,
-    ):
+    with ExitStack() as stack:
+        door, desk = (stack.enter_context(Publisher("tcp://127.0.0.1:*", keys=keys)) for _ in streams)
+        launch = make_launch(
+            weights,
+            nodes='["prior", "trajectory"]',
+            server__kiosks=str([door.endpoint, desk.endpoint]),
+            transport__lossless="false",
+            transport__queue=100,
+            transport__keys=tmp_path / "keys" if secret else "",
+        )
+        prior, trajectory = PriorNode(launch, clock), TrajectoryNode(launch, clock)
+        stack.enter_context(running(prior, trajectory))
+        heard = Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD, keys=keys, name="test")
+        subscriber = stack.enter_context(heard)
         for publisher in (door, desk):
             assert publisher.wait_for_listeners({"prior"}, timeout_s=20)
         until(lambda: {"trajectory"} <= prior._publisher.listeners)
