@@ -25,6 +25,7 @@ COMMANDS = {
     "train": ("prior.train:train", "train a model of the prior"),
     "evaluate": ("nodes.evaluate:evaluate", "measure the prior against its tuned peers, by protocol"),
     "simulate": ("nodes.simulate:simulate", "make streams as a depth camera would see them, with their truth"),
+    "calibrate": ("nodes.calibrate:calibrate", "a camera's lens and place in the world, into its launch file"),
     "doctor": ("nodes.doctor:doctor", "what is missing on this machine, and how to get it"),
     "keys": ("nodes.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),
 }

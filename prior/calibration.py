@@ -1,0 +1,344 @@
+"""Calibration of a camera: its lens from pictures of a ChArUco board, its place in the world from the floor.
+
+The camera's frame is the optical one: x right, y down, z forward. The world is z up with the floor at z = 0. On a
+board that lies flat the world begins at the lower left corner of the pattern, as one reads it: x along the lower edge,
+y along the left one.
+
+Lens: Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, as in OpenCV. Plane: RANSAC
+(Fischler and Bolles, CACM 24(6), 1981), then least squares over its inliers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from msgs.types import Pose
+from prior.level import level_pose
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+LEAST_CORNERS = 6
+"""of the board that must be seen for a picture to be used"""
+LEAST_VIEWS = 8
+"""pictures of the board, at least, that tell a lens"""
+WORST_VIEW = 3.0
+"""times the median error of all pictures: one that is worse is left out (the board was bent, or moved)"""
+CORNER_SIGMA_PX = 0.05
+"""of a corner well seen, standard deviation"""
+CORNER_SCALE_PX = 0.3
+"""from where a corner should be, beyond which it is soon taken to be found wrong"""
+MOST_CORNERS = 0.8
+"""share of the corners by whose error a pose is judged"""
+MOST_ERROR_PX = 2.0
+"""root mean square of where corners are seen, from where they should be, beyond which a result is refused"""
+FLOOR_SLACK, FLOOR_SHARE = 0.02, 0.1
+"""metres from the floor within which a point is on it, and the least share of all points that must be"""
+FLOOR_TILT = np.radians(10.0)
+"""by which the floor's normal may differ from where up is taken to be"""
+
+
+class CalibrationError(ValueError):
+    """What was given does not calibrate. The text says what was expected, what came, and what to do."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A ChArUco board: a chessboard with markers in its white squares.
+
+    Attributes:
+        columns, rows: squares.
+        square: metres, a square's side, as measured on the print.
+        marker: share of a square's side that a marker has.
+    """
+
+    columns: int = 7
+    rows: int = 5
+    square: float = 0.056
+    marker: float = 0.75
+
+    def __post_init__(self) -> None:
+        if not (3 <= self.columns <= 20 and 3 <= self.rows <= 20 and 0.005 <= self.square <= 1.0):
+            raise CalibrationError(
+                "board: expected 3 to 20 columns and rows and squares of 0.005 to 1 metres, "
+                f"got {self.columns} x {self.rows} of {self.square:g}"
+            )
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Metres, width and height of the pattern."""
+        return self.columns * self.square, self.rows * self.square
+
+    @cached_property
+    def pattern(self) -> cv2.aruco.CharucoBoard:
+        """The board as OpenCV has it; 4x4 markers, the largest that are told apart from afar."""
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker * self.square, dictionary)
+
+    def picture(self, pixels_per_square: int) -> Image:
+        """(rows * pixels, columns * pixels) the pattern to print, without margin."""
+        return np.asarray(
+            self.pattern.generateImage((self.columns * pixels_per_square, self.rows * pixels_per_square)), np.uint8
+        )
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Where a picture shows the board's corners.
+
+    Attributes:
+        board: (N, 3) metres, in the world of a board that lies flat.
+        image: (N, 2) pixels.
+    """
+
+    board: Floats
+    image: Floats
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A lens, as OpenCV has it.
+
+    Attributes:
+        size: pixels, width and height of the pictures.
+        focal: (fx, fy) pixels.
+        centre: (cx, cy) pixels.
+        distortion: k1, k2, p1, p2, k3 of the Brown-Conrady model; empty for none.
+        error_px: root mean square of what the calibration left unexplained.
+    """
+
+    size: tuple[int, int]
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    distortion: tuple[float, ...] = ()
+    error_px: float = field(default=0.0, compare=False)
+
+    @property
+    def matrix(self) -> Floats:
+        """(3, 3)."""
+        return np.array([[self.focal[0], 0.0, self.centre[0]], [0.0, self.focal[1], self.centre[1]], [0.0, 0.0, 1.0]])
+
+    @property
+    def coefficients(self) -> Floats:
+        """(5,) of distortion."""
+        return np.array([*self.distortion, *[0.0] * (5 - len(self.distortion))])
+
+
+def find_corners(picture: Image, board: Board) -> Corners | None:
+    """The board's corners in a picture (H, W) or (H, W, 3); None where too few are seen to be of use."""
+    detector = cv2.aruco.CharucoDetector(board.pattern)
+    points, image = np.zeros((0, 3)), np.zeros((0, 2))
+    for finer in (1, 2):  # small markers are read better when they are enlarged, large corners are found better as is
+        enlarged = cv2.resize(picture, None, fx=finer, fy=finer, interpolation=cv2.INTER_CUBIC)
+        corners, ids, _, _ = detector.detectBoard(enlarged)
+        if ids is not None and len(ids) > len(points):
+            on_board, on_image = board.pattern.matchImagePoints(corners, ids)  # pyright: ignore
+            points = np.asarray(on_board, np.float64).reshape(-1, 3)
+            image = (np.asarray(on_image, np.float64).reshape(-1, 2) + 0.5) / finer - 0.5
+        if len(points) == (board.columns - 1) * (board.rows - 1):
+            break
+    if len(points) < LEAST_CORNERS:
+        return None
+    if len(np.unique(points[:, 0])) < 2 or len(np.unique(points[:, 1])) < 2:
+        return None  # on one line: they say nothing of the board's plane
+    # OpenCV counts from the upper left corner, y down and z into the board
+    flat = np.array([0.0, board.size[1], 0.0]) + points * [1.0, -1.0, -1.0]
+    return Corners(flat, image)
+
+
+def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsics:
+    """The lens that took pictures of one board in many positions.
+
+    Args:
+        views: of pictures of the same size.
+        size: pixels, width and height.
+
+    Raises:
+        CalibrationError: too few pictures, or they do not agree.
+    """
+    kept = [view for view in views if len(view.image) >= LEAST_CORNERS]
+    while True:
+        if len(kept) < LEAST_VIEWS:
+            raise CalibrationError(
+                f"expected {LEAST_VIEWS} pictures or more that show the board well, got {len(kept)}: take 15 to 25, "
+                "the board near and far, tilted to all sides, in the middle and in every corner of the picture"
+            )
+        error, matrix, distortion, _, _, _, _, errors = cv2.calibrateCameraExtended(
+            [view.board.astype(np.float32) for view in kept],
+            [view.image.astype(np.float32) for view in kept],
+            size,
+            np.eye(3),
+            np.zeros(5),
+        )
+        errors = np.ravel(errors)
+        bad = errors > max(WORST_VIEW * float(np.median(errors)), 0.5)
+        if not bad.any():
+            break
+        kept = [view for view, out in zip(kept, bad, strict=True) if not out]
+    if not error < MOST_ERROR_PX:
+        raise CalibrationError(
+            f"expected corners within {MOST_ERROR_PX:g} pixels of where the lens puts them, got {error:.1f}: is the "
+            "board flat, the number of squares as printed, and every picture from the same camera and resolution?"
+        )
+    return Intrinsics(
+        size=(int(size[0]), int(size[1])),
+        focal=(float(matrix[0, 0]), float(matrix[1, 1])),
+        centre=(float(matrix[0, 2]), float(matrix[1, 2])),
+        distortion=tuple(np.ravel(distortion).tolist()[:5]),
+        error_px=float(error),
+    )
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a camera stands.
+
+    Attributes:
+        pose: of its optical frame in the world.
+        error_px: how far most corners, four in five, at most are from where they should be.
+        sigma_m, sigma_rad: how sure the place and the orientation are: standard deviations, along the worst axis.
+    """
+
+    pose: Pose
+    error_px: float
+    sigma_m: float
+    sigma_rad: float
+
+
+def camera_pose(views: Sequence[Corners], lens: Intrinsics) -> Placement:
+    """Where a camera stands, from pictures of a board that lies flat on the floor; neither moves.
+
+    Raises:
+        CalibrationError: no picture, or the corners do not fit one place.
+    """
+    if not views:
+        raise CalibrationError("expected a picture that shows the board on the floor, got none with enough corners")
+    points = np.concatenate([view.board for view in views])
+    image = np.concatenate([view.image for view in views])
+    # a plane seen from afar has two poses that look nearly alike: the better one, among those above the floor
+    _, turns, moves, _ = cv2.solvePnPGeneric(points, image, lens.matrix, lens.coefficients, flags=cv2.SOLVEPNP_IPPE)
+    starts = [np.asarray([*turn, *move], np.float64).ravel() for turn, move in zip(turns, moves, strict=True)]
+    placed = [_refined(points, image, lens, start) for start in starts]
+    above = [placement for placement in placed if placement.pose.position[2] > 0]
+    if not above:
+        raise CalibrationError(
+            "the board is seen from below: lay it face up, and leave it as it is printed (no mirror image)"
+        )
+    best = min(above, key=lambda placement: placement.error_px)
+    if not best.error_px < MOST_ERROR_PX:
+        raise CalibrationError(
+            f"expected the corners within {MOST_ERROR_PX:g} pixels of one place of the board, got {best.error_px:.1f}: "
+            "camera and board must not move between the pictures, and the lens must be of this camera and resolution"
+        )
+    return best
+
+
+def _refined(points: Floats, image: Floats, lens: Intrinsics, start: Floats) -> Placement:
+    """The best pose near a first one, (6,) rotation vector and translation.
+
+    Errors count with Cauchy's loss: a corner found wrong, as where glare or a crease lies over it, moves nothing.
+    """
+
+    def away(pose: Floats) -> Floats:
+        seen = cv2.projectPoints(points, pose[:3], pose[3:], lens.matrix, lens.coefficients)[0]
+        return (seen.reshape(-1, 2) - image).ravel()
+
+    fit = least_squares(away, start, loss="cauchy", f_scale=CORNER_SCALE_PX, x_scale="jac")
+    turn, move = fit.x[:3], fit.x[3:]
+    error = float(np.quantile(np.linalg.norm(away(fit.x).reshape(-1, 2), axis=1), MOST_CORNERS))
+    to_world = Rotation.from_rotvec(turn).inv()
+    # By the Gauss-Markov theorem; the camera's place is -R^T t, so both errors move it.
+    covariance = max(error, CORNER_SIGMA_PX) ** 2 * np.linalg.inv(fit.jac.T @ fit.jac)
+    place = np.empty((3, 6))
+    for k in range(3):
+        step = np.zeros(3)
+        step[k] = 1e-6
+        nudged = Rotation.from_rotvec(turn + step).inv().apply(move)
+        place[:, k] = -(nudged - to_world.apply(move)) / 1e-6
+        place[:, 3 + k] = -to_world.as_matrix()[:, k]
+    return Placement(
+        pose=Pose(-to_world.apply(move), to_world.as_quat()),
+        error_px=error,
+        sigma_m=float(np.sqrt(np.linalg.eigvalsh(place @ covariance @ place.T)[-1])),
+        sigma_rad=float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
+    )
+
+
+def points_of_depth(depth: NDArray[np.integer], lens: Intrinsics) -> Floats:
+    """(N, 3) metres, optical frame: what a depth image (H, W) in millimetres sees; 0 is nothing.
+
+    Raises:
+        CalibrationError: the image is not of the lens's size.
+    """
+    height, width = depth.shape
+    if (width, height) != lens.size:
+        raise CalibrationError(
+            f"expected a depth image of {lens.size[0]} x {lens.size[1]} pixels, as the lens was calibrated for, "
+            f"got {width} x {height}"
+        )
+    rows, columns = np.nonzero(depth)
+    z = depth[rows, columns].astype(np.float64) / 1000.0
+    pixels = np.stack([columns, rows], axis=-1).astype(np.float64)
+    rays = cv2.undistortPoints(pixels[:, None], lens.matrix, lens.coefficients).reshape(-1, 2)
+    return np.column_stack([rays * z[:, None], z])
+
+
+def floor_pose(points: Floats, up: Floats, seed: int = 0) -> tuple[Pose, float]:
+    """Where a camera stands that sees the floor: above the world's origin, looking along +y.
+
+    The floor is the lowest of the large planes that are about level.
+
+    Args:
+        points: (N, 3) metres, optical frame.
+        up: (3,) where up is, as gravity says, to `FLOOR_TILT`.
+        seed: of the sampling.
+
+    Returns:
+        the pose, and the share of points that lie on the floor.
+
+    Raises:
+        CalibrationError: no floor is seen.
+    """
+    up = np.asarray(up, np.float64) / np.linalg.norm(up)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < 100:
+        raise CalibrationError(f"expected a depth image with 100 points or more, got {len(points)}")
+    rng = np.random.default_rng(seed)
+    sample = points[rng.choice(len(points), min(len(points), 4000), replace=False)]
+    best: tuple[int, Floats, float] | None = None
+    for a, b, c in sample[rng.integers(len(sample), size=(1000, 3))]:
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-6:
+            continue
+        normal *= np.sign(normal @ up) / length
+        if normal @ up < np.cos(FLOOR_TILT):
+            continue
+        height = float(normal @ a)
+        count = int((np.abs(sample @ normal - height) < FLOOR_SLACK).sum())
+        # a table is a plane too: what lies under a plane was seen, so that plane is not the floor
+        under = int((sample @ normal < height - 3 * FLOOR_SLACK).sum())
+        if under < 0.3 * count and (best is None or count > best[0]):
+            best = count, normal, height
+    if best is None or best[0] < FLOOR_SHARE * len(sample):
+        raise CalibrationError(
+            f"expected {FLOOR_SHARE:.0%} of what the camera sees to be floor, level to {np.degrees(FLOOR_TILT):.0f} "
+            "degrees; turn the camera down, clear the floor, or use the board"
+        )
+    _, normal, height = best
+    for slack in (2 * FLOOR_SLACK, FLOOR_SLACK):
+        on_floor = points[np.abs(points @ normal - height) < slack]
+        middle = on_floor.mean(axis=0)
+        axes = np.linalg.eigh(np.cov((on_floor - middle).T))[1]
+        normal = axes[:, 0] * np.sign(axes[:, 0] @ up)
+        height = float(normal @ middle)
+    share = float((np.abs(points @ normal - height) < FLOOR_SLACK).mean())
+    return Pose(np.array([0.0, 0.0, -height]), level_pose(normal).orientation), share
