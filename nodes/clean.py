@@ -30,7 +30,7 @@ def clean(
     that cannot be cleaned does not stop the others: the exit status is then 1.
 
     Args:
-        source: a recording, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps; or a
+        source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps; or a
             folder with any number of these, at any depth.
         out: the recording to make, or .npz with one row for each row of the input; or the folder for them.
         weights: weight set of the models: 'default', unless given, or 'research'.

@@ -13,6 +13,7 @@ import pytest
 from conftest import record, walk
 from rich.console import Console
 
+from msgs.types import JOINTS
 from nodes import batch
 from nodes.batch import Job, find_recordings, is_folder_of_recordings, on_cores, plan, work
 from nodes.clean import clean
@@ -194,6 +195,17 @@ def test_folders_that_hold_nothing_or_two_of_a_name(tmp_path: Path) -> None:
     (tmp_path / "other.mcap").write_bytes(b"")
     with pytest.raises(LaunchError, match="would both become"):
         clean(tmp_path, tmp_path.parent / "out")
+
+
+def test_a_table_becomes_npz(tmp_path: Path, options: tuple[str, ...], here: list[Job]) -> None:
+    positions = np.array([frame.bodies[0].positions for frame in walk(FRAMES)])
+    (tmp_path / "in").mkdir()
+    header = ",".join(f"{joint}_{axis}" for joint in JOINTS for axis in "xyz")
+    rows = [",".join([f"{k / 30:.6f}", *map(str, frame.ravel())]) for k, frame in enumerate(positions)]
+    (tmp_path / "in" / "walk.csv").write_text("\n".join([f"stamp,{header}", *rows]))
+    assert clean(tmp_path / "in", tmp_path / "out", settings=options) == 0
+    with np.load(tmp_path / "out" / "walk.npz") as out:
+        assert out["positions"].shape == (FRAMES, 22, 3)
 
 
 def test_jobs_are_for_folders(tmp_path: Path) -> None:
