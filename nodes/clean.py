@@ -30,8 +30,8 @@ def clean(
     that cannot be cleaned does not stop the others: the exit status is then 1.
 
     Args:
-        source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps; or a
-            folder with any number of these, at any depth.
+        source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
+            or a folder with any number of these, at any depth.
         out: the recording to make, or .npz with one row for each row of the input; or the folder for them.
         weights: weight set of the models: 'default', unless given, or 'research'.
         delay: frames at 30 Hz to wait for, 0 to 16; more is smoother. 4 unless given.
