@@ -16,16 +16,18 @@ from conftest import VirtualClock, running
 from fake_oak import CAMERA, Moment, Player, detections, moment, opener, plugged, script
 from scipy.spatial.transform import Rotation
 
-from msgs.topics import DIAGNOSTICS, POSE_RAW
+from msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
 from msgs.transport import Subscriber
-from msgs.types import Diagnostics, PoseRaw
+from msgs.types import JOINTS, Diagnostics, PoseRaw, PoseWorld
 from nodes import oak
 from nodes.launch import Launch, LaunchError, OakSettings
 from nodes.live import PAUSES_S
 from nodes.oak import FRAME_ID, QUEUE, SILENT_S, Host, OakSource
 from nodes.pose_input import PoseInputNode, open_input
+from nodes.prior import PriorNode
 from nodes.run import _check
 from nodes.runtime import Clock, SystemClock
+from nodes.trajectory import TrajectoryNode
 from prior.skeletons import COCO17
 
 MakeLaunch = Callable[..., Launch]
@@ -121,6 +123,31 @@ def test_frames_reach_subscribers_and_diagnostics_tell(make_launch: MakeLaunch, 
     assert news["camera"] == "streaming"
     assert news["camera.name"] == "oak-test"
     assert int(news["timeline.stamp_ns"]) == int(news["timeline.wall_ns"])
+
+
+def test_from_the_camera_to_the_world(make_launch: MakeLaunch, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(oak, "QUEUE", 1000)  # these frames come faster than any camera's
+    scene = [moment(frame) for frame in range(24)]
+    launch = make_launch(input__source="oak")
+    source = OakSource(launch.input.oak, SystemClock(), opener(lambda _: script(scene)))
+    nodes = [PoseInputNode(launch, SystemClock(), source), PriorNode(launch), TrajectoryNode(launch)]
+    worlds: list[PoseWorld] = []
+    with Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD) as subscriber, running(*nodes):
+        end = time.monotonic() + 120
+        while len(worlds) < 12 and time.monotonic() < end:
+            received = subscriber.receive(1)
+            if received and isinstance(received[1], PoseWorld) and received[1].bodies:
+                worlds.append(received[1])
+    assert len(worlds) == 12
+    hips = [COCO17.index("left_hip"), COCO17.index("right_hip")]
+    middle = np.mean([one.joints[0][hips].mean(axis=0) for one in scene], axis=0)
+    for world in worlds[4:]:
+        seen = world.bodies[0].positions[[JOINTS.index("left_hip"), JOINTS.index("right_hip")]].mean(axis=0)
+        # a level camera: its x is the world's, its depth the world's y; how high it stands nobody told it
+        np.testing.assert_allclose(seen[:2], middle[[0, 2]], atol=0.12)
+        heights = world.bodies[0].positions[:, 2] - seen[2]
+        assert np.nanmax(heights) == pytest.approx(0.6, abs=0.25), "upright: the neck, or the head"
+        assert np.nanmin(heights) == pytest.approx(-0.9, abs=0.2), "the feet"
 
 
 def test_it_goes_on_when_the_camera_is_plugged_in_again(clock: VirtualClock, walk: list[Moment]) -> None:
