@@ -240,9 +240,12 @@ class CleanBody(_Record):
     sigma: Float32
     """(22,) metres, standard deviation of a position along an axis"""
     anomaly: float
-    """how unlike human motion the window is; the scale is that of the threshold behind `anomaly_flag`"""
+    """how unlike human motion the last half second is: -log10 of the rate at which clean motion scores as high; NaN if
+    it was not scored"""
     anomaly_flag: bool
     """the estimate cannot be trusted"""
+    joint_anomaly: Float32
+    """(22,) the same scale, joint by joint: which ones caused it; NaN where not seen"""
     bone_lengths: Float32
     """(22,) metres, joint to parent; 0 for the pelvis"""
     raw_positions: Float32
@@ -257,6 +260,7 @@ class CleanBody(_Record):
         self._states("state")
         self._array("sigma", np.float32, _J)
         self._number("anomaly")
+        self._array("joint_anomaly", np.float32, _J)
         self._array("bone_lengths", np.float32, _J)
         self._array("raw_positions", np.float32, _J, 3)
         self._array("raw_confidence", np.float32, _J)

@@ -114,7 +114,15 @@ class Ros2Settings:
             raise LaunchError(f"[input.ros2] up: expected z, y or -y, got {self.up!r}")
 
 
-SOURCES = ("recording", "oak", "webcam", "ros2")
+SOURCES = ("recording", "oak", "webcam", "ros2", "merge")
+
+
+@dataclass(frozen=True)
+class MergeSettings:
+    """``[input.merge]``: several calibrated cameras in place of one."""
+
+    cameras: list[str] = field(default_factory=list)
+    """addresses of their input nodes (``tcp://192.168.1.21:7111``)"""
 
 
 @dataclass(frozen=True)
@@ -161,7 +169,7 @@ class InputSettings:
     """``[input]``: where skeletons come from."""
 
     source: str = "recording"
-    """recording, oak, webcam or ros2"""
+    """recording, oak, webcam, ros2 or merge"""
     recording: str = ""
     """rosbag2 directory, .npz or .csv to play; a relative path starts at the launch file"""
     rate: float = 1.0
@@ -172,6 +180,7 @@ class InputSettings:
     oak: OakSettings = field(default_factory=OakSettings)
     ros2: Ros2Settings = field(default_factory=Ros2Settings)
     webcam: WebcamSettings = field(default_factory=WebcamSettings)
+    merge: MergeSettings = field(default_factory=MergeSettings)
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:

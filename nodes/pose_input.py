@@ -9,6 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Protocol
 
+from msgs.keys import Keys
 from msgs.recording import RecordingError, RecordingReader
 from msgs.topics import POSE_RAW, POSE_TRUTH
 from msgs.types import Diagnostics, Message, PoseRaw
@@ -79,8 +80,13 @@ def open_source(path: str | Path) -> RecordingSource | NpzSource | CsvSource:
     return {".npz": NpzSource, ".csv": CsvSource}.get(path.suffix, RecordingSource)(path)
 
 
-def open_input(settings: InputSettings, clock: Clock) -> Source | LiveSource:
+def open_input(settings: InputSettings, clock: Clock, keys: Keys | None = None) -> Source | LiveSource:
     """What ``[input]`` names: a recording, or a camera, which is looked for when its frames are asked for.
+
+    Args:
+        settings: of the launch.
+        clock: of the node.
+        keys: for cameras on other machines.
 
     Raises:
         LaunchError, RecordingError, NpzError, CsvError: a setting, or the recording, cannot be used.
@@ -96,6 +102,10 @@ def open_input(settings: InputSettings, clock: Clock) -> Source | LiveSource:
         from nodes.ros2_source import Ros2Source
 
         return Ros2Source(settings.ros2)
+    if settings.source == "merge":
+        from nodes.merge import MergeSource
+
+        return MergeSource(settings.merge, keys)
     from nodes.webcam import WebcamSource
 
     return WebcamSource(settings.webcam, clock)
@@ -122,7 +132,7 @@ class PoseInputNode(Node):
         settings = launch.input
         if settings.rate < 0:
             raise LaunchError(f"[input] rate: expected 0 (as fast as possible) or more, got {settings.rate:g}")
-        self._source = source or open_input(settings, self.clock)
+        self._source = source or open_input(settings, self.clock, launch.transport.curve_keys())
         self._rate = settings.rate
         self._loop = settings.loop
         self._pose = settings.calibration.pose

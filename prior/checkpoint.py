@@ -40,6 +40,11 @@ def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: 
     _write_whole(path.with_suffix(".md"), ("\n".join(lines) + "\n").encode())
 
 
+def weights_path(name: str, model: str) -> Path:
+    """Where ``model``'s weights lie, by the name of the weight set or as a path."""
+    return Path(name) if name.endswith(".safetensors") else WEIGHTS / f"{model}-{name}.safetensors"
+
+
 def load_weights(name: str, model: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The state dict and configuration of ``model``.
 
@@ -50,7 +55,7 @@ def load_weights(name: str, model: str) -> tuple[dict[str, Tensor], dict[str, An
     Raises:
         FileNotFoundError: no such weights; says which there are.
     """
-    path = Path(name) if name.endswith(".safetensors") else WEIGHTS / f"{model}-{name}.safetensors"
+    path = weights_path(name, model)
     if not path.is_file():
         known = sorted(p.stem.removeprefix(f"{model}-") for p in WEIGHTS.glob(f"{model}-*.safetensors"))
         raise FileNotFoundError(

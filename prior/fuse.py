@@ -37,10 +37,24 @@ _MOST_MOBILE = 3.0
 yields without resistance no longer says where it was, and the fit needs many more sweeps."""
 
 
+def _bones_between() -> NDArray[np.int64]:
+    """(22, 22) bones on the way from one joint to another."""
+    between = np.full((len(PARENTS), len(PARENTS)), -1)
+    for joint, parent in enumerate(PARENTS):
+        between[joint, :joint] = between[:joint, joint] = between[parent, :joint] + 1
+        between[joint, joint] = 0
+    return between
+
+
+_NEAR = 1 / (1 + _bones_between()) ** 2
+"""(22, 22) how much one joint's error tells of another's"""
+
+
 class Fuse:
     """Joins a fixed-lag smoother of what was seen with the rotations that the prior decoded for the rest.
 
-    The prior's body is solved from the joints well seen; others hang from these in the rotations decoded. Each joint
+    The prior's body is solved from the joints well seen; others are where HG-VAE completes the body or, without it,
+    hang from those seen in the rotations decoded. Each joint
     is the mean of smoother and body, weighted by their precisions: one well seen stays near the observation, one
     hidden follows the prior as the smoother's uncertainty grows. Of the poses on the person's bones, the one nearest
     to that mean is the answer: lengths are constant, and positions and rotations agree.
@@ -70,6 +84,7 @@ class Fuse:
         unseen_s = self._unseen_s.all[-1 - back][slots]
         held_s = _least_below(unseen_s)
         seen_weight = 1 / (smoothed.sigma[slots] ** 2 + self._bias_sigma**2)
+        imputed = window.imputed
         prior_weight = 1 / (s.prior_sigma**2 + (s.prior_drift * np.minimum(held_s, s.fade)) ** 2)
         known = seen_weight > 0
         observed = np.where(known[..., None], smoothed.positions[slots], 0.0)
@@ -83,6 +98,13 @@ class Fuse:
             well = share > 0.5
             hung = solve_pose(np.where(well, observed, np.nan), offsets, decoded)[1]
             body = np.where(well[:, :1], hung, body)
+            if imputed is not None:
+                completed, sigma = imputed.positions[-1 - back][slots], imputed.sigma[-1 - back][slots]
+                filled = np.isfinite(completed[..., 0]) & (unseen_s > 0)
+                beside = _beside_seen(completed, observed, np.where(unseen_s > 0, 0.0, seen_weight))
+                body = np.where(filled[..., None], beside, body)
+                prior_weight = np.where(filled, 1 / (sigma**2 + self._bias_sigma**2), prior_weight)
+                share = (seen_weight / (seen_weight + prior_weight))[..., None]
             variance = 1 / (seen_weight + prior_weight)
             mobility = np.minimum(variance, _MOST_MOBILE * variance.min(axis=1, keepdims=True))
             rotations, body = fit_pose(body + share * (observed - body), offsets, mobility, decoded)
@@ -96,6 +118,18 @@ class Fuse:
             sigma=_scatter(window.slots, slots[placed], sigma[placed], np.inf),
             state=_scatter(window.slots, slots[placed], state[placed], JointState.UNKNOWN).astype(np.uint8),
         )
+
+
+def _beside_seen(
+    completed: NDArray[np.float64], observed: NDArray[np.float64], weight: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Joints (S, 22, 3) as the model completes them, each moved as the seen ones near it are off there.
+
+    ``weight`` (S, 22) is how far to believe ``observed`` (S, 22, 3), 0 where a joint was not seen.
+    """
+    near = _NEAR * weight[:, None]
+    off = np.where(weight[..., None] > 0, observed - completed, 0.0)
+    return completed + near @ off / np.maximum(near.sum(axis=-1, keepdims=True), 1e-12)
 
 
 def _weighted_mean(vectors: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,8 @@ class MotionSet:
         offsets: (N, 22, 3) metres, the bones of the person in each frame.
         contacts: (N, 8) labels.
         clip_start: (C + 1,) first frame of each clip, and the end.
+        subject: (C,) who moves, as the source names people; empty where the clips' origin does not matter.
+        action: (C,) what they do, as the source names it; as well.
     """
 
     rotations: Tensor
@@ -32,6 +34,8 @@ class MotionSet:
     offsets: Tensor
     contacts: Tensor
     clip_start: NDArray[np.int64]
+    subject: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+    action: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
 
     @classmethod
     def load(cls, path: Path, weights: str, split: str, *, flat: bool = False) -> MotionSet:
@@ -64,7 +68,24 @@ class MotionSet:
             offsets=torch.from_numpy(np.repeat(data["offsets"][wanted], lengths, axis=0)),
             contacts=torch.from_numpy(data["contacts"][frames]),
             clip_start=np.concatenate([[0], np.cumsum(lengths)]),
+            subject=data["subject"][wanted],
+            action=data["action"][wanted],
         )
+
+    def only(self, clips: NDArray[np.bool_]) -> MotionSet:
+        """These clips (C,) alone.
+
+        Raises:
+            ValueError: there are none.
+        """
+        if not clips.any():
+            raise ValueError(f"expected at least one of {len(clips)} clips, none is wanted")
+        frames = np.concatenate([np.arange(*self.clip_start[c : c + 2]) for c in np.flatnonzero(clips)])
+        lengths = np.diff(self.clip_start)[clips]
+        return MotionSet(
+            self.rotations[frames], self.positions[frames], self.offsets[frames], self.contacts[frames],
+            np.concatenate([[0], np.cumsum(lengths)]), self.subject[clips], self.action[clips],
+        )  # fmt: skip
 
     def sample(
         self, count: int, window: int, strides: Sequence[int], generator: np.random.Generator

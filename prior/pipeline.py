@@ -1,4 +1,4 @@
-"""The prior, stage by stage: adapt, gate, correct, smooth, bones, solve, refine, fuse.
+"""The prior, stage by stage: adapt, gate, correct, smooth, bones, encode, score, impute, solve, refine, fuse.
 
 One object serves a stream: `PriorPipeline.process` takes ``pose/raw`` messages and gives the ``pose/clean`` messages
 they complete. All bodies go through each stage together, one slot a body. Nothing here reads a clock or draws a
@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs.types import CleanBody, PoseClean, PoseRaw, RawBody
+from prior.anomaly import Score, ScoreSettings
 from prior.bones import Bones, BonesSettings
 from prior.correct import Correct, CorrectSettings
+from prior.encode import Encode, EncodeSettings
 from prior.fuse import Fuse, FuseSettings
 from prior.gate import Gate, GateSettings
 from prior.identify import Identify, IdentifySettings
+from prior.impute import Impute, ImputeSettings
 from prior.refine import Refine, RefineSettings
 from prior.resample import Resampler
 from prior.settings import build_settings
@@ -55,7 +58,7 @@ class PriorSettings:
             more bones are measured rather than taken from human proportions, and the surer joints are said to be.
             Depth cameras have 2 cm or more, marker-based motion capture next to none.
         identify: who tells bodies apart: the source (the default), or the prior.
-        gate, correct, smooth, bones, refine, fuse: settings of the stages.
+        gate, correct, smooth, bones, encode, score, impute, refine, fuse: settings of the stages.
     """
 
     delay: int = 4
@@ -67,6 +70,9 @@ class PriorSettings:
     correct: CorrectSettings = field(default_factory=CorrectSettings)
     smooth: SmoothSettings = field(default_factory=SmoothSettings)
     bones: BonesSettings = field(default_factory=BonesSettings)
+    encode: EncodeSettings = field(default_factory=EncodeSettings)
+    score: ScoreSettings = field(default_factory=ScoreSettings)
+    impute: ImputeSettings = field(default_factory=ImputeSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     fuse: FuseSettings = field(default_factory=FuseSettings)
 
@@ -96,7 +102,22 @@ class PriorPipeline:
         refine = Refine(settings.refine, settings.delay)
         self._identify = Identify(settings.identify, 2 * slots, self.counters) if settings.identify.enabled else None
         self._resampler = Resampler(slots)
-        self._window = Window(max(refine.window, settings.delay + 1), slots)
+        # what the sensor may be off by, slowly and fast
+        sensor_sigma = float(np.hypot(settings.bias_sigma, settings.smooth.measurement_sigma))
+        reads = settings.score.enabled or settings.impute.enabled
+        self._encode = Encode(settings.encode, sensor_sigma) if reads else None
+        self._impute: Impute | None = None
+        hgvae: list[Stage] = []
+        if self._encode:
+            hgvae.append(self._encode)
+            if settings.score.enabled:
+                hgvae.append(Score(settings.score, settings.encode.weights, sensor_sigma, slots))
+            if settings.impute.enabled:
+                self._impute = Impute(settings.impute, self._encode.model, settings.delay, slots, self.counters)
+                hgvae.append(self._impute)
+        shortest = max(refine.window, settings.delay + 1)
+        window_frames = max(shortest, self._encode.model.frames if self._encode else 0)
+        self._window = Window(window_frames, slots, decoded_frames=shortest)
         self._smooth = Smooth(settings.smooth, settings.delay, slots)
         self._fuse = Fuse(settings.fuse, settings.bias_sigma, settings.delay, slots)
         self._stages: tuple[Stage, ...] = (
@@ -104,6 +125,7 @@ class PriorPipeline:
             *([Correct(settings.correct, slots)] if settings.correct.sensor else []),
             self._smooth,
             Bones(settings.bones, settings.bias_sigma, slots),
+            *hgvae,
             Solve(),
             refine,
             self._fuse,
@@ -271,8 +293,9 @@ class PriorPipeline:
                     rotations=Rotation.from_matrix(rotations, assume_valid=True).as_quat(),
                     state=estimate.state[slot],
                     sigma=estimate.sigma[slot],
-                    anomaly=np.nan,
-                    anomaly_flag=False,
+                    anomaly=float(window.anomaly[slot]),
+                    anomaly_flag=bool(window.anomaly_flag[slot]),
+                    joint_anomaly=window.joint_anomaly[slot],
                     bone_lengths=np.sqrt((window.offsets[slot] ** 2).sum(axis=-1)),
                     raw_positions=(window.raw.all[-1 - back][slot] - origin) @ to_world,
                     raw_confidence=window.confidence.all[-1 - back][slot],

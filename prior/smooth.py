@@ -72,7 +72,7 @@ class Smooth:
         known = np.isfinite(self._last[..., 0]) & (smoothed.sigma < _SURE)
         step = self._smoother.velocity / FPS if self.delay_frames == 0 else smoothed.positions - self._last
         step = np.where(np.isfinite(self._last), step, 0.0)
-        self._last = smoothed.positions
+        self._last = smoothed.positions.copy()
         return smoothed._replace(positions=self._follower.update(smoothed.positions, step, known))
 
     def _honest(self, smoothed: Smoothed, window: Window) -> Smoothed:

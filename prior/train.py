@@ -11,7 +11,7 @@ from prior.distributed import join, neighbours, writes
 
 
 def train(
-    model: Literal["hmvae", "trajectory", "correction"],
+    model: Literal["hmvae", "hgvae", "hgvae-wide", "trajectory", "correction"],
     data: Path = Path("data/prepared.npz"),
     weights: Literal["default", "research", "kinect_v2"] | None = None,
     runs: Path = Path("runs"),
@@ -28,7 +28,8 @@ def train(
     prior/weights.
 
     Args:
-        model: hmvae (refinement), trajectory (root velocity and contacts), or correction (a sensor's own error).
+        model: hmvae (refinement), hgvae (anomaly score and imputation), hgvae-wide (the same in the paper's size, for
+            recordings), trajectory (root velocity and contacts), or correction (a sensor's own error).
         data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon.
         weights: the set to train: 'default' takes only data free for products, 'research' all of it; a correction
             is named after its sensor, kinect_v2.
@@ -40,6 +41,10 @@ def train(
     torch.set_num_threads(max(threads // neighbours(), 1))
     if model == "hmvae":
         from prior.train_hmvae import train_hmvae as train_model
+    elif model == "hgvae":
+        from prior.train_hgvae import train_hgvae as train_model
+    elif model == "hgvae-wide":
+        from prior.train_hgvae import train_hgvae_wide as train_model
     elif model == "trajectory":
         from prior.train_trajectory import train_trajectory as train_model
     else:

@@ -84,8 +84,8 @@ def observe(clip: Clip, rng: np.random.Generator) -> list[PoseClean]:
         positions = root[t] + local[t]
         body = CleanBody(
             id=0, positions=positions, rotations=clip.rotations[t], state=state, sigma=sigma[t], anomaly=0.0,
-            anomaly_flag=False, bone_lengths=np.zeros(22, np.float32), raw_positions=positions,
-            raw_confidence=np.ones(22, np.float32),
+            anomaly_flag=False, joint_anomaly=np.zeros(22, np.float32), bone_lengths=np.zeros(22, np.float32),
+            raw_positions=positions, raw_confidence=np.ones(22, np.float32),
         )  # fmt: skip
         messages.append(PoseClean(round(t * FRAME_S * 1e9), "world", "clip", Pose.identity(), True, 0, [body]))
     return messages

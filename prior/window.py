@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prior.filters import Smoothed
 from prior.skeletons import REST_OFFSETS
+
+if TYPE_CHECKING:
+    from prior.encode import Encoded
 
 FPS = 30.0
 """Frames a second of the prior's grid, of prepared motion and of every model."""
@@ -70,6 +73,18 @@ class Estimate:
     state: NDArray[np.uint8]
 
 
+class Imputed(NamedTuple):
+    """The last frames of every body as HG-VAE completes them, the newest last.
+
+    Attributes:
+        positions: (K, S, 22, 3) metres; NaN for a body of which nothing is hidden.
+        sigma: (K, S, 22) metres, standard deviation along an axis.
+    """
+
+    positions: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+
 class Window:
     """The last T frames of S bodies in world-aligned coordinates (z up); the newest is the last.
 
@@ -83,14 +98,19 @@ class Window:
         smoothed: the fixed-lag smoother's estimate of the frame ``delay`` before the newest, or None while there is
             none.
         rotations: ring of (S, 22, 3, 3) local, solved from the positions.
+        encoded: (S) what HG-VAE makes of each body's window; None where there is no body or no such stage.
+        anomaly: (S,) how unlike human motion the last half second is; see `prior.anomaly`. NaN if it was not scored.
+        anomaly_flag: (S,) whether it is too much so.
+        joint_anomaly: (S, 22) the same joint by joint; NaN where not seen.
+        imputed: the last frames as HG-VAE completes them, or None while there is no such stage.
         present: (S,) which slots hold a body.
         offsets: (S, 22, 3) metres, each person's bones.
         measured: (S,) whether these are the person's own, not yet those of a generic adult.
-        decoded: (T, S, 22, 3, 3) local rotations of the same frames, from the refinement model.
+        decoded: (D, S, 22, 3, 3) local rotations of the last frames, from the refinement model.
         out: the estimate of the frame ``delay`` before the newest, or None while there is none.
     """
 
-    def __init__(self, frames: int, slots: int) -> None:
+    def __init__(self, frames: int, slots: int, decoded_frames: int | None = None) -> None:
         self.slots = slots
         self.stamp_s = Ring(frames, ())
         self.raw = Ring(frames, (slots, 22, 3))
@@ -100,10 +120,15 @@ class Window:
         self.sensor_position = np.zeros(3)
         self.noise = np.zeros(slots)
         self.smoothed: Smoothed | None = None
+        self.encoded: list[Encoded | None] = [None] * slots
+        self.anomaly = np.full(slots, np.nan)
+        self.anomaly_flag = np.zeros(slots, dtype=bool)
+        self.joint_anomaly = np.full((slots, 22), np.nan)
+        self.imputed: Imputed | None = None
         self.present = np.zeros(slots, dtype=bool)
         self.offsets = np.tile(REST_OFFSETS, (slots, 1, 1))
         self.measured = np.zeros(slots, dtype=bool)
-        self.decoded = np.broadcast_to(np.eye(3), (frames, slots, 22, 3, 3)).copy()
+        self.decoded = np.broadcast_to(np.eye(3), (decoded_frames or frames, slots, 22, 3, 3)).copy()
         self.out: Estimate | None = None
 
     def clear(self, slot: NDArray[np.bool_]) -> None:
@@ -112,6 +137,7 @@ class Window:
             ring.clear(slot)
         self.present &= ~slot
         self.measured &= ~slot
+        self.anomaly_flag &= ~slot
         self.noise[slot] = 0.0
         self.offsets[slot] = REST_OFFSETS
         self.decoded[:, slot] = np.eye(3)

@@ -39,6 +39,7 @@ CLEAN_BODIES = st.builds(
     sigma=f32(22),
     anomaly=st.floats(),
     anomaly_flag=st.booleans(),
+    joint_anomaly=f32(22),
     bone_lengths=f32(22),
     raw_positions=f32(22, 3),
     raw_confidence=f32(22),
@@ -113,8 +114,9 @@ def raw(stamp_ns: int = 0, joints: int = 32, bodies: int = 1) -> PoseRaw:
 def clean(stamp_ns: int = 0) -> PoseClean:
     joints = np.arange(66).reshape(22, 3)
     body = CleanBody(
-        7, joints, np.ones((22, 4)), np.full(22, 2), np.ones(22), 0.5, True, np.ones(22), joints * np.nan, np.zeros(22)
-    )
+        7, joints, np.ones((22, 4)), np.full(22, 2), np.ones(22), 0.5, True, np.ones(22), np.ones(22), joints * np.nan,
+        np.zeros(22),
+    )  # fmt: skip
     return PoseClean(stamp_ns, "camera", "test", Pose.from_up("-y"), False, 4, [body])
 
 

@@ -128,7 +128,8 @@ def messages(
             clean_bodies.append(
                 CleanBody(
                     body, _f32(to_camera(positions)), _f32(rotations), state.astype(np.uint8), _f32(sigma), anomaly,
-                    nonsense, _f32(np.linalg.norm(REST_OFFSETS, axis=1)), _f32(to_camera(canonical)), _f32(trust),
+                    nonsense, np.full(22, anomaly, np.float32), _f32(np.linalg.norm(REST_OFFSETS, axis=1)),
+                    _f32(to_camera(canonical)), _f32(trust),
                 )
             )  # fmt: skip
             world_bodies.append(_world(body, positions, rotations, velocity, state, 0.06 if arm_hidden else 0.012))

@@ -133,7 +133,7 @@ def answers(stamp_ns: int, position: float, turn: Rotation, body: int = 0) -> tu
     state = np.full(22, JointState.SEEN if position < 0.5 else JointState.IMPUTED)
     ones, zeros = np.ones(22), np.zeros((22, 3))
     sensor = Pose.identity()
-    made = CleanBody(body, positions, rotations, state, ones * position, position, False, ones, zeros, ones)
+    made = CleanBody(body, positions, rotations, state, ones * position, position, False, ones, ones, zeros, ones)
     placed = WorldBody(
         body, zeros[0], turn.as_quat(), np.full(3, position), np.eye(6), positions, rotations, state, ones, np.ones(8),
         Tracking.OK,

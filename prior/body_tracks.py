@@ -1,0 +1,206 @@
+"""Windows of joints as HG-VAE reads them: tracks about a smooth path of the trunk, facing forward, of one size.
+
+The path is a low-passed mean of what is seen of the trunk, so that it neither jitters with one noisy joint nor jumps
+when one disappears. All joints but the pelvis are relative to it; the pelvis's track is relative to the path's mean,
+so that it tells where the body goes. In a gap a joint goes in a straight line beside the joint it hangs from; before
+its first and after its last sighting it stays beside it: the guess from which imputation starts.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from prior.skeletons import PARENTS, REST_OFFSETS, J
+
+_TRUNK = np.array([J[n] for n in ("pelvis", "left_hip", "right_hip", "spine1", "spine2", "spine3", "neck",
+                                  "left_shoulder", "right_shoulder")])  # fmt: skip
+_SIDES = np.array([(J[f"left_{n}"], J[f"right_{n}"]) for n in ("hip", "shoulder")])
+_REST = np.zeros((22, 3))
+for _joint, _parent in enumerate(PARENTS[1:], start=1):
+    _REST[_joint] = _REST[_parent] + REST_OFFSETS[_joint]
+_PARENT = np.array(PARENTS)
+_LEGS = np.array([J[f"{s}_{n}"] for s in ("left", "right") for n in ("knee", "ankle")])
+_SPINE = np.array([J[n] for n in ("spine1", "spine2", "spine3", "neck")])
+_PATH_COEFFICIENTS = 8
+"""of the cosine transform of the trunk's path: in a window of 50 frames, all that is slower than 2 Hz"""
+
+
+class Tracks(NamedTuple):
+    """One window in its body's frame.
+
+    Attributes:
+        x: (66, T) metres of a body of standard size; node ``3 * joint + axis``. NaN for a joint never seen.
+        observed: (66, T) 1 where seen, else 0.
+        path: (T, 3) metres, world: the origin of all joints but the pelvis, whose origin is the path's mean.
+        yaw: radians, the mean heading of the window.
+    """
+
+    x: NDArray[np.float64]
+    observed: NDArray[np.float64]
+    path: NDArray[np.float64]
+    yaw: float
+
+
+def body_size(offsets: NDArray[np.floating]) -> NDArray[np.float64]:
+    """How much longer than the generic adult's the legs and spine of bones (..., 22, 3) are."""
+    lengths = np.linalg.norm(offsets[..., np.concatenate([_LEGS, _SPINE]), :], axis=-1)
+    return lengths.sum(axis=-1) / np.linalg.norm(REST_OFFSETS[np.concatenate([_LEGS, _SPINE])], axis=-1).sum()
+
+
+def to_tracks(positions: NDArray[np.float64], size: float) -> Tracks:
+    """A window (T, 22, 3) metres, z up, NaN where missing, as tracks; ``size`` as `body_size` gives it."""
+    return Tracks(*_to_tracks(positions, size, _low_pass(len(positions))))
+
+
+def in_frame_of(tracks: Tracks, positions: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+    """(66, T) tracks of other joints (T, 22, 3) in the frame of ``tracks``: those of the truth beside what was seen."""
+    local = positions - tracks.path[:, None]
+    local[:, 0] = positions[:, 0] - tracks.path.mean(axis=0)
+    c, s = math.cos(tracks.yaw), math.sin(tracks.yaw)
+    local = local @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) / size
+    return local.transpose(1, 2, 0).reshape(66, -1)
+
+
+def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: float) -> NDArray[np.float64]:
+    """The joints (T, 22, 3) metres, world, of tracks ``x`` (66, T) in the frame of ``tracks``."""
+    local = x.reshape(22, 3, -1).transpose(2, 0, 1) * size
+    c, s = math.cos(tracks.yaw), math.sin(tracks.yaw)
+    world = local @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    world[:, 0] += tracks.path.mean(axis=0)
+    world[:, 1:] += tracks.path[:, None]
+    return world
+
+
+def hang_unseen(deviations: NDArray[np.floating]) -> None:
+    """Give joints never seen the deviation from the training mean of what they hang from, in place.
+
+    Args:
+        deviations: (..., 66, T) tracks less the mean tracks; NaN for joints never seen.
+    """
+    joints = deviations.reshape(*deviations.shape[:-2], 22, 3, -1)
+    for joint, parent in enumerate(PARENTS):
+        unseen = np.isnan(joints[..., joint, :, :])
+        if unseen.any():
+            # the pelvis's own track is relative to another origin
+            joints[..., joint, :, :] = np.where(unseen, joints[..., parent, :, :] if parent > 0 else 0.0,
+                                                joints[..., joint, :, :])  # fmt: skip
+
+
+_low_passes: dict[int, NDArray[np.float64]] = {}
+
+
+def _low_pass(frames: int) -> NDArray[np.float64]:
+    """(T, T) the projection onto the lowest cosines."""
+    if frames not in _low_passes:
+        k, n = np.arange(_PATH_COEFFICIENTS)[:, None], np.arange(frames)
+        basis = np.sqrt(2 / frames) * np.cos(np.pi / (2 * frames) * (2 * n + 1) * k)
+        basis[0] /= np.sqrt(2)
+        _low_passes[frames] = np.ascontiguousarray(basis.T @ basis)
+    return _low_passes[frames]
+
+
+@njit(cache=True)
+def _to_tracks(positions, size, low_pass):
+    frames, joints = positions.shape[:2]
+    yaw = _heading(positions)
+    path = low_pass @ _centre(positions, yaw, size)
+    middle = np.array([path[:, 0].mean(), path[:, 1].mean(), path[:, 2].mean()])
+    c, s = math.cos(yaw), math.sin(yaw)
+    x = np.full((3 * joints, frames), np.nan)
+    observed = np.zeros((3 * joints, frames))
+    for j in range(joints):
+        for t in range(frames):
+            if math.isnan(positions[t, j, 0]):
+                continue
+            a = positions[t, j, 0] - (middle[0] if j == 0 else path[t, 0])
+            b = positions[t, j, 1] - (middle[1] if j == 0 else path[t, 1])
+            x[3 * j, t] = (c * a + s * b) / size
+            x[3 * j + 1, t] = (c * b - s * a) / size
+            x[3 * j + 2, t] = (positions[t, j, 2] - (middle[2] if j == 0 else path[t, 2])) / size
+            observed[3 * j : 3 * j + 3, t] = 1.0
+    for j in range(joints):
+        parent = _PARENT[j]
+        while parent > 0 and math.isnan(x[3 * parent, 0]):
+            parent = _PARENT[parent]
+        for axis in range(3):
+            # relative to the nearest joint above that was ever seen, whose gaps are bridged by now
+            above = x[3 * parent + axis] if parent > 0 else np.zeros(frames)
+            _bridge(x[3 * j + axis], above)
+    return x, observed, path, yaw
+
+
+@njit(cache=True)
+def _bridge(track, above):
+    """Fill the gaps of a track (T,) in place: what it is beside ``above`` goes in a straight line, or stays."""
+    frames = len(track)
+    last = -1
+    for t in range(frames + 1):
+        if t < frames and math.isnan(track[t]):
+            continue
+        if t == frames and last < 0:
+            return
+        for u in range(last + 1, t):
+            share = 1.0 if last < 0 else (0.0 if t == frames else (u - last) / (t - last))
+            beside = 0.0
+            if last >= 0:
+                beside += (1.0 - share) * (track[last] - above[last])
+            if t < frames:
+                beside += share * (track[t] - above[t])
+            track[u] = above[u] + beside
+        last = t
+
+
+@njit(cache=True)
+def _heading(positions):
+    """Of the mean of all vectors from right to left, over hips and shoulders."""
+    a = b = 0.0
+    for t in range(len(positions)):
+        for left, right in _SIDES:
+            dx = positions[t, left, 0] - positions[t, right, 0]
+            dy = positions[t, left, 1] - positions[t, right, 1]
+            if not math.isnan(dx):
+                a += dx
+                b += dy
+    return math.atan2(-a, b)
+
+
+@njit(cache=True)
+def _centre(positions, yaw, size):
+    """(T, 3) where the pelvis would be, from all of the trunk that is seen; held where nothing is."""
+    frames = len(positions)
+    c, s = math.cos(yaw), math.sin(yaw)
+    centre = np.full((frames, 3), np.nan)
+    total = np.zeros((frames, 3))
+    weight = np.zeros(frames)
+    for j in _TRUNK:
+        # how the joint lies to the pelvis: as it was seen in this window, or as in a generic body
+        lies = np.array([c * _REST[j, 0] - s * _REST[j, 1], s * _REST[j, 0] + c * _REST[j, 1], _REST[j, 2]]) * size
+        seen = np.zeros(3)
+        count = 0
+        for t in range(frames):
+            if not math.isnan(positions[t, j, 0]) and not math.isnan(positions[t, 0, 0]):
+                seen += positions[t, j] - positions[t, 0]
+                count += 1
+        if count:
+            lies = seen / count
+        for t in range(frames):
+            if not math.isnan(positions[t, j, 0]):
+                total[t] += positions[t, j] - lies
+                weight[t] += 1.0
+    last = -1
+    for t in range(frames):
+        if weight[t] == 0.0:
+            continue
+        centre[t] = total[t] / weight[t]
+        for u in range(last + 1, t):
+            share = 1.0 if last < 0 else (u - last) / (t - last)
+            centre[u] = share * centre[t] + (1.0 - share) * (centre[last] if last >= 0 else 0.0 * centre[t])
+        last = t
+    for u in range(last + 1, frames):
+        centre[u] = centre[last] if last >= 0 else np.zeros(3)
+    return centre

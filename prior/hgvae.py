@@ -1,0 +1,308 @@
+"""HG-VAE: a hierarchical graph-convolutional VAE over windows of joint tracks ("Hierarchical Graph-Convolutional
+Variational Autoencoding for Generative Modelling of Human Motion", sections 4 and 5, appendix A).
+
+A node is one coordinate's track of one joint. Its features are the track's cosine transform; graph convolutions with
+learned adjacency mix nodes, contract them to fewer on the way up and expand them on the way down. The decoder keeps a
+deterministic stream of all nodes, to which every stochastic level, from the single top node down to one latent for
+each track, adds what it knows.
+
+Beyond the paper: the encoder is told which entries were observed, so that one pass already completes a window; and
+the cosine transform may be cut off at its lower coefficients, which makes the live model small.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+JOINT_NODES = 66
+"""22 joints, 3 coordinates: node ``3 * joint + axis``."""
+
+SCALE = 0.2
+"""Metres that the network counts as one."""
+
+LOG_VAR_RANGE = (-10.0, 3.0)
+"""of latents and, in units of `SCALE`, of tracks: standard deviations from 1.3 mm to 0.9 m"""
+
+TRACK_LOG_VAR = -4.0
+"""Log-variance of tracks that the network's zero stands for: 2.7 cm"""
+
+
+class Level(NamedTuple):
+    """One stochastic level: how many nodes, and how many latent features each has."""
+
+    nodes: int
+    latent: int
+
+
+@dataclass(frozen=True)
+class HGVAEConfig:
+    """The sizes of an HG-VAE.
+
+    Attributes:
+        frames: T, frames of a window at 30 Hz (the paper has 50).
+        coefficients: of the cosine transform that are kept, lowest first (the paper keeps all T).
+        features: F, of every node in the deterministic streams (the paper has 256).
+        levels: stochastic levels, the top one first (the paper: 1, 8, 24 and 54 nodes).
+        stochastic: how many of the levels, counted from the bottom, are random; those above stay at their prior's
+            mean and carry nothing (table 1: depth at equal capacity). None: all.
+        actions: action classes, given one-hot beside the top latent; 0 for a model without.
+    """
+
+    frames: int = 50
+    coefficients: int = 20
+    features: int = 64
+    levels: tuple[Level, ...] = (Level(1, 64), Level(8, 32), Level(24, 32), Level(JOINT_NODES, 16))
+    stochastic: int | None = None
+    actions: int = 0
+
+    @classmethod
+    def from_dict(cls, config: dict[str, Any]) -> HGVAEConfig:
+        """From the JSON of a weights file."""
+        return cls(**{**config, "levels": tuple(Level(*level) for level in config["levels"])})
+
+
+def dct_matrix(frames: int) -> Tensor:
+    """(T, T) orthonormal cosine transform, equation 7: ``tracks @ dct_matrix(T).T`` are the coefficients.
+
+    Row ``k`` is the k-th frequency, so a constant track has one coefficient. Its transpose is the inverse,
+    equation 8.
+    """
+    k = torch.arange(frames, dtype=torch.float64)[:, None]
+    n = torch.arange(frames, dtype=torch.float64)[None]
+    matrix = math.sqrt(2 / frames) * torch.cos(math.pi / (2 * frames) * (2 * n + 1) * k)
+    matrix[0] /= math.sqrt(2)
+    return matrix.float()
+
+
+class GraphLinear(nn.Module):
+    """``S A W + b``: graphs (n_in, B, f_in) to (n_out, B, f_out), equation 4 without its activation.
+
+    Nodes come first inside the model, so that either product is one of two matrices, however large the batch.
+    ``nodes_in == nodes_out`` stands for the same nodes: then S starts near the identity.
+    """
+
+    def __init__(self, nodes_in: int, nodes_out: int, features_in: int, features_out: int) -> None:
+        super().__init__()
+        if nodes_in == nodes_out:
+            adjacency = torch.eye(nodes_in) + torch.randn(nodes_in, nodes_in) * 0.3 / math.sqrt(nodes_in)
+        else:
+            adjacency = torch.randn(nodes_out, nodes_in) / math.sqrt(nodes_in)
+        self.adjacency = nn.Parameter(adjacency)
+        self.weight = nn.Parameter(torch.randn(features_in, features_out) / math.sqrt(features_in))
+        self.bias = nn.Parameter(torch.zeros(nodes_out, features_out))
+
+    def forward(self, graph: Tensor) -> Tensor:
+        """(n_in, B, f_in) to (n_out, B, f_out)."""
+        if len(self.bias) < len(graph):  # the cheaper order
+            return self._mix(graph) @ self.weight + self.bias[:, None]
+        return self._mix(graph @ self.weight) + self.bias[:, None]
+
+    def _mix(self, graph: Tensor) -> Tensor:
+        return (self.adjacency @ graph.flatten(1)).unflatten(1, graph.shape[1:])
+
+
+class GraphBlock(nn.Module):
+    """Two graph convolutional layers beside a residual connection (equation 5).
+
+    The learned weight, 0 at first, stands on the layers' branch, as Bachlechner et al. (2020) have it and as the
+    official code does; the paper's formula puts it on the residual.
+    """
+
+    def __init__(self, nodes: int, features: int) -> None:
+        super().__init__()
+        self.first = GraphLinear(nodes, nodes, features, features)
+        self.second = GraphLinear(nodes, nodes, features, features)
+        self.alpha = nn.Parameter(torch.zeros(()))
+
+    def forward(self, graph: Tensor) -> Tensor:
+        """(n, B, f) to (n, B, f)."""
+        return graph + self.alpha * F.gelu(self.second(F.gelu(self.first(graph))))
+
+
+class Gaussian(NamedTuple):
+    """A diagonal normal distribution."""
+
+    mean: Tensor
+    log_var: Tensor
+
+    def sample(self, spread: Tensor | float = 1.0) -> Tensor:
+        """By the reparametrisation trick, with ``spread`` times the standard deviation."""
+        return self.mean + spread * torch.randn_like(self.mean) * (0.5 * self.log_var).exp()
+
+    def log_density(self, value: Tensor) -> Tensor:
+        """Of every entry of ``value``, natural logarithm."""
+        return -0.5 * (self.log_var + math.log(2 * math.pi) + (value - self.mean).square() * (-self.log_var).exp())
+
+    def kl(self, other: Gaussian) -> Tensor:
+        """KL(self || other), entry by entry."""
+        ratio = (self.log_var - other.log_var).exp()
+        shift = (self.mean - other.mean).square() * (-other.log_var).exp()
+        return 0.5 * (ratio + shift - 1 - self.log_var + other.log_var)
+
+
+class Pass(NamedTuple):
+    """What one pass through the model gives.
+
+    Attributes:
+        tracks: p(x | z), mean and log-variance (B, N, T), in units of `SCALE`.
+        kl: (B, L) KL(q || p) of each level, top first; 0 where a level is turned off.
+        log_prior: (B, L) log p(m | above) at the posterior's means m, the terms of the score of section 7.
+        top: (B, latent) the top level's posterior mean.
+    """
+
+    tracks: Gaussian
+    kl: Tensor
+    log_prior: Tensor
+    top: Tensor
+
+
+class HGVAE(nn.Module):
+    """Encoder and decoder of windows (B, N, T): tracks about the training mean, in units of `SCALE`."""
+
+    def __init__(self, config: HGVAEConfig) -> None:
+        super().__init__()
+        self.config = config
+        nodes, features = JOINT_NODES, config.features
+        self.register_buffer("dct", dct_matrix(config.frames)[: config.coefficients].clone())
+        self.register_buffer("mean", torch.zeros(nodes))
+        self.read = GraphLinear(nodes, nodes, config.coefficients + config.frames, features)
+        self.read_block = GraphBlock(nodes, features)
+        self.up = nn.ModuleList()  # bottom level first
+        self.encoder = nn.ModuleList()
+        below = nodes
+        for level in reversed(config.levels):
+            same = level.nodes == below
+            self.up.append(nn.Identity() if same else GraphLinear(below, level.nodes, features, features))
+            self.encoder.append(GraphBlock(level.nodes, features))
+            below = level.nodes
+        self.start = nn.Parameter(torch.zeros(nodes, features))
+        self.down = nn.ModuleList(
+            DecoderLevel(nodes, features, level, top=k == 0, extra=config.actions if k == 0 else 0)
+            for k, level in enumerate(config.levels)
+        )
+        self.last_block = GraphBlock(nodes, features)
+        self.write = GraphLinear(nodes, nodes, features, 2 * config.coefficients)
+
+    dct: Tensor
+    mean: Tensor
+
+    @property
+    def encoder_levels(self) -> list[tuple[nn.Module, GraphBlock]]:
+        """What contracts the graph for a level, and the level's block; the bottom level first."""
+        return [(up, cast("GraphBlock", block)) for up, block in zip(self.up, self.encoder, strict=True)]
+
+    @property
+    def decoder_levels(self) -> list[DecoderLevel]:
+        """The stochastic levels, the top one first."""
+        return [cast("DecoderLevel", level) for level in self.down]
+
+    def forward(
+        self, x: Tensor, observed: Tensor, *, spread: Tensor | None = None, action: Tensor | None = None
+    ) -> Pass:
+        """Encode and decode windows.
+
+        Args:
+            x: (B, N, T) tracks; what was not observed holds a guess.
+            observed: (B, N, T) 1 where observed, else 0.
+            spread: (B, 1) the share of the posterior's standard deviation with which latents are drawn: 1 to draw
+                them, 0 or None to take the means.
+            action: (B, actions) one-hot, for a model with actions.
+        """
+        read = torch.cat([x @ self.dct.T, observed], dim=-1).transpose(0, 1)
+        graph = self.read_block(F.gelu(self.read(read)))
+        found: list[Tensor] = []
+        for up, block in self.encoder_levels:
+            graph = block(up(graph))
+            found.append(graph)
+        stream = self.start[:, None].expand(-1, len(x), -1)
+        kl, log_prior, top = [], [], None
+        off = len(self.down) - (len(self.down) if self.config.stochastic is None else self.config.stochastic)
+        for k, (level, seen) in enumerate(zip(self.decoder_levels, reversed(found), strict=True)):
+            prior = level.prior(stream)
+            if k < off:
+                stream = level.add(stream, prior.mean, action)
+                kl.append(x.new_zeros(len(x)))
+                log_prior.append(x.new_zeros(len(x)))
+                continue
+            posterior = level.posterior(stream, seen)
+            kl.append(posterior.kl(prior).sum(dim=(0, 2)))
+            log_prior.append(prior.log_density(posterior.mean).sum(dim=(0, 2)))
+            if k == 0:
+                top = posterior.mean[0]
+            stream = level.add(stream, posterior.mean if spread is None else posterior.sample(spread), action)
+        tracks = self._decode(stream)
+        if top is None:
+            top = x.new_zeros(len(x), self.config.levels[0].latent)
+        return Pass(tracks, torch.stack(kl, dim=1), torch.stack(log_prior, dim=1), top)
+
+    def generate(
+        self, count: int, *, random_levels: int | None = None, top: Tensor | None = None, action: Tensor | None = None
+    ) -> Gaussian:
+        """Tracks (count, N, T) decoded from the prior.
+
+        Args:
+            count: how many.
+            random_levels: latents of so many levels, from the top, are drawn; those below are their prior's means
+                (figure 6). None: all are drawn.
+            top: (count, latent) the top latent, if it is given; counts as drawn.
+            action: (count, actions) one-hot, for a model with actions.
+        """
+        stream = self.start[:, None].expand(-1, count, -1)
+        for k, level in enumerate(self.decoder_levels):
+            prior = level.prior(stream)
+            drawn = prior.sample() if random_levels is None or k < random_levels else prior.mean
+            stream = level.add(stream, top[None] if k == 0 and top is not None else drawn, action)
+        return self._decode(stream)
+
+    def _decode(self, stream: Tensor) -> Gaussian:
+        mean, log_var = self.write(self.last_block(stream)).transpose(0, 1).chunk(2, dim=-1)
+        return Gaussian(mean @ self.dct, (log_var @ self.dct + TRACK_LOG_VAR).clamp(*LOG_VAR_RANGE))
+
+
+class DecoderLevel(nn.Module):
+    """One stochastic level of the decoder (figure 2)."""
+
+    def __init__(self, nodes: int, features: int, level: Level, *, top: bool, extra: int) -> None:
+        super().__init__()
+        self.level, self.top, self.extra = level, top, extra
+        same = level.nodes == nodes
+        self.contract = nn.Identity() if same else GraphLinear(nodes, level.nodes, features, features)
+        self.join = nn.Linear(2 * features, features)
+        self.posterior_block = GraphBlock(level.nodes, features)
+        self.posterior_head = nn.Linear(features, 2 * level.latent)
+        if not top:
+            self.prior_block = GraphBlock(level.nodes, features)
+            self.prior_head = nn.Linear(features, 2 * level.latent)
+        self.expand = GraphLinear(level.nodes, nodes, level.latent + extra, features)
+        self.block = GraphBlock(nodes, features)
+
+    def prior(self, stream: Tensor) -> Gaussian:
+        """p(z | what stands above); N(0, I) at the top."""
+        if self.top:
+            zero = stream.new_zeros(self.level.nodes, stream.shape[1], self.level.latent)
+            return Gaussian(zero, zero)
+        return _heads(self.prior_head(self.prior_block(self.contract(stream))))
+
+    def posterior(self, stream: Tensor, seen: Tensor) -> Gaussian:
+        """q(z | what stands above, x)."""
+        joined = self.join(torch.cat([self.contract(stream), seen], dim=-1))
+        return _heads(self.posterior_head(self.posterior_block(joined)))
+
+    def add(self, stream: Tensor, z: Tensor, action: Tensor | None) -> Tensor:
+        """The stream with this level's latent in it."""
+        if self.extra:
+            if action is None:
+                raise ValueError(f"expected an action, one-hot (B, {self.extra})")
+            z = torch.cat([z, action[None]], dim=-1)
+        return self.block(stream + self.expand(z))
+
+
+def _heads(features: Tensor) -> Gaussian:
+    mean, log_var = features.chunk(2, dim=-1)
+    return Gaussian(mean, log_var.clamp(*LOG_VAR_RANGE))

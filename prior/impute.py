@@ -1,0 +1,154 @@
+"""The impute stage: where the joints are that nobody saw, by gradient ascent on HG-VAE's posterior.
+
+The encoder, told which entries were observed, completes a window in one pass: the start. From there the latents climb
+log p(z) + log p(x | z) of the entries observed, each weighted by its confidence, and what they decode to is the answer.
+Live, the climb goes on from frame to frame: how far the latents were moved is kept as the window slides, so that one
+step a frame is enough.
+
+The paper moves the missing entries themselves, up log p(z | x). That drifts away from the truth with every step
+(`steadypose evaluate hgvae`; docs/experiments.md): the posterior is surest of windows that the encoder finds easy, not
+of those that are right.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from prior.body_tracks import from_tracks
+from prior.encode import Encoded
+from prior.hgvae_live import LiveHGVAE, Look
+from prior.window import Imputed, Window
+
+Floats = NDArray[np.float64]
+
+FIRST_DECAY, SECOND_DECAY = 0.9, 0.99
+"""of Adam's moments"""
+
+CARRY_FRAMES = 10.0
+"""Frames over which what the model was off at the edge of a gap fades inside it."""
+
+
+@dataclass(frozen=True)
+class ImputeSettings:
+    """How far to climb.
+
+    Attributes:
+        enabled: whether to impute at all; off, hidden joints follow the refinement model.
+        steps: gradient steps a frame; 0 takes what one pass through the encoder gives.
+        rate: of a step, in units of the latents, as Adam has it.
+    """
+
+    enabled: bool = True
+    steps: int = 1
+    rate: float = 0.03
+
+
+class Climb:
+    """Gradient ascent (Adam) of the latents of one body's window, as it slides."""
+
+    def __init__(self, model: LiveHGVAE, settings: ImputeSettings) -> None:
+        self._model, self._rate = model, settings.rate
+        self._moved = np.zeros(model.latents)
+        self._first = np.zeros_like(self._moved)
+        self._second = np.zeros_like(self._moved)
+        self._count = 0
+
+    def complete(self, encoded: Encoded, steps: int) -> Look:
+        """What the model makes of the window: of the points visited, the one of highest score.
+
+        Each of ``steps`` looks at a point and takes a step from it; where the last one leads is seen in the next frame.
+        """
+        model, best, best_at = self._model, encoded.look, np.zeros_like(self._moved)
+        if steps and model.at is not encoded.tracks.x:  # another body's window has been looked at since
+            model.look(encoded.tracks.x, encoded.trust)
+        for step in range(steps):
+            look = model.decode(self._moved)
+            if look.score > best.score:
+                best, best_at = look, self._moved
+            elif step == 0:  # where the climb had come to is worth less than a new start
+                self._moved = best_at
+                model.decode(self._moved)
+            self._climb(model.gradient())
+        return best
+
+    def _climb(self, uphill: Floats) -> None:
+        self._count += 1
+        self._first += (1 - FIRST_DECAY) * (uphill - self._first)
+        self._second += (1 - SECOND_DECAY) * (uphill**2 - self._second)
+        first = self._first / (1 - FIRST_DECAY**self._count)
+        second = self._second / (1 - SECOND_DECAY**self._count)
+        self._moved = self._moved + self._rate * first / (np.sqrt(second) + 1e-8)
+
+
+class Impute:
+    """Gives ``window.imputed``: every body's joints of the last frames, as the model completes its window."""
+
+    def __init__(
+        self, settings: ImputeSettings, model: LiveHGVAE, delay_frames: int, slots: int, counters: Counter[str]
+    ) -> None:
+        if settings.steps < 0 or settings.rate <= 0:
+            raise ValueError(f"impute: expected steps >= 0 and rate > 0, got {settings.steps} and {settings.rate:g}")
+        self._settings, self._model, self._counters = settings, model, counters
+        self.delay_frames = delay_frames
+        self._climbs: list[Climb | None] = [None] * slots
+        self.hurry = False
+        """Whether this frame is to do without the climb: a live node that falls behind says so."""
+
+    def reset(self, slot: NDArray[np.bool_]) -> None:
+        """Forget the bodies in these slots."""
+        for k in np.flatnonzero(slot):
+            self._climbs[k] = None
+
+    def update(self, window: Window) -> Window:
+        """Complete the windows of those of whom something is hidden in the frames that are still to be answered."""
+        frames = self.delay_frames + 1
+        imputed = Imputed(np.full((frames, window.slots, 22, 3), np.nan), np.full((frames, window.slots, 22), np.inf))
+        for slot, encoded in enumerate(window.encoded):
+            if encoded is None or encoded.tracks.observed[:, -frames:].all():
+                self._climbs[slot] = None
+                continue
+            # A joint never seen in the window is one that the sensor does not have: that takes no climb.
+            lost = encoded.tracks.observed.any(axis=1) & ~encoded.tracks.observed[:, -frames:].all(axis=1)
+            steps = self._settings.steps if lost.any() else 0
+            if self.hurry and steps:
+                self._counters["imputation_skipped"] += 1
+                steps = 0
+            climb = self._climbs[slot] = self._climbs[slot] or Climb(self._model, self._settings)
+            look = climb.complete(encoded, steps)
+            tracks = encoded.tracks
+            carried = _carried(np.nan_to_num(tracks.x - look.mean), tracks.observed, CARRY_FRAMES)
+            positions = from_tracks(look.mean + carried, tracks, encoded.size)
+            imputed.positions[:, slot] = positions[-frames:]
+            sigma = look.sigma.reshape(22, 3, -1) * encoded.size
+            imputed.sigma[:, slot] = np.sqrt((sigma**2).mean(axis=1)).T[-frames:]
+        window.imputed = imputed
+        return window
+
+
+@njit(cache=True)
+def _carried(off, observed, fade):
+    """(66, T) what the model was off where observed, carried from either side into the gaps, where it fades."""
+    nodes, frames = off.shape
+    carried = np.where(observed > 0, off, 0.0)
+    for node in range(nodes):
+        last = -1
+        for t in range(frames + 1):
+            if t < frames and observed[node, t] == 0.0:
+                continue
+            for u in range(last + 1, min(t, frames)):
+                before, after = u - last, t - u
+                value = 0.0
+                share = 0.0 if last < 0 else (1.0 if t == frames else after / (before + after))
+                if last >= 0:
+                    value += share * off[node, last] * math.exp(-before / fade)
+                if t < frames:
+                    value += (1.0 - share) * off[node, t] * math.exp(-after / fade)
+                carried[node, u] = value
+            last = t
+    return carried

@@ -1,0 +1,45 @@
+"""Windows of prepared motion as HG-VAE takes them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from prior.body_tracks import body_size, hang_unseen, to_tracks
+from prior.hgvae import HGVAE, SCALE
+from prior.motion_windows import MotionSet, mirror_offsets
+
+Floats = NDArray[np.float64]
+
+
+class Windows:
+    """Windows of a split, drawn at random, as the model takes them."""
+
+    def __init__(self, motion: MotionSet) -> None:
+        self.motion = motion
+
+    def clean(self, rows: NDArray[np.int64], mirrored: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        """Positions (B, T, 22, 3) of frames ``rows`` (B, T), some as in a mirror, and body sizes (B,)."""
+        positions = self.motion.positions[rows]
+        positions = torch.where(torch.from_numpy(mirrored)[:, None, None, None], mirror_offsets(positions), positions)
+        return positions.numpy().astype(np.float64), body_size(self.motion.offsets[rows[:, 0]].numpy())
+
+    def draw(self, count: int, frames: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """``count`` random windows and body sizes."""
+        return self.clean(self.motion.sample(count, frames, (1,), rng), rng.random(count) < 0.5)
+
+
+def standardise(model: HGVAE, x: Floats) -> Tensor:
+    """Tracks (B, 66, T) metres as the model takes them, complete; see `hang_unseen`."""
+    deviations = (x - model.mean.double().numpy()[:, None]) / SCALE
+    hang_unseen(deviations)
+    return torch.from_numpy(deviations).float()
+
+
+def mean_tracks(windows: Windows, frames: int, count: int = 2000) -> Tensor:
+    """(66,) metres, over random training windows."""
+    positions, sizes = windows.draw(count, frames, np.random.default_rng(0))
+    tracks = [to_tracks(window, size).x for window, size in zip(positions, sizes, strict=True)]
+    return torch.from_numpy(np.mean(tracks, axis=(0, 2))).float()
