@@ -213,8 +213,11 @@ def test_jobs_are_for_folders(tmp_path: Path) -> None:
         clean(write_npz(tmp_path / "a.npz"), tmp_path / "b.npz", jobs=2)
 
 
-def test_a_ray_cluster_gives_the_same(tmp_path: Path, settings: dict[str, Any]) -> None:
+def test_a_ray_cluster_gives_the_same(
+    tmp_path: Path, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     ray = pytest.importorskip("ray", reason="the extra 'ray' is not installed")
+    monkeypatch.setenv("RAY_raylet_start_wait_time_s", "120")  # on a busy machine it takes longer than the usual 30
     source, out = a_folder(tmp_path / "in"), tmp_path / "out"
     ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
     try:
