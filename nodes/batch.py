@@ -25,6 +25,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from nodes.cleaning import clean_recording
+from nodes.cli import is_for_user
 from nodes.launch import LaunchError
 
 MANIFEST = "manifest.jsonl"
@@ -125,7 +126,8 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
             progress.advance(bar)
             if result["state"] == "failed":
                 failed += 1
-                console.print(f"{job.source}: {result['error']}", style="red", markup=False, highlight=False)
+                said = str(result["error"]).removeprefix(f"{job.source}: ")
+                console.print(f"{job.source}: {said}", style="red", markup=False, highlight=False, soft_wrap=True)
             elif not result["poses"]:
                 console.print(f"{job.source}: no body was recognised", markup=False, highlight=False)
     console.print(f"{out}: {len(found) - failed} of {len(found)} recordings are clean", highlight=False)
@@ -191,7 +193,7 @@ def work(job: Job, settings: Settings) -> dict[str, Any]:
     try:
         return {"state": "done"} | asdict(clean_recording(job.source, job.out, settings, replace=True))
     except Exception as error:  # any file may hold what nobody thought of, and the others wait
-        return _failed("".join(traceback.format_exception_only(error)).strip())
+        return _failed(str(error) if is_for_user(error) else "".join(traceback.format_exception_only(error)).strip())
 
 
 def _failed(error: str) -> dict[str, Any]:

@@ -73,7 +73,7 @@ def _main(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:
-        if isinstance(error, BrokenPipeError) or not _is_for_user(error):
+        if isinstance(error, BrokenPipeError) or not is_for_user(error):
             raise
         print(f"steadypose {name}: {error}", file=sys.stderr)
         return USAGE_ERROR
@@ -94,7 +94,7 @@ def usage() -> str:
     )
 
 
-def _is_for_user(error: Exception) -> bool:
+def is_for_user(error: Exception) -> bool:
     """Errors of this project's own, and of files, say what to do; any other is a bug and keeps its traceback."""
     return isinstance(error, OSError) or type(error).__module__.partition(".")[0] in ("msgs", "prior", "nodes")
 
