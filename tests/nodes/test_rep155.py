@@ -44,7 +44,8 @@ def forward(description: str, angles: dict[str, float], suffix: str) -> dict[str
         here[:3, 3] = [float(x) for x in told(joint, "origin", "xyz").split()]
         if joint.get("type") == "revolute":
             axis = np.array([float(x) for x in told(joint, "axis", "xyz").split()])
-            here[:3, :3] = Rotation.from_rotvec(axis * angles[joint.attrib["name"].removesuffix(f"_{suffix}")]).as_matrix()
+            angle = angles[joint.attrib["name"].removesuffix(f"_{suffix}")]
+            here[:3, :3] = Rotation.from_rotvec(axis * angle).as_matrix()
         poses[told(joint, "child", "link")] = poses[told(joint, "parent", "link")] @ here
     return poses
 
