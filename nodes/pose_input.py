@@ -155,9 +155,15 @@ class PoseInputNode(Node):
                     return
                 if frame:
                     if self.timeline is None:
-                        self.timeline = Timeline(frame.stamp_ns, frame.stamp_ns, 1.0)
+                        now = self.clock.now_ns()
+                        # a topic may replay what was captured long ago
+                        wall_ns = frame.stamp_ns if abs(now - frame.stamp_ns) < LEAP_NS else now
+                        self.timeline = Timeline(frame.stamp_ns, wall_ns, 1.0)
                         self.report()
-                    self.publish(POSE_RAW, self._placed(frame))
+                    try:
+                        self.publish(POSE_RAW, self._placed(frame))
+                    except ValueError as error:  # more bodies than a message holds
+                        self.refuse(POSE_RAW, error)
                 self.report_if_due()
 
     def _play(self, source: Source) -> None:

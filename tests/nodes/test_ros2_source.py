@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import running, until
+from conftest import VirtualClock, raw, running, until, walking
 from synthetic_poses import walker
 
 from msgs.topics import POSE_RAW
@@ -20,9 +20,10 @@ from msgs.transport import Subscriber
 from msgs.types import PoseRaw
 from nodes.adapters import from_pose_array
 from nodes.launch import Launch, LaunchError
+from nodes.live import LiveSource
 from nodes.pose_input import PoseInputNode
 from nodes.ros2_bridge import PACKAGES
-from prior.skeletons import COCO17, SKELETONS
+from prior.skeletons import CANONICAL, COCO17, SKELETONS
 
 DOMAIN = str(1 + (os.getpid() + 100) % 200)
 
@@ -102,6 +103,35 @@ def test_a_topic_becomes_pose_raw(make_launch: Callable[..., Launch], tmp_path: 
         np.testing.assert_array_equal(body.positions, expected.astype(np.float32))
     assert message.bodies[1].confidence[4] == 0
     assert source.status()["camera"].startswith("/skeletons, ")
+
+
+class Topic(LiveSource):
+    """A source that gives these frames."""
+
+    def __init__(self, *found: PoseRaw) -> None:
+        super().__init__()
+        self._frames = found
+
+    def frames(self) -> Generator[PoseRaw | None, None, None]:
+        yield from self._frames
+        while True:
+            yield None
+
+    def status(self) -> dict[str, str]:
+        return {}
+
+
+def test_more_bodies_than_a_message_holds_are_refused_and_the_next_frame_comes(
+    make_launch: Callable[..., Launch], clock: VirtualClock
+) -> None:
+    crowd = from_pose_array(pose_array(22 * 4000), CANONICAL, "z")
+    frames = Topic(raw(1, walking(1)), crowd, raw(2, walking(2)))
+    source = PoseInputNode(make_launch(transport__lossless="false"), clock, frames)
+    with running(source):
+        until(lambda: source._published[POSE_RAW] == 2)
+    assert source.counts["refused.ValueError"] == 1
+    assert source.timeline
+    assert source.timeline.wall(raw(1).stamp_ns) == clock.now_ns(), "captured at another time: it counts from now"
 
 
 def pose_array(count: int) -> Any:
