@@ -46,7 +46,7 @@ def run(
     A node that crashes is started again. With `view` on a terminal, the picture stays when the stream has ended.
 
     Args:
-        launch: a launch file, or the name of one of the project's own: replay, server.
+        launch: a launch file, or the name of one of the project's own, such as replay, oak, ros2 or server.
         input: the recording, .npz or .csv to play in place of the launch file's.
         rate: times real time; 0 is as fast as it goes.
         loop: play it again and again.
