@@ -76,7 +76,7 @@ class Bench:
             if self.quick or not self.data.is_file():
                 train, val = as_set(self.training_clips()), as_set(self.clips())
                 with tempfile.TemporaryDirectory() as runs:
-                    return window_vaes.trained(name, frames, train, val, Path(runs), steps=3)
+                    return window_vaes.trained(name, frames, train, val, Path(runs), steps=1)
             train, val = (prepared_set(self.data, split) for split in ("train", "val"))
             runs = ROOT / "runs" / f"reconstruction-{digest(self.data)}"
             return window_vaes.trained(name, frames, train, val, runs, window_vaes.STEPS[frames])
