@@ -39,7 +39,7 @@ def test_joints_of_the_other_arm_reach_a_leg_in_the_skeletons_bottleneck_only() 
     moved[:, :, 21] += 1.0  # the right wrist
     for kind, everywhere in ((MVAE, False), (TCNVAE, True)):
         model = kind(CONFIGS[8]).eval()
-        first = model.encoder[0][0] if kind is MVAE else model.encoder[0]
+        first = model.encoder[0][0] if kind is MVAE else model.encoder[0]  # type: ignore[index]
         changed = (first(x.flatten(2).transpose(1, 2)) != first(moved.flatten(2).transpose(1, 2))).any(dim=-1)[0]
         assert bool(changed.all()) == everywhere
         assert changed.any()
