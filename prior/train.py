@@ -15,6 +15,7 @@ def train(
     data: Path = Path("data/prepared.npz"),
     weights: Literal["default", "research", "kinect_v2"] | None = None,
     runs: Path = Path("runs"),
+    iterations: int | None = None,
     seed: int = 0,
     threads: int = 2,
 ) -> None:
@@ -34,6 +35,7 @@ def train(
         weights: the set to train: 'default' takes only data free for products, 'research' all of it; a correction
             is named after its sensor, kinect_v2.
         runs: where checkpoints and curves go.
+        iterations: optimiser steps; the model's own number, if left out. Fewer make a weaker model sooner.
         seed: for weights and sampling.
         threads: CPU threads; under torchrun, of all processes of a machine together.
     """
@@ -50,6 +52,7 @@ def train(
     else:
         from prior.train_correction import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")
-    path = train_model(data, runs, weights=name, seed=seed)
+    length = {} if iterations is None else {"iterations": iterations}
+    path = train_model(data, runs, weights=name, seed=seed, **length)
     if writes():
         print(f"weights: {path}")
