@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -52,7 +53,8 @@ def train(
     else:
         from prior.train_correction import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")
-    length = {} if iterations is None else {"iterations": iterations}
-    path = train_model(data, runs, weights=name, seed=seed, **length)
+    if iterations is not None:
+        train_model = partial(train_model, iterations=iterations)
+    path = train_model(data, runs, weights=name, seed=seed)
     if writes():
         print(f"weights: {path}")

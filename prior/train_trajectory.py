@@ -129,8 +129,8 @@ def train_trajectory(
         f"{hours['val']:.2f} h validation, split by subject",
         "Licence": "Apache-2.0; trained only on data free for products" if weights == "default"
         else "non-commercial use only: trained on CC BY-NC 4.0 data too",
-        "Training": f"`steadypose train trajectory --weights {weights} --iterations {iterations}`: steps of {batch} windows, "
-        f"Adam {learning_rate:g}, seed {seed}",
+        "Training": f"`steadypose train trajectory --weights {weights} --iterations {iterations}`: "
+        f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}",
         "Validation": ", ".join(f"{k} {v:.4g}" for k, v in run.curves[-1].items()),
         "Calibration": f"standard deviations times {config.sigma_scale}, errors last {config.correlation_s} s "
         "(horizontal, vertical)",
