@@ -64,7 +64,7 @@ class Picture:
 class Args:
     """How near the truth key points are lifted."""
 
-    pictures: int = 300
+    pictures: int = 180
     """at each distance"""
     quick: bool = False
     """30 pictures, to see that it works; nothing is written unless --out says where"""

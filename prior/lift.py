@@ -61,6 +61,10 @@ _SEEN_WIDTH = 0.65
 """of the shoulders' width: nearer to each other, one of them is hidden"""
 _TURN_EVIDENCE = 0.10
 """metres by which one side's arm and leg are nearer, when there is no doubt which side that is"""
+_SURE = 0.5
+"""of 1, from when on the far side is taken for known"""
+_FAR_LIMBS = np.array([0.05, 0.05, -0.03, -0.03])
+"""metres behind the middle of the hips where the far arm (elbow, wrist) and leg (knee, ankle) are, at least"""
 _CONFIDENCE_EVIDENCE = 0.05
 """by which a detector is less sure of the far side's arm and leg"""
 
@@ -88,8 +92,8 @@ _ALONG = np.linspace(0.1, 0.9, 9)
 _BAND, _BAND_GROWTH = 0.04, 0.005
 _SHARE = 0.25
 """of its neighbourhood that a surface must fill"""
-_TRUNK_SHARE = 0.5
-"""the same at the hips, which a hand may hide in part"""
+_HIP_SAMPLES, _HIP_SIDE_SAMPLES = 2.7, 2.2
+"""times that radius: the neighbourhoods of the middle of the hips, and of each of them"""
 _TRUNK_BAND = 0.25
 """metres of depth over which a trunk's skin extends, leaning or turned"""
 
@@ -177,7 +181,7 @@ def _lift_body(pixels: Floats, confidence: Floats, view: _View) -> Floats:
         skin = _surface(samples[joint], trunk - _TRUNK_REACH, trunk + _TRUNK_REACH)
         positions[joint] = _behind(rays[joint], skin, _TO_CENTRE[joint])
     chest = _mean(positions, _SHOULDERS)
-    hips = _Hips.find(pixels, positions, chest, trunk, radius, view)
+    hips = _Hips.find(pixels, chest, trunk, radius, view)
     if hips:
         positions[list(_HIPS)] = hips.middle
 
@@ -202,6 +206,11 @@ def _lift_body(pixels: Floats, confidence: Floats, view: _View) -> Floats:
     turn = _turn(positions, confidence)
     if hips:
         positions[list(_HIPS)] = hips.places(turn)
+        if hips.turned and abs(turn) > _SURE:
+            # what is not behind the middle of the trunk is the trunk, or the other limb, that hides this one
+            far = _LIMB_ENDS[0 if turn > 0 else 1]
+            hidden = positions[far, 2] < hips.middle[2] + _FAR_LIMBS
+            positions[np.array(far)[hidden]] = np.nan
     _drop_doubles(positions, confidence, turn, _SHOULDER_WIDTH * (hips.trunk if hips else _TRUNK_LENGTH))
     return positions
 
@@ -222,14 +231,13 @@ class _Hips:
     """metres by which the left hip's skin is farther; NaN where either is not seen"""
 
     @classmethod
-    def find(
-        cls, pixels: Floats, positions: Floats, chest: Floats, trunk: float, radius: float, view: _View
-    ) -> _Hips | None:
-        """From key points (17, 2) and what is known of the hips' skin and the chest (3,)."""
+    def find(cls, pixels: Floats, chest: Floats, trunk: float, radius: float, view: _View) -> _Hips | None:
+        """From key points (17, 2), the middle of the shoulders (3,) and the depth of the trunk."""
         both = pixels[list(_HIPS)]
         centre = both.mean(axis=0)
-        samples = view.sample((both[0] + _ALONG[::2, None] * (both[1] - both[0]))[:, None] + radius * _DISC[::2])
-        skin = _surface(samples, trunk - _TRUNK_REACH, trunk + _TRUNK_REACH, share=_TRUNK_SHARE)
+        # wider than an arm that hangs before the hips: where there are two surfaces, the trunk is the one behind
+        samples = view.sample(centre + _HIP_SAMPLES * radius * _DISC)
+        skin = -_surface(-samples, -trunk - _TRUNK_REACH, -trunk + _TRUNK_REACH)
         if not np.isfinite(skin):
             return None
         rays = view.rays(both)
@@ -242,14 +250,22 @@ class _Hips:
         cosine = min(beside / (_HIP_WIDTH * length), 1.0)
         sine = np.sqrt(1 - cosine**2)
         thickness = _HALF_DEPTH * _HALF_BREADTH / np.hypot(_HALF_BREADTH * cosine, _HALF_DEPTH * sine)
-        left, right = positions[list(_HIPS), 2]
-        return cls(_behind(ray, skin, float(thickness)), length, rays, beside, float(left - right))
+        left, right = (
+            _surface(view.sample(hip + _HIP_SIDE_SAMPLES * radius * _DISC), trunk - _TRUNK_REACH, trunk + _TRUNK_REACH)
+            for hip in both
+        )
+        return cls(_behind(ray, skin, float(thickness)), length, rays, beside, left - right)
+
+    @property
+    def turned(self) -> bool:
+        """Whether the trunk is seen from its side."""
+        return self.beside < _TURNED * _HIP_WIDTH * self.trunk
 
     def places(self, turn: float) -> Floats:
         """(2, 3) metres: both hips, on their rays. ``turn`` as from `_turn`."""
         width = _HIP_WIDTH * self.trunk
         apart = np.sqrt(max(width**2 - self.beside**2, 0.0))
-        if self.beside >= _TURNED * width and np.isfinite(self.measured):
+        if not self.turned and np.isfinite(self.measured):
             farther = float(np.clip(self.measured, -apart - _HIP_SLACK, apart + _HIP_SLACK))
         else:
             farther = turn * apart
@@ -336,7 +352,7 @@ def _drop_doubles(positions: Floats, confidence: Floats, turn: float, shoulder_w
     for name, least in apart.items():
         left, right = _K[f"left_{name}"], _K[f"right_{name}"]
         if np.linalg.norm(positions[left] - positions[right]) < least:
-            left_goes = turn > 0 if abs(turn) > 0.5 else confidence[left] < confidence[right]
+            left_goes = turn > 0 if abs(turn) > _SURE else confidence[left] < confidence[right]
             positions[left if left_goes else right] = np.nan
 
 

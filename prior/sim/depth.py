@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, grey_dilation, uniform_filter
 
 from prior.sim.body import CAPSULES, REST_HEIGHT, stature
 from prior.skeletons import J
@@ -105,8 +106,8 @@ def spoil(depth: Floats, camera: Stereo, rng: np.random.Generator) -> NDArray[np
     """(H, W) millimetres as a stereo camera gives them, 0 where it has none, from depth (H, W) in metres."""
     disparity = camera.focal * camera.baseline / depth
     # the matcher's window takes the nearer side here, both sides there
-    fat = grey_dilation(disparity, size=(camera.window // 2 + 1,) * 2)
-    mixed = uniform_filter(disparity, size=camera.window // 2)
+    half = camera.window // 2
+    fat, mixed = cv2.dilate(disparity, np.ones((half + 1, half + 1))), cv2.blur(disparity, (half, half))
     mood = _texture(depth.shape, 4.0, rng)
     seen = np.where(mood > 0.3, fat, np.where(mood < -0.6, mixed, disparity))
     seen += camera.noise * (0.8 * _texture(depth.shape, 2.0, rng) + 0.6 * rng.standard_normal(depth.shape))
@@ -123,6 +124,7 @@ def spoil(depth: Floats, camera: Stereo, rng: np.random.Generator) -> NDArray[np
     return np.where(hidden | (seen <= 0), 0, np.clip(1000 * metres, 0, 65535)).astype(np.uint16)
 
 
+@cache
 def _rays(camera: Stereo) -> Floats:
     """(H, W, 3) with z = 1."""
     x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
@@ -132,7 +134,7 @@ def _rays(camera: Stereo) -> Floats:
 
 def _texture(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Floats:
     """Noise of unit variance that pixels within about ``size`` share."""
-    noise = gaussian_filter(rng.standard_normal(shape), size, mode="wrap")
+    noise = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), size)
     return noise / noise.std()
 
 

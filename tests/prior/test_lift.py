@@ -195,7 +195,7 @@ def test_the_root_holds_however_the_body_is_turned(degrees: int) -> None:
     hips = [K["left_hip"], K["right_hip"]]
     # seen from the side, an arm hangs before the hips
     side = abs(np.cos(np.radians(degrees))) < 0.5
-    assert np.linalg.norm(positions[hips].mean(axis=0) - truth[hips].mean(axis=0)) < (0.08 if side else 0.03)
-    np.testing.assert_allclose(positions[hips], truth[hips], atol=0.09 if side else 0.04)
+    assert np.linalg.norm(positions[hips].mean(axis=0) - truth[hips].mean(axis=0)) < (0.08 if side else 0.04)
+    np.testing.assert_allclose(positions[hips], truth[hips], atol=0.09 if side else 0.05)
     error = np.linalg.norm(positions - truth, axis=-1)
     assert np.nanmax(error[near & known]) < 0.12
