@@ -33,7 +33,7 @@ from prior.pipeline import PriorSettings
 from prior.streams import StreamBatch
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings
 
-KIOSKS = (1, 2, 4, 8, 12, 16, 24)
+KIOSKS = (1, 4, 8, 16)
 NETWORK_NS = 3_000_000
 """what a message travels"""
 PERIOD_MS = FRAME_NS / 1e6
