@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import cv2
 import matplotlib
@@ -30,6 +30,9 @@ from prior.calibration import (
     floor_pose,
     points_of_depth,
 )
+
+if TYPE_CHECKING:
+    from nodes.oak_still import Still
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -153,9 +156,27 @@ class CalibrateFloor:
     picture: Path | None = None
 
 
+@dataclass(frozen=True)
+class CalibrateOak:
+    """A picture and a depth image of an OAK camera for the other steps, and its lens, which it knows.
+
+    Try:
+      steadypose calibrate oak kitchen.toml floor
+      steadypose calibrate pose kitchen.toml floor.png --square 0.0561
+
+    Args:
+        launch: the launch file of this camera; the lens goes into its [input.calibration].
+        out: name of the files to write, without ending: NAME.png and NAME.depth.png.
+    """
+
+    launch: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.Positional]
+
+
 def calibrate(
     step: Annotated[
         Annotated[PrintBoard, tyro.conf.subcommand("board")]
+        | Annotated[CalibrateOak, tyro.conf.subcommand("oak")]
         | Annotated[CalibrateLens, tyro.conf.subcommand("lens")]
         | Annotated[CalibratePose, tyro.conf.subcommand("pose")]
         | Annotated[CalibrateFloor, tyro.conf.subcommand("floor")],
@@ -174,6 +195,8 @@ def calibrate(
         _calibrate_lens(step)
     elif isinstance(step, CalibratePose):
         _calibrate_pose(step)
+    elif isinstance(step, CalibrateOak):
+        _calibrate_oak(step)
     else:
         _calibrate_floor(step)
 
@@ -263,6 +286,31 @@ def _calibrate_floor(step: CalibrateFloor) -> None:
     grey = np.asarray(cv2.normalize(depth.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX), np.uint8)  # pyright: ignore
     _write_grid(step.picture or step.launch.with_suffix(".floor.png"), grey, lens, pose)
     print(f"{step.launch}: [input.calibration] written; poses of this camera are calibrated now")
+
+
+def _calibrate_oak(step: CalibrateOak) -> None:
+    launch = _check_launch(step.launch)
+    from nodes.oak_still import take_with_camera  # brings depthai
+
+    try:
+        still = take_with_camera(launch.input.oak)
+    except RuntimeError as error:
+        raise CalibrationError(str(error)) from error
+    _write_still(step, still)
+
+
+def _write_still(step: CalibrateOak, still: Still) -> None:
+    picture, depth = step.out.with_name(f"{step.out.name}.png"), step.out.with_name(f"{step.out.name}.depth.png")
+    cv2.imwrite(str(picture), still.colour)
+    cv2.imwrite(str(depth), still.depth)
+    height, width = still.depth.shape
+    focal, centre = still.intrinsics[[0, 1], [0, 1]], still.intrinsics[:2, 2]
+    lens = Intrinsics((width, height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
+    _save(step.launch, lens=lens)
+    up = "" if still.up is None else " --up " + " ".join(f"{value:.3f}" for value in still.up)
+    print(f"{step.launch}: [input.calibration] has the camera's lens now. With the board on the floor:")
+    print(f"  steadypose calibrate pose {step.launch} {picture} --square METRES")
+    print(f"without it:\n  steadypose calibrate floor {step.launch} {depth}{up}")
 
 
 def _described(pose: Pose) -> str:

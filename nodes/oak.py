@@ -195,6 +195,17 @@ class Host:
 Connect = Callable[[OakSettings, Clock], AbstractContextManager[Host]]
 
 
+def open_device(settings: OakSettings) -> dai.Device:
+    """The camera that the settings name.
+
+    Raises:
+        RuntimeError: there is no such camera, or it cannot be opened.
+    """
+    if not settings.device and not dai.Device.getAllAvailableDevices():
+        raise CameraError("no camera found; `steadypose doctor` says whether one is plugged in")
+    return dai.Device(dai.DeviceInfo(settings.device)) if settings.device else dai.Device()
+
+
 @contextmanager
 def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
     """Open the camera and run the whole pipeline on it.
@@ -202,9 +213,7 @@ def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
     Raises:
         RuntimeError: there is no such camera, it cannot be opened, or the model cannot be had; depthai says which.
     """
-    if not settings.device and not dai.Device.getAllAvailableDevices():
-        raise CameraError("no camera found; `steadypose doctor` says whether one is plugged in")
-    device = dai.Device(dai.DeviceInfo(settings.device)) if settings.device else dai.Device()
+    device = open_device(settings)
     with device:
         device.setMaxReconnectionAttempts(0)  # this program does that, and says so
         platform = device.getPlatformAsString()
@@ -219,15 +228,17 @@ def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
             )
             network = pipeline.create(dai.node.DetectionNetwork).build(colour, model, fps)
             network.setConfidenceThreshold(settings.confidence)
-            depth = _aligned_depth(pipeline, colour, platform)
-            imu = _imu(pipeline, device)
+            _, depth = aligned_depth(pipeline, colour, platform)
+            imu = accelerometer(pipeline, device)
             host = Host(pipeline, network.out, depth, imu, f"oak-{device.getDeviceId()}", clock)
             pipeline.start()
             yield host
 
 
-def _aligned_depth(pipeline: dai.Pipeline, colour: dai.node.Camera, platform: str) -> dai.Node.Output:
-    """Stereo depth in the view of the colour camera, without distortion."""
+def aligned_depth(
+    pipeline: dai.Pipeline, colour: dai.node.Camera, platform: str
+) -> tuple[dai.Node.Output, dai.Node.Output]:
+    """Pictures of the colour camera, without distortion, and stereo depth in the same view."""
     stereo = pipeline.create(dai.node.StereoDepth).build(
         autoCreateCameras=True, presetMode=dai.node.StereoDepth.PresetMode.DEFAULT, size=DEPTH_SIZE, fps=DEPTH_FPS
     )
@@ -238,12 +249,12 @@ def _aligned_depth(pipeline: dai.Pipeline, colour: dai.node.Camera, platform: st
         align = pipeline.create(dai.node.ImageAlign)
         stereo.depth.link(align.input)
         view.link(align.inputAlignTo)
-        return align.outputAligned
+        return view, align.outputAligned
     view.link(stereo.inputAlignTo)
-    return stereo.depth
+    return view, stereo.depth
 
 
-def _imu(pipeline: dai.Pipeline, device: dai.Device) -> tuple[dai.Node.Output, Floats] | None:
+def accelerometer(pipeline: dai.Pipeline, device: dai.Device) -> tuple[dai.Node.Output, Floats] | None:
     """The accelerometer's readings and how it is mounted; None for a camera that lacks it, or was not calibrated."""
     if device.getConnectedIMU() in ("", "NONE"):
         return None

@@ -47,13 +47,14 @@ class Level:
 
     Attributes:
         pose: of the camera's frame in the world.
-        measured: whether it rests on readings.
+        up: (3,) what points up in the camera's frame.
+        measured: whether both rest on readings.
     """
 
     def __init__(self) -> None:
         self.pose = Pose.from_up("-y")
         self.measured = False
-        self._felt = self._told = np.array([0.0, -1.0, 0.0])
+        self._felt = self.up = np.array([0.0, -1.0, 0.0])
         self._last_ns = 0
 
     def update(self, acceleration: Floats, stamp_ns: int) -> None:
@@ -66,5 +67,5 @@ class Level:
         share = 1 - np.exp(-np.clip(elapsed_s, 0.0, MEMORY_S) / MEMORY_S) if self.measured else 1.0
         self._felt = self._felt + share * (up - self._felt)
         felt = self._felt / np.linalg.norm(self._felt)
-        if not self.measured or felt @ self._told < np.cos(TURNED):
-            self.pose, self._told, self.measured = level_pose(felt), felt, True
+        if not self.measured or felt @ self.up < np.cos(TURNED):
+            self.pose, self.up, self.measured = level_pose(felt), felt, True
