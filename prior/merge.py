@@ -1,0 +1,218 @@
+"""Several calibrated cameras as one: their bodies at one moment, matched by place and merged joint by joint.
+
+Cameras do not take their pictures at the same moments: each one's bodies are first interpolated to a common grid. What
+they say of a joint is then weighed by confidence, by distance, and by direction, for a depth camera errs more along its
+line of sight than across; the weights are inverse covariances, and the mean is that of independent measurements.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+from msgs.types import Pose, PoseRaw, RawBody
+from prior.skeletons import CANONICAL, SKELETONS, finite_joints, to_canonical
+from prior.window import FPS
+
+Floats = NDArray[np.float64]
+
+PERIOD_NS = round(1e9 / FPS)
+SOURCE, FRAME_ID = "merged", "world"
+SAME_M = 0.4
+"""Two sightings of one body are nearer than this to each other, in the median over their joints."""
+APART_M = 0.25
+"""Two sightings of a joint farther than this from each other are not of the same thing: the surer one is taken."""
+ALONG = 2.0
+"""Times the error across the line of sight is that along it."""
+WAIT_NS = 100_000_000
+"""For a camera that is late, before the others are merged without it."""
+SILENT_NS = 500_000_000
+"""A camera without a picture for so long is not waited for."""
+LONGEST_STEP_NS = 150_000_000
+"""Between pictures of a camera; over longer ones is not interpolated."""
+LATE_IN_A_ROW = 30
+"""Pictures of all cameras; then the clocks were set, and the merged stream starts anew."""
+MOST_BODIES = 16
+"""In a message; a camera sees fewer."""
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """The bodies that one camera sees at one moment.
+
+    Attributes:
+        stamp_ns: capture.
+        joints: (N, 22, 3) metres, world; NaN where unobserved.
+        confidence: (N, 22), 0 where unobserved.
+        eye: (3,) metres, world: where the camera stands.
+    """
+
+    stamp_ns: int
+    joints: Floats
+    confidence: Floats
+    eye: Floats
+
+
+class Merge:
+    """Merges the ``pose/raw`` of several cameras into one, on a 30 Hz grid of capture times.
+
+    A moment is given out when every camera that is there has told of it, or `WAIT_NS` later. Only stamps count, so the
+    cameras' clocks must agree (on several machines by NTP or PTP); what comes too late is counted.
+
+    Attributes:
+        counters: what was refused or came too late, by cause and camera.
+    """
+
+    def __init__(self) -> None:
+        self.counters: Counter[str] = Counter()
+        self._reset()
+
+    def _reset(self) -> None:
+        self._last: dict[str, Sightings] = {}
+        self._waiting: dict[int, list[Sightings]] = {}
+        self._given_ns = -1
+        self._late = 0
+
+    def update(self, raw: PoseRaw) -> list[PoseRaw]:
+        """Take what a camera saw; give the merged messages it completes, oldest first."""
+        seen = self._sightings(raw)
+        if seen is None:
+            return []
+        before = self._last.get(raw.source)
+        late = seen.stamp_ns <= max(self._given_ns, before.stamp_ns if before else -1)
+        self._late = self._late + 1 if late else 0
+        if late:
+            self.counters[f"late or repeated, {raw.source}"] += 1
+            if self._late >= LATE_IN_A_ROW:
+                self._reset()
+            return []
+        self._last[raw.source] = seen
+        for tick in _ticks(before.stamp_ns if before else seen.stamp_ns - PERIOD_NS, seen.stamp_ns):
+            if tick > self._given_ns:
+                self._waiting.setdefault(tick, []).append(_interpolated(before, seen, tick))
+        return self._complete()
+
+    def _sightings(self, raw: PoseRaw) -> Sightings | None:
+        """A message's bodies in the world; None if it cannot be used."""
+        skeleton, place = SKELETONS.get(raw.skeleton), raw.sensor_pose
+        unit = abs(float(np.linalg.norm(place.orientation)) - 1.0) < 0.01
+        if raw.end_of_stream:
+            self._last.pop(raw.source, None)
+        elif skeleton is None:
+            self.counters[f"unknown skeleton, {raw.source}"] += 1
+        elif not raw.calibrated or not np.isfinite(place.position).all() or not unit:
+            self.counters[f"not calibrated, {raw.source}"] += 1
+        else:
+            bodies = [body for body in raw.bodies if len(body.positions) == len(skeleton.joints)][:MOST_BODIES]
+            self.counters[f"wrong joint count, {raw.source}"] += len(raw.bodies[:MOST_BODIES]) - len(bodies)
+            joints = np.array([body.positions for body in bodies], np.float64).reshape(-1, len(skeleton.joints), 3)
+            trust = np.array([body.confidence for body in bodies], np.float64).reshape(joints.shape[:2])
+            joints, trust = to_canonical(skeleton, joints, np.clip(np.nan_to_num(trust), 0.0, 1.0))
+            turn = Rotation.from_quat(place.orientation).as_matrix()
+            return Sightings(raw.stamp_ns, joints @ turn.T + place.position, trust, place.position)
+        return None
+
+    def _complete(self) -> list[PoseRaw]:
+        newest_ns = max(seen.stamp_ns for seen in self._last.values())
+        merged = []
+        for tick in sorted(self._waiting):
+            expected = [seen for seen in self._last.values() if abs(newest_ns - seen.stamp_ns) <= SILENT_NS]
+            if any(seen.stamp_ns < tick for seen in expected) and newest_ns < tick + WAIT_NS:
+                break
+            merged.append(self._message(tick, self._waiting.pop(tick)))
+            self._given_ns = tick
+        return merged
+
+    def _message(self, stamp_ns: int, views: list[Sightings]) -> PoseRaw:
+        bodies = [RawBody(k, *merge_joints(group)) for k, group in enumerate(match_views(views))]
+        return PoseRaw(stamp_ns, FRAME_ID, SOURCE, CANONICAL.name, Pose.identity(), True, bodies)
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One body as one camera sees it.
+
+    Attributes:
+        joints: (22, 3) metres, world; NaN where unobserved.
+        confidence: (22,).
+        eye: (3,) metres, world.
+    """
+
+    joints: Floats
+    confidence: Floats
+    eye: Floats
+
+
+def match_views(views: list[Sightings]) -> list[list[Sighting]]:
+    """The bodies of several cameras at one moment, one list of sightings for each body."""
+    groups: list[list[Sighting]] = []
+    for view in sorted(views, key=lambda view: -len(view.joints)):
+        own = [Sighting(j, c, view.eye) for j, c in zip(view.joints, view.confidence, strict=True)]
+        # a body is where the camera that has it first sees it
+        firsts = np.array([group[0].joints for group in groups]).reshape(-1, 22, 3)
+        pairs = {body: group for group, body in match_bodies(firsts, view.joints)}
+        for body, sighting in enumerate(own):
+            if body in pairs:
+                groups[pairs[body]].append(sighting)
+            else:
+                groups.append([sighting])
+    return groups
+
+
+def match_bodies(some: Floats, others: Floats) -> list[tuple[int, int]]:
+    """Pairs of bodies (N, 22, 3) and (M, 22, 3) that are in one place: the assignment with the least distances."""
+    away = np.linalg.norm(some[:, None] - others[None], axis=-1)
+    both = np.isfinite(away).any(axis=-1)
+    distance = np.full(away.shape[:2], np.inf)
+    distance[both] = np.nanmedian(away[both], axis=-1)
+    near = distance < SAME_M
+    rows, columns = linear_sum_assignment(np.where(near, distance - SAME_M, 0.0))
+    return [(int(r), int(c)) for r, c in zip(rows, columns, strict=True) if near[r, c]]
+
+
+def merge_joints(sightings: list[Sighting]) -> tuple[Floats, Floats]:
+    """Joints (22, 3) and their confidence (22,) of a body that several cameras see.
+
+    The precision of a sighting, up to a factor, is ``c² / d² (I + (1 / ALONG² - 1) r rᵀ)`` for confidence c, distance d
+    and line of sight r; the confidence that all were wrong is the product.
+    """
+    joints = np.array([sighting.joints for sighting in sightings])
+    confidence = np.array([sighting.confidence for sighting in sightings])
+    ray = joints - np.array([sighting.eye for sighting in sightings])[:, None]
+    reach = np.maximum(np.linalg.norm(ray, axis=-1), 0.1)
+    seen = finite_joints(joints) & (confidence > 0)
+    weight = np.where(seen, (confidence / np.where(seen, reach, 1.0)) ** 2, 0.0)
+    surest = np.take_along_axis(joints, weight.argmax(axis=0)[None, :, None], axis=0)
+    weight[~(np.linalg.norm(joints - surest, axis=-1) < APART_M)] = 0.0
+    used = weight > 0
+    ray = np.where(used[..., None], ray / reach[..., None], 0.0)
+    precision = weight[..., None, None] * (np.eye(3) + (ALONG**-2 - 1.0) * ray[..., :, None] * ray[..., None, :])
+    pulled = (precision @ np.where(used[..., None], joints, 0.0)[..., None]).sum(axis=0)
+    any_used = np.asarray(used.any(axis=0))
+    total = np.where(any_used[:, None, None], precision.sum(axis=0), np.eye(3))
+    merged = np.linalg.solve(total, pulled)[..., 0]
+    merged = np.where(any_used[:, None], merged, np.nan)
+    return merged, 1.0 - np.prod(np.where(used, 1.0 - confidence, 1.0), axis=0)
+
+
+def _ticks(after_ns: int, until_ns: int) -> range:
+    """The grid's moments after one stamp, up to another; no more than a step's worth."""
+    after_ns = max(after_ns, until_ns - LONGEST_STEP_NS)
+    return range((after_ns // PERIOD_NS + 1) * PERIOD_NS, until_ns + 1, PERIOD_NS)
+
+
+def _interpolated(before: Sightings | None, after: Sightings, tick: int) -> Sightings:
+    """What a camera saw at a moment between two of its pictures; bodies of the later one where there is no earlier."""
+    joints, confidence = after.joints.copy(), after.confidence.copy()
+    if before and after.stamp_ns - before.stamp_ns <= LONGEST_STEP_NS:
+        share = (tick - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+        for earlier, later in match_bodies(before.joints, after.joints):
+            joints[later] += (1.0 - share) * (before.joints[earlier] - joints[later])
+            confidence[later] = np.minimum(before.confidence[earlier], confidence[later])
+    confidence[~finite_joints(joints)] = 0.0
+    return Sightings(tick, joints, confidence, after.eye)
