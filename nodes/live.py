@@ -14,6 +14,8 @@ from nodes.runtime import TURN_S, Clock
 PAUSES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
 """before each try in a row to find the camera again; the last goes on"""
 
+STREAMING = "streaming"
+
 
 class CameraError(RuntimeError):
     """A camera that cannot be used now; it may be, later. The text says what is wrong."""
@@ -81,7 +83,7 @@ class CameraSource(LiveSource):
                     self._state = "waiting for the first frame"
                     for frame in self._connection.frames():
                         if frame:
-                            self._state, tries = "streaming", 0
+                            self._state, tries = STREAMING, 0
                         yield frame
                 trouble = "camera lost"
                 self.refused[trouble] += 1
@@ -100,6 +102,8 @@ class CameraSource(LiveSource):
 
     def status(self) -> dict[str, str]:
         values = {"camera": self._state, "camera.connections": str(self._connections)}
+        if self._state != STREAMING:
+            values["state"] = self._state  # of the node: `steadypose run` shows it
         if self._connection:
             values |= {"camera.name": self._connection.name} | self._connection.status()
             values |= {f"dropped.camera {cause}": str(n) for cause, n in self._connection.counts.items()}

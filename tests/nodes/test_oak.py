@@ -120,7 +120,7 @@ def test_frames_reach_subscribers_and_diagnostics_tell(make_launch: MakeLaunch, 
                 news = received[1].values
     assert len(got) >= 2, "over a real socket"
     assert all(len(frame.bodies) == 2 for frame in got)
-    assert news["camera"] == "streaming"
+    assert (news["camera"], news["state"]) == ("streaming", "running")
     assert news["camera.name"] == "oak-test"
     assert int(news["timeline.stamp_ns"]) == int(news["timeline.wall_ns"])
 
@@ -197,6 +197,7 @@ def test_it_looks_for_a_camera_at_growing_intervals(clock: VirtualClock) -> None
         assert next(frames) is None
     np.testing.assert_allclose(np.diff(tries), [*PAUSES_S, PAUSES_S[-1]], atol=0.2)
     assert "no camera found; next try in" in source.status()["camera"]
+    assert source.status()["state"] == source.status()["camera"], "what `steadypose run` shows of the node"
 
 
 def test_a_camera_that_falls_silent_is_given_up(clock: VirtualClock, walk: list[Moment]) -> None:
