@@ -18,6 +18,6 @@ if [ ! -e "$stamp" ] || [ uv.lock -nt "$stamp" ] || [ pyproject.toml -nt "$stamp
     fi
     .uv/bin/uv sync --frozen --compile-bytecode --extra view --python "$python"
     # numba compiles its loops once; else the first stream would wait for it
-    .venv/bin/python -c "import prior.pose_solver, prior.trajectory_filter"
+    .venv/bin/python -c "import prior.pose_solver, prior.trajectory_filter, prior.lift"
     touch "$stamp"
 fi
