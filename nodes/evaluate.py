@@ -9,7 +9,9 @@ import tyro
 
 
 def evaluate(
-    protocol: Literal["all", "kinect_vicon", "noisy_joints", "hidden_joints", "reconstruction", "world", "streaming"],
+    protocol: Literal[
+        "all", "kinect_vicon", "noisy_joints", "hidden_joints", "reconstruction", "hgvae", "world", "streaming"
+    ],
     quick: bool = False,
     mocap: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     data: Path = Path("data/prepared.npz"),

@@ -50,7 +50,7 @@ class PriorNode(Node):
         if isinstance(self._pipeline, StreamBatch):
             cleaned = self._pipeline.process_at(message, self.clock.now_ns())
         else:
-            cleaned = self._pipeline.process(message)
+            cleaned = self._pipeline.process(message, hurry=self.behind)
         for clean in cleaned:
             self._bodies = len(clean.bodies)
             self._anomalies += sum(body.anomaly_flag for body in clean.bodies)

@@ -188,6 +188,11 @@ class Node(ABC):
         """Frames kept when this node falls behind; None: it loses nothing."""
         return None if self.launch.transport.lossless else self.launch.transport.queue
 
+    @property
+    def behind(self) -> bool:
+        """Whether frames wait that will be dropped if this node does not catch up."""
+        return self.queue_limit is not None and self._inbox is not None and len(self._inbox) > 0
+
     def stop(self) -> None:
         """Ask the node to end; `run` returns within `TURN_S` and what the message at hand takes."""
         self._stopping = True

@@ -110,7 +110,9 @@ class Fuse:
             rotations, body = fit_pose(body + share * (observed - body), offsets, mobility, decoded)
         placed = known.any(axis=1)
         state = _states(unseen_s, held_s, s.fade)
-        sigma = 1 / np.sqrt(seen_weight + prior_weight)
+        # of a joint not seen, smoother and prior know the same past: what one says does not make the other surer
+        known_by = np.where(unseen_s > 0, np.maximum(seen_weight, prior_weight), seen_weight + prior_weight)
+        sigma = 1 / np.sqrt(known_by)
         return Estimate(
             stamp_s=smoothed.stamp_s,
             positions=_scatter(window.slots, slots[placed], body[placed], np.nan),

@@ -30,8 +30,12 @@ Floats = NDArray[np.float64]
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.99
 """of Adam's moments"""
 
-CARRY_FRAMES = 10.0
+CARRY_FRAMES = 20.0
 """Frames over which what the model was off at the edge of a gap fades inside it."""
+
+
+SIGMA_FOUND = 1.3
+"""Times the standard deviation that the model states: what limbs hidden for 0.3 to 2 s are off on validation motion."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +49,8 @@ class ImputeSettings:
     """
 
     enabled: bool = True
-    steps: int = 1
-    rate: float = 0.03
+    steps: int = 2
+    rate: float = 0.05
 
 
 class Climb:
@@ -121,14 +125,19 @@ class Impute:
                 steps = 0
             climb = self._climbs[slot] = self._climbs[slot] or Climb(self._model, self._settings)
             look = climb.complete(encoded, steps)
-            tracks = encoded.tracks
-            carried = _carried(np.nan_to_num(tracks.x - look.mean), tracks.observed, CARRY_FRAMES)
-            positions = from_tracks(look.mean + carried, tracks, encoded.size)
+            positions = from_tracks(completed_tracks(encoded, look), encoded.tracks, encoded.size)
             imputed.positions[:, slot] = positions[-frames:]
-            sigma = look.sigma.reshape(22, 3, -1) * encoded.size
+            # at the start: where the climb ends, the model is surer than it is right
+            sigma = SIGMA_FOUND * encoded.look.sigma.reshape(22, 3, -1) * encoded.size
             imputed.sigma[:, slot] = np.sqrt((sigma**2).mean(axis=1)).T[-frames:]
         window.imputed = imputed
         return window
+
+
+def completed_tracks(encoded: Encoded, look: Look) -> Floats:
+    """(66, T) metres: what was seen, and what the model makes of the rest, without a jump at the edge of a gap."""
+    tracks = encoded.tracks
+    return look.mean + _carried(np.nan_to_num(tracks.x - look.mean), tracks.observed, CARRY_FRAMES)
 
 
 @njit(cache=True)

@@ -135,11 +135,14 @@ class PriorPipeline:
         self._last: PoseRaw | None = None
         self._origin_ns = 0  # stage times are seconds since: a float of seconds since 1970 would round stamps
 
-    def process(self, raw: PoseRaw) -> list[PoseClean]:
+    def process(self, raw: PoseRaw, *, hurry: bool = False) -> list[PoseClean]:
         """Take a ``pose/raw`` message and give the ``pose/clean`` messages it completes, oldest first.
 
-        A message that cannot be used is counted in `counters` and otherwise ignored.
+        A message that cannot be used is counted in `counters` and otherwise ignored. In a hurry, hidden joints are
+        imputed without gradient ascent: for a live node that falls behind. A replay is never in a hurry.
         """
+        if self._impute:
+            self._impute.hurry = hurry
         if raw.end_of_stream:
             ended = self._clean(raw.stamp_ns, raw, [])
             ended.end_of_stream = True

@@ -7,6 +7,7 @@ PROTOCOLS: dict[str, str] = {
     "noisy_joints": "independent and correlated noise, spikes, exchanged limbs",
     "hidden_joints": "joints below 0.9 m, an arm behind the body, limbs away for 0.2 to 2 s",
     "reconstruction": "windows through the refinement model (HM-VAE, table 3)",
+    "hgvae": "likelihood and depth, anomalies, imputation, actions (the HG-VAE paper)",
     "world": "root drift and foot skate",
     "streaming": "delay found, jitter at matched delay, recovery, lost frames, jittering stamps",
 }

@@ -112,6 +112,8 @@ def prepared(path: Path, clips: int = 4) -> Path:
         clip_start=np.arange(clips + 1) * 80,
         split=np.array(["train"] * (clips - 1) + ["val"]),
         set=np.array(["default"] * clips),
+        subject=np.array([f"person {k}" for k in range(clips)]),
+        action=np.array(["waving"] * clips),
     )
     return path
 

@@ -1,0 +1,103 @@
+"""What HG-VAE's score must tell from clean motion: noise, exchanged and frozen joints, and what is no fault at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prior.skeletons import MIRROR, PARENTS, J
+
+Floats = NDArray[np.float64]
+Fault = Callable[[Floats, np.random.Generator], tuple[Floats, NDArray[np.bool_]]]
+"""From clean windows (B, T, 22, 3) to spoilt ones, and which of them (B,) hold the fault at all."""
+
+BEGINS = 20
+"""Frame in which a fault begins that lasts to the window's end."""
+LEAST_MOTION = 0.10
+"""Metres: a joint that would have moved less is not told from one that is frozen, by anybody."""
+
+_ARMS = [J["left_elbow"], J["left_wrist"]]
+_LEGS = [J["left_knee"], J["left_ankle"], J["left_foot"]]
+_MOVERS = np.array([J[f"{side}_{n}"] for side in ("left", "right") for n in ("elbow", "wrist", "knee", "ankle")])
+
+
+def _all(windows: Floats) -> NDArray[np.bool_]:
+    return np.ones(len(windows), dtype=bool)
+
+
+def noise(windows: Floats, rng: np.random.Generator, sigma: float) -> tuple[Floats, NDArray[np.bool_]]:
+    """Independent noise along each axis."""
+    return windows + rng.normal(0.0, sigma, windows.shape), _all(windows)
+
+
+def exchanged(windows: Floats, rng: np.random.Generator, limb: list[int]) -> tuple[Floats, NDArray[np.bool_]]:
+    """A limb and the other side's are taken for each other, from `BEGINS` on; only where they are apart."""
+    del rng
+    both = np.array([*limb, *MIRROR[limb]])
+    out = windows.copy()
+    out[:, BEGINS:, both] = windows[:, BEGINS:, MIRROR[both]]
+    return out, np.linalg.norm(out - windows, axis=-1).max(axis=(1, 2)) > LEAST_MOTION
+
+
+def frozen(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
+    """One of the joints that move stays where it was in the frame before `BEGINS`."""
+    out = windows.copy()
+    moved = np.linalg.norm(windows[:, BEGINS:] - windows[:, BEGINS - 1 : BEGINS], axis=-1)[..., _MOVERS].max(axis=1)
+    for k, by in enumerate(moved):
+        joint = _MOVERS[rng.choice(np.flatnonzero(by > LEAST_MOTION))] if (by > LEAST_MOTION).any() else _MOVERS[0]
+        out[k, BEGINS:, joint] = windows[k, BEGINS - 1, joint]
+    return out, (moved > LEAST_MOTION).any(axis=1)
+
+
+def other_skeleton(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
+    """Bones 0.6 to 1.6 times as long, each by itself: a skeleton taken for another."""
+    out = windows.copy()
+    factor = np.exp(rng.uniform(np.log(0.6), np.log(1.6), (len(windows), 22)))
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        out[:, :, joint] = out[:, :, parent] + factor[:, None, joint, None] * (
+            windows[:, :, joint] - windows[:, :, parent]
+        )
+    return out, _all(windows)
+
+
+def other_persons_limb(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
+    """From `BEGINS` on, an arm is that of somebody else, half a metre away."""
+    out = windows.copy()
+    other = windows[rng.permutation(len(windows))]
+    beside = windows[:, BEGINS:, :1] - other[:, BEGINS:, :1] + rng.normal(0.0, 0.3, (len(windows), 1, 1, 3))
+    out[:, BEGINS:, _ARMS] = other[:, BEGINS:, _ARMS] + beside
+    return out, _all(windows)
+
+
+def relabelled(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
+    """Left and right are taken for each other everywhere: the knees bend the wrong way."""
+    del rng
+    return windows[:, :, MIRROR], _all(windows)
+
+
+def mirrored(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
+    """As in a mirror: somebody else's motion, and no fault."""
+    del rng
+    return windows[:, :, MIRROR] * np.array([1.0, -1.0, 1.0]), _all(windows)
+
+
+def reversed_in_time(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
+    """Backwards: most of what people do can be done backwards too."""
+    del rng
+    return windows[:, ::-1].copy(), _all(windows)
+
+
+FAULTS: Mapping[str, Fault] = {
+    **{f"noise of {s} cm": partial(noise, sigma=s / 100) for s in (1, 2, 4, 8)},
+    "arms exchanged": partial(exchanged, limb=_ARMS),
+    "legs exchanged": partial(exchanged, limb=_LEGS),
+    "a joint frozen": frozen,
+    "left taken for right": relabelled,
+    "another skeleton": other_skeleton,
+    "another person's arm": other_persons_limb,
+    "mirrored (no fault)": mirrored,
+    "backwards (no fault)": reversed_in_time,
+}

@@ -1,0 +1,105 @@
+"""Small HG-VAEs trained for tables and pictures: stochastic depth at equal capacity, and conditioned on actions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from prior.hgvae import HGVAE, JOINT_NODES, HGVAEConfig, Level
+from prior.motion_windows import MotionSet
+from prior.track_windows import Windows, mean_tracks
+from prior.train_hgvae import CLIP_ENTRY, Batch, evidence
+from prior.training import TrainingRun
+
+DEPTHS = (1, 2, 4, 8, 16)
+"""Stochastic levels, of the paper's table 1."""
+
+_NODES = (1, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 54, JOINT_NODES)
+
+
+def of_depth(depth: int) -> HGVAEConfig:
+    """16 levels, of which the lowest ``depth`` are random: the same parameters at every depth."""
+    return HGVAEConfig(features=32, levels=tuple(Level(n, 16) for n in _NODES), stochastic=depth)
+
+
+def with_actions(count: int) -> HGVAEConfig:
+    """The live model's levels, with a one-hot of the action beside the top latent."""
+    levels = (Level(1, 48), Level(8, 24), Level(24, 24), Level(JOINT_NODES, 12))
+    return HGVAEConfig(features=48, levels=levels, actions=count)
+
+
+class ActionWindows(Windows):
+    """Windows of some actions, each action drawn as often.
+
+    Attributes:
+        names: of the actions.
+    """
+
+    def __init__(self, motion: MotionSet, names: Sequence[str]) -> None:
+        super().__init__(motion)
+        self.names = names
+        kind = np.array([action_name(action) for action in motion.action])
+        self._parts = [Windows(motion.only(kind == name)) for name in names]
+
+    def draw_actions(
+        self, count: int, frames: int, rng: np.random.Generator
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.intp]]:
+        """``count`` random windows, body sizes, and the number of each window's action."""
+        actions = rng.integers(len(self.names), size=count)
+        positions, sizes = np.empty((count, frames, 22, 3)), np.empty(count)
+        for k, part in enumerate(self._parts):
+            rows = np.flatnonzero(actions == k)
+            if len(rows):
+                found = part.motion.sample(len(rows), frames, (1,), rng)
+                positions[rows], sizes[rows] = part.clean(found, np.zeros(len(rows), dtype=bool))
+        return positions, sizes, actions
+
+
+def action_name(name: str) -> str:
+    """What is done, without the style and the number of a take: 'walk-turn-left active' is 'walk-turn-left'."""
+    return re.sub(r"[_ ]?\d+$", "", name.split()[0]) if name else ""
+
+
+def train(config: HGVAEConfig, windows: Windows, directory: Path, steps: int, batch: int = 32, seed: int = 0) -> HGVAE:
+    """By the evidence lower bound alone, as the paper; a run of the same name in ``directory`` is taken up again."""
+    torch.manual_seed(seed)
+    model = HGVAE(config)
+    model.mean.copy_(mean_tracks(windows, config.frames, count=500))
+    optimiser = torch.optim.Adam(model.parameters(), lr=1e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    run = TrainingRun(
+        directory, {"model": model, "optimiser": optimiser, "schedule": schedule}, steps, every=max(steps // 8, 1)
+    )
+    losses: dict[str, float] = {}
+    for step in run.steps(lambda: losses):
+        rng = run.random(seed)
+        action = None
+        if isinstance(windows, ActionWindows):
+            positions, sizes, actions = windows.draw_actions(batch, config.frames, rng)
+            action = one_hot(actions, config.actions)
+        else:
+            positions, sizes = windows.draw(batch, config.frames, rng)
+        whole = Batch.of(model, positions, positions, sizes)
+        likelihood, kl = evidence(
+            model(whole.x, whole.observed, spread=torch.ones(batch, 1), action=action), whole.target
+        )
+        beta = min(0.001 + step / (0.2 * steps), 1.0)
+        loss = (beta * kl - likelihood).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), CLIP_ENTRY * whole.x[0].numel() ** 0.5)
+        optimiser.step()
+        schedule.step()
+        losses.update({"ELBO": (likelihood - kl).mean().item() / whole.x[0].numel(), "KL": kl.mean().item()})
+    return model.eval()
+
+
+def one_hot(actions: NDArray[np.intp], count: int) -> Tensor:
+    """(B, count)"""
+    return torch.nn.functional.one_hot(torch.from_numpy(actions).long(), count).float()
