@@ -33,7 +33,7 @@ from prior.skeletons import COCO17
 Floats = NDArray[np.float64]
 
 DISTANCES = (2.0, 3.0, 4.0)
-KEYPOINT_NOISE = (0.0, 1.5)
+KEYPOINT_NOISE = (0.0, 1.5, 4.0)
 ON_THE_BACKGROUND = 0.25
 """metres behind its true place, from where a joint is not on the body any more"""
 POSES = (scripts.idle, scripts.walk_turn, scripts.reach, scripts.sit_rise, scripts.wave_hidden_arm)
@@ -64,7 +64,7 @@ class Picture:
 class Args:
     """How near the truth key points are lifted."""
 
-    pictures: int = 180
+    pictures: int = 120
     """at each distance"""
     quick: bool = False
     """30 pictures, to see that it works; nothing is written unless --out says where"""
