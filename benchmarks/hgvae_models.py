@@ -63,7 +63,7 @@ class ActionWindows(Windows):
 
 def action_name(name: str) -> str:
     """What is done, without the style and the number of a take: 'walk-turn-left active' is 'walk-turn-left'."""
-    return re.sub(r"[_ ]?\d+$", "", name.split()[0]) if name else ""
+    return re.sub(r"\W*[_ ]?\d*$", "", name.split()[0]) if name else ""
 
 
 def train(config: HGVAEConfig, windows: Windows, directory: Path, steps: int, batch: int = 32, seed: int = 0) -> HGVAE:

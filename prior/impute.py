@@ -49,7 +49,7 @@ class ImputeSettings:
     """
 
     enabled: bool = True
-    steps: int = 2
+    steps: int = 1
     rate: float = 0.05
 
 

@@ -299,7 +299,7 @@ def _prediction(bench: Bench, model: HGVAE, data: _Data) -> Result:
 
 def _depth(bench: Bench, data: _Data) -> Result:
     """Table 1: stochastic depth at equal capacity."""
-    steps = 2 if bench.quick else 700
+    steps = 2 if bench.quick else 300
     records = []
     for depth in models.DEPTHS:
         bench.progress.stop()  # training draws a bar of its own
@@ -329,7 +329,7 @@ def _actions(bench: Bench, data: _Data) -> Result:
         for name in counts
     }
     names = sorted(sorted((n for n in counts if n and not n.startswith("m")), key=lambda n: -frames[n])[:10])
-    steps = 2 if bench.quick else 1200
+    steps = 2 if bench.quick else 800
     windows = models.ActionWindows(motion, names)
     bench.progress.stop()
     model = models.train(models.with_actions(len(names)), windows, data.runs(bench) / "actions", steps)
