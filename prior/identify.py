@@ -131,7 +131,8 @@ class Identify:
         now = (stamp_ns - self._origin_ns) * 1e-9
         self._last_ns = stamp_ns
         count = len(bodies)
-        self._counters["too_many_bodies"] += max(count - self._rows, 0)
+        if count > self._rows:
+            self._counters["too_many_bodies"] += count - self._rows
         bodies, confidence = bodies[: self._rows], confidence[: self._rows]
         unseen_s = now - self._seen_s
         self._forget((unseen_s > self._settings.death) | ((self._id == _NAMELESS) & (unseen_s > RECENT_S)))
