@@ -14,7 +14,7 @@ from benchmarks.depth_lifting import Args, Picture, main, measure, median, ours,
 
 @pytest.fixture(scope="module")
 def at_three_metres() -> list[Picture]:
-    return pictures(60, 3.0, seed=7)
+    return pictures(40, 3.0, seed=7)
 
 
 def test_joints_are_within_three_centimetres_and_none_is_on_the_background(at_three_metres: list[Picture]) -> None:
