@@ -90,14 +90,15 @@ def impute_all(
     live = LiveHGVAE(model, SENSOR_SIGMA)
     hung = standardise(model, guess).double().numpy() * SCALE + mean
     found = {"mean": np.where(masks, mean, truth), "hold": hold, "line": line, "guess": hung}
-    encoded = [
-        Encoded(t._replace(x=x, observed=o.astype(float)), o.astype(float), float(size), live.look(x, o.astype(float)))
-        for t, x, o, size in zip(clean, guess, observed, sizes, strict=True)
-    ]
-    found["HG-VAE, one pass"] = np.stack([completed_tracks(e, e.look) for e in encoded])
+    passes: dict[str, list[Floats]] = {}
+    for t, x, seen, size in zip(clean, guess, observed.astype(float), sizes, strict=True):
+        encoded = Encoded(t._replace(x=x, observed=seen), seen, float(size), live.look(x, seen), live)
+        passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(encoded, encoded.look))
+        for count in steps:
+            look = Climb(live.latents, ImputeSettings()).complete(encoded, count)
+            passes.setdefault(f"HG-VAE, {count} steps", []).append(completed_tracks(encoded, look))
+    found |= {name: np.stack(windows) for name, windows in passes.items()}
     for count in steps:
-        climbed = [completed_tracks(e, Climb(live, ImputeSettings()).complete(e, count)) for e in encoded]
-        found[f"HG-VAE, {count} steps"] = np.stack(climbed)
         found[f"HG-VAE, the paper's ascent, {count} steps"] = ascend_entries(model, line, observed, count)
     return {name: (np.where(masks, x, truth), truth) for name, x in found.items()}
 

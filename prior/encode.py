@@ -37,12 +37,14 @@ class Encoded(NamedTuple):
         trust: (66, T) how far to believe each entry: the confidence of its joint, 0 where it was not seen.
         size: of the body, as `body_size` gives it.
         look: what the model makes of it.
+        model: that looked, and still stands at this window.
     """
 
     tracks: Tracks
     trust: NDArray[np.float64]
     size: float
     look: Look
+    model: LiveHGVAE
 
 
 class Encode:
@@ -50,11 +52,13 @@ class Encode:
 
     delay_frames = 0
 
-    def __init__(self, settings: EncodeSettings, sensor_sigma: float) -> None:
+    def __init__(self, settings: EncodeSettings, sensor_sigma: float, slots: int) -> None:
         state, config = load_weights(settings.weights, "hgvae")
         model = HGVAE(HGVAEConfig.from_dict(config))
         model.load_state_dict(state)
-        self.model = LiveHGVAE(model, sensor_sigma)
+        first = LiveHGVAE(model, sensor_sigma)
+        self._models = [first, *(first.another() for _ in range(slots - 1))]
+        self.frames = first.frames
 
     def reset(self, slot: NDArray[np.bool_]) -> None:
         """Nothing is kept here."""
@@ -64,8 +68,9 @@ class Encode:
         window.encoded = [None] * window.slots
         for slot in np.flatnonzero(window.present):
             size = float(body_size(window.offsets[slot]))
-            tracks = to_tracks(window.positions.all[-self.model.frames :, slot], size)
-            confidence = np.clip(window.confidence.all[-self.model.frames :, slot], LEAST_TRUST, 1.0)
+            tracks = to_tracks(window.positions.all[-self.frames :, slot], size)
+            confidence = np.clip(window.confidence.all[-self.frames :, slot], LEAST_TRUST, 1.0)
             trust = tracks.observed * np.repeat(confidence.T, 3, axis=0)
-            window.encoded[slot] = Encoded(tracks, trust, size, self.model.look(tracks.x, trust))
+            model = self._models[slot]
+            window.encoded[slot] = Encoded(tracks, trust, size, model.look(tracks.x, trust), model)
         return window

@@ -8,6 +8,7 @@ run forwards and backwards. The same numbers as `HGVAE` with the means of its la
 from __future__ import annotations
 
 import math
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from prior.hgvae import HGVAE, JOINT_NODES, LOG_VAR_RANGE, SCALE, TRACK_LOG_VAR,
 Floats = NDArray[np.float32]
 
 # Steps: the kind, the matrix written, one or two matrices read, and where in the weights their numbers begin.
-_LINEAR, _GELU, _ADD, _JOIN, _TAKE, _DENSITY, _LIKELIHOOD = range(7)
+_LINEAR, _GELU, _ADD, _JOIN, _TAKE, _DENSITY = range(6)
 _FIELDS = 6
 _NONE = -1
 
@@ -93,10 +94,6 @@ class _Program:
         """The logarithm of a normal density, entry by entry; ``log_var`` is clamped to `LOG_VAR_RANGE`."""
         return self._step(_DENSITY, self.matrix(*self.shapes[of]), of, mean, log_var)
 
-    def likelihood(self, of: int, mean: int, log_var: int, weight: int) -> int:
-        """The same with an observation's variance added, times a weight: both stand in ``weight``, side by side."""
-        return self._step(_LIKELIHOOD, self.matrix(*self.shapes[of]), of, mean, log_var, weight)
-
     def constant(self, values: Tensor) -> int:
         """A matrix of weights that depends on nothing: a linear step from nothing."""
         zero = self.matrix(1, 1)
@@ -128,7 +125,6 @@ class LiveHGVAE:
     Attributes:
         frames: T, of a window.
         latents: how many numbers all latents together are.
-        at: the tracks last looked at.
     """
 
     def __init__(self, model: HGVAE, sensor_sigma: float) -> None:
@@ -136,7 +132,6 @@ class LiveHGVAE:
         self.frames, self._mean = config.frames, model.mean.numpy().astype(np.float64)[:, None]
         self._x = p.matrix(JOINT_NODES, config.frames)
         self._observed = p.matrix(JOINT_NODES, config.frames)
-        self._weight = p.matrix(JOINT_NODES, 2 * config.frames)
         coefficients = p.linear(self._x, model.dct.T)
         graph = p.block(p.gelu(p.layer(p.join(coefficients, self._observed), model.read)), model.read_block)
         found = []
@@ -165,7 +160,6 @@ class LiveHGVAE:
         shift = torch.full((config.frames,), TRACK_LOG_VAR)
         self._tracks = p.linear(p.take(written, 0, kept), model.dct)
         self._log_var = p.linear(p.take(written, kept, kept), model.dct, shift)
-        self._terms.append(p.likelihood(self._x, self._tracks, self._log_var, self._weight))
         steps = np.array(p.steps, dtype=np.int64)
         self._encoder, self._decoder = steps[:encoder_steps], steps[encoder_steps:]
         self._shapes = np.array(p.shapes, dtype=np.int64)
@@ -174,9 +168,15 @@ class LiveHGVAE:
         self._weights = np.concatenate(p.weights)
         self._values = np.zeros(self._starts[-1], dtype=np.float32)
         self._gradients = np.zeros_like(self._values)
-        self._matrix(self._values, self._weight)[:, config.frames :] = (sensor_sigma / SCALE) ** 2
+        self._sensor_variance = (sensor_sigma / SCALE) ** 2
+        self._trust = np.zeros((JOINT_NODES, config.frames), dtype=np.float32)
         self.latents = int(sizes[self._moves].sum())
-        self.at: NDArray[np.float64] | None = None
+
+    def another(self) -> LiveHGVAE:
+        """The same model for another body: the window last looked at is each one's own."""
+        other = copy(self)
+        other._values, other._gradients = self._values.copy(), self._gradients.copy()
+        return other
 
     def _matrix(self, arena: Floats, number: int) -> Floats:
         return arena[self._starts[number] : self._starts[number + 1]].reshape(self._shapes[number])
@@ -188,13 +188,12 @@ class LiveHGVAE:
             x: (66, T) metres of a standard body; see `prior.body_tracks`. NaN for a joint never seen.
             observed: (66, T) how far to believe each entry: 0 where there was none, at most 1.
         """
-        self.at = x
         deviations = (x - self._mean) / SCALE
         if np.isnan(deviations[:, 0]).any():
             hang_unseen(deviations)
         self._matrix(self._values, self._x)[:] = deviations
         self._matrix(self._values, self._observed)[:] = observed > 0
-        self._matrix(self._values, self._weight)[:, : self.frames] = observed
+        self._trust = observed.astype(np.float32)
         _forward(self._encoder, self._shapes, self._starts, self._weights, self._values)
         return self.decode(np.zeros(self.latents))
 
@@ -206,18 +205,31 @@ class LiveHGVAE:
             matrix[:] = moved[begin : begin + matrix.size].reshape(matrix.shape)
             begin += matrix.size
         _forward(self._decoder, self._shapes, self._starts, self._weights, self._values)
-        log_var = np.clip(self._matrix(self._values, self._log_var), *LOG_VAR_RANGE)
+        own = self._variance()
+        variance = own + self._sensor_variance
+        off = self._matrix(self._values, self._x) - self._matrix(self._values, self._tracks)
+        likelihood = -0.5 * self._trust * (np.log(2 * np.pi * variance) + off**2 / variance)
         return Look(
             mean=self._matrix(self._values, self._tracks) * SCALE + self._mean,
-            sigma=np.exp(0.5 * log_var.astype(np.float64)) * SCALE,
-            score=sum(float(self._matrix(self._values, k).sum()) for k in self._terms),
+            sigma=np.sqrt(own.astype(np.float64)) * SCALE,
+            score=float(likelihood.sum()) + sum(float(self._matrix(self._values, k).sum()) for k in self._terms),
         )
+
+    def _variance(self) -> Floats:
+        """(66, T) of the tracks, in units of `SCALE`, as the model states it."""
+        return np.exp(np.clip(self._matrix(self._values, self._log_var), *LOG_VAR_RANGE))
 
     def gradient(self) -> NDArray[np.float64]:
         """(n,) gradient of the score last decoded by how far the latents were moved."""
         self._gradients[:] = 0.0
         for number in self._terms:
             self._matrix(self._gradients, number)[:] = 1.0
+        own, log_var = self._variance(), self._matrix(self._values, self._log_var)
+        variance = own + self._sensor_variance
+        off = (self._matrix(self._values, self._x) - self._matrix(self._values, self._tracks)) / variance
+        within = (log_var > LOG_VAR_RANGE[0]) & (log_var < LOG_VAR_RANGE[1])
+        self._matrix(self._gradients, self._tracks)[:] = self._trust * off
+        self._matrix(self._gradients, self._log_var)[:] = 0.5 * self._trust * within * own * (off**2 - 1 / variance)
         _backward(self._decoder, self._shapes, self._starts, self._weights, self._values, self._gradients)
         return np.concatenate([self._matrix(self._gradients, k).ravel() for k in self._moves]).astype(np.float64)
 
@@ -314,14 +326,9 @@ def _forward(steps, shapes, starts, weights, values):
             log_var = _view(values, shapes, starts, third)
             for i in range(nodes):
                 for j in range(features):
-                    variance = math.exp(min(max(log_var[i, j], _LEAST), _MOST))
-                    weight = 1.0
-                    if kind == _LIKELIHOOD:
-                        beside = _view(values, shapes, starts, fourth)
-                        weight = beside[i, j]
-                        variance += beside[i, features + j]
+                    clamped = min(max(log_var[i, j], _LEAST), _MOST)
                     off = a[i, j] - mean[i, j]
-                    out[i, j] = -0.5 * weight * (math.log(variance) + _LOG_2PI + off * off / variance)
+                    out[i, j] = -0.5 * (clamped + _LOG_2PI + off * off * math.exp(-clamped))
 
 
 @njit(cache=True)
@@ -357,14 +364,9 @@ def _backward(steps, shapes, starts, weights, values, gradients):
             log_var, by_log_var = _view(values, shapes, starts, third), _view(gradients, shapes, starts, third)
             for i in range(nodes):
                 for j in range(features):
-                    own = math.exp(min(max(log_var[i, j], _LEAST), _MOST))
-                    variance, weight = own, by_out[i, j]
-                    if kind == _LIKELIHOOD:
-                        beside = _view(values, shapes, starts, fourth)
-                        weight *= beside[i, j]
-                        variance += beside[i, features + j]
-                    off = (a[i, j] - mean[i, j]) / variance
-                    by_a[i, j] -= weight * off
-                    by_mean[i, j] += weight * off
+                    clamped = min(max(log_var[i, j], _LEAST), _MOST)
+                    off = (a[i, j] - mean[i, j]) * math.exp(-clamped)
+                    by_a[i, j] -= by_out[i, j] * off
+                    by_mean[i, j] += by_out[i, j] * off
                     if _LEAST < log_var[i, j] < _MOST:
-                        by_log_var[i, j] += weight * 0.5 * (off * off - 1.0 / variance) * own
+                        by_log_var[i, j] += by_out[i, j] * 0.5 * (off * (a[i, j] - mean[i, j]) - 1.0)

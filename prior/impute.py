@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from prior.body_tracks import from_tracks
 from prior.encode import Encoded
-from prior.hgvae_live import LiveHGVAE, Look
+from prior.hgvae_live import Look
 from prior.window import Imputed, Window
 
 Floats = NDArray[np.float64]
@@ -36,6 +36,10 @@ CARRY_FRAMES = 20.0
 
 SIGMA_FOUND = 1.3
 """Times the standard deviation that the model states: what limbs hidden for 0.3 to 2 s are off on validation motion."""
+
+
+CLIMBS_A_FRAME = 2
+"""Bodies that take their steps in one frame; of more, each has its turn, so that eight fit into a camera's period."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +60,9 @@ class ImputeSettings:
 class Climb:
     """Gradient ascent (Adam) of the latents of one body's window, as it slides."""
 
-    def __init__(self, model: LiveHGVAE, settings: ImputeSettings) -> None:
-        self._model, self._rate = model, settings.rate
-        self._moved = np.zeros(model.latents)
+    def __init__(self, latents: int, settings: ImputeSettings) -> None:
+        self._rate = settings.rate
+        self._moved = np.zeros(latents)
         self._first = np.zeros_like(self._moved)
         self._second = np.zeros_like(self._moved)
         self._count = 0
@@ -67,10 +71,12 @@ class Climb:
         """What the model makes of the window: of the points visited, the one of highest score.
 
         Each of ``steps`` looks at a point and takes a step from it; where the last one leads is seen in the next frame.
+        Without a step, the point that the climb had come to is looked at.
         """
-        model, best, best_at = self._model, encoded.look, np.zeros_like(self._moved)
-        if steps and model.at is not encoded.tracks.x:  # another body's window has been looked at since
-            model.look(encoded.tracks.x, encoded.trust)
+        model, best, best_at = encoded.model, encoded.look, np.zeros_like(self._moved)
+        if not steps and self._moved.any():
+            look = model.decode(self._moved)
+            return look if look.score > best.score else best
         for step in range(steps):
             look = model.decode(self._moved)
             if look.score > best.score:
@@ -93,14 +99,13 @@ class Climb:
 class Impute:
     """Gives ``window.imputed``: every body's joints of the last frames, as the model completes its window."""
 
-    def __init__(
-        self, settings: ImputeSettings, model: LiveHGVAE, delay_frames: int, slots: int, counters: Counter[str]
-    ) -> None:
+    def __init__(self, settings: ImputeSettings, delay_frames: int, slots: int, counters: Counter[str]) -> None:
         if settings.steps < 0 or settings.rate <= 0:
             raise ValueError(f"impute: expected steps >= 0 and rate > 0, got {settings.steps} and {settings.rate:g}")
-        self._settings, self._model, self._counters = settings, model, counters
+        self._settings, self._counters = settings, counters
         self.delay_frames = delay_frames
         self._climbs: list[Climb | None] = [None] * slots
+        self._frame = 0
         self.hurry = False
         """Whether this frame is to do without the climb: a live node that falls behind says so."""
 
@@ -109,8 +114,15 @@ class Impute:
         for k in np.flatnonzero(slot):
             self._climbs[k] = None
 
+    def _turn(self, slot: int) -> bool:
+        """Whether it is this body's turn to climb: of many, so many in each frame."""
+        climbing = [k for k, climb in enumerate(self._climbs) if climb or k == slot]
+        turns = -(-len(climbing) // CLIMBS_A_FRAME)
+        return (climbing.index(slot) + self._frame) % turns == 0
+
     def update(self, window: Window) -> Window:
         """Complete the windows of those of whom something is hidden in the frames that are still to be answered."""
+        self._frame += 1
         frames = self.delay_frames + 1
         imputed = Imputed(np.full((frames, window.slots, 22, 3), np.nan), np.full((frames, window.slots, 22), np.inf))
         for slot, encoded in enumerate(window.encoded):
@@ -119,11 +131,11 @@ class Impute:
                 continue
             # A joint never seen in the window is one that the sensor does not have: that takes no climb.
             lost = encoded.tracks.observed.any(axis=1) & ~encoded.tracks.observed[:, -frames:].all(axis=1)
-            steps = self._settings.steps if lost.any() else 0
+            steps = self._settings.steps if lost.any() and self._turn(slot) else 0
             if self.hurry and steps:
                 self._counters["imputation_skipped"] += 1
                 steps = 0
-            climb = self._climbs[slot] = self._climbs[slot] or Climb(self._model, self._settings)
+            climb = self._climbs[slot] = self._climbs[slot] or Climb(encoded.model.latents, self._settings)
             look = climb.complete(encoded, steps)
             positions = from_tracks(completed_tracks(encoded, look), encoded.tracks, encoded.size)
             imputed.positions[:, slot] = positions[-frames:]

@@ -105,7 +105,7 @@ class PriorPipeline:
         # what the sensor may be off by, slowly and fast
         sensor_sigma = float(np.hypot(settings.bias_sigma, settings.smooth.measurement_sigma))
         reads = settings.score.enabled or settings.impute.enabled
-        self._encode = Encode(settings.encode, sensor_sigma) if reads else None
+        self._encode = Encode(settings.encode, sensor_sigma, slots) if reads else None
         self._impute: Impute | None = None
         hgvae: list[Stage] = []
         if self._encode:
@@ -113,10 +113,10 @@ class PriorPipeline:
             if settings.score.enabled:
                 hgvae.append(Score(settings.score, settings.encode.weights, sensor_sigma, slots))
             if settings.impute.enabled:
-                self._impute = Impute(settings.impute, self._encode.model, settings.delay, slots, self.counters)
+                self._impute = Impute(settings.impute, settings.delay, slots, self.counters)
                 hgvae.append(self._impute)
         shortest = max(refine.window, settings.delay + 1)
-        window_frames = max(shortest, self._encode.model.frames if self._encode else 0)
+        window_frames = max(shortest, self._encode.frames if self._encode else 0)
         self._window = Window(window_frames, slots, decoded_frames=shortest)
         self._smooth = Smooth(settings.smooth, settings.delay, slots)
         self._fuse = Fuse(settings.fuse, settings.bias_sigma, settings.delay, slots)
