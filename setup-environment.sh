@@ -16,8 +16,8 @@ if [ ! -e "$stamp" ] || [ uv.lock -nt "$stamp" ] || [ pyproject.toml -nt "$stamp
         }
         .uv/bin/python -m pip install --quiet --disable-pip-version-check "uv==$UV_VERSION"
     fi
-    .uv/bin/uv sync --frozen --compile-bytecode --extra view --python "$python"
+    .uv/bin/uv sync --frozen --inexact --compile-bytecode --extra view --python "$python"
     # numba compiles its loops once; else the first stream would wait for it
-    .venv/bin/python -c "import prior.pose_solver, prior.trajectory_filter, prior.lift"
+    .venv/bin/python -c "import prior.lift, prior.trajectory_filter; from prior.pipeline import *; PriorPipeline(PriorSettings())"
     touch "$stamp"
 fi

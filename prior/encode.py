@@ -57,6 +57,10 @@ class Encode:
         model = HGVAE(HGVAEConfig.from_dict(config))
         model.load_state_dict(state)
         first = LiveHGVAE(model, sensor_sigma)
+        # loops are compiled at their first call, or loaded: not while a frame waits
+        tracks = to_tracks(np.zeros((first.frames, 22, 3)), 1.0)
+        first.look(tracks.x, tracks.observed)
+        first.gradient()
         self._models = [first, *(first.another() for _ in range(slots - 1))]
         self.frames = first.frames
 
