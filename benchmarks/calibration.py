@@ -52,7 +52,7 @@ def rays(lens: Intrinsics, finer: int = 1) -> Floats:
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     pixels = (np.stack([x, y], axis=-1).reshape(-1, 1, 2) + 0.5) / finer - 0.5
     exact = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-9)
-    plane = cv2.undistortPoints(pixels, lens.matrix, lens.coefficients, criteria=exact)
+    plane = np.float64(cv2.undistortPoints(pixels, lens.matrix, lens.coefficients, criteria=exact))
     return np.concatenate([plane.reshape(height, width, 2), np.ones((height, width, 1))], axis=-1)
 
 

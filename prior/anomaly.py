@@ -1,12 +1,12 @@
 """The score stage: how unlike human motion what was seen of a body is, and because of which joints.
 
-A joint is odd when it was seen where HG-VAE would not have put it: the mean squared deviation from what the model
-reconstructs, in units of the model's own uncertainty and of the sensor's, over the last half second. The window is as
-odd as its oddest joint. Both are told on one scale: the number of decimals of the rate at which clean motion of people
-whom the model has not seen scores as high. An anomaly of 2 is met once in a hundred clean windows.
+A joint is odd when it was seen where HG-VAE would not have put it, or in a body of which the model no longer knows what
+to think: its expected squared distance from where it was seen, bias and variance together, over the last half second.
+(In units of the model's own deviation, exchanged limbs go unnoticed: it says that it is not sure.) The window is as odd
+as its oddest joint. Both are told on one scale: the number of decimals of the rate at which clean motion of people whom
+the model has not seen scores as high. An anomaly of 2 is met once in a hundred clean windows.
 
-The paper scores by log p(z | x) alone. That tells exchanged limbs, but neither noise nor a joint that stands still
-(`steadypose evaluate hgvae` has both).
+The paper scores by log p(z | x) alone (`steadypose evaluate hgvae` has both).
 """
 
 from __future__ import annotations
@@ -93,21 +93,19 @@ class Calibration:
         return Calibration(*((1 - share) * value[:, low] + share * value[:, low + 1] for value in values))
 
 
-def deviations(
-    x: Floats, mean: Floats, sigma: Floats, observed: NDArray[np.floating], sensor_sigma: float | Floats
-) -> Floats:
-    """(..., 22) logarithm of each joint's mean squared deviation over the last `RECENT` frames; NaN if not seen.
+def deviations(x: Floats, mean: Floats, sigma: Floats, observed: NDArray[np.floating]) -> Floats:
+    """(..., 22) logarithm of how far, squared, each joint seen is from where it is, as the model expects it: over the
+    last `RECENT` frames; NaN if not seen.
 
     Args:
         x: (..., 66, T) metres, tracks seen.
         mean: (..., 66, T) what the model would put there, and
         sigma: (..., 66, T) how sure it is.
         observed: (..., 66, T) 1 where seen.
-        sensor_sigma: metres along an axis, the sensor's error.
     """
     x, mean, sigma = (a[..., -RECENT:] for a in (x, mean, sigma))
     seen = observed[..., -RECENT:] > 0
-    squared = np.where(seen, x - mean, 0.0) ** 2 / (sigma**2 + np.square(sensor_sigma))
+    squared = np.where(seen, (x - mean) ** 2 + sigma**2, 0.0)
     joints = (*x.shape[:-2], 22, 3 * RECENT)
     count = seen.reshape(joints).sum(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -149,7 +147,6 @@ class Score:
             raise ValueError(f"score.false_alarms: expected a share between 0 and 1, got {settings.false_alarms:g}")
         self._height = -np.log10(settings.false_alarms)
         self._hold = settings.hold
-        self._sensor_sigma = sensor_sigma
         self._calibration = Calibration.load(weights).at(sensor_sigma)
         self._quiet_s = np.full(slots, np.inf)
 
@@ -170,7 +167,7 @@ class Score:
     def _score(self, encoded: Encoded) -> tuple[float, Floats]:
         """The anomaly of one window and, on the same scale, of its joints (22,)."""
         tracks, look = encoded.tracks, encoded.look
-        logs = deviations(tracks.x, look.mean, look.sigma, tracks.observed, self._sensor_sigma)
+        logs = deviations(tracks.x, look.mean, look.sigma, tracks.observed)
         missing = np.isnan(logs).sum()
         odd = oddities(logs, self._calibration, missing)
         told = decimals(odd, self._calibration, np.broadcast_to(missing, odd.shape))

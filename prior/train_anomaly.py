@@ -56,7 +56,7 @@ def calibrate(model: HGVAE, windows: Windows, count: int, seed: int) -> Calibrat
     for m, s in track(conditions, "calibrating"):
         positions, sizes = windows.draw(count, model.config.frames, rng)
         seen = hide_joints(sensed(positions, SENSOR_SIGMAS[s], rng), MISSING[m], rng)
-        logs = score_windows(model, seen, sizes, SENSOR_SIGMAS[s])
+        logs = score_windows(model, seen, sizes)
         mean[m, s], spread[m, s] = np.nanmean(logs, axis=0), np.nanstd(logs, axis=0)
         z = (logs - mean[m, s]) / spread[m, s]
         quantiles[m, s] = np.quantile(np.nanmax(z, axis=1), 1 - np.array(RATES))
@@ -77,7 +77,7 @@ def hide_joints(positions: Floats, count: int, rng: np.random.Generator) -> Floa
 
 
 @torch.no_grad()
-def score_windows(model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Floats:
+def score_windows(model: HGVAE, seen: Floats, sizes: Floats) -> Floats:
     """(B, 22) log deviations of windows (B, T, 22, 3) of bodies of sizes (B,)."""
     logs = []
     for start in range(0, len(seen), 256):
@@ -87,7 +87,7 @@ def score_windows(model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float
         found = model(standardise(model, x), torch.from_numpy(observed).float()).tracks
         mean = found.mean.double().numpy() * SCALE + model.mean.double().numpy()[:, None]
         sigma = (0.5 * found.log_var).exp().double().numpy() * SCALE
-        logs.append(deviations(x, mean, sigma, observed, sensor_sigma))
+        logs.append(deviations(x, mean, sigma, observed))
     return np.concatenate(logs)
 
 

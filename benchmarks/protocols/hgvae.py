@@ -135,13 +135,13 @@ def _anomalies(bench: Bench, model: HGVAE, data: _Data) -> Result:
     for axis, (sensor, sigma) in zip(figure.subplots(1, 2, sharey=True), SENSORS.items(), strict=True):
         ours = calibration.at(sigma)
         clean, sizes = windows.draw(count, frames, rng)
-        quiet = window_oddity(score_windows(model, sensed(clean, sigma, rng), sizes, sigma), ours)
+        quiet = window_oddity(score_windows(model, sensed(clean, sigma, rng), sizes), ours)
         plain = -_paper_score(model, sensed(clean, sigma, rng), sizes)
         other, other_sizes = windows.draw(count, frames, rng)
         for name, fault in FAULTS.items():
             spoilt, holds = fault(other, rng)
             seen = sensed(spoilt, sigma, rng)[holds]
-            loud = window_oddity(score_windows(model, seen, other_sizes[holds], sigma), ours)
+            loud = window_oddity(score_windows(model, seen, other_sizes[holds]), ours)
             paper = -_paper_score(model, seen, other_sizes[holds])
             truth = np.r_[np.zeros(count), np.ones(len(loud))]
             record = {"fault": name, "sensor": sensor, "windows": len(loud),
@@ -200,7 +200,7 @@ def _false_alarms(bench: Bench, model: HGVAE, data: _Data, calibration: Calibrat
     for people, motion in sets.items():
         rng = np.random.default_rng(13)
         positions, sizes = Windows(motion).draw(64 if bench.quick else 1500, model.config.frames, rng)
-        logs = score_windows(model, sensed(positions, sigma, rng), sizes, sigma)
+        logs = score_windows(model, sensed(positions, sigma, rng), sizes)
         missing = np.isnan(logs).sum(axis=-1)
         told = decimals(oddities(logs, calibration.at(sigma), missing).max(axis=-1), calibration.at(sigma), missing)
         records.append({"people": people, "windows": len(told)} | {

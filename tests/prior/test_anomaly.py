@@ -28,13 +28,13 @@ def scored(positions: np.ndarray, **settings) -> list:
     return [c.bodies[0] for m in stream(positions) for c in pipeline.process(m)]
 
 
-def test_deviations_are_of_recent_frames_seen_in_units_of_model_and_sensor() -> None:
+def test_deviations_are_of_recent_frames_seen_bias_and_variance_together() -> None:
     x, mean, sigma, observed = np.zeros((66, 50)), np.zeros((66, 50)), np.full((66, 50), 0.03), np.ones((66, 50))
     x[:, : 50 - RECENT] = 9.0  # long ago
     x[3 * J["head"] : 3 * J["head"] + 3, -RECENT:] = 0.1
     observed[3 * J["neck"] : 3 * J["neck"] + 3, -RECENT:] = 0
-    logs = deviations(x, mean, sigma, observed, 0.04)
-    assert logs[J["head"]] == pytest.approx(2 * np.log(0.1 / 0.05))
+    logs = deviations(x, mean, sigma, observed)
+    assert logs[J["head"]] == pytest.approx(np.log(0.1**2 + 0.03**2))
     assert np.isnan(logs[J["neck"]])
     odd = oddities(logs, SCALE.at(0.02), np.array(1))
     assert odd.argmax() == J["head"]
