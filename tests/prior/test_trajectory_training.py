@@ -52,6 +52,8 @@ def prepared(tmp_path: Path) -> Path:
         split=np.array(["train"] * 4 + ["val"] * 2),
         set=np.array(["default"] * 6),
         flat=np.array([True, True, True, False, True, True]),
+        subject=np.array(["somebody"] * 6),
+        action=np.array(["walking"] * 6),
     )
     return path
 
