@@ -66,14 +66,14 @@ def test_clean_motion_is_no_anomaly_and_frames_are_scored_alike_twice() -> None:
 
 def test_exchanged_arms_raise_the_flag_which_goes_down_after_they_are_over() -> None:
     """The gate is off: it would put them back."""
-    spoilt = waving(160)
+    spoilt = waving(200)
     arms = [J[f"{side}_{n}"] for n in ("elbow", "wrist") for side in ("left", "right")]
     spoilt[60:100, arms] = spoilt[60:100][:, MIRROR[arms]]
     bodies = scored(spoilt, gate={"enabled": False}, bones={"enabled": False})
     flags = np.array([b.anomaly_flag for b in bodies])
     assert not flags[:60].any()
-    assert flags[60:70].any()
-    assert not flags[140:].any()
+    assert flags[60:90].any()
+    assert not flags[165:].any()
     worst = bodies[int(np.argmax([b.anomaly for b in bodies]))]
     assert np.nanargmax(worst.joint_anomaly) in {*arms, *(PARENTS[j] for j in arms)}
     assert np.nanmax(worst.joint_anomaly) == pytest.approx(worst.anomaly, rel=1e-5)
