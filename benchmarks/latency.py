@@ -38,7 +38,7 @@ from prior.pipeline import PriorPipeline, PriorSettings
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings
 
 CROWDS = (1, 4, 8)
-LIVE_CROWDS = (1, 4)
+LIVE_CROWDS = (1, 4, 8)
 SPACING = 0.8
 """metres between the copies of a body"""
 WARM_UP = 60

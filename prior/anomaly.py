@@ -156,19 +156,21 @@ class Score:
 
     def update(self, window: Window) -> Window:
         """Score the newest window of each body."""
-        for slot, encoded in enumerate(window.encoded):
-            window.anomaly[slot], window.joint_anomaly[slot] = self._score(encoded) if encoded else (np.nan, np.nan)
+        window.anomaly[:], window.joint_anomaly[:] = np.nan, np.nan
+        slots = [slot for slot, encoded in enumerate(window.encoded) if encoded]
+        if slots:
+            window.anomaly[slots], window.joint_anomaly[slots] = self._score([e for e in window.encoded if e])
         with np.errstate(invalid="ignore"):
             self._quiet_s = np.where(window.anomaly > self._height / 2, 0.0, self._quiet_s + 1 / FPS)
             raised = window.anomaly > self._height
         window.anomaly_flag = raised | window.anomaly_flag & (self._quiet_s < self._hold)
         return window
 
-    def _score(self, encoded: Encoded) -> tuple[float, Floats]:
-        """The anomaly of one window and, on the same scale, of its joints (22,)."""
-        tracks, look = encoded.tracks, encoded.look
-        logs = deviations(tracks.x, look.mean, look.sigma, tracks.observed)
-        missing = np.isnan(logs).sum()
+    def _score(self, encoded: list[Encoded]) -> tuple[Floats, Floats]:
+        """The anomaly of each window (B,) and, on the same scale, of its joints (B, 22)."""
+        looks = [(e.tracks.x, e.look.mean, e.look.sigma, e.tracks.observed) for e in encoded]
+        logs = deviations(*(np.stack([part[:, -RECENT:] for part in parts]) for parts in zip(*looks, strict=True)))
+        missing = np.isnan(logs).sum(axis=-1)
         odd = oddities(logs, self._calibration, missing)
-        told = decimals(odd, self._calibration, np.broadcast_to(missing, odd.shape))
-        return float(told.max()), np.where(np.isinf(odd), np.nan, told)
+        told = decimals(odd, self._calibration, np.broadcast_to(missing[:, None], odd.shape))
+        return told.max(axis=-1), np.where(np.isinf(odd), np.nan, told)

@@ -63,6 +63,7 @@ class Climb:
     def __init__(self, latents: int, settings: ImputeSettings) -> None:
         self._rate = settings.rate
         self._moved = np.zeros(latents)
+        self._gained: Floats | float = 0.0
         self._first = np.zeros_like(self._moved)
         self._second = np.zeros_like(self._moved)
         self._count = 0
@@ -71,12 +72,11 @@ class Climb:
         """What the model makes of the window: of the points visited, the one of highest score.
 
         Each of ``steps`` looks at a point and takes a step from it; where the last one leads is seen in the next frame.
-        Without a step, the point that the climb had come to is looked at.
+        Without a step, what the climb had gained when it was last looked at is added to the new start.
         """
         model, best, best_at = encoded.model, encoded.look, np.zeros_like(self._moved)
-        if not steps and self._moved.any():
-            look = model.decode(self._moved)
-            return look if look.score > best.score else best
+        if not steps:
+            return best._replace(mean=best.mean + self._gained)
         for step in range(steps):
             look = model.decode(self._moved)
             if look.score > best.score:
@@ -85,6 +85,7 @@ class Climb:
                 self._moved = best_at
                 model.decode(self._moved)
             self._climb(model.gradient())
+        self._gained = best.mean - encoded.look.mean
         return best
 
     def _climb(self, uphill: Floats) -> None:

@@ -84,7 +84,7 @@ def test_a_flag_is_held_until_it_has_been_quiet_for_a_while() -> None:
     window = Window(4, 1)
     told = iter([0.0, 2.5, 1.5, 0.9, 0.9, 0.9, 0.9, 2.5])
     window.encoded = [object()]  # type: ignore[list-item]
-    stage._score = lambda encoded: (next(told), np.zeros(22))  # type: ignore[method-assign]
+    stage._score = lambda _: (np.array([next(told)]), np.zeros((1, 22)))  # type: ignore[method-assign]
     flags = [bool(stage.update(window).anomaly_flag[0]) for _ in range(8)]
     assert flags == [False, True, True, True, True, False, False, True]
 
