@@ -43,12 +43,12 @@ class ScoreSettings:
 
     Attributes:
         enabled: whether to score at all; off, the anomaly is NaN and the flag down.
-        false_alarms: the share of frames of clean motion that may be flagged.
+        false_alarms: the share of frames of clean motion that may be flagged; 0.01 would be one every three seconds.
         hold: seconds that the anomaly must stay at half the flag's height or lower before the flag goes down.
     """
 
     enabled: bool = True
-    false_alarms: float = 0.01
+    false_alarms: float = 0.001
     hold: float = 0.3
 
 
