@@ -238,7 +238,6 @@ def test_the_server_shows_a_page_on_this_machine_alone() -> None:
     ViewerServer(port).close()
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="parents take their children along on Linux alone")
 def test_the_server_goes_with_a_node_that_is_killed() -> None:
     port = free_ports()
     code = (
