@@ -40,6 +40,9 @@ MODELS: dict[str, HGVAEConfig] = {
 }
 """``hgvae`` fits a robot's budget; ``hgvae-wide`` has the paper's size, for recordings."""
 
+STRIDES = (1, 1, 1, 2)
+"""Every fourth window at twice the speed: people move faster than most of those who were recorded."""
+
 KL_START = 0.001
 """beta at the start (section 5)"""
 WARM_UP = 0.2
@@ -53,7 +56,7 @@ def train_hgvae(
     runs: Path,
     weights: str = "default",
     model: str = "hgvae",
-    iterations: int = 6_500,
+    iterations: int = 12_000,
     batch: int = 64,
     learning_rate: float = 1e-3,
     seed: int = 0,
@@ -98,7 +101,7 @@ def train_hgvae(
 
 def train_hgvae_wide(data: Path, runs: Path, weights: str = "default", seed: int = 0) -> Path:
     """Train the paper's size: fewer and smaller steps, so that it stays within an hour on two cores."""
-    return train_hgvae(data, runs, weights, "hgvae-wide", iterations=1_500, batch=32, learning_rate=5e-4, seed=seed)
+    return train_hgvae(data, runs, weights, "hgvae-wide", iterations=5_000, batch=32, learning_rate=5e-4, seed=seed)
 
 
 class Batch(NamedTuple):
@@ -144,7 +147,7 @@ def fit(
     for step in run.steps(lambda: {**losses, **evaluate_hgvae(model, val)}):
         model.train()
         rng = run.random(seed)
-        positions, sizes = train.draw(batch, frames, rng)
+        positions, sizes = train.draw(batch, frames, rng, STRIDES)
         half = batch // 2
         whole = Batch.of(model, positions[:half], positions[:half], sizes[:half])
         seen = occlude(spoil(add_noise(positions[half:], rng), rng), rng)
@@ -262,6 +265,8 @@ def occlude(positions: Floats, rng: np.random.Generator) -> Floats:
     for window in seen:
         if rng.random() < 0.4:
             window[:, _ABSENT] = np.nan
+        if rng.random() < 0.25:
+            window[:, 1 + rng.choice(len(PARENTS) - 1, rng.integers(1, 7), replace=False)] = np.nan
         for _ in range(rng.integers(1, 4)):
             kind = rng.random()
             joints = (
