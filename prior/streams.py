@@ -29,6 +29,8 @@ PATIENCE_NS = 2 * PERIOD_NS
 again for the network."""
 DRIFT = 200e-6
 """By how much two clocks may run apart: twice what two bad quartzes do."""
+LATE_IN_A_ROW = 15
+"""Frames of a stream, half a second; then its clock was set or its way has become longer, and it starts anew."""
 
 Joints = tuple[NDArray[np.float64], NDArray[np.float64]]
 """(S, 22, 3) metres and the confidence (S, 22)"""
@@ -46,6 +48,7 @@ class _Stream:
         time_ns: of that message's capture.
         heard_ns: when it came.
         first_ns, newest_ns: the first and the newest grid time that it has given joints for; none yet if negative.
+        late: how many of its frames in a row came too late.
         ids: from its bodies' ids to the batch's.
     """
 
@@ -57,6 +60,7 @@ class _Stream:
     heard_ns: int = -1
     first_ns: int = -1
     newest_ns: int = -1
+    late: int = 0
     ids: dict[int, int] = field(default_factory=dict)
 
 
@@ -129,6 +133,10 @@ class StreamBatch(PriorPipeline):
             self.counters["stream_gap" if raw.stamp_ns > stream.last.stamp_ns else "stamp_jumped_back"] += 1
             self._forget(raw.source)
             stream = None
+        elif stream and stream.late >= LATE_IN_A_ROW:
+            self.counters["stream_late"] += 1
+            self._forget(raw.source)
+            stream = None
         if stream is None:
             if len(self._streams) >= self._most:
                 self.counters["too_many_streams"] += 1
@@ -147,6 +155,7 @@ class StreamBatch(PriorPipeline):
         if time_ns <= stream.time_ns:
             # out of order; or the first messages came late, and the clock turns out to be another
             self.counters["stamp_out_of_order"] += 1
+            stream.late += 1
             return
         stream.last, stream.time_ns = raw, time_ns
         self._current, self._identify = stream, stream.identify
@@ -159,7 +168,9 @@ class StreamBatch(PriorPipeline):
             if self._done_ns is not None and tick_ns <= self._done_ns:
                 # the first frames of a stream, which nobody expected yet, are not late
                 self.counters["late_for_batch"] += stream.first_ns >= 0
+                stream.late += 1
                 continue
+            stream.late = 0
             stream.first_ns = tick_ns if stream.first_ns < 0 else stream.first_ns
             stream.newest_ns = tick_ns
             self._waiting.setdefault(tick_ns, []).append((ready[0], ready[1]))

@@ -154,6 +154,24 @@ def test_all_fall_silent_and_come_back() -> None:
     assert len(stamps) >= 20 + 30 - 5
 
 
+@pytest.mark.parametrize(
+    ("clock_ns", "way_ns", "until"),
+    [(-400_000_000, 0, 90), (400_000_000, 0, 31), (0, 150_000_000, 90)],
+    ids=["clock set back", "one stamp ahead", "way became longer"],
+)
+def test_who_would_be_late_for_ever_starts_anew(clock_ns: int, way_ns: int, until: int) -> None:
+    """The offset between clocks is the least seen: it would take half an hour to let go of one that is wrong."""
+    spoiled = [
+        (now + way_ns, dataclasses.replace(m, stamp_ns=m.stamp_ns + clock_ns)) if 30 <= k < until else (now, m)
+        for k, (now, m) in enumerate(kiosk("other", 90))
+    ]
+    answers, batch = serve(kiosk("good", 90), spoiled)
+    assert len(answers["good"]) >= 82
+    assert batch.counters["stream_late"] == 1
+    assert [len(clean.bodies) for clean in answers["other"][-20:]] == [1] * 20
+    assert 0 < batch.counters["late_for_batch"] + batch.counters["stamp_out_of_order"] < 35
+
+
 def test_more_streams_and_bodies_than_there_is_room_for() -> None:
     kiosks = [kiosk(name, 20, bodies=3) for name in ("a", "bb", "ccc", "dddd", "eeeee")]
     answers, batch = serve(*kiosks, max_bodies=8)
