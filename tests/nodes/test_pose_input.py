@@ -198,9 +198,12 @@ GOOD = {"positions": np.zeros((5, 22, 3)), "skeleton": np.array("smpl22"), "fps"
         ({"fps": None}, "expected stamp_ns"),
         ({"fps": np.array(0)}, "fps: expected one number above 0"),
         ({"fps": np.array([30, 30])}, "fps: expected one number"),
+        ({"fps": np.array(1e-9)}, "5 frames at 1e-09 a second last longer than stamps can tell"),
         ({"stamp_ns": np.arange(4)}, "stamp_ns: expected 5 integers"),
         ({"stamp_ns": np.arange(5.0)}, "stamp_ns: expected 5 integers"),
-        ({"stamp_ns": np.arange(5) - 1}, "least -1"),
+        ({"stamp_ns": np.arange(5) - 1}, "-1 to 3"),
+        ({"stamp_ns": np.arange(5) + 2**61}, "under 2147483648000000000, .* to 2305843009213693956"),
+        ({"stamp_ns": np.full(5, 2**63 + 5, np.uint64)}, "stamp_ns: expected 5 integers"),
         ({"confidence": np.ones((5, 17))}, r"confidence: expected \(5, 22\)"),
         ({"up": np.array("x")}, "up: expected one of"),
     ],
@@ -210,6 +213,24 @@ def test_an_npz_that_is_not_poses_says_what_was_expected(tmp_path: Path, change:
     np.savez(tmp_path / "x.npz", **arrays)
     with pytest.raises(NpzError, match=expected):
         NpzSource(tmp_path / "x.npz")
+
+
+def test_an_npz_with_damaged_bytes_says_that_it_cannot_be_read(tmp_path: Path) -> None:
+    """zipfile, zlib and numpy's parser of headers each complain in their own way."""
+    path, rng, refused = tmp_path / "x.npz", np.random.default_rng(0), 0
+    for save in (np.savez, np.savez_compressed):
+        save(path, **GOOD)  # type: ignore[arg-type]
+        whole = path.read_bytes()
+        for _ in range(300):
+            damaged = bytearray(whole)
+            for place in rng.integers(len(whole), size=rng.integers(1, 9)):
+                damaged[place] = rng.integers(256)
+            path.write_bytes(damaged)
+            try:
+                list(NpzSource(path))
+            except NpzError:
+                refused += 1
+    assert refused > 500
 
 
 def test_an_npz_gives_a_message_a_row(tmp_path: Path) -> None:
