@@ -55,13 +55,17 @@ class CsvSource:
         notes = [line[1:].partition(":") for line in lines if line.startswith("#")]
         said = {key.strip(): value.strip() for key, _, value in notes}
         rows = csv.reader(line for line in lines if line.strip() and not line.startswith("#"))
-        columns = [name.strip() for name in next(rows, [])]
+        try:
+            columns = [name.strip() for name in next(rows, [])]
+            cells = list(rows)
+        except csv.Error as error:
+            raise CsvError(f"{path}: cannot be read as CSV: {error}") from error
         self._skeleton = _skeleton(path, columns, said.get("skeleton"))
         try:
             self._sensor_pose = Pose.from_up(said.get("up", "z"))
         except ValueError as error:
             raise CsvError(f"{path}: {error}") from error
-        self._frames = self._read(rows, columns)
+        self._frames = self._read(cells, columns)
         if not self._frames:
             raise CsvError(f"{path}: expected at least one row of numbers after the header, got none that can be read")
 
@@ -75,7 +79,7 @@ class CsvSource:
             )
             yield POSE_RAW, message
 
-    def _read(self, rows: Iterator[list[str]], columns: list[str]) -> list[tuple[int, list[RawBody]]]:
+    def _read(self, rows: list[list[str]], columns: list[str]) -> list[tuple[int, list[RawBody]]]:
         """Each frame's stamp and bodies, in the order of the file."""
         positions = _columns(columns, self._skeleton, AXES)
         confidence = _columns(columns, self._skeleton, ("confidence",))
@@ -92,11 +96,14 @@ class CsvSource:
                 if not 0 <= seconds < LATEST_S:
                     self.refused["rows without a stamp of 0 s or more"] += 1
                     continue
-                id = 0 if body is None else int(numbers[body])
+                id = 0.0 if body is None else float(numbers[body])
+                if not id.is_integer():
+                    self.refused["rows of which the body is no whole number"] += 1
+                    continue
                 joints, sure = numbers[positions], numbers[confidence][:, 0]
                 sure = np.where(np.isnan(sure), np.isfinite(joints).all(axis=-1), sure)
                 with np.errstate(over="ignore"):
-                    read.append((round(seconds * 1e9), RawBody(id, joints, sure)))
+                    read.append((round(seconds * 1e9), RawBody(int(id), joints, sure)))
             except ValueError:
                 self.refused["rows with something else than numbers"] += 1
         return [(stamp_ns, [one for _, one in group]) for stamp_ns, group in groupby(read, key=lambda pair: pair[0])]

@@ -68,6 +68,16 @@ def test_several_bodies_have_a_row_each(tmp_path: Path) -> None:
     assert [[body.id for body in frame.bodies] for frame in frames(path)] == [[4, 7], [7], [4]]
 
 
+def test_a_body_is_a_whole_number_that_fits(tmp_path: Path) -> None:
+    rows = [f"0.{k},{body},1,1,1" for k, body in enumerate(["2.0", "1.5", "inf", "", "nan", "1e30", "-7"])]
+    source = CsvSource(write(tmp_path / "x.csv", "stamp,body,nose_x,nose_y,nose_z", *rows))
+    assert [body.id for _, message in source if isinstance(message, PoseRaw) for body in message.bodies] == [2, -7]
+    assert source.refused == {
+        "rows of which the body is no whole number": 4,
+        "rows with something else than numbers": 1,
+    }
+
+
 def test_a_skeleton_may_be_named(tmp_path: Path) -> None:
     header = "stamp,left_wrist_x,left_wrist_y,left_wrist_z"
     assert frames(write(tmp_path / "x.csv", header, "0,1,2,3"))[0].skeleton == "smpl22"
@@ -103,6 +113,7 @@ def test_rows_that_are_no_frames_are_counted_and_left_out(tmp_path: Path) -> Non
         (["# up: x", "stamp,nose_x,nose_y,nose_z", "0,1,2,3"], "up: expected one of"),
         (["stamp,nose_x,nose_y,nose_z"], "at least one row"),
         (["stamp,nose_x,nose_y,nose_z", "a,b,c,d"], "at least one row"),
+        (["stamp,nose_x,nose_y,nose_z", "0,1,2," + "3" * 200_000], "cannot be read as CSV: field larger"),
     ],
 )
 def test_a_csv_that_is_not_poses_says_what_was_expected(tmp_path: Path, lines: list[str], expected: str) -> None:
