@@ -19,7 +19,7 @@ from benchmarks.corruption import LIMBS
 from prior.body_tracks import Tracks, from_tracks, in_frame_of, to_tracks
 from prior.encode import Encoded
 from prior.hgvae import HGVAE, SCALE
-from prior.hgvae_live import LiveHGVAE
+from prior.hgvae_live import LiveHGVAE, Look
 from prior.impute import Climb, ImputeSettings, completed_tracks
 from prior.track_windows import Windows, standardise
 
@@ -87,16 +87,19 @@ def impute_all(
     for b in range(len(truth)):
         hold[b], line[b] = _held(truth[b], observed[b], mean), _line(truth[b], observed[b], mean)
         guess[b] = _guess(positions[b], sizes[b], clean[b], observed[b], line[b])
-    live = LiveHGVAE(model, SENSOR_SIGMA)
+    live = LiveHGVAE(model, SENSOR_SIGMA, 1)
     hung = standardise(model, guess).double().numpy() * SCALE + mean
     found = {"mean": np.where(masks, mean, truth), "hold": hold, "line": line, "guess": hung}
     passes: dict[str, list[Floats]] = {}
     for t, x, seen, size in zip(clean, guess, observed.astype(float), sizes, strict=True):
-        encoded = Encoded(t._replace(x=x, observed=seen), seen, float(size), live.look(x, seen), live)
-        passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(encoded, encoded.look))
+        tracks = t._replace(x=x, observed=seen)
+        look = live.look(x[None], seen[None])
+        batch = Tracks(*(np.asarray(part)[None] for part in tracks))
+        encoded = Encoded(np.zeros(1, dtype=np.intp), batch, seen[None], np.array([size]), look, live)
+        passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(tracks, Look(*(part[0] for part in look))))
         for count in steps:
-            look = Climb(live.latents, ImputeSettings()).complete(encoded, count)
-            passes.setdefault(f"HG-VAE, {count} steps", []).append(completed_tracks(encoded, look))
+            found_there = Climb(live.latents, ImputeSettings()).complete(encoded, 0, count)
+            passes.setdefault(f"HG-VAE, {count} steps", []).append(completed_tracks(tracks, found_there))
     found |= {name: np.stack(windows) for name, windows in passes.items()}
     for count in steps:
         found[f"HG-VAE, the paper's ascent, {count} steps"] = ascend_entries(model, line, observed, count)

@@ -157,19 +157,18 @@ class Score:
     def update(self, window: Window) -> Window:
         """Score the newest window of each body."""
         window.anomaly[:], window.joint_anomaly[:] = np.nan, np.nan
-        slots = [slot for slot, encoded in enumerate(window.encoded) if encoded]
-        if slots:
-            window.anomaly[slots], window.joint_anomaly[slots] = self._score([e for e in window.encoded if e])
+        if window.encoded:
+            slots = window.encoded.slots
+            window.anomaly[slots], window.joint_anomaly[slots] = self._score(window.encoded)
         with np.errstate(invalid="ignore"):
             self._quiet_s = np.where(window.anomaly > self._height / 2, 0.0, self._quiet_s + 1 / FPS)
             raised = window.anomaly > self._height
         window.anomaly_flag = raised | window.anomaly_flag & (self._quiet_s < self._hold)
         return window
 
-    def _score(self, encoded: list[Encoded]) -> tuple[Floats, Floats]:
+    def _score(self, encoded: Encoded) -> tuple[Floats, Floats]:
         """The anomaly of each window (B,) and, on the same scale, of its joints (B, 22)."""
-        looks = [(e.tracks.x, e.look.mean, e.look.sigma, e.tracks.observed) for e in encoded]
-        logs = deviations(*(np.stack([part[:, -RECENT:] for part in parts]) for parts in zip(*looks, strict=True)))
+        logs = deviations(encoded.tracks.x, encoded.look.mean, encoded.look.sigma, encoded.tracks.observed)
         missing = np.isnan(logs).sum(axis=-1)
         odd = oddities(logs, self._calibration, missing)
         told = decimals(odd, self._calibration, np.broadcast_to(missing[:, None], odd.shape))

@@ -31,19 +31,19 @@ _PATH_COEFFICIENTS = 8
 
 
 class Tracks(NamedTuple):
-    """One window in its body's frame.
+    """Windows, each in its body's frame.
 
     Attributes:
-        x: (66, T) metres of a body of standard size; node ``3 * joint + axis``. NaN for a joint never seen.
-        observed: (66, T) 1 where seen, else 0.
-        path: (T, 3) metres, world: the origin of all joints but the pelvis, whose origin is the path's mean.
-        yaw: radians, the mean heading of the window.
+        x: (..., 66, T) metres of a body of standard size; node ``3 * joint + axis``. NaN for a joint never seen.
+        observed: (..., 66, T) 1 where seen, else 0.
+        path: (..., T, 3) metres, world: the origin of all joints but the pelvis, whose origin is the path's mean.
+        yaw: (...) radians, the mean heading of the window.
     """
 
     x: NDArray[np.float64]
     observed: NDArray[np.float64]
     path: NDArray[np.float64]
-    yaw: float
+    yaw: NDArray[np.float64]
 
 
 def body_size(offsets: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -52,9 +52,15 @@ def body_size(offsets: NDArray[np.floating]) -> NDArray[np.float64]:
     return lengths.sum(axis=-1) / np.linalg.norm(REST_OFFSETS[np.concatenate([_LEGS, _SPINE])], axis=-1).sum()
 
 
-def to_tracks(positions: NDArray[np.float64], size: float) -> Tracks:
-    """A window (T, 22, 3) metres, z up, NaN where missing, as tracks; ``size`` as `body_size` gives it."""
-    return Tracks(*_to_tracks(positions, size, _low_pass(len(positions))))
+def to_tracks(positions: NDArray[np.float64], size: NDArray[np.floating] | float) -> Tracks:
+    """Windows (..., T, 22, 3) metres, z up, NaN where missing, as tracks; ``size`` (...) as `body_size` gives it."""
+    batch, frames = positions.shape[:-3], positions.shape[-3]
+    windows = np.ascontiguousarray(positions, dtype=np.float64).reshape(-1, frames, 22, 3)
+    sizes = np.array(np.broadcast_to(size, batch), dtype=np.float64).reshape(-1)
+    x, observed = np.empty((2, len(windows), 66, frames))
+    path, yaw = np.empty((len(windows), frames, 3)), np.empty(len(windows))
+    _to_tracks(windows, sizes, _low_pass(frames), x, observed, path, yaw)
+    return Tracks(*(part.reshape((*batch, *part.shape[1:])) for part in (x, observed, path, yaw)))
 
 
 def in_frame_of(tracks: Tracks, positions: NDArray[np.float64], size: float) -> NDArray[np.float64]:
@@ -82,13 +88,12 @@ def hang_unseen(deviations: NDArray[np.floating]) -> None:
     Args:
         deviations: (..., 66, T) tracks less the mean tracks; NaN for joints never seen.
     """
-    joints = deviations.reshape(*deviations.shape[:-2], 22, 3, -1)
-    for joint, parent in enumerate(PARENTS):
-        unseen = np.isnan(joints[..., joint, :, :])
-        if unseen.any():
-            # the pelvis's own track is relative to another origin
-            joints[..., joint, :, :] = np.where(unseen, joints[..., parent, :, :] if parent > 0 else 0.0,
-                                                joints[..., joint, :, :])  # fmt: skip
+    joints = deviations.reshape(-1, 22, 3, deviations.shape[-1])
+    unseen = np.isnan(joints[:, :, 0, 0])
+    for joint in np.flatnonzero(unseen.any(axis=0)):  # parents come first
+        rows, parent = unseen[:, joint], PARENTS[joint]
+        # the pelvis's own track is relative to another origin
+        joints[rows, joint] = joints[rows, parent] if parent > 0 else 0.0
 
 
 _low_passes: dict[int, NDArray[np.float64]] = {}
@@ -105,33 +110,35 @@ def _low_pass(frames: int) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _to_tracks(positions, size, low_pass):
-    frames, joints = positions.shape[:2]
-    yaw = _heading(positions)
-    path = low_pass @ _centre(positions, yaw, size)
-    middle = np.array([path[:, 0].mean(), path[:, 1].mean(), path[:, 2].mean()])
-    c, s = math.cos(yaw), math.sin(yaw)
-    x = np.full((3 * joints, frames), np.nan)
-    observed = np.zeros((3 * joints, frames))
-    for j in range(joints):
-        for t in range(frames):
-            if math.isnan(positions[t, j, 0]):
-                continue
-            a = positions[t, j, 0] - (middle[0] if j == 0 else path[t, 0])
-            b = positions[t, j, 1] - (middle[1] if j == 0 else path[t, 1])
-            x[3 * j, t] = (c * a + s * b) / size
-            x[3 * j + 1, t] = (c * b - s * a) / size
-            x[3 * j + 2, t] = (positions[t, j, 2] - (middle[2] if j == 0 else path[t, 2])) / size
-            observed[3 * j : 3 * j + 3, t] = 1.0
-    for j in range(joints):
-        parent = _PARENT[j]
-        while parent > 0 and math.isnan(x[3 * parent, 0]):
-            parent = _PARENT[parent]
-        for axis in range(3):
-            # relative to the nearest joint above that was ever seen, whose gaps are bridged by now
-            above = x[3 * parent + axis] if parent > 0 else np.zeros(frames)
-            _bridge(x[3 * j + axis], above)
-    return x, observed, path, yaw
+def _to_tracks(windows, sizes, low_pass, all_x, all_observed, all_path, yaws):
+    """Of B windows (B, T, 22, 3): writes the four parts of `Tracks`."""
+    frames, joints = windows.shape[1:3]
+    still = np.zeros(frames)
+    for window in range(len(windows)):
+        positions, size = windows[window], sizes[window]
+        x, observed, path = all_x[window], all_observed[window], all_path[window]
+        yaw = yaws[window] = _heading(positions)
+        path[:] = low_pass @ _centre(positions, yaw, size)
+        middle = np.array([path[:, 0].mean(), path[:, 1].mean(), path[:, 2].mean()])
+        c, s = math.cos(yaw), math.sin(yaw)
+        x[:], observed[:] = np.nan, 0.0
+        for j in range(joints):
+            for t in range(frames):
+                if math.isnan(positions[t, j, 0]):
+                    continue
+                a = positions[t, j, 0] - (middle[0] if j == 0 else path[t, 0])
+                b = positions[t, j, 1] - (middle[1] if j == 0 else path[t, 1])
+                x[3 * j, t] = (c * a + s * b) / size
+                x[3 * j + 1, t] = (c * b - s * a) / size
+                x[3 * j + 2, t] = (positions[t, j, 2] - (middle[2] if j == 0 else path[t, 2])) / size
+                observed[3 * j : 3 * j + 3, t] = 1.0
+        for j in range(joints):
+            parent = _PARENT[j]
+            while parent > 0 and math.isnan(x[3 * parent, 0]):
+                parent = _PARENT[parent]
+            for axis in range(3):
+                # relative to the nearest joint above that was ever seen, whose gaps are bridged by now
+                _bridge(x[3 * j + axis], x[3 * parent + axis] if parent > 0 else still)
 
 
 @njit(cache=True)

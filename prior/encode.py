@@ -30,25 +30,27 @@ class EncodeSettings:
 
 
 class Encoded(NamedTuple):
-    """One body's window, seen and as the model would have it.
+    """The windows of the bodies present, seen and as the model would have them.
 
     Attributes:
-        tracks: what was seen, in the body's frame.
-        trust: (66, T) how far to believe each entry: the confidence of its joint, 0 where it was not seen.
-        size: of the body, as `body_size` gives it.
-        look: what the model makes of it.
-        model: that looked, and still stands at this window.
+        slots: (B,) whose windows these are.
+        tracks: what was seen, each in its body's frame.
+        trust: (B, 66, T) how far to believe each entry: the confidence of its joint, 0 where it was not seen.
+        size: (B,) of the bodies, as `body_size` gives it.
+        look: what the model makes of them.
+        model: that looked, and still stands at these windows.
     """
 
+    slots: NDArray[np.intp]
     tracks: Tracks
     trust: NDArray[np.float64]
-    size: float
+    size: NDArray[np.float64]
     look: Look
     model: LiveHGVAE
 
 
 class Encode:
-    """Runs HG-VAE once over the last frames of each body and keeps the result in ``window.encoded``."""
+    """Runs HG-VAE once over the last frames of the bodies present and keeps the result in ``window.encoded``."""
 
     delay_frames = 0
 
@@ -56,25 +58,26 @@ class Encode:
         state, config = load_weights(settings.weights, "hgvae")
         model = HGVAE(HGVAEConfig.from_dict(config))
         model.load_state_dict(state)
-        first = LiveHGVAE(model, sensor_sigma)
+        self._model = LiveHGVAE(model, sensor_sigma, slots)
+        self.frames = self._model.frames
         # loops are compiled at their first call, or loaded: not while a frame waits
-        tracks = to_tracks(np.zeros((first.frames, 22, 3)), 1.0)
-        first.look(tracks.x, tracks.observed)
-        first.gradient()
-        self._models = [first, *(first.another() for _ in range(slots - 1))]
-        self.frames = first.frames
+        tracks = to_tracks(np.zeros((1, self.frames, 22, 3)), 1.0)
+        self._model.look(tracks.x, tracks.observed)
+        self._model.gradient(0)
 
     def reset(self, slot: NDArray[np.bool_]) -> None:
         """Nothing is kept here."""
 
     def update(self, window: Window) -> Window:
-        """Encode the window of every body present."""
-        window.encoded = [None] * window.slots
-        for slot in np.flatnonzero(window.present):
-            size = float(body_size(window.offsets[slot]))
-            tracks = to_tracks(window.positions.all[-self.frames :, slot], size)
-            confidence = np.clip(window.confidence.all[-self.frames :, slot], LEAST_TRUST, 1.0)
-            trust = tracks.observed * np.repeat(confidence.T, 3, axis=0)
-            model = self._models[slot]
-            window.encoded[slot] = Encoded(tracks, trust, size, model.look(tracks.x, trust), model)
+        """Encode the windows of the bodies present."""
+        slots = np.flatnonzero(window.present)
+        window.encoded = None
+        if not len(slots):
+            return window
+        size = body_size(window.offsets[slots])
+        tracks = to_tracks(window.positions.all[-self.frames :, slots].swapaxes(0, 1), size)
+        confidence = np.clip(window.confidence.all[-self.frames :, slots], LEAST_TRUST, 1.0)
+        trust = tracks.observed * np.repeat(confidence.transpose(1, 2, 0), 3, axis=1)
+        look = self._model.look(tracks.x, trust)
+        window.encoded = Encoded(slots, tracks, trust, size, look, self._model)
         return window

@@ -1,14 +1,18 @@
-"""HG-VAE as the live node runs it: one window at a time, forward and the gradient of its score by its latents.
+"""HG-VAE as the live node runs it: the windows of all bodies, forward, and the gradient of a window's score by its
+latents.
 
 A model of this size is all overhead in torch: 250 small operations and their gradients take ten times as long as their
 arithmetic. Here the network is written down once as a list of a few kinds of steps on matrices, which compiled loops
 run forwards and backwards. The same numbers as `HGVAE` with the means of its latents.
+
+Each step is done for one body after the other: a body's matrices of 66 nodes fit into the processor's first cache,
+where their products take half as long a body as those of eight bodies side by side, and a step's weights are still at
+hand for the next body. So what is found for a body does not depend on the others, bit for bit.
 """
 
 from __future__ import annotations
 
 import math
-from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -22,14 +26,18 @@ from prior.hgvae import HGVAE, JOINT_NODES, LOG_VAR_RANGE, SCALE, TRACK_LOG_VAR,
 
 Floats = NDArray[np.float32]
 
-# Steps: the kind, the matrix written, one or two matrices read, and where in the weights their numbers begin.
-_LINEAR, _GELU, _ADD, _JOIN, _TAKE, _DENSITY = range(6)
-_FIELDS = 6
+# Steps: the kind, the matrix written, that read, and what else the kind needs (see `_do`).
+_LINEAR, _GELU, _SUM, _DENSITY = range(4)
+_FIELDS = 8
 _NONE = -1
 
 
 class _Program:
-    """A network written down: steps, the shapes of the matrices they work on, and all weights in one row."""
+    """A network written down: steps, the shapes of the matrices they work on, and all weights in one row.
+
+    Steps may write over a matrix. No gradient needs what it held: only what goes into `gelu` and `density` is asked for
+    again, and that is never written over.
+    """
 
     def __init__(self) -> None:
         self.steps: list[list[int]] = []
@@ -38,7 +46,7 @@ class _Program:
         self._used = 0
 
     def matrix(self, nodes: int, features: int) -> int:
-        """A new matrix's number."""
+        """A new matrix's number; zero where no step writes it."""
         self.shapes.append((nodes, features))
         return len(self.shapes) - 1
 
@@ -52,67 +60,70 @@ class _Program:
         self.steps.append([kind, out, *fields, *[_NONE] * (_FIELDS - 2 - len(fields))])
         return out
 
-    def linear(self, of: int, weight: Tensor, bias: Tensor | None = None, adjacency: Tensor | None = None) -> int:
-        """``adjacency @ of @ weight + bias``; without an adjacency, nodes stay by themselves."""
-        nodes = self.shapes[of][0] if adjacency is None else len(adjacency)
-        out = self.matrix(nodes, weight.shape[1])
-        if bias is None:
-            bias = torch.zeros(weight.shape[1])
-        stored = _NONE if adjacency is None else self._store(adjacency)
-        return self._step(_LINEAR, out, of, self._store(weight), self._store(bias.expand(nodes, -1)), stored)
+    def linear(
+        self,
+        of: int,
+        weight: Tensor,
+        bias: Tensor,
+        adjacency: Tensor | None = None,
+        plus: int = _NONE,
+        onto: int = _NONE,
+        active: bool = False,
+    ) -> int:
+        """``adjacency @ of @ weight + bias + plus``; without an adjacency, nodes stay by themselves.
 
-    def layer(self, of: int, layer: nn.Module) -> int:
-        """A `GraphLinear`, a linear layer of each node by itself, or nothing."""
+        Args:
+            of, weight, bias, adjacency: (n_in, f_in), (f_in, f_out), (f_out) or (n_out, f_out), (n_out, n_in).
+            plus: matrix to add.
+            onto: matrix to write; a new one if left out.
+            active: whether ``of`` goes through a GELU first.
+        """
+        nodes = self.shapes[of][0] if adjacency is None else len(adjacency)
+        out = self.matrix(nodes, weight.shape[1]) if onto == _NONE else onto
+        stored = _NONE if adjacency is None else self._store(adjacency)
+        shift = self._store(bias.expand(nodes, -1))
+        return self._step(_LINEAR, out, of, self._store(weight), shift, stored, plus, int(active))
+
+    def layer(self, of: int, layer: nn.Module, *, plus: int = _NONE, onto: int = _NONE, active: bool = False) -> int:
+        """A `GraphLinear`, or nothing."""
         if isinstance(layer, GraphLinear):
-            return self.linear(of, layer.weight, layer.bias, layer.adjacency)
-        if isinstance(layer, nn.Linear):
-            return self.linear(of, layer.weight.T, layer.bias)
+            return self.linear(of, layer.weight, layer.bias, layer.adjacency, plus, onto, active)
         return of
 
-    def block(self, of: int, block: GraphBlock) -> int:
-        """A graph convolutional block, equation 5."""
-        inner = self.gelu(self.layer(self.gelu(self.layer(of, block.first)), block.second))
-        return self.add(of, inner, block.alpha)
+    def block(self, of: int, block: GraphBlock, *, onto: int) -> int:
+        """A graph convolutional block, equation 5, written to ``onto``, which may be ``of`` itself."""
+        inner = self.layer(self.layer(of, block.first), block.second, active=True)
+        return self._step(_GELU, onto, inner, self._store(block.alpha.reshape(1)), of)
 
     def gelu(self, of: int) -> int:
-        return self._step(_GELU, self.matrix(*self.shapes[of]), of)
+        """Of a matrix, by itself."""
+        return self._step(_GELU, self.matrix(*self.shapes[of]), of, self._store(torch.ones(1)), _NONE)
 
-    def add(self, of: int, other: int, times: Tensor) -> int:
-        """``of + times * other``."""
-        return self._step(_ADD, self.matrix(*self.shapes[of]), of, other, self._store(times.reshape(1)))
+    def sum(self, of: int, other: int) -> int:
+        """Of two matrices."""
+        return self._step(_SUM, self.matrix(*self.shapes[of]), of, other)
 
-    def join(self, of: int, other: int) -> int:
-        """Features side by side."""
-        nodes, features = self.shapes[of]
-        return self._step(_JOIN, self.matrix(nodes, features + self.shapes[other][1]), of, other)
+    def density(self, of: int, gaussian: int) -> int:
+        """The logarithm of a normal density, entry by entry.
 
-    def take(self, of: int, first: int, count: int) -> int:
-        """Some of the features."""
-        return self._step(_TAKE, self.matrix(self.shapes[of][0], count), of, first)
-
-    def density(self, of: int, mean: int, log_var: int) -> int:
-        """The logarithm of a normal density, entry by entry; ``log_var`` is clamped to `LOG_VAR_RANGE`."""
-        return self._step(_DENSITY, self.matrix(*self.shapes[of]), of, mean, log_var)
-
-    def constant(self, values: Tensor) -> int:
-        """A matrix of weights that depends on nothing: a linear step from nothing."""
-        zero = self.matrix(1, 1)
-        return self.linear(zero, torch.zeros(1, values.shape[1]), values, torch.zeros(len(values), 1))
+        ``gaussian`` (n, 2 f) holds means and then log-variances, which are clamped to `LOG_VAR_RANGE`.
+        """
+        return self._step(_DENSITY, self.matrix(*self.shapes[of]), of, gaussian)
 
 
 class Look(NamedTuple):
-    """What the model makes of one window.
+    """What the model makes of windows.
 
     Attributes:
-        mean: (66, T) metres of a standard body, the tracks that the model would put there.
-        sigma: (66, T) metres, standard deviation.
-        score: nats: sum over all levels of log p(z | above), the score of section 7, and of what was observed,
+        mean: (..., 66, T) metres of a standard body, the tracks that the model would put there.
+        sigma: (..., 66, T) metres, standard deviation.
+        score: (...) nats: sum over all levels of log p(z | above), the score of section 7, and of what was observed,
             weighted, log p(x | z).
     """
 
     mean: NDArray[np.float64]
     sigma: NDArray[np.float64]
-    score: float
+    score: NDArray[np.float64]
 
 
 class LiveHGVAE:
@@ -121,121 +132,148 @@ class LiveHGVAE:
     Args:
         model: whose weights are copied; without actions.
         sensor_sigma: metres, standard deviation of an observation.
+        most: windows that can be looked at, at once.
 
     Attributes:
         frames: T, of a window.
-        latents: how many numbers all latents together are.
+        latents: how many numbers all latents of a window are.
     """
 
-    def __init__(self, model: HGVAE, sensor_sigma: float) -> None:
+    def __init__(self, model: HGVAE, sensor_sigma: float, most: int) -> None:
         config, p = model.config, _Program()
         self.frames, self._mean = config.frames, model.mean.numpy().astype(np.float64)[:, None]
-        self._x = p.matrix(JOINT_NODES, config.frames)
-        self._observed = p.matrix(JOINT_NODES, config.frames)
-        coefficients = p.linear(self._x, model.dct.T)
-        graph = p.block(p.gelu(p.layer(p.join(coefficients, self._observed), model.read)), model.read_block)
-        found = []
-        for up, block in model.encoder_levels:
-            graph = p.block(p.layer(graph, up), block)
-            found.append(graph)
-        encoder_steps = len(p.steps)
-        stream = p.constant(model.start)
-        self._moves, self._terms = [], []
-        one = torch.ones(())
-        for level, seen in zip(model.decoder_levels, reversed(found), strict=True):
-            latent = level.level.latent
-            above = p.layer(stream, level.contract)
-            if level.top:
-                prior = p.constant(torch.zeros(level.level.nodes, 2 * latent))
-            else:
-                prior = p.layer(p.block(above, level.prior_block), level.prior_head)
-            joined = p.layer(p.join(above, seen), level.join)
-            mean = p.take(p.layer(p.block(joined, level.posterior_block), level.posterior_head), 0, latent)
-            self._moves.append(p.matrix(level.level.nodes, latent))
-            z = p.add(mean, self._moves[-1], one)
-            self._terms.append(p.density(z, p.take(prior, 0, latent), p.take(prior, latent, latent)))
-            stream = p.block(p.add(stream, p.layer(z, level.expand), one), level.block)
-        written = p.layer(p.block(stream, model.last_block), model.write)
+        self._x = p.matrix(JOINT_NODES, 2 * config.frames)  # the tracks, and beside them what was observed
         kept = config.coefficients
-        shift = torch.full((config.frames,), TRACK_LOG_VAR)
-        self._tracks = p.linear(p.take(written, 0, kept), model.dct)
-        self._log_var = p.linear(p.take(written, kept, kept), model.dct, shift)
+        weight = torch.cat([model.dct.T @ model.read.weight[:kept], model.read.weight[kept:]])
+        graph = p.gelu(p.linear(self._x, weight, model.read.bias, model.read.adjacency))
+        p.block(graph, model.read_block, onto=graph)
+        # Of a level's joined features, what the encoder has to say: the stream's half of the product comes later.
+        features, seen = config.features, []
+        for (up, block), level in zip(model.encoder_levels, reversed(model.decoder_levels), strict=True):
+            graph = p.layer(graph, up)
+            p.block(graph, block, onto=graph)
+            seen.append(p.linear(graph, level.join.weight.T[features:], level.join.bias))
+        encoder_steps = len(p.steps)
+        stream = p.linear(p.matrix(1, 1), torch.zeros(1, features), model.start, torch.zeros(JOINT_NODES, 1))
+        self._moves, self._terms = [], []
+        nothing = torch.zeros(1)
+        for level, found in zip(model.decoder_levels, reversed(seen), strict=True):
+            nodes, latent = level.level
+            above = p.layer(stream, level.contract)
+            joined = p.linear(above, level.join.weight.T[:features], nothing.expand(features), plus=found)
+            p.block(joined, level.posterior_block, onto=joined)
+            head = level.posterior_head
+            mean = p.linear(joined, head.weight.T[:, :latent], head.bias[:latent])
+            if level.top:
+                prior = p.matrix(nodes, 2 * latent)
+            else:
+                before = p.block(above, level.prior_block, onto=p.matrix(nodes, features))
+                prior = p.linear(before, level.prior_head.weight.T, level.prior_head.bias)
+            self._moves.append(p.matrix(nodes, latent))
+            z = p.sum(mean, self._moves[-1])
+            self._terms.append(p.density(z, prior))
+            p.layer(z, level.expand, plus=stream, onto=stream)
+            p.block(stream, level.block, onto=stream)
+        p.block(stream, model.last_block, onto=stream)
+        # the inverse cosine transform of tracks and log-variances, within the last layer
+        weight = torch.cat([part @ model.dct for part in model.write.weight.split(kept, dim=1)], dim=1)
+        shift = torch.tensor([0.0, TRACK_LOG_VAR]).repeat_interleave(config.frames)
+        bias = torch.cat([part @ model.dct for part in model.write.bias.split(kept, dim=1)], dim=1) + shift
+        self._written = p.linear(stream, weight, bias, model.write.adjacency)  # tracks, and their log-variances
         steps = np.array(p.steps, dtype=np.int64)
         self._encoder, self._decoder = steps[:encoder_steps], steps[encoder_steps:]
         self._shapes = np.array(p.shapes, dtype=np.int64)
         sizes = self._shapes.prod(axis=1)
         self._starts = np.concatenate([[0], np.cumsum(sizes)])
         self._weights = np.concatenate(p.weights)
-        self._values = np.zeros(self._starts[-1], dtype=np.float32)
-        self._gradients = np.zeros_like(self._values)
-        self._sensor_variance = (sensor_sigma / SCALE) ** 2
-        self._trust = np.zeros((JOINT_NODES, config.frames), dtype=np.float32)
+        self._values = np.zeros((most, self._starts[-1]), dtype=np.float32)
+        self._gradients = np.zeros(self._starts[-1], dtype=np.float32)
+        self._scratch = np.zeros((3, self._shapes.max(axis=0).prod()), dtype=np.float32)
+        self._sensor_variance = np.float32((sensor_sigma / SCALE) ** 2)
+        self._trust = np.zeros((most, JOINT_NODES, config.frames), dtype=np.float32)
         self.latents = int(sizes[self._moves].sum())
 
-    def another(self) -> LiveHGVAE:
-        """The same model for another body: the window last looked at is each one's own."""
-        other = copy(self)
-        other._values, other._gradients = self._values.copy(), self._gradients.copy()
-        return other
-
-    def _matrix(self, arena: Floats, number: int) -> Floats:
-        return arena[self._starts[number] : self._starts[number + 1]].reshape(self._shapes[number])
-
     def look(self, x: NDArray[np.float64], observed: NDArray[np.float64]) -> Look:
-        """Encode and decode one window.
+        """Encode and decode windows. The model stands at them until it looks again; a window's row is its place here.
 
         Args:
-            x: (66, T) metres of a standard body; see `prior.body_tracks`. NaN for a joint never seen.
-            observed: (66, T) how far to believe each entry: 0 where there was none, at most 1.
+            x: (B, 66, T) metres of a standard body; see `prior.body_tracks`. NaN for a joint never seen.
+            observed: (B, 66, T) how far to believe each entry: 0 where there was none, at most 1.
         """
+        rows = np.arange(len(x))
         deviations = (x - self._mean) / SCALE
-        if np.isnan(deviations[:, 0]).any():
-            hang_unseen(deviations)
-        self._matrix(self._values, self._x)[:] = deviations
-        self._matrix(self._values, self._observed)[:] = observed > 0
-        self._trust = observed.astype(np.float32)
-        _forward(self._encoder, self._shapes, self._starts, self._weights, self._values)
-        return self.decode(np.zeros(self.latents))
-
-    def decode(self, moved: NDArray[np.float64]) -> Look:
-        """Decode the window last looked at, its latents (n,) moved from where the encoder puts them."""
-        begin = 0
+        hang_unseen(deviations)
+        self._trust[rows] = observed
+        seen = self._matrix(self._x, rows)
+        seen[..., : self.frames], seen[..., self.frames :] = deviations, observed > 0
         for number in self._moves:
-            matrix = self._matrix(self._values, number)
+            self._matrix(number, rows)[:] = 0.0
+        self._run(self._encoder, rows)
+        return self._decode(rows)
+
+    def decode(self, row: int, moved: NDArray[np.float64]) -> Look:
+        """Decode a window anew, its latents (n,) moved from where the encoder puts them."""
+        rows, begin = np.array([row]), 0
+        for number in self._moves:
+            matrix = self._matrix(number, rows)
             matrix[:] = moved[begin : begin + matrix.size].reshape(matrix.shape)
             begin += matrix.size
-        _forward(self._decoder, self._shapes, self._starts, self._weights, self._values)
-        own = self._variance()
-        variance = own + self._sensor_variance
-        off = self._matrix(self._values, self._x) - self._matrix(self._values, self._tracks)
-        likelihood = -0.5 * self._trust * (np.log(2 * np.pi * variance) + off**2 / variance)
-        return Look(
-            mean=self._matrix(self._values, self._tracks) * SCALE + self._mean,
-            sigma=np.sqrt(own.astype(np.float64)) * SCALE,
-            score=float(likelihood.sum()) + sum(float(self._matrix(self._values, k).sum()) for k in self._terms),
-        )
+        return Look(*(part[0] for part in self._decode(rows)))
 
-    def _variance(self) -> Floats:
-        """(66, T) of the tracks, in units of `SCALE`, as the model states it."""
-        return np.exp(np.clip(self._matrix(self._values, self._log_var), *LOG_VAR_RANGE))
-
-    def gradient(self) -> NDArray[np.float64]:
-        """(n,) gradient of the score last decoded by how far the latents were moved."""
+    def gradient(self, row: int) -> NDArray[np.float64]:
+        """(n,) gradient of the score of a window, as last decoded, by how far the latents were moved."""
         self._gradients[:] = 0.0
         for number in self._terms:
-            self._matrix(self._gradients, number)[:] = 1.0
-        own, log_var = self._variance(), self._matrix(self._values, self._log_var)
+            self._own_gradient(number)[:] = 1.0
+        off, own, inside = (part[0] for part in self._off_and_variance(np.array([row])))
         variance = own + self._sensor_variance
-        off = (self._matrix(self._values, self._x) - self._matrix(self._values, self._tracks)) / variance
-        within = (log_var > LOG_VAR_RANGE[0]) & (log_var < LOG_VAR_RANGE[1])
-        self._matrix(self._gradients, self._tracks)[:] = self._trust * off
-        self._matrix(self._gradients, self._log_var)[:] = 0.5 * self._trust * within * own * (off**2 - 1 / variance)
-        _backward(self._decoder, self._shapes, self._starts, self._weights, self._values, self._gradients)
-        return np.concatenate([self._matrix(self._gradients, k).ravel() for k in self._moves]).astype(np.float64)
+        off /= variance
+        by_written = self._own_gradient(self._written)
+        by_written[:, : self.frames] = self._trust[row] * off
+        by_written[:, self.frames :] = 0.5 * self._trust[row] * inside * own * (off**2 - 1 / variance)
+        _backward(
+            self._decoder, self._shapes, self._starts, self._weights, self._values[row], self._gradients, self._scratch
+        )
+        return np.concatenate([self._own_gradient(k).ravel() for k in self._moves]).astype(np.float64)
+
+    def _run(self, steps: NDArray[np.int64], rows: NDArray[np.intp]) -> None:
+        _forward(steps, self._shapes, self._starts, self._weights, self._values, rows, self._scratch)
+
+    def _matrix(self, number: int, rows: NDArray[np.intp]) -> Floats:
+        """(B, n, f) one matrix of the windows in ``rows``, which follow each other; a view."""
+        part = self._values[rows[0] : rows[-1] + 1, self._starts[number] : self._starts[number + 1]]
+        return part.reshape(len(rows), *self._shapes[number])
+
+    def _own_gradient(self, number: int) -> Floats:
+        return self._gradients[self._starts[number] : self._starts[number + 1]].reshape(self._shapes[number])
+
+    def _off_and_variance(self, rows: NDArray[np.intp]) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """How far tracks are from where the model puts them, (B, 66, T) in units of `SCALE`, the variance it states,
+        and whether that is inside its range."""
+        written = self._matrix(self._written, rows)
+        log_var = written[..., self.frames :]
+        off = self._matrix(self._x, rows)[..., : self.frames] - written[..., : self.frames]
+        return (
+            off,
+            np.exp(np.clip(log_var, *LOG_VAR_RANGE)),
+            (log_var > LOG_VAR_RANGE[0]) & (log_var < LOG_VAR_RANGE[1]),
+        )
+
+    def _decode(self, rows: NDArray[np.intp]) -> Look:
+        self._run(self._decoder, rows)
+        off, own, _ = self._off_and_variance(rows)
+        variance = own + self._sensor_variance
+        likelihood = -0.5 * self._trust[rows] * (np.log(2 * np.pi * variance) + off**2 / variance)
+        terms = [likelihood, *(self._matrix(number, rows) for number in self._terms)]
+        return Look(
+            mean=self._matrix(self._written, rows)[..., : self.frames] * SCALE + self._mean,
+            sigma=np.sqrt(own.astype(np.float64)) * SCALE,
+            score=sum((term.sum(axis=(1, 2), dtype=np.float64) for term in terms), np.zeros(len(rows))),
+        )
 
 
 # ---------------------------------------------------------------------------------------------------------------
-# The steps, compiled. The types of all five arguments are those of LiveHGVAE's attributes.
+# The steps, compiled. The types of all arguments are those of LiveHGVAE's attributes.
 
 # Abramowitz and Stegun 7.1.28: erf within 3e-7 without an exponential, which compilers turn into vector instructions.
 _ERF = tuple(
@@ -244,6 +282,7 @@ _ERF = tuple(
 _ROOT_HALF = np.float32(math.sqrt(0.5))
 _LOG_2PI = math.log(2 * math.pi)
 _LEAST, _MOST = LOG_VAR_RANGE
+_ONE = np.float32(1)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -262,8 +301,8 @@ def _gelu(values, out):
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _by_gelu(values, by_out, by_values):
-    """Add the gradient by the row that went into `_gelu`: that of the same approximation."""
+def _by_gelu(values, factor, by_out, by_values):
+    """Add ``factor`` times the gradient by the row that went into `_gelu`: that of the same approximation."""
     zero, half, one, eight = np.float32(0), np.float32(0.5), np.float32(1), np.float32(8)
     two, three, four, five, six = np.float32(2), np.float32(3), np.float32(4), np.float32(5), np.float32(6)
     a, b, c, d, e, f = _ERF
@@ -278,10 +317,10 @@ def _by_gelu(values, by_out, by_values):
         q = q * q
         sign = np.float32(x > zero) - np.float32(x < zero)
         cdf = half * (one + sign * (one - q))
-        by_values[k] += by_out[k] * (cdf + eight * _ROOT_HALF * x * slope * q / p)
+        by_values[k] += factor * by_out[k] * (cdf + eight * _ROOT_HALF * x * slope * q / p)
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True)
 def _add(values, factor, out):
     for k in range(len(values)):
         out[k] += factor * values[k]
@@ -293,80 +332,116 @@ def _view(arena, shapes, starts, number):
 
 
 @njit(cache=True)
-def _forward(steps, shapes, starts, weights, values):
-    for kind, number, first, second, third, fourth in steps:
-        out = _view(values, shapes, starts, number)
-        a = _view(values, shapes, starts, first)
-        nodes, features = out.shape
-        if kind == _LINEAR:
-            weight = weights[second : second + a.shape[1] * features].reshape(a.shape[1], features)
-            bias = weights[third : third + nodes * features].reshape(nodes, features)
-            if fourth < 0:
-                np.dot(a, weight, out)
-            else:
-                adjacency = weights[fourth : fourth + nodes * len(a)].reshape(nodes, len(a))
-                if nodes < len(a):
-                    np.dot(np.dot(adjacency, a), weight, out)
-                else:
-                    np.dot(adjacency, np.dot(a, weight), out)
-            out += bias
-        elif kind == _GELU:
-            _gelu(a.ravel(), out.ravel())
-        elif kind == _ADD:
-            out[:] = a
-            _add(_view(values, shapes, starts, second).ravel(), weights[third], out.ravel())
-        elif kind == _JOIN:
-            b = _view(values, shapes, starts, second)
-            out[:, : a.shape[1]] = a
-            out[:, a.shape[1] :] = b
-        elif kind == _TAKE:
-            out[:] = a[:, second : second + features]
-        else:
-            mean = _view(values, shapes, starts, second)
-            log_var = _view(values, shapes, starts, third)
-            for i in range(nodes):
-                for j in range(features):
-                    clamped = min(max(log_var[i, j], _LEAST), _MOST)
-                    off = a[i, j] - mean[i, j]
-                    out[i, j] = -0.5 * (clamped + _LOG_2PI + off * off * math.exp(-clamped))
+def _mix_first(nodes_in, features_in, nodes, features):
+    """Whether ``(S a) W`` costs less than ``S (a W)``."""
+    return nodes * features_in * (nodes_in + features) < nodes_in * features * (features_in + nodes)
 
 
 @njit(cache=True)
-def _backward(steps, shapes, starts, weights, values, gradients):
-    for k in range(len(steps) - 1, -1, -1):
-        kind, number, first, second, third, fourth = steps[k]
-        by_out = _view(gradients, shapes, starts, number)
-        a, by_a = _view(values, shapes, starts, first), _view(gradients, shapes, starts, first)
-        nodes, features = by_out.shape
-        if kind == _LINEAR:
-            weight = weights[second : second + a.shape[1] * features].reshape(a.shape[1], features)
-            if fourth < 0:
-                by_a += np.dot(by_out, weight.T)
-            else:
-                adjacency = weights[fourth : fourth + nodes * len(a)].reshape(nodes, len(a))
-                if nodes < len(a):
-                    by_a += np.dot(adjacency.T, np.dot(by_out, weight.T))
-                else:
-                    by_a += np.dot(np.dot(adjacency.T, by_out), weight.T)
-        elif kind == _GELU:
-            _by_gelu(a.ravel(), by_out.ravel(), by_a.ravel())
-        elif kind == _ADD:
-            _add(by_out.ravel(), np.float32(1), by_a.ravel())
-            _add(by_out.ravel(), weights[third], _view(gradients, shapes, starts, second).ravel())
-        elif kind == _JOIN:
-            by_b = _view(gradients, shapes, starts, second)
-            by_a += by_out[:, : a.shape[1]]
-            by_b += by_out[:, a.shape[1] :]
-        elif kind == _TAKE:
-            by_a[:, second : second + features] += by_out
+def _forward(steps, shapes, starts, weights, values, rows, scratch):
+    """Do the steps for the windows in these rows of ``values`` (most, all matrices)."""
+    for k in range(len(steps)):
+        for row in rows:
+            _do(steps[k], shapes, starts, weights, values[row], scratch)
+
+
+@njit(cache=True)
+def _do(step, shapes, starts, weights, values, scratch):
+    out, a = _view(values, shapes, starts, step[1]), _view(values, shapes, starts, step[2])
+    nodes, features = out.shape
+    nodes_in, features_in = a.shape
+    if step[0] == _LINEAR:
+        _, _, _, of_weight, of_bias, of_adjacency, plus, active = step
+        if active:
+            activated = scratch[0, : a.size].reshape(a.shape)
+            _gelu(a.ravel(), activated.ravel())
+            a = activated
+        weight = weights[of_weight : of_weight + features_in * features].reshape(features_in, features)
+        product = scratch[2, : out.size].reshape(out.shape)
+        if of_adjacency == _NONE:
+            np.dot(a, weight, product)
         else:
-            mean, by_mean = _view(values, shapes, starts, second), _view(gradients, shapes, starts, second)
-            log_var, by_log_var = _view(values, shapes, starts, third), _view(gradients, shapes, starts, third)
-            for i in range(nodes):
-                for j in range(features):
-                    clamped = min(max(log_var[i, j], _LEAST), _MOST)
-                    off = (a[i, j] - mean[i, j]) * math.exp(-clamped)
-                    by_a[i, j] -= by_out[i, j] * off
-                    by_mean[i, j] += by_out[i, j] * off
-                    if _LEAST < log_var[i, j] < _MOST:
-                        by_log_var[i, j] += by_out[i, j] * 0.5 * (off * (a[i, j] - mean[i, j]) - 1.0)
+            adjacency = weights[of_adjacency : of_adjacency + nodes * nodes_in].reshape(nodes, nodes_in)
+            if _mix_first(nodes_in, features_in, nodes, features):
+                mixed = scratch[1, : nodes * features_in].reshape(nodes, features_in)
+                np.dot(np.dot(adjacency, a, mixed), weight, product)
+            else:
+                weighed = scratch[1, : nodes_in * features].reshape(nodes_in, features)
+                np.dot(adjacency, np.dot(a, weight, weighed), product)
+        _add(weights[of_bias : of_bias + out.size], _ONE, product.ravel())
+        if plus != _NONE:
+            _add(_view(values, shapes, starts, plus).ravel(), _ONE, product.ravel())
+        out[:] = product
+    elif step[0] == _GELU:
+        _, _, _, factor, plus = step[:5]
+        activated = scratch[0, : a.size]
+        _gelu(a.ravel(), activated)
+        if plus == _NONE:
+            out[:] = 0.0
+        elif plus != step[1]:
+            out[:] = _view(values, shapes, starts, plus)
+        _add(activated, weights[factor], out.ravel())
+    elif step[0] == _SUM:
+        out[:] = a
+        _add(_view(values, shapes, starts, step[3]).ravel(), _ONE, out.ravel())
+    else:
+        gaussian = _view(values, shapes, starts, step[3])
+        for i in range(nodes):
+            for j in range(features):
+                log_var = min(max(gaussian[i, features + j], _LEAST), _MOST)
+                off = a[i, j] - gaussian[i, j]
+                out[i, j] = -0.5 * (log_var + _LOG_2PI + off * off * math.exp(-log_var))
+
+
+@njit(cache=True)
+def _backward(steps, shapes, starts, weights, values, gradients, scratch):
+    """From the gradients of some matrices, those of all that they were made of, of one window."""
+    for k in range(len(steps) - 1, -1, -1):
+        _undo(steps[k], shapes, starts, weights, values, gradients, scratch)
+
+
+@njit(cache=True)
+def _undo(step, shapes, starts, weights, values, gradients, scratch):
+    by_out, by_a = _view(gradients, shapes, starts, step[1]), _view(gradients, shapes, starts, step[2])
+    nodes, features = by_out.shape
+    nodes_in, features_in = by_a.shape
+    if step[0] == _LINEAR:
+        _, _, _, of_weight, _, of_adjacency, plus, active = step
+        weight = weights[of_weight : of_weight + features_in * features].reshape(features_in, features)
+        by_input = scratch[2, : by_a.size].reshape(by_a.shape)
+        if of_adjacency == _NONE:
+            np.dot(by_out, weight.T, by_input)
+        else:
+            adjacency = weights[of_adjacency : of_adjacency + nodes * nodes_in].reshape(nodes, nodes_in)
+            if _mix_first(nodes_in, features_in, nodes, features):
+                by_mixed = scratch[1, : nodes * features_in].reshape(nodes, features_in)
+                np.dot(adjacency.T, np.dot(by_out, weight.T, by_mixed), by_input)
+            else:
+                by_weighed = scratch[1, : nodes_in * features].reshape(nodes_in, features)
+                np.dot(np.dot(adjacency.T, by_out, by_weighed), weight.T, by_input)
+        if plus != _NONE and plus != step[1]:
+            _add(by_out.ravel(), _ONE, _view(gradients, shapes, starts, plus).ravel())
+        if active:
+            _by_gelu(_view(values, shapes, starts, step[2]).ravel(), _ONE, by_input.ravel(), by_a.ravel())
+        else:
+            _add(by_input.ravel(), _ONE, by_a.ravel())
+    elif step[0] == _GELU:
+        _, _, _, factor, plus = step[:5]
+        _by_gelu(_view(values, shapes, starts, step[2]).ravel(), weights[factor], by_out.ravel(), by_a.ravel())
+        if plus != step[1]:
+            _add(by_out.ravel(), _ONE, _view(gradients, shapes, starts, plus).ravel())
+    elif step[0] == _SUM:
+        _add(by_out.ravel(), _ONE, by_a.ravel())
+        _add(by_out.ravel(), _ONE, _view(gradients, shapes, starts, step[3]).ravel())
+    else:
+        a = _view(values, shapes, starts, step[2])
+        gaussian, by_gaussian = _view(values, shapes, starts, step[3]), _view(gradients, shapes, starts, step[3])
+        for i in range(nodes):
+            for j in range(features):
+                log_var = gaussian[i, features + j]
+                scale = math.exp(-min(max(log_var, _LEAST), _MOST))
+                off = a[i, j] - gaussian[i, j]
+                by_a[i, j] -= by_out[i, j] * off * scale
+                by_gaussian[i, j] += by_out[i, j] * off * scale
+                if _LEAST < log_var < _MOST:
+                    by_gaussian[i, features + j] += by_out[i, j] * 0.5 * (off * off * scale - 1.0)

@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.body_tracks import from_tracks
+from prior.body_tracks import Tracks, from_tracks
 from prior.encode import Encoded
 from prior.hgvae_live import Look
 from prior.window import Imputed, Window
@@ -68,24 +68,27 @@ class Climb:
         self._second = np.zeros_like(self._moved)
         self._count = 0
 
-    def complete(self, encoded: Encoded, steps: int) -> Look:
-        """What the model makes of the window: of the points visited, the one of highest score.
+    def complete(self, encoded: Encoded, row: int, steps: int) -> Look:
+        """What the model makes of the window in this row of ``encoded``: of the points visited, the one of highest
+        score.
 
         Each of ``steps`` looks at a point and takes a step from it; where the last one leads is seen in the next frame.
         Without a step, what the climb had gained when it was last looked at is added to the new start.
         """
-        model, best, best_at = encoded.model, encoded.look, np.zeros_like(self._moved)
+        model, start = encoded.model, Look(*(part[row] for part in encoded.look))
+        best, best_at = start, np.zeros_like(self._moved)
         if not steps:
             return best._replace(mean=best.mean + self._gained)
         for step in range(steps):
-            look = model.decode(self._moved)
-            if look.score > best.score:
-                best, best_at = look, self._moved
-            elif step == 0:  # where the climb had come to is worth less than a new start
-                self._moved = best_at
-                model.decode(self._moved)
-            self._climb(model.gradient())
-        self._gained = best.mean - encoded.look.mean
+            if step or self._moved.any():
+                look = model.decode(row, self._moved)
+                if look.score > best.score:
+                    best, best_at = look, self._moved
+                elif step == 0:  # where the climb had come to is worth less than a new start
+                    self._moved = best_at
+                    model.decode(row, self._moved)
+            self._climb(model.gradient(row))
+        self._gained = best.mean - start.mean
         return best
 
     def _climb(self, uphill: Floats) -> None:
@@ -125,32 +128,36 @@ class Impute:
     def update(self, window: Window) -> Window:
         """Complete the windows of those of whom something is hidden in the frames that are still to be answered."""
         self._frame += 1
-        frames = self.delay_frames + 1
+        window.imputed = None
+        encoded, frames = window.encoded, self.delay_frames + 1
+        if encoded is None:
+            self._climbs = [None] * window.slots
+            return window
         imputed = Imputed(np.full((frames, window.slots, 22, 3), np.nan), np.full((frames, window.slots, 22), np.inf))
-        for slot, encoded in enumerate(window.encoded):
-            if encoded is None or encoded.tracks.observed[:, -frames:].all():
+        seen = encoded.tracks.observed[..., -frames:].all(axis=-1)
+        # A joint never seen in the window is one that the sensor does not have: that takes no climb.
+        lost = (encoded.tracks.observed.any(axis=-1) & ~seen).any(axis=-1)
+        for row, slot in enumerate(encoded.slots):
+            if seen[row].all():
                 self._climbs[slot] = None
                 continue
-            # A joint never seen in the window is one that the sensor does not have: that takes no climb.
-            lost = encoded.tracks.observed.any(axis=1) & ~encoded.tracks.observed[:, -frames:].all(axis=1)
-            steps = self._settings.steps if lost.any() and self._turn(slot) else 0
+            steps = self._settings.steps if lost[row] and self._turn(slot) else 0
             if self.hurry and steps:
                 self._counters["imputation_skipped"] += 1
                 steps = 0
             climb = self._climbs[slot] = self._climbs[slot] or Climb(encoded.model.latents, self._settings)
-            look = climb.complete(encoded, steps)
-            positions = from_tracks(completed_tracks(encoded, look), encoded.tracks, encoded.size)
-            imputed.positions[:, slot] = positions[-frames:]
+            look = climb.complete(encoded, row, steps)
+            tracks, size = Tracks(*(part[row] for part in encoded.tracks)), float(encoded.size[row])
+            imputed.positions[:, slot] = from_tracks(completed_tracks(tracks, look), tracks, size)[-frames:]
             # at the start: where the climb ends, the model is surer than it is right
-            sigma = SIGMA_FOUND * encoded.look.sigma.reshape(22, 3, -1) * encoded.size
+            sigma = SIGMA_FOUND * encoded.look.sigma[row].reshape(22, 3, -1) * size
             imputed.sigma[:, slot] = np.sqrt((sigma**2).mean(axis=1)).T[-frames:]
         window.imputed = imputed
         return window
 
 
-def completed_tracks(encoded: Encoded, look: Look) -> Floats:
+def completed_tracks(tracks: Tracks, look: Look) -> Floats:
     """(66, T) metres: what was seen, and what the model makes of the rest, without a jump at the edge of a gap."""
-    tracks = encoded.tracks
     return look.mean + _carried(np.nan_to_num(tracks.x - look.mean), tracks.observed, CARRY_FRAMES)
 
 

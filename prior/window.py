@@ -98,7 +98,7 @@ class Window:
         smoothed: the fixed-lag smoother's estimate of the frame ``delay`` before the newest, or None while there is
             none.
         rotations: ring of (S, 22, 3, 3) local, solved from the positions.
-        encoded: (S) what HG-VAE makes of each body's window; None where there is no body or no such stage.
+        encoded: what HG-VAE makes of the windows of the bodies present; None if there is no body or no such stage.
         anomaly: (S,) how unlike human motion the last half second is; see `prior.anomaly`. NaN if it was not scored.
         anomaly_flag: (S,) whether it is too much so.
         joint_anomaly: (S, 22) the same joint by joint; NaN where not seen.
@@ -120,7 +120,7 @@ class Window:
         self.sensor_position = np.zeros(3)
         self.noise = np.zeros(slots)
         self.smoothed: Smoothed | None = None
-        self.encoded: list[Encoded | None] = [None] * slots
+        self.encoded: Encoded | None = None
         self.anomaly = np.full(slots, np.nan)
         self.anomaly_flag = np.zeros(slots, dtype=bool)
         self.joint_anomaly = np.full((slots, 22), np.nan)

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -83,7 +85,7 @@ def test_a_flag_is_held_until_it_has_been_quiet_for_a_while() -> None:
     stage = Score(ScoreSettings(false_alarms=0.01, hold=0.1), "default", 0.02, 1)
     window = Window(4, 1)
     told = iter([0.0, 2.5, 1.5, 0.9, 0.9, 0.9, 0.9, 2.5])
-    window.encoded = [object()]  # type: ignore[list-item]
+    window.encoded = SimpleNamespace(slots=np.array([0]))  # type: ignore[assignment]
     stage._score = lambda _: (np.array([next(told)]), np.zeros((1, 22)))  # type: ignore[method-assign]
     flags = [bool(stage.update(window).anomaly_flag[0]) for _ in range(8)]
     assert flags == [False, True, True, True, True, False, False, True]

@@ -142,30 +142,48 @@ def test_generation_draws_as_many_levels_as_asked() -> None:
 
 def test_the_live_model_is_the_trained_one() -> None:
     model = awake()
-    live = LiveHGVAE(model, sensor_sigma=0.01)
+    live = LiveHGVAE(model, sensor_sigma=0.01, most=4)
     rng = np.random.default_rng(0)
-    x, observed = rng.normal(scale=0.3, size=(66, 12)), (rng.random((66, 12)) < 0.7).astype(float)
+    x, observed = rng.normal(scale=0.3, size=(3, 66, 12)), (rng.random((3, 66, 12)) < 0.7).astype(float)
     look = live.look(x, observed)
-    scaled = torch.from_numpy((x - model.mean.numpy()[:, None]) / 0.2).float()[None]
-    found = model(scaled, torch.from_numpy(observed).float()[None])
-    np.testing.assert_allclose(look.mean, found.tracks.mean[0].numpy() * 0.2 + model.mean.numpy()[:, None], atol=1e-5)
-    np.testing.assert_allclose(look.sigma, (0.5 * found.tracks.log_var[0]).exp().numpy() * 0.2, rtol=1e-4)
+    scaled = torch.from_numpy((x - model.mean.numpy()[:, None]) / 0.2).float()
+    found = model(scaled, torch.from_numpy(observed).float())
+    np.testing.assert_allclose(look.mean, found.tracks.mean.numpy() * 0.2 + model.mean.numpy()[:, None], atol=1e-5)
+    np.testing.assert_allclose(look.sigma, (0.5 * found.tracks.log_var).exp().numpy() * 0.2, rtol=1e-4)
     wide = Gaussian(found.tracks.mean, (found.tracks.log_var.exp() + (0.01 / 0.2) ** 2).log())
-    told = found.log_prior.sum() + (wide.log_density(scaled)[0] * torch.from_numpy(observed)).sum()
-    assert look.score == pytest.approx(float(told), rel=1e-4)
+    told = found.log_prior.sum(dim=1) + (wide.log_density(scaled) * torch.from_numpy(observed)).sum(dim=(1, 2))
+    np.testing.assert_allclose(look.score, told.numpy(), rtol=1e-4)
+
+
+def test_what_the_live_model_makes_of_a_window_does_not_depend_on_the_others() -> None:
+    model, rng = awake(), np.random.default_rng(0)
+    x, observed = rng.normal(scale=0.3, size=(3, 66, 12)), np.ones((3, 66, 12))
+    x[2, 30:33] = np.nan  # a joint never seen
+    together, alone = LiveHGVAE(model, 0.01, most=3), LiveHGVAE(model, 0.01, most=1)
+    looks = together.look(x, observed)
+    gradients = [together.gradient(row) for row in range(3)]
+    moved = rng.normal(scale=0.1, size=together.latents)
+    elsewhere = together.decode(1, moved)
+    for row in range(3):
+        look = alone.look(x[row : row + 1], observed[row : row + 1])
+        assert all((a[0] == b[row]).all() for a, b in zip(look, looks, strict=True))
+        assert (alone.gradient(0) == gradients[row]).all()
+        if row == 1:
+            assert all((a == b).all() for a, b in zip(alone.decode(0, moved), elsewhere, strict=True))
 
 
 def test_the_gradient_of_the_live_score_is_that_of_its_differences() -> None:
-    live = LiveHGVAE(awake(), sensor_sigma=0.01)
+    live = LiveHGVAE(awake(), sensor_sigma=0.01, most=2)
     rng = np.random.default_rng(0)
-    live.look(rng.normal(scale=0.2, size=(66, 12)), (rng.random((66, 12)) < 0.7) * rng.uniform(0.2, 1, (66, 12)))
+    trust = (rng.random((2, 66, 12)) < 0.7) * rng.uniform(0.2, 1, (2, 66, 12))
+    live.look(rng.normal(scale=0.2, size=(2, 66, 12)), trust)
     at = rng.normal(scale=0.1, size=live.latents)
-    live.decode(at)
-    gradient = live.gradient()
+    live.decode(1, at)
+    gradient = live.gradient(1)
     for k in rng.choice(live.latents, 12, replace=False):
         step = np.zeros(live.latents)
         step[k] = 1e-2
-        found = (live.decode(at + step).score - live.decode(at - step).score) / 2e-2
+        found = (live.decode(1, at + step).score - live.decode(1, at - step).score) / 2e-2
         # scores of thousands in single precision: differences are good to a few hundredths
         assert gradient[k] == pytest.approx(found, rel=0.02, abs=0.1)
 
@@ -201,9 +219,9 @@ def test_the_weights_that_ship_reconstruct_motion_they_never_saw() -> None:
     state, config = load_weights("default", "hgvae")
     model = HGVAE(HGVAEConfig.from_dict(config)).eval()
     model.load_state_dict(state)
-    live = LiveHGVAE(model, sensor_sigma=0.01)
-    tracks = [to_tracks(waving(120)[start : start + 50], 1.0) for start in range(0, 70, 10)]
-    off = [live.look(t.x, t.observed).mean - t.x for t in tracks]
+    live = LiveHGVAE(model, sensor_sigma=0.01, most=7)
+    tracks = to_tracks(np.stack([waving(120)[start : start + 50] for start in range(0, 70, 10)]), 1.0)
+    off = live.look(tracks.x, tracks.observed).mean - tracks.x
     assert 1000 * np.sqrt(np.mean(np.square(off))) == pytest.approx(GOLDEN_RMS_MM, abs=1.0)
     assert (WEIGHTS / "hgvae-default.md").is_file()
 
