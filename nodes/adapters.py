@@ -42,7 +42,8 @@ def from_mediapipe(
         source: the camera's name.
 
     Returns:
-        bodies in the camera's optical frame (x right, y down, z forward), of a camera taken for level.
+        bodies in the camera's optical frame (x right, y down, z forward), of a camera taken for level. One of which too
+        few landmarks are seen to tell where it is, is left out.
     """
     bodies = []
     for number, (world, image) in enumerate(zip(result.pose_world_landmarks, result.pose_landmarks, strict=True)):
@@ -50,7 +51,8 @@ def from_mediapipe(
         pixels = np.array([(p.x, p.y) for p in image], np.float64) * image_size
         confidence = np.array([p.visibility for p in world], np.float64)
         place = _placed(joints, pixels, confidence, np.asarray(intrinsics, np.float64))
-        bodies.append(RawBody(number, joints + place, np.clip(confidence, 0.0, 1.0)))
+        if place is not None:
+            bodies.append(RawBody(number, joints + place, np.clip(confidence, 0.0, 1.0)))
     return _message(stamp_ns, "camera_optical_frame", source, BLAZEPOSE33, "-y", bodies)
 
 
@@ -159,21 +161,21 @@ def pinhole(image_size: tuple[int, int], field_of_view: float) -> Floats:
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
 
 
-def _placed(joints: Floats, pixels: Floats, confidence: Floats, intrinsics: Floats) -> Floats:
+def _placed(joints: Floats, pixels: Floats, confidence: Floats, intrinsics: Floats) -> Floats | None:
     """(3,) where joints (J, 3) have to be moved to so that they fall on pixels (J, 2): linear least squares.
 
-    A joint at p + t is seen at (u, v, 1) · depth: x + tx = u (z + tz), y + ty = v (z + tz). Zeros if it cannot be told.
+    A joint at p + t is seen at (u, v, 1) · depth: x + tx = u (z + tz), y + ty = v (z + tz). None if it cannot be told.
     """
     seen = (confidence > 0.5) & finite_joints(joints) & finite_joints(pixels)
     if seen.sum() < LEAST_POINTS:
-        return np.zeros(3)
+        return None
     rays = np.concatenate([pixels[seen], np.ones((int(seen.sum()), 1))], axis=1) @ np.linalg.inv(intrinsics).T
     x, y, z = joints[seen].T
     u, v = rays[:, 0], rays[:, 1]
     one, none = np.ones_like(u), np.zeros_like(u)
     equations = np.concatenate([np.stack([one, none, -u], axis=1), np.stack([none, one, -v], axis=1)])
     place, *_ = np.linalg.lstsq(equations, np.concatenate([u * z - x, v * z - y]), rcond=None)
-    return np.asarray(place, np.float64) if place[2] > 0 else np.zeros(3)
+    return np.asarray(place, np.float64) if place[2] > 0 else None
 
 
 def _table(skeleton: Skeleton, points: Sequence[Any], name: str) -> Floats:
