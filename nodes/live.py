@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Generator, Iterator
@@ -10,6 +11,8 @@ from typing import Protocol
 
 from msgs.types import PoseRaw
 from nodes.runtime import TURN_S, Clock
+
+logger = logging.getLogger(__name__)
 
 PAUSES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
 """before each try in a row to find the camera again; the last goes on"""
@@ -28,7 +31,7 @@ class Connection(Protocol):
 
     @property
     def counts(self) -> Counter[str]:
-        """Frames dropped or refused, by cause."""
+        """Frames dropped or refused since it was opened, by cause."""
         ...
 
     def frames(self) -> Iterator[PoseRaw | None]:
@@ -38,6 +41,14 @@ class Connection(Protocol):
     def status(self) -> dict[str, str]:
         """What there is to say of it in `diagnostics`."""
         ...
+
+
+def count_failure(counts: Counter[str], camera: str, error: Exception) -> None:
+    """Count a frame of a camera that could not be worked on, and log the first of its kind."""
+    cause = f"frame: {type(error).__name__}"
+    if cause not in counts:
+        logger.error("%s: a frame failed; more are only counted", camera, exc_info=error)
+    counts[cause] += 1
 
 
 class LiveSource(ABC):
@@ -65,6 +76,7 @@ class CameraSource(LiveSource):
         self._state = "looking for a camera"
         self._connection: Connection | None = None
         self._connections = 0
+        self._dropped: Counter[str] = Counter()  # by connections that are closed
 
     @abstractmethod
     def connect(self) -> AbstractContextManager[Connection]:
@@ -87,10 +99,10 @@ class CameraSource(LiveSource):
                         yield frame
                 trouble = "camera lost"
                 self.refused[trouble] += 1
-            except RuntimeError as error:  # depthai and OpenCV have no narrower ones
+            except RuntimeError as error:  # depthai and MediaPipe have no narrower ones
                 trouble = str(error)
-            if self._connection:  # keep what it counted
-                self.refused.update({f"camera {cause}": n for cause, n in self._connection.counts.items()})
+            if self._connection:
+                self._dropped.update(self._connection.counts)
             self._connection = None
             pause_s = PAUSES_S[min(tries, len(PAUSES_S) - 1)]
             tries += 1
@@ -104,7 +116,8 @@ class CameraSource(LiveSource):
         values = {"camera": self._state, "camera.connections": str(self._connections)}
         if self._state != STREAMING:
             values["state"] = self._state  # of the node: `steadypose run` shows it
+        dropped = self._dropped.copy()
         if self._connection:
             values |= {"camera.name": self._connection.name} | self._connection.status()
-            values |= {f"dropped.camera {cause}": str(n) for cause, n in self._connection.counts.items()}
-        return values
+            dropped.update(self._connection.counts)
+        return values | {f"dropped.camera {cause}": str(n) for cause, n in dropped.items()}

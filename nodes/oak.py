@@ -6,6 +6,7 @@ has no camera.
 """
 
 # without `from __future__ import annotations`: depthai reads those of `process` to know what an input takes
+import math
 import queue
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from msgs.types import PoseRaw, RawBody
 from nodes.launch import LaunchError, OakSettings
-from nodes.live import CameraError, CameraSource
+from nodes.live import CameraError, CameraSource, count_failure
 from nodes.runtime import TURN_S, Clock
 from prior.level import Level
 from prior.lift import lift
@@ -89,7 +90,7 @@ class Skeletons(dai.node.HostNode):
             assert isinstance(depth, dai.ImgFrame)
             frame = self._lifted(detections, depth)
         except Exception as error:  # whatever the camera sends, the next frame may be good
-            self.counts[f"frame: {type(error).__name__}"] += 1
+            count_failure(self.counts, self._source, error)
             return
         while self.found.qsize() >= QUEUE:
             self.found.get_nowait()
@@ -103,6 +104,8 @@ class Skeletons(dai.node.HostNode):
         found = detections.transformTo(view).detections if detections.getTransformation() else detections.detections
         found = sorted(found, key=lambda detection: -detection.confidence)
         people = [p for p in (detection.getKeypoints() for detection in found) if len(p) == len(COCO17.joints)]
+        if strangers := len(found) - len(people):  # another network than one of poses, or of other poses
+            self.counts["person without the 17 key points of COCO"] += strangers
         people = people[:MOST_BODIES]
         points = np.array([[(k.imageCoordinates.x, k.imageCoordinates.y, k.confidence) for k in p] for p in people])
         points = points.reshape(len(people), len(COCO17.joints), 3)
@@ -176,8 +179,8 @@ class Host:
 
     @property
     def counts(self) -> Counter[str]:
-        """Frames dropped or refused, by cause."""
-        return self._skeletons.counts
+        """Frames dropped or refused, by cause: a copy, because the pipeline's thread goes on counting."""
+        return self._skeletons.counts.copy()
 
     def frames(self) -> Iterator[PoseRaw | None]:
         """Skeletons as they come, None where none came for a while; ends when the camera does."""
@@ -283,7 +286,7 @@ class OakSource(CameraSource):
                 f"[input.oak] archive: expected a file that is an NN archive (.tar.xz), got {settings.archive}; "
                 "Luxonis' hub has some, their modelconverter makes others"
             )
-        if settings.fps < 0 or not 0 < settings.confidence < 1:
+        if not 0 <= settings.fps < math.inf or not 0 < settings.confidence < 1:
             raise LaunchError(
                 "[input.oak] expected fps of 0 (as the camera can) or more and confidence between 0 and 1, got "
                 f"{settings.fps:g} and {settings.confidence:g}"

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from msgs.types import PoseRaw
 from nodes.adapters import from_mediapipe, pinhole
 from nodes.launch import LaunchError, WebcamSettings
-from nodes.live import CameraError, CameraSource
+from nodes.live import CameraError, CameraSource, count_failure
 from nodes.runtime import Clock
 
 MODEL = (
@@ -52,9 +52,14 @@ class Webcam:
             now_ms = (stamp_ns - started_ns) // 1_000_000
             last_ms = now_ms if last_ms is None else max(now_ms, last_ms + 1)  # the landmarker wants them to rise
             height, width = image.shape[:2]
-            result = self._look(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), last_ms)
             intrinsics = pinhole((width, height), self._settings.field_of_view)
-            yield from_mediapipe(result, stamp_ns, (width, height), intrinsics, self.name)
+            frame = None
+            try:
+                result = self._look(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), last_ms)
+                frame = from_mediapipe(result, stamp_ns, (width, height), intrinsics, self.name)
+            except (cv2.error, ValueError) as error:  # a picture of another kind, a result that is none
+                count_failure(self.counts, self.name, error)
+            yield frame
 
     def status(self) -> dict[str, str]:
         return {}

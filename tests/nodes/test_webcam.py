@@ -85,6 +85,24 @@ def test_each_picture_gives_the_bodies_in_it(video: Path, model: str) -> None:
     assert list(milliseconds) == sorted(set(milliseconds)), "MediaPipe wants them to rise"
 
 
+def test_a_picture_that_fails_is_counted_and_the_next_one_comes(video: Path, model: str) -> None:
+    class Stumbles(Seen):
+        def look(self, image: np.ndarray, milliseconds: int) -> Made:
+            found = super().look(image, milliseconds)
+            if len(self.pictures) == 2:
+                found.pose_world_landmarks[0].pop()
+            elif len(self.pictures) == 4:
+                cv2.cvtColor(image[:0], cv2.COLOR_BGR2RGB)  # nothing, where a picture is expected
+            return found
+
+    source = WebcamSource(WebcamSettings(camera=3, model=model), SystemClock(), Stumbles().landmarker)
+    frames = source.frames()
+    assert [next(frames) is not None for _ in range(FRAMES)] == [True, False, True, False, True]
+    status = source.status()
+    assert (status["dropped.camera frame: ValueError"], status["dropped.camera frame: error"]) == ("1", "1")
+    assert not source.refused
+
+
 def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str, clock: VirtualClock) -> None:
     source = WebcamSource(WebcamSettings(camera=4, model=model), clock, Seen().landmarker)
     frames = source.frames()
