@@ -20,6 +20,13 @@ WEIGHTS = Path(__file__).parent / "weights"
 """Where the weights lie: ``MODEL-SET.safetensors``, each with ``MODEL-SET.md``, its card."""
 
 
+LICENCES = {
+    "default": "Apache-2.0; trained only on data free for products",
+    "research": "non-commercial use only: trained on CC BY-NC 4.0 data too",
+}
+"""by weight set, as a card tells it"""
+
+
 def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, Any]) -> None:
     """Write weights, in half precision, with their configuration, and the card; on the first process of torchrun.
 

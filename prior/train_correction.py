@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from prior.checkpoint import WEIGHTS, save_weights
 from prior.correct import DENSITY, recall
 from prior.correction_net import HISTORY, CorrectionConfig, CorrectionNet, features, mirror_features, trunk_frame
 from prior.distributed import share
@@ -19,7 +18,7 @@ from prior.kinematics import rigid_alignment
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
 from prior.motion_windows import mirror_offsets
 from prior.skeletons import KINECT22, finite_joints, to_canonical
-from prior.training import TrainingRun, draw_curves
+from prior.training import TrainingRun
 
 HIDE = 0.1
 """Share of training frames with joints hidden, so that the network can do without some."""
@@ -74,17 +73,12 @@ def train_correction(
         optimiser.step()
         schedule.step()
         losses.append(1000 * loss.item())
-    path = WEIGHTS / f"correction-{weights}.safetensors"
-    save_weights(path, net, asdict(config), {
+    return run.ship(f"correction-{weights}", net, asdict(config), {
         "Model": "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses (prior/correction_net.py)",
         "Data": f"UI-PRMD, Kinect beside Vicon: {', '.join(TRAIN_SUBJECTS)}",
         "Licence": "Apache-2.0; the data is in the public domain (PDDL 1.0)",
         "Training": f"`steadypose train correction --data ui_prmd.npz`: {iterations} steps of {batch}, seed {seed}",
-        "Validation": ", ".join(f"{k} {v:.4g}" for k, v in run.curves[-1].items()),
-        "Curves": f"`correction-{weights}.png`",
     })  # fmt: skip
-    draw_curves(run.curves, path.with_suffix(".png"))
-    return path
 
 
 def _examples(data: Path, subjects: Collection[str]) -> tuple[Tensor, Tensor]:

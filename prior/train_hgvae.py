@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from prior.body_tracks import in_frame_of, to_tracks
-from prior.checkpoint import WEIGHTS, save_weights
+from prior.checkpoint import LICENCES
 from prior.distributed import share
 from prior.hgvae import HGVAE, JOINT_NODES, SCALE, HGVAEConfig, Level, Pass
 from prior.motion_windows import MotionSet
 from prior.skeletons import MIRROR, PARENTS, J
 from prior.track_windows import Windows, mean_tracks, standardise
 from prior.train_anomaly import calibrate_anomaly
-from prior.training import TrainingRun, draw_curves
+from prior.training import TrainingRun
 from prior.window import FPS
 
 Floats = NDArray[np.float64]
@@ -87,18 +87,13 @@ def train_hgvae(
     network = HGVAE(MODELS[model])
     network.mean.copy_(mean_tracks(train, network.config.frames))
     run = fit(network, train, val, runs / name, iterations, batch, learning_rate, seed)
-    path = WEIGHTS / f"{name}.safetensors"
-    save_weights(path, network, asdict(network.config), {
+    path = run.ship(name, network, asdict(network.config), {
         "Model": f"HG-VAE, '{model}' of prior/train_hgvae.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject",
-        "Licence": "Apache-2.0; trained only on data free for products" if weights == "default"
-        else "non-commercial use only: trained on CC BY-NC 4.0 data too",
+        "Licence": LICENCES[weights],
         "Training": f"`steadypose train {model} --weights {weights}`: {iterations} steps of {batch} windows, "
         f"Adam {learning_rate:g}, seed {seed}",
-        "Validation": ", ".join(f"{k} {v:.4g}" for k, v in run.curves[-1].items()),
-        "Curves": f"`{name}.png`",
     })  # fmt: skip
-    draw_curves(run.curves, path.with_suffix(".png"))
     calibrate_anomaly(data, weights, path)
     return path
 

@@ -11,12 +11,12 @@ import roma
 import torch
 from torch import Tensor
 
-from prior.checkpoint import WEIGHTS, save_weights
+from prior.checkpoint import LICENCES
 from prior.distributed import share
 from prior.hmvae import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
 from prior.kinematics import forward_kinematics
 from prior.motion_windows import MotionSet, mirror_offsets, mirror_rotations, remove_heading
-from prior.training import TrainingRun, draw_curves
+from prior.training import TrainingRun
 
 JOINT_WEIGHT = 10.0
 """lambda of equation 5."""
@@ -69,21 +69,15 @@ def train_hmvae(
     config = HMVAEConfig()
     model = HMVAE(config)
     run = fit(model, train, val, runs / f"hmvae-{weights}", iterations, batch, learning_rate, STRIDES, seed)
-    path = WEIGHTS / f"hmvae-{weights}.safetensors"
     hours = {split: len(s.rotations) / 30 / 3600 for split, s in (("train", train), ("val", val))}
-    save_weights(path, model, asdict(config), {
+    return run.ship(f"hmvae-{weights}", model, asdict(config), {
         "Model": "HM-VAE, window 8, 22 joints (prior/hmvae.py)",
         "Data": f"the '{weights}' set of `steadypose prepare`: {hours['train']:.2f} h training, "
         f"{hours['val']:.2f} h validation, split by subject",
-        "Licence": "Apache-2.0; trained only on data free for products" if weights == "default"
-        else "non-commercial use only: trained on CC BY-NC 4.0 data too",
+        "Licence": LICENCES[weights],
         "Training": f"`steadypose train hmvae --weights {weights} --iterations {iterations}`: "
         f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}",
-        "Validation": ", ".join(f"{k} {v:.4g}" for k, v in run.curves[-1].items()),
-        "Curves": f"`hmvae-{weights}.png`",
     })  # fmt: skip
-    draw_curves(run.curves, path.with_suffix(".png"))
-    return path
 
 
 def fit(

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from prior.checkpoint import WEIGHTS, save_weights
+from prior.checkpoint import LICENCES
 from prior.distributed import share
 from prior.kinematics import CONTACT_JOINTS
 from prior.motion_windows import MotionSet, yaw_rotation
 from prior.skeletons import MIRROR, J
-from prior.training import TrainingRun, draw_curves
+from prior.training import TrainingRun
 from prior.trajectory_net import FRAME_S, RootMotion, TrajectoryConfig, TrajectoryNet
 
 WINDOW = 48
@@ -121,23 +121,17 @@ def train_trajectory(
         optimiser.step()
         schedule.step()
     config = calibrate(model, val)
-    path = WEIGHTS / f"trajectory-{weights}.safetensors"
     hours = {split: len(s.rotations) / 30 / 3600 for split, s in (("train", train), ("val", val))}
-    save_weights(path, model, asdict(config), {
+    return run.ship(f"trajectory-{weights}", model, asdict(config), {
         "Model": f"root velocity and contacts, {config.context} frames of context, 22 joints (prior/trajectory_net.py)",
         "Data": f"the '{weights}' set of `steadypose prepare`: {hours['train']:.2f} h training, "
         f"{hours['val']:.2f} h validation, split by subject",
-        "Licence": "Apache-2.0; trained only on data free for products" if weights == "default"
-        else "non-commercial use only: trained on CC BY-NC 4.0 data too",
+        "Licence": LICENCES[weights],
         "Training": f"`steadypose train trajectory --weights {weights} --iterations {iterations}`: "
         f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}",
-        "Validation": ", ".join(f"{k} {v:.4g}" for k, v in run.curves[-1].items()),
         "Calibration": f"standard deviations times {config.sigma_scale}, errors last {config.correlation_s} s "
         "(horizontal, vertical)",
-        "Curves": f"`trajectory-{weights}.png`",
     })  # fmt: skip
-    draw_curves(run.curves, path.with_suffix(".png"))
-    return path
 
 
 _SPAN = int(np.ceil((WINDOW + 1) * RATES[1])) + 2

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import nn
 from torch.optim import Optimizer
 
+from prior import checkpoint
 from prior.distributed import average_gradients, from_first, processes, rank, writes
 
 
@@ -72,6 +74,24 @@ class TrainingRun:
                     if writes():
                         self._save()
                 progress.update(task, completed=self.step, result=self._latest())
+
+    def ship(self, name: str, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, str]) -> Path:
+        """Write what came of the training among the weights that ship: the model, its card, its curves.
+
+        Args:
+            name: ``MODEL-SET``.
+            model: trained.
+            config: what rebuilds it.
+            card: heading to content: what it is, its data, licence and training; how well it did is added here.
+
+        Returns:
+            The path of the weights.
+        """
+        path = checkpoint.WEIGHTS / f"{name}.safetensors"
+        told = {"Validation": ", ".join(f"{k} {v:.4g}" for k, v in self.curves[-1].items()), "Curves": f"`{name}.png`"}
+        checkpoint.save_weights(path, model, config, {**card, **told})
+        draw_curves(self.curves, path.with_suffix(".png"))
+        return path
 
     def _latest(self) -> str:
         return "  ".join(f"{k} {v:.4g}" for k, v in (self.curves[-1] if self.curves else {}).items() if k != "step")

@@ -202,7 +202,7 @@ def test_what_a_camera_does_to_windows_leaves_the_truth_alone() -> None:
 
 
 def test_training_writes_weights_their_card_and_their_scale(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("prior.train_hgvae.WEIGHTS", tmp_path / "weights")
+    monkeypatch.setattr("prior.checkpoint.WEIGHTS", tmp_path / "weights")
     config = replace(SMALL, frames=20)
     monkeypatch.setattr("prior.train_hgvae.MODELS", {"hgvae": config})
     monkeypatch.setattr("prior.train_anomaly.WINDOWS", 16)

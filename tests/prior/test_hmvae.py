@@ -135,7 +135,7 @@ def test_a_missing_split_and_a_missing_file_are_said(tmp_path: Path) -> None:
 
 
 def test_training_resumes_where_it_was_killed_and_ends_the_same(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("prior.train_hmvae.WEIGHTS", tmp_path / "weights")
+    monkeypatch.setattr("prior.checkpoint.WEIGHTS", tmp_path / "weights")
     data = prepared(tmp_path / "m.npz")
     whole = train_hmvae(data, tmp_path / "a", iterations=6, batch=4).read_bytes()
 
