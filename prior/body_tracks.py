@@ -72,13 +72,14 @@ def in_frame_of(tracks: Tracks, positions: NDArray[np.float64], size: float) -> 
     return local.transpose(1, 2, 0).reshape(66, -1)
 
 
-def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: float) -> NDArray[np.float64]:
-    """The joints (T, 22, 3) metres, world, of tracks ``x`` (66, T) in the frame of ``tracks``."""
-    local = x.reshape(22, 3, -1).transpose(2, 0, 1) * size
-    c, s = math.cos(tracks.yaw), math.sin(tracks.yaw)
-    world = local @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    world[:, 0] += tracks.path.mean(axis=0)
-    world[:, 1:] += tracks.path[:, None]
+def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: NDArray[np.floating] | float) -> NDArray[np.float64]:
+    """The joints (..., T, 22, 3) metres, world, of tracks ``x`` (..., 66, T) in the frame of ``tracks``."""
+    local = np.moveaxis(x.reshape(*x.shape[:-2], 22, 3, -1), -1, -3) * np.asarray(size)[..., None, None, None]
+    c, s, zero = np.cos(tracks.yaw), np.sin(tracks.yaw), np.zeros_like(tracks.yaw)
+    turn = np.stack([c, s, zero, -s, c, zero, zero, zero, zero + 1.0], axis=-1).reshape(*np.shape(c), 1, 3, 3)
+    world = local @ turn
+    world[..., 0, :] += tracks.path.mean(axis=-2, keepdims=True)
+    world[..., 1:, :] += tracks.path[..., None, :]
     return world
 
 

@@ -1,4 +1,4 @@
-"""The prior, stage by stage: adapt, gate, correct, smooth, bones, encode, score, impute, solve, refine, fuse.
+"""The prior, stage by stage: adapt, gate, correct, smooth, encode, denoise, bones, score, impute, solve, refine, fuse.
 
 One object serves a stream: `PriorPipeline.process` takes ``pose/raw`` messages and gives the ``pose/clean`` messages
 they complete. All bodies go through each stage together, one slot a body. Nothing here reads a clock or draws a
@@ -21,6 +21,7 @@ from msgs.types import CleanBody, PoseClean, PoseRaw, RawBody
 from prior.anomaly import Score, ScoreSettings
 from prior.bones import Bones, BonesSettings
 from prior.correct import Correct, CorrectSettings
+from prior.denoise import Denoise, DenoiseSettings
 from prior.encode import Encode, EncodeSettings
 from prior.fuse import Fuse, FuseSettings
 from prior.gate import Gate, GateSettings
@@ -58,7 +59,7 @@ class PriorSettings:
             more bones are measured rather than taken from human proportions, and the surer joints are said to be.
             Depth cameras have 2 cm or more, marker-based motion capture next to none.
         identify: who tells bodies apart: the source (the default), or the prior.
-        gate, correct, smooth, bones, encode, score, impute, refine, fuse: settings of the stages.
+        gate, correct, smooth, encode, denoise, bones, score, impute, refine, fuse: settings of the stages.
     """
 
     delay: int = 4
@@ -69,8 +70,9 @@ class PriorSettings:
     gate: GateSettings = field(default_factory=GateSettings)
     correct: CorrectSettings = field(default_factory=CorrectSettings)
     smooth: SmoothSettings = field(default_factory=SmoothSettings)
-    bones: BonesSettings = field(default_factory=BonesSettings)
     encode: EncodeSettings = field(default_factory=EncodeSettings)
+    denoise: DenoiseSettings = field(default_factory=DenoiseSettings)
+    bones: BonesSettings = field(default_factory=BonesSettings)
     score: ScoreSettings = field(default_factory=ScoreSettings)
     impute: ImputeSettings = field(default_factory=ImputeSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
@@ -104,32 +106,29 @@ class PriorPipeline:
         self._resampler = Resampler(slots)
         # what the sensor may be off by, slowly and fast
         sensor_sigma = float(np.hypot(settings.bias_sigma, settings.smooth.measurement_sigma))
-        reads = settings.score.enabled or settings.impute.enabled
-        self._encode = Encode(settings.encode, sensor_sigma, slots) if reads else None
-        self._impute: Impute | None = None
-        hgvae: list[Stage] = []
-        if self._encode:
-            hgvae.append(self._encode)
-            if settings.score.enabled:
-                hgvae.append(Score(settings.score, settings.encode.weights, sensor_sigma, slots))
-            if settings.impute.enabled:
-                self._impute = Impute(settings.impute, settings.delay, slots, self.counters)
-                hgvae.append(self._impute)
+        denoise, score, impute = settings.denoise.enabled, settings.score.enabled, settings.impute.enabled
+        self._encode = Encode(settings.encode, sensor_sigma, slots) if denoise or score or impute else None
+        self._denoise = Denoise(settings.smooth.measurement_sigma, settings.delay, slots) if denoise else None
+        self._impute = Impute(settings.impute, settings.delay, slots, self.counters) if impute else None
         shortest = max(refine.window, settings.delay + 1)
         window_frames = max(shortest, self._encode.frames if self._encode else 0)
         self._window = Window(window_frames, slots, decoded_frames=shortest)
         self._smooth = Smooth(settings.smooth, settings.delay, slots)
         self._fuse = Fuse(settings.fuse, settings.bias_sigma, settings.delay, slots)
-        self._stages: tuple[Stage, ...] = (
+        stages: tuple[Stage | None, ...] = (
             Gate(settings.gate, slots, self.counters),
-            *([Correct(settings.correct, slots)] if settings.correct.sensor else []),
+            Correct(settings.correct, slots) if settings.correct.sensor else None,
             self._smooth,
+            self._encode,
+            self._denoise,
             Bones(settings.bones, settings.bias_sigma, slots),
-            *hgvae,
+            Score(settings.score, settings.encode.weights, sensor_sigma, slots) if score else None,
+            self._impute,
             Solve(),
             refine,
             self._fuse,
         )
+        self._stages = [stage for stage in stages if stage]
         self._ids: list[int | None] = [None] * slots
         self._unseen_ns = np.zeros(slots, dtype=np.int64)
         self._last: PoseRaw | None = None
@@ -189,6 +188,8 @@ class PriorPipeline:
         if last is not None:
             held = self._smooth.flush(self._window)
             for back, smoothed in zip(reversed(range(len(held))), held, strict=True):
+                if self._denoise:
+                    smoothed = self._denoise.denoised(self._window, smoothed, back)
                 cleaned.append(self._message(self._fuse.estimate(self._window, smoothed, back), back, last))
         self._drop(np.ones(self.settings.max_bodies, dtype=bool))
         self._resampler.reset()
