@@ -30,6 +30,10 @@ LEAST_CORNERS = 6
 """of the board that must be seen for a picture to be used"""
 LEAST_VIEWS = 8
 """pictures of the board, at least, that tell a lens"""
+LEAST_TILT = np.radians(20.0)
+"""between the planes of the board in two of the pictures, at least: of parallel ones a lens cannot be told"""
+SURE_FOCAL = 0.01
+"""of a focal length, the standard deviation up to which it is accepted"""
 WORST_VIEW = 3.0
 """times the median error of all pictures: one that is worse is left out (the board was bent, or moved)"""
 CORNER_SIGMA_PX = 0.05
@@ -162,7 +166,7 @@ def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsic
         size: pixels, width and height.
 
     Raises:
-        CalibrationError: too few pictures, or they do not agree.
+        CalibrationError: too few pictures, they do not agree, or they are too much alike.
     """
     kept = [view for view in views if len(view.image) >= LEAST_CORNERS]
     while True:
@@ -171,7 +175,7 @@ def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsic
                 f"expected {LEAST_VIEWS} pictures or more that show the board well, got {len(kept)}: take 15 to 25, "
                 "the board near and far, tilted to all sides, in the middle and in every corner of the picture"
             )
-        error, matrix, distortion, _, _, _, _, errors = cv2.calibrateCameraExtended(
+        error, matrix, distortion, turns, _, sigma, _, errors = cv2.calibrateCameraExtended(
             [view.board.astype(np.float32) for view in kept],
             [view.image.astype(np.float32) for view in kept],
             size,
@@ -188,9 +192,19 @@ def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsic
             f"expected corners within {MOST_ERROR_PX:g} pixels of where the lens puts them, got {error:.1f}: is the "
             "board flat, the number of squares as printed, and every picture from the same camera and resolution?"
         )
+    focal = matrix[[0, 1], [0, 1]]
+    unsure = float((np.ravel(sigma)[:2] / focal).max())
+    normals = Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()[:, :, 2]
+    tilt = float(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0).min()))
+    if tilt < LEAST_TILT or not unsure < SURE_FOCAL:
+        raise CalibrationError(
+            f"expected pictures that tell the focal length to {SURE_FOCAL:.0%}, with the board tilted by "
+            f"{np.degrees(LEAST_TILT):.0f} degrees or more from one to another, got {unsure:.1%} and "
+            f"{np.degrees(tilt):.0f} degrees: they are too much alike; tilt the board to all sides, near and far"
+        )
     return Intrinsics(
         size=(int(size[0]), int(size[1])),
-        focal=(float(matrix[0, 0]), float(matrix[1, 1])),
+        focal=(float(focal[0]), float(focal[1])),
         centre=(float(matrix[0, 2]), float(matrix[1, 2])),
         distortion=tuple(np.ravel(distortion).tolist()[:5]),
         error_px=float(error),

@@ -95,6 +95,19 @@ def test_too_few_pictures_and_pictures_at_odds_are_refused() -> None:
         calibrate_lens([dataclasses.replace(v, image=rng.uniform(0, 700, v.image.shape)) for v in views], LENS.size)
 
 
+def test_pictures_that_are_too_much_alike_are_refused_though_their_error_is_small() -> None:
+    """Of them a lens is found that is off by a factor of three, or fifty, and fits to a tenth of a pixel."""
+    rng, middle = np.random.default_rng(0), np.array([*BOARD.size, 0.0]) / 2
+    above = middle + [0.0, -0.1, 0.6]
+    for eyes in (
+        [above] * 15,
+        [middle + [0.2, -0.4, 0.6]] * 15,
+        [middle + [*rng.normal(0.0, 0.02, 2), rng.uniform(0.5, 0.9)] for _ in range(15)],
+    ):
+        with pytest.raises(CalibrationError, match="they are too much alike"):
+            calibrate_lens([view(look_at(eye, middle), rng) for eye in eyes], LENS.size)
+
+
 def test_the_place_is_as_sure_as_it_is_said_to_be() -> None:
     rng = np.random.default_rng(0)
     ratios = []
