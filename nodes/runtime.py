@@ -17,6 +17,7 @@ it plays at which time (`Timeline`); with that, every node knows how late it is.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import resource
 import sys
@@ -96,13 +97,13 @@ class Timeline:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> Self | None:
-        """From diagnostics, or None if they carry none."""
+        """From diagnostics, or None if they carry none that can be."""
         try:
-            return cls(
-                int(values["timeline.stamp_ns"]), int(values["timeline.wall_ns"]), float(values["timeline.rate"])
-            )
+            stamp_ns, wall_ns = int(values["timeline.stamp_ns"]), int(values["timeline.wall_ns"])
+            rate = float(values["timeline.rate"])
         except (KeyError, ValueError):
             return None
+        return cls(stamp_ns, wall_ns, rate) if 0 < rate < math.inf else None
 
 
 class Inbox:

@@ -194,6 +194,8 @@ def test_a_timeline_goes_through_diagnostics_and_back() -> None:
     assert Timeline.from_values(timeline.values()) == timeline
     assert Timeline.from_values({"timeline.stamp_ns": "x"}) is None
     assert Timeline.from_values({}) is None
+    for rate in ("0", "-1", "nan", "inf"):
+        assert Timeline.from_values(timeline.values() | {"timeline.rate": rate}) is None, rate
 
 
 def test_a_node_stops_though_it_waits_for_a_listener_who_never_comes(make_launch: MakeLaunch) -> None:
