@@ -15,6 +15,7 @@ import signal
 import traceback
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnContext
@@ -153,7 +154,8 @@ class Manifest:
         if self.path.exists():
             text = self.path.read_text(encoding="utf-8", errors="replace")
             if not text.endswith("\n"):  # cut short by whatever stopped the run that wrote it
-                self.path.write_text(text + "\n", encoding="utf-8")
+                with self.path.open("a", encoding="utf-8") as file:
+                    file.write("\n")
             for line in text.splitlines():
                 try:
                     entry = json.loads(line)
@@ -239,7 +241,8 @@ class _Worker:
 
     def give(self, job: Job) -> None:
         self.job = job
-        self.connection.send(job)
+        with suppress(OSError):  # if the process has died since its last job, `take` tells
+            self.connection.send(job)
 
     def take(self) -> dict[str, Any]:
         try:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from rich.console import Console
 
 from msgs.types import JOINTS
 from nodes import batch
-from nodes.batch import Job, find_recordings, is_folder_of_recordings, on_cores, plan, work
+from nodes.batch import Job, _Worker, find_recordings, is_folder_of_recordings, on_cores, plan, work
 from nodes.clean import clean
 from nodes.cleaning import clean_recording
 from nodes.launch import LaunchError
@@ -132,6 +134,15 @@ def test_a_process_that_dies_takes_one_recording_with_it(tmp_path: Path) -> None
     results = [result["error"] for _, result in on_cores([deadly, broken, deadly, broken], {}, 1)]
     assert ["status 3" in error for error in results] == [True, False, True, False]
     assert all("cannot be read as .npz" in error for error in results[1::2])
+
+
+def test_a_process_that_died_between_two_recordings_takes_one_with_it(tmp_path: Path) -> None:
+    worker = object.__new__(_Worker)
+    worker.connection, theirs = multiprocessing.Pipe()
+    worker.process = Mock(exitcode=-9)
+    theirs.close()
+    worker.give(Job(tmp_path / "a.npz", tmp_path / "b.npz"))
+    assert worker.take() == {"state": "failed", "error": "the process that cleaned it ended with status -9"}
 
 
 def test_an_output_is_whole_or_not_there(tmp_path: Path, settings, monkeypatch: pytest.MonkeyPatch) -> None:
