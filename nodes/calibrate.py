@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import cv2
 import matplotlib
@@ -46,6 +47,7 @@ PAPERS_MM = {"a4": (297.0, 210.0), "a3": (420.0, 297.0), "letter": (279.4, 215.9
 SURE_M = 0.005
 """a place less sure than this is worth another try"""
 DPI = 300
+AXIS_PX = 4
 _MARGIN_MM = 8.0
 _INCH_MM = 25.4
 
@@ -263,6 +265,8 @@ def _calibrate_pose(step: CalibratePose) -> None:
         print(f"{name}: {f'{len(view.image)} corners' if view else f'fewer than {LEAST_CORNERS} corners'}")
         views += [view] if view else []
     found = camera_pose(views, lens)
+    assert last is not None, "without a picture there is no pose"
+    _write_grid(step.picture or step.launch.with_suffix(".floor.png"), last, lens, found.pose)
     _save(step.launch, pose=found.pose)
     print(
         f"\n{_described(found.pose)}; most corners within {found.error_px:.2f} pixels; "
@@ -270,8 +274,6 @@ def _calibrate_pose(step: CalibratePose) -> None:
     )
     if found.sigma_m > SURE_M:
         print("More pictures, a larger board, or the board nearer to the camera would make it surer.")
-    assert last is not None, "without a picture there is no pose"
-    _write_grid(step.picture or step.launch.with_suffix(".floor.png"), last, lens, found.pose)
     print(f"{step.launch}: [input.calibration] written; poses of this camera are calibrated now")
 
 
@@ -281,10 +283,9 @@ def _calibrate_floor(step: CalibrateFloor) -> None:
     if not np.isfinite(step.up).all() or not np.linalg.norm(step.up) > 0:
         raise CalibrationError(f"--up: expected a direction, got {step.up}")
     pose, share = floor_pose(points_of_depth(depth, lens), np.array(step.up))
+    _write_grid(step.picture or step.launch.with_suffix(".floor.png"), depth_picture(depth), lens, pose)
     _save(step.launch, pose=pose)
     print(f"{_described(pose)}; {share:.0%} of what it sees is floor")
-    grey = np.asarray(cv2.normalize(depth.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX), np.uint8)  # pyright: ignore
-    _write_grid(step.picture or step.launch.with_suffix(".floor.png"), grey, lens, pose)
     print(f"{step.launch}: [input.calibration] written; poses of this camera are calibrated now")
 
 
@@ -301,8 +302,8 @@ def _calibrate_oak(step: CalibrateOak) -> None:
 
 def _write_still(step: CalibrateOak, still: Still) -> None:
     picture, depth = step.out.with_name(f"{step.out.name}.png"), step.out.with_name(f"{step.out.name}.depth.png")
-    cv2.imwrite(str(picture), still.colour)
-    cv2.imwrite(str(depth), still.depth)
+    _write_picture(picture, still.colour)
+    _write_picture(depth, still.depth)
     height, width = still.depth.shape
     focal, centre = still.intrinsics[[0, 1], [0, 1]], still.intrinsics[:2, 2]
     lens = Intrinsics((width, height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
@@ -342,6 +343,8 @@ def _pictures(paths: Sequence[Path]) -> Iterator[tuple[str, Image]]:
             raise CalibrationError(f"{path} does not exist: expected a picture, a folder of pictures, or a video")
     if not files:
         raise CalibrationError(f"no pictures in {', '.join(map(str, paths))}: expected {', '.join(PICTURES)}")
+    if len(files) > MOST_PICTURES:
+        print(f"of {len(files)} pictures the first {MOST_PICTURES} are taken")
     for file in track(files[:MOST_PICTURES], "reading", disable=len(files) < 2):
         if file.suffix.lower() in VIDEOS:
             yield from _frames(file)
@@ -354,7 +357,8 @@ def _pictures(paths: Sequence[Path]) -> Iterator[tuple[str, Image]]:
 
 def _frames(file: Path) -> Iterator[tuple[str, Image]]:
     video = cv2.VideoCapture(str(file))
-    fps = video.get(cv2.CAP_PROP_FPS) or 30.0
+    fps = video.get(cv2.CAP_PROP_FPS)
+    fps = fps if 1.0 <= fps <= 1000.0 else 30.0  # some files do not tell, or tell their time base
     step, taken, index = max(round(VIDEO_STEP_S * fps), 1), 0, 0
     while taken < MOST_PICTURES and video.grab():
         if index % step == 0:
@@ -374,9 +378,12 @@ def _frames(file: Path) -> Iterator[tuple[str, Image]]:
 def _depth(file: Path) -> NDArray[np.integer]:
     if not file.is_file():
         raise CalibrationError(f"{file} does not exist: expected a depth image, .png of 16 bits or .npy")
-    depth = np.load(file) if file.suffix == ".npy" else cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if depth is None or depth.ndim != 2 or depth.dtype.kind not in "iu" or depth.dtype.itemsize < 2:
-        shape = "nothing that can be read" if depth is None else f"{depth.dtype} of shape {depth.shape}"
+    try:
+        depth = np.load(file) if file.suffix == ".npy" else cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    except Exception as error:  # of damaged bytes numpy's parser raises several kinds
+        raise CalibrationError(f"{file}: cannot be read as .npy: {error}") from error
+    if not isinstance(depth, np.ndarray) or depth.ndim != 2 or depth.dtype.kind not in "iu" or depth.dtype.itemsize < 2:
+        shape = f"{depth.dtype} of shape {depth.shape}" if isinstance(depth, np.ndarray) else "nothing that can be read"
         raise CalibrationError(f"{file}: expected (H, W) integers of 16 bits, millimetres of depth, got {shape}")
     return np.asarray(depth, np.int64)
 
@@ -406,7 +413,7 @@ def draw_floor(picture: Image, lens: Intrinsics, pose: Pose, reach: float = 6.0,
             bold = abs(line[0, 1 - axis] % 1.0) < 1e-9
             lines.append((line, (200, 255, 120) if bold else (140, 180, 90), 2 if bold else 1))
     for axis, colour in enumerate(((60, 60, 255), (60, 220, 60), (255, 120, 60))):
-        lines.append((np.linspace(0.0, 0.5, 50)[:, None] * np.eye(3)[axis], colour, 4))
+        lines.append((np.linspace(0.0, 0.5, 50)[:, None] * np.eye(3)[axis], colour, AXIS_PX))
     back = turn.inv()
     half = 0.75 * np.array(lens.size) / lens.focal  # beyond, the distortion's polynomial means nothing
     for line, colour, thickness in lines:
@@ -419,14 +426,32 @@ def draw_floor(picture: Image, lens: Intrinsics, pose: Pose, reach: float = 6.0,
             if len(run) > 1:
                 points = np.round(pixels[run] * 16).astype(np.int32)[:, None]
                 cv2.polylines(drawn, [points], False, colour, thickness, cv2.LINE_AA, shift=4)
+        if thickness == AXIS_PX and inside[-1]:
+            x, y = np.round(pixels[-1]).astype(int).tolist()
+            name = "xyz"[int(np.argmax(line[-1]))]
+            cv2.putText(drawn, name, (x + 6, y - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
     return drawn
 
 
-def _write_grid(out: Path, picture: Image, lens: Intrinsics, pose: Pose) -> None:
-    if not cv2.imwrite(str(out), draw_floor(picture, lens, pose)):
+def depth_picture(depth: NDArray[np.integer]) -> Image:
+    """Depth (H, W) in millimetres as grey, near light and far dark, as inverse depth is seen; black in holes."""
+    near = np.percentile(depth[depth > 0], 1) if depth.any() else 1.0
+    return (255 * np.clip(near / np.where(depth > 0, depth, np.inf), 0.0, 1.0)).astype(np.uint8)
+
+
+def _write_picture(out: Path, picture: NDArray[Any]) -> None:
+    try:
+        written = cv2.imwrite(str(out), picture)
+    except cv2.error:  # an ending it does not know
+        written = False
+    if not written:
         raise CalibrationError(
             f"{out} cannot be written: expected a picture such as .png or .jpg in a folder that exists"
         )
+
+
+def _write_grid(out: Path, picture: Image, lens: Intrinsics, pose: Pose) -> None:
+    _write_picture(out, draw_floor(picture, lens, pose))
     print(f"{out}: the floor's grid, half a metre a square; it must lie on the floor, its axes where the world begins")
 
 
@@ -464,5 +489,12 @@ def _save(path: Path, *, lens: Intrinsics | None = None, pose: Pose | None = Non
     if pose:
         section["position"] = [round(float(value), 5) for value in pose.position]
         section["orientation"] = [round(float(value), 7) for value in pose.orientation]
-    path.write_text(tomlkit.dumps(document), encoding="utf-8")
-    Launch.read(path)
+    # the user's own file: whole, as it was or as it becomes, whatever happens in between
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(tomlkit.dumps(document), encoding="utf-8")
+        shutil.copymode(path, part)
+        Launch.read(part)
+        part.replace(path.resolve())
+    finally:
+        part.unlink(missing_ok=True)

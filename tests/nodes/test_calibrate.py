@@ -59,15 +59,25 @@ def test_board_lens_and_pose_end_in_the_launch_file(
     assert drawn.shape == (360, 640, 3)
 
 
-def test_the_floor_seen_in_depth_tells_height_and_tilt(tmp_path: Path) -> None:
-    launch = tmp_path / "kitchen.toml"
-    launch.write_text("[input.calibration]\nsize = [320, 200]\nfocal = [215.0, 215.0]\ncentre = [159.5, 99.5]\n")
+LENS_TOLD = "[input.calibration]\nsize = [320, 200]\nfocal = [215.0, 215.0]\ncentre = [159.5, 99.5]\n"
+UP = ("--up", "0", "-0.7", "-0.7")
+"""in the frame of `EYE`, about"""
+
+
+def floor_depth() -> np.ndarray:
+    """(200, 320) millimetres, the floor as that lens sees it from `EYE`."""
     points = depth_points(EYE, np.random.default_rng(0))
     columns, rows = np.round(points[:, :2] / points[:, 2:] * 215.0 + [159.5, 99.5]).astype(int).T
     depth = np.zeros((200, 320), np.uint16)
     depth[rows, columns] = np.round(1000 * points[:, 2])
-    cv2.imwrite(str(tmp_path / "depth.png"), depth)
-    assert main(["calibrate", "floor", str(launch), str(tmp_path / "depth.png"), "--up", "0", "-0.7", "-0.7"]) == 0
+    return depth
+
+
+def test_the_floor_seen_in_depth_tells_height_and_tilt(tmp_path: Path) -> None:
+    launch = tmp_path / "kitchen.toml"
+    launch.write_text(LENS_TOLD)
+    cv2.imwrite(str(tmp_path / "depth.png"), floor_depth())
+    assert main(["calibrate", "floor", str(launch), str(tmp_path / "depth.png"), *UP]) == 0
     pose = Launch.read(launch).input.calibration.pose
     assert pose is not None
     assert pose.position == pytest.approx([0.0, 0.0, EYE.position[2]], abs=0.01)
@@ -114,16 +124,51 @@ def _pixel(point: np.ndarray) -> np.ndarray:
         (["lens", "{launch}", "{folder}/nothing"], "expected a picture, a folder of pictures, or a video"),
         (["lens", "{launch}", "{launch}"], "expected a picture that OpenCV reads"),
         (["floor", "{launch}", "{folder}/no.png"], "tells no lens"),
+        (["floor", "{lens}", "{folder}/no.npy"], "does not exist"),
+        (["floor", "{lens}", "{folder}/bad.npy"], "cannot be read as .npy"),
+        (["floor", "{lens}", "{folder}/several.npy"], "got nothing that can be read"),
+        (["floor", "{lens}", "{folder}/floor.npy", *UP, "--picture", "grid.txt"], "grid.txt cannot be written"),
+        (["floor", "{lens}", "{folder}/floor.npy", *UP, "--picture", "{folder}/no/x.png"], "x.png cannot be written"),
     ],
 )
 def test_what_cannot_be_done_is_said(
     arguments: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    launch = tmp_path / "kitchen.toml"
+    launch, lens = tmp_path / "kitchen.toml", tmp_path / "hall.toml"
     launch.write_text("")
-    filled = [a.format(launch=launch, folder=tmp_path) for a in arguments]
+    lens.write_text(LENS_TOLD)
+    (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY\1\0\4\0{'de")
+    with (tmp_path / "several.npy").open("wb") as file:
+        np.savez(file, depth=np.zeros((2, 2)))
+    np.save(tmp_path / "floor.npy", floor_depth())
+    filled = [a.format(launch=launch, lens=lens, folder=tmp_path) for a in arguments]
     assert main(["calibrate", *filled]) == 2
     assert complaint in capsys.readouterr().err
+    assert (launch.read_text(), lens.read_text()) == ("", LENS_TOLD), "left as they were"
+
+
+def test_a_launch_file_is_whole_whatever_happens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    launch = tmp_path / "kitchen.toml"
+    launch.write_text(LENS_TOLD)
+    launch.chmod(0o640)
+    link = tmp_path / "link.toml"
+    link.symlink_to(launch)
+    np.save(tmp_path / "floor.npy", floor_depth())
+    arguments = ["calibrate", "floor", str(link), str(tmp_path / "floor.npy"), *UP]
+
+    def full(self: Path, text: str, encoding: str) -> None:
+        self.write_bytes(text.encode()[:40])
+        raise OSError("no space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", full)
+        assert main(arguments) == 2
+    assert launch.read_text() == LENS_TOLD
+    assert main(arguments) == 0
+    assert Launch.read(launch).input.calibration.pose is not None
+    assert link.is_symlink()
+    assert launch.stat().st_mode & 0o777 == 0o640
+    assert {file.name for file in tmp_path.iterdir()} == {"kitchen.toml", "link.toml", "floor.npy", "link.floor.png"}
 
 
 def test_a_calibrated_camera_sends_its_place(make_launch: Callable[..., Launch], clock: VirtualClock) -> None:
@@ -150,6 +195,11 @@ def test_a_calibrated_camera_sends_its_place(make_launch: Callable[..., Launch],
         {"input__calibration__position": "[0.0, 0.0, 1.0]", "input__calibration__orientation": "[0.0, 0.0, 0.0, 2.0]"},
         {"input__calibration__position": "[nan, 0.0, 1.0]", "input__calibration__orientation": "[0.0, 0.0, 0.0, 1.0]"},
         {"input__calibration__size": "[640, 360]"},
+        {
+            "input__calibration__size": "[640, 360]",
+            "input__calibration__focal": "[0.0, 500.0]",
+            "input__calibration__centre": "[320.0, 180.0]",
+        },
     ],
 )
 def test_a_calibration_that_cannot_be_is_refused(make_launch: Callable[..., Launch], settings: dict[str, str]) -> None:

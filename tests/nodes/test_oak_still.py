@@ -74,6 +74,16 @@ def test_it_becomes_the_files_and_the_lens_that_the_other_steps_want(
     assert "floor.depth.png --up 0.000 -0.980 0.199" in capsys.readouterr().out
 
 
+def test_a_folder_that_is_not_there_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    still = Still(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.uint16), CAMERA.intrinsics, UP)
+    monkeypatch.setattr(oak_still, "take_with_camera", lambda _: still)
+    launch = tmp_path / "kitchen.toml"
+    launch.write_text("")
+    with pytest.raises(CalibrationError, match=r"gone/floor\.png cannot be written"):
+        calibrate(CalibrateOak(launch, tmp_path / "gone" / "floor"))
+    assert launch.read_text() == ""
+
+
 def test_without_a_camera_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def none(settings: OakSettings) -> Still:
         raise CameraError("no camera found")
