@@ -124,6 +124,9 @@ class MergeSettings:
     cameras: list[str] = field(default_factory=list)
     """addresses of their input nodes (``tcp://192.168.1.21:7111``)"""
 
+    def __post_init__(self) -> None:
+        _check_addresses("[input.merge] cameras", self.cameras)
+
 
 @dataclass(frozen=True)
 class CalibrationSettings:
@@ -157,6 +160,8 @@ class CalibrationSettings:
             raise LaunchError(f"[input.calibration] orientation: expected a unit quaternion, got {self.orientation}")
         if bool(self.size) != bool(self.focal) or bool(self.size) != bool(self.centre):
             raise LaunchError("[input.calibration] expected size, focal and centre of a lens, or none of them")
+        if any(value <= 0 for value in (*self.size, *self.focal)):
+            raise LaunchError(f"[input.calibration] expected a size and focal above 0, got {self.size}, {self.focal}")
 
     @property
     def pose(self) -> Pose | None:
@@ -188,6 +193,8 @@ class InputSettings:
                 f"[input] source: expected {', '.join(SOURCES[:-1])} or {SOURCES[-1]}, got {self.source!r}"
                 f"{nearest(self.source, SOURCES)}"
             )
+        if not 0 <= self.rate < math.inf:
+            raise LaunchError(f"[input] rate: expected 0 (as fast as possible) or more, got {self.rate:g}")
 
 
 @dataclass(frozen=True)
@@ -215,6 +222,8 @@ class TransportSettings:
                     f"[transport.endpoints] names {node!r}, which is no node{nearest(node, LISTENS)}; "
                     f"nodes are {', '.join(LISTENS)}"
                 )
+        if self.queue < 1:
+            raise LaunchError(f"[transport] queue: expected 1 frame or more, got {self.queue}")
 
     def endpoint(self, node: str) -> str:
         """The address ``node`` publishes at."""
@@ -245,6 +254,9 @@ class ServerSettings:
     kiosks: list[str] = field(default_factory=list)
     """addresses of their input nodes (``tcp://192.168.1.21:7101``), listened to in place of an own one"""
 
+    def __post_init__(self) -> None:
+        _check_addresses("[server] kiosks", self.kiosks)
+
 
 @dataclass(frozen=True)
 class RecorderSettings:
@@ -268,7 +280,11 @@ class ViewerSettings:
     """``[viewer]``: the picture in the browser."""
 
     port: int = 9090
-    """of the web page"""
+    """of the web page; the drawings come on the next one"""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.port <= 65534:
+            raise LaunchError(f"[viewer] port: expected 1 to 65534, got {self.port}")
 
 
 @dataclass(frozen=True)
@@ -341,6 +357,12 @@ class Launch:
             for name in self.nodes
             if name != "viewer" and any(topic != DIAGNOSTICS for topic in LISTENS[name].get(node, ()))
         )
+
+
+def _check_addresses(setting: str, addresses: list[str]) -> None:
+    for address in addresses:
+        if not isinstance(address, str):
+            raise LaunchError(f"{setting}: expected addresses such as tcp://192.168.1.21:7111, got {address!r}")
 
 
 def default_directory() -> Path:

@@ -130,8 +130,6 @@ class PoseInputNode(Node):
     def __init__(self, launch: Launch, clock: Clock | None = None, source: Source | LiveSource | None = None) -> None:
         super().__init__(launch, clock)
         settings = launch.input
-        if settings.rate < 0:
-            raise LaunchError(f"[input] rate: expected 0 (as fast as possible) or more, got {settings.rate:g}")
         self._source = source or open_input(settings, self.clock, launch.transport.curve_keys())
         self._rate = settings.rate
         self._loop = settings.loop

@@ -44,6 +44,12 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("[recorder]\ntopics = ['pose/row']", "did you mean 'pose/raw'"),
         ("[transport.endpoints]\nprio = 'tcp://127.0.0.1:1'", "did you mean 'prior'"),
         ("[transport.endpoints]\nprior = 7101", "expected an address"),
+        ("[transport]\nqueue = 0", "queue: expected 1 frame or more, got 0"),
+        ("[input]\nrate = nan", r"rate: expected 0 \(as fast as possible\) or more, got nan"),
+        ("[input]\nrate = inf", "rate: expected 0"),
+        ("[input.merge]\ncameras = [7111, 7112]", "cameras: expected addresses such as tcp://.*, got 7111"),
+        ("[server]\nkiosks = [7111]", "kiosks: expected addresses such as tcp://.*, got 7111"),
+        ("[viewer]\nport = 65535", "port: expected 1 to 65534, got 65535"),
         ("[input", "is not TOML"),
     ],
 )
