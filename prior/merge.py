@@ -92,6 +92,8 @@ class Merge:
                 self._reset()
             return []
         self._last[raw.source] = seen
+        if before and seen.stamp_ns - before.stamp_ns > LONGEST_STEP_NS:
+            before = None  # too long ago to say where bodies were in between
         for tick in _ticks(before.stamp_ns if before else seen.stamp_ns - PERIOD_NS, seen.stamp_ns):
             if tick > self._given_ns:
                 self._waiting.setdefault(tick, []).append(_interpolated(before, seen, tick))
@@ -201,15 +203,14 @@ def merge_joints(sightings: list[Sighting]) -> tuple[Floats, Floats]:
 
 
 def _ticks(after_ns: int, until_ns: int) -> range:
-    """The grid's moments after one stamp, up to another; no more than a step's worth."""
-    after_ns = max(after_ns, until_ns - LONGEST_STEP_NS)
+    """The grid's moments after one stamp, up to another."""
     return range((after_ns // PERIOD_NS + 1) * PERIOD_NS, until_ns + 1, PERIOD_NS)
 
 
 def _interpolated(before: Sightings | None, after: Sightings, tick: int) -> Sightings:
     """What a camera saw at a moment between two of its pictures; bodies of the later one where there is no earlier."""
     joints, confidence = after.joints.copy(), after.confidence.copy()
-    if before and after.stamp_ns - before.stamp_ns <= LONGEST_STEP_NS:
+    if before:
         share = (tick - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
         for earlier, later in match_bodies(before.joints, after.joints):
             joints[later] += (1.0 - share) * (before.joints[earlier] - joints[later])

@@ -90,6 +90,17 @@ def test_bodies_are_interpolated_to_the_moment() -> None:
         assert x == pytest.approx([0.0, m.stamp_ns * 1e-9], abs=1e-5)
 
 
+def test_where_a_camera_was_blind_for_a_while_it_says_nothing() -> None:
+    """Somebody who slides along at 2 m/s; one of the cameras skips a fifth of a second."""
+    moves = [(k * PERIOD_NS, BODY[0] + [2.0 * k / 30, 0.0, 0.0]) for k in range(30)]
+    messages = [seen("a", stamp, body) for stamp, body in moves]
+    messages += [seen("b", stamp + 1, body, eye=(0, 4, 1)) for k, (stamp, body) in enumerate(moves) if not 10 < k < 16]
+    merged, _ = play(messages)
+    assert len(merged) > 25
+    for m in merged[1:]:
+        assert m.bodies[0].positions[0, 0] - BODY[0, 0, 0] == pytest.approx(2.0 * m.stamp_ns * 1e-9, abs=1e-5)
+
+
 def test_a_camera_errs_along_its_line_of_sight() -> None:
     """Two cameras at right angles: each is believed across its own line of sight."""
     truth = np.tile([2.0, 2.0, 1.0], (22, 1))
