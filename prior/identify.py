@@ -37,9 +37,12 @@ class IdentifySettings:
     death: float = 5.0
 
     def __post_init__(self) -> None:
-        for name in ("birth", "death"):
-            if not 0.0 <= getattr(self, name) < 60.0:
-                raise ValueError(f"[prior.identify] {name}: expected 0 to 60 seconds, got {getattr(self, name)}")
+        # who is forgotten sooner than a body is followed from frame to frame is never told apart
+        for name, least in (("birth", 0.0), ("death", RECENT_S)):
+            if not least <= getattr(self, name) < 60.0:
+                raise ValueError(
+                    f"[prior.identify] {name}: expected {least:g} to 60 seconds, got {getattr(self, name)}"
+                )
 
 
 RECENT_S = 0.25

@@ -102,9 +102,16 @@ def test_what_a_hostile_source_sends_is_survived_and_counted() -> None:
     assert [ids(identify, 10**9 + 1 + k, crowd[0])[0] for k in range(9)][-1] == 9, "ids are never given again"
 
 
-@pytest.mark.parametrize("setting", [{"birth": -1.0}, {"death": float("nan")}])
-def test_settings_that_cannot_be_are_refused(setting: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="expected 0 to 60 seconds"):
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ({"birth": -1.0}, "birth: expected 0 to 60 seconds"),
+        ({"death": float("nan")}, "death: expected 0.25 to 60 seconds"),
+        ({"death": 0.0}, "death: expected 0.25 to 60 seconds"),  # with which nobody would ever get an id
+    ],
+)
+def test_settings_that_cannot_be_are_refused(setting: dict[str, float], expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
         PriorSettings.from_dict({"identify": setting})
 
 
