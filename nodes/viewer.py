@@ -96,7 +96,7 @@ def require_rerun() -> None:
     """
     if find_spec("rerun") is None:
         raise ViewerError(
-            "the viewer needs rerun-sdk, which is not installed: run `uv sync --extra view` in the checkout, "
+            "the viewer needs rerun-sdk, which is not installed: run `uv sync --inexact --extra view` in the checkout, "
             "or `pip install 'steadypose[view]'`; everything but the viewer works without it"
         )
 
