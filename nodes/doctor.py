@@ -30,11 +30,11 @@ EXTRAS = {
     "webcam": "a webcam as the source",
 }
 """what is optional, by the extra that it takes"""
-MODELS = ("hmvae", "trajectory")
+MODELS = ("hmvae", "hgvae", "trajectory")
 FRAMES = 100
 FRAME_NS = 1_000_000_000 / 30
 WARM_UP = 20
-TARGET_MS = 5.0
+TARGET_MS = 10.0
 BUDGET_MS = 1000 / 30
 LONGEST_IPC_PATH = 107
 """bytes of a unix socket's path that the system takes"""
