@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shutil
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -20,6 +23,7 @@ from msgs.recording import RecordingWriter
 from msgs.topics import POSE_RAW
 from msgs.types import Pose, PoseRaw, RawBody
 from nodes.launch import Launch
+from nodes.ros2_bridge import PACKAGES
 from nodes.runtime import Node
 from prior.checkpoint import save_weights
 from prior.hmvae import HMVAE, HMVAEConfig
@@ -115,6 +119,28 @@ def record(directory: Path, messages: list[PoseRaw]) -> Path:
         for message in messages:
             writer.write(POSE_RAW, message, message.stamp_ns)
     return directory
+
+
+@pytest.fixture
+def ros(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ROS 2, if it is installed, in a domain of this test's own."""
+    for package in PACKAGES:
+        pytest.importorskip(package, reason="the extra 'ros2' is not installed")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))  # above 101 a domain's ports may be taken by others
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+@contextmanager
+def another_python(script: str, folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """A Python process with this script, ended with the block at the latest."""
+    file = folder / "script.py"
+    file.write_text(script)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    with subprocess.Popen([sys.executable, file, *arguments], env=environment, stdout=subprocess.PIPE, text=True) as it:
+        try:
+            yield it
+        finally:
+            it.kill()
 
 
 @contextmanager

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from itertools import cycle
 from pathlib import Path
@@ -13,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from conftest import running, until
+from conftest import another_python, running, until
 from scipy.spatial.transform import Rotation
 from synthetic_poses import messages
 
@@ -22,9 +19,7 @@ from msgs.transport import Publisher
 from msgs.types import Diagnostics, Level, PoseWorld, Tracking
 from nodes.launch import Launch, LaunchError
 from nodes.rep155 import JOINTS, LINKS, frames
-from nodes.ros2_bridge import PACKAGES, Ros2BridgeNode, require_ros2
-
-DOMAIN = str(1 + os.getpid() % 200)
+from nodes.ros2_bridge import Ros2BridgeNode, require_ros2
 
 LISTENER = """
 import json, sys
@@ -81,23 +76,6 @@ print(json.dumps(heard))
 
 
 @pytest.fixture
-def ros(monkeypatch: pytest.MonkeyPatch) -> None:
-    """ROS 2, if it is installed, in a domain of this test's own."""
-    for package in PACKAGES:
-        pytest.importorskip(package, reason="the extra 'ros2' is not installed")
-    monkeypatch.setenv("ROS_DOMAIN_ID", DOMAIN)
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-
-
-def start(script: str, folder: Path, *arguments: str) -> subprocess.Popen[str]:
-    """A Python process with this script."""
-    file = folder / "script.py"
-    file.write_text(script)
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    return subprocess.Popen([sys.executable, str(file), *arguments], env=environment, stdout=subprocess.PIPE, text=True)
-
-
-@pytest.fixture
 def worlds() -> list[PoseWorld]:
     """A second of two bodies that walk, one of which has an arm hidden."""
     found = [message for topic, message in messages(3.0, bodies=2) if topic == POSE_WORLD]
@@ -109,9 +87,12 @@ def test_a_ros_node_hears_bodies(make_launch: Callable[..., Launch], tmp_path: P
     launch = make_launch(nodes='["trajectory", "ros2_bridge"]', transport__lossless="true")
     news = Diagnostics(1, "prior", Level.WARN, "late", {"dropped.late": "3"})
     bridge = Ros2BridgeNode(launch)
-    listener = start(LISTENER, tmp_path)
     stream = cycle(worlds)
-    with Publisher(launch.transport.endpoint("trajectory"), lossless=True) as publisher, running(bridge):
+    with (
+        another_python(LISTENER, tmp_path) as listener,
+        Publisher(launch.transport.endpoint("trajectory"), lossless=True) as publisher,
+        running(bridge),
+    ):
         assert publisher.wait_for_listeners({"ros2_bridge"}, timeout_s=20)
 
         def told() -> bool:
@@ -120,8 +101,8 @@ def test_a_ros_node_hears_bodies(make_launch: Callable[..., Launch], tmp_path: P
             return listener.poll() is not None
 
         until(told, timeout_s=60)
-    assert listener.stdout
-    heard = json.loads(listener.stdout.read())
+        assert listener.stdout
+        heard = json.loads(listener.stdout.read())
     assert not bridge.counts
 
     by_stamp = {message.stamp_ns: message for message in worlds}

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Generator
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import VirtualClock, raw, running, until, walking
+from conftest import VirtualClock, another_python, raw, running, until, walking
 from synthetic_poses import walker
 
 from msgs.topics import POSE_RAW
@@ -22,10 +19,7 @@ from nodes.adapters import from_pose_array
 from nodes.launch import Launch, LaunchError
 from nodes.live import LiveSource
 from nodes.pose_input import PoseInputNode
-from nodes.ros2_bridge import PACKAGES
 from prior.skeletons import CANONICAL, COCO17, SKELETONS
-
-DOMAIN = str(1 + (os.getpid() + 100) % 200)
 
 PUBLISHER = """
 import sys
@@ -60,15 +54,6 @@ for k in range(1, 1000):
 """
 
 
-@pytest.fixture
-def ros(monkeypatch: pytest.MonkeyPatch) -> None:
-    """ROS 2, if it is installed, in a domain of this test's own."""
-    for package in PACKAGES:
-        pytest.importorskip(package, reason="the extra 'ros2' is not installed")
-    monkeypatch.setenv("ROS_DOMAIN_ID", DOMAIN)
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-
-
 @pytest.mark.usefixtures("ros")
 @pytest.mark.parametrize(("kind", "skeleton"), [("PoseArray", "smpl22"), ("MarkerArray", "azure_kinect32")])
 def test_a_topic_becomes_pose_raw(make_launch: Callable[..., Launch], tmp_path: Path, kind: str, skeleton: str) -> None:
@@ -76,15 +61,17 @@ def test_a_topic_becomes_pose_raw(make_launch: Callable[..., Launch], tmp_path: 
     joints[:, :22] += walker(0.5)[0]
     joints[1, 4] = np.nan
     np.save(tmp_path / "joints.npy", joints)
-    (tmp_path / "publisher.py").write_text(PUBLISHER)
     launch = make_launch(
         nodes='["pose_input"]', input__source="ros2", input__ros2__topic="/skeletons", input__ros2__type=kind,
         transport__lossless="false",
     )  # fmt: skip
     source = PoseInputNode(launch)
     heard: list[PoseRaw] = []
-    tracker = subprocess.Popen([sys.executable, tmp_path / "publisher.py", tmp_path / "joints.npy", kind])
-    with running(source), Subscriber(launch.transport.endpoint("pose_input"), POSE_RAW) as subscriber:
+    with (
+        another_python(PUBLISHER, tmp_path, str(tmp_path / "joints.npy"), kind),
+        running(source),
+        Subscriber(launch.transport.endpoint("pose_input"), POSE_RAW) as subscriber,
+    ):
 
         def enough() -> bool:
             while received := subscriber.receive(0):
@@ -93,8 +80,6 @@ def test_a_topic_becomes_pose_raw(make_launch: Callable[..., Launch], tmp_path: 
             return len(heard) >= 3 and any("not a" in cause for cause in source.status())
 
         until(enough, timeout_s=60)
-    tracker.kill()
-    tracker.wait()
     message = heard[-1]
     assert (message.skeleton, message.frame_id, message.source) == (skeleton, "depth", "/skeletons")
     assert message.stamp_ns % 33_333_333 == 0
