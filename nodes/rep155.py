@@ -5,7 +5,8 @@ REP-155 (ROS for human-robot interaction) names 15 links and 20 revolute joints,
 has x forward, y left and z up. The canonical skeleton rests in a T instead, so that arms differ by a quarter turn.
 
 The frames are exact: each is where the canonical joint is. The joint angles are what that model can say: its torso
-bends only forwards, its elbows and knees are hinges, and its shoulders and hips lie fast in torso and body.
+is stiff and bends only forwards, at the pelvis; its elbows and knees are hinges, and its shoulders and hips lie fast in
+torso and body.
 """
 
 from __future__ import annotations
@@ -140,14 +141,22 @@ def _zxz(turn: Floats, sign: float) -> tuple[float, float, float]:
     return float(a), float(b), float(np.arctan2(sign * turn[2, 0], sign * turn[2, 1]))
 
 
-def measures(links: Links) -> dict[str, Floats]:
-    """(3,) metres, where each link of the URDF begins in the frame of the one it hangs from, in the zero pose."""
+def measures(body: WorldBody) -> dict[str, Floats]:
+    """(3,) metres, where each link of the URDF begins in the frame of the one it hangs from, in the zero pose.
+
+    The person's, whatever the pose: of the body at rest, with no joint turned.
+    """
+    positions, turned = body.positions.astype(np.float64), joint_rotations(body)
+    rest = np.zeros_like(positions)
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0:
+            rest[joint] = rest[parent] + turned[parent].T @ (positions[joint] - positions[parent])
 
     def inside(parent: str, child: str) -> Floats:
-        return links[parent][1].T @ (links[child][0] - links[parent][0])
+        return rest[LINKS[child].origin] - rest[LINKS[parent].origin]
 
     def below(parent: str, child: str) -> Floats:
-        return np.array([0.0, 0.0, -np.linalg.norm(links[child][0] - links[parent][0])])
+        return np.array([0.0, 0.0, -np.linalg.norm(inside(parent, child))])
 
     measured = {"torso": inside("waist", "torso"), "head": -below("torso", "head")}
     for side in "lr":

