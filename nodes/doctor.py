@@ -6,10 +6,11 @@ import os
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +31,9 @@ EXTRAS = {
     "webcam": "a webcam as the source",
 }
 """what is optional, by the extra that it takes"""
+PROJECT = Path(__file__).parent.parent / "pyproject.toml"
+TOLD = ("torch", "numpy", "rosbags", "pyzmq", "depthai")
+"""packages whose versions matter when something is wrong"""
 MODELS = ("hmvae", "hgvae", "trajectory")
 FRAMES = 100
 FRAME_NS = 1_000_000_000 / 30
@@ -116,45 +120,32 @@ def check_python() -> Iterator[Finding]:
 
 
 def check_packages() -> Iterator[Finding]:
-    """The distribution's own requirements, optional extras apart."""
+    """What the checkout requires, and its optional extras."""
+    # not what the installed distribution says of itself: that is older than the checkout after a pull
+    project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
+    if missing := _missing(project["dependencies"]):
+        yield Finding("packages", Verdict.BAD, "; ".join(missing), INSTALL)
+    else:
+        yield Finding("packages", Verdict.GOOD, ", ".join(f"{name} {version(name)}" for name in TOLD))
+    for extra, wanted in sorted(project["optional-dependencies"].items()):
+        if missing := _missing(wanted):
+            found = f"{EXTRAS[extra]}: {'; '.join(missing)}"
+            yield Finding(f"optional: {extra}", Verdict.NOTE, found, f"{INSTALL_EXTRA} {extra}")
+
+
+def _missing(wanted: list[str]) -> list[str]:
+    """Of these requirements, those that are not installed, or not in the version wanted."""
     from packaging.requirements import Requirement
 
-    try:
-        wanted = [Requirement(text) for text in requires("steadypose") or []]
-    except PackageNotFoundError:
-        yield Finding("packages", Verdict.BAD, "steadypose itself is not installed", INSTALL)
-        return
-    missing: list[str] = []
-    lacking: dict[str, list[str]] = {}
-    for requirement in wanted:
+    missing = []
+    for requirement in map(Requirement, wanted):
         try:
             installed = version(requirement.name)
         except PackageNotFoundError:
             installed = ""
-        if installed and requirement.specifier.contains(installed, prereleases=True):
-            continue
-        found = f"{requirement.name} {installed or 'not installed'}, expected {requirement.specifier}"
-        marker = str(requirement.marker)
-        if "extra" in marker:
-            lacking.setdefault(marker.split('"')[1], []).append(found)
-        else:
-            missing.append(found)
-    told = ("torch", "numpy", "rosbags", "pyzmq", "depthai", "rerun-sdk")
-    names = [name for name in told if any(r.name == name for r in wanted) and not any(name in m for m in missing)]
-    versions = []
-    for name in names:
-        try:
-            versions.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            continue
-    if missing:
-        yield Finding("packages", Verdict.BAD, "; ".join(missing), INSTALL)
-    else:
-        yield Finding("packages", Verdict.GOOD, ", ".join(versions))
-    for extra, absent in sorted(lacking.items()):
-        what = f"optional: {extra}"
-        found = f"{EXTRAS.get(extra, extra)}: {'; '.join(absent)}"
-        yield Finding(what, Verdict.NOTE, found, f"{INSTALL_EXTRA} {extra}")
+        if not installed or not requirement.specifier.contains(installed, prereleases=True):
+            missing.append(f"{requirement.name} {installed or 'not installed'}, expected {requirement.specifier}")
+    return missing
 
 
 def check_processor() -> Iterator[Finding]:

@@ -87,8 +87,18 @@ def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) 
     assert packages.fix == INSTALL
 
 
+def test_what_a_pull_brought_is_missed_though_nothing_was_installed_anew(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pulled = module.PROJECT.read_text().replace("dependencies = [", 'dependencies = [\n  "brandnew>=1",', 1)
+    monkeypatch.setattr(module, "PROJECT", tmp_path / "pyproject.toml")
+    module.PROJECT.write_text(pulled)
+    finding = next(iter(module.check_packages()))
+    assert (finding.verdict, finding.found) == (Verdict.BAD, "brandnew not installed, expected >=1")
+
+
 def test_every_extra_is_told_what_for() -> None:
-    project = tomllib.loads((Path(module.__file__).parents[1] / "pyproject.toml").read_text())
+    project = tomllib.loads(module.PROJECT.read_text())
     assert set(project["project"]["optional-dependencies"]) == set(module.EXTRAS)
 
 
