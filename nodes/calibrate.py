@@ -70,7 +70,7 @@ class PrintBoard:
         rows: squares along the left edge.
     """
 
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     paper: str = "a3"
     columns: int = Board.columns
     rows: int = Board.rows
@@ -96,8 +96,8 @@ class CalibrateLens:
         rows: squares along the left edge.
     """
 
-    launch: Annotated[Path, tyro.conf.Positional]
-    pictures: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    launch: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
+    pictures: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PICTURE ...")]
     square: float = Board.square
     columns: int = Board.columns
     rows: int = Board.rows
@@ -124,12 +124,12 @@ class CalibratePose:
         picture: where to write what the camera sees with the floor's grid; beside the launch file if left out.
     """
 
-    launch: Annotated[Path, tyro.conf.Positional]
-    pictures: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    launch: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
+    pictures: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PICTURE ...")]
     square: float = Board.square
     columns: int = Board.columns
     rows: int = Board.rows
-    picture: Path | None = None
+    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
 
 
 @dataclass(frozen=True)
@@ -152,10 +152,10 @@ class CalibrateFloor:
         picture: where to write the depth image with the floor's grid; beside the launch file if left out.
     """
 
-    launch: Annotated[Path, tyro.conf.Positional]
-    depth: Annotated[Path, tyro.conf.Positional]
+    launch: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
+    depth: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DEPTH")]
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)
-    picture: Path | None = None
+    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,8 @@ class CalibrateOak:
         out: name of the files to write, without ending: NAME.png and NAME.depth.png.
     """
 
-    launch: Annotated[Path, tyro.conf.Positional]
-    out: Annotated[Path, tyro.conf.Positional]
+    launch: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
 
 
 def calibrate(
@@ -342,7 +342,10 @@ def _pictures(paths: Sequence[Path]) -> Iterator[tuple[str, Image]]:
         else:
             raise CalibrationError(f"{path} does not exist: expected a picture, a folder of pictures, or a video")
     if not files:
-        raise CalibrationError(f"no pictures in {', '.join(map(str, paths))}: expected {', '.join(PICTURES)}")
+        where = f" in {', '.join(map(str, paths))}" if paths else ""
+        raise CalibrationError(
+            f"expected pictures ({', '.join(PICTURES)}), folders of them, or videos; got none{where}"
+        )
     if len(files) > MOST_PICTURES:
         print(f"of {len(files)} pictures the first {MOST_PICTURES} are taken")
     for file in track(files[:MOST_PICTURES], "reading", disable=len(files) < 2):

@@ -37,6 +37,8 @@ INFO_S = 2.0
 """for which `info` listens to a topic that is published"""
 
 Topics = Annotated[tuple[str, ...], tyro.conf.arg(name="topic", metavar="TOPIC")]
+Count = Annotated[int | None, tyro.conf.arg(metavar="N")]
+LaunchFile = Annotated[str | None, tyro.conf.arg(metavar="FILE")]
 Address = Annotated[tuple[str, ...], tyro.conf.arg(name="endpoint", metavar="ADDRESS")]
 
 
@@ -46,20 +48,25 @@ class InspectError(ValueError):
 
 def echo(
     target: Annotated[str, tyro.conf.arg(metavar="TOPIC|RECORDING")],
-    count: int | None = None,
+    count: Count = None,
     full: bool = False,
     topics: Topics = (),
-    launch: str | None = None,
+    launch: LaunchFile = None,
     endpoints: Address = (),
 ) -> None:
     """Print messages, a line for each and one for each body.
+
+    Try:
+      steadypose echo pose/world
+      steadypose echo diagnostics --full --count 3
+      steadypose echo RECORDING --topic pose/clean
 
     Args:
         target: a topic, such as pose/clean, or a recording.
         count: stop after so many messages.
         full: print every field instead, as YAML.
         topics: of a recording, this topic alone. May be given again.
-        launch: the launch file whose addresses to look at.
+        launch: the launch file, or the name of one of the project's own, whose addresses to look at.
         endpoints: the address to look at. May be given again.
     """
     left = sys.maxsize if count is None else count
@@ -73,19 +80,23 @@ def echo(
 def hz(
     target: Annotated[str, tyro.conf.arg(metavar="TOPIC|RECORDING")],
     window: float = 10.0,
-    count: int | None = None,
+    count: Count = None,
     topics: Topics = (),
-    launch: str | None = None,
+    launch: LaunchFile = None,
     endpoints: Address = (),
 ) -> None:
     """Measure how often messages come: of a topic by the time they arrive, of a recording by their stamps.
+
+    Try:
+      steadypose hz pose/world
+      steadypose hz pose/raw --launch kiosk
 
     Args:
         target: a topic, such as pose/clean, or a recording.
         window: seconds to look back; a recording is measured as a whole.
         count: stop after so many messages.
         topics: of a recording, this topic alone. May be given again.
-        launch: the launch file whose addresses to look at.
+        launch: the launch file, or the name of one of the project's own, whose addresses to look at.
         endpoints: the address to look at. May be given again.
     """
     if target not in TOPICS:
@@ -106,14 +117,18 @@ def hz(
 
 def info(
     target: Annotated[str, tyro.conf.arg(metavar="TOPIC|RECORDING")],
-    launch: str | None = None,
+    launch: LaunchFile = None,
     endpoints: Address = (),
 ) -> int:
     """Tell what is in a recording, or who publishes a topic.
 
+    Try:
+      steadypose info RECORDING
+      steadypose info pose/world
+
     Args:
         target: a topic, such as pose/clean, or a recording.
-        launch: the launch file whose addresses to look at.
+        launch: the launch file, or the name of one of the project's own, whose addresses to look at.
         endpoints: the address to look at. May be given again.
 
     Returns:
