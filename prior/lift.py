@@ -122,10 +122,12 @@ def lift(
             f"keypoints and confidence: expected shapes (B, {_JOINTS}, 2) and (B, {_JOINTS}), got {keypoints.shape} "
             f"and {confidence.shape}"
         )
-    if depth.ndim != 2 or np.shape(intrinsics) != (3, 3):
+    if depth.ndim != 2 or not depth.size or np.shape(intrinsics) != (3, 3):
         raise ValueError(
-            f"depth and intrinsics: expected shapes (H, W) and (3, 3), got {depth.shape} and {np.shape(intrinsics)}"
+            "depth and intrinsics: expected shapes (H, W), of a pixel or more, and (3, 3), got "
+            f"{depth.shape} and {np.shape(intrinsics)}"
         )
+    confidence = np.clip(np.nan_to_num(confidence), 0.0, 1.0)
     intrinsics = np.asarray(intrinsics, np.float64)
     view = _View(depth, intrinsics, np.linalg.inv(intrinsics).astype(np.float64))
     height, width = depth.shape
@@ -137,7 +139,7 @@ def lift(
     for body in range(len(keypoints)):
         positions[body] = _lift_body(np.where(known[body, :, None], keypoints[body], np.nan), confidence[body], view)
     seen = np.isfinite(positions).all(axis=-1)
-    return positions.astype(np.float32), np.where(seen, np.minimum(confidence, 1.0), 0.0).astype(np.float32)
+    return positions.astype(np.float32), np.where(seen, confidence, 0.0).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -152,12 +152,27 @@ def test_images_without_a_body_give_none() -> None:
         (((1, 17, 2), (17,), (4, 4), (3, 3)), r"\(B, 17, 2\)"),
         (((1, 17, 2), (1, 17), (4, 4, 1), (3, 3)), r"\(H, W\)"),
         (((1, 17, 2), (1, 17), (4, 4), (4,)), r"\(3, 3\)"),
+        (((1, 17, 2), (1, 17), (0, 4), (3, 3)), r"of a pixel or more, .* got \(0, 4\)"),
     ],
 )
 def test_shapes_that_do_not_fit_say_so(shapes: tuple[tuple[int, ...], ...], expected: str) -> None:
     keypoints, confidence, depth, intrinsics = (np.ones(shape) for shape in shapes)
     with pytest.raises(ValueError, match=expected):
         lift(keypoints, confidence, depth, intrinsics)
+
+
+@pytest.mark.filterwarnings("error")
+def test_whatever_a_broken_detector_or_camera_says_is_lifted_or_not_given() -> None:
+    rng = np.random.default_rng(0)
+
+    def wild(*shape: int) -> np.ndarray:
+        return rng.choice([np.nan, np.inf, -np.inf, 1e30, -1.0, 0.0, 0.5, 3.0, 200.0], shape)
+
+    for depth in (wild(4, 6), wild(400, 640), rng.integers(0, 65536, (400, 640)).astype(np.uint16), np.ones((1, 1))):
+        positions, confidence = lift(wild(3, 17, 2), wild(3, 17), depth, CAMERA.intrinsics)
+        given = np.isfinite(positions).all(axis=-1)
+        assert ((confidence >= 0) & (confidence <= 1)).all()
+        np.testing.assert_array_equal(confidence > 0, given)
 
 
 def standing(yaw: float) -> np.ndarray:
