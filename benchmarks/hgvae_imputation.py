@@ -19,7 +19,7 @@ from benchmarks.corruption import LIMBS
 from prior.body_tracks import Tracks, from_tracks, in_frame_of, to_tracks
 from prior.encode import Encoded
 from prior.hgvae import HGVAE, SCALE
-from prior.hgvae_live import LiveHGVAE, Look
+from prior.hgvae_live import LiveHGVAE
 from prior.impute import Climb, ImputeSettings, completed_tracks
 from prior.track_windows import Windows, standardise
 
@@ -96,10 +96,10 @@ def impute_all(
         look = live.look(x[None], seen[None])
         batch = Tracks(*(np.asarray(part)[None] for part in tracks))
         encoded = Encoded(np.zeros(1, dtype=np.intp), batch, seen[None], np.array([size]), look, live)
-        passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(tracks, Look(*(part[0] for part in look))))
+        passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(tracks, look.mean[0]))
         for count in steps:
-            found_there = Climb(live.latents, ImputeSettings()).complete(encoded, 0, count)
-            passes.setdefault(f"HG-VAE, {count} steps", []).append(completed_tracks(tracks, found_there))
+            climbed = Climb(live.latents, ImputeSettings()).complete(encoded, 0, count)
+            passes.setdefault(f"HG-VAE, {count} steps", []).append(completed_tracks(tracks, climbed.mean))
     found |= {name: np.stack(windows) for name, windows in passes.items()}
     for count in steps:
         found[f"HG-VAE, the paper's ascent, {count} steps"] = ascend_entries(model, line, observed, count)

@@ -73,13 +73,19 @@ def in_frame_of(tracks: Tracks, positions: NDArray[np.float64], size: float) -> 
 
 
 def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: NDArray[np.floating] | float) -> NDArray[np.float64]:
-    """The joints (..., T, 22, 3) metres, world, of tracks ``x`` (..., 66, T) in the frame of ``tracks``."""
-    local = np.moveaxis(x.reshape(*x.shape[:-2], 22, 3, -1), -1, -3) * np.asarray(size)[..., None, None, None]
-    c, s, zero = np.cos(tracks.yaw), np.sin(tracks.yaw), np.zeros_like(tracks.yaw)
-    turn = np.stack([c, s, zero, -s, c, zero, zero, zero, zero + 1.0], axis=-1).reshape(*np.shape(c), 1, 3, 3)
-    world = local @ turn
+    """The joints (..., K, 22, 3) metres, world, of the last K frames of windows.
+
+    Args:
+        x: (..., 66, K) tracks of those frames, in the frames of
+        tracks: windows of at least so many frames, of
+        size: (...), as `body_size` gives it.
+    """
+    frames = x.shape[-1]
+    local = np.moveaxis(x.reshape(*x.shape[:-2], 22, 3, frames), -1, -3) * np.asarray(size)[..., None, None, None]
+    c, s = np.cos(tracks.yaw)[..., None, None], np.sin(tracks.yaw)[..., None, None]
+    world = np.stack([c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], -1)
     world[..., 0, :] += tracks.path.mean(axis=-2, keepdims=True)
-    world[..., 1:, :] += tracks.path[..., None, :]
+    world[..., 1:, :] += tracks.path[..., -frames:, None, :]
     return world
 
 
@@ -89,12 +95,7 @@ def hang_unseen(deviations: NDArray[np.floating]) -> None:
     Args:
         deviations: (..., 66, T) tracks less the mean tracks; NaN for joints never seen.
     """
-    joints = deviations.reshape(-1, 22, 3, deviations.shape[-1])
-    unseen = np.isnan(joints[:, :, 0, 0])
-    for joint in np.flatnonzero(unseen.any(axis=0)):  # parents come first
-        rows, parent = unseen[:, joint], PARENTS[joint]
-        # the pelvis's own track is relative to another origin
-        joints[rows, joint] = joints[rows, parent] if parent > 0 else 0.0
+    _hang_unseen(deviations.reshape(-1, 22, 3, deviations.shape[-1]))
 
 
 _low_passes: dict[int, NDArray[np.float64]] = {}
@@ -110,36 +111,56 @@ def _low_pass(frames: int) -> NDArray[np.float64]:
     return _low_passes[frames]
 
 
+# ---------------------------------------------------------------------------------------------------------------
+# Compiled. No vectors in the loops over joints and frames: making them would take most of the time.
+
+
 @njit(cache=True)
 def _to_tracks(windows, sizes, low_pass, all_x, all_observed, all_path, yaws):
     """Of B windows (B, T, 22, 3): writes the four parts of `Tracks`."""
     frames, joints = windows.shape[1:3]
     still = np.zeros(frames)
+    middle = np.empty((frames, 3))
     for window in range(len(windows)):
-        positions, size = windows[window], sizes[window]
-        x, observed, path = all_x[window], all_observed[window], all_path[window]
+        positions, x, observed = windows[window], all_x[window], all_observed[window]
         yaw = yaws[window] = _heading(positions)
-        path[:] = low_pass @ _centre(positions, yaw, size)
-        middle = np.array([path[:, 0].mean(), path[:, 1].mean(), path[:, 2].mean()])
-        c, s = math.cos(yaw), math.sin(yaw)
-        x[:], observed[:] = np.nan, 0.0
+        path = np.dot(low_pass, _centre(positions, yaw, sizes[window]), all_path[window])
+        for axis in range(3):
+            middle[:, axis] = path[:, axis].mean()
+        c, s = math.cos(yaw) / sizes[window], math.sin(yaw) / sizes[window]
         for j in range(joints):
+            origin = middle if j == 0 else path
+            missing = 0
             for t in range(frames):
-                if math.isnan(positions[t, j, 0]):
-                    continue
-                a = positions[t, j, 0] - (middle[0] if j == 0 else path[t, 0])
-                b = positions[t, j, 1] - (middle[1] if j == 0 else path[t, 1])
-                x[3 * j, t] = (c * a + s * b) / size
-                x[3 * j + 1, t] = (c * b - s * a) / size
-                x[3 * j + 2, t] = (positions[t, j, 2] - (middle[2] if j == 0 else path[t, 2])) / size
-                observed[3 * j : 3 * j + 3, t] = 1.0
-        for j in range(joints):
+                a = positions[t, j, 0] - origin[t, 0]
+                b = positions[t, j, 1] - origin[t, 1]
+                x[3 * j, t] = c * a + s * b
+                x[3 * j + 1, t] = c * b - s * a
+                x[3 * j + 2, t] = (positions[t, j, 2] - origin[t, 2]) / sizes[window]
+                missing += math.isnan(a)
+                for axis in range(3):
+                    observed[3 * j + axis, t] = 0.0 if math.isnan(a) else 1.0
+            if missing == 0:
+                continue
             parent = _PARENT[j]
             while parent > 0 and math.isnan(x[3 * parent, 0]):
                 parent = _PARENT[parent]
             for axis in range(3):
                 # relative to the nearest joint above that was ever seen, whose gaps are bridged by now
                 _bridge(x[3 * j + axis], x[3 * parent + axis] if parent > 0 else still)
+
+
+@njit(cache=True)
+def _hang_unseen(deviations):
+    """As `hang_unseen`, of (N, 22, 3, T)."""
+    for window in deviations:
+        for joint in range(len(_PARENT)):
+            parent = _PARENT[joint]
+            if math.isnan(window[joint, 0, 0]):
+                for axis in range(3):
+                    for t in range(window.shape[-1]):
+                        # the pelvis's own track is relative to another origin
+                        window[joint, axis, t] = window[parent, axis, t] if parent > 0 else 0.0
 
 
 @njit(cache=True)
@@ -182,33 +203,41 @@ def _centre(positions, yaw, size):
     """(T, 3) where the pelvis would be, from all of the trunk that is seen; held where nothing is."""
     frames = len(positions)
     c, s = math.cos(yaw), math.sin(yaw)
-    centre = np.full((frames, 3), np.nan)
-    total = np.zeros((frames, 3))
+    centre = np.zeros((frames, 3))
     weight = np.zeros(frames)
+    lies, seen = np.zeros(3), np.zeros(3)
     for j in _TRUNK:
-        # how the joint lies to the pelvis: as it was seen in this window, or as in a generic body
-        lies = np.array([c * _REST[j, 0] - s * _REST[j, 1], s * _REST[j, 0] + c * _REST[j, 1], _REST[j, 2]]) * size
-        seen = np.zeros(3)
+        seen[:] = 0.0
         count = 0
         for t in range(frames):
             if not math.isnan(positions[t, j, 0]) and not math.isnan(positions[t, 0, 0]):
-                seen += positions[t, j] - positions[t, 0]
+                for axis in range(3):
+                    seen[axis] += positions[t, j, axis] - positions[t, 0, axis]
                 count += 1
-        if count:
-            lies = seen / count
+        # how the joint lies to the pelvis: as it was seen in this window, or as in a generic body
+        lies[0] = size * (c * _REST[j, 0] - s * _REST[j, 1])
+        lies[1] = size * (s * _REST[j, 0] + c * _REST[j, 1])
+        lies[2] = size * _REST[j, 2]
+        for axis in range(3):
+            if count:
+                lies[axis] = seen[axis] / count
         for t in range(frames):
             if not math.isnan(positions[t, j, 0]):
-                total[t] += positions[t, j] - lies
+                for axis in range(3):
+                    centre[t, axis] += positions[t, j, axis] - lies[axis]
                 weight[t] += 1.0
     last = -1
     for t in range(frames):
         if weight[t] == 0.0:
             continue
-        centre[t] = total[t] / weight[t]
+        for axis in range(3):
+            centre[t, axis] /= weight[t]
         for u in range(last + 1, t):
             share = 1.0 if last < 0 else (u - last) / (t - last)
-            centre[u] = share * centre[t] + (1.0 - share) * (centre[last] if last >= 0 else 0.0 * centre[t])
+            for axis in range(3):
+                centre[u, axis] = share * centre[t, axis] + (1.0 - share) * centre[max(last, 0), axis]
         last = t
     for u in range(last + 1, frames):
-        centre[u] = centre[last] if last >= 0 else np.zeros(3)
+        for axis in range(3):
+            centre[u, axis] = centre[max(last, 0), axis]
     return centre

@@ -31,6 +31,9 @@ _LINEAR, _GELU, _SUM, _DENSITY = range(4)
 _FIELDS = 8
 _NONE = -1
 
+_LINE = 16
+"""Numbers in a line of the cache. Matrices begin with one: products of those that do not take a seventh longer."""
+
 
 class _Program:
     """A network written down: steps, the shapes of the matrices they work on, and all weights in one row.
@@ -52,9 +55,9 @@ class _Program:
 
     def _store(self, values: Tensor) -> int:
         row = np.ascontiguousarray(values.detach().numpy(), dtype=np.float32).ravel()
-        self.weights.append(row)
-        self._used += len(row)
-        return self._used - len(row)
+        self.weights.append(np.pad(row, (0, -len(row) % _LINE)))
+        self._used += len(self.weights[-1])
+        return self._used - len(self.weights[-1])
 
     def _step(self, kind: int, out: int, *fields: int) -> int:
         self.steps.append([kind, out, *fields, *[_NONE] * (_FIELDS - 2 - len(fields))])
@@ -104,11 +107,11 @@ class _Program:
         return self._step(_SUM, self.matrix(*self.shapes[of]), of, other)
 
     def density(self, of: int, gaussian: int) -> int:
-        """The logarithm of a normal density, entry by entry.
+        """The logarithm of a normal density, summed over all entries.
 
         ``gaussian`` (n, 2 f) holds means and then log-variances, which are clamped to `LOG_VAR_RANGE`.
         """
-        return self._step(_DENSITY, self.matrix(*self.shapes[of]), of, gaussian)
+        return self._step(_DENSITY, self.matrix(1, 1), of, gaussian)
 
 
 class Look(NamedTuple):
@@ -117,13 +120,10 @@ class Look(NamedTuple):
     Attributes:
         mean: (..., 66, T) metres of a standard body, the tracks that the model would put there.
         sigma: (..., 66, T) metres, standard deviation.
-        score: (...) nats: sum over all levels of log p(z | above), the score of section 7, and of what was observed,
-            weighted, log p(x | z).
     """
 
     mean: NDArray[np.float64]
     sigma: NDArray[np.float64]
-    score: NDArray[np.float64]
 
 
 class LiveHGVAE:
@@ -184,11 +184,17 @@ class LiveHGVAE:
         self._encoder, self._decoder = steps[:encoder_steps], steps[encoder_steps:]
         self._shapes = np.array(p.shapes, dtype=np.int64)
         sizes = self._shapes.prod(axis=1)
-        self._starts = np.concatenate([[0], np.cumsum(sizes)])
-        self._weights = np.concatenate(p.weights)
-        self._values = np.zeros((most, self._starts[-1]), dtype=np.float32)
-        self._gradients = np.zeros(self._starts[-1], dtype=np.float32)
-        self._scratch = np.zeros((3, self._shapes.max(axis=0).prod()), dtype=np.float32)
+        self._starts = np.concatenate([[0], np.cumsum(-(-sizes // _LINE) * _LINE)])
+        ends = self._starts[:-1] + sizes
+        self._places = [
+            (int(begin), int(end), tuple(shape))
+            for begin, end, shape in zip(self._starts, ends, p.shapes, strict=False)
+        ]
+        self._term_places = self._starts[self._terms]
+        self._weights = _zeros(sum(map(len, p.weights)))
+        np.concatenate(p.weights, out=self._weights)
+        self._values, self._gradients = _zeros(most, self._starts[-1]), _zeros(self._starts[-1])
+        self._scratch = _zeros(3, -(-self._shapes.max(axis=0).prod() // _LINE) * _LINE)
         self._sensor_variance = np.float32((sensor_sigma / SCALE) ** 2)
         self._trust = np.zeros((most, JOINT_NODES, config.frames), dtype=np.float32)
         self.latents = int(sizes[self._moves].sum())
@@ -200,12 +206,12 @@ class LiveHGVAE:
             x: (B, 66, T) metres of a standard body; see `prior.body_tracks`. NaN for a joint never seen.
             observed: (B, 66, T) how far to believe each entry: 0 where there was none, at most 1.
         """
-        rows = np.arange(len(x))
+        rows = slice(0, len(x))
         deviations = (x - self._mean) / SCALE
         hang_unseen(deviations)
-        self._trust[rows] = observed
         seen = self._matrix(self._x, rows)
         seen[..., : self.frames], seen[..., self.frames :] = deviations, observed > 0
+        self._trust[rows] = observed
         for number in self._moves:
             self._matrix(number, rows)[:] = 0.0
         self._run(self._encoder, rows)
@@ -213,63 +219,70 @@ class LiveHGVAE:
 
     def decode(self, row: int, moved: NDArray[np.float64]) -> Look:
         """Decode a window anew, its latents (n,) moved from where the encoder puts them."""
-        rows, begin = np.array([row]), 0
+        rows, begin = slice(row, row + 1), 0
         for number in self._moves:
             matrix = self._matrix(number, rows)
             matrix[:] = moved[begin : begin + matrix.size].reshape(matrix.shape)
             begin += matrix.size
         return Look(*(part[0] for part in self._decode(rows)))
 
+    def score(self, row: int) -> float:
+        """Nats, of a window as last decoded: sum over all levels of log p(z | above), the score of section 7, and of
+        what was observed, weighted, log p(x | z)."""
+        off, log_var = self._off_and_log_var(row)
+        variance = np.exp(np.clip(log_var, *LOG_VAR_RANGE)) + self._sensor_variance
+        likelihood = -0.5 * self._trust[row] * (np.log(2 * np.pi * variance) + off * off / variance)
+        return float(likelihood.sum(dtype=np.float64)) + sum(float(self._values[row, k]) for k in self._term_places)
+
     def gradient(self, row: int) -> NDArray[np.float64]:
         """(n,) gradient of the score of a window, as last decoded, by how far the latents were moved."""
         self._gradients[:] = 0.0
-        for number in self._terms:
-            self._own_gradient(number)[:] = 1.0
-        off, own, inside = (part[0] for part in self._off_and_variance(np.array([row])))
+        self._gradients[self._term_places] = 1.0
+        off, log_var = self._off_and_log_var(row)
+        own = np.exp(np.clip(log_var, *LOG_VAR_RANGE))
         variance = own + self._sensor_variance
         off /= variance
-        by_written = self._own_gradient(self._written)
+        inside = (log_var > LOG_VAR_RANGE[0]) & (log_var < LOG_VAR_RANGE[1])
+        begin, end, shape = self._places[self._written]
+        by_written = self._gradients[begin:end].reshape(shape)
         by_written[:, : self.frames] = self._trust[row] * off
-        by_written[:, self.frames :] = 0.5 * self._trust[row] * inside * own * (off**2 - 1 / variance)
+        by_written[:, self.frames :] = 0.5 * self._trust[row] * inside * own * (off * off - 1 / variance)
         _backward(
             self._decoder, self._shapes, self._starts, self._weights, self._values[row], self._gradients, self._scratch
         )
-        return np.concatenate([self._own_gradient(k).ravel() for k in self._moves]).astype(np.float64)
+        return np.concatenate([self._gradients[slice(*self._places[k][:2])] for k in self._moves]).astype(np.float64)
 
-    def _run(self, steps: NDArray[np.int64], rows: NDArray[np.intp]) -> None:
-        _forward(steps, self._shapes, self._starts, self._weights, self._values, rows, self._scratch)
+    def _run(self, steps: NDArray[np.int64], rows: slice) -> None:
+        _forward(steps, self._shapes, self._starts, self._weights, self._values[rows], self._scratch)
 
-    def _matrix(self, number: int, rows: NDArray[np.intp]) -> Floats:
-        """(B, n, f) one matrix of the windows in ``rows``, which follow each other; a view."""
-        part = self._values[rows[0] : rows[-1] + 1, self._starts[number] : self._starts[number + 1]]
-        return part.reshape(len(rows), *self._shapes[number])
+    def _matrix(self, number: int, rows: slice) -> Floats:
+        """(B, n, f) one matrix of the windows in these rows; a view."""
+        begin, end, shape = self._places[number]
+        return self._values[rows, begin:end].reshape(-1, *shape)
 
-    def _own_gradient(self, number: int) -> Floats:
-        return self._gradients[self._starts[number] : self._starts[number + 1]].reshape(self._shapes[number])
+    def _off_and_log_var(self, row: int) -> tuple[Floats, Floats]:
+        """How far the tracks of a window are from where the model puts them, (66, T) in units of `SCALE`, and the
+        log-variance that it states, not clamped."""
+        rows = slice(row, row + 1)
+        written = self._matrix(self._written, rows)[0]
+        return self._matrix(self._x, rows)[0, :, : self.frames] - written[:, : self.frames], written[:, self.frames :]
 
-    def _off_and_variance(self, rows: NDArray[np.intp]) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """How far tracks are from where the model puts them, (B, 66, T) in units of `SCALE`, the variance it states,
-        and whether that is inside its range."""
-        written = self._matrix(self._written, rows)
-        log_var = written[..., self.frames :]
-        off = self._matrix(self._x, rows)[..., : self.frames] - written[..., : self.frames]
-        return (
-            off,
-            np.exp(np.clip(log_var, *LOG_VAR_RANGE)),
-            (log_var > LOG_VAR_RANGE[0]) & (log_var < LOG_VAR_RANGE[1]),
-        )
-
-    def _decode(self, rows: NDArray[np.intp]) -> Look:
+    def _decode(self, rows: slice) -> Look:
         self._run(self._decoder, rows)
-        off, own, _ = self._off_and_variance(rows)
-        variance = own + self._sensor_variance
-        likelihood = -0.5 * self._trust[rows] * (np.log(2 * np.pi * variance) + off**2 / variance)
-        terms = [likelihood, *(self._matrix(number, rows) for number in self._terms)]
+        written = self._matrix(self._written, rows)
+        half_log_var = 0.5 * np.clip(written[..., self.frames :], *LOG_VAR_RANGE)
         return Look(
-            mean=self._matrix(self._written, rows)[..., : self.frames] * SCALE + self._mean,
-            sigma=np.sqrt(own.astype(np.float64)) * SCALE,
-            score=sum((term.sum(axis=(1, 2), dtype=np.float64) for term in terms), np.zeros(len(rows))),
+            mean=written[..., : self.frames] * np.float64(SCALE) + self._mean,
+            sigma=np.exp(half_log_var) * np.float64(SCALE),
         )
+
+
+def _zeros(*shape: int) -> Floats:
+    """Zeros in memory that begins with a line of the cache."""
+    size = math.prod(shape)
+    room = np.zeros(size + _LINE, dtype=np.float32)
+    first = -(room.ctypes.data // room.itemsize) % _LINE
+    return room[first : first + size].reshape(shape)
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -280,9 +293,12 @@ _ERF = tuple(
     np.array([0.0705230784, 0.0422820123, 0.0092705272, 0.0001520143, 0.0002765672, 0.0000430638], dtype=np.float32)
 )
 _ROOT_HALF = np.float32(math.sqrt(0.5))
-_LOG_2PI = math.log(2 * math.pi)
-_LEAST, _MOST = LOG_VAR_RANGE
-_ONE = np.float32(1)
+_FAR = np.float32(5)
+"""erf is 1 from here on. What is left of its slope would soon be a denormal number, on which processors take 100 times
+as long."""
+_LOG_2PI = np.float32(math.log(2 * math.pi))
+_LEAST, _MOST = (np.float32(end) for end in LOG_VAR_RANGE)
+_HALF, _ONE = np.float32(0.5), np.float32(1)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -308,7 +324,7 @@ def _by_gelu(values, factor, by_out, by_values):
     a, b, c, d, e, f = _ERF
     for k in range(len(values)):
         x = values[k]
-        u = abs(x) * _ROOT_HALF
+        u = min(abs(x) * _ROOT_HALF, _FAR)
         p = one + u * (a + u * (b + u * (c + u * (d + u * (e + u * f)))))
         slope = a + u * (two * b + u * (three * c + u * (four * d + u * (five * e + u * six * f))))
         q = one / (p * p)
@@ -326,9 +342,17 @@ def _add(values, factor, out):
         out[k] += factor * values[k]
 
 
+@njit(cache=True, fastmath=True)
+def _copy(values, out):
+    """What ``out[:] = values`` does, in a tenth of the time."""
+    for k in range(len(values)):
+        out[k] = values[k]
+
+
 @njit(cache=True)
 def _view(arena, shapes, starts, number):
-    return arena[starts[number] : starts[number + 1]].reshape(shapes[number, 0], shapes[number, 1])
+    nodes, features = shapes[number]
+    return arena[starts[number] : starts[number] + nodes * features].reshape(nodes, features)
 
 
 @njit(cache=True)
@@ -338,11 +362,11 @@ def _mix_first(nodes_in, features_in, nodes, features):
 
 
 @njit(cache=True)
-def _forward(steps, shapes, starts, weights, values, rows, scratch):
-    """Do the steps for the windows in these rows of ``values`` (most, all matrices)."""
+def _forward(steps, shapes, starts, weights, windows, scratch):
+    """Do the steps for windows (B, all matrices)."""
     for k in range(len(steps)):
-        for row in rows:
-            _do(steps[k], shapes, starts, weights, values[row], scratch)
+        for row in range(len(windows)):
+            _do(steps[k], shapes, starts, weights, windows[row], scratch)
 
 
 @njit(cache=True)
@@ -371,26 +395,29 @@ def _do(step, shapes, starts, weights, values, scratch):
         _add(weights[of_bias : of_bias + out.size], _ONE, product.ravel())
         if plus != _NONE:
             _add(_view(values, shapes, starts, plus).ravel(), _ONE, product.ravel())
-        out[:] = product
+        _copy(product.ravel(), out.ravel())
     elif step[0] == _GELU:
         _, _, _, factor, plus = step[:5]
         activated = scratch[0, : a.size]
         _gelu(a.ravel(), activated)
         if plus == _NONE:
-            out[:] = 0.0
+            _copy(activated, out.ravel())
         elif plus != step[1]:
-            out[:] = _view(values, shapes, starts, plus)
-        _add(activated, weights[factor], out.ravel())
+            _copy(_view(values, shapes, starts, plus).ravel(), out.ravel())
+        if plus != _NONE:
+            _add(activated, weights[factor], out.ravel())
     elif step[0] == _SUM:
-        out[:] = a
+        _copy(a.ravel(), out.ravel())
         _add(_view(values, shapes, starts, step[3]).ravel(), _ONE, out.ravel())
     else:
         gaussian = _view(values, shapes, starts, step[3])
-        for i in range(nodes):
-            for j in range(features):
-                log_var = min(max(gaussian[i, features + j], _LEAST), _MOST)
+        total = 0.0
+        for i in range(nodes_in):
+            for j in range(features_in):
+                log_var = min(max(gaussian[i, features_in + j], _LEAST), _MOST)
                 off = a[i, j] - gaussian[i, j]
-                out[i, j] = -0.5 * (log_var + _LOG_2PI + off * off * math.exp(-log_var))
+                total -= _HALF * (log_var + _LOG_2PI + off * off * math.exp(-log_var))
+        out[0, 0] = total
 
 
 @njit(cache=True)
@@ -434,14 +461,14 @@ def _undo(step, shapes, starts, weights, values, gradients, scratch):
         _add(by_out.ravel(), _ONE, by_a.ravel())
         _add(by_out.ravel(), _ONE, _view(gradients, shapes, starts, step[3]).ravel())
     else:
-        a = _view(values, shapes, starts, step[2])
+        a, by_sum = _view(values, shapes, starts, step[2]), by_out[0, 0]
         gaussian, by_gaussian = _view(values, shapes, starts, step[3]), _view(gradients, shapes, starts, step[3])
-        for i in range(nodes):
-            for j in range(features):
-                log_var = gaussian[i, features + j]
+        for i in range(nodes_in):
+            for j in range(features_in):
+                log_var = gaussian[i, features_in + j]
                 scale = math.exp(-min(max(log_var, _LEAST), _MOST))
                 off = a[i, j] - gaussian[i, j]
-                by_a[i, j] -= by_out[i, j] * off * scale
-                by_gaussian[i, j] += by_out[i, j] * off * scale
+                by_a[i, j] -= by_sum * off * scale
+                by_gaussian[i, j] += by_sum * off * scale
                 if _LEAST < log_var < _MOST:
-                    by_gaussian[i, features + j] += by_out[i, j] * 0.5 * (off * off * scale - 1.0)
+                    by_gaussian[i, features_in + j] += by_sum * _HALF * (off * off * scale - _ONE)

@@ -79,11 +79,12 @@ class Climb:
         best, best_at = start, np.zeros_like(self._moved)
         if not steps:
             return best._replace(mean=best.mean + self._gained)
+        best_score = model.score(row)
         for step in range(steps):
             if step or self._moved.any():
-                look = model.decode(row, self._moved)
-                if look.score > best.score:
-                    best, best_at = look, self._moved
+                look, score = model.decode(row, self._moved), model.score(row)
+                if score > best_score:
+                    best, best_at, best_score = look, self._moved, score
                 elif step == 0:  # where the climb had come to is worth less than a new start
                     self._moved = best_at
                     model.decode(row, self._moved)
@@ -133,10 +134,10 @@ class Impute:
         if encoded is None:
             self._climbs = [None] * window.slots
             return window
-        imputed = Imputed(np.full((frames, window.slots, 22, 3), np.nan), np.full((frames, window.slots, 22), np.inf))
-        seen = encoded.tracks.observed[..., -frames:].all(axis=-1)
+        seen = np.asarray(encoded.tracks.observed[..., -frames:].all(axis=-1))
         # A joint never seen in the window is one that the sensor does not have: that takes no climb.
-        lost = (encoded.tracks.observed.any(axis=-1) & ~seen).any(axis=-1)
+        lost = np.asarray((encoded.tracks.observed.any(axis=-1) & ~seen).any(axis=-1))
+        mean = encoded.look.mean.copy()
         for row, slot in enumerate(encoded.slots):
             if seen[row].all():
                 self._climbs[slot] = None
@@ -146,24 +147,31 @@ class Impute:
                 self._counters["imputation_skipped"] += 1
                 steps = 0
             climb = self._climbs[slot] = self._climbs[slot] or Climb(encoded.model.latents, self._settings)
-            look = climb.complete(encoded, row, steps)
-            tracks, size = Tracks(*(part[row] for part in encoded.tracks)), float(encoded.size[row])
-            imputed.positions[:, slot] = from_tracks(completed_tracks(tracks, look), tracks, size)[-frames:]
-            # at the start: where the climb ends, the model is surer than it is right
-            sigma = SIGMA_FOUND * encoded.look.sigma[row].reshape(22, 3, -1) * size
-            imputed.sigma[:, slot] = np.sqrt((sigma**2).mean(axis=1)).T[-frames:]
+            mean[row] = climb.complete(encoded, row, steps).mean
+        hidden = np.flatnonzero(~seen.all(axis=-1))
+        slots, tracks = encoded.slots[hidden], Tracks(*(part[hidden] for part in encoded.tracks))
+        completed = completed_tracks(tracks, mean[hidden])[..., -frames:]
+        imputed = Imputed(np.full((frames, window.slots, 22, 3), np.nan), np.full((frames, window.slots, 22), np.inf))
+        imputed.positions[:, slots] = from_tracks(completed, tracks, encoded.size[hidden]).swapaxes(0, 1)
+        # at the start: where the climb ends, the model is surer than it is right
+        variance = (encoded.look.sigma[hidden, :, -frames:] ** 2).reshape(-1, 22, 3, frames).mean(axis=2)
+        sigma = SIGMA_FOUND * encoded.size[hidden, None, None] * np.sqrt(variance)
+        imputed.sigma[:, slots] = sigma.transpose(2, 0, 1)
         window.imputed = imputed
         return window
 
 
-def completed_tracks(tracks: Tracks, look: Look) -> Floats:
-    """(66, T) metres: what was seen, and what the model makes of the rest, without a jump at the edge of a gap."""
-    return look.mean + _carried(np.nan_to_num(tracks.x - look.mean), tracks.observed, CARRY_FRAMES)
+def completed_tracks(tracks: Tracks, mean: Floats) -> Floats:
+    """(..., 66, T) metres: what was seen, and what the model makes of the rest, ``mean``, without a jump at the edge of
+    a gap."""
+    frames = mean.shape[-1]
+    off, observed = (part.reshape(-1, frames) for part in (tracks.x - mean, tracks.observed))
+    return mean + _carried(off, observed, CARRY_FRAMES).reshape(mean.shape)
 
 
 @njit(cache=True)
 def _carried(off, observed, fade):
-    """(66, T) what the model was off where observed, carried from either side into the gaps, where it fades."""
+    """(N, T) what the model was off where observed, carried from either side into the gaps, where it fades."""
     nodes, frames = off.shape
     carried = np.where(observed > 0, off, 0.0)
     for node in range(nodes):
