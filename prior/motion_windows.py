@@ -12,7 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from prior.checkpoint import LICENCES
 from prior.skeletons import MIRROR
+from prior.window import FPS
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,10 @@ class MotionSet:
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: no clip of this split in it.
+            ValueError: no clip of this split in it, or no such set.
         """
+        if weights not in LICENCES:
+            raise ValueError(f"weights: expected one of {', '.join(LICENCES)}, got {weights!r}")
         if not path.is_file():
             raise FileNotFoundError(f"no prepared motion at {path}: make it with 'steadypose prepare MOCAP --out DIR'")
         data = np.load(path)
@@ -71,6 +75,11 @@ class MotionSet:
             subject=data["subject"][wanted],
             action=data["action"][wanted],
         )
+
+    @property
+    def hours(self) -> float:
+        """Of motion."""
+        return len(self.rotations) / FPS / 3600
 
     def only(self, clips: NDArray[np.bool_]) -> MotionSet:
         """These clips (C,) alone.
@@ -107,6 +116,14 @@ class MotionSet:
             np.arange(a, b - window + 1, step) for a, b in zip(self.clip_start, self.clip_start[1:], strict=False)
         ]
         return np.concatenate(starts)[:, None] + np.arange(window)
+
+
+def data_told(weights: str, train: MotionSet, val: MotionSet) -> str:
+    """What a card says of the data that weights were made from."""
+    return (
+        f"the '{weights}' set of `steadypose prepare`: {train.hours:.2f} h training, {val.hours:.2f} h validation, "
+        "split by subject"
+    )
 
 
 def mirror_rotations(rotations: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from prior.checkpoint import LICENCES
 from prior.distributed import share
 from prior.hmvae import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
 from prior.kinematics import forward_kinematics
-from prior.motion_windows import MotionSet, mirror_offsets, mirror_rotations, remove_heading
+from prior.motion_windows import MotionSet, data_told, mirror_offsets, mirror_rotations, remove_heading
 from prior.training import TrainingRun
 
 JOINT_WEIGHT = 10.0
@@ -69,11 +69,9 @@ def train_hmvae(
     config = HMVAEConfig()
     model = HMVAE(config)
     run = fit(model, train, val, runs / f"hmvae-{weights}", iterations, batch, learning_rate, STRIDES, seed)
-    hours = {split: len(s.rotations) / 30 / 3600 for split, s in (("train", train), ("val", val))}
     return run.ship(f"hmvae-{weights}", model, asdict(config), {
         "Model": "HM-VAE, window 8, 22 joints (prior/hmvae.py)",
-        "Data": f"the '{weights}' set of `steadypose prepare`: {hours['train']:.2f} h training, "
-        f"{hours['val']:.2f} h validation, split by subject",
+        "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train hmvae --weights {weights} --iterations {iterations}`: "
         f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}",

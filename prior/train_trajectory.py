@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from prior.checkpoint import LICENCES
 from prior.distributed import share
 from prior.kinematics import CONTACT_JOINTS
-from prior.motion_windows import MotionSet, yaw_rotation
+from prior.motion_windows import MotionSet, data_told, yaw_rotation
 from prior.skeletons import MIRROR, J
 from prior.training import TrainingRun
 from prior.trajectory_net import FRAME_S, RootMotion, TrajectoryConfig, TrajectoryNet
@@ -121,11 +121,9 @@ def train_trajectory(
         optimiser.step()
         schedule.step()
     config = calibrate(model, val)
-    hours = {split: len(s.rotations) / 30 / 3600 for split, s in (("train", train), ("val", val))}
     return run.ship(f"trajectory-{weights}", model, asdict(config), {
         "Model": f"root velocity and contacts, {config.context} frames of context, 22 joints (prior/trajectory_net.py)",
-        "Data": f"the '{weights}' set of `steadypose prepare`: {hours['train']:.2f} h training, "
-        f"{hours['val']:.2f} h validation, split by subject",
+        "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train trajectory --weights {weights} --iterations {iterations}`: "
         f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}",

@@ -132,6 +132,8 @@ def test_a_missing_split_and_a_missing_file_are_said(tmp_path: Path) -> None:
         MotionSet.load(tmp_path / "none.npz", "default", "train")
     with pytest.raises(ValueError, match="test"):
         MotionSet.load(prepared(tmp_path / "m.npz"), "default", "test")
+    with pytest.raises(ValueError, match="expected one of default, research, got 'kinect_v2'"):
+        MotionSet.load(prepared(tmp_path / "m.npz"), "kinect_v2", "train")
 
 
 def test_training_resumes_where_it_was_killed_and_ends_the_same(tmp_path: Path, monkeypatch) -> None:
