@@ -1,10 +1,8 @@
-"""The score stage: how unlike human motion what was seen of a body is, and because of which joints.
+"""The score stage: whether what was seen of a body can be trusted, and which joints cannot.
 
-A joint is odd when it was seen where HG-VAE would not have put it, or in a body of which the model no longer knows what
-to think: its expected squared distance from where it was seen, bias and variance together, over the last half second.
-(In units of the model's own deviation, exchanged limbs go unnoticed: it says that it is not sure.) The window is as odd
-as its oddest joint. Both are told on one scale: the number of decimals of the rate at which clean motion of people whom
-the model has not seen scores as high. An anomaly of 2 is met once in a hundred clean windows.
+The fault network says of each joint how much more likely it is off than not; the window is as odd as its oddest joint.
+Both are told on one scale: the number of decimals of the rate at which clean motion of people whom the networks have
+not seen scores as high. An anomaly of 2 is met once in a hundred clean windows.
 
 The paper scores by log p(z | x) alone (`steadypose evaluate hgvae` has both).
 """
@@ -12,20 +10,23 @@ The paper scores by log p(z | x) alone (`steadypose evaluate hgvae` has both).
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from prior.checkpoint import weights_path
+from prior.checkpoint import load_weights, weights_path
 from prior.encode import Encoded
+from prior.fault_net import FaultNet, FaultNetConfig
 from prior.window import FPS, Window
 
 Floats = NDArray[np.float64]
 
 RECENT = 15
-"""Frames over which a joint's deviation is averaged: what is wrong now must not be watered down by what was right."""
+"""Frames that are scored: what is wrong now must not be watered down by what was right."""
 
 MISSING = (0, 4, 8, 14)
 """Joints missing at which the scale was measured; between them it is interpolated."""
@@ -54,16 +55,12 @@ class ScoreSettings:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Oddity on validation motion, by joints missing and error of the sensor.
+    """What clean windows score, by joints missing and error of the sensor.
 
     Attributes:
-        mean: (M, S, 22) of each joint's log deviation.
-        spread: (M, S, 22) its standard deviation.
         quantiles: (M, S, R) of the window's score, at `RATES`.
     """
 
-    mean: Floats
-    spread: Floats
     quantiles: Floats
 
     @classmethod
@@ -76,47 +73,40 @@ class Calibration:
         path = weights_path(weights, "hgvae").with_suffix(".anomaly.json")
         if not path.is_file():
             raise FileNotFoundError(f"no {path.name} beside the weights: 'steadypose train hgvae' makes both")
-        content = json.loads(path.read_text())
-        return cls(**{name: np.array(content[name]) for name in ("mean", "spread", "quantiles")})
+        return cls(np.array(json.loads(path.read_text())["quantiles"]))
 
     def save(self, path: Path, note: str) -> None:
         """Write as JSON."""
-        values = {name: np.round(value, 4).tolist() for name, value in asdict(self).items()}
-        path.write_text(json.dumps({"note": note, **values}) + "\n")
+        path.write_text(json.dumps({"note": note, "quantiles": np.round(self.quantiles, 4).tolist()}) + "\n")
 
     def at(self, sensor_sigma: float) -> Calibration:
         """For one sensor: the same without the axis S."""
         place = np.interp(np.log(sensor_sigma), np.log(SENSOR_SIGMAS), np.arange(len(SENSOR_SIGMAS)))
         low = min(int(place), len(SENSOR_SIGMAS) - 2)
         share = place - low
-        values = (self.mean, self.spread, self.quantiles)
-        return Calibration(*((1 - share) * value[:, low] + share * value[:, low + 1] for value in values))
+        return Calibration((1 - share) * self.quantiles[:, low] + share * self.quantiles[:, low + 1])
 
 
-def deviations(x: Floats, mean: Floats, sigma: Floats, observed: NDArray[np.floating]) -> Floats:
-    """(..., 22) logarithm of how far, squared, each joint seen is from where it is, as the model expects it: over the
-    last `RECENT` frames; NaN if not seen.
+def load_fault_net(weights: str) -> FaultNet:
+    """The fault network beside HG-VAE's weights of this name."""
+    path = weights_path(weights, "hgvae").with_suffix(".faults.safetensors")
+    state, config = load_weights(str(path), "hgvae")
+    network = FaultNet(FaultNetConfig.from_dict(config))
+    network.load_state_dict(state)
+    return network.eval()
 
-    Args:
-        x: (..., 66, T) metres, tracks seen.
-        mean: (..., 66, T) what the model would put there, and
-        sigma: (..., 66, T) how sure it is.
-        observed: (..., 66, T) 1 where seen.
+
+@torch.inference_mode()
+def joint_odds(
+    network: FaultNet, x: Tensor, found: Tensor, sigma: Tensor, observed: Tensor, sensor_sigma: float
+) -> Floats:
+    """(B, 22) logarithm of the odds that a joint is off; -inf for one not seen in the last `RECENT` frames.
+
+    The arguments are those of `FaultNet`.
     """
-    x, mean, sigma = (a[..., -RECENT:] for a in (x, mean, sigma))
-    seen = observed[..., -RECENT:] > 0
-    squared = np.where(seen, (x - mean) ** 2 + sigma**2, 0.0)
-    joints = (*x.shape[:-2], 22, 3 * RECENT)
-    count = seen.reshape(joints).sum(axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.log(squared.reshape(joints).sum(axis=-1) / count)
-
-
-def oddities(logs: Floats, calibration: Calibration, missing: NDArray[np.integer]) -> Floats:
-    """(..., 22) each joint's oddity as a z-score of clean motion; -inf where the joint was not seen."""
-    weight = _between(missing)
-    z = (logs - weight @ calibration.mean) / (weight @ calibration.spread)
-    return np.where(np.isnan(z), -np.inf, z)
+    odds = network(x, found, sigma, observed, torch.full((len(x),), sensor_sigma))
+    recent = observed.unflatten(1, (22, 3))[:, :, 0, -RECENT:].amax(dim=-1) > 0
+    return torch.where(recent, odds, -torch.inf).double().numpy()
 
 
 def decimals(score: Floats, calibration: Calibration, missing: NDArray[np.integer]) -> Floats:
@@ -147,6 +137,7 @@ class Score:
             raise ValueError(f"score.false_alarms: expected a share between 0 and 1, got {settings.false_alarms:g}")
         self._height = -np.log10(settings.false_alarms)
         self._hold = settings.hold
+        self._network, self._sensor_sigma = load_fault_net(weights), sensor_sigma
         self._calibration = Calibration.load(weights).at(sensor_sigma)
         self._quiet_s = np.full(slots, np.inf)
 
@@ -168,8 +159,9 @@ class Score:
 
     def _score(self, encoded: Encoded) -> tuple[Floats, Floats]:
         """The anomaly of each window (B,) and, on the same scale, of its joints (B, 22)."""
-        logs = deviations(encoded.tracks.x, encoded.look.mean, encoded.look.sigma, encoded.tracks.observed)
-        missing = np.isnan(logs).sum(axis=-1)
-        odd = oddities(logs, self._calibration, missing)
-        told = decimals(odd, self._calibration, np.broadcast_to(missing[:, None], odd.shape))
-        return told.max(axis=-1), np.where(np.isinf(odd), np.nan, told)
+        tracks, look = encoded.tracks, encoded.look
+        parts = (torch.from_numpy(part).float() for part in (tracks.x, look.mean, look.sigma, tracks.observed))
+        odds = joint_odds(self._network, *parts, self._sensor_sigma)
+        missing = np.isinf(odds).sum(axis=-1)
+        told = decimals(odds, self._calibration, np.broadcast_to(missing[:, None], odds.shape))
+        return told.max(axis=-1), np.where(np.isinf(odds), np.nan, told)

@@ -15,6 +15,9 @@ from prior.motion_windows import MotionSet, mirror_offsets
 
 Floats = NDArray[np.float64]
 
+STRIDES = (1, 1, 1, 2)
+"""Every fourth window at twice the speed: people move faster than most of those who were recorded."""
+
 
 class Windows:
     """Windows of a split, drawn at random, as the model takes them."""

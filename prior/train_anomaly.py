@@ -1,23 +1,43 @@
-"""Calibration of the anomaly score: what clean motion of people whom the model has not seen scores.
+"""What the score stage is made of: the fault network, and what clean motion of people it has not seen scores.
 
-Everything is measured as the live node sees it: a sensor of a given error, half of it slow, and some joints missing.
+Everything is as the live node sees it: a sensor of a given error, half of it slow, and some joints missing.
 """
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.progress import track
+from torch import Tensor
+from torch.nn import functional as F
 
-from prior.anomaly import MISSING, RATES, SENSOR_SIGMAS, Calibration, deviations, oddities
+from prior.anomaly import MISSING, RATES, RECENT, SENSOR_SIGMAS, Calibration, joint_odds
 from prior.body_tracks import to_tracks
-from prior.checkpoint import load_weights
+from prior.checkpoint import load_weights, save_weights
+from prior.corruption import (
+    elsewhere,
+    exchanged,
+    hide_joints,
+    jumps,
+    noisy,
+    occlude,
+    other_bones,
+    sensed,
+    sides_exchanged,
+    somebody_elses,
+    spoil,
+    stands_still,
+)
+from prior.distributed import share
+from prior.fault_net import FaultNet, FaultNetConfig
 from prior.hgvae import HGVAE, SCALE, HGVAEConfig
 from prior.motion_windows import MotionSet
-from prior.track_windows import Windows, standardise
+from prior.track_windows import STRIDES, Windows, standardise
+from prior.training import TrainingRun, draw_curves
 
 Floats = NDArray[np.float64]
 
@@ -27,70 +47,130 @@ HELD_BACK = "s08"
 WINDOWS = 2000
 """for each error and number of joints missing"""
 
+STEPS, BATCH = 4_000, 64
+"""of the fault network's optimiser, and windows in each"""
 
-def calibrate_anomaly(data: Path, weights: str, path: Path) -> None:
-    """Measure the scale of the anomaly score on validation motion and write it beside an HG-VAE's weights.
+LEAST_FAULT = 0.015
+"""Metres along an axis, over the frames that are scored: a joint less off than that, or than the sensor's own error, is
+no fault worth the name, and one less off than a fifth of it is none."""
+
+FAULTS = (stands_still, exchanged, sides_exchanged, elsewhere, somebody_elses, other_bones, noisy, jumps)
+SPOILT = 0.6
+"""share of the windows that has a fault"""
+
+
+def train_anomaly(data: Path, runs: Path, weights: str, path: Path, seed: int = 0) -> None:
+    """Train the fault network of an HG-VAE, and measure its scale on validation motion; both go beside its weights.
 
     Args:
         data: ``prepared.npz``.
+        runs: folder of training runs.
         weights: which set: ``default`` or ``research``.
-        path: of the weights, ``.safetensors``.
+        path: of HG-VAE's weights, ``.safetensors``.
+        seed: of weights and of sampling.
     """
+    model = _model(path)
+    val = MotionSet.load(data, weights, "val")
+    val = val.only(val.subject != HELD_BACK)
+    torch.manual_seed(seed)
+    network = FaultNet(FaultNetConfig(frames=model.config.frames))
+    network.mean.copy_(model.mean)
+    train = Windows(MotionSet.load(data, weights, "train"))
+    run = fit(network, model, train, Windows(val), runs / f"{path.stem}-faults", seed)
+    beside = path.with_suffix(".faults.safetensors")
+    save_weights(beside, network, asdict(network.config), {
+        "Model": f"fault network beside {path.name}, prior/fault_net.py",
+        "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, spoilt by prior/train_anomaly.py",
+        "Licence": f"that of {path.name}",
+        "Training": f"with the HG-VAE, by `steadypose train`: {STEPS} steps of {BATCH} windows, seed {seed}",
+        "Validation": ", ".join(f"{k} {v:.4g}" for k, v in run.curves[-1].items()),
+        "Curves": f"`{beside.stem}.png`",
+    })  # fmt: skip
+    draw_curves(run.curves, beside.with_suffix(".png"))
+    note = f"what validation people but {HELD_BACK} score; made with the weights by 'steadypose train'"
+    calibrate(network, model, Windows(val), WINDOWS, seed=0).save(path.with_suffix(".anomaly.json"), note)
+
+
+def _model(path: Path) -> HGVAE:
     state, config = load_weights(str(path), "hgvae")
     model = HGVAE(HGVAEConfig.from_dict(config))
     model.load_state_dict(state)
-    model.eval()
-    motion = MotionSet.load(data, weights, "val")
-    motion = motion.only(motion.subject != HELD_BACK)
-    note = f"what validation people but {HELD_BACK} score; made with the weights by 'steadypose train'"
-    calibrate(model, Windows(motion), WINDOWS, seed=0).save(path.with_suffix(".anomaly.json"), note)
+    return model.eval()
 
 
-def calibrate(model: HGVAE, windows: Windows, count: int, seed: int) -> Calibration:
+def fit(network: FaultNet, model: HGVAE, train: Windows, val: Windows, directory: Path, seed: int) -> TrainingRun:
+    """Train ``network``; see `train_anomaly`."""
+    optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
+    state = {"model": network, "optimiser": optimiser, "schedule": schedule}
+    run = TrainingRun(directory, state, STEPS, every=max(STEPS // 10, 1))
+    losses: dict[str, float] = {}
+
+    def evaluate() -> dict[str, float]:
+        with torch.no_grad():
+            return {**losses, "val loss": _loss(network, model, val, 1024, np.random.default_rng(1)).item()}
+
+    for _ in run.steps(evaluate):
+        loss = _loss(network, model, train, share(BATCH), run.random(seed))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        losses["loss"] = loss.item()
+    network.eval()
+    return run
+
+
+def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np.random.Generator) -> Tensor:
+    """Binary cross-entropy over the joints seen of which it is clear whether they are off."""
+    clean, sizes = windows.draw(count, model.config.frames, rng, STRIDES)
+    sigma = np.exp(rng.uniform(np.log(SENSOR_SIGMAS[0]), np.log(SENSOR_SIGMAS[-1]), count))
+    spoilt = spoil(clean, FAULTS, SPOILT, rng)
+    seen = sensed(spoilt, sigma[:, None, None, None], rng)
+    lacking = rng.random(count)
+    for k in np.flatnonzero(lacking < 0.7):
+        alone = seen[k : k + 1]
+        alone[:] = (
+            hide_joints(alone, int(rng.integers(1, MISSING[-1])), rng) if lacking[k] < 0.4 else occlude(alone, rng)
+        )
+    off = np.sqrt(((spoilt - clean)[:, -RECENT:] ** 2).mean(axis=(1, 3)))
+    limit = np.maximum(LEAST_FAULT, sigma)[:, None]
+    shown = np.isfinite(seen[:, -RECENT:, :, 0]).any(axis=1)
+    clear = torch.from_numpy(shown & ((off > limit) | (off < 0.2 * limit))).float()
+    logits = network(*_look(model, seen, sizes), torch.from_numpy(sigma).float())
+    faulty = torch.from_numpy(off > limit).float()
+    return (F.binary_cross_entropy_with_logits(logits, faulty, reduction="none") * clear).sum() / clear.sum()
+
+
+@torch.no_grad()
+def _look(model: HGVAE, seen: Floats, sizes: Floats) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Tracks of windows (B, T, 22, 3) of bodies of sizes (B,), what HG-VAE makes of them and how sure it is, all
+    (B, 66, T) metres, and what was observed."""
+    tracks = to_tracks(seen, sizes)
+    observed = torch.from_numpy(tracks.observed).float()
+    found = model(standardise(model, tracks.x), observed).tracks
+    mean = found.mean * SCALE + model.mean[:, None]
+    return torch.from_numpy(tracks.x).float(), mean, (0.5 * found.log_var).exp() * SCALE, observed
+
+
+def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Floats:
+    """(B, 22) `joint_odds` of windows (B, T, 22, 3) of bodies of sizes (B,)."""
+    parts = [slice(start, start + 256) for start in range(0, len(seen), 256)]
+    return np.concatenate([joint_odds(network, *_look(model, seen[p], sizes[p]), sensor_sigma) for p in parts])
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# The scale
+
+
+def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, seed: int) -> Calibration:
     """The scale, from ``count`` windows for each condition."""
     rng = np.random.default_rng(seed)
     conditions = [(m, s) for m in range(len(MISSING)) for s in range(len(SENSOR_SIGMAS))]
-    mean = np.zeros((len(MISSING), len(SENSOR_SIGMAS), 22))
-    spread = np.ones_like(mean)
     quantiles = np.zeros((len(MISSING), len(SENSOR_SIGMAS), len(RATES)))
     for m, s in track(conditions, "calibrating"):
         positions, sizes = windows.draw(count, model.config.frames, rng)
         seen = hide_joints(sensed(positions, SENSOR_SIGMAS[s], rng), MISSING[m], rng)
-        logs = score_windows(model, seen, sizes)
-        mean[m, s], spread[m, s] = np.nanmean(logs, axis=0), np.nanstd(logs, axis=0)
-        z = (logs - mean[m, s]) / spread[m, s]
-        quantiles[m, s] = np.quantile(np.nanmax(z, axis=1), 1 - np.array(RATES))
-    return Calibration(mean, spread, quantiles)
-
-
-def sensed(positions: Floats, sigma: float, rng: np.random.Generator) -> Floats:
-    """Windows (B, T, 22, 3) as a sensor of error ``sigma`` (metres along an axis) sees them; half of it is slow."""
-    count, _, joints, _ = positions.shape
-    slow = rng.standard_normal((count, 1, joints, 3))
-    return positions + sigma * np.sqrt(0.5) * (slow + rng.standard_normal(positions.shape))
-
-
-def hide_joints(positions: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """Windows (B, T, 22, 3), each without ``count`` joints, at random."""
-    hidden = rng.permuted(np.tile(np.arange(22) < count, (len(positions), 1)), axis=1)
-    return np.where(hidden[:, None, :, None], np.nan, positions)
-
-
-@torch.no_grad()
-def score_windows(model: HGVAE, seen: Floats, sizes: Floats) -> Floats:
-    """(B, 22) log deviations of windows (B, T, 22, 3) of bodies of sizes (B,)."""
-    logs = []
-    for start in range(0, len(seen), 256):
-        part = slice(start, start + 256)
-        tracks = [to_tracks(window, size) for window, size in zip(seen[part], sizes[part], strict=True)]
-        x, observed = np.stack([t.x for t in tracks]), np.stack([t.observed for t in tracks])
-        found = model(standardise(model, x), torch.from_numpy(observed).float()).tracks
-        mean = found.mean.double().numpy() * SCALE + model.mean.double().numpy()[:, None]
-        sigma = (0.5 * found.log_var).exp().double().numpy() * SCALE
-        logs.append(deviations(x, mean, sigma, observed))
-    return np.concatenate(logs)
-
-
-def window_oddity(logs: Floats, calibration: Calibration) -> Floats:
-    """(B,) the score of windows from their log deviations (B, 22), on the z-scale of their oddest joint."""
-    return oddities(logs, calibration, np.isnan(logs).sum(axis=-1)).max(axis=-1)
+        odds = score_windows(network, model, seen, sizes, SENSOR_SIGMAS[s])
+        quantiles[m, s] = np.quantile(odds.max(axis=1), 1 - np.array(RATES))
+    return Calibration(quantiles)

@@ -20,14 +20,13 @@ from torch import Tensor
 
 from prior.body_tracks import in_frame_of, to_tracks
 from prior.checkpoint import LICENCES
+from prior.corruption import add_noise, elsewhere, exchanged, occlude, spoil, stands_still
 from prior.distributed import share
 from prior.hgvae import HGVAE, JOINT_NODES, SCALE, HGVAEConfig, Level, Pass
 from prior.motion_windows import MotionSet
-from prior.skeletons import MIRROR, PARENTS, J
-from prior.track_windows import Windows, mean_tracks, standardise
-from prior.train_anomaly import calibrate_anomaly
+from prior.track_windows import STRIDES, Windows, mean_tracks, standardise
+from prior.train_anomaly import train_anomaly
 from prior.training import TrainingRun
-from prior.window import FPS
 
 Floats = NDArray[np.float64]
 
@@ -41,11 +40,8 @@ MODELS: dict[str, HGVAEConfig] = {
 }
 """``hgvae`` fits a robot's budget; ``hgvae-wide`` has the paper's size, for recordings."""
 
-STRIDES = (1, 1, 1, 2)
-"""Every fourth window at twice the speed: people move faster than most of those who were recorded."""
-
-SLOW_HZ = 0.7
-"""how fast a sensor's slow error changes at most"""
+SPOILT_BY = (stands_still, exchanged, elsewhere)
+"""what half of the windows that are to be completed has"""
 
 KL_START = 0.001
 """beta at the start (section 5)"""
@@ -94,7 +90,7 @@ def train_hgvae(
         "Training": f"`steadypose train {model} --weights {weights}`: {iterations} steps of {batch} windows, "
         f"Adam {learning_rate:g}, seed {seed}",
     })  # fmt: skip
-    calibrate_anomaly(data, weights, path)
+    train_anomaly(data, runs, weights, path)
     return path
 
 
@@ -149,7 +145,7 @@ def fit(
         positions, sizes = train.draw(batch, frames, rng, STRIDES)
         half = batch // 2
         whole = Batch.of(model, positions[:half], positions[:half], sizes[:half])
-        seen = occlude(spoil(add_noise(positions[half:], rng), rng), rng)
+        seen = occlude(spoil(add_noise(positions[half:], rng), SPOILT_BY, 0.5, rng), rng)
         both = whole.beside(Batch.of(model, seen, positions[half:], sizes[half:]))
         drawn = model(both.x, both.observed, spread=(torch.arange(batch) < half).float()[:, None])
         likelihood = (drawn.tracks.log_density(both.target) * both.counts).flatten(1).sum(dim=1)
@@ -204,93 +200,3 @@ def evaluate_hgvae(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, 
 def _joint_error(x: Tensor, target: Tensor) -> Tensor:
     """(B, 22, T) millimetres of a standard body."""
     return (x - target).unflatten(1, (-1, 3)).norm(dim=2) * (SCALE * 1000)
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# What a camera does to a window
-
-_LIMBS = [
-    [J[f"{side}_{n}"] for n in names]
-    for side in ("left", "right")
-    for names in (("wrist",), ("elbow", "wrist"), ("shoulder", "elbow", "wrist"), ("foot",), ("ankle", "foot"),
-                  ("knee", "ankle", "foot"), ("hip", "knee", "ankle", "foot"))
-]  # fmt: skip
-_LOWER = [J[f"{side}_{n}"] for side in ("left", "right") for n in ("hip", "knee", "ankle", "foot")]
-_ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_collar", "left_foot", "right_foot")]
-"""joints that many sensors do not have"""
-
-
-def add_noise(positions: Floats, rng: np.random.Generator) -> Floats:
-    """Windows (B, T, 22, 3) with noise from frame to frame, of some joints more than of others, up to 10 cm, and with
-    errors that last or change slowly, up to 3 cm."""
-    count, frames, joints, _ = positions.shape
-    fast = 10 ** rng.uniform(-3.3, -1.0, (count, 1, 1, 1)) * np.exp(0.4 * rng.standard_normal((count, 1, joints, 1)))
-    slow = 0.03 * rng.uniform(0.0, 1.0, (count, 1, 1, 1)) * (rng.random((count, 1, 1, 1)) < 0.7)
-    phase = rng.uniform(0.0, 2 * np.pi, (count, 1, joints, 3))
-    turns = rng.uniform(0.0, SLOW_HZ, (count, 1, joints, 3)) * np.arange(frames)[:, None, None] / FPS
-    bias = np.sqrt(2.0) * slow * np.cos(phase + 2 * np.pi * turns)
-    return positions + fast * rng.standard_normal((count, frames, joints, 3)) + bias
-
-
-def spoil(positions: Floats, rng: np.random.Generator) -> Floats:
-    """Windows (B, T, 22, 3), half of them with what trackers get plainly wrong, for a while: limbs that stand still,
-    that are exchanged with the other side's, or that lie elsewhere."""
-    spoilt = positions.copy()
-    frames = positions.shape[1]
-    for window in spoilt:
-        if rng.random() < 0.5:
-            continue
-        length = int(np.clip(np.exp(rng.uniform(np.log(2), np.log(2.0 * frames))), 1, frames - 1))
-        start = frames - length if rng.random() < 0.5 else int(rng.integers(1, frames - length + 1))
-        joints = _LIMBS[rng.integers(len(_LIMBS))] if rng.random() < 0.7 else [int(rng.integers(len(PARENTS)))]
-        part, before = window[start : start + length], window[start - 1]
-        kind = rng.random()
-        if kind < 0.25:
-            part[:, joints] = before[joints]
-        elif kind < 0.4:
-            part[:, joints] = before[joints] - before[0] + part[:, :1]
-        elif kind < 0.7:
-            both = [*joints, *MIRROR[joints]]
-            part[:, both] = part[:, MIRROR[both]]
-        else:
-            part[:, joints] += rng.normal(0.0, 0.15, 3)
-    return spoilt
-
-
-def occlude(positions: Floats, rng: np.random.Generator) -> Floats:
-    """Windows (B, T, 22, 3) with entries made NaN as cameras lose them: limbs, sets of joints, single ones, the past.
-
-    The newest frame matters most, so half of the gaps reach it.
-    """
-    seen = positions.copy()
-    frames = positions.shape[1]
-    for window in seen:
-        if rng.random() < 0.4:
-            window[:, _ABSENT] = np.nan
-        if rng.random() < 0.25:
-            window[:, 1 + rng.choice(len(PARENTS) - 1, rng.integers(1, 7), replace=False)] = np.nan
-        for _ in range(rng.integers(1, 4)):
-            kind = rng.random()
-            joints = (
-                _LIMBS[rng.integers(len(_LIMBS))] if kind < 0.6
-                else _LOWER if kind < 0.7
-                else _below(int(rng.integers(1, len(PARENTS)))) if kind < 0.8
-                else np.flatnonzero(rng.random(len(PARENTS)) < rng.uniform(0.05, 0.5))
-            )  # fmt: skip
-            length = int(np.clip(np.exp(rng.uniform(np.log(2), np.log(2.0 * frames))), 1, frames))
-            start = frames - length if rng.random() < 0.5 else int(rng.integers(0, frames - length + 1))
-            window[start : start + length, joints] = np.nan
-        if rng.random() < 0.2:
-            window[rng.random(window.shape[:2]) < 10 ** rng.uniform(-3, -0.3)] = np.nan
-        if rng.random() < 0.15:
-            window[: rng.integers(1, frames - 3)] = np.nan
-    return seen
-
-
-def _below(joint: int) -> list[int]:
-    """A joint and all that hangs from it."""
-    found = [joint]
-    for child in range(joint + 1, len(PARENTS)):
-        if PARENTS[child] in found:
-            found.append(child)
-    return found

@@ -26,14 +26,16 @@ from benchmarks.machine import ROOT
 from benchmarks.motion import as_set, digest
 from benchmarks.results import Table
 from msgs.types import JOINTS
-from prior.anomaly import Calibration, decimals, oddities
+from prior.anomaly import Calibration, decimals, load_fault_net
 from prior.body_tracks import in_frame_of, to_tracks
 from prior.checkpoint import WEIGHTS, load_weights
+from prior.corruption import sensed
+from prior.fault_net import FaultNet
 from prior.hgvae import HGVAE, SCALE, HGVAEConfig
 from prior.motion_windows import MotionSet
 from prior.skeletons import PARENTS
 from prior.track_windows import Windows, standardise
-from prior.train_anomaly import HELD_BACK, score_windows, sensed, window_oddity
+from prior.train_anomaly import HELD_BACK, score_windows
 from prior.train_hgvae import Batch, evidence
 
 Floats = NDArray[np.float64]
@@ -128,20 +130,19 @@ def _anomalies(bench: Bench, model: HGVAE, data: _Data) -> Result:
     """AUROC of every fault, by our score and the paper's, and false alarms among people not calibrated on."""
     count = 64 if bench.quick else 600
     rng = np.random.default_rng(11)
-    windows, calibration = Windows(data.val), Calibration.load("default")
+    windows, network = Windows(data.val), load_fault_net("default")
     frames = model.config.frames
     records: list[dict[str, Any]] = []
     figure = Figure(figsize=(9.5, 4.2), layout="constrained")
     for axis, (sensor, sigma) in zip(figure.subplots(1, 2, sharey=True), SENSORS.items(), strict=True):
-        ours = calibration.at(sigma)
         clean, sizes = windows.draw(count, frames, rng)
-        quiet = window_oddity(score_windows(model, sensed(clean, sigma, rng), sizes), ours)
+        quiet = score_windows(network, model, sensed(clean, sigma, rng), sizes, sigma).max(axis=1)
         plain = -_paper_score(model, sensed(clean, sigma, rng), sizes)
         other, other_sizes = windows.draw(count, frames, rng)
         for name, fault in FAULTS.items():
             spoilt, holds = fault(other, rng)
             seen = sensed(spoilt, sigma, rng)[holds]
-            loud = window_oddity(score_windows(model, seen, other_sizes[holds]), ours)
+            loud = score_windows(network, model, seen, other_sizes[holds], sigma).max(axis=1)
             paper = -_paper_score(model, seen, other_sizes[holds])
             truth = np.r_[np.zeros(count), np.ones(len(loud))]
             record = {"fault": name, "sensor": sensor, "windows": len(loud),
@@ -154,7 +155,7 @@ def _anomalies(bench: Bench, model: HGVAE, data: _Data) -> Result:
         axis.grid(alpha=0.3)
         axis.legend(fontsize=6, loc="lower right")
     figure.axes[0].set_ylabel("found")
-    alarms = _false_alarms(bench, model, data, calibration)
+    alarms = _false_alarms(bench, network, model, data)
     first, second = SENSORS
     by = {(r["fault"], r["sensor"]): r for r in records}
     tables = [
@@ -188,7 +189,7 @@ def _paper_score(model: HGVAE, seen: Floats, sizes: Floats) -> Floats:
     return np.concatenate(scores)
 
 
-def _false_alarms(bench: Bench, model: HGVAE, data: _Data, calibration: Calibration) -> list[dict[str, Any]]:
+def _false_alarms(bench: Bench, network: FaultNet, model: HGVAE, data: _Data) -> list[dict[str, Any]]:
     sets: dict[str, MotionSet] = {"all validation people": data.val}
     if data.prepared:
         sets[f"{HELD_BACK}, not calibrated on"] = data.val.only(data.val.subject == HELD_BACK)
@@ -200,9 +201,8 @@ def _false_alarms(bench: Bench, model: HGVAE, data: _Data, calibration: Calibrat
     for people, motion in sets.items():
         rng = np.random.default_rng(13)
         positions, sizes = Windows(motion).draw(64 if bench.quick else 1500, model.config.frames, rng)
-        logs = score_windows(model, sensed(positions, sigma, rng), sizes)
-        missing = np.isnan(logs).sum(axis=-1)
-        told = decimals(oddities(logs, calibration.at(sigma), missing).max(axis=-1), calibration.at(sigma), missing)
+        odds = score_windows(network, model, sensed(positions, sigma, rng), sizes, sigma)
+        told = decimals(odds.max(axis=1), Calibration.load("default").at(sigma), np.isinf(odds).sum(axis=1))
         records.append({"people": people, "windows": len(told)} | {
             f"at_{rate:g}": float((told > -np.log10(rate)).mean()) for rate in RATES
         })  # fmt: skip

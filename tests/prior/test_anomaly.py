@@ -2,6 +2,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from prior.anomaly import (
     MISSING,
@@ -12,17 +13,17 @@ from prior.anomaly import (
     Score,
     ScoreSettings,
     decimals,
-    deviations,
-    oddities,
+    joint_odds,
+    load_fault_net,
 )  # fmt: skip
+from prior.fault_net import FaultNet, FaultNetConfig
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.skeletons import MIRROR, PARENTS, J
 from prior.window import Window
 from tests.prior.bodies import stream, waving
 
-SHAPE = (len(MISSING), len(SENSOR_SIGMAS))
 HEIGHTS = np.linspace(0.0, 7.0, len(RATES))
-SCALE = Calibration(np.zeros((*SHAPE, 22)), np.ones((*SHAPE, 22)), np.broadcast_to(HEIGHTS, (*SHAPE, len(RATES))))
+SCALE = Calibration(np.broadcast_to(HEIGHTS, (len(MISSING), len(SENSOR_SIGMAS), len(RATES))))
 
 
 def scored(positions: np.ndarray, **settings) -> list:
@@ -30,17 +31,20 @@ def scored(positions: np.ndarray, **settings) -> list:
     return [c.bodies[0] for m in stream(positions) for c in pipeline.process(m)]
 
 
-def test_deviations_are_of_recent_frames_seen_bias_and_variance_together() -> None:
-    x, mean, sigma, observed = np.zeros((66, 50)), np.zeros((66, 50)), np.full((66, 50), 0.03), np.ones((66, 50))
-    x[:, : 50 - RECENT] = 9.0  # long ago
-    x[3 * J["head"] : 3 * J["head"] + 3, -RECENT:] = 0.1
-    observed[3 * J["neck"] : 3 * J["neck"] + 3, -RECENT:] = 0
-    logs = deviations(x, mean, sigma, observed)
-    assert logs[J["head"]] == pytest.approx(np.log(0.1**2 + 0.03**2))
-    assert np.isnan(logs[J["neck"]])
-    odd = oddities(logs, SCALE.at(0.02), np.array(1))
-    assert odd.argmax() == J["head"]
-    assert odd[J["neck"]] == -np.inf
+def test_what_was_not_observed_is_not_read_and_a_joint_not_seen_of_late_has_no_odds() -> None:
+    torch.manual_seed(0)
+    network = FaultNet(FaultNetConfig(frames=20, features=8)).eval()
+    x, found, sigma, observed = (torch.rand(2, 66, 20) + 0.1 for _ in range(4))
+    observed = (observed > 0.4).float()
+    observed.unflatten(1, (22, 3))[:] = observed.unflatten(1, (22, 3))[:, :, :1]  # joints are seen whole
+    observed[0, 3 * J["neck"] : 3 * J["neck"] + 3, -RECENT:] = 0
+    odds = joint_odds(network, x, found, sigma, observed, 0.01)
+    assert odds.shape == (2, 22)
+    assert np.flatnonzero(np.isinf(odds[0])).tolist() == [J["neck"]]
+    hidden = torch.where(observed > 0, x, torch.nan)
+    np.testing.assert_array_equal(joint_odds(network, hidden, found, sigma, observed, 0.01), odds)
+    alone = joint_odds(network, x[1:], found[1:], sigma[1:], observed[1:], 0.01)
+    np.testing.assert_allclose(alone, odds[1:], atol=1e-5)
 
 
 def test_the_scale_is_the_decimals_of_the_rate_among_clean_windows() -> None:
@@ -50,13 +54,26 @@ def test_the_scale_is_the_decimals_of_the_rate_among_clean_windows() -> None:
     beyond = decimals(np.array([7.0, 8.0, 9.0]), scale, missing[:3])
     assert beyond[2] - beyond[1] == pytest.approx(beyond[1] - beyond[0])
     assert decimals(np.array([-50.0]), scale, missing[:1]) == 0
+    assert decimals(np.array([-np.inf]), scale, missing[:1]) == 0
 
 
 def test_between_measured_sensors_the_scale_is_between_theirs() -> None:
-    mean = np.zeros((*SHAPE, 22))
-    mean[:, 1] = 1.0
-    middle = Calibration(mean, SCALE.spread, SCALE.quantiles).at(float(np.sqrt(SENSOR_SIGMAS[1] * SENSOR_SIGMAS[2])))
-    np.testing.assert_allclose(middle.mean, 0.5)
+    quantiles = np.zeros_like(SCALE.quantiles)
+    quantiles[:, 1] = 1.0
+    middle = Calibration(quantiles).at(float(np.sqrt(SENSOR_SIGMAS[1] * SENSOR_SIGMAS[2])))
+    np.testing.assert_allclose(middle.quantiles, 0.5)
+
+
+def test_the_weights_that_ship_find_the_wrist_that_stands_still() -> None:
+    """What a hand at rest and a frozen one have in common is all that one joint shows: the others tell."""
+    assert load_fault_net("default").config.frames == 50
+    moving = waving(90, speed=2.0)
+    frozen = moving.copy()
+    frozen[60:, J["left_wrist"]] = moving[59, J["left_wrist"]]
+    gate_off = {"gate": {"enabled": False}, "bones": {"enabled": False}}
+    clean, spoilt = scored(moving, **gate_off)[-1], scored(frozen, **gate_off)[-1]
+    assert spoilt.anomaly > clean.anomaly + 1
+    assert np.nanargmax(spoilt.joint_anomaly) == J["left_wrist"]
 
 
 def test_clean_motion_is_no_anomaly_and_frames_are_scored_alike_twice() -> None:

@@ -1,0 +1,158 @@
+"""What cameras and trackers do to a window, for training: noise, hidden joints, and what they get plainly wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prior.skeletons import MIRROR, PARENTS, J
+from prior.window import FPS
+
+Floats = NDArray[np.float64]
+Rng = np.random.Generator
+Fault = Callable[[Floats, slice, list[int], Floats, Rng], None]
+"""Spoils a window (T, 22, 3) in place: some joints in a part of its frames; with another window, of somebody else."""
+
+SLOW_HZ = 0.7
+"""how fast a sensor's slow error changes at most"""
+
+_LIMBS = [
+    [J[f"{side}_{n}"] for n in names]
+    for side in ("left", "right")
+    for names in (("wrist",), ("elbow", "wrist"), ("shoulder", "elbow", "wrist"), ("foot",), ("ankle", "foot"),
+                  ("knee", "ankle", "foot"), ("hip", "knee", "ankle", "foot"))
+]  # fmt: skip
+_LOWER = [J[f"{side}_{n}"] for side in ("left", "right") for n in ("hip", "knee", "ankle", "foot")]
+_ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_collar", "left_foot", "right_foot")]
+"""joints that many sensors do not have"""
+
+
+def add_noise(positions: Floats, rng: Rng) -> Floats:
+    """Windows (B, T, 22, 3) with noise from frame to frame, of some joints more than of others, up to 10 cm, and with
+    errors that last or change slowly, up to 3 cm."""
+    count, frames, joints, _ = positions.shape
+    fast = 10 ** rng.uniform(-3.3, -1.0, (count, 1, 1, 1)) * np.exp(0.4 * rng.standard_normal((count, 1, joints, 1)))
+    slow = 0.03 * rng.uniform(0.0, 1.0, (count, 1, 1, 1)) * (rng.random((count, 1, 1, 1)) < 0.7)
+    phase = rng.uniform(0.0, 2 * np.pi, (count, 1, joints, 3))
+    turns = rng.uniform(0.0, SLOW_HZ, (count, 1, joints, 3)) * np.arange(frames)[:, None, None] / FPS
+    bias = np.sqrt(2.0) * slow * np.cos(phase + 2 * np.pi * turns)
+    return positions + fast * rng.standard_normal((count, frames, joints, 3)) + bias
+
+
+def sensed(positions: Floats, sigma: Floats | float, rng: Rng) -> Floats:
+    """Windows (B, T, 22, 3) as a sensor of error ``sigma`` (metres along an axis) sees them; half of it is slow."""
+    count, _, joints, _ = positions.shape
+    slow = rng.standard_normal((count, 1, joints, 3))
+    return positions + sigma * np.sqrt(0.5) * (slow + rng.standard_normal(positions.shape))
+
+
+def spoil(clean: Floats, faults: Sequence[Fault], share: float, rng: Rng) -> Floats:
+    """Windows (B, T, 22, 3), a ``share`` of them with one of ``faults``, most of these to the window's end."""
+    spoilt = clean.copy()
+    frames = clean.shape[1]
+    for window in spoilt:
+        if rng.random() > share:
+            continue
+        length = int(np.clip(np.exp(rng.uniform(np.log(3), np.log(1.5 * frames))), 3, frames - 1))
+        start = frames - length if rng.random() < 0.6 else int(rng.integers(1, frames - length + 1))
+        joints = _LIMBS[rng.integers(len(_LIMBS))] if rng.random() < 0.6 else [int(rng.integers(1, len(PARENTS)))]
+        other = clean[rng.integers(len(clean))]
+        faults[rng.integers(len(faults))](window, slice(start, start + length), joints, other, rng)
+    return spoilt
+
+
+def stands_still(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
+    """Limbs that stay where they were: in the room, or beside the pelvis."""
+    before = window[part.start - 1].copy()
+    if rng.random() < 0.6:
+        window[part, joints] = before[joints]
+    else:  # beside the pelvis
+        window[part, joints] = before[joints] - before[0] + window[part, :1]
+
+
+def exchanged(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
+    """Limbs taken for the other side's."""
+    both = [*joints, *MIRROR[joints]]
+    window[part, both] = window[part][:, MIRROR[both]]
+
+
+def sides_exchanged(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
+    """Left taken for right, all over."""
+    when = part if rng.random() < 0.5 else slice(None)
+    window[when] = window[when][:, MIRROR]
+
+
+def elsewhere(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
+    """Limbs that lie 2 to 40 cm elsewhere."""
+    window[part, joints] += rng.normal(0.0, 10 ** rng.uniform(-1.7, -0.4), 3)
+
+
+def somebody_elses(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
+    """Somebody else's limbs."""
+    beside = window[part, :1] - other[part, :1] + rng.normal(0.0, 10 ** rng.uniform(-2.0, -0.4), 3)
+    window[part, joints] = other[part][:, joints] + beside
+
+
+def other_bones(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
+    """Bones each longer or shorter by itself: a skeleton taken for another."""
+    own, factor = window.copy(), np.exp(rng.normal(0.0, rng.uniform(0.05, 0.35), len(PARENTS)))
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        window[:, joint] = window[:, parent] + factor[joint] * (own[:, joint] - own[:, parent])
+
+
+def noisy(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
+    """More noise, of 1 to 10 cm, on some joints or on all."""
+    which = joints if rng.random() < 0.5 else list(range(len(PARENTS)))
+    window[part, which] += rng.normal(0.0, 10 ** rng.uniform(-2.0, -1.0), (part.stop - part.start, len(which), 3))
+
+
+def jumps(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
+    """One frame in which a limb is far away."""
+    window[rng.integers(part.start, part.stop), joints] += rng.normal(0.0, 0.2, 3)
+
+
+def occlude(positions: Floats, rng: Rng) -> Floats:
+    """Windows (B, T, 22, 3) with entries made NaN as cameras lose them: limbs, sets of joints, single ones, the past.
+
+    The newest frame matters most, so half of the gaps reach it.
+    """
+    seen = positions.copy()
+    frames = positions.shape[1]
+    for window in seen:
+        if rng.random() < 0.4:
+            window[:, _ABSENT] = np.nan
+        if rng.random() < 0.25:
+            window[:, 1 + rng.choice(len(PARENTS) - 1, rng.integers(1, 7), replace=False)] = np.nan
+        for _ in range(rng.integers(1, 4)):
+            kind = rng.random()
+            joints = (
+                _LIMBS[rng.integers(len(_LIMBS))] if kind < 0.6
+                else _LOWER if kind < 0.7
+                else _below(int(rng.integers(1, len(PARENTS)))) if kind < 0.8
+                else np.flatnonzero(rng.random(len(PARENTS)) < rng.uniform(0.05, 0.5))
+            )  # fmt: skip
+            length = int(np.clip(np.exp(rng.uniform(np.log(2), np.log(2.0 * frames))), 1, frames))
+            start = frames - length if rng.random() < 0.5 else int(rng.integers(0, frames - length + 1))
+            window[start : start + length, joints] = np.nan
+        if rng.random() < 0.2:
+            window[rng.random(window.shape[:2]) < 10 ** rng.uniform(-3, -0.3)] = np.nan
+        if rng.random() < 0.15:
+            window[: rng.integers(1, frames - 3)] = np.nan
+    return seen
+
+
+def hide_joints(positions: Floats, count: int, rng: Rng) -> Floats:
+    """Windows (B, T, 22, 3), each without ``count`` joints, at random."""
+    hidden = rng.permuted(np.tile(np.arange(22) < count, (len(positions), 1)), axis=1)
+    return np.where(hidden[:, None, :, None], np.nan, positions)
+
+
+def _below(joint: int) -> list[int]:
+    """A joint and all that hangs from it."""
+    found = [joint]
+    for child in range(joint + 1, len(PARENTS)):
+        if PARENTS[child] in found:
+            found.append(child)
+    return found

@@ -1,0 +1,64 @@
+import numpy as np
+import pytest
+
+from prior.corruption import add_noise, exchanged, hide_joints, occlude, sensed, spoil
+from prior.skeletons import MIRROR, J
+from prior.train_anomaly import FAULTS
+from tests.prior.bodies import waving
+
+WINDOWS = np.stack([waving(50, speed=1.0 + 0.05 * k) for k in range(40)])
+
+
+def test_the_truth_is_left_alone() -> None:
+    rng, kept = np.random.default_rng(0), WINDOWS.copy()
+    for spoilt in (occlude(WINDOWS, rng), add_noise(WINDOWS, rng), spoil(WINDOWS, FAULTS, 1.0, rng),
+                   sensed(WINDOWS, 0.01, rng), hide_joints(WINDOWS, 3, rng)):  # fmt: skip
+        assert spoilt.shape == WINDOWS.shape
+        assert not np.array_equal(spoilt, kept, equal_nan=True)
+    np.testing.assert_array_equal(WINDOWS, kept)
+
+
+def test_gaps_are_many_and_reach_the_newest_frame() -> None:
+    hidden = np.isnan(occlude(WINDOWS, np.random.default_rng(0))[..., 0])
+    assert 0.1 < hidden.mean() < 0.7
+    assert hidden[:, -1].any(axis=1).mean() > 0.5
+
+
+def test_as_many_joints_are_hidden_as_asked_and_all_the_time() -> None:
+    hidden = np.isnan(hide_joints(WINDOWS, 5, np.random.default_rng(0))[..., 0])
+    assert (hidden.sum(axis=-1) == 5).all()
+
+
+def test_a_sensor_errs_by_what_is_said_half_of_it_for_good() -> None:
+    off = sensed(WINDOWS, 0.02, np.random.default_rng(0)) - WINDOWS
+    assert off.std() == pytest.approx(0.02, rel=0.05)
+    assert off.mean(axis=1).std() == pytest.approx(0.02 * np.sqrt(0.5 + 0.5 / 50), rel=0.05)
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
+def test_a_fault_is_where_it_is_said_to_be(fault) -> None:
+    """Joints or frames that have no part in it stay as they were, but where the fault is of the whole body."""
+    rng, joints = np.random.default_rng(3), [J["left_elbow"], J["left_wrist"]]
+    for _ in range(20):
+        window = WINDOWS[0].copy()
+        fault(window, slice(20, 40), joints, WINDOWS[9], rng)
+        off = np.linalg.norm(window - WINDOWS[0], axis=-1) > 1e-9
+        assert off.any()
+        if fault.__name__ not in ("sides_exchanged", "other_bones"):
+            assert not off[:20].any()
+            assert not off[40:].any()
+        if fault.__name__ not in ("sides_exchanged", "other_bones", "noisy"):
+            assert set(np.flatnonzero(off.any(axis=0))) <= {*joints, *MIRROR[joints]}
+
+
+def test_exchanged_limbs_are_each_others() -> None:
+    window = WINDOWS[0].copy()
+    exchanged(window, slice(10, 50), [J["left_wrist"]], WINDOWS[1], np.random.default_rng(0))
+    np.testing.assert_array_equal(window[10:, J["left_wrist"]], WINDOWS[0, 10:, J["right_wrist"]])
+    np.testing.assert_array_equal(window[10:, J["right_wrist"]], WINDOWS[0, 10:, J["left_wrist"]])
+
+
+def test_the_share_asked_for_is_spoilt() -> None:
+    spoilt = spoil(np.tile(WINDOWS, (10, 1, 1, 1)), FAULTS, 0.6, np.random.default_rng(0))
+    off = np.linalg.norm(spoilt - np.tile(WINDOWS, (10, 1, 1, 1)), axis=-1) > 0
+    assert off.any(axis=(1, 2)).mean() == pytest.approx(0.6, abs=0.1)
