@@ -92,7 +92,7 @@ class WebcamSettings:
     bodies: int = 1
     """most bodies to look for"""
     field_of_view: float = 1.05
-    """radians, of the image's width: scales how far away bodies seem"""
+    """radians, of the image's width, where the lens is not calibrated: scales how far away bodies seem"""
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,7 @@ def open_input(settings: InputSettings, clock: Clock, keys: Keys | None = None) 
         return MergeSource(settings.merge, keys)
     from nodes.webcam import WebcamSource
 
-    return WebcamSource(settings.webcam, clock)
+    return WebcamSource(settings.webcam, settings.calibration, clock)
 
 
 def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 from numpy.typing import NDArray
 
 from msgs.types import PoseRaw
 from nodes.adapters import from_mediapipe, pinhole
-from nodes.launch import LaunchError, WebcamSettings
+from nodes.launch import CalibrationSettings, LaunchError, WebcamSettings
 from nodes.live import CameraError, CameraSource, count_failure
 from nodes.runtime import Clock
 
@@ -31,16 +32,60 @@ Landmarker = Callable[[NDArray[Any], int], Any]
 """an RGB image (H, W, 3) and its milliseconds, which rise, to a ``PoseLandmarkerResult``"""
 
 
+class Lens:
+    """What takes a webcam's distortion out of its pictures, and their intrinsics then: as calibrated, or a guess.
+
+    Args:
+        size: width and height of the pictures.
+        field_of_view: radians; what is guessed from where nothing is calibrated.
+        told: the calibration; for pictures of another size it is scaled.
+
+    Raises:
+        LaunchError: it is of pictures of another shape.
+    """
+
+    def __init__(self, size: tuple[int, int], field_of_view: float, told: CalibrationSettings) -> None:
+        self.size = size
+        self.intrinsics = pinhole(size, field_of_view)
+        self._maps = None
+        if told.size:
+            scale = np.array(size) / told.size
+            if abs(scale[0] / scale[1] - 1.0) > 0.01:  # another part of the lens's view, and nobody says which
+                raise LaunchError(
+                    f"[input.calibration] size: the lens was calibrated for pictures of {told.size[0]} x "
+                    f"{told.size[1]}, the camera gives {size[0]} x {size[1]}; calibrate it with pictures of that size"
+                )
+            self.intrinsics[[0, 1], [0, 1]] = told.focal * scale
+            self.intrinsics[:2, 2] = (np.array(told.centre) + 0.5) * scale - 0.5
+            bent = np.array(told.distortion)
+            if bent.any():
+                self._maps = cv2.initUndistortRectifyMap(
+                    self.intrinsics, bent, np.eye(3), self.intrinsics, size, cv2.CV_16SC2
+                )
+
+    def straightened(self, image: NDArray[Any]) -> NDArray[Any]:
+        """A picture (H, W, 3) without distortion."""
+        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR) if self._maps else image
+
+
 class Webcam:
     """A webcam that is open, and the landmarker that looks at its pictures."""
 
-    def __init__(self, capture: cv2.VideoCapture, look: Landmarker, settings: WebcamSettings, clock: Clock) -> None:
+    def __init__(
+        self,
+        capture: cv2.VideoCapture,
+        look: Landmarker,
+        settings: WebcamSettings,
+        calibration: CalibrationSettings,
+        clock: Clock,
+    ) -> None:
         self.name = f"webcam-{settings.camera}"
         self.counts: Counter[str] = Counter()
-        self._capture, self._look, self._settings, self._clock = capture, look, settings, clock
+        self._capture, self._look, self._clock = capture, look, clock
+        self._settings, self._calibration = settings, calibration
 
     def frames(self) -> Iterator[PoseRaw | None]:
-        started_ns = last_ms = None
+        started_ns = last_ms = lens = None
         while self._capture.grab():
             stamp_ns = self._clock.now_ns()  # the system tells no better: exposure and transfer have passed
             started_ns = stamp_ns if started_ns is None else started_ns
@@ -51,12 +96,13 @@ class Webcam:
                 continue
             now_ms = (stamp_ns - started_ns) // 1_000_000
             last_ms = now_ms if last_ms is None else max(now_ms, last_ms + 1)  # the landmarker wants them to rise
-            height, width = image.shape[:2]
-            intrinsics = pinhole((width, height), self._settings.field_of_view)
+            size = (image.shape[1], image.shape[0])
+            if lens is None or lens.size != size:
+                lens = Lens(size, self._settings.field_of_view, self._calibration)
             frame = None
             try:
-                result = self._look(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), last_ms)
-                frame = from_mediapipe(result, stamp_ns, (width, height), intrinsics, self.name)
+                result = self._look(cv2.cvtColor(lens.straightened(image), cv2.COLOR_BGR2RGB), last_ms)
+                frame = from_mediapipe(result, stamp_ns, size, lens.intrinsics, self.name)
             except (cv2.error, ValueError) as error:  # a picture of another kind, a result that is none
                 count_failure(self.counts, self.name, error)
             yield frame
@@ -103,6 +149,7 @@ class WebcamSource(CameraSource):
     def __init__(
         self,
         settings: WebcamSettings,
+        calibration: CalibrationSettings,
         clock: Clock,
         make_landmarker: Callable[[WebcamSettings], AbstractContextManager[Landmarker]] = landmarker,
     ) -> None:
@@ -119,7 +166,7 @@ class WebcamSource(CameraSource):
             )
         if make_landmarker is landmarker:
             require_mediapipe()
-        self._settings, self._make_landmarker = settings, make_landmarker
+        self._settings, self._calibration, self._make_landmarker = settings, calibration, make_landmarker
 
     @contextmanager
     def connect(self) -> Iterator[Webcam]:
@@ -129,7 +176,7 @@ class WebcamSource(CameraSource):
                 raise CameraError(f"camera {self._settings.camera} cannot be opened; `ls /dev/video*` lists them")
             capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest picture, not the oldest that waits
             with self._make_landmarker(self._settings) as look:
-                yield Webcam(capture, look, self._settings, self._clock)
+                yield Webcam(capture, look, self._settings, self._calibration, self._clock)
         finally:
             capture.release()
 

@@ -14,12 +14,13 @@ from conftest import VirtualClock
 
 from msgs.types import PoseRaw
 from nodes import webcam
-from nodes.launch import Launch, LaunchError, WebcamSettings
+from nodes.launch import CalibrationSettings, Launch, LaunchError, WebcamSettings
 from nodes.live import PAUSES_S
 from nodes.runtime import SystemClock
-from nodes.webcam import WebcamSource, require_mediapipe
+from nodes.webcam import Lens, WebcamSource, require_mediapipe
 
 SIZE = (320, 240)
+NOT_CALIBRATED = CalibrationSettings()
 FRAMES = 5
 
 
@@ -66,7 +67,7 @@ class Seen:
 
 def test_each_picture_gives_the_bodies_in_it(video: Path, model: str) -> None:
     seen = Seen()
-    source = WebcamSource(WebcamSettings(camera=3, model=model), SystemClock(), seen.landmarker)
+    source = WebcamSource(WebcamSettings(camera=3, model=model), NOT_CALIBRATED, SystemClock(), seen.landmarker)
     frames: list[PoseRaw] = []
     for frame in source.frames():
         if frame is None:
@@ -95,7 +96,7 @@ def test_a_picture_that_fails_is_counted_and_the_next_one_comes(video: Path, mod
                 cv2.cvtColor(image[:0], cv2.COLOR_BGR2RGB)  # nothing, where a picture is expected
             return found
 
-    source = WebcamSource(WebcamSettings(camera=3, model=model), SystemClock(), Stumbles().landmarker)
+    source = WebcamSource(WebcamSettings(camera=3, model=model), NOT_CALIBRATED, SystemClock(), Stumbles().landmarker)
     frames = source.frames()
     assert [next(frames) is not None for _ in range(FRAMES)] == [True, False, True, False, True]
     status = source.status()
@@ -103,8 +104,33 @@ def test_a_picture_that_fails_is_counted_and_the_next_one_comes(video: Path, mod
     assert not source.refused
 
 
+def test_a_lens_that_is_calibrated_is_used_for_pictures_of_any_size() -> None:
+    told = CalibrationSettings([640, 480], [500.0, 510.0], [330.0, 235.0], [-0.3, 0.1, 0.0, 0.0, 0.0])
+    guessed, lens, half = (
+        Lens(size, 1.05, calibration)
+        for size, calibration in (((640, 480), NOT_CALIBRATED), ((640, 480), told), ((320, 240), told))
+    )
+    assert guessed.intrinsics[0, 0] == pytest.approx(320 / np.tan(0.525))
+    points = np.array([[x, y, 2.0] for x in (-1.0, -0.3, 0.5, 1.0) for y in (-0.7, 0.1, 0.6)])
+    for one, size in ((lens, (640, 480)), (half, (320, 240))):
+        scale = size[0] / 640
+        matrix = np.array([[500.0, 0, 330.0], [0, 510.0, 235.0], [0, 0, 1]])
+        bent = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(told.distortion))[0].reshape(-1, 2)
+        straight = points @ one.intrinsics.T
+        straight = straight[:, :2] / straight[:, 2:]
+        for (x, y), expected in zip((bent + 0.5) * scale - 0.5, straight, strict=True):
+            picture = np.zeros((size[1], size[0], 3), np.float32)
+            cv2.circle(picture, (round(x), round(y)), 3, (1.0, 1.0, 1.0), -1)
+            shown = np.argwhere(one.straightened(picture)[..., 0] > 0.5)[:, ::-1].mean(axis=0)
+            np.testing.assert_allclose(shown, expected, atol=1.0)
+    image = np.zeros((480, 640, 3), np.uint8)
+    assert guessed.straightened(image) is image
+    with pytest.raises(LaunchError, match="for pictures of 640 x 480, the camera gives 1280 x 720; calibrate it"):
+        Lens((1280, 720), 1.05, told)
+
+
 def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str, clock: VirtualClock) -> None:
-    source = WebcamSource(WebcamSettings(camera=4, model=model), clock, Seen().landmarker)
+    source = WebcamSource(WebcamSettings(camera=4, model=model), NOT_CALIBRATED, clock, Seen().landmarker)
     frames = source.frames()
     for _ in range(30):
         assert next(frames) is None
@@ -124,13 +150,13 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
 )
 def test_settings_that_cannot_be_used_say_so(settings: WebcamSettings, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
-        WebcamSource(settings, SystemClock(), Seen().landmarker)
+        WebcamSource(settings, NOT_CALIBRATED, SystemClock(), Seen().landmarker)
 
 
 def test_without_mediapipe_it_says_what_to_install(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(webcam, "find_spec", lambda name: None)
     with pytest.raises(LaunchError, match="--extra webcam"):
-        WebcamSource(WebcamSettings(model=model), SystemClock())
+        WebcamSource(WebcamSettings(model=model), NOT_CALIBRATED, SystemClock())
 
 
 def test_the_launch_file_names_what_to_download() -> None:
