@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
+from numba import njit
 from numpy.typing import NDArray
 
 from prior.checkpoint import load_weights
-from prior.hmvae import HMVAE, HMVAEConfig, from_6d
+from prior.hmvae import HMVAE, HMVAEConfig
 from prior.hmvae_live import LiveHMVAE
 from prior.kinematics import heading, yaw_matrix
 from prior.window import Window
@@ -54,7 +54,6 @@ class Refine:
     def reset(self, slot: NDArray[np.bool_]) -> None:
         """Nothing is kept here."""
 
-    @torch.inference_mode()
     def update(self, window: Window) -> Window:
         """Write ``window.decoded`` for every body present, all of them in one batch."""
         slots = np.flatnonzero(window.present)
@@ -74,7 +73,34 @@ class Refine:
         for k in range(2):  # the first two columns of each rotation, as `to_6d`
             x[..., 3 * k : 3 * k + 3] = frames[..., k].swapaxes(0, 1)
             x[:, :, 0, 3 * k : 3 * k + 3] = root[..., k].swapaxes(0, 1)
-        decoded = from_6d(self._reconstruct(torch.from_numpy(x))[:, -kept:]).numpy().astype(np.float64)
+        decoded = rotations_of(self._reconstruct(x)[:, -kept:])
         decoded[:, :, 0] = back[:, None] @ decoded[:, :, 0]
         window.decoded[-kept:, slots] = decoded.swapaxes(0, 1)
         return window
+
+
+def rotations_of(x: NDArray[np.float32]) -> NDArray[np.float64]:
+    """As `prior.hmvae.from_6d`: (..., 6) to rotation matrices (..., 3, 3)."""
+    rotations = np.empty((*x.shape[:-1], 3, 3))
+    _rotations_of(np.ascontiguousarray(x).reshape(-1, 6), rotations.reshape(-1, 3, 3))
+    return rotations
+
+
+@njit("(f4[:,::1], f8[:,:,::1])", cache=True)
+def _rotations_of(x, rotations):
+    for k in range(len(x)):
+        r = rotations[k]
+        along = length = rest = 0.0
+        for i in range(3):
+            length += x[k, i] * x[k, i]
+        for i in range(3):
+            r[i, 0] = x[k, i] / max(np.sqrt(length), 1e-12)
+            along += r[i, 0] * x[k, 3 + i]
+        for i in range(3):
+            r[i, 1] = x[k, 3 + i] - along * r[i, 0]
+            rest += r[i, 1] * r[i, 1]
+        for i in range(3):
+            r[i, 1] /= max(np.sqrt(rest), 1e-12)
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            r[i, 2] = r[a, 0] * r[b, 1] - r[b, 0] * r[a, 1]

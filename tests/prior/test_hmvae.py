@@ -18,6 +18,7 @@ from prior.motion_windows import (
     yaw_rotation,
 )
 from prior.pose_solver import solve_rotations
+from prior.refine import rotations_of
 from prior.skeleton_conv import SkeletonConv
 from prior.skeletons import REST_OFFSETS
 from prior.train_hmvae import train_hmvae
@@ -33,7 +34,9 @@ def test_six_numbers_are_the_first_two_columns_and_back() -> None:
     rotations = random_rotations(5, 22)
     assert torch.equal(to_6d(rotations)[0, 0], torch.cat([rotations[0, 0, :, 0], rotations[0, 0, :, 1]]))
     assert torch.allclose(from_6d(to_6d(rotations)), rotations)
-    stretched = from_6d(to_6d(rotations) * 3 + 0.05)
+    x = to_6d(rotations) * 3 + 0.05
+    np.testing.assert_allclose(rotations_of(x.float().numpy()), from_6d(x).numpy(), atol=1e-5)
+    stretched = from_6d(x)
     assert torch.allclose(stretched.mT @ stretched, torch.eye(3, dtype=torch.float64).expand_as(stretched), atol=1e-9)
 
 
@@ -54,15 +57,17 @@ def test_the_papers_two_window_lengths_have_the_official_latents(config, local, 
 
 
 @pytest.mark.parametrize("config", [HMVAEConfig(), HMVAEConfig(64, 15, (2, 2, 2, 2), 12, 24)])
-def test_the_live_model_reconstructs_as_the_trained_one(config) -> None:
+@pytest.mark.parametrize("bodies", [1, 3])
+def test_the_live_model_reconstructs_as_the_trained_one(config, bodies) -> None:
     model = HMVAE(config).eval()
     for parameter in model.parameters():  # biases start at zero, where a slip in folding them would not show
         torch.nn.init.normal_(parameter, std=0.05)
-    x = torch.randn(3, config.window, 22, 6)
+    x = torch.randn(bodies, config.window, 22, 6)
     for module in model.modules():
         if isinstance(module, SkeletonConv):
             module.weight.data *= module.mask
-    assert torch.allclose(LiveHMVAE(model)(x), model.reconstruct(x), rtol=1e-4, atol=1e-4)
+    found = LiveHMVAE(model)(x.numpy())
+    np.testing.assert_allclose(found, model.reconstruct(x).detach().numpy(), rtol=1e-4, atol=1e-4)
 
 
 def test_a_window_that_the_strides_do_not_divide_is_refused() -> None:
