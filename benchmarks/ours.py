@@ -14,6 +14,7 @@ from msgs.types import Pose, PoseClean, PoseRaw, RawBody
 from prior.anomaly import ScoreSettings
 from prior.checkpoint import WEIGHTS
 from prior.correct import CorrectSettings
+from prior.denoise import DenoiseSettings
 from prior.fuse import FuseSettings
 from prior.impute import ImputeSettings
 from prior.pipeline import PriorPipeline, PriorSettings
@@ -29,7 +30,10 @@ def weight_sets(model: str) -> list[str]:
 
 OURS: Mapping[str, PriorSettings] = {
     "HM-VAE": PriorSettings(
-        score=ScoreSettings(enabled=False), impute=ImputeSettings(enabled=False), fuse=FuseSettings(enabled=False)
+        denoise=DenoiseSettings(enabled=False),
+        score=ScoreSettings(enabled=False),
+        impute=ImputeSettings(enabled=False),
+        fuse=FuseSettings(enabled=False),
     ),
     "steadypose": PriorSettings(),
     "steadypose, bias_sigma = 0.002": PriorSettings(bias_sigma=0.002),
