@@ -48,7 +48,7 @@ class PriorNode(Node):
         if not isinstance(message, PoseRaw):
             return
         if isinstance(self._pipeline, StreamBatch):
-            cleaned = self._pipeline.process_at(message, self.clock.now_ns())
+            cleaned = self._pipeline.process_at(message, self.clock.now_ns(), hurry=self.behind)
         else:
             cleaned = self._pipeline.process(message, hurry=self.behind)
         for clean in cleaned:

@@ -85,13 +85,16 @@ class StreamBatch(PriorPipeline):
         """How many there are now."""
         return len(self._streams)
 
-    def process_at(self, raw: PoseRaw, now_ns: int) -> list[PoseClean]:
+    def process_at(self, raw: PoseRaw, now_ns: int, *, hurry: bool = False) -> list[PoseClean]:
         """Take a message of any stream, and give the frames that are then complete, of all streams, oldest first.
 
         Args:
             raw: the message.
             now_ns: when it came, on the server's clock.
+            hurry: as of `PriorPipeline.process`.
         """
+        if self._impute:
+            self._impute.hurry = hurry
         silence_ns = round(self.settings.timeout * 1e9)
         cleaned: list[PoseClean] = []
         if self._done_ns is not None and now_ns - self._done_ns > silence_ns + 2 * PATIENCE_NS:

@@ -199,6 +199,15 @@ def test_nonsense_from_one_is_counted_and_the_others_go_on() -> None:
     assert batch.counters["sensor_pose_invalid"] == 10
 
 
+def test_a_server_that_falls_behind_imputes_without_the_climb() -> None:
+    batch = StreamBatch(PriorSettings(), streams=2)
+    for k, (now_ns, message) in enumerate(kiosk("hidden", 20)):
+        if k > 8:
+            message.bodies[0].positions[[18, 20]] = np.nan
+        batch.process_at(message, now_ns, hurry=k >= 15)
+    assert batch.counters == {"imputation_skipped": 5}
+
+
 @pytest.mark.parametrize("stamp_ns", [0, 1, 10_000_000, 20_000_000, PERIOD_NS, 7 * PERIOD_NS + 12_345_678])
 def test_an_aligned_grid_begins_at_the_first_multiple_in_reach(stamp_ns: int) -> None:
     resampler = Resampler(1, aligned=True)
