@@ -32,9 +32,11 @@ class MergeSource(LiveSource):
         self._addresses, self._keys = settings.cameras, keys
         self._merge = Merge()
         self._heard: Counter[str] = Counter()
+        self._lost: Counter[str] = Counter()
 
     def frames(self) -> Generator[PoseRaw | None, None, None]:
         with Subscriber(self._addresses, POSE_RAW, keys=self._keys, name="merge") as subscriber:
+            self._lost = subscriber.dropped
             while True:
                 received = subscriber.receive(TURN_S)
                 if received is None or not isinstance(received[1], PoseRaw):
@@ -46,4 +48,5 @@ class MergeSource(LiveSource):
 
     def status(self) -> dict[str, str]:
         heard = {f"camera.{name}": f"{count} messages" for name, count in sorted(self._heard.items())}
-        return {"camera": f"{len(heard)} of {len(self._addresses)} cameras heard"} | heard
+        lost = {f"dropped.lost {topic}": str(count) for topic, count in self._lost.items()}
+        return {"camera": f"{len(heard)} of {len(self._addresses)} cameras heard"} | heard | lost

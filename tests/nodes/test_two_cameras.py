@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from msgs.topics import POSE_RAW, POSE_WORLD
 from msgs.transport import Publisher, Subscriber
 from msgs.types import Pose, PoseRaw, PoseWorld, RawBody
-from nodes.launch import Launch, LaunchError
+from nodes.launch import Launch, LaunchError, MergeSettings
+from nodes.merge import MergeSource
 from nodes.pose_input import PoseInputNode
 from nodes.prior import PriorNode
 from nodes.trajectory import TrajectoryNode
@@ -97,6 +98,21 @@ def test_two_cameras_become_one_world(
     ids = [sorted(body.id for body in world.bodies) for world in worlds if world.bodies]
     assert ids[-1] == [1, 2]
     assert nodes[0].status()["camera"] == "2 of 2 cameras heard"
+
+
+def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path) -> None:
+    addresses = [f"ipc://{folder}/{name}" for name in PLACES]
+    source = MergeSource(MergeSettings(addresses), None)
+    frames, (first, *_, last) = source.frames(), filmed("left", range(0))
+    with Publisher(addresses[0]) as camera:
+        assert next(frames) is None
+        assert camera.wait_for_listeners({"merge"}, timeout_s=20)
+        camera.publish(POSE_RAW, first)
+        camera._sequence[POSE_RAW] += 3  # which nobody heard
+        camera.publish(POSE_RAW, last)
+        until(lambda: (next(frames), source._heard.total())[1] == 2)
+    assert source.status()["dropped.lost pose/raw"] == "3"
+    frames.close()
 
 
 @pytest.mark.parametrize("cameras", ["[]", '["tcp://127.0.0.1:7111"]', '["ipc:///a", "ipc:///a"]'])
