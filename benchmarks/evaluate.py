@@ -6,20 +6,20 @@ import importlib
 import time
 from pathlib import Path
 
-import torch
 from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks.bench import Bench, Result
 from benchmarks.protocols import PROTOCOLS
 from benchmarks.results import RESULTS, save, show
+from nodes.threads import one_thread
 
 
 def evaluate(protocol: str, *, quick: bool, mocap: Path | None, data: Path, out: Path | None) -> None:
     """Run one protocol, or all that can be run here; see ``steadypose evaluate --help``."""
     if protocol == "kinect_vicon" and mocap is None:
         raise FileNotFoundError("kinect_vicon: expected --mocap DIR, the folder that holds ui_prmd.npz")
-    torch.set_num_threads(1)
+    one_thread()
     console = Console()
     with Progress(console=console, transient=True) as progress:
         bench = Bench(quick=quick, mocap=mocap, data=data, progress=progress)

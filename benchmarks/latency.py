@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import tyro
 from numpy.typing import ArrayLike
 from rich.console import Console
@@ -34,6 +33,7 @@ from msgs.recording import RecordingReader, RecordingWriter
 from msgs.topics import POSE_RAW, POSE_WORLD
 from msgs.types import Diagnostics, PoseRaw, RawBody
 from nodes.runtime import FRAME_NS, Timeline
+from nodes.threads import one_thread
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings
 
@@ -166,7 +166,7 @@ def percentiles(values: ArrayLike) -> dict[str, float]:
 def main(args: Args) -> None:
     """Measure, print, write."""
     console = Console()
-    torch.set_num_threads(1)
+    one_thread()
     seconds = 10.0 if args.quick else args.seconds
     warm_up_s = 5.0
     with RecordingReader(args.recording) as reader:

@@ -16,7 +16,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import torch
 import tyro
 from rich.console import Console
 from rich.progress import Progress
@@ -29,6 +28,7 @@ from msgs.topics import POSE_RAW
 from msgs.types import PoseRaw
 from nodes.cleaning import clean_recording
 from nodes.runtime import FRAME_NS
+from nodes.threads import one_thread
 from prior.pipeline import PriorSettings
 from prior.streams import StreamBatch
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings
@@ -111,7 +111,7 @@ def clean_rate(recording: Path) -> dict[str, float]:
 def main(args: Args) -> None:
     """Measure, print, write."""
     console = Console()
-    torch.set_num_threads(1)
+    one_thread()
     periods = round((2.0 if args.quick else args.seconds) * 30)
     with RecordingReader(args.recording) as reader:
         frames = [m for _, _, m in islice(reader.messages([POSE_RAW]), 600) if isinstance(m, PoseRaw)]

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import tyro
 from numpy.typing import NDArray
 from rich.console import Console
@@ -29,6 +28,7 @@ from msgs.types import CONTACTS, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from nodes.cleaning import stream
 from nodes.npz import NpzCollector
 from nodes.pose_input import RecordingSource
+from nodes.threads import one_thread
 from prior.filters import FixedLagRTS
 from prior.kinematics import rigid_alignment
 from prior.pipeline import PriorPipeline, PriorSettings
@@ -252,7 +252,7 @@ def tune(
 def main(args: Args) -> None:
     """Run, measure, print, write."""
     console = Console()
-    torch.set_num_threads(1)
+    one_thread()
     paths = sorted(path.parent for path in args.streams.glob("*/metadata.yaml"))
     if not paths:
         raise SystemExit(f"{args.streams}: expected folders with recordings, found none")

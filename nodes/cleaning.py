@@ -95,12 +95,11 @@ def clean_recording(
         raise LaunchError(f"{out} exists: expected a new directory to write the recording to")
     frames = open_source(source)
     # these bring torch, which takes seconds: not before it is known that there is something to do
-    import torch
-
     from nodes.prior import make_prior
+    from nodes.threads import one_thread
     from nodes.trajectory import make_trajectory
 
-    torch.set_num_threads(1)  # the models are too small to gain from more
+    one_thread()
     prior, trajectory = make_prior(settings["prior"]), make_trajectory(settings["trajectory"])
     began(len(frames))
     collector = NpzCollector()

@@ -259,23 +259,19 @@ def check_models() -> Iterator[Finding]:
 def _self_test() -> Finding:
     """A body that stands for a hundred frames, through the prior."""
     import numpy as np
-    import torch
 
+    from nodes.threads import one_thread
     from prior.pipeline import PriorPipeline, PriorSettings
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        pipeline = PriorPipeline(PriorSettings())
-        spent_ms, bodies = [], []
-        for frame in range(FRAMES):
-            raw = _standing(frame)
-            started = time.perf_counter()
-            for clean in pipeline.process(raw):
-                bodies += clean.bodies
-            spent_ms.append((time.perf_counter() - started) * 1e3)
-    finally:
-        torch.set_num_threads(threads)
+    one_thread()
+    pipeline = PriorPipeline(PriorSettings())
+    spent_ms, bodies = [], []
+    for frame in range(FRAMES):
+        raw = _standing(frame)
+        started = time.perf_counter()
+        for clean in pipeline.process(raw):
+            bodies += clean.bodies
+        spent_ms.append((time.perf_counter() - started) * 1e3)
     p50, p99 = np.percentile(spent_ms[WARM_UP:], (50, 99))
     found = f"{p50:.1f} ms a frame, p99 {p99:.1f} ms, of {BUDGET_MS:.0f}"
     if not bodies or not all(np.isfinite(body.positions).all() for body in bodies):

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-
 from msgs.topics import POSE_CLEAN
 from msgs.types import Message, PoseRaw
 from nodes.launch import Launch, LaunchError
 from nodes.runtime import FRAME_NS, Clock, Node
+from nodes.threads import one_thread
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.streams import StreamBatch
 
@@ -38,8 +37,7 @@ class PriorNode(Node):
 
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
-        # two threads that share the cores with other nodes wait for each other: a p99 of 100 ms
-        torch.set_num_threads(1)
+        one_thread()
         self._pipeline = make_prior(launch.prior, len(launch.server.kiosks))
         self._bodies = 0
         self._anomalies = 0

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-
 from msgs.topics import POSE_WORLD
 from msgs.types import Message, PoseClean
 from nodes.launch import Launch, LaunchError
 from nodes.runtime import FRAME_NS, Clock, Node
+from nodes.threads import one_thread
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings
 
 
@@ -33,7 +32,7 @@ class TrajectoryNode(Node):
 
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
-        torch.set_num_threads(1)  # as in the prior node
+        one_thread()
         self._pipeline = make_trajectory(launch.trajectory)
         self._of_kiosks: dict[str, TrajectoryPipeline] = {}
         self._delay_frames = 0
