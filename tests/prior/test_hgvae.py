@@ -8,12 +8,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from prior.anomaly import load_fault_net
 from prior.body_tracks import from_tracks, hang_unseen, in_frame_of, to_tracks
 from prior.checkpoint import WEIGHTS, load_weights
 from prior.hgvae import HGVAE, Gaussian, GraphBlock, GraphLinear, HGVAEConfig, Level, dct_matrix
 from prior.hgvae_live import LiveHGVAE
 from prior.skeletons import J
-from prior.train_hgvae import add_noise, occlude, spoil, train_hgvae
+from prior.train_hgvae import train_hgvae
 from tests.prior.bodies import waving
 from tests.prior.test_hmvae import prepared
 
@@ -192,29 +193,18 @@ def test_the_gradient_of_the_live_score_is_that_of_its_differences() -> None:
         assert gradient[k] == pytest.approx(found, rel=0.02, abs=0.1)
 
 
-def test_what_a_camera_does_to_windows_leaves_the_truth_alone() -> None:
-    rng = np.random.default_rng(0)
-    windows = np.stack([waving(50)] * 40)
-    kept = windows.copy()
-    hidden = np.isnan(occlude(windows, rng)[..., 0])
-    assert 0.1 < hidden.mean() < 0.7
-    assert hidden[:, -1].any()
-    spoilt = np.linalg.norm(spoil(windows, rng) - windows, axis=-1) > 0
-    assert 0.2 < spoilt.any(axis=(1, 2)).mean() < 0.8
-    assert (np.linalg.norm(add_noise(windows, rng) - windows, axis=-1) > 0).all()
-    np.testing.assert_array_equal(windows, kept)
-
-
 def test_training_writes_weights_their_card_and_their_scale(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("prior.checkpoint.WEIGHTS", tmp_path / "weights")
     config = replace(SMALL, frames=20)
     monkeypatch.setattr("prior.train_hgvae.MODELS", {"hgvae": config})
     monkeypatch.setattr("prior.train_anomaly.WINDOWS", 16)
+    monkeypatch.setattr("prior.train_anomaly.STEPS", 2)
     path = train_hgvae(prepared(tmp_path / "m.npz"), tmp_path / "runs", iterations=2, batch=4)
     state, stored = load_weights(str(path), "hgvae")
     HGVAE(HGVAEConfig.from_dict(stored)).load_state_dict(state)
     assert HGVAEConfig.from_dict(stored) == config
     assert json.loads(path.with_suffix(".anomaly.json").read_text())["quantiles"]
+    assert load_fault_net(str(path)).config.frames == 20
     assert "steadypose train hgvae" in path.with_suffix(".md").read_text()
 
 
