@@ -137,6 +137,7 @@ class LiveHGVAE:
     Attributes:
         frames: T, of a window.
         latents: how many numbers all latents of a window are.
+        elsewhere: the row in which `decode` leaves the window that it decoded last.
     """
 
     def __init__(self, model: HGVAE, sensor_sigma: float, most: int) -> None:
@@ -153,7 +154,7 @@ class LiveHGVAE:
             graph = p.layer(graph, up)
             p.block(graph, block, onto=graph)
             seen.append(p.linear(graph, level.join.weight.T[features:], level.join.bias))
-        encoder_steps = len(p.steps)
+        encoder_steps, encoder_matrices = len(p.steps), len(p.shapes)
         stream = p.linear(p.matrix(1, 1), torch.zeros(1, features), model.start, torch.zeros(JOINT_NODES, 1))
         self._moves, self._terms = [], []
         nothing = torch.zeros(1)
@@ -193,10 +194,11 @@ class LiveHGVAE:
         self._term_places = self._starts[self._terms]
         self._weights = _zeros(sum(map(len, p.weights)))
         np.concatenate(p.weights, out=self._weights)
-        self._values, self._gradients = _zeros(most, self._starts[-1]), _zeros(self._starts[-1])
+        self.elsewhere, self._encoded = most, self._starts[encoder_matrices]
+        self._values, self._gradients = _zeros(most + 1, self._starts[-1]), _zeros(self._starts[-1])
         self._scratch = _zeros(3, -(-self._shapes.max(axis=0).prod() // _LINE) * _LINE)
         self._sensor_variance = np.float32((sensor_sigma / SCALE) ** 2)
-        self._trust = np.zeros((most, JOINT_NODES, config.frames), dtype=np.float32)
+        self._trust = np.zeros((most + 1, JOINT_NODES, config.frames), dtype=np.float32)
         self.latents = int(sizes[self._moves].sum())
 
     def look(self, x: NDArray[np.float64], observed: NDArray[np.float64]) -> Look:
@@ -218,8 +220,10 @@ class LiveHGVAE:
         return self._decode(rows)
 
     def decode(self, row: int, moved: NDArray[np.float64]) -> Look:
-        """Decode a window anew, its latents (n,) moved from where the encoder puts them."""
-        rows, begin = slice(row, row + 1), 0
+        """Decode a window anew in the row `elsewhere`, its latents (n,) moved from where the encoder puts them."""
+        rows, begin = slice(self.elsewhere, self.elsewhere + 1), 0
+        self._values[rows, : self._encoded] = self._values[row, : self._encoded]
+        self._trust[rows] = self._trust[row]
         for number in self._moves:
             matrix = self._matrix(number, rows)
             matrix[:] = moved[begin : begin + matrix.size].reshape(matrix.shape)

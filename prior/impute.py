@@ -81,14 +81,15 @@ class Climb:
             return best._replace(mean=best.mean + self._gained)
         best_score = model.score(row)
         for step in range(steps):
+            at = row
             if step or self._moved.any():
-                look, score = model.decode(row, self._moved), model.score(row)
+                at = model.elsewhere
+                look, score = model.decode(row, self._moved), model.score(at)
                 if score > best_score:
                     best, best_at, best_score = look, self._moved, score
                 elif step == 0:  # where the climb had come to is worth less than a new start
-                    self._moved = best_at
-                    model.decode(row, self._moved)
-            self._climb(model.gradient(row))
+                    self._moved, at = best_at, row
+            self._climb(model.gradient(at))
         self._gained = best.mean - start.mean
         return best
 

@@ -180,14 +180,14 @@ def test_the_gradient_of_the_live_score_is_that_of_its_differences() -> None:
     live.look(rng.normal(scale=0.2, size=(2, 66, 12)), trust)
     at = rng.normal(scale=0.1, size=live.latents)
     live.decode(1, at)
-    gradient = live.gradient(1)
+    gradient = live.gradient(live.elsewhere)
     for k in rng.choice(live.latents, 12, replace=False):
         step = np.zeros(live.latents)
         step[k] = 1e-2
         scores = []
         for end in (at + step, at - step):
             live.decode(1, end)
-            scores.append(live.score(1))
+            scores.append(live.score(live.elsewhere))
         found = (scores[0] - scores[1]) / 2e-2
         # scores of thousands in single precision: differences are good to a few hundredths
         assert gradient[k] == pytest.approx(found, rel=0.02, abs=0.1)
