@@ -57,7 +57,7 @@ class Denoise:
         self._found[:-1], self._found[-1] = self._found[1:], np.nan
         if window.encoded is not None:
             slots, tracks, _, size, look, _ = window.encoded
-            latest = from_tracks(look.mean, tracks, size)[:, -self.delay_frames - 1 :].swapaxes(0, 1)
+            latest = from_tracks(look.mean[..., -self.delay_frames - 1 :], tracks, size).swapaxes(0, 1)
             before = self._found[:, slots]
             self._found[:, slots] = np.where(np.isnan(before), latest, before + RENEWAL * (latest - before))
         if window.smoothed is not None:
