@@ -1,12 +1,13 @@
 """A folder of recordings, cleaned many at once: on the cores at hand, or on a Ray cluster.
 
 A manifest in the output folder has a line for each recording that was tried, written when it is done. What it says
-is done is not done again, unless the recording or the settings have changed: so a run that was stopped goes on where
-it was, and one with new recordings does these.
+is done is not done again, unless the recording, the settings or the models have changed: so a run that was stopped goes
+on where it was, and one with new recordings does these.
 """
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 import multiprocessing
@@ -149,7 +150,7 @@ class Manifest:
 
     def __init__(self, out: Path, folder: Path, settings: Settings) -> None:
         self.path = out / MANIFEST
-        self._out, self._folder, self._settings = out, folder, settings
+        self._out, self._folder, self._settings, self._models = out, folder, settings, _models()
         self._known: dict[str, dict[str, Any]] = {}
         if self.path.exists():
             text = self.path.read_text(encoding="utf-8", errors="replace")
@@ -178,7 +179,7 @@ class Manifest:
             file.write(json.dumps(entry) + "\n")
 
     def _signature(self, job: Job) -> dict[str, Any]:
-        """What a result belongs to: the recording, by size and time of change, and the settings."""
+        """What a result belongs to: the recording, by size and time of change, the settings, and the models."""
         files = sorted(job.source.rglob("*")) if job.source.is_dir() else [job.source]
         status = [file.stat() for file in files if file.exists()]
         return {
@@ -186,8 +187,17 @@ class Manifest:
             "bytes": sum(s.st_size for s in status),
             "changed_ns": max((s.st_mtime_ns for s in status), default=0),
             "settings": json.loads(json.dumps(self._settings)),
+            "models": self._models,
             "output": str(job.out.relative_to(self._out)),
         }
+
+
+def _models() -> str:
+    """What tells the weights that ship from those of another release."""
+    from prior import checkpoint  # brings torch
+
+    files = sorted(file for file in checkpoint.WEIGHTS.iterdir() if file.suffix in (".safetensors", ".json"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 
 def work(job: Job, settings: Settings) -> dict[str, Any]:

@@ -92,7 +92,9 @@ def test_processes_clean_a_folder(tmp_path: Path, options: tuple[str, ...], sett
             np.testing.assert_array_equal(many[name], alone[name])
 
 
-def test_what_is_done_is_not_done_again(tmp_path: Path, options: tuple[str, ...], here: list[Job]) -> None:
+def test_what_is_done_is_not_done_again(
+    tmp_path: Path, options: tuple[str, ...], here: list[Job], monkeypatch: pytest.MonkeyPatch
+) -> None:
     source, out = a_folder(tmp_path / "in"), tmp_path / "out"
     assert clean(source, out, settings=options) == 1
     assert len(here) == 4
@@ -107,6 +109,10 @@ def test_what_is_done_is_not_done_again(tmp_path: Path, options: tuple[str, ...]
     assert not here
     assert clean(source, out, settings=(*options, "bones.enabled=false")) == 0
     assert len(here) == 4, "other settings, other results"
+    here.clear()
+    monkeypatch.setattr(batch, "_models", lambda: "of another release")
+    assert clean(source, out, settings=(*options, "bones.enabled=false")) == 0
+    assert len(here) == 4, "other models, other results"
 
 
 def test_the_last_line_cut_short_does_not_spoil_the_next(tmp_path: Path, options, here: list[Job]) -> None:
