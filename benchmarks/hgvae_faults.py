@@ -14,6 +14,7 @@ Floats = NDArray[np.float64]
 Fault = Callable[[Floats, np.random.Generator], tuple[Floats, NDArray[np.bool_]]]
 """From clean windows (B, T, 22, 3) to spoilt ones, and which of them (B,) hold the fault at all."""
 
+HELD = "a joint frozen"
 BEGINS = 20
 """Frame in which a fault begins that lasts to the window's end."""
 LEAST_MOTION = 0.10
@@ -44,11 +45,16 @@ def exchanged(windows: Floats, rng: np.random.Generator, limb: list[int]) -> tup
 
 def frozen(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
     """One of the joints that move stays where it was in the frame before `BEGINS`."""
-    out = windows.copy()
+    return held(windows, windows, rng)
+
+
+def held(seen: Floats, windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
+    """The same of what a sensor saw of ``windows``: of one joint that moves, it repeats its last answer."""
+    out = seen.copy()
     moved = np.linalg.norm(windows[:, BEGINS:] - windows[:, BEGINS - 1 : BEGINS], axis=-1)[..., _MOVERS].max(axis=1)
     for k, by in enumerate(moved):
         joint = _MOVERS[rng.choice(np.flatnonzero(by > LEAST_MOTION))] if (by > LEAST_MOTION).any() else _MOVERS[0]
-        out[k, BEGINS:, joint] = windows[k, BEGINS - 1, joint]
+        out[k, BEGINS:, joint] = seen[k, BEGINS - 1, joint]
     return out, (moved > LEAST_MOTION).any(axis=1)
 
 
@@ -94,7 +100,8 @@ FAULTS: Mapping[str, Fault] = {
     **{f"noise of {s} cm": partial(noise, sigma=s / 100) for s in (1, 2, 4, 8)},
     "arms exchanged": partial(exchanged, limb=_ARMS),
     "legs exchanged": partial(exchanged, limb=_LEGS),
-    "a joint frozen": frozen,
+    HELD: frozen,  # the protocol repeats what was seen, its noise and all
+    "a joint at rest that should move": frozen,
     "left taken for right": relabelled,
     "another skeleton": other_skeleton,
     "another person's arm": other_persons_limb,

@@ -41,11 +41,12 @@ def add_noise(positions: Floats, rng: Rng) -> Floats:
     return positions + fast * rng.standard_normal((count, frames, joints, 3)) + bias
 
 
-def sensed(positions: Floats, sigma: Floats | float, rng: Rng) -> Floats:
-    """Windows (B, T, 22, 3) as a sensor of error ``sigma`` (metres along an axis) sees them; half of it is slow."""
+def sensed(positions: Floats, sigma: Floats | float, rng: Rng, fast: Floats | float = 0.5) -> Floats:
+    """Windows (B, T, 22, 3) as a sensor of error ``sigma`` (metres along an axis) sees them; of its variance, ``fast``
+    is noise from frame to frame, the rest lasts."""
     count, _, joints, _ = positions.shape
-    slow = rng.standard_normal((count, 1, joints, 3))
-    return positions + sigma * np.sqrt(0.5) * (slow + rng.standard_normal(positions.shape))
+    slow = np.sqrt(1.0 - fast) * rng.standard_normal((count, 1, joints, 3))
+    return positions + sigma * (slow + np.sqrt(fast) * rng.standard_normal(positions.shape))
 
 
 def spoil(clean: Floats, faults: Sequence[Fault], share: float, rng: Rng) -> Floats:
@@ -70,6 +71,11 @@ def stands_still(window: Floats, part: slice, joints: list[int], other: Floats, 
         window[part, joints] = before[joints]
     else:  # beside the pelvis
         window[part, joints] = before[joints] - before[0] + window[part, :1]
+
+
+def repeats(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
+    """A tracker's last answer for some limbs, its noise and all."""
+    window[part, joints] = window[part.start - 1, joints]
 
 
 def exchanged(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:

@@ -17,8 +17,14 @@ from torch.nn import functional as F
 
 from prior.hgvae import JOINT_NODES, SCALE, GraphBlock, GraphLinear
 
+RECENT = 15
+"""Frames that are scored: what is wrong now must not be watered down by what was right."""
+
 OFF_SCALE = 0.02
 """Metres: how far a joint is off HG-VAE's opinion is told in these, large values by their logarithm."""
+
+ROUGH_SCALE = 0.003
+"""Metres: how rough a track is, is told in these, by its logarithm."""
 
 SENSOR_SCALE = 0.01
 """Metres, of the sensor's error, told by its logarithm."""
@@ -49,7 +55,7 @@ class FaultNet(nn.Module):
         super().__init__()
         self.config = config
         self.register_buffer("mean", torch.zeros(JOINT_NODES))
-        self.read = GraphLinear(JOINT_NODES, JOINT_NODES, 4 * config.frames + 1, config.features)
+        self.read = GraphLinear(JOINT_NODES, JOINT_NODES, 4 * config.frames + 2, config.features)
         self.blocks = nn.Sequential(*(GraphBlock(JOINT_NODES, config.features) for _ in range(2)))
         self.write = GraphLinear(JOINT_NODES, JOINT_NODES // 3, config.features, 1)
 
@@ -71,6 +77,15 @@ class FaultNet(nn.Module):
             torch.asinh((seen - found) / OFF_SCALE),
             (sigma / OFF_SCALE).log(),
             observed,
+            _roughness(seen, observed),
             (sensor_sigma / SENSOR_SCALE).log()[:, None, None].expand(-1, JOINT_NODES, 1),
         ]
         return self.write(self.blocks(F.gelu(self.read(torch.cat(told, dim=-1).transpose(0, 1)))))[..., 0].T
+
+
+def _roughness(seen: Tensor, observed: Tensor) -> Tensor:
+    """(B, 66, 1) how much tracks (B, 66, T) shake, where observed: a tracker that holds its last answer does not."""
+    shown = observed[..., 2:] * observed[..., 1:-1] * observed[..., :-2]
+    shaken = (seen.diff(n=2, dim=-1).square() * shown)[..., -RECENT:].sum(dim=-1, keepdim=True)
+    mean = shaken / shown[..., -RECENT:].sum(dim=-1, keepdim=True).clamp(min=1.0)
+    return 0.5 * (mean / ROUGH_SCALE**2 + 1e-3).log()

@@ -15,7 +15,7 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
-from prior.anomaly import MISSING, RATES, RECENT, SENSOR_SIGMAS, Calibration, joint_odds
+from prior.anomaly import LEAST_NOISE, MISSING, RATES, SENSOR_SIGMAS, STUCK_ODDS, Calibration, joint_odds, stuck
 from prior.body_tracks import to_tracks
 from prior.checkpoint import load_weights, save_weights
 from prior.corruption import (
@@ -26,6 +26,7 @@ from prior.corruption import (
     noisy,
     occlude,
     other_bones,
+    repeats,
     sensed,
     sides_exchanged,
     somebody_elses,
@@ -33,7 +34,7 @@ from prior.corruption import (
     stands_still,
 )
 from prior.distributed import share
-from prior.fault_net import FaultNet, FaultNetConfig
+from prior.fault_net import RECENT, FaultNet, FaultNetConfig
 from prior.hgvae import HGVAE, SCALE, HGVAEConfig
 from prior.motion_windows import MotionSet
 from prior.track_windows import STRIDES, Windows, standardise
@@ -47,7 +48,7 @@ HELD_BACK = "s08"
 WINDOWS = 2000
 """for each error and number of joints missing"""
 
-STEPS, BATCH = 4_000, 64
+STEPS, BATCH = 3_000, 64
 """of the fault network's optimiser, and windows in each"""
 
 LEAST_FAULT = 0.015
@@ -57,6 +58,8 @@ no fault worth the name, and one less off than a fifth of it is none."""
 FAULTS = (stands_still, exchanged, sides_exchanged, elsewhere, somebody_elses, other_bones, noisy, jumps)
 SPOILT = 0.6
 """share of the windows that has a fault"""
+REPEATED = 0.15
+"""share of the windows in which a tracker repeats its last answer for some joints"""
 
 
 def train_anomaly(data: Path, runs: Path, weights: str, path: Path, seed: int = 0) -> None:
@@ -126,19 +129,22 @@ def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np
     clean, sizes = windows.draw(count, model.config.frames, rng, STRIDES)
     sigma = np.exp(rng.uniform(np.log(SENSOR_SIGMAS[0]), np.log(SENSOR_SIGMAS[-1]), count))
     spoilt = spoil(clean, FAULTS, SPOILT, rng)
-    seen = sensed(spoilt, sigma[:, None, None, None], rng)
+    fast = rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.8)  # some sensors smooth what they say
+    answered = sensed(spoilt, sigma[:, None, None, None], rng, fast[:, None, None, None])
+    seen = spoil(answered, (repeats,), REPEATED, rng)
+    astray = np.sqrt(((spoilt - clean + seen - answered)[:, -RECENT:] ** 2).mean(axis=(1, 3)))
+    repeated = (seen != answered)[:, -RECENT:].any(axis=-1).mean(axis=1)
+    stuck = (repeated > 0.5) & (sigma * np.sqrt(fast) > LEAST_NOISE)[:, None]
     lacking = rng.random(count)
     for k in np.flatnonzero(lacking < 0.7):
-        alone = seen[k : k + 1]
-        alone[:] = (
-            hide_joints(alone, int(rng.integers(1, MISSING[-1])), rng) if lacking[k] < 0.4 else occlude(alone, rng)
-        )
-    off = np.sqrt(((spoilt - clean)[:, -RECENT:] ** 2).mean(axis=(1, 3)))
+        alone, few = seen[k : k + 1], lacking[k] < 0.4
+        alone[:] = hide_joints(alone, int(rng.integers(1, MISSING[-1])), rng) if few else occlude(alone, rng)
     limit = np.maximum(LEAST_FAULT, sigma)[:, None]
     shown = np.isfinite(seen[:, -RECENT:, :, 0]).any(axis=1)
-    clear = torch.from_numpy(shown & ((off > limit) | (off < 0.2 * limit))).float()
+    off = (astray > limit) | stuck
+    clear = torch.from_numpy(shown & (off | (astray < 0.2 * limit) & (repeated == 0))).float()
     logits = network(*_look(model, seen, sizes), torch.from_numpy(sigma).float())
-    faulty = torch.from_numpy(off > limit).float()
+    faulty = torch.from_numpy(off).float()
     return (F.binary_cross_entropy_with_logits(logits, faulty, reduction="none") * clear).sum() / clear.sum()
 
 
@@ -156,7 +162,8 @@ def _look(model: HGVAE, seen: Floats, sizes: Floats) -> tuple[Tensor, Tensor, Te
 def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Floats:
     """(B, 22) `joint_odds` of windows (B, T, 22, 3) of bodies of sizes (B,)."""
     parts = [slice(start, start + 256) for start in range(0, len(seen), 256)]
-    return np.concatenate([joint_odds(network, *_look(model, seen[p], sizes[p]), sensor_sigma) for p in parts])
+    odds = np.concatenate([joint_odds(network, *_look(model, seen[p], sizes[p]), sensor_sigma) for p in parts])
+    return np.where(stuck(seen), np.maximum(odds, STUCK_ODDS), odds)
 
 
 # ---------------------------------------------------------------------------------------------------------------

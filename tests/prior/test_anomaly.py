@@ -7,7 +7,6 @@ import torch
 from prior.anomaly import (
     MISSING,
     RATES,
-    RECENT,
     SENSOR_SIGMAS,
     Calibration,
     Score,
@@ -15,8 +14,10 @@ from prior.anomaly import (
     decimals,
     joint_odds,
     load_fault_net,
+    stuck,
 )  # fmt: skip
-from prior.fault_net import FaultNet, FaultNetConfig
+from prior.fault_net import RECENT, FaultNet, FaultNetConfig
+from prior.fault_net_live import LiveFaultNet
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.skeletons import MIRROR, PARENTS, J
 from prior.window import Window
@@ -29,6 +30,21 @@ SCALE = Calibration(np.broadcast_to(HEIGHTS, (len(MISSING), len(SENSOR_SIGMAS), 
 def scored(positions: np.ndarray, **settings) -> list:
     pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0, **settings}))
     return [c.bodies[0] for m in stream(positions) for c in pipeline.process(m)]
+
+
+def test_the_live_fault_network_is_the_trained_one() -> None:
+    torch.manual_seed(0)
+    network = FaultNet(FaultNetConfig(frames=20, features=8)).eval()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    rng = np.random.default_rng(0)
+    x, found = rng.normal(scale=0.5, size=(2, 3, 66, 20))
+    observed, sigma = (rng.random((3, 66, 20)) < 0.7).astype(float), rng.uniform(0.005, 0.1, (3, 66, 20))
+    parts = (torch.from_numpy(part).float() for part in (x, found, sigma, observed))
+    with torch.inference_mode():
+        odds = network(*parts, torch.full((3,), 0.02)).numpy()
+    x[observed == 0] = np.nan
+    np.testing.assert_allclose(LiveFaultNet(network, 0.02, 4)(x, found, sigma, observed), odds, atol=1e-4)
 
 
 def test_what_was_not_observed_is_not_read_and_a_joint_not_seen_of_late_has_no_odds() -> None:
@@ -64,16 +80,30 @@ def test_between_measured_sensors_the_scale_is_between_theirs() -> None:
     np.testing.assert_allclose(middle.quantiles, 0.5)
 
 
-def test_the_weights_that_ship_find_the_wrist_that_stands_still() -> None:
-    """What a hand at rest and a frozen one have in common is all that one joint shows: the others tell."""
+def test_the_weights_that_ship_find_the_wrist_of_which_the_last_answer_is_repeated() -> None:
     assert load_fault_net("default").config.frames == 50
     moving = waving(90, speed=2.0)
+    moving += np.random.default_rng(0).normal(0.0, 0.005, moving.shape)
     frozen = moving.copy()
     frozen[60:, J["left_wrist"]] = moving[59, J["left_wrist"]]
     gate_off = {"gate": {"enabled": False}, "bones": {"enabled": False}}
     clean, spoilt = scored(moving, **gate_off)[-1], scored(frozen, **gate_off)[-1]
     assert spoilt.anomaly > clean.anomaly + 1
     assert np.nanargmax(spoilt.joint_anomaly) == J["left_wrist"]
+
+
+def test_a_joint_is_stuck_that_repeats_itself_while_others_shake() -> None:
+    rng = np.random.default_rng(0)
+    seen = np.stack([waving(50)] * 3)
+    seen[:2] += rng.normal(0.0, 0.005, seen[:2].shape)
+    seen[:, -RECENT:, J["left_wrist"]] = seen[:, -RECENT - 1, None, J["left_wrist"]]
+    seen[1, :, J["neck"]] = np.nan
+    found = stuck(seen)
+    assert np.flatnonzero(found[0]).tolist() == [J["left_wrist"]]
+    assert np.flatnonzero(found[1]).tolist() == [J["left_wrist"]]
+    assert not found[2].any()  # without noise, it may be at rest
+    seen[0, -RECENT + 5 :, J["left_wrist"]] += rng.random((RECENT - 5, 3))
+    assert not stuck(seen)[0].any()
 
 
 def test_clean_motion_is_no_anomaly_and_frames_are_scored_alike_twice() -> None:
@@ -103,7 +133,7 @@ def test_a_flag_is_held_until_it_has_been_quiet_for_a_while() -> None:
     window = Window(4, 1)
     told = iter([0.0, 2.5, 1.5, 0.9, 0.9, 0.9, 0.9, 2.5])
     window.encoded = SimpleNamespace(slots=np.array([0]))  # type: ignore[assignment]
-    stage._score = lambda _: (np.array([next(told)]), np.zeros((1, 22)))  # type: ignore[method-assign]
+    stage._score = lambda *_: (np.array([next(told)]), np.zeros((1, 22)))  # type: ignore[method-assign]
     flags = [bool(stage.update(window).anomaly_flag[0]) for _ in range(8)]
     assert flags == [False, True, True, True, True, False, False, True]
 
