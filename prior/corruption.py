@@ -60,7 +60,7 @@ def spoil(clean: Floats, faults: Sequence[Fault], share: float, rng: Rng) -> Flo
         start = frames - length if rng.random() < 0.6 else int(rng.integers(1, frames - length + 1))
         joints = _LIMBS[rng.integers(len(_LIMBS))] if rng.random() < 0.6 else [int(rng.integers(1, len(PARENTS)))]
         other = clean[rng.integers(len(clean))]
-        faults[rng.integers(len(faults))](window, slice(start, start + length), joints, other, rng)
+        faults[int(rng.integers(len(faults)))](window, slice(start, start + length), joints, other, rng)
     return spoilt
 
 
