@@ -336,7 +336,7 @@ def _actions(bench: Bench, data: _Data) -> Result:
         for name in counts
     }
     names = sorted(sorted((n for n in counts if n and not n.startswith("m")), key=lambda n: -frames[n])[:10])
-    steps = 2 if bench.quick else 800
+    steps = 2 if bench.quick else 3_000
     windows = models.ActionWindows(motion, names)
     bench.progress.stop()
     model = models.train(models.with_actions(len(names)), windows, data.runs(bench) / "actions", steps)
