@@ -59,7 +59,10 @@ class Denoise:
             slots, tracks, _, size, look, _ = window.encoded
             latest = from_tracks(look.mean[..., -self.delay_frames - 1 :], tracks, size).swapaxes(0, 1)
             before = self._found[:, slots]
-            self._found[:, slots] = np.where(np.isnan(before), latest, before + RENEWAL * (latest - before))
+            renewed = np.where(np.isnan(before), latest, before + RENEWAL * (latest - before))
+            # a window that ends in the dark tells less of what went before than the last one that did not
+            seen = np.isfinite(window.positions.newest[slots, :, 0]).any(axis=1)
+            self._found[:, slots] = np.where(seen[:, None, None], renewed, before)
         if window.smoothed is not None:
             window.smoothed = self.denoised(window, window.smoothed, self.delay_frames)
         return window
