@@ -53,6 +53,9 @@ def curves(
         axis.set(xlabel=label, ylabel=text)
         if log:
             axis.set(xscale="log", yscale="log")
+            measured = sorted({r[x] for r in records if r.get(x) is not None})
+            axis.set_xticks(measured, [f"{value:g}" for value in measured])
+            axis.set_xticks([], minor=True)
         axis.grid(alpha=0.3, which="both")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", fontsize=8, frameon=False)
