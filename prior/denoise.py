@@ -61,7 +61,7 @@ class Denoise:
             before = self._found[:, slots]
             renewed = np.where(np.isnan(before), latest, before + RENEWAL * (latest - before))
             # a window that ends in the dark tells less of what went before than the last one that did not
-            seen = np.isfinite(window.positions.newest[slots, :, 0]).any(axis=1)
+            seen = np.asarray(np.isfinite(window.positions.newest[slots, :, 0]).any(axis=1))
             self._found[:, slots] = np.where(seen[:, None, None], renewed, before)
         if window.smoothed is not None:
             window.smoothed = self.denoised(window, window.smoothed, self.delay_frames)
