@@ -14,9 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from prior.checkpoint import load_weights, weights_path
 from prior.encode import Encoded
@@ -103,19 +101,6 @@ def load_fault_net(weights: str) -> FaultNet:
     return network.eval()
 
 
-@torch.inference_mode()
-def joint_odds(
-    network: FaultNet, x: Tensor, found: Tensor, sigma: Tensor, observed: Tensor, sensor_sigma: float
-) -> Floats:
-    """(B, 22) logarithm of the odds that a joint is off; -inf for one not seen in the last `RECENT` frames.
-
-    The arguments are those of `FaultNet`.
-    """
-    odds = network(x, found, sigma, observed, torch.full((len(x),), sensor_sigma))
-    recent = observed.unflatten(1, (22, 3))[:, :, 0, -RECENT:].amax(dim=-1) > 0
-    return torch.where(recent, odds, -torch.inf).double().numpy()
-
-
 def stuck(positions: Floats) -> NDArray[np.bool_]:
     """(B, 22) joints that a tracker has lost and of which it repeats the last answer, in the last `RECENT` frames.
 
@@ -185,7 +170,7 @@ class Score:
         tracks, look = encoded.tracks, encoded.look
         odds = self._network(tracks.x, look.mean, look.sigma, tracks.observed)
         odds[lost] = np.maximum(odds[lost], STUCK_ODDS)
-        odds[~(tracks.observed[:, ::3, -RECENT:] > 0).any(axis=-1)] = -np.inf  # as in `joint_odds`
+        odds[~(tracks.observed[:, ::3, -RECENT:] > 0).any(axis=-1)] = -np.inf
         missing = np.isinf(odds).sum(axis=-1)
         told = decimals(odds, self._calibration, np.broadcast_to(missing[:, None], odds.shape))
         return told.max(axis=-1), np.where(np.isinf(odds), np.nan, told)

@@ -15,9 +15,9 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
-from prior.anomaly import LEAST_NOISE, MISSING, RATES, SENSOR_SIGMAS, STUCK_ODDS, Calibration, joint_odds, stuck
+from prior.anomaly import LEAST_NOISE, MISSING, RATES, SENSOR_SIGMAS, STUCK_ODDS, Calibration, stuck
 from prior.body_tracks import to_tracks
-from prior.checkpoint import load_weights, save_weights
+from prior.checkpoint import LICENCES, load_weights
 from prior.corruption import (
     elsewhere,
     exchanged,
@@ -38,7 +38,7 @@ from prior.fault_net import RECENT, FaultNet, FaultNetConfig
 from prior.hgvae import HGVAE, SCALE, HGVAEConfig
 from prior.motion_windows import MotionSet
 from prior.track_windows import STRIDES, Windows, standardise
-from prior.training import TrainingRun, draw_curves
+from prior.training import TrainingRun
 
 Floats = NDArray[np.float64]
 
@@ -80,16 +80,12 @@ def train_anomaly(data: Path, runs: Path, weights: str, path: Path, seed: int = 
     network.mean.copy_(model.mean)
     train = Windows(MotionSet.load(data, weights, "train"))
     run = fit(network, model, train, Windows(val), runs / f"{path.stem}-faults", seed)
-    beside = path.with_suffix(".faults.safetensors")
-    save_weights(beside, network, asdict(network.config), {
+    run.ship(f"{path.stem}.faults", network, asdict(network.config), {
         "Model": f"fault network beside {path.name}, prior/fault_net.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, spoilt by prior/train_anomaly.py",
-        "Licence": f"that of {path.name}",
+        "Licence": LICENCES[weights],
         "Training": f"with the HG-VAE, by `steadypose train`: {STEPS} steps of {BATCH} windows, seed {seed}",
-        "Validation": ", ".join(f"{k} {v:.4g}" for k, v in run.curves[-1].items()),
-        "Curves": f"`{beside.stem}.png`",
     })  # fmt: skip
-    draw_curves(run.curves, beside.with_suffix(".png"))
     note = f"what validation people but {HELD_BACK} score; made with the weights by 'steadypose train'"
     calibrate(network, model, Windows(val), WINDOWS, seed=0).save(path.with_suffix(".anomaly.json"), note)
 
@@ -134,14 +130,14 @@ def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np
     seen = spoil(answered, (repeats,), REPEATED, rng)
     astray = np.sqrt(((spoilt - clean + seen - answered)[:, -RECENT:] ** 2).mean(axis=(1, 3)))
     repeated = (seen != answered)[:, -RECENT:].any(axis=-1).mean(axis=1)
-    stuck = (repeated > 0.5) & (sigma * np.sqrt(fast) > LEAST_NOISE)[:, None]
+    lost = (repeated > 0.5) & (sigma * np.sqrt(fast) > LEAST_NOISE)[:, None]
     lacking = rng.random(count)
     for k in np.flatnonzero(lacking < 0.7):
         alone, few = seen[k : k + 1], lacking[k] < 0.4
         alone[:] = hide_joints(alone, int(rng.integers(1, MISSING[-1])), rng) if few else occlude(alone, rng)
     limit = np.maximum(LEAST_FAULT, sigma)[:, None]
     shown = np.isfinite(seen[:, -RECENT:, :, 0]).any(axis=1)
-    off = (astray > limit) | stuck
+    off = (astray > limit) | lost
     clear = torch.from_numpy(shown & (off | (astray < 0.2 * limit) & (repeated == 0))).float()
     logits = network(*_look(model, seen, sizes), torch.from_numpy(sigma).float())
     faulty = torch.from_numpy(off).float()
@@ -157,6 +153,19 @@ def _look(model: HGVAE, seen: Floats, sizes: Floats) -> tuple[Tensor, Tensor, Te
     found = model(standardise(model, tracks.x), observed).tracks
     mean = found.mean * SCALE + model.mean[:, None]
     return torch.from_numpy(tracks.x).float(), mean, (0.5 * found.log_var).exp() * SCALE, observed
+
+
+@torch.inference_mode()
+def joint_odds(
+    network: FaultNet, x: Tensor, found: Tensor, sigma: Tensor, observed: Tensor, sensor_sigma: float
+) -> Floats:
+    """(B, 22) logarithm of the odds that a joint is off; -inf for one not seen in the last `RECENT` frames.
+
+    The arguments are those of `FaultNet`.
+    """
+    odds = network(x, found, sigma, observed, torch.full((len(x),), sensor_sigma))
+    recent = observed.unflatten(1, (22, 3))[:, :, 0, -RECENT:].amax(dim=-1) > 0
+    return torch.where(recent, odds, -torch.inf).double().numpy()
 
 
 def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Floats:

@@ -12,7 +12,6 @@ from prior.anomaly import (
     Score,
     ScoreSettings,
     decimals,
-    joint_odds,
     load_fault_net,
     stuck,
 )  # fmt: skip
@@ -20,6 +19,7 @@ from prior.fault_net import RECENT, FaultNet, FaultNetConfig
 from prior.fault_net_live import LiveFaultNet
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.skeletons import MIRROR, PARENTS, J
+from prior.train_anomaly import joint_odds
 from prior.window import Window
 from tests.prior.bodies import stream, waving
 
