@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,11 +55,23 @@ _APPROACH = 0.1  # of the way to a renewed estimate, a frame: bones that jump wo
 _ENOUGH_SAMPLES = 4
 
 
+class Measured(NamedTuple):
+    """A person's bones.
+
+    Attributes:
+        offsets: (22, 3) metres, each joint in its parent's frame.
+        give: (22,) metres^2, how much of the variance of each bone's length more samples will take away.
+    """
+
+    offsets: Floats
+    give: Floats
+
+
 class Bones:
     """Keeps each slot's ``window.offsets``: `estimate_bones` over frames sampled from the person's first ten seconds.
 
     The estimate is renewed each time there are half as many samples more, so that it costs little and soon stands
-    still, and is approached smoothly.
+    still, and is approached smoothly. ``window.give`` says how far lengths are still to be learned.
     """
 
     delay_frames = 0
@@ -67,6 +80,7 @@ class Bones:
         self._settings, self._bias_sigma = settings, bias_sigma
         self._samples = np.full((slots, settings.samples, 22, 3), np.nan)
         self._target = np.zeros((slots, 22, 3))
+        self._give = np.zeros((slots, 22))
         self._count = np.zeros(slots, dtype=np.int64)
         self._used = np.zeros(slots, dtype=np.int64)
         self._wait = np.zeros(slots, dtype=np.int64)
@@ -95,19 +109,23 @@ class Bones:
         renew = (self._count >= _RENEWAL * self._used) | (full & (self._count > self._used))
         # People who came together would all be due in the same frame: after the first estimate, one at a time.
         stale = np.flatnonzero(renew & (self._count > 0) & window.present & enough)
-        for slot in [*stale[self._used[stale] == 0], *stale[self._used[stale] > 0][:1]]:
+        for slot in [*stale[self._used[stale] == 0], *stale[self._used[stale] > 0][: max(1, len(self._count) // 8)]]:
             count = self._used[slot] = self._count[slot]
             noise = float(np.median(window.smoothed.sigma[slot, sure[slot]]))
-            self._target[slot] = estimate_bones(self._samples[slot, :count], self._bias_sigma, noise)
+            samples = self._samples[slot, :count]
+            self._target[slot], self._give[slot] = estimate_bones(
+                samples, self._bias_sigma, noise, self._settings.samples
+            )
             window.measured[slot] = count >= _ENOUGH_SAMPLES
             if count == 1:
-                window.offsets[slot] = self._target[slot]
+                window.offsets[slot], window.give[slot] = self._target[slot], self._give[slot]
         known = self._used > 0
         window.offsets[known] += _APPROACH * (self._target[known] - window.offsets[known])
+        window.give[known] += _APPROACH * (self._give[known] - window.give[known])
         return window
 
 
-def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float) -> Floats:
+def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float, samples: int) -> Measured:
     """This person's bones, the same on both sides, from a few poses in a row.
 
     Lengths are the posterior mean of a log-normal model: a person's size varies about the generic adult's, each bone
@@ -120,16 +138,15 @@ def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float) -> 
         positions: (T, 22, 3) metres, NaN where unobserved; samples of about 6 Hz.
         bias_sigma: metres along an axis, the sensor's slow error.
         noise_sigma: metres along an axis, the positions' other error.
-
-    Returns:
-        (22, 3) metres, each joint in its parent's frame.
+        samples: how many there will be in the end.
     """
-    same = 1.0 + len(positions) / LIKE_SAMPLES
+    counts = np.array([len(positions), max(samples, len(positions))])
+    same = 1.0 + counts / LIKE_SAMPLES
     bias, noise = LENGTH_BIASES * bias_sigma, np.sqrt(2.0) * noise_sigma
     seen = np.asarray(finite_joints(positions).any(axis=0))
     seen |= seen[MIRROR]
     bones = _bones(seen)
-    log_ratio, sigma = np.zeros(len(bones)), np.full(len(bones), np.inf)
+    log_ratio, sigma = np.zeros(len(bones)), np.full((2, len(bones)), np.inf)  # now, and in the end
     for k, paths in enumerate(bones):
         generic = float(np.linalg.norm(REST_OFFSETS[paths[0]].sum(axis=0)))
         ends = [(path[0], max(PARENTS[path[-1]], 0)) for path in paths]
@@ -141,20 +158,27 @@ def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float) -> 
             log_ratio[k] = np.log(max(median, 0.1 * generic) / generic)
             # What noise does not explain of the deviation is as lasting as the bias.
             lasting = max(deviation**2 - noise**2, bias**2)
-            sigma[k] = np.sqrt(lasting / same + noise**2 / len(lengths)) / generic
+            sigma[:, k] = np.sqrt(lasting / same + noise**2 / len(lengths) * counts[0] / counts) / generic
     spread = np.array([LIMB_SPREAD if paths[0][0] in _LIMBS else TRUNK_SPREAD for paths in bones])
     weight = 1.0 / (spread**2 + sigma**2)
-    size = (weight * log_ratio).sum() / (weight.sum() + STATURE_SPREAD**-2)
-    own = spread**2 * weight * (log_ratio - size)
-    offsets = REST_OFFSETS * np.exp(size)
-    for paths, factor in zip(bones, np.exp(own), strict=True):
+    stature = 1.0 / (weight.sum(axis=1) + STATURE_SPREAD**-2)
+    size = stature[0] * (weight[0] * log_ratio).sum()
+    own = spread**2 * weight[0] * (log_ratio - size)
+    variance = spread**2 * (1.0 - spread**2 * weight) + stature[:, None] * (1.0 - spread**2 * weight) ** 2
+    offsets, to_learn = REST_OFFSETS * np.exp(size), np.zeros(22)
+    for paths, factor, (now, then) in zip(bones, np.exp(own), variance.T, strict=True):
         offsets[np.concatenate(paths)] *= factor
-    doubt = bias**2 / same + noise**2 / len(positions)
-    return _place_on_trunk(positions, seen, offsets, TRUNK_PLACE_SPREAD**2 / (TRUNK_PLACE_SPREAD**2 + doubt))
+        to_learn[np.concatenate(paths)] = max(now - then, 0.0)
+    give = to_learn * (offsets**2).sum(axis=-1)
+    doubt = bias**2 / same + noise**2 / counts
+    trust = TRUNK_PLACE_SPREAD**2 / (TRUNK_PLACE_SPREAD**2 + doubt)
+    give[_ON_TRUNK] = TRUNK_PLACE_SPREAD**2 * (trust[1] - trust[0])
+    return Measured(_place_on_trunk(positions, seen, offsets, trust[0]), give)
 
 
 _LIMBS = frozenset(j for j, name in enumerate(JOINTS) if name.endswith(("knee", "ankle", "elbow", "wrist")))
 _TRUNKS = ((J["pelvis"], (J["left_hip"],)), (J["spine3"], (J["neck"], J["left_collar"])))
+_ON_TRUNK = sorted({int(end) for _, joints in _TRUNKS for joint in joints for end in (joint, MIRROR[joint])})
 _COLLAR_TO_SHOULDER = J["left_shoulder"] - J["left_collar"]
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from prior.body_tracks import from_tracks
 from prior.filters import Smoothed
+from prior.skeletons import J
 from prior.window import Window
 
 Floats = NDArray[np.float64]
@@ -27,6 +28,8 @@ NOISE_LEFT = 0.59
 
 RENEWAL = 0.5
 """How far a frame's answer goes to that of the next window: windows one frame apart disagree, which would be jitter."""
+
+_BESIDE_PELVIS = [J["left_hip"], J["right_hip"], J["spine1"]]
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,9 @@ class Denoise:
         self._found[:-1], self._found[-1] = self._found[1:], np.nan
         if window.encoded is not None:
             slots, tracks, _, size, look, _ = window.encoded
-            latest = from_tracks(look.mean[..., -self.delay_frames - 1 :], tracks, size).swapaxes(0, 1)
+            latest = from_tracks(look.mean[..., -self.delay_frames - 1 :], tracks, size)
+            _place_pelvis(latest, window.positions.all[:, slots].swapaxes(0, 1))
+            latest = latest.swapaxes(0, 1)
             before = self._found[:, slots]
             renewed = np.where(np.isnan(before), latest, before + RENEWAL * (latest - before))
             # a window that ends in the dark tells less of what went before than the last one that did not
@@ -85,3 +90,23 @@ class Denoise:
             positions=smoothed.positions + share[..., None] * moved,
             sigma=smoothed.sigma * np.sqrt(1.0 - share * (1.0 - NOISE_LEFT)),
         )
+
+
+def _place_pelvis(found: Floats, seen: Floats) -> None:
+    """Move the pelvis to where it lay beside hips and spine, in place.
+
+    The other joints' tracks are told about the trunk's path, the pelvis's about that path's mean, so no joint tells
+    HG-VAE of the pelvis's noise: it leaves more of it than of any other's.
+
+    Args:
+        found: (B, K, 22, 3) metres, of the newest frames.
+        seen: (B, T, 22, 3) metres, NaN where not.
+    """
+    beside = seen[:, :, :1] - seen[:, :, _BESIDE_PELVIS]
+    shown = np.isfinite(beside)
+    counts = shown.sum(axis=1)
+    lies = np.where(shown, beside, 0.0).sum(axis=1) / np.maximum(counts, 1)
+    known = counts[..., :1] > 0
+    places = np.where(known, found[:, :, _BESIDE_PELVIS].swapaxes(0, 1) + lies, 0.0).sum(axis=2)
+    among = known.sum(axis=1)
+    found[:, :, 0] = np.where(among > 0, places / np.maximum(among, 1), found[:, :, 0].swapaxes(0, 1)).swapaxes(0, 1)

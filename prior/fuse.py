@@ -108,7 +108,8 @@ class Fuse:
                 share = (seen_weight / (seen_weight + prior_weight))[..., None]
             variance = 1 / (seen_weight + prior_weight)
             mobility = np.minimum(variance, _MOST_MOBILE * variance.min(axis=1, keepdims=True))
-            rotations, body = fit_pose(body + share * (observed - body), offsets, mobility, decoded)
+            fitted = fit_pose(body + share * (observed - body), offsets, mobility, decoded, window.give[slots])
+            rotations, body, offsets = fitted
         placed = known.any(axis=1)
         state = _states(unseen_s, held_s, s.fade)
         # of a joint not seen, smoother and prior know the same past: what one says does not make the other surer
@@ -118,6 +119,7 @@ class Fuse:
             stamp_s=smoothed.stamp_s,
             positions=_scatter(window.slots, slots[placed], body[placed], np.nan),
             rotations=_scatter(window.slots, slots[placed], rotations[placed], np.nan),
+            offsets=_scatter(window.slots, slots[placed], offsets[placed], np.nan),
             sigma=_scatter(window.slots, slots[placed], sigma[placed], np.inf),
             state=_scatter(window.slots, slots[placed], state[placed], JointState.UNKNOWN).astype(np.uint8),
         )

@@ -300,7 +300,7 @@ class PriorPipeline:
                     anomaly=float(window.anomaly[slot]),
                     anomaly_flag=bool(window.anomaly_flag[slot]),
                     joint_anomaly=window.joint_anomaly[slot],
-                    bone_lengths=np.sqrt((window.offsets[slot] ** 2).sum(axis=-1)),
+                    bone_lengths=np.sqrt((estimate.offsets[slot] ** 2).sum(axis=-1)),
                     raw_positions=(window.raw.all[-1 - back][slot] - origin) @ to_world,
                     raw_confidence=window.confidence.all[-1 - back][slot],
                 )

@@ -114,29 +114,37 @@ def fit_pose(
     offsets: NDArray[np.floating],
     mobility: NDArray[np.floating],
     fallback: NDArray[np.floating] | None = None,
-) -> tuple[Floats, Floats]:
+    give: NDArray[np.floating] | float = 0.0,
+) -> tuple[Floats, Floats, Floats]:
     """Rotations and positions of the pose on these bones that is nearest to the positions.
 
     `solve_pose` follows the chain: where a bone seems too long or short, all of that goes to its end, and on to what
     hangs from it. Here every bone and every rigid part of the trunk pulls at both its ends until the lengths are
     right, by sweeps of Gauss-Newton over the distances (position-based dynamics, Müller et al. 2007); what comes out
-    is solved, which moves it by about a millimetre.
+    is solved, which moves it by about a millimetre. Bones of uncertain length give way as their variance says
+    (compliant constraints, XPBD, Macklin et al. 2016).
 
     Args:
         positions: (..., 22, 3) metres, all of them finite.
         offsets: (22, 3) or (..., 22, 3) metres, the person's bones.
         mobility: (..., 22) how easily each joint yields: its variance, in any unit.
         fallback: (..., 22, 3, 3) local rotations of the leaves, which no position shows; identity if left out.
+        give: (..., 22) how easily the bone above each joint yields: the variance of its length, in that unit.
 
     Returns:
-        local rotations (..., 22, 3, 3), and the positions (..., 22, 3) where they put the joints, metres.
+        local rotations (..., 22, 3, 3), the positions (..., 22, 3) where they put the joints, metres, and the bones
+        (..., 22, 3) on which they do.
     """
     shape = np.shape(positions)
     p, bones = _frames(positions, shape), _frames(offsets, shape)
-    _constrain(p, bones, np.array(np.broadcast_to(mobility, shape[:-1]), order="C").reshape(p.shape[:-1]))
+    yields, gives = (
+        np.array(np.broadcast_to(of, shape[:-1]), dtype=np.float64, order="C").reshape(p.shape[:-1])
+        for of in (mobility, give)
+    )
+    _constrain(p, bones, yields, gives)
     local, placed = _initial(fallback, p), np.empty_like(p)
     _solve(p, np.ones(p.shape[:-1], dtype=bool), bones, True, local, placed)
-    return local.reshape(*shape, 3), placed.reshape(shape)
+    return local.reshape(*shape, 3), placed.reshape(shape), bones.reshape(shape)
 
 
 def place_joints(rotations: NDArray[np.floating], offsets: NDArray[np.floating]) -> Floats:
@@ -291,11 +299,13 @@ def _rigid_trunk(which, p, rest, here):
     return _product(_frame(p[left] - p[right], p[up] - here), at_rest.T)
 
 
-@njit("(f8[:,:,::1], f8[:,:,::1], f8[:,::1])", cache=True)
-def _constrain(positions, offsets, mobility):
-    """Of B frames: moves ``positions`` (B, 22, 3) until what is rigid has its lengths."""
+@njit("(f8[:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,::1])", cache=True)
+def _constrain(positions, offsets, mobility, give):
+    """Of B frames: moves ``positions`` (B, 22, 3) until what is rigid has its lengths, and ``offsets`` as they give."""
     rest = np.empty((len(_PARENT), 3))
     length = np.empty(len(_RIGID))
+    compliance = np.empty(len(_RIGID))
+    force = np.empty(len(_RIGID))
     for frame in range(len(positions)):
         p, yields = positions[frame], mobility[frame]
         rest[0] = 0.0
@@ -304,6 +314,9 @@ def _constrain(positions, offsets, mobility):
         for k in range(len(_RIGID)):
             bone = rest[_RIGID[k, 0]] - rest[_RIGID[k, 1]]
             length[k] = np.sqrt(_dot(bone, bone))
+            a, b = _RIGID[k]
+            compliance[k] = give[frame, a] + (0.0 if b == _PARENT[a] else give[frame, b])
+            force[k] = 0.0
         for _ in range(_SWEEPS):
             for k in range(len(_RIGID)):
                 a, b = _RIGID[k]
@@ -311,11 +324,18 @@ def _constrain(positions, offsets, mobility):
                 for i in range(3):  # no vectors here: in the innermost loop, making them would take most of the time
                     squared += (p[a, i] - p[b, i]) ** 2
                 now = max(np.sqrt(squared), 1e-9)
-                share = (now - length[k]) / now / (yields[a] + yields[b])
+                pull = (now - length[k] - compliance[k] * force[k]) / (yields[a] + yields[b] + compliance[k])
+                force[k] += pull
                 for i in range(3):
-                    along = share * (p[a, i] - p[b, i])
+                    along = pull / now * (p[a, i] - p[b, i])
                     p[a, i] -= yields[a] * along
                     p[b, i] += yields[b] * along
+        for k in range(len(_RIGID)):
+            a, b = _RIGID[k]
+            if b == _PARENT[a]:
+                stretch = 1.0 + compliance[k] * force[k] / max(length[k], 1e-9)
+                for i in range(3):
+                    offsets[frame, a, i] *= stretch
 
 
 @njit(cache=True)
