@@ -50,6 +50,7 @@ LIKE_SAMPLES = 12
 
 _ENOUGH_JOINTS = 8
 _RENEWAL = 1.5
+_RENEWED = 8  # one in so many slots, at most, in one frame
 _SURE = 0.05  # metres: a joint whose place is known less well, hidden for a while, measures no bone
 _APPROACH = 0.1  # of the way to a renewed estimate, a frame: bones that jump would shake the whole limb
 _ENOUGH_SAMPLES = 4
@@ -107,9 +108,12 @@ class Bones:
             self._wait[slot] = self._settings.every - 1
         full = self._count == self._settings.samples
         renew = (self._count >= _RENEWAL * self._used) | (full & (self._count > self._used))
-        # People who came together would all be due in the same frame: after the first estimate, one at a time.
+        # People who came together would all be due in the same frame: after the first estimate, a few at a time.
         stale = np.flatnonzero(renew & (self._count > 0) & window.present & enough)
-        for slot in [*stale[self._used[stale] == 0], *stale[self._used[stale] > 0][: max(1, len(self._count) // 8)]]:
+        for slot in [
+            *stale[self._used[stale] == 0],
+            *stale[self._used[stale] > 0][: max(1, len(self._count) // _RENEWED)],
+        ]:
             count = self._used[slot] = self._count[slot]
             noise = float(np.median(window.smoothed.sigma[slot, sure[slot]]))
             samples = self._samples[slot, :count]

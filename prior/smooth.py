@@ -28,7 +28,7 @@ _MEMORY = (0.25, 0.4, 0.5)
 """Of what follows the smoother, by delay in frames: an answer without later frames jumps with the newest measurement.
 At a Kinect it takes 29 % of the jitter for 3 % of the position error at once, 7 % for nothing two frames later."""
 
-_LONG = 5
+_LONG = 2.75
 """Frames. With a longer delay, a longer memory costs no lag."""
 
 _SURE = 0.05
@@ -41,8 +41,8 @@ class Smooth:
     def __init__(self, settings: SmoothSettings, delay_frames: int, slots: int) -> None:
         self._settings = settings
         self.delay_frames = delay_frames
-        # The time constant goes with the fourth root of the density: here, with the square root of the delay.
-        density = settings.acceleration_density * min(1.0, (_LONG / max(delay_frames, 1)) ** 2)
+        # The time constant goes with the fourth root of the density: here, with that of the delay.
+        density = settings.acceleration_density * min(1.0, _LONG / max(delay_frames, 1))
         self._smoother = FixedLagRTS(delay_frames, density, settings.measurement_sigma)
         self._follower = Follower(_MEMORY[delay_frames]) if delay_frames < len(_MEMORY) else None
         self._last = np.full((slots, 22, 3), np.nan)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from prior.denoise import MODEL_SIGMA, NOISE_LEFT, Denoise
+from prior.denoise import MODEL_SIGMA, NOISE_LEFT, Denoise, _place_pelvis
 from prior.filters import Smoothed
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.skeletons import J
@@ -70,3 +70,17 @@ def test_hidden_joints_and_bodies_that_left_are_not_touched() -> None:
     assert moved[0, J["left_wrist"]] == 0
     assert (moved[0, : J["left_wrist"]] > 0).all()
     assert (moved[1] == 0).all()
+
+
+def test_the_pelvis_goes_where_it_lay_beside_hips_and_spine() -> None:
+    truth = waving(50)
+    seen = truth.copy()
+    seen[10:, J["left_hip"]] = np.nan
+    found = truth[None, -3:].copy()
+    found[:, :, 0] += 0.05
+    before = found.copy()
+    _place_pelvis(found, seen[None])
+    assert np.abs(found[:, :, 0] - truth[-3:, 0]).max() < 0.02
+    np.testing.assert_array_equal(found[:, :, 1:], before[:, :, 1:])
+    _place_pelvis(before, np.full((1, 50, 22, 3), np.nan))
+    np.testing.assert_array_equal(before[:, :, 0], truth[None, -3:, 0] + 0.05)
