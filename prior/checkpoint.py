@@ -74,6 +74,22 @@ def load_weights(name: str, model: str) -> tuple[dict[str, Tensor], dict[str, An
         return {key: file.get_tensor(key).float() for key in file.keys()}, config  # noqa: SIM118 (not a mapping)
 
 
+def started(model: nn.Module, name: str, start: str | None) -> str:
+    """Load into ``model`` the weights ``start`` of the model ``name``, if there are to be any; what a card says of it.
+
+    Raises:
+        FileNotFoundError: no such weights.
+        ValueError: weights of another model.
+    """
+    if start is None:
+        return ""
+    try:
+        model.load_state_dict(load_weights(start, name)[0])
+    except RuntimeError as error:
+        raise ValueError(f"start: expected weights of {name}, of this size, got '{start}': {error}") from error
+    return f", started from the weights '{start}'"
+
+
 def _write_whole(path: Path, content: bytes) -> None:
     part = path.with_name(path.name + ".part")
     part.write_bytes(content)

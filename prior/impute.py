@@ -33,13 +33,16 @@ FIRST_DECAY, SECOND_DECAY = 0.9, 0.99
 CARRY_FRAMES = 20.0
 """Frames over which what the model was off at the edge of a gap fades inside it."""
 
+EDGE_FRAMES = 3
+"""Frames beside a gap over which what the model is off is averaged: a single one carries its noise into the gap."""
 
 SIGMA_FOUND = 1.3
 """Times the standard deviation that the model states: what limbs hidden for 0.3 to 2 s are off on validation motion."""
 
 
-CLIMBS_A_FRAME = 2
-"""Bodies that take their steps in one frame; of more, each has its turn, so that eight fit into a camera's period."""
+CLIMBING = 4
+"""One slot in so many climbs in one frame; if more bodies are to, each has its turn, so that eight fit into a camera's
+period."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ class Impute:
         if settings.steps < 0 or settings.rate <= 0:
             raise ValueError(f"impute: expected steps >= 0 and rate > 0, got {settings.steps} and {settings.rate:g}")
         self._settings, self._counters = settings, counters
-        _carried(np.zeros((1, 2)), np.ones((1, 2)), CARRY_FRAMES)  # compiled now, not while a frame waits
+        _carried(np.zeros((1, 2)), np.ones((1, 2)), CARRY_FRAMES, EDGE_FRAMES)  # compiled now, not while a frame waits
         self.delay_frames = delay_frames
         self._climbs: list[Climb | None] = [None] * slots
         self._frame = 0
@@ -124,7 +127,7 @@ class Impute:
     def _turn(self, slot: int) -> bool:
         """Whether it is this body's turn to climb: of many, so many in each frame."""
         climbing = [k for k, climb in enumerate(self._climbs) if climb or k == slot]
-        turns = -(-len(climbing) // CLIMBS_A_FRAME)
+        turns = -(-len(climbing) // max(1, len(self._climbs) // CLIMBING))
         return (climbing.index(slot) + self._frame) % turns == 0
 
     def update(self, window: Window) -> Window:
@@ -167,12 +170,15 @@ def completed_tracks(tracks: Tracks, mean: Floats) -> Floats:
     a gap."""
     frames = mean.shape[-1]
     off, observed = (part.reshape(-1, frames) for part in (tracks.x - mean, tracks.observed))
-    return mean + _carried(off, observed, CARRY_FRAMES).reshape(mean.shape)
+    return mean + _carried(off, observed, CARRY_FRAMES, EDGE_FRAMES).reshape(mean.shape)
 
 
 @njit(cache=True)
-def _carried(off, observed, fade):
-    """(N, T) what the model was off where observed, carried from either side into the gaps, where it fades."""
+def _carried(off, observed, fade, edge):
+    """(N, T) what the model was off where observed, carried from either side into the gaps, where it fades.
+
+    ``edge``: over how many frames beside a gap the mean is taken.
+    """
     nodes, frames = off.shape
     carried = np.where(observed > 0, off, 0.0)
     for node in range(nodes):
@@ -180,14 +186,32 @@ def _carried(off, observed, fade):
         for t in range(frames + 1):
             if t < frames and observed[node, t] == 0.0:
                 continue
-            for u in range(last + 1, min(t, frames)):
-                before, after = u - last, t - u
-                value = 0.0
-                share = 0.0 if last < 0 else (1.0 if t == frames else after / (before + after))
-                if last >= 0:
-                    value += share * off[node, last] * math.exp(-before / fade)
-                if t < frames:
-                    value += (1.0 - share) * off[node, t] * math.exp(-after / fade)
-                carried[node, u] = value
+            if t > last + 1:
+                earlier, later = _beside_gap(off[node], observed[node], last, t, edge)
+                for u in range(last + 1, t):
+                    before, after = u - last, t - u
+                    share = 0.0 if last < 0 else (1.0 if t == frames else after / (before + after))
+                    carried[node, u] = share * earlier * math.exp(-before / fade)
+                    carried[node, u] += (1.0 - share) * later * math.exp(-after / fade)
             last = t
     return carried
+
+
+@njit(cache=True)
+def _beside_gap(off, observed, last, following, edge):
+    """What the model was off just before and just after a gap, from ``last`` to ``following``; 0 beyond the window."""
+    earlier = later = 0.0
+    count = 0
+    for t in range(last, max(last - edge, -1), -1):
+        if observed[t] == 0.0:
+            break
+        earlier += off[t]
+        count += 1
+    earlier /= max(count, 1)
+    count = 0
+    for t in range(following, min(following + edge, len(off))):
+        if observed[t] == 0.0:
+            break
+        later += off[t]
+        count += 1
+    return earlier, later / max(count, 1)

@@ -17,6 +17,7 @@ def train(
     weights: Literal["default", "research", "kinect_v2"] | None = None,
     runs: Path = Path("runs"),
     iterations: int | None = None,
+    start: str | None = None,
     seed: int = 0,
     threads: int = 2,
 ) -> None:
@@ -37,6 +38,8 @@ def train(
             is named after its sensor, kinect_v2.
         runs: where checkpoints and curves go.
         iterations: optimiser steps; the model's own number, if left out. Fewer make a weaker model sooner.
+        start: weights to go on from, a set or a .safetensors file: with motion of one's own and a third of the
+            iterations, say. Not for a correction.
         seed: for weights and sampling.
         threads: CPU threads; under torchrun, of all processes of a machine together.
     """
@@ -55,6 +58,10 @@ def train(
     name = weights or ("kinect_v2" if model == "correction" else "default")
     if iterations is not None:
         train_model = partial(train_model, iterations=iterations)
+    if start is not None:
+        if model == "correction":
+            raise ValueError("--start: a correction is trained from the beginning, in minutes; leave it out")
+        train_model = partial(train_model, start=start)
     path = train_model(data, runs, weights=name, seed=seed)
     if writes():
         print(f"weights: {path}")

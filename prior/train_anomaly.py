@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from prior.anomaly import LEAST_NOISE, MISSING, RATES, SENSOR_SIGMAS, STUCK_ODDS, Calibration, stuck
 from prior.body_tracks import to_tracks
-from prior.checkpoint import LICENCES, load_weights
+from prior.checkpoint import LICENCES, load_weights, started
 from prior.corruption import (
     elsewhere,
     exchanged,
@@ -48,8 +48,8 @@ HELD_BACK = "s08"
 WINDOWS = 2000
 """for each error and number of joints missing"""
 
-STEPS, BATCH = 3_000, 64
-"""of the fault network's optimiser, and windows in each"""
+BATCH = 64
+"""windows in each step of the fault network's optimiser"""
 
 LEAST_FAULT = 0.015
 """Metres along an axis, over the frames that are scored: a joint less off than that, or than the sensor's own error, is
@@ -62,7 +62,9 @@ REPEATED = 0.15
 """share of the windows in which a tracker repeats its last answer for some joints"""
 
 
-def train_anomaly(data: Path, runs: Path, weights: str, path: Path, seed: int = 0) -> None:
+def train_anomaly(
+    data: Path, runs: Path, weights: str, path: Path, iterations: int, seed: int = 0, start: str | None = None
+) -> None:
     """Train the fault network of an HG-VAE, and measure its scale on validation motion; both go beside its weights.
 
     Args:
@@ -70,7 +72,9 @@ def train_anomaly(data: Path, runs: Path, weights: str, path: Path, seed: int = 
         runs: folder of training runs.
         weights: which set: ``default`` or ``research``.
         path: of HG-VAE's weights, ``.safetensors``.
+        iterations: optimiser steps.
         seed: of weights and of sampling.
+        start: weights of a fault network to go on from.
     """
     model = _model(path)
     val = MotionSet.load(data, weights, "val")
@@ -78,13 +82,15 @@ def train_anomaly(data: Path, runs: Path, weights: str, path: Path, seed: int = 
     torch.manual_seed(seed)
     network = FaultNet(FaultNetConfig(frames=model.config.frames))
     network.mean.copy_(model.mean)
+    origin = started(network, "hgvae", start)
     train = Windows(MotionSet.load(data, weights, "train"))
-    run = fit(network, model, train, Windows(val), runs / f"{path.stem}-faults", seed)
+    run = fit(network, model, train, Windows(val), runs / f"{path.stem}-faults", iterations, seed)
     run.ship(f"{path.stem}.faults", network, asdict(network.config), {
         "Model": f"fault network beside {path.name}, prior/fault_net.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, spoilt by prior/train_anomaly.py",
         "Licence": LICENCES[weights],
-        "Training": f"with the HG-VAE, by `steadypose train`: {STEPS} steps of {BATCH} windows, seed {seed}",
+        "Training": f"with the HG-VAE, by `steadypose train`: {iterations} steps of {BATCH} windows, seed {seed}"
+        f"{origin}",
     })  # fmt: skip
     note = f"what validation people but {HELD_BACK} score; made with the weights by 'steadypose train'"
     calibrate(network, model, Windows(val), WINDOWS, seed=0).save(path.with_suffix(".anomaly.json"), note)
@@ -97,12 +103,14 @@ def _model(path: Path) -> HGVAE:
     return model.eval()
 
 
-def fit(network: FaultNet, model: HGVAE, train: Windows, val: Windows, directory: Path, seed: int) -> TrainingRun:
+def fit(
+    network: FaultNet, model: HGVAE, train: Windows, val: Windows, directory: Path, iterations: int, seed: int
+) -> TrainingRun:
     """Train ``network``; see `train_anomaly`."""
     optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
     state = {"model": network, "optimiser": optimiser, "schedule": schedule}
-    run = TrainingRun(directory, state, STEPS, every=max(STEPS // 10, 1))
+    run = TrainingRun(directory, state, iterations, every=max(iterations // 10, 1))
     losses: dict[str, float] = {}
 
     def evaluate() -> dict[str, float]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from prior.body_tracks import in_frame_of, to_tracks
-from prior.checkpoint import LICENCES
+from prior.checkpoint import LICENCES, started, weights_path
 from prior.corruption import add_noise, elsewhere, exchanged, occlude, spoil, stands_still
 from prior.distributed import share
 from prior.hgvae import HGVAE, JOINT_NODES, SCALE, HGVAEConfig, Level, Pass
@@ -60,6 +60,7 @@ def train_hgvae(
     batch: int = 64,
     learning_rate: float = 1e-3,
     seed: int = 0,
+    start: str | None = None,
 ) -> Path:
     """Train HG-VAE on prepared motion and write weights, card and curves.
 
@@ -72,6 +73,7 @@ def train_hgvae(
         batch: windows a step.
         learning_rate: of Adam at the start; falls to nothing along a cosine.
         seed: of weights and of sampling.
+        start: weights to go on from: a set or a path; the fault network beside them is taken up too.
 
     Returns:
         The path of the weights.
@@ -82,21 +84,30 @@ def train_hgvae(
     torch.manual_seed(seed)
     network = HGVAE(MODELS[model])
     network.mean.copy_(mean_tracks(train, network.config.frames))
+    origin = started(network, model, start)
     run = fit(network, train, val, runs / name, iterations, batch, learning_rate, seed)
     path = run.ship(name, network, asdict(network.config), {
         "Model": f"HG-VAE, '{model}' of prior/train_hgvae.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject",
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train {model} --weights {weights}`: {iterations} steps of {batch} windows, "
-        f"Adam {learning_rate:g}, seed {seed}",
+        f"Adam {learning_rate:g}, seed {seed}{origin}",
     })  # fmt: skip
-    train_anomaly(data, runs, weights, path)
+    faults = None if start is None else str(weights_path(start, model).with_suffix(".faults.safetensors"))
+    train_anomaly(data, runs, weights, path, iterations // 3, seed, faults)
     return path
 
 
-def train_hgvae_wide(data: Path, runs: Path, weights: str = "default", seed: int = 0) -> Path:
+def train_hgvae_wide(
+    data: Path,
+    runs: Path,
+    weights: str = "default",
+    iterations: int = 4_000,
+    seed: int = 0,
+    start: str | None = None,
+) -> Path:
     """Train the paper's size: fewer and smaller steps, so that it stays within an hour on two cores."""
-    return train_hgvae(data, runs, weights, "hgvae-wide", iterations=4_000, batch=32, learning_rate=5e-4, seed=seed)
+    return train_hgvae(data, runs, weights, "hgvae-wide", iterations, 32, 5e-4, seed, start)
 
 
 class Batch(NamedTuple):

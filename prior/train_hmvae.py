@@ -11,7 +11,7 @@ import roma
 import torch
 from torch import Tensor
 
-from prior.checkpoint import LICENCES
+from prior.checkpoint import LICENCES, started
 from prior.distributed import share
 from prior.hmvae import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
 from prior.kinematics import forward_kinematics
@@ -45,6 +45,7 @@ def train_hmvae(
     batch: int = 64,
     learning_rate: float = 5e-4,
     seed: int = 0,
+    start: str | None = None,
 ) -> Path:
     """Train HM-VAE on prepared motion and write weights, card and curves.
 
@@ -59,6 +60,7 @@ def train_hmvae(
         batch: windows a step.
         learning_rate: of Adam at the start.
         seed: of weights and of sampling.
+        start: weights to go on from: a set or a path.
 
     Returns:
         The path of the weights.
@@ -68,13 +70,14 @@ def train_hmvae(
     val = MotionSet.load(data, weights, "val")
     config = HMVAEConfig()
     model = HMVAE(config)
+    origin = started(model, "hmvae", start)
     run = fit(model, train, val, runs / f"hmvae-{weights}", iterations, batch, learning_rate, STRIDES, seed)
     return run.ship(f"hmvae-{weights}", model, asdict(config), {
         "Model": "HM-VAE, window 8, 22 joints (prior/hmvae.py)",
         "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train hmvae --weights {weights} --iterations {iterations}`: "
-        f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}",
+        f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}{origin}",
     })  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from prior.checkpoint import LICENCES
+from prior.checkpoint import LICENCES, started
 from prior.distributed import share
 from prior.kinematics import CONTACT_JOINTS
 from prior.motion_windows import MotionSet, data_told, yaw_rotation
@@ -82,6 +82,7 @@ def train_trajectory(
     batch: int = 64,
     learning_rate: float = 2e-3,
     seed: int = 0,
+    start: str | None = None,
 ) -> Path:
     """Train the trajectory network on prepared motion and write weights, card and curves.
 
@@ -93,6 +94,7 @@ def train_trajectory(
         batch: windows a step.
         learning_rate: of Adam at the start; it falls along a cosine.
         seed: of weights and of sampling.
+        start: weights to go on from: a set or a path.
 
     Returns:
         The path of the weights.
@@ -102,6 +104,7 @@ def train_trajectory(
     val = MotionSet.load(data, weights, "val", flat=True)
     starts, chances = _chances(train)
     model = TrajectoryNet(TrajectoryConfig())
+    origin = started(model, "trajectory", start)
     optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=learning_rate / 100)
     state = {"model": model, "optimiser": optimiser, "schedule": schedule}
@@ -126,7 +129,7 @@ def train_trajectory(
         "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train trajectory --weights {weights} --iterations {iterations}`: "
-        f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}",
+        f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}{origin}",
         "Calibration": f"standard deviations times {config.sigma_scale}, errors last {config.correlation_s} s "
         "(horizontal, vertical)",
     })  # fmt: skip

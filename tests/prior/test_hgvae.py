@@ -198,7 +198,6 @@ def test_training_writes_weights_their_card_and_their_scale(tmp_path: Path, monk
     config = replace(SMALL, frames=20)
     monkeypatch.setattr("prior.train_hgvae.MODELS", {"hgvae": config})
     monkeypatch.setattr("prior.train_anomaly.WINDOWS", 16)
-    monkeypatch.setattr("prior.train_anomaly.STEPS", 2)
     path = train_hgvae(prepared(tmp_path / "m.npz"), tmp_path / "runs", iterations=2, batch=4)
     state, stored = load_weights(str(path), "hgvae")
     HGVAE(HGVAEConfig.from_dict(stored)).load_state_dict(state)
