@@ -15,6 +15,7 @@ from prior.anomaly import ScoreSettings
 from prior.checkpoint import WEIGHTS
 from prior.correct import CorrectSettings
 from prior.denoise import DenoiseSettings
+from prior.encode import EncodeSettings
 from prior.fuse import FuseSettings
 from prior.impute import ImputeSettings
 from prior.pipeline import PriorPipeline, PriorSettings
@@ -38,7 +39,9 @@ OURS: Mapping[str, PriorSettings] = {
     "steadypose": PriorSettings(),
     "steadypose, bias_sigma = 0.002": PriorSettings(bias_sigma=0.002),
     **{
-        f"steadypose, {weights} weights": PriorSettings(refine=RefineSettings(weights=weights))
+        f"steadypose, {weights} weights": PriorSettings(
+            refine=RefineSettings(weights=weights), encode=EncodeSettings(weights=weights)
+        )
         for weights in weight_sets("hmvae")
         if weights != RefineSettings().weights
     },

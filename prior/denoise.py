@@ -64,10 +64,10 @@ class Denoise:
             _place_pelvis(latest, window.positions.all[:, slots].swapaxes(0, 1))
             latest = latest.swapaxes(0, 1)
             before = self._found[:, slots]
-            renewed = np.where(np.isnan(before), latest, before + RENEWAL * (latest - before))
             # a window that ends in the dark tells less of what went before than the last one that did not
             seen = np.asarray(np.isfinite(window.positions.newest[slots, :, 0]).any(axis=1))
-            self._found[:, slots] = np.where(seen[:, None, None], renewed, before)
+            renewed = np.where(seen[:, None, None], before + RENEWAL * (latest - before), before)
+            self._found[:, slots] = np.where(np.isnan(before), latest, renewed)
         if window.smoothed is not None:
             window.smoothed = self.denoised(window, window.smoothed, self.delay_frames)
         return window
@@ -79,7 +79,10 @@ class Denoise:
         the first one's noise and an error of its own, `MODEL_SIGMA`.
         """
         found = self._found[-1 - back]
-        known = np.isfinite(window.positions.all[-1 - back][..., 0]) & np.isfinite(found[..., 0] + smoothed.sigma)
+        seen = np.isfinite(window.positions.all[-1 - back][..., 0])
+        # in a frame that was lost whole, the answer must not jump to the smoother's
+        seen |= ~seen.any(axis=1, keepdims=True)
+        known = seen & np.isfinite(found[..., 0] + smoothed.sigma)
         # `smoothed.sigma` takes noise to be what the smoother assumes, or more if more was found
         relative = window.noise / self._measurement_sigma
         noise = np.where(known, smoothed.sigma, 0.0) * (relative / np.maximum(relative, 1.0))[:, None]

@@ -17,6 +17,10 @@ from prior.window import Window
 LEAST_TRUST = 0.1
 """in a joint that passed the gate"""
 
+BRIDGED = 3
+"""Frames: when so many at most were lost whole, joints went in a straight line. The model knows limbs that are hidden,
+not bodies that flicker, and would pass the flicker on."""
+
 
 @dataclass(frozen=True)
 class EncodeSettings:
@@ -59,6 +63,7 @@ class Encode:
         model = HGVAE(HGVAEConfig.from_dict(config))
         model.load_state_dict(state)
         self._model = LiveHGVAE(model, sensor_sigma, slots)
+        self._lost = np.zeros(slots, dtype=np.int64)
         self.frames = self._model.frames
         # loops are compiled at their first call, or loaded: not while a frame waits
         tracks = to_tracks(np.zeros((1, self.frames, 22, 3)), 1.0)
@@ -66,10 +71,12 @@ class Encode:
         self._model.gradient(0)
 
     def reset(self, slot: NDArray[np.bool_]) -> None:
-        """Nothing is kept here."""
+        """Forget the bodies in these slots."""
+        self._lost[slot] = 0
 
     def update(self, window: Window) -> Window:
         """Encode the windows of the bodies present."""
+        self._bridge(window)
         slots = np.flatnonzero(window.present)
         window.encoded = None
         if not len(slots):
@@ -81,3 +88,13 @@ class Encode:
         look = self._model.look(tracks.x, trust)
         window.encoded = Encoded(slots, tracks, trust, size, look, self._model)
         return window
+
+    def _bridge(self, window: Window) -> None:
+        """Fill the frames of which nothing was seen, once the body is seen again."""
+        seen = np.isfinite(window.positions.newest[..., 0]).any(axis=1)
+        for slot in np.flatnonzero(seen & (self._lost > 0) & (self._lost <= BRIDGED)):
+            lost = int(self._lost[slot])
+            before, now = window.positions.all[-2 - lost][slot], window.positions.newest[slot]
+            for back in range(1, lost + 1):
+                window.positions.amend(back, slot, now + back / (lost + 1) * (before - now))
+        self._lost = np.where(seen, 0, self._lost + 1)

@@ -106,7 +106,9 @@ class Fuse:
             if imputed is not None:
                 completed, sigma = imputed.positions[-1 - back][slots], imputed.sigma[-1 - back][slots]
                 # A joint that the sensor does not have hangs: what is imputed of it shakes the joints seen beside it.
-                filled = np.isfinite(completed[..., 0]) & (unseen_s > 0) & np.isfinite(unseen_s)
+                # Of a frame that was lost whole, the smoother knows more.
+                hidden = unseen_s > unseen_s.min(axis=1, keepdims=True)
+                filled = np.isfinite(completed[..., 0]) & hidden & np.isfinite(unseen_s)
                 beside = _beside_seen(completed, observed, np.where(unseen_s > 0, 0.0, seen_weight))
                 body = np.where(filled[..., None], beside, body)
                 prior_weight = np.where(filled, 1 / (sigma**2 + self._bias_sigma**2), prior_weight)

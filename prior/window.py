@@ -49,6 +49,11 @@ class Ring:
         last = (self._next - 1) % self._frames
         self._data[last] = self._data[last + self._frames] = frame
 
+    def amend(self, back: int, slot: int, values: NDArray[np.floating]) -> None:
+        """Write over what the frame ``back`` before the newest holds in a slot, the first axis of a frame."""
+        at = (self._next - 1 - back) % self._frames
+        self._data[at, slot] = self._data[at + self._frames, slot] = values
+
     def clear(self, slot: NDArray[np.bool_]) -> None:
         """Refill these slots, the first axis of a frame, with the initial value in all frames."""
         self._data[:, slot] = self._fill
@@ -134,6 +139,11 @@ class Window:
         self.measured = np.zeros(slots, dtype=bool)
         self.decoded = np.broadcast_to(np.eye(3), (decoded_frames or frames, slots, 22, 3, 3)).copy()
         self.out: Estimate | None = None
+
+    def amend(self, back: int, slot: int, values: NDArray[np.floating]) -> None:
+        """Write over what the frame ``back`` before the newest holds in a slot, the first axis of a frame."""
+        at = (self._next - 1 - back) % self._frames
+        self._data[at, slot] = self._data[at + self._frames, slot] = values
 
     def clear(self, slot: NDArray[np.bool_]) -> None:
         """Forget what these slots (S,) held."""

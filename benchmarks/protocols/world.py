@@ -84,7 +84,7 @@ def chain(settings: ours.PriorSettings, seen: Floats, stamps_s: Floats) -> tuple
     """Clips (T, C, 22, 3) through prior and trajectory, calibrated: pose/clean and pose/world, (T, C, 22, 3)."""
     count = seen.shape[1]
     prior = PriorPipeline(replace(settings, delay=DELAY, max_bodies=count))
-    trajectory = TrajectoryPipeline(TrajectorySettings())
+    trajectory = TrajectoryPipeline(TrajectorySettings(weights=settings.refine.weights))
     clean, world = np.full(seen.shape, np.nan), np.full(seen.shape, np.nan)
     for row, message in enumerate(ours.stream(prior, seen, stamps_s, calibrated=True)):
         for body in message.bodies:
