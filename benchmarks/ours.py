@@ -57,6 +57,9 @@ OURS_KINECT: Mapping[str, PriorSettings] = {
 SIDE_BY_SIDE = 64
 """Clips in one stream: bodies do not touch each other, and many together take a fraction of the time."""
 
+SLOTS_A_CLIP = 4
+"""So that each is treated as a person alone: where all slots are taken, people take turns to be imputed."""
+
 
 @dataclass(frozen=True)
 class Cleaned:
@@ -94,7 +97,8 @@ def run(settings: PriorSettings, seen: Floats, stamps_s: Floats, delay: int, ske
         delay: frames.
         skeleton: of the J joints.
     """
-    prior = PriorPipeline(replace(settings, delay=delay, max_bodies=min(SIDE_BY_SIDE, seen.shape[1])))
+    slots = SLOTS_A_CLIP * min(SIDE_BY_SIDE, seen.shape[1])
+    prior = PriorPipeline(replace(settings, delay=delay, max_bodies=slots))
     parts = [
         list(stream(prior, seen[:, start : start + SIDE_BY_SIDE], stamps_s, skeleton))
         for start in range(0, seen.shape[1], SIDE_BY_SIDE)

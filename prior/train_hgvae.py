@@ -94,7 +94,7 @@ def train_hgvae(
         f"Adam {learning_rate:g}, seed {seed}{origin}",
     })  # fmt: skip
     faults = None if start is None else str(weights_path(start, model).with_suffix(".faults.safetensors"))
-    train_anomaly(data, runs, weights, path, iterations // 3, seed, faults)
+    train_anomaly(data, runs, weights, path, -(-iterations // 3), seed, faults)
     return path
 
 

@@ -41,6 +41,23 @@ def test_the_last_frames_are_denoised_as_the_others() -> None:
     assert (np.linalg.norm(found - plain, axis=-1)[-4:].mean(axis=1) > 0.002).all()
 
 
+def test_lost_frames_do_not_make_the_answer_flicker() -> None:
+    """A body that is away for a frame now and then, in noise: as smooth as one that is not."""
+    truth = waving(150)
+    seen = truth + np.random.default_rng(3).normal(0.0, 0.02, truth.shape)
+    flickering = seen.copy()
+    flickering[20:149:7] = np.nan
+    flickering[[60, 61, 90, 91, 92]] = np.nan
+
+    def shaken(found: np.ndarray) -> float:
+        return float(np.linalg.norm(np.diff(found - truth, n=2, axis=0), axis=-1)[30:].mean())
+
+    steady = answers(seen)
+    assert len(answers(flickering)) == len(truth)
+    assert shaken(answers(flickering)) < 1.3 * shaken(steady)
+    assert error_mm(answers(flickering), truth) < 1.15 * error_mm(steady, truth)
+
+
 def test_the_weight_is_that_of_least_variance() -> None:
     """Of estimates with noise n and own + sqrt(NOISE_LEFT) n', correlated as the better of the two demands."""
     stage = Denoise(measurement_sigma=0.02, delay_frames=0, slots=1)

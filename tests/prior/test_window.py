@@ -25,6 +25,16 @@ def test_a_ring_never_allocates() -> None:
     assert ring._data.ctypes.data == where
 
 
+def test_a_frame_amended_stays_so_as_the_ring_turns() -> None:
+    ring = Ring(3, (2, 1))
+    for k in range(5):
+        ring.push(np.full((2, 1), float(k)))
+    ring.amend(1, 0, np.array([9.0]))
+    assert ring.all[:, :, 0].tolist() == [[2.0, 2.0], [9.0, 3.0], [4.0, 4.0]]
+    ring.push(np.full((2, 1), 5.0))
+    assert ring.all[:, :, 0].tolist() == [[9.0, 3.0], [4.0, 4.0], [5.0, 5.0]]
+
+
 def test_clearing_a_slot_leaves_the_others() -> None:
     window = Window(4, 3)
     window.positions.push(np.ones((3, 22, 3)))
