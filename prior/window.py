@@ -140,11 +140,6 @@ class Window:
         self.decoded = np.broadcast_to(np.eye(3), (decoded_frames or frames, slots, 22, 3, 3)).copy()
         self.out: Estimate | None = None
 
-    def amend(self, back: int, slot: int, values: NDArray[np.floating]) -> None:
-        """Write over what the frame ``back`` before the newest holds in a slot, the first axis of a frame."""
-        at = (self._next - 1 - back) % self._frames
-        self._data[at, slot] = self._data[at + self._frames, slot] = values
-
     def clear(self, slot: NDArray[np.bool_]) -> None:
         """Forget what these slots (S,) held."""
         for ring in (self.raw, self.confidence, self.positions, self.rotations):
