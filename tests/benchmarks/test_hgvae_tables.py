@@ -110,6 +110,15 @@ def test_training_for_a_table_resumes(tmp_path) -> None:
     assert all(torch.equal(a, b) for a, b in zip(first.state_dict().values(), again.state_dict().values(), strict=True))
 
 
+def test_top_latents_are_drawn_where_windows_of_the_action_are() -> None:
+    rng = np.random.default_rng(0)
+    actions = np.repeat([0, 1], 200)
+    top = np.where(actions[:, None] == 1, 5.0, -5.0) + 0.1 * rng.normal(size=(400, 3))
+    drawn = models.draw_tops(top, actions, np.array([1, 0, 1]), seed=0)
+    assert (drawn.sign() == torch.tensor([[1.0], [-1.0], [1.0]])).all()
+    assert (drawn.abs() - 5).abs().max() < 0.6
+
+
 def test_a_predictors_future_stands_in_the_frame_of_its_past() -> None:
     torch.manual_seed(0)
     model = HGVAE(models.with_actions(0))
