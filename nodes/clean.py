@@ -33,7 +33,8 @@ def clean(
         source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
             or a folder with any number of these, at any depth.
         out: the recording to make, or .npz with one row for each row of the input; or the folder for them.
-        weights: weight set of the models: 'default', unless given, or 'research'.
+        weights: weight set of the models: 'default', unless given, or 'research', for non-commercial use only.
+            The HG-VAE of the paper's size, which takes two to three times as long: --set encode.weights=wide-default.
         delay: frames at 30 Hz to wait for, 0 to 16; more is smoother. 4 unless given.
         settings: any setting of [prior], such as gate.enabled=false, or of [trajectory], such as
             trajectory.contacts=false. May be given again.
@@ -44,7 +45,8 @@ def clean(
     """
     table: dict[str, Any] = {"prior": {}, "trajectory": {}}
     if weights is not None:
-        table = {"prior": {"refine": {"weights": weights}}, "trajectory": {"weights": weights}}
+        of_prior = {stage: {"weights": weights} for stage in ("refine", "encode")}
+        table = {"prior": of_prior, "trajectory": {"weights": weights}}
     if delay is not None:
         table["prior"]["delay"] = delay
     for override in settings:

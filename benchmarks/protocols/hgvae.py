@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from cycler import cycler
+from matplotlib import color_sequences
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from sklearn.decomposition import PCA
@@ -133,7 +135,7 @@ def _anomalies(bench: Bench, model: HGVAE, data: _Data) -> Result:
     windows, network = Windows(data.val), load_fault_net("default")
     frames = model.config.frames
     records: list[dict[str, Any]] = []
-    figure = Figure(figsize=(9.5, 4.2), layout="constrained")
+    figure = Figure(figsize=(9.5, 5.6), layout="constrained")
     for axis, (sensor, sigma) in zip(figure.subplots(1, 2, sharey=True), SENSORS.items(), strict=True):
         clean, sizes = windows.draw(count, frames, rng)
         quiet = score_windows(network, model, sensed(clean, sigma, rng), sizes, sigma).max(axis=1)
@@ -154,10 +156,11 @@ def _anomalies(bench: Bench, model: HGVAE, data: _Data) -> Result:
                       "auroc_paper": float(roc_auc_score(truth, np.r_[plain, paper]))}  # fmt: skip
             records.append(record)
             false, true, _ = roc_curve(truth, np.r_[quiet, loud])
-            axis.plot(np.maximum(false, 1 / count), true, lw=1.2, label=f"{name}: {record['auroc']:.3f}")
+            colour = color_sequences["tab20"][list(FAULTS).index(name)]
+            axis.plot(np.maximum(false, 1 / count), true, lw=1.4, color=colour, label=f"{name}: {record['auroc']:.3f}")
         axis.set(xscale="log", xlabel="false alarms", title=sensor)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=6, loc="lower right")
+        axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncol=2, frameon=False)
     figure.axes[0].set_ylabel("found")
     alarms = _false_alarms(bench, network, model, data)
     first, second = SENSORS
@@ -245,10 +248,10 @@ def _sweep(bench: Bench, found: dict[str, HGVAE], data: _Data) -> Result:
          for c in conditions],
         "Clean windows of 50 frames of validation people; one coordinate's error, hidden entries only. 'guess' is the "
         "line beside the joint above, from which the model starts; the paper's ascent moves the entries up log p(z|x); "
-        "the wide model's columns are of 24 other windows.",
+        "the columns of the wide and the research model are of 24 other windows.",
     )  # fmt: skip
-    figure = Figure(figsize=(9.5, 3.8), layout="constrained")
-    shares, bursts = figure.subplots(1, 2)
+    figure = Figure(figsize=(9.5, 4.8), layout="constrained")
+    shares, bursts = figure.subplots(1, 2, subplot_kw={"prop_cycle": cycler(color=color_sequences["tab20"])})
     for method in methods:
         shares.plot(
             [100 * s for s in imputation.FEATURES],
@@ -261,7 +264,7 @@ def _sweep(bench: Bench, found: dict[str, HGVAE], data: _Data) -> Result:
                     "o-", ms=3)  # fmt: skip
     shares.set(xscale="log", yscale="log", xlabel="entries hidden, %", ylabel="error, mm RMS")
     bursts.set(yscale="log", xlabel="a limb hidden for, s")
-    shares.legend(fontsize=6)
+    figure.legend(*shares.get_legend_handles_labels(), loc="outside lower center", ncol=3, fontsize=7, frameon=False)
     for axis in (shares, bursts):
         axis.grid(alpha=0.3)
     return Result([table], {"imputation": records}, {"hgvae_imputation": figure})

@@ -173,6 +173,9 @@ def _jitter(records: list[dict[str, Any]], tried: list[dict[str, Any]]) -> Figur
             )  # fmt: skip
     axis.set(xlabel="delay found, ms", ylabel="jitter: acceleration error, mm/frame²", yscale="log")
     axis.set_title("Jitter at matched delay, 2 cm of noise; small: other parameters tried", fontsize=10)
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter("{x:g}")
+    axis.tick_params(which="minor", labelsize=7)
     axis.grid(alpha=0.3, which="both")
     figure.legend(loc="outside right center", fontsize=8, frameon=False)
     return figure
