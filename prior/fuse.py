@@ -38,8 +38,8 @@ yields without resistance no longer says where it was, and the fit needs many mo
 
 _COASTING = 4.0
 """Times: the standard deviation of a smoother that coasts, beside what is imputed. It holds that a joint goes on as it
-went, which people need not: limbs hidden for half a second are 4 % nearer to the truth so than if it is believed, and off
-by what is said."""
+went, which people need not: limbs hidden for half a second are 4 % nearer to the truth so than if it is believed, and
+off by what is said."""
 
 
 def _bones_between() -> NDArray[np.int64]:
