@@ -34,7 +34,10 @@ CARRY_FRAMES = 20.0
 """Frames over which what the model was off at the edge of a gap fades inside it."""
 
 EDGE_FRAMES = 3
-"""Frames beside a gap over which what the model is off is averaged: a single one carries its noise into the gap."""
+"""Frames beside a gap over which what the model is off is averaged, where a single one would carry its noise into the
+gap: where joints jump about by more than"""
+EDGE_NOISE = 0.005
+"""metres. Without noise the last frame knows best."""
 
 SIGMA_FOUND = 1.3
 """Times the standard deviation that the model states: what limbs hidden for 0.3 to 2 s are off on validation motion."""
@@ -112,7 +115,9 @@ class Impute:
         if settings.steps < 0 or settings.rate <= 0:
             raise ValueError(f"impute: expected steps >= 0 and rate > 0, got {settings.steps} and {settings.rate:g}")
         self._settings, self._counters = settings, counters
-        _carried(np.zeros((1, 2)), np.ones((1, 2)), CARRY_FRAMES, EDGE_FRAMES)  # compiled now, not while a frame waits
+        _carried(
+            np.zeros((1, 2)), np.ones((1, 2)), CARRY_FRAMES, np.ones(1, dtype=np.int64)
+        )  # compiled now, not while a frame waits
         self.delay_frames = delay_frames
         self._climbs: list[Climb | None] = [None] * slots
         self._frame = 0
@@ -154,7 +159,7 @@ class Impute:
             mean[row] = climb.complete(encoded, row, steps).mean
         hidden = np.flatnonzero(~seen.all(axis=-1))
         slots, tracks = encoded.slots[hidden], Tracks(*(part[hidden] for part in encoded.tracks))
-        completed = completed_tracks(tracks, mean[hidden])[..., -frames:]
+        completed = completed_tracks(tracks, mean[hidden], window.noise[slots])[..., -frames:]
         imputed = Imputed(np.full((frames, window.slots, 22, 3), np.nan), np.full((frames, window.slots, 22), np.inf))
         imputed.positions[:, slots] = from_tracks(completed, tracks, encoded.size[hidden]).swapaxes(0, 1)
         # at the start: where the climb ends, the model is surer than it is right
@@ -165,19 +170,21 @@ class Impute:
         return window
 
 
-def completed_tracks(tracks: Tracks, mean: Floats) -> Floats:
+def completed_tracks(tracks: Tracks, mean: Floats, noise: Floats | float = 0.0) -> Floats:
     """(..., 66, T) metres: what was seen, and what the model makes of the rest, ``mean``, without a jump at the edge of
-    a gap."""
+    a gap; ``noise`` (...) metres, how much the joints seen jump about."""
     frames = mean.shape[-1]
     off, observed = (part.reshape(-1, frames) for part in (tracks.x - mean, tracks.observed))
-    return mean + _carried(off, observed, CARRY_FRAMES, EDGE_FRAMES).reshape(mean.shape)
+    edge = np.where(np.asarray(noise)[..., None] > EDGE_NOISE, EDGE_FRAMES, 1)
+    edges = np.array(np.broadcast_to(edge, mean.shape[:-1])).reshape(-1)
+    return mean + _carried(off, observed, CARRY_FRAMES, edges).reshape(mean.shape)
 
 
 @njit(cache=True)
 def _carried(off, observed, fade, edge):
     """(N, T) what the model was off where observed, carried from either side into the gaps, where it fades.
 
-    ``edge``: over how many frames beside a gap the mean is taken.
+    ``edge`` (N,): over how many frames beside a gap the mean is taken.
     """
     nodes, frames = off.shape
     carried = np.where(observed > 0, off, 0.0)
@@ -187,7 +194,7 @@ def _carried(off, observed, fade, edge):
             if t < frames and observed[node, t] == 0.0:
                 continue
             if t > last + 1:
-                earlier, later = _beside_gap(off[node], observed[node], last, t, edge)
+                earlier, later = _beside_gap(off[node], observed[node], last, t, edge[node])
                 for u in range(last + 1, t):
                     before, after = u - last, t - u
                     share = 0.0 if last < 0 else (1.0 if t == frames else after / (before + after))

@@ -33,7 +33,7 @@ def test_what_the_model_was_off_is_carried_into_a_gap_from_both_sides_and_fades(
     observed[0, 2:4] = 0
     observed[1, 3:] = 0
     off[1, 2] = 1.0
-    carried = _carried(off, observed, CARRY_FRAMES, 1)
+    carried = _carried(off, observed, CARRY_FRAMES, np.ones(2, dtype=np.int64))
     near, far = np.exp(-1 / CARRY_FRAMES), np.exp(-2 / CARRY_FRAMES)
     assert carried[0, 2] == pytest.approx(2 / 3 * near + 1 / 3 * 2 * far)
     np.testing.assert_allclose(carried[1, 3:], np.exp(-np.arange(1, 4) / CARRY_FRAMES))
@@ -43,7 +43,7 @@ def test_what_the_model_was_off_is_carried_into_a_gap_from_both_sides_and_fades(
 def test_beside_a_gap_the_mean_of_some_frames_is_carried_and_none_beyond_the_next_gap() -> None:
     off = np.array([[5.0, 1.0, 3.0, 0.0, 8.0, 0.0, 6.0, 9.0]])
     observed = np.array([[1.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 1.0]])
-    carried = _carried(off, observed, 1e9, 2)
+    carried = _carried(off, observed, 1e9, np.array([2]))
     np.testing.assert_allclose(carried[0, [3, 5]], [(2.0 + 8.0) / 2, (8.0 + 7.5) / 2])
 
 
