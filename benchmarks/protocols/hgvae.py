@@ -406,7 +406,7 @@ def _draw_levels(model: HGVAE) -> Figure:
     for levels in range(len(model.config.levels) + 1):
         torch.manual_seed(5)
         strips.append(model.generate(1, random_levels=levels).mean)
-    return _strips(model, torch.cat(strips), [f"{levels} levels drawn" for levels in range(len(strips))])
+    return _strips(model, torch.cat(strips), [f"levels drawn: {levels}" for levels in range(len(strips))])
 
 
 def _strips(model: HGVAE, x: torch.Tensor, labels: list[str]) -> Figure:
