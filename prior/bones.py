@@ -157,8 +157,8 @@ def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float, sam
         lengths = np.concatenate([np.linalg.norm(positions[:, a] - positions[:, b], axis=-1) for a, b in ends])
         lengths = lengths[np.isfinite(lengths)]
         if len(lengths):
-            median = np.median(lengths)
-            deviation = 1.4826 * np.median(np.abs(lengths - median))
+            median = _median(lengths)
+            deviation = 1.4826 * _median(np.abs(lengths - median))
             log_ratio[k] = np.log(max(median, 0.1 * generic) / generic)
             # What noise does not explain of the deviation is as lasting as the bias.
             lasting = max(deviation**2 - noise**2, bias**2)
@@ -210,6 +210,12 @@ def _bones(seen: NDArray[np.bool_]) -> list[list[list[int]]]:
     return measurable
 
 
+def _median(values: Floats) -> Floats:
+    """Along the first axis, in a tenth of the time that numpy's takes for as few."""
+    ordered = np.sort(values, axis=0)
+    return 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
+
+
 def _place_on_trunk(positions: Floats, seen: NDArray[np.bool_], offsets: Floats, trust: float) -> Floats:
     """Offsets (22, 3) with hips, neck and collars moved by ``trust`` towards where the samples (T, 22, 3) have them."""
     placed = offsets.copy()
@@ -224,7 +230,7 @@ def _place_on_trunk(positions: Floats, seen: NDArray[np.bool_], offsets: Floats,
                 both.append(vectors[finite_joints(vectors)] * [1.0, side, 1.0])
             vectors = np.concatenate(both)
             if len(vectors):
-                moved = offsets[joint] + trust * (np.median(vectors, axis=0) - offsets[joint])
+                moved = offsets[joint] + trust * (_median(vectors) - offsets[joint])
                 if MIRROR[joint] == joint:
                     moved[1] = 0.0
                 placed[joint], placed[MIRROR[joint]] = moved, moved * [1.0, -1.0, 1.0]
