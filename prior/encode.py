@@ -92,7 +92,7 @@ class Encode:
     def _bridge(self, window: Window) -> None:
         """Fill the frames of which nothing was seen, once the body is seen again."""
         seen = np.isfinite(window.positions.newest[..., 0]).any(axis=1)
-        for slot in np.flatnonzero(seen & (self._lost > 0) & (self._lost <= BRIDGED)):
+        for slot in np.flatnonzero(seen & (self._lost > 0) & (self._lost <= BRIDGED)).tolist():
             lost = int(self._lost[slot])
             before, now = window.positions.all[-2 - lost][slot], window.positions.newest[slot]
             for back in range(1, lost + 1):
