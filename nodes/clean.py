@@ -34,7 +34,7 @@ def clean(
             or a folder with any number of these, at any depth.
         out: the recording to make, or .npz with one row for each row of the input; or the folder for them.
         weights: weight set of the models: 'default', unless given, or 'research', for non-commercial use only.
-            The HG-VAE of the paper's size, which takes two to three times as long: --set encode.weights=wide-default.
+            An HG-VAE of the paper's size, made by 'steadypose train hgvae-wide': --set encode.weights=wide-default.
         delay: frames at 30 Hz to wait for, 0 to 16; more is smoother. 4 unless given.
         settings: any setting of [prior], such as gate.enabled=false, or of [trajectory], such as
             trajectory.contacts=false. May be given again.

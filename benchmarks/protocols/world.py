@@ -83,7 +83,7 @@ def run(bench: Bench) -> Result:
 def chain(settings: ours.PriorSettings, seen: Floats, stamps_s: Floats) -> tuple[Floats, Floats]:
     """Clips (T, C, 22, 3) through prior and trajectory, calibrated: pose/clean and pose/world, (T, C, 22, 3)."""
     count = seen.shape[1]
-    prior = PriorPipeline(replace(settings, delay=DELAY, max_bodies=count))
+    prior = PriorPipeline(replace(settings, delay=DELAY, max_bodies=ours.SLOTS_A_CLIP * count))
     trajectory = TrajectoryPipeline(TrajectorySettings(weights=settings.refine.weights))
     clean, world = np.full(seen.shape, np.nan), np.full(seen.shape, np.nan)
     for row, message in enumerate(ours.stream(prior, seen, stamps_s, calibrated=True)):
