@@ -2,7 +2,8 @@
 
 Entries are hidden one by one, joint by joint, or a limb for a while; every method gets the same windows. "mean" is the
 training mean of each track, "hold" the last sighting, "line" a straight line in time, "guess" the line beside the
-joint above from which the model starts. The paper climbs log p(z | x) by the missing entries; we climb by the latents.
+joint above, "completion" what the network makes of it, from which HG-VAE starts. The paper climbs log p(z | x) by the
+missing entries; we climb by the latents.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from torch import Tensor, nn
 from benchmarks.corruption import LIMBS
 from prior.body_tracks import Tracks, from_tracks, in_frame_of, to_tracks
 from prior.encode import Encoded
-from prior.hgvae import HGVAE, SCALE
+from prior.graph import SCALE
+from prior.hgvae import HGVAE
 from prior.hgvae_live import LiveHGVAE
 from prior.impute import Climb, ImputeSettings, completed_tracks
 from prior.track_windows import Windows, standardise
@@ -33,7 +35,7 @@ BURSTS_S = (0.1, 0.3, 0.5, 1.0)
 PAPER_RATE = 0.01
 """Metres: Adam's rate for the entries, by its best result on windows of training."""
 
-SENSOR_SIGMA = 0.003
+SENSOR_SIGMA, SLOW = 0.003, 0.0
 """Metres: the windows are clean."""
 
 
@@ -87,9 +89,13 @@ def impute_all(
     for b in range(len(truth)):
         hold[b], line[b] = _held(truth[b], observed[b], mean), _line(truth[b], observed[b], mean)
         guess[b] = _guess(positions[b], sizes[b], clean[b], observed[b], line[b])
-    live = LiveHGVAE(model, SENSOR_SIGMA, 1)
-    hung = standardise(model, guess).double().numpy() * SCALE + mean
-    found = {"mean": np.where(masks, mean, truth), "hold": hold, "line": line, "guess": hung}
+    live = LiveHGVAE(model, SENSOR_SIGMA, SLOW, 1)
+    hung = standardise(model, guess)
+    completed = model.completed(hung, torch.from_numpy(observed).float(), SLOW)
+    guess_m, completed_m = (x.double().numpy() * SCALE + mean for x in (hung, completed))
+    found = {"mean": np.where(masks, mean, truth), "hold": hold, "line": line, "guess": guess_m}
+    if model.completion:
+        found["completion"] = completed_m
     passes: dict[str, list[Floats]] = {}
     for t, x, seen, size in zip(clean, guess, observed.astype(float), sizes, strict=True):
         tracks = t._replace(x=x, observed=seen)

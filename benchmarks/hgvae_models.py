@@ -12,10 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.hgvae import HGVAE, JOINT_NODES, SCALE, HGVAEConfig, Level
+from prior.graph import JOINT_NODES, SCALE
+from prior.hgvae import HGVAE, HGVAEConfig, Level
 from prior.motion_windows import MotionSet
-from prior.track_windows import Windows, mean_tracks
-from prior.train_hgvae import CLIP_ENTRY, Batch, evidence
+from prior.track_windows import Batch, Windows, mean_tracks
+from prior.train_hgvae import CLIP_ENTRY, evidence
 from prior.training import TrainingRun
 
 DEPTHS = (1, 2, 4, 8, 16)

@@ -29,19 +29,39 @@ _ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_co
 """joints that many sensors do not have"""
 
 
-def add_noise(positions: Floats, rng: Rng) -> Floats:
+def slow_errors(count: int, rng: Rng) -> Floats:
+    """(B,) metres along an axis: how large the errors of a sensor are that last or change slowly, in many none."""
+    return 0.03 * rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.7)
+
+
+def add_noise(positions: Floats, rng: Rng, slow: Floats) -> Floats:
     """Windows (B, T, 22, 3) with noise from frame to frame, of some joints more than of others, up to 10 cm, and with
-    errors that last or change slowly, up to 3 cm."""
+    errors ``slow`` (B,) that last or change slowly; see `slow_errors`."""
     count, frames, joints, _ = positions.shape
     fast = 10 ** rng.uniform(-3.3, -1.0, (count, 1, 1, 1)) * np.exp(0.4 * rng.standard_normal((count, 1, joints, 1)))
-    slow = 0.03 * rng.uniform(0.0, 1.0, (count, 1, 1, 1)) * (rng.random((count, 1, 1, 1)) < 0.7)
     phase = rng.uniform(0.0, 2 * np.pi, (count, 1, joints, 3))
     turns = rng.uniform(0.0, SLOW_HZ, (count, 1, joints, 3)) * np.arange(frames)[:, None, None] / FPS
-    bias = np.sqrt(2.0) * slow * np.cos(phase + 2 * np.pi * turns)
+    bias = np.sqrt(2.0) * slow[:, None, None, None] * np.cos(phase + 2 * np.pi * turns)
     return positions + fast * rng.standard_normal((count, frames, joints, 3)) + bias
 
 
-def sensed(positions: Floats, sigma: Floats | float, rng: Rng, fast: Floats | float = 0.5) -> Floats:
+def other_lengths(positions: Floats, sigma: float, rng: Rng) -> Floats:
+    """Windows (B, T, 22, 3) of people whose bones are longer or shorter, each by itself, alike on both sides."""
+    factor = np.exp(sigma * rng.standard_normal((len(positions), len(PARENTS))))
+    factor = np.sqrt(factor * factor[:, MIRROR])[:, None, :, None]
+    other = positions.copy()
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        other[:, :, joint] = other[:, :, parent] + factor[:, :, joint] * (
+            positions[:, :, joint] - positions[:, :, parent]
+        )
+    return other
+
+
+FAST = 0.5
+"""share of a sensor's variance that is noise from frame to frame, if nothing else is known"""
+
+
+def sensed(positions: Floats, sigma: Floats | float, rng: Rng, fast: Floats | float = FAST) -> Floats:
     """Windows (B, T, 22, 3) as a sensor of error ``sigma`` (metres along an axis) sees them; of its variance, ``fast``
     is noise from frame to frame, the rest lasts."""
     count, _, joints, _ = positions.shape

@@ -58,11 +58,11 @@ class Encode:
 
     delay_frames = 0
 
-    def __init__(self, settings: EncodeSettings, sensor_sigma: float, slots: int) -> None:
+    def __init__(self, settings: EncodeSettings, sensor_sigma: float, slow: float, slots: int) -> None:
         state, config = load_weights(settings.weights, "hgvae")
         model = HGVAE(HGVAEConfig.from_dict(config))
         model.load_state_dict(state)
-        self._model = LiveHGVAE(model, sensor_sigma, slots)
+        self._model = LiveHGVAE(model, sensor_sigma, slow, slots)
         self._lost = np.zeros(slots, dtype=np.int64)
         self.frames = self._model.frames
         # loops are compiled at their first call, or loaded: not while a frame waits

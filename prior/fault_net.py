@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from prior.hgvae import JOINT_NODES, SCALE, GraphBlock, GraphLinear
+from prior.graph import JOINT_NODES, SCALE, GraphBlock, GraphLinear
 
 RECENT = 15
 """Frames that are scored: what is wrong now must not be watered down by what was right."""

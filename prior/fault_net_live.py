@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prior.fault_net import OFF_SCALE, RECENT, ROUGH_SCALE, SENSOR_SCALE, FaultNet
+from prior.graph import JOINT_NODES, SCALE
 from prior.graph_program import Network, Program
-from prior.hgvae import JOINT_NODES, SCALE
 
 Floats = NDArray[np.float64]
 

@@ -6,8 +6,9 @@ learned adjacency mix nodes, contract them to fewer on the way up and expand the
 deterministic stream of all nodes, to which every stochastic level, from the single top node down to one latent for
 each track, adds what it knows.
 
-Beyond the paper: the encoder is told which entries were observed, so that one pass already completes a window; and
-the cosine transform may be cut off at its lower coefficients, which makes the live model small.
+Beyond the paper: the encoder is told which entries were observed, and the others are guessed by a network of their own
+(`prior.completion_net`), so that one pass already completes a window; and the cosine transform may be cut off at its
+lower coefficients, which makes the live model small.
 """
 
 from __future__ import annotations
@@ -16,21 +17,21 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-JOINT_NODES = 66
-"""22 joints, 3 coordinates: node ``3 * joint + axis``."""
-
-SCALE = 0.2
-"""Metres that the network counts as one."""
-
-LOG_VAR_RANGE = (-10.0, 3.0)
-"""of latents and, in units of `SCALE`, of tracks: standard deviations from 1.3 mm to 0.9 m"""
+from prior.completion_net import CompletionConfig, CompletionNet
+from prior.graph import JOINT_NODES, LOG_VAR_RANGE, GraphBlock, GraphLinear
 
 TRACK_LOG_VAR = -4.0
 """Log-variance of tracks that the network's zero stands for: 2.7 cm"""
+
+
+FAINT, SURE = 0.25, -4.0
+"""How a model begins: the factor on what a level adds to the stream, and the log-variance of the posteriors"""
 
 
 class Level(NamedTuple):
@@ -52,6 +53,7 @@ class HGVAEConfig:
         stochastic: how many of the levels, counted from the bottom, are random; those above stay at their prior's
             mean and carry nothing (table 1: depth at equal capacity). None: all.
         actions: action classes, given one-hot beside the top latent; 0 for a model without.
+        completion: sizes of the network that guesses what was not observed; None for a model without.
     """
 
     frames: int = 50
@@ -60,11 +62,17 @@ class HGVAEConfig:
     levels: tuple[Level, ...] = (Level(1, 64), Level(8, 32), Level(24, 32), Level(JOINT_NODES, 16))
     stochastic: int | None = None
     actions: int = 0
+    completion: CompletionConfig | None = None
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> HGVAEConfig:
         """From the JSON of a weights file."""
-        return cls(**{**config, "levels": tuple(Level(*level) for level in config["levels"])})
+        completion = config.get("completion")
+        return cls(**{
+            **config,
+            "levels": tuple(Level(*level) for level in config["levels"]),
+            "completion": completion and CompletionConfig(**completion),
+        })  # fmt: skip
 
 
 def dct_matrix(frames: int) -> Tensor:
@@ -78,51 +86,6 @@ def dct_matrix(frames: int) -> Tensor:
     matrix = math.sqrt(2 / frames) * torch.cos(math.pi / (2 * frames) * (2 * n + 1) * k)
     matrix[0] /= math.sqrt(2)
     return matrix.float()
-
-
-class GraphLinear(nn.Module):
-    """``S A W + b``: graphs (n_in, B, f_in) to (n_out, B, f_out), equation 4 without its activation.
-
-    Nodes come first inside the model, so that either product is one of two matrices, however large the batch.
-    ``nodes_in == nodes_out`` stands for the same nodes: then S starts near the identity.
-    """
-
-    def __init__(self, nodes_in: int, nodes_out: int, features_in: int, features_out: int) -> None:
-        super().__init__()
-        if nodes_in == nodes_out:
-            adjacency = torch.eye(nodes_in) + torch.randn(nodes_in, nodes_in) * 0.3 / math.sqrt(nodes_in)
-        else:
-            adjacency = torch.randn(nodes_out, nodes_in) / math.sqrt(nodes_in)
-        self.adjacency = nn.Parameter(adjacency)
-        self.weight = nn.Parameter(torch.randn(features_in, features_out) / math.sqrt(features_in))
-        self.bias = nn.Parameter(torch.zeros(nodes_out, features_out))
-
-    def forward(self, graph: Tensor) -> Tensor:
-        """(n_in, B, f_in) to (n_out, B, f_out)."""
-        if len(self.bias) < len(graph):  # the cheaper order
-            return self._mix(graph) @ self.weight + self.bias[:, None]
-        return self._mix(graph @ self.weight) + self.bias[:, None]
-
-    def _mix(self, graph: Tensor) -> Tensor:
-        return (self.adjacency @ graph.flatten(1)).unflatten(1, graph.shape[1:])
-
-
-class GraphBlock(nn.Module):
-    """Two graph convolutional layers beside a residual connection (equation 5).
-
-    The learned weight, 0 at first, stands on the layers' branch, as Bachlechner et al. (2020) have it and as the
-    official code does; the paper's formula puts it on the residual.
-    """
-
-    def __init__(self, nodes: int, features: int) -> None:
-        super().__init__()
-        self.first = GraphLinear(nodes, nodes, features, features)
-        self.second = GraphLinear(nodes, nodes, features, features)
-        self.alpha = nn.Parameter(torch.zeros(()))
-
-    def forward(self, graph: Tensor) -> Tensor:
-        """(n, B, f) to (n, B, f)."""
-        return graph + self.alpha * F.gelu(self.second(F.gelu(self.first(graph))))
 
 
 class Gaussian(NamedTuple):
@@ -171,6 +134,7 @@ class HGVAE(nn.Module):
         nodes, features = JOINT_NODES, config.features
         self.register_buffer("dct", dct_matrix(config.frames)[: config.coefficients].clone())
         self.register_buffer("mean", torch.zeros(nodes))
+        self.completion = CompletionNet(config.frames, config.completion) if config.completion else None
         self.read = GraphLinear(nodes, nodes, config.coefficients + config.frames, features)
         self.read_block = GraphBlock(nodes, features)
         self.up = nn.ModuleList()  # bottom level first
@@ -201,6 +165,16 @@ class HGVAE(nn.Module):
     def decoder_levels(self) -> list[DecoderLevel]:
         """The stochastic levels, the top one first."""
         return [cast("DecoderLevel", level) for level in self.down]
+
+    def completed(self, x: Tensor, observed: Tensor, slow: NDArray[np.floating] | float) -> Tensor:
+        """(B, N, T) windows with a better guess of what was not observed.
+
+        Args:
+            x: (B, N, T) tracks; what was not observed holds a guess.
+            observed: (B, N, T) 1 where observed, else 0.
+            slow: (B,) metres along an axis, the errors of the sensor that last.
+        """
+        return self.completion.complete(x, observed, slow) if self.completion else x
 
     def forward(
         self, x: Tensor, observed: Tensor, *, spread: Tensor | None = None, action: Tensor | None = None
@@ -281,6 +255,9 @@ class DecoderLevel(nn.Module):
             self.prior_head = nn.Linear(features, 2 * level.latent)
         self.expand = GraphLinear(level.nodes, nodes, level.latent + extra, features)
         self.block = GraphBlock(nodes, features)
+        with torch.no_grad():  # latents begin as faint and as sure: the noise of many levels would bury what each tells
+            self.expand.weight *= FAINT
+            self.posterior_head.bias[level.latent :] += SURE
 
     def prior(self, stream: Tensor) -> Gaussian:
         """p(z | what stands above); N(0, I) at the top."""

@@ -11,8 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from prior.body_tracks import hang_unseen
+from prior.completion_live import LiveCompletion
+from prior.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE
 from prior.graph_program import Floats, Network, Program
-from prior.hgvae import HGVAE, JOINT_NODES, LOG_VAR_RANGE, SCALE, TRACK_LOG_VAR
+from prior.hgvae import HGVAE, TRACK_LOG_VAR
 
 
 class Look(NamedTuple):
@@ -33,6 +35,7 @@ class LiveHGVAE:
     Args:
         model: whose weights are copied; without actions.
         sensor_sigma: metres, standard deviation of an observation.
+        slow: metres, what of it lasts.
         most: windows that can be looked at, at once.
 
     Attributes:
@@ -41,8 +44,9 @@ class LiveHGVAE:
         elsewhere: the row in which `decode` leaves the window that it decoded last.
     """
 
-    def __init__(self, model: HGVAE, sensor_sigma: float, most: int) -> None:
+    def __init__(self, model: HGVAE, sensor_sigma: float, slow: float, most: int) -> None:
         config, p = model.config, Program()
+        self._completion = LiveCompletion(model.completion, slow, most) if model.completion else None
         self.frames, self._mean = config.frames, model.mean.numpy().astype(np.float64)[:, None]
         self._x = p.matrix(JOINT_NODES, 2 * config.frames)  # the tracks, and beside them what was observed
         kept = config.coefficients
@@ -100,6 +104,8 @@ class LiveHGVAE:
         rows = slice(0, len(x))
         deviations = (x - self._mean) / SCALE
         hang_unseen(deviations)
+        if self._completion:
+            self._completion.complete(deviations, observed)
         seen = self._net.matrix(self._x, rows)
         seen[..., : self.frames], seen[..., self.frames :] = deviations, observed > 0
         self._trust[rows] = observed

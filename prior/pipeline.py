@@ -107,7 +107,8 @@ class PriorPipeline:
         # what the sensor may be off by, slowly and fast
         sensor_sigma = float(np.hypot(settings.bias_sigma, settings.smooth.measurement_sigma))
         denoise, score, impute = settings.denoise.enabled, settings.score.enabled, settings.impute.enabled
-        self._encode = Encode(settings.encode, sensor_sigma, slots) if denoise or score or impute else None
+        needed = denoise or score or impute
+        self._encode = Encode(settings.encode, sensor_sigma, settings.bias_sigma, slots) if needed else None
         self._denoise = Denoise(settings.smooth.measurement_sigma, settings.delay, slots) if denoise else None
         self._impute = Impute(settings.impute, settings.delay, slots, self.counters) if impute else None
         shortest = max(refine.window, settings.delay + 1)

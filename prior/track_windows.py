@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.body_tracks import body_size, hang_unseen, to_tracks
-from prior.hgvae import HGVAE, SCALE
+from prior.body_tracks import body_size, hang_unseen, in_frame_of, to_tracks
+from prior.graph import SCALE
+from prior.hgvae import HGVAE
 from prior.motion_windows import MotionSet, mirror_offsets
 
 Floats = NDArray[np.float64]
@@ -36,6 +38,43 @@ class Windows:
     ) -> tuple[Floats, Floats]:
         """``count`` random windows, each at one of ``strides`` (2 is twice as fast), and body sizes."""
         return self.clean(self.motion.sample(count, frames, strides, rng), rng.random(count) < 0.5)
+
+
+class Batch(NamedTuple):
+    """Windows as tensors.
+
+    Attributes:
+        x: (B, 66, T) what was seen and, elsewhere, the guess, about the model's mean and in its scale.
+        observed: (B, 66, T) 1 where seen.
+        target: (B, 66, T) the truth in the same frame.
+        counts: (B, 1, T) 1 from the first sighting on; what was before, nobody asks for.
+    """
+
+    x: Tensor
+    observed: Tensor
+    target: Tensor
+    counts: Tensor
+
+    @classmethod
+    def of(cls, model: HGVAE, seen: Floats, truth: Floats, sizes: Floats) -> Batch:
+        """From positions (B, T, 22, 3) seen and true, and body sizes (B,)."""
+        tracks = [to_tracks(window, size) for window, size in zip(seen, sizes, strict=True)]
+        true = [in_frame_of(t, window, size) for t, window, size in zip(tracks, truth, sizes, strict=True)]
+        observed = torch.from_numpy(np.stack([t.observed for t in tracks])).float()
+        counts = (observed.amax(dim=1, keepdim=True).cumsum(dim=-1) > 0).float()
+        x = standardise(model, np.stack([t.x for t in tracks]))
+        return cls(x, observed, standardise(model, np.stack(true)), counts)
+
+    def completed(self, model: HGVAE, slow: Floats | float) -> Batch:
+        """The same with the model's guess of what was not seen.
+
+        ``slow`` (B,) metres along an axis: the errors of the sensor that last.
+        """
+        return self._replace(x=model.completed(self.x, self.observed, slow))
+
+    def beside(self, other: Batch) -> Batch:
+        """Both, one after the other."""
+        return Batch(*(torch.cat(pair) for pair in zip(self, other, strict=True)))
 
 
 def standardise(model: HGVAE, x: Floats) -> Tensor:

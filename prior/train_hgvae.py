@@ -1,9 +1,10 @@
 """Training of HG-VAE (section 5): the evidence lower bound, and completion of windows seen in part.
 
 Half of each batch is the paper's: clean windows, every entry observed, latents drawn, KL warmed up. The other half
-teaches the encoder what a camera does: entries are hidden, the rest is noisy or plainly wrong, and the likelihood of
-the true window, at the means of the latents, is all that counts. One pass then completes a window and says how sure it
-is; what was seen where the model would not have put it is an anomaly.
+teaches the encoder what a camera does: entries are hidden, and guessed by the completion network, which is trained
+first (`prior.train_completion`); the rest is noisy or plainly wrong; and the likelihood of the true window, at the
+means of the latents, is all that counts. One pass then completes a window and says how sure it is; what was seen where
+the model would not have put it is an anomaly.
 """
 
 from __future__ import annotations
@@ -11,31 +12,38 @@ from __future__ import annotations
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.body_tracks import in_frame_of, to_tracks
 from prior.checkpoint import LICENCES, started, weights_path
-from prior.corruption import add_noise, elsewhere, exchanged, occlude, spoil, stands_still
+from prior.completion_net import CompletionConfig
+from prior.corruption import add_noise, elsewhere, exchanged, occlude, slow_errors, spoil, stands_still
 from prior.distributed import share
-from prior.hgvae import HGVAE, JOINT_NODES, SCALE, HGVAEConfig, Level, Pass
+from prior.graph import JOINT_NODES, SCALE
+from prior.hgvae import HGVAE, HGVAEConfig, Level, Pass
 from prior.motion_windows import MotionSet
-from prior.track_windows import STRIDES, Windows, mean_tracks, standardise
+from prior.track_windows import STRIDES, Batch, Windows, mean_tracks
 from prior.train_anomaly import train_anomaly
+from prior.train_completion import train_completion
 from prior.training import TrainingRun
 
 Floats = NDArray[np.float64]
 
 MODELS: dict[str, HGVAEConfig] = {
     "hgvae": HGVAEConfig(
-        coefficients=20, features=48, levels=(Level(1, 48), Level(8, 24), Level(24, 24), Level(JOINT_NODES, 12))
+        coefficients=20,
+        features=48,
+        levels=(Level(1, 48), Level(8, 24), Level(24, 24), Level(JOINT_NODES, 12)),
+        completion=CompletionConfig(),
     ),
     "hgvae-wide": HGVAEConfig(
-        coefficients=50, features=256, levels=(Level(1, 256), Level(8, 128), Level(24, 128), Level(JOINT_NODES, 128))
+        coefficients=50,
+        features=256,
+        levels=(Level(1, 256), Level(8, 128), Level(24, 128), Level(JOINT_NODES, 128)),
+        completion=CompletionConfig(),
     ),
 }
 """``hgvae`` fits a robot's budget; ``hgvae-wide`` has the paper's size, for recordings."""
@@ -85,6 +93,7 @@ def train_hgvae(
     network = HGVAE(MODELS[model])
     network.mean.copy_(mean_tracks(train, network.config.frames))
     origin = started(network, model, start)
+    train_completion(network, train, val, runs / f"{name}-completion", iterations, seed)
     run = fit(network, train, val, runs / name, iterations, batch, learning_rate, seed)
     path = run.ship(name, network, asdict(network.config), {
         "Model": f"HG-VAE, '{model}' of prior/train_hgvae.py",
@@ -110,41 +119,12 @@ def train_hgvae_wide(
     return train_hgvae(data, runs, weights, "hgvae-wide", iterations, 32, 5e-4, seed, start)
 
 
-class Batch(NamedTuple):
-    """Windows as tensors.
-
-    Attributes:
-        x: (B, 66, T) what was seen and, elsewhere, the guess, about the model's mean and in its scale.
-        observed: (B, 66, T) 1 where seen.
-        target: (B, 66, T) the truth in the same frame.
-        counts: (B, 1, T) 1 from the first sighting on; what was before, nobody asks for.
-    """
-
-    x: Tensor
-    observed: Tensor
-    target: Tensor
-    counts: Tensor
-
-    @classmethod
-    def of(cls, model: HGVAE, seen: Floats, truth: Floats, sizes: Floats) -> Batch:
-        """From positions (B, T, 22, 3) seen and true, and body sizes (B,)."""
-        tracks = [to_tracks(window, size) for window, size in zip(seen, sizes, strict=True)]
-        true = [in_frame_of(t, window, size) for t, window, size in zip(tracks, truth, sizes, strict=True)]
-        observed = torch.from_numpy(np.stack([t.observed for t in tracks])).float()
-        counts = (observed.amax(dim=1, keepdim=True).cumsum(dim=-1) > 0).float()
-        x = standardise(model, np.stack([t.x for t in tracks]))
-        return cls(x, observed, standardise(model, np.stack(true)), counts)
-
-    def beside(self, other: Batch) -> Batch:
-        """Both, one after the other."""
-        return Batch(*(torch.cat(pair) for pair in zip(self, other, strict=True)))
-
-
 def fit(
     model: HGVAE, train: Windows, val: Windows, directory: Path, iterations: int, batch: int, rate: float, seed: int
 ) -> TrainingRun:
-    """Train ``model``; see `train_hgvae`."""
-    optimiser = torch.optim.Adam(model.parameters(), lr=rate)
+    """Train ``model``, all but what completes windows; see `train_hgvae`."""
+    learned = [p for name, p in model.named_parameters() if not name.startswith("completion.")]
+    optimiser = torch.optim.Adam(learned, lr=rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
     state = {"model": model, "optimiser": optimiser, "schedule": schedule}
     run = TrainingRun(directory, state, iterations, every=max(iterations // 24, 1))
@@ -156,8 +136,9 @@ def fit(
         positions, sizes = train.draw(batch, frames, rng, STRIDES)
         half = batch // 2
         whole = Batch.of(model, positions[:half], positions[:half], sizes[:half])
-        seen = occlude(spoil(add_noise(positions[half:], rng), SPOILT_BY, 0.5, rng), rng)
-        both = whole.beside(Batch.of(model, seen, positions[half:], sizes[half:]))
+        slow = slow_errors(batch - half, rng)
+        seen = occlude(spoil(add_noise(positions[half:], rng, slow), SPOILT_BY, 0.5, rng), rng)
+        both = whole.beside(Batch.of(model, seen, positions[half:], sizes[half:]).completed(model, slow))
         drawn = model(both.x, both.observed, spread=(torch.arange(batch) < half).float()[:, None])
         likelihood = (drawn.tracks.log_density(both.target) * both.counts).flatten(1).sum(dim=1)
         kl = drawn.kl[:half].sum() / batch
@@ -165,7 +146,7 @@ def fit(
         loss = beta * kl - likelihood.mean()
         optimiser.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), CLIP_ENTRY * math.sqrt(frames * JOINT_NODES))
+        torch.nn.utils.clip_grad_norm_(learned, CLIP_ENTRY * math.sqrt(frames * JOINT_NODES))
         optimiser.step()
         schedule.step()
         losses.update({"loss": loss.item(), "KL": 2 * kl.item()})
@@ -185,7 +166,7 @@ def evaluate_hgvae(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, 
 
     Returns:
         ``ELBO`` and its ``log p(x|z)``, nats an entry; ``val mm``, the mean joint error of whole windows; ``hidden
-        mm``, that of entries hidden as in training, and ``line mm``, that of the guess they started from.
+        mm``, that of entries hidden as in training, and ``guess mm``, that of the completion it started from.
     """
     model.eval()
     rng = np.random.default_rng(1)
@@ -193,7 +174,9 @@ def evaluate_hgvae(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, 
     whole = Batch.of(model, positions, positions, sizes)
     likelihood, kl = evidence(model(whole.x, whole.observed, spread=torch.ones(windows, 1)), whole.target)
     found = model(whole.x, whole.observed)
-    partial = Batch.of(model, occlude(add_noise(positions, rng), rng), positions, sizes)
+    slow = slow_errors(windows, rng)
+    partial = Batch.of(model, occlude(add_noise(positions, rng, slow), rng), positions, sizes)
+    partial = partial.completed(model, slow)
     completed = model(partial.x, partial.observed)
     hidden = (partial.observed[:, ::3] == 0) & (partial.counts > 0)
     z = (completed.tracks.mean - partial.target).square() * (-completed.tracks.log_var).exp()
@@ -203,7 +186,7 @@ def evaluate_hgvae(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, 
         "log p(x|z)": (likelihood.mean() / entries).item(),
         "val mm": _joint_error(found.tracks.mean, whole.target).mean().item(),
         "hidden mm": _joint_error(completed.tracks.mean, partial.target)[hidden].mean().item(),
-        "line mm": _joint_error(partial.x, partial.target)[hidden].mean().item(),
+        "guess mm": _joint_error(partial.x, partial.target)[hidden].mean().item(),
         "hidden found/stated": z.unflatten(1, (-1, 3)).mean(dim=2)[hidden].mean().sqrt().item(),
     }
 

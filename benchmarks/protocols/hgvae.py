@@ -28,17 +28,19 @@ from benchmarks.machine import ROOT
 from benchmarks.motion import as_set, digest
 from benchmarks.results import Table
 from msgs.types import JOINTS
-from prior.anomaly import Calibration, decimals, load_fault_net
+from prior.anomaly import RATES as QUANTILES
+from prior.anomaly import Calibration, load_fault_net
 from prior.body_tracks import to_tracks
 from prior.checkpoint import WEIGHTS, load_weights
 from prior.corruption import sensed
 from prior.fault_net import FaultNet
-from prior.hgvae import HGVAE, SCALE, HGVAEConfig
+from prior.graph import SCALE
+from prior.hgvae import HGVAE, HGVAEConfig
 from prior.motion_windows import MotionSet
 from prior.skeletons import PARENTS
-from prior.track_windows import Windows, standardise
-from prior.train_anomaly import HELD_BACK, score_windows
-from prior.train_hgvae import Batch, evidence
+from prior.track_windows import Batch, Windows, standardise
+from prior.train_anomaly import score_windows
+from prior.train_hgvae import evidence
 
 Floats = NDArray[np.float64]
 
@@ -180,7 +182,8 @@ def _anomalies(bench: Bench, model: HGVAE, data: _Data) -> Result:
             "hgvae-false-alarms", "HG-VAE: windows of clean motion flagged",
             ["people and motion", "windows", *(f"asked for {100 * r:g} %" for r in RATES)],
             [[r["people"], str(r["windows"]), *(f"{100 * r[f'at_{rate:g}']:.1f} %" for rate in RATES)] for r in alarms],
-            f"The scale was made of all validation people but {HELD_BACK}; the model has seen none of these.",
+            "Seen by a camera of 20 mm. First row: the mean of those below, weighted by how much there is of each; the "
+            "networks have seen none of them. Bandai-Namco's people act in styles; by the scale that ships.",
         ),
     ]  # fmt: skip
     return Result(tables, {"anomalies": records, "false_alarms": alarms}, {"hgvae_roc": figure})
@@ -198,23 +201,39 @@ def _paper_score(model: HGVAE, seen: Floats, sizes: Floats) -> Floats:
 
 
 def _false_alarms(bench: Bench, network: FaultNet, model: HGVAE, data: _Data) -> list[dict[str, Any]]:
-    sets: dict[str, MotionSet] = {"all validation people": data.val}
+    """Of clean windows: of each validation person by a scale of the others, and of kinds of motion never seen."""
+    sigma, count = SENSORS["camera, 20 mm"], 128 if bench.quick else 4000
+
+    def scores(motion: MotionSet, windows: int) -> Floats:
+        rng = np.random.default_rng(13)
+        positions, sizes = Windows(motion).draw(windows, model.config.frames, rng)
+        return score_windows(network, model, sensed(positions, sigma, rng), sizes, sigma).max(axis=1)
+
+    people = {str(person): data.val.only(data.val.subject == person) for person in np.unique(data.val.subject)}
+    found = {p: scores(m, max(round(count * m.hours / data.val.hours), 8)) for p, m in people.items()}
+    records: list[dict[str, Any]] = []
+    for person, own in found.items():
+        others = [of for other, of in found.items() if other != person] or [own]
+        limits = np.quantile(np.concatenate(others), 1 - np.array(RATES))
+        records.append({"people": person, "windows": len(own)} | _above(own, limits))
+    total = sum(r["windows"] for r in records)
+    mean = {f"at_{rate:g}": sum(r["windows"] * r[f"at_{rate:g}"] for r in records) / total for rate in RATES}
+    records.insert(0, {"people": "all validation people, each by a scale of the others", "windows": total} | mean)
     if data.prepared:
-        sets[f"{HELD_BACK}, not calibrated on"] = data.val.only(data.val.subject == HELD_BACK)
         everything = MotionSet.load(data.prepared, "research", "val")
         known = np.isin(everything.subject, data.val.subject)
         if not known.all():
-            sets["kinds of motion never seen (Bandai-Namco)"] = everything.only(~known)
-    sigma, records = SENSORS["camera, 20 mm"], []
-    for people, motion in sets.items():
-        rng = np.random.default_rng(13)
-        positions, sizes = Windows(motion).draw(64 if bench.quick else 1500, model.config.frames, rng)
-        odds = score_windows(network, model, sensed(positions, sigma, rng), sizes, sigma)
-        told = decimals(odds.max(axis=1), Calibration.load("default").at(sigma), np.isinf(odds).sum(axis=1))
-        records.append({"people": people, "windows": len(told)} | {
-            f"at_{rate:g}": float((told > -np.log10(rate)).mean()) for rate in RATES
-        })  # fmt: skip
+            scale = Calibration.load("default").at(sigma).quantiles[0]
+            limits = np.interp(-np.log10(RATES), -np.log10(QUANTILES), scale)
+            odds = scores(everything.only(~known), count)
+            records.append(
+                {"people": "kinds of motion never seen (Bandai-Namco)", "windows": count} | _above(odds, limits)
+            )
     return records
+
+
+def _above(scores: Floats, limits: Floats) -> dict[str, float]:
+    return {f"at_{rate:g}": float((scores > limit).mean()) for rate, limit in zip(RATES, limits, strict=True)}
 
 
 def _sweep(bench: Bench, found: dict[str, HGVAE], data: _Data) -> Result:
@@ -224,7 +243,7 @@ def _sweep(bench: Bench, found: dict[str, HGVAE], data: _Data) -> Result:
     for name, model in found.items():
         first = name == "default"
         steps = (3,) if bench.quick else (10, 100) if first else (10,)
-        count = 4 if bench.quick else 48
+        count = 4 if bench.quick else 96
         for condition, hide in bench.progress.track(
             list(imputation.CONDITIONS.items()), description=f"imputation, {NAMES[name]}"
         ):
@@ -247,7 +266,8 @@ def _sweep(bench: Bench, found: dict[str, HGVAE], data: _Data) -> Result:
         [[c, *(f"{by[m, c] ** 0.5:.1f} ({100 * (by[m, c] / by['mean', c] - 1):.0f} %)" for m in methods)]
          for c in conditions],
         "Clean windows of 50 frames of validation people; one coordinate's error, hidden entries only. 'guess' is the "
-        "line beside the joint above, from which the model starts; the paper's ascent moves the entries up log p(z|x).",
+        "line beside the joint above, 'completion' what the network makes of it, from which HG-VAE starts; the paper's "
+        "ascent moves the entries up log p(z|x).",
     )  # fmt: skip
     figure = Figure(figsize=(9.5, 4.8), layout="constrained")
     shares, bursts = figure.subplots(1, 2, subplot_kw={"prop_cycle": cycler(color=color_sequences["tab20"])})
@@ -308,7 +328,7 @@ def _prediction(bench: Bench, model: HGVAE, data: _Data) -> Result:
 
 def _depth(bench: Bench, data: _Data) -> Result:
     """Table 1: stochastic depth at equal capacity."""
-    steps = 2 if bench.quick else 300
+    steps = 2 if bench.quick else 1000
     records = []
     for depth in models.DEPTHS:
         bench.progress.stop()  # training draws a bar of its own

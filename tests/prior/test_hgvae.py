@@ -11,14 +11,22 @@ from hypothesis import strategies as st
 from prior.anomaly import load_fault_net
 from prior.body_tracks import from_tracks, hang_unseen, in_frame_of, to_tracks
 from prior.checkpoint import WEIGHTS, load_weights
-from prior.hgvae import HGVAE, Gaussian, GraphBlock, GraphLinear, HGVAEConfig, Level, dct_matrix
+from prior.completion_net import CompletionConfig
+from prior.graph import GraphBlock, GraphLinear
+from prior.hgvae import HGVAE, Gaussian, HGVAEConfig, Level, dct_matrix
 from prior.hgvae_live import LiveHGVAE
 from prior.skeletons import J
 from prior.train_hgvae import train_hgvae
 from tests.prior.bodies import waving
 from tests.prior.test_hmvae import prepared
 
-SMALL = HGVAEConfig(frames=12, coefficients=6, features=8, levels=(Level(1, 4), Level(5, 3), Level(66, 2)))
+SMALL = HGVAEConfig(
+    frames=12,
+    coefficients=6,
+    features=8,
+    levels=(Level(1, 4), Level(5, 3), Level(66, 2)),
+    completion=CompletionConfig(patch=4, features=8, blocks=1),
+)
 
 
 def awake(config: HGVAEConfig = SMALL, seed: int = 0) -> HGVAE:
@@ -143,11 +151,12 @@ def test_generation_draws_as_many_levels_as_asked() -> None:
 
 def test_the_live_model_is_the_trained_one() -> None:
     model = awake()
-    live = LiveHGVAE(model, sensor_sigma=0.01, most=4)
+    live = LiveHGVAE(model, sensor_sigma=0.01, slow=0.0, most=4)
     rng = np.random.default_rng(0)
     x, observed = rng.normal(scale=0.3, size=(3, 66, 12)), (rng.random((3, 66, 12)) < 0.7).astype(float)
     look = live.look(x, observed)
     scaled = torch.from_numpy((x - model.mean.numpy()[:, None]) / 0.2).float()
+    scaled = model.completed(scaled, torch.from_numpy(observed).float(), 0.0)
     found = model(scaled, torch.from_numpy(observed).float())
     np.testing.assert_allclose(look.mean, found.tracks.mean.numpy() * 0.2 + model.mean.numpy()[:, None], atol=1e-5)
     np.testing.assert_allclose(look.sigma, (0.5 * found.tracks.log_var).exp().numpy() * 0.2, rtol=1e-4)
@@ -160,7 +169,7 @@ def test_what_the_live_model_makes_of_a_window_does_not_depend_on_the_others() -
     model, rng = awake(), np.random.default_rng(0)
     x, observed = rng.normal(scale=0.3, size=(3, 66, 12)), np.ones((3, 66, 12))
     x[2, 30:33] = np.nan  # a joint never seen
-    together, alone = LiveHGVAE(model, 0.01, most=3), LiveHGVAE(model, 0.01, most=1)
+    together, alone = LiveHGVAE(model, 0.01, 0.0, most=3), LiveHGVAE(model, 0.01, 0.0, most=1)
     looks = together.look(x, observed)
     found = [(together.score(row), *together.gradient(row)) for row in range(3)]
     moved = rng.normal(scale=0.1, size=together.latents)
@@ -174,7 +183,7 @@ def test_what_the_live_model_makes_of_a_window_does_not_depend_on_the_others() -
 
 
 def test_the_gradient_of_the_live_score_is_that_of_its_differences() -> None:
-    live = LiveHGVAE(awake(), sensor_sigma=0.01, most=2)
+    live = LiveHGVAE(awake(), sensor_sigma=0.01, slow=0.0, most=2)
     rng = np.random.default_rng(0)
     trust = (rng.random((2, 66, 12)) < 0.7) * rng.uniform(0.2, 1, (2, 66, 12))
     live.look(rng.normal(scale=0.2, size=(2, 66, 12)), trust)
@@ -212,7 +221,7 @@ def test_the_weights_that_ship_reconstruct_motion_they_never_saw() -> None:
     state, config = load_weights("default", "hgvae")
     model = HGVAE(HGVAEConfig.from_dict(config)).eval()
     model.load_state_dict(state)
-    live = LiveHGVAE(model, sensor_sigma=0.01, most=7)
+    live = LiveHGVAE(model, sensor_sigma=0.01, slow=0.0, most=7)
     tracks = to_tracks(np.stack([waving(120)[start : start + 50] for start in range(0, 70, 10)]), 1.0)
     off = live.look(tracks.x, tracks.observed).mean - tracks.x
     assert 1000 * np.sqrt(np.mean(np.square(off))) == pytest.approx(GOLDEN_RMS_MM, abs=1.0)

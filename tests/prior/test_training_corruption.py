@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from prior.corruption import add_noise, exchanged, hide_joints, occlude, sensed, spoil
-from prior.skeletons import MIRROR, J
+from prior.corruption import add_noise, exchanged, hide_joints, occlude, other_lengths, sensed, slow_errors, spoil
+from prior.skeletons import MIRROR, PARENTS, J
 from prior.train_anomaly import FAULTS
 from tests.prior.bodies import waving
 
@@ -11,11 +11,37 @@ WINDOWS = np.stack([waving(50, speed=1.0 + 0.05 * k) for k in range(40)])
 
 def test_the_truth_is_left_alone() -> None:
     rng, kept = np.random.default_rng(0), WINDOWS.copy()
-    for spoilt in (occlude(WINDOWS, rng), add_noise(WINDOWS, rng), spoil(WINDOWS, FAULTS, 1.0, rng),
-                   sensed(WINDOWS, 0.01, rng), hide_joints(WINDOWS, 3, rng)):  # fmt: skip
+    for spoilt in (
+        occlude(WINDOWS, rng),
+        add_noise(WINDOWS, rng, slow_errors(40, rng)),
+        other_lengths(WINDOWS, 0.05, rng),
+        spoil(WINDOWS, FAULTS, 1.0, rng),
+        sensed(WINDOWS, 0.01, rng),
+        hide_joints(WINDOWS, 3, rng),
+    ):
         assert spoilt.shape == WINDOWS.shape
         assert not np.array_equal(spoilt, kept, equal_nan=True)
     np.testing.assert_array_equal(WINDOWS, kept)
+
+
+def test_other_bones_are_as_long_on_both_sides_and_in_every_frame() -> None:
+    other = other_lengths(WINDOWS, 0.1, np.random.default_rng(0))
+    factor = bone_lengths(other)[..., 1:] / bone_lengths(WINDOWS)[..., 1:]
+    assert 0.05 < np.log(factor).std() < 0.15
+    np.testing.assert_allclose(factor, factor[:, :1].repeat(50, axis=1))
+    np.testing.assert_allclose(factor, factor[..., np.array(MIRROR)[1:] - 1])
+
+
+def test_errors_that_last_are_as_large_as_told() -> None:
+    rng = np.random.default_rng(0)
+    slow = np.repeat([0.0, 0.03], 20)
+    off = np.abs((add_noise(WINDOWS, rng, slow) - WINDOWS).mean(axis=1))
+    assert off[20:].mean() > 3 * off[:20].mean()
+    assert 0.5 < (slow_errors(4000, rng) > 0).mean() < 0.8
+
+
+def bone_lengths(windows: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(windows - windows[..., PARENTS, :], axis=-1)
 
 
 def test_gaps_are_many_and_reach_the_newest_frame() -> None:
