@@ -13,7 +13,7 @@ from nodes.threads import one_thread
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.streams import StreamBatch
 
-GATED = ("joints_refused", "limbs_exchanged")
+GATED = ("joints_refused", "limbs_exchanged", "joints_stuck")
 """counts of what the gate found in the sensor's joints: its daily work, and no fault of a message"""
 
 

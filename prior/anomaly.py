@@ -27,12 +27,6 @@ Floats = NDArray[np.float64]
 MISSING = (0, 4, 8, 14)
 """Joints missing at which the scale was measured; between them it is interpolated."""
 
-SAME = 1e-6
-"""Metres: a joint that has moved less from one frame to the next repeats itself."""
-
-LEAST_NOISE = 0.001
-"""Metres along an axis, from frame to frame: of a sensor with less, a joint that repeats itself may be at rest."""
-
 STUCK_ODDS = 12.0
 """of a joint of which the last answer is repeated while the others shake, logarithm"""
 
@@ -101,21 +95,6 @@ def load_fault_net(weights: str) -> FaultNet:
     return network.eval()
 
 
-def stuck(positions: Floats) -> NDArray[np.bool_]:
-    """(B, 22) joints that a tracker has lost and of which it repeats the last answer, in the last `RECENT` frames.
-
-    Args:
-        positions: (B, T, 22, 3) metres as the sensor gave them, NaN where it did not.
-    """
-    recent = positions[:, -RECENT - 1 :]
-    with np.errstate(invalid="ignore"):
-        repeated = (np.abs(np.diff(recent, axis=1)).max(axis=-1) < SAME).mean(axis=1) > 0.5
-    shaken = np.diff(recent, n=2, axis=1) ** 2
-    seen = np.isfinite(shaken)
-    noise = np.sqrt(np.where(seen, shaken, 0.0).sum(axis=(1, 3)) / 6 / np.maximum(seen.sum(axis=(1, 3)), 1))
-    return repeated & (np.median(noise, axis=-1, keepdims=True) > LEAST_NOISE)
-
-
 def decimals(score: Floats, calibration: Calibration, missing: NDArray[np.integer]) -> Floats:
     """(...) -log10 of the rate at which clean windows score at least so high."""
     quantiles = _between(missing) @ calibration.quantiles
@@ -157,20 +136,19 @@ class Score:
         window.anomaly[:], window.joint_anomaly[:] = np.nan, np.nan
         if window.encoded:
             slots = window.encoded.slots
-            lost = stuck(window.raw.all[-RECENT - 1 :, slots].swapaxes(0, 1))
-            window.anomaly[slots], window.joint_anomaly[slots] = self._score(window.encoded, lost)
+            window.anomaly[slots], window.joint_anomaly[slots] = self._score(window.encoded, window.stuck[slots])
         with np.errstate(invalid="ignore"):
             self._quiet_s = np.where(window.anomaly > self._height / 2, 0.0, self._quiet_s + 1 / FPS)
             raised = window.anomaly > self._height
         window.anomaly_flag = raised | window.anomaly_flag & (self._quiet_s < self._hold)
         return window
 
-    def _score(self, encoded: Encoded, lost: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-        """The anomaly of each window (B,) and, on the same scale, of its joints (B, 22); some are known to be lost."""
+    def _score(self, encoded: Encoded, stuck: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        """The anomaly of each window (B,) and, on the same scale, of its joints (B, 22); some are known to be stuck."""
         tracks, look = encoded.tracks, encoded.look
         odds = self._network(tracks.x, look.mean, look.sigma, tracks.observed)
-        odds[lost] = np.maximum(odds[lost], STUCK_ODDS)
         odds[~(tracks.observed[:, ::3, -RECENT:] > 0).any(axis=-1)] = -np.inf
+        odds[stuck] = np.maximum(odds[stuck], STUCK_ODDS)
         missing = np.isinf(odds).sum(axis=-1)
         told = decimals(odds, self._calibration, np.broadcast_to(missing[:, None], odds.shape))
         return told.max(axis=-1), np.where(np.isinf(odds), np.nan, told)

@@ -1,4 +1,4 @@
-"""The gate: jumps, impossible bone lengths and exchanged limbs, before they reach a network."""
+"""The gate: jumps, impossible bone lengths, exchanged limbs and stuck joints, before they reach a network."""
 
 from __future__ import annotations
 
@@ -11,6 +11,18 @@ from numpy.typing import NDArray
 from prior.filters import FixedLagRTS, Smoothed
 from prior.skeletons import MIRROR, PARENTS, J
 from prior.window import FPS, Window
+
+RECENT = 15
+"""Frames in which a joint that repeats itself must do so mostly."""
+
+SAME = 1e-6
+"""Metres: a joint that has moved less from one frame to the next repeats itself."""
+
+LEAST_NOISE = 0.001
+"""Metres along an axis, from frame to frame: of a sensor with less, a joint that repeats itself may be at rest."""
+
+_LEAST_NEW = 5
+"""frames that were no repetition of the whole body"""
 
 
 @dataclass(frozen=True)
@@ -78,6 +90,12 @@ class Gate:
         stamp = float(window.stamp_s.newest)
         positions = window.raw.newest.copy()
         positions[window.confidence.newest < s.min_confidence] = np.nan
+        slots = np.flatnonzero(window.present)
+        window.stuck[:] = False
+        window.stuck[slots] = stuck(window.raw.all[-RECENT - 1 :, slots].swapaxes(0, 1))
+        if s.enabled and window.stuck.any():
+            self._counters["joints_stuck"] += int(window.stuck.sum())
+            positions[window.stuck] = np.nan
         expected = self._filter.predict(stamp)
         if expected is not None:
             distance = np.sqrt(((positions - expected.positions) ** 2).sum(axis=-1))
@@ -169,6 +187,25 @@ class Gate:
         # A bad bone does not say which end is wrong: where the next bone is bad too, it is the joint between.
         bad[:, _LEAF] &= ~bad[:, _PARENT][:, _LEAF]
         return bad & window.measured[:, None]
+
+
+def stuck(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(B, 22) joints that a tracker has lost and of which it repeats the last answer.
+
+    They do so in most of the frames in which the body is not repeated whole, and other joints shake.
+
+    Args:
+        positions: (B, T, 22, 3) metres as the sensor gave them, NaN where it did not; the last frames count.
+    """
+    recent = positions[:, -RECENT - 1 :]
+    with np.errstate(invalid="ignore"):
+        same = np.abs(np.diff(recent, axis=1)).max(axis=-1) < SAME
+    new = ~(same.mean(axis=-1, keepdims=True) > 0.5)
+    repeated = (same & new).sum(axis=1) > 0.5 * np.maximum(new.sum(axis=1), _LEAST_NEW)
+    shaken = np.diff(recent, n=2, axis=1) ** 2
+    seen = np.isfinite(shaken)
+    noise = np.sqrt(np.where(seen, shaken, 0.0).sum(axis=(1, 3)) / 6 / np.maximum(seen.sum(axis=(1, 3)), 1))
+    return repeated & (np.median(noise, axis=-1, keepdims=True) > LEAST_NOISE)
 
 
 _PARENT = np.maximum(np.array(PARENTS), 0)

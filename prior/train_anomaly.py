@@ -15,7 +15,7 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
-from prior.anomaly import LEAST_NOISE, MISSING, RATES, SENSOR_SIGMAS, STUCK_ODDS, Calibration, stuck
+from prior.anomaly import MISSING, RATES, SENSOR_SIGMAS, STUCK_ODDS, Calibration
 from prior.body_tracks import to_tracks
 from prior.checkpoint import LICENCES, load_weights, started
 from prior.corruption import (
@@ -36,6 +36,7 @@ from prior.corruption import (
 )
 from prior.distributed import share
 from prior.fault_net import RECENT, FaultNet, FaultNetConfig
+from prior.gate import LEAST_NOISE, stuck
 from prior.graph import SCALE
 from prior.hgvae import HGVAE, HGVAEConfig
 from prior.motion_windows import MotionSet

@@ -102,6 +102,7 @@ class Window:
         positions: ring of (S, 22, 3) metres after gate and correction; NaN where unobserved or refused.
         sensor_position: (3,) metres, where the sensor stands.
         noise: (S,) metres along an axis, how much each body's joints jump about from frame to frame.
+        stuck: (S, 22) joints of which the sensor repeats its last answer.
         smoothed: the fixed-lag smoother's estimate of the frame ``delay`` before the newest, or None while there is
             none.
         rotations: ring of (S, 22, 3, 3) local, solved from the positions.
@@ -127,6 +128,7 @@ class Window:
         self.rotations = Ring(frames, (slots, 22, 3, 3))
         self.sensor_position = np.zeros(3)
         self.noise = np.zeros(slots)
+        self.stuck = np.zeros((slots, 22), dtype=bool)
         self.smoothed: Smoothed | None = None
         self.encoded: Encoded | None = None
         self.anomaly = np.full(slots, np.nan)

@@ -13,7 +13,6 @@ from prior.anomaly import (
     ScoreSettings,
     decimals,
     load_fault_net,
-    stuck,
 )  # fmt: skip
 from prior.fault_net import RECENT, FaultNet, FaultNetConfig
 from prior.fault_net_live import LiveFaultNet
@@ -90,20 +89,6 @@ def test_the_weights_that_ship_find_the_wrist_of_which_the_last_answer_is_repeat
     clean, spoilt = scored(moving, **gate_off)[-1], scored(frozen, **gate_off)[-1]
     assert spoilt.anomaly > clean.anomaly + 1
     assert np.nanargmax(spoilt.joint_anomaly) == J["left_wrist"]
-
-
-def test_a_joint_is_stuck_that_repeats_itself_while_others_shake() -> None:
-    rng = np.random.default_rng(0)
-    seen = np.stack([waving(50)] * 3)
-    seen[:2] += rng.normal(0.0, 0.005, seen[:2].shape)
-    seen[:, -RECENT:, J["left_wrist"]] = seen[:, -RECENT - 1, None, J["left_wrist"]]
-    seen[1, :, J["neck"]] = np.nan
-    found = stuck(seen)
-    assert np.flatnonzero(found[0]).tolist() == [J["left_wrist"]]
-    assert np.flatnonzero(found[1]).tolist() == [J["left_wrist"]]
-    assert not found[2].any()  # without noise, it may be at rest
-    seen[0, -RECENT + 5 :, J["left_wrist"]] += rng.random((RECENT - 5, 3))
-    assert not stuck(seen)[0].any()
 
 
 def test_clean_motion_is_no_anomaly_and_frames_are_scored_alike_twice() -> None:

@@ -2,7 +2,7 @@ from collections import Counter
 
 import numpy as np
 
-from prior.gate import Gate, GateSettings
+from prior.gate import RECENT, Gate, GateSettings, stuck
 from prior.skeletons import MIRROR, J
 from prior.window import Window
 from tests.prior.bodies import waving
@@ -90,3 +90,38 @@ def test_switched_off_everything_passes() -> None:
     passed, counters = run(positions, enabled=False)
     assert np.array_equal(passed, positions)
     assert not counters
+
+
+def test_a_joint_is_stuck_that_repeats_itself_while_others_shake() -> None:
+    rng = np.random.default_rng(0)
+    seen = np.stack([waving(50)] * 3)
+    seen[:2] += rng.normal(0.0, 0.005, seen[:2].shape)
+    seen[:, -RECENT:, J["left_wrist"]] = seen[:, -RECENT - 1, None, J["left_wrist"]]
+    seen[1, :, J["neck"]] = np.nan
+    found = stuck(seen)
+    assert np.flatnonzero(found[0]).tolist() == [J["left_wrist"]]
+    assert np.flatnonzero(found[1]).tolist() == [J["left_wrist"]]
+    assert not found[2].any()  # without noise, it may be at rest
+    seen[0, -RECENT + 5 :, J["left_wrist"]] += rng.random((RECENT - 5, 3))
+    assert not stuck(seen)[0].any()
+
+
+def test_a_body_that_is_repeated_whole_has_no_joint_stuck() -> None:
+    """A camera of 15 Hz on a grid of 30, or one that pauses."""
+    rng = np.random.default_rng(0)
+    seen = (waving(50) + rng.normal(0.0, 0.005, (50, 22, 3)))[None]
+    slower = seen[:, np.arange(50) // 2 * 2]
+    assert not stuck(slower).any()
+    assert not stuck(np.repeat(seen[:, :1], RECENT + 1, axis=1)).any()
+    slower[:, :, WRIST] = slower[:, :1, WRIST]
+    assert np.flatnonzero(stuck(slower[0:1, -RECENT - 1 :])[0]).tolist() == [WRIST]
+
+
+def test_a_joint_that_is_stuck_becomes_unobserved() -> None:
+    positions = noisy()
+    positions[40:70, WRIST] = positions[39, WRIST]
+    passed, counters = run(positions)
+    assert np.isnan(passed[46:70, WRIST]).all()
+    assert np.isfinite(np.delete(passed, WRIST, axis=1)).all()
+    assert np.isfinite(passed[-10:]).all()
+    assert counters["joints_stuck"] >= 24
