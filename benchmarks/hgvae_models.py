@@ -35,6 +35,11 @@ LEAST_SIGMA = 0.05
 what the arms do, and neither latents nor samples tell of them."""
 
 
+def of_levels() -> HGVAEConfig:
+    """Four levels of which the finest has few latents: the others are used, and what is drawn from all is a body."""
+    return HGVAEConfig(features=48, levels=(Level(1, 48), Level(8, 24), Level(24, 24), Level(JOINT_NODES, 2)))
+
+
 def with_actions(count: int) -> HGVAEConfig:
     """One level, with a one-hot of the action beside its latent: of several, the top one is hardly used."""
     return HGVAEConfig(features=48, levels=(Level(1, 96),), actions=count)

@@ -1,13 +1,14 @@
-"""The impute stage: where the joints are that nobody saw, by gradient ascent on HG-VAE's posterior.
+"""The impute stage: where the joints are that nobody saw, as HG-VAE completes the window.
 
-The encoder, told which entries were observed, completes a window in one pass: the start. From there the latents climb
-log p(z) + log p(x | z) of the entries observed, each weighted by its confidence, and what they decode to is the answer.
-Live, the climb goes on from frame to frame: how far the latents were moved is kept as the window slides, so that one
-step a frame is enough.
+The encoder, given the completion network's guess and told which entries were observed, completes a window in one pass.
+From there the latents may climb log p(z) + log p(x | z) of the entries observed, each weighted by its confidence, and
+what they decode to is the answer. The climb goes on from frame to frame: how far the latents were moved is kept as the
+window slides. Since the completion network is there, limbs hidden for 0.2 to 2 s are as near to the truth without
+(docs/experiments.md), so no step is taken unless asked for.
 
 The paper moves the missing entries themselves, up log p(z | x). That drifts away from the truth with every step
-(`steadypose evaluate hgvae`; docs/experiments.md): the posterior is surest of windows that the encoder finds easy, not
-of those that are right.
+(`steadypose evaluate hgvae`): the posterior is surest of windows that the encoder finds easy, not of those that are
+right.
 """
 
 from __future__ import annotations
@@ -54,12 +55,12 @@ class ImputeSettings:
 
     Attributes:
         enabled: whether to impute at all; off, hidden joints follow the refinement model.
-        steps: gradient steps a frame; 0 takes what one pass through the encoder gives.
+        steps: gradient steps a frame, 1.6 ms each; 0 takes what one pass through the encoder gives.
         rate: of a step, in units of the latents, as Adam has it.
     """
 
     enabled: bool = True
-    steps: int = 1
+    steps: int = 0
     rate: float = 0.05
 
 

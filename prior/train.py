@@ -26,7 +26,7 @@ def train(
     With torchrun, several processes or machines share each batch; the first of them writes:
     `torchrun --nproc-per-node 2 -m nodes.cli train hmvae`.
 
-    Takes under an hour on two cores, shows its progress, draws its curves as it goes, and resumes where it was if
+    Takes about an hour on two cores, shows its progress, draws its curves as it goes, and resumes where it was if
     it is killed and started again. The weights, with a card that says how they were made, replace those in
     prior/weights.
 

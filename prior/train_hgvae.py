@@ -140,7 +140,10 @@ def fit(
         seen = occlude(spoil(add_noise(positions[half:], rng, slow), SPOILT_BY, 0.5, rng), rng)
         both = whole.beside(Batch.of(model, seen, positions[half:], sizes[half:]).completed(model, slow))
         drawn = model(both.x, both.observed, spread=(torch.arange(batch) < half).float()[:, None])
-        likelihood = (drawn.tracks.log_density(both.target) * both.counts).flatten(1).sum(dim=1)
+        density = drawn.tracks.log_density(both.target) * both.counts
+        stated = (0.5 * drawn.tracks.log_var[half:]).exp().detach()
+        density[half:] = density[half:] * (stated / stated.mean())  # as in `prior.train_completion`, and for its reason
+        likelihood = density.flatten(1).sum(dim=1)
         kl = drawn.kl[:half].sum() / batch
         beta = min(KL_START + (1 - KL_START) * step / (WARM_UP * iterations), 1.0)
         loss = beta * kl - likelihood.mean()

@@ -61,20 +61,20 @@ def test_the_same_stream_is_imputed_alike_bit_for_bit() -> None:
 
 
 def test_other_bodies_do_not_change_what_is_imputed() -> None:
-    alone, _ = answers(hidden_arm(70))
+    alone, _ = answers(hidden_arm(70), impute={"steps": 1})
     messages = stream(hidden_arm(70))
     for message, other in zip(messages, stream(waving(70) + [2.0, 0.0, 0.0]), strict=True):
         body = other.bodies[0]
         body.id = 5
         body.positions[ARM] = np.nan
         message.bodies.append(body)
-    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0}))
+    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0, "impute": {"steps": 1}}))
     beside = [c.bodies[0] for m in messages for c in pipeline.process(m)]
     assert all(np.allclose(a.positions, b.positions, atol=1e-6) for a, b in zip(alone, beside, strict=True))
 
 
 def test_a_node_in_a_hurry_does_without_the_climb_and_counts_it() -> None:
-    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0}))
+    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0, "impute": {"steps": 1}}))
     for k, message in enumerate(stream(hidden_arm(60))):
         pipeline.process(message, hurry=k % 2 == 1)
     assert pipeline.counters["imputation_skipped"] == 5

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msgs.types import Pose, PoseClean, PoseRaw
+from prior.impute import ImputeSettings
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.resample import PERIOD_NS, Resampler
 from prior.streams import PATIENCE_NS, StreamBatch
@@ -200,7 +201,7 @@ def test_nonsense_from_one_is_counted_and_the_others_go_on() -> None:
 
 
 def test_a_server_that_falls_behind_imputes_without_the_climb() -> None:
-    batch = StreamBatch(PriorSettings(), streams=2)
+    batch = StreamBatch(PriorSettings(impute=ImputeSettings(steps=1)), streams=2)
     for k, (now_ns, message) in enumerate(kiosk("hidden", 20)):
         if k > 8:
             message.bodies[0].positions[[18, 20]] = np.nan
