@@ -27,7 +27,7 @@ from prior.hgvae import HGVAE, HGVAEConfig, Level, Pass
 from prior.motion_windows import MotionSet
 from prior.track_windows import STRIDES, Batch, Windows, mean_tracks
 from prior.train_anomaly import train_anomaly
-from prior.train_completion import train_completion
+from prior.train_completion import BATCH, train_completion
 from prior.training import TrainingRun
 
 Floats = NDArray[np.float64]
@@ -100,6 +100,7 @@ def train_hgvae(
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject",
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train {model} --weights {weights}`: {iterations} steps of {batch} windows, "
+        f"after as many of {BATCH} for its completion network, "
         f"Adam {learning_rate:g}, seed {seed}{origin}",
     })  # fmt: skip
     faults = None if start is None else str(weights_path(start, model).with_suffix(".faults.safetensors"))
