@@ -79,7 +79,7 @@ class CompletionNet(nn.Module):
         self.blocks = nn.Sequential(*(GraphBlock(nodes, features) for _ in range(config.blocks)))
         self.write = GraphLinear(nodes, nodes, features, (JOINT_NODES + _JOINTS) * config.patch)
         with torch.no_grad():
-            self.write.weight *= 0.1  # begins near the guess
+            self.write.weight.mul_(0.1)  # begins near the guess
 
     def forward(self, nodes: Tensor) -> tuple[Tensor, Tensor]:
         """The correction (B, 66, T) and its log-variance by joint (B, 22, T), in units of `SCALE`.

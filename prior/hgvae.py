@@ -256,7 +256,7 @@ class DecoderLevel(nn.Module):
         self.expand = GraphLinear(level.nodes, nodes, level.latent + extra, features)
         self.block = GraphBlock(nodes, features)
         with torch.no_grad():  # latents begin as faint and as sure: the noise of many levels would bury what each tells
-            self.expand.weight *= FAINT
+            self.expand.weight.mul_(FAINT)
             self.posterior_head.bias[level.latent :] += SURE
 
     def prior(self, stream: Tensor) -> Gaussian:
