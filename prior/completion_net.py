@@ -24,6 +24,10 @@ from prior.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE, GraphBlock, GraphLine
 NEAR = 8.0
 """Frames from a sighting over which what it tells falls to 1/e."""
 
+STAYS = 0.5
+"""How far a joint that was seen in the window is left where the guess has it, beside the joint above, at the most: the
+network forgets within half a second what was seen, and moves arms that hold still to where most people have theirs."""
+
 CENTIMETRE = 0.01 / SCALE
 """in the network's units: how much joints jump about is told in these, by its logarithm"""
 
@@ -128,21 +132,24 @@ def _tell(deviations, observed, patch, told, share):
     count, tracks, frames = deviations.shape
     joints = tracks // 3
     frame = tracks + 2 * joints
-    fades = np.float32(math.exp(-1.0 / NEAR))
     for b in range(count):
         for track in range(tracks):
-            near = np.float32(0)
+            since = frames
             for t in range(frames):
-                near = np.float32(1) if observed[b, track, t] > 0 else near * fades
-                share[b, track, t] = near
+                since = 0 if observed[b, track, t] > 0 else min(since + 1, frames)
+                share[b, track, t] = since
                 told[b, t // patch, (t % patch) * frame + track] = deviations[b, track, t]
                 if track % 3 == 0:
+                    near = math.exp(-since / NEAR) if since < frames else 0.0
                     told[b, t // patch, (t % patch) * frame + tracks + track // 3] = near
-            near = np.float32(0)
+            since = frames
             for t in range(frames - 1, -1, -1):
-                near = np.float32(1) if observed[b, track, t] > 0 else near * fades
-                share[b, track, t] = np.float32(1) - max(near, share[b, track, t])
+                since = 0 if observed[b, track, t] > 0 else min(since + 1, frames)
+                apart = min(since, share[b, track, t])
+                stays = max(math.exp(-apart / NEAR), STAYS * (1.0 - (apart / frames) ** 2))
+                share[b, track, t] = 1.0 - stays if apart < frames else 1.0
                 if track % 3 == 0:
+                    near = math.exp(-since / NEAR) if since < frames else 0.0
                     told[b, t // patch, (t % patch) * frame + tracks + joints + track // 3] = near
         _tell_noise(deviations[b], observed[b], told[b, :, patch * frame :])
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from prior.completion_net import NEAR, CompletionConfig, CompletionNet, tell
+from prior.completion_net import NEAR, STAYS, CompletionConfig, CompletionNet, tell
 from prior.graph import SCALE
 from prior.skeletons import J
 from prior.track_windows import Windows
@@ -31,6 +31,12 @@ def test_a_correction_is_the_smaller_the_nearer_a_sighting_is() -> None:
     apart = np.array([1, 2, 3, 2, 1])
     np.testing.assert_allclose(share[1, TRACKS, 4:9], np.tile(1 - np.exp(-apart / NEAR), (3, 1)), rtol=1e-6)
     assert (share[2, TRACKS] == 1).all()
+    long = np.ones((1, 66, 50))
+    long[:, TRACKS, 1:] = 0  # seen once, long ago: the guess is half believed, and forgotten as it leaves the window
+    fading = tell(np.zeros((1, 66, 50)), long, 0.0, patch=5).share[0, TRACKS.start]
+    assert (np.diff(fading) > 0).all()
+    assert fading[12] == pytest.approx(1 - STAYS * (1 - (12 / 50) ** 2))
+    assert fading[-1] > 0.95
     assert (np.delete(share, range(TRACKS.start, TRACKS.stop), axis=1) == 0).all()
 
 
