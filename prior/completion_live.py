@@ -23,9 +23,7 @@ class LiveCompletion:
         p, self._patch, self._slow = Program(), model.config.patch, slow
         inputs = model.read.weight.shape[0]
         self._told = p.matrix(len(model.read.adjacency), inputs)
-        graph = p.gelu(p.layer(self._told, model.read))
-        for block in model.blocks:
-            p.block(graph, block, onto=graph)  # type: ignore[arg-type]  (a Sequential of GraphBlocks)
+        graph = p.trunk(self._told, model.read, model.blocks)
         kept, write = JOINT_NODES * self._patch, model.write
         self._written = p.linear(graph, write.weight[:, :kept], write.bias[:, :kept], write.adjacency)
         self._net = Network(p, most)

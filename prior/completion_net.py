@@ -26,7 +26,8 @@ NEAR = 8.0
 
 STAYS = 0.5
 """How far a joint that was seen in the window is left where the guess has it, beside the joint above, at the most: the
-network forgets within half a second what was seen, and moves arms that hold still to where most people have theirs."""
+network forgets within half a second what was seen, and moves arms that hold still to where most people have theirs. The
+weights that ship were trained without; a network trained with it would learn to correct the more."""
 
 CENTIMETRE = 0.01 / SCALE
 """in the network's units: how much joints jump about is told in these, by its logarithm"""
@@ -95,12 +96,16 @@ class CompletionNet(nn.Module):
         log_var = (_by_track(log_var, _JOINTS) + FIRST_LOG_VAR).clamp(*LOG_VAR_RANGE)
         return _by_track(found, JOINT_NODES), log_var
 
-    @torch.no_grad()
-    def complete(self, deviations: Tensor, observed: Tensor, slow: NDArray[np.floating] | float) -> Tensor:
-        """(B, 66, T) windows with a better guess of what was not observed; the arguments are those of `tell`."""
+    def complete(
+        self, deviations: Tensor, observed: Tensor, slow: NDArray[np.floating] | float
+    ) -> tuple[Tensor, Tensor]:
+        """Windows (B, 66, T) with a better guess of what was not observed, and its log-variance by joint (B, 22, T).
+
+        The arguments are those of `tell`.
+        """
         told = tell(deviations.numpy(), observed.numpy(), slow, self.config.patch)
-        found, _ = self(torch.from_numpy(told.nodes))
-        return deviations + torch.from_numpy(told.share) * found
+        found, log_var = self(torch.from_numpy(told.nodes))
+        return deviations + torch.from_numpy(told.share) * found, log_var
 
 
 def _by_track(nodes: Tensor, tracks: int) -> Tensor:

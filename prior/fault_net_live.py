@@ -25,9 +25,7 @@ class LiveFaultNet:
         p, frames = Program(), model.config.frames
         self._mean = model.mean.double().numpy()[:, None]
         self._told = p.matrix(JOINT_NODES, 4 * frames + 2)
-        graph = p.gelu(p.layer(self._told, model.read))
-        for block in model.blocks:
-            p.block(graph, block, onto=graph)  # type: ignore[arg-type]  (a Sequential of GraphBlocks)
+        graph = p.trunk(self._told, model.read, model.blocks)
         self._odds = p.layer(graph, model.write)
         self._net = Network(p, most)
         self._net.matrix(self._told, slice(None))[..., -1] = np.log(sensor_sigma / SENSOR_SCALE)

@@ -11,6 +11,7 @@ for the next window. So what is found for a window does not depend on the others
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 import torch
@@ -93,6 +94,13 @@ class Program:
         """A graph convolutional block, equation 5, written to ``onto``, which may be ``of`` itself."""
         inner = self.layer(self.layer(of, block.first), block.second, active=True)
         return self._step(_GELU, onto, inner, self._store(block.alpha.reshape(1)), of)
+
+    def trunk(self, of: int, read: GraphLinear, blocks: nn.Sequential) -> int:
+        """A layer with its GELU, and `GraphBlock`s one after the other."""
+        graph = self.gelu(self.layer(of, read))
+        for block in blocks:
+            self.block(graph, cast("GraphBlock", block), onto=graph)
+        return graph
 
     def gelu(self, of: int) -> int:
         """Of a matrix, by itself."""

@@ -166,6 +166,7 @@ class HGVAE(nn.Module):
         """The stochastic levels, the top one first."""
         return [cast("DecoderLevel", level) for level in self.down]
 
+    @torch.no_grad()
     def completed(self, x: Tensor, observed: Tensor, slow: NDArray[np.floating] | float) -> Tensor:
         """(B, N, T) windows with a better guess of what was not observed.
 
@@ -174,7 +175,7 @@ class HGVAE(nn.Module):
             observed: (B, N, T) 1 where observed, else 0.
             slow: (B,) metres along an axis, the errors of the sensor that last.
         """
-        return self.completion.complete(x, observed, slow) if self.completion else x
+        return self.completion.complete(x, observed, slow)[0] if self.completion else x
 
     def forward(
         self, x: Tensor, observed: Tensor, *, spread: Tensor | None = None, action: Tensor | None = None

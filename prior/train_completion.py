@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.completion_net import CompletionNet, tell
+from prior.completion_net import CompletionNet
 from prior.corruption import add_noise, elsewhere, exchanged, occlude, other_lengths, slow_errors, spoil, stands_still
 from prior.distributed import share
 from prior.graph import SCALE
@@ -27,8 +27,9 @@ Floats = NDArray[np.float64]
 BATCH = 128
 """windows a step"""
 
+SPOILT_BY = (stands_still, exchanged, elsewhere)
 SPOILT = 0.3
-"""share of the windows in which something seen is plainly wrong"""
+"""what something seen is plainly wrong by, and the share of the windows in which it is"""
 
 BONES = 0.05
 """Standard deviation by which each bone is longer or shorter than it was: 22 people are few."""
@@ -58,9 +59,8 @@ def train_completion(model: HGVAE, train: Windows, val: Windows, directory: Path
         rng = run.random(seed)
         clean, sizes = train.draw(share(BATCH), model.config.frames, rng, STRIDES)
         clean = other_lengths(clean, BONES, rng)
-        faults = (stands_still, exchanged, elsewhere)
         slow = slow_errors(len(clean), rng)
-        seen = occlude(spoil(add_noise(clean, rng, slow), faults, SPOILT, rng), rng)
+        seen = occlude(spoil(add_noise(clean, rng, slow), SPOILT_BY, SPOILT, rng), rng)
         off, log_var, hidden = _errors(model, seen, clean, sizes, slow)
         density = 0.5 * (log_var + off.square() * (-log_var).exp())
         loss = (density * (0.5 * log_var.detach()).exp())[hidden].mean()
@@ -86,11 +86,9 @@ def _errors(model: HGVAE, seen: Floats, truth: Floats, sizes: Floats, slow: Floa
     Returns:
         Three times (B, 66, T); what was before the first sighting of a body does not count as hidden.
     """
-    network = _network(model)
     batch = Batch.of(model, seen, truth, sizes)
-    told = tell(batch.x.numpy(), batch.observed.numpy(), slow, network.config.patch)
-    found, log_var = network(torch.from_numpy(told.nodes))
-    off = batch.x + torch.from_numpy(told.share) * found - batch.target
+    completed, log_var = _network(model).complete(batch.x, batch.observed, slow)
+    off = completed - batch.target
     return off, log_var.repeat_interleave(3, dim=1), (batch.observed == 0) & (batch.counts > 0)
 
 

@@ -20,14 +20,14 @@ from torch import Tensor
 
 from prior.checkpoint import LICENCES, started, weights_path
 from prior.completion_net import CompletionConfig
-from prior.corruption import add_noise, elsewhere, exchanged, occlude, slow_errors, spoil, stands_still
+from prior.corruption import add_noise, occlude, slow_errors, spoil
 from prior.distributed import share
 from prior.graph import JOINT_NODES, SCALE
 from prior.hgvae import HGVAE, HGVAEConfig, Level, Pass
 from prior.motion_windows import MotionSet
 from prior.track_windows import STRIDES, Batch, Windows, mean_tracks
 from prior.train_anomaly import train_anomaly
-from prior.train_completion import BATCH, train_completion
+from prior.train_completion import BATCH, SPOILT_BY, train_completion
 from prior.training import TrainingRun
 
 Floats = NDArray[np.float64]
@@ -47,9 +47,6 @@ MODELS: dict[str, HGVAEConfig] = {
     ),
 }
 """``hgvae`` fits a robot's budget; ``hgvae-wide`` has the paper's size, for recordings."""
-
-SPOILT_BY = (stands_still, exchanged, elsewhere)
-"""what half of the windows that are to be completed has"""
 
 KL_START = 0.001
 """beta at the start (section 5)"""
