@@ -22,12 +22,8 @@ from torch.nn import functional as F
 from prior.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE, GraphBlock, GraphLinear
 
 NEAR = 8.0
-"""Frames from a sighting over which what it tells falls to 1/e."""
-
-STAYS = 0.5
-"""How far a joint that was seen in the window is left where the guess has it, beside the joint above, at the most: the
-network forgets within half a second what was seen, and moves arms that hold still to where most people have theirs. The
-weights that ship were trained without; a network trained with it would learn to correct the more."""
+"""Frames from a sighting at which half is told of it, and at which the guess beside it is left by 1 - 1/e. What is told
+falls as 1 / (1 + d / NEAR): by an exponential, an arm seen a second ago would pass for one never seen."""
 
 CENTIMETRE = 0.01 / SCALE
 """in the network's units: how much joints jump about is told in these, by its logarithm"""
@@ -145,16 +141,15 @@ def _tell(deviations, observed, patch, told, share):
                 share[b, track, t] = since
                 told[b, t // patch, (t % patch) * frame + track] = deviations[b, track, t]
                 if track % 3 == 0:
-                    near = math.exp(-since / NEAR) if since < frames else 0.0
+                    near = 1.0 / (1.0 + since / NEAR) if since < frames else 0.0
                     told[b, t // patch, (t % patch) * frame + tracks + track // 3] = near
             since = frames
             for t in range(frames - 1, -1, -1):
                 since = 0 if observed[b, track, t] > 0 else min(since + 1, frames)
                 apart = min(since, share[b, track, t])
-                stays = max(math.exp(-apart / NEAR), STAYS * (1.0 - (apart / frames) ** 2))
-                share[b, track, t] = 1.0 - stays if apart < frames else 1.0
+                share[b, track, t] = 1.0 - math.exp(-apart / NEAR) if apart < frames else 1.0
                 if track % 3 == 0:
-                    near = math.exp(-since / NEAR) if since < frames else 0.0
+                    near = 1.0 / (1.0 + since / NEAR) if since < frames else 0.0
                     told[b, t // patch, (t % patch) * frame + tracks + joints + track // 3] = near
         _tell_noise(deviations[b], observed[b], told[b, :, patch * frame :])
 

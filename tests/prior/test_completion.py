@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from prior.completion_net import NEAR, STAYS, CompletionConfig, CompletionNet, tell
+from prior.completion_net import NEAR, CompletionConfig, CompletionNet, tell
 from prior.graph import SCALE
 from prior.skeletons import J
 from prior.track_windows import Windows
@@ -31,13 +31,18 @@ def test_a_correction_is_the_smaller_the_nearer_a_sighting_is() -> None:
     apart = np.array([1, 2, 3, 2, 1])
     np.testing.assert_allclose(share[1, TRACKS, 4:9], np.tile(1 - np.exp(-apart / NEAR), (3, 1)), rtol=1e-6)
     assert (share[2, TRACKS] == 1).all()
-    long = np.ones((1, 66, 50))
-    long[:, TRACKS, 1:] = 0  # seen once, long ago: the guess is half believed, and forgotten as it leaves the window
-    fading = tell(np.zeros((1, 66, 50)), long, 0.0, patch=5).share[0, TRACKS.start]
-    assert (np.diff(fading) > 0).all()
-    assert fading[12] == pytest.approx(1 - STAYS * (1 - (12 / 50) ** 2))
-    assert fading[-1] > 0.95
     assert (np.delete(share, range(TRACKS.start, TRACKS.stop), axis=1) == 0).all()
+
+
+def test_a_sighting_a_second_ago_is_told_from_none() -> None:
+    observed = np.ones((2, 66, 50))
+    observed[0, TRACKS, 1:] = 0
+    observed[1, TRACKS] = 0
+    told = tell(np.zeros((2, 66, 50)), observed, 0.0, patch=5).nodes[:, :, :550].reshape(2, 50, 110)
+    last, following = told[0, :, 66 + WRIST], told[0, :, 88 + WRIST]
+    np.testing.assert_allclose(last, 1 / (1 + np.arange(50) / NEAR), rtol=1e-6)
+    assert (following[1:] == 0).all()
+    assert (told[1, :, [66 + WRIST, 88 + WRIST]] == 0).all()
 
 
 def test_only_what_was_not_seen_moves() -> None:
