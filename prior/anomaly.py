@@ -95,6 +95,18 @@ def load_fault_net(weights: str) -> FaultNet:
     return network.eval()
 
 
+def judged(odds: Floats, observed: Floats, stuck: NDArray[np.bool_]) -> Floats:
+    """(B, 22) what a fault network says, -inf of joints not seen in the frames that are scored.
+
+    Args:
+        odds: (B, 22) of `FaultNet`.
+        observed: (B, 66, T) more than 0 where seen.
+        stuck: (B, 22) joints of which the sensor repeats its last answer.
+    """
+    seen = (observed[:, ::3, -RECENT:] > 0).any(axis=-1)
+    return np.where(seen, np.where(stuck, np.maximum(odds, STUCK_ODDS), odds), -np.inf)
+
+
 def decimals(score: Floats, calibration: Calibration, missing: NDArray[np.integer]) -> Floats:
     """(...) -log10 of the rate at which clean windows score at least so high."""
     quantiles = _between(missing) @ calibration.quantiles
@@ -147,8 +159,7 @@ class Score:
         """The anomaly of each window (B,) and, on the same scale, of its joints (B, 22); some are known to be stuck."""
         tracks, look = encoded.tracks, encoded.look
         odds = self._network(tracks.x, look.mean, look.sigma, tracks.observed)
-        odds[~(tracks.observed[:, ::3, -RECENT:] > 0).any(axis=-1)] = -np.inf
-        odds[stuck] = np.maximum(odds[stuck], STUCK_ODDS)
+        odds = judged(odds, tracks.observed, stuck)
         missing = np.isinf(odds).sum(axis=-1)
         told = decimals(odds, self._calibration, np.broadcast_to(missing[:, None], odds.shape))
         return told.max(axis=-1), np.where(np.isinf(odds), np.nan, told)

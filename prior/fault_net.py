@@ -8,10 +8,14 @@ and how sure it was, and is taught by clean motion and by motion with what track
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numba import njit
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -61,31 +65,59 @@ class FaultNet(nn.Module):
 
     mean: Tensor
 
-    def forward(self, x: Tensor, found: Tensor, sigma: Tensor, observed: Tensor, sensor_sigma: Tensor) -> Tensor:
-        """(B, 22) logits.
-
-        Args:
-            x: (B, 66, T) metres of a standard body, tracks seen; not read where there is nothing observed.
-            found: (B, 66, T) metres, what HG-VAE makes of them.
-            sigma: (B, 66, T) metres, how sure HG-VAE is.
-            observed: (B, 66, T) 1 where seen.
-            sensor_sigma: (B,) metres along an axis, what the sensor may be off by.
-        """
-        seen = torch.where(observed > 0, x, found)
-        told = [
-            (seen - self.mean[:, None]) / SCALE * observed,
-            torch.asinh((seen - found) / OFF_SCALE),
-            (sigma / OFF_SCALE).log(),
-            observed,
-            _roughness(seen, observed),
-            (sensor_sigma / SENSOR_SCALE).log()[:, None, None].expand(-1, JOINT_NODES, 1),
-        ]
-        return self.write(self.blocks(F.gelu(self.read(torch.cat(told, dim=-1).transpose(0, 1)))))[..., 0].T
+    def forward(self, told: Tensor) -> Tensor:
+        """(B, 22) logits of windows as `tell` tells of them."""
+        return self.write(self.blocks(F.gelu(self.read(told.transpose(0, 1)))))[..., 0].T
 
 
-def _roughness(seen: Tensor, observed: Tensor) -> Tensor:
-    """(B, 66, 1) how much tracks (B, 66, T) shake, where observed: a tracker that holds its last answer does not."""
-    shown = observed[..., 2:] * observed[..., 1:-1] * observed[..., :-2]
-    shaken = (seen.diff(n=2, dim=-1).square() * shown)[..., -RECENT:].sum(dim=-1, keepdim=True)
-    mean = shaken / shown[..., -RECENT:].sum(dim=-1, keepdim=True).clamp(min=1.0)
-    return 0.5 * (mean / ROUGH_SCALE**2 + 1e-3).log()
+def tell(
+    x: NDArray[np.floating],
+    found: NDArray[np.floating],
+    sigma: NDArray[np.floating],
+    observed: NDArray[np.floating],
+    sensor_sigma: NDArray[np.floating] | float,
+    mean: NDArray[np.floating],
+) -> NDArray[np.float32]:
+    """Windows as `FaultNet` reads them.
+
+    Args:
+        x: (B, 66, T) metres of a standard body, tracks seen; not read where there is nothing observed.
+        found: (B, 66, T) metres, what HG-VAE makes of them.
+        sigma: (B, 66, T) metres, how sure HG-VAE is.
+        observed: (B, 66, T) more than 0 where seen.
+        sensor_sigma: (B,) metres along an axis, what the sensor may be off by.
+        mean: (66,) metres, of the network.
+
+    Returns:
+        (B, 66, 4 T + 2): where a track was seen, how far that is off, how sure HG-VAE is, what was seen; how much the
+        last frames of the track shake (a tracker that holds its last answer does not); the sensor's error.
+    """
+    count, tracks, frames = x.shape
+    told = np.empty((count, tracks, 4 * frames + 2), dtype=np.float32)
+    _tell(x, found, sigma, observed, mean, told)
+    told[..., -1] = np.broadcast_to(np.log(np.asarray(sensor_sigma) / SENSOR_SCALE), count)[:, None]
+    return told
+
+
+@njit(cache=True)
+def _tell(x, found, sigma, observed, mean, told):
+    count, tracks, frames = x.shape
+    for b in range(count):
+        for track in range(tracks):
+            row = told[b, track]
+            square, shown = 0.0, 0
+            for t in range(frames):
+                seen = observed[b, track, t] > 0
+                row[t] = (x[b, track, t] - mean[track]) / SCALE if seen else 0.0
+                row[frames + t] = math.asinh((x[b, track, t] - found[b, track, t]) / OFF_SCALE) if seen else 0.0
+                row[2 * frames + t] = math.log(sigma[b, track, t] / OFF_SCALE)
+                row[3 * frames + t] = 1.0 if seen else 0.0
+                if (
+                    t >= max(frames - RECENT, 2)
+                    and seen
+                    and observed[b, track, t - 1] > 0
+                    and observed[b, track, t - 2] > 0
+                ):
+                    square += (x[b, track, t] - 2 * x[b, track, t - 1] + x[b, track, t - 2]) ** 2
+                    shown += 1
+            row[4 * frames] = 0.5 * math.log(square / max(shown, 1) / ROUGH_SCALE**2 + 1e-3)

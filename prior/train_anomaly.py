@@ -15,7 +15,7 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
-from prior.anomaly import MISSING, RATES, SENSOR_SIGMAS, STUCK_ODDS, Calibration
+from prior.anomaly import MISSING, RATES, SENSOR_SIGMAS, Calibration, judged
 from prior.body_tracks import to_tracks
 from prior.checkpoint import LICENCES, load_weights, started
 from prior.corruption import (
@@ -35,7 +35,7 @@ from prior.corruption import (
     stands_still,
 )
 from prior.distributed import share
-from prior.fault_net import RECENT, FaultNet, FaultNetConfig
+from prior.fault_net import RECENT, FaultNet, FaultNetConfig, tell
 from prior.gate import LEAST_NOISE, stuck
 from prior.graph import SCALE
 from prior.hgvae import HGVAE, HGVAEConfig
@@ -145,41 +145,33 @@ def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np
     shown = np.isfinite(seen[:, -RECENT:, :, 0]).any(axis=1)
     off = (astray > limit) | lost
     clear = torch.from_numpy(shown & (off | (astray < 0.2 * limit) & (repeated == 0))).float()
-    logits = network(*_look(model, seen, sizes, sigma * np.sqrt(1.0 - fast)), torch.from_numpy(sigma).float())
+    told = tell(*_look(model, seen, sizes, sigma * np.sqrt(1.0 - fast)), sigma, network.mean.numpy())
+    logits = network(torch.from_numpy(told))
     faulty = torch.from_numpy(off).float()
     return (F.binary_cross_entropy_with_logits(logits, faulty, reduction="none") * clear).sum() / clear.sum()
 
 
 @torch.no_grad()
-def _look(model: HGVAE, seen: Floats, sizes: Floats, slow: Floats | float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _look(model: HGVAE, seen: Floats, sizes: Floats, slow: Floats | float) -> tuple[Floats, Floats, Floats, Floats]:
     """Tracks of windows (B, T, 22, 3) of bodies of sizes (B,), what HG-VAE makes of them and how sure it is, all
     (B, 66, T) metres, and what was observed; ``slow`` (B,) metres, the errors of the sensor that last."""
     tracks = to_tracks(seen, sizes)
     observed = torch.from_numpy(tracks.observed).float()
     found = model(model.completed(standardise(model, tracks.x), observed, slow), observed).tracks
-    mean = found.mean * SCALE + model.mean[:, None]
-    return torch.from_numpy(tracks.x).float(), mean, (0.5 * found.log_var).exp() * SCALE, observed
+    mean = found.mean.double() * SCALE + model.mean[:, None]
+    return tracks.x, mean.numpy(), (0.5 * found.log_var.double()).exp().numpy() * SCALE, tracks.observed
 
 
 @torch.inference_mode()
-def joint_odds(
-    network: FaultNet, x: Tensor, found: Tensor, sigma: Tensor, observed: Tensor, sensor_sigma: float
-) -> Floats:
-    """(B, 22) logarithm of the odds that a joint is off; -inf for one not seen in the last `RECENT` frames.
-
-    The arguments are those of `FaultNet`.
-    """
-    odds = network(x, found, sigma, observed, torch.full((len(x),), sensor_sigma))
-    recent = observed.unflatten(1, (22, 3))[:, :, 0, -RECENT:].amax(dim=-1) > 0
-    return torch.where(recent, odds, -torch.inf).double().numpy()
-
-
 def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Floats:
-    """(B, 22) `joint_odds` of windows (B, T, 22, 3) of bodies of sizes (B,)."""
-    parts = [slice(start, start + 256) for start in range(0, len(seen), 256)]
-    slow = sensor_sigma * np.sqrt(1.0 - FAST)
-    odds = np.concatenate([joint_odds(network, *_look(model, seen[p], sizes[p], slow), sensor_sigma) for p in parts])
-    return np.where(stuck(seen), np.maximum(odds, STUCK_ODDS), odds)
+    """(B, 22) odds, `judged`, of windows (B, T, 22, 3) of bodies of sizes (B,)."""
+    slow, mean, parts = sensor_sigma * np.sqrt(1.0 - FAST), network.mean.numpy(), []
+    for start in range(0, len(seen), 256):
+        some = slice(start, start + 256)
+        look = _look(model, seen[some], sizes[some], slow)
+        odds = network(torch.from_numpy(tell(*look, sensor_sigma, mean)))
+        parts.append(judged(odds.double().numpy(), look[-1], stuck(seen[some])))
+    return np.concatenate(parts)
 
 
 # ---------------------------------------------------------------------------------------------------------------

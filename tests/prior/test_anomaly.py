@@ -8,17 +8,18 @@ from prior.anomaly import (
     MISSING,
     RATES,
     SENSOR_SIGMAS,
+    STUCK_ODDS,
     Calibration,
     Score,
     ScoreSettings,
     decimals,
+    judged,
     load_fault_net,
 )  # fmt: skip
-from prior.fault_net import RECENT, FaultNet, FaultNetConfig
+from prior.fault_net import OFF_SCALE, RECENT, ROUGH_SCALE, FaultNet, FaultNetConfig, tell
 from prior.fault_net_live import LiveFaultNet
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.skeletons import MIRROR, PARENTS, J
-from prior.train_anomaly import joint_odds
 from prior.window import Window
 from tests.prior.bodies import stream, waving
 
@@ -31,35 +32,56 @@ def scored(positions: np.ndarray, **settings) -> list:
     return [c.bodies[0] for m in stream(positions) for c in pipeline.process(m)]
 
 
-def test_the_live_fault_network_is_the_trained_one() -> None:
+def looks(count: int) -> tuple[np.ndarray, ...]:
+    """Windows (count, 66, 20): tracks, NaN where not seen, what is made of them, how surely, and what was seen."""
+    rng = np.random.default_rng(0)
+    x, found = rng.normal(scale=0.5, size=(2, count, 66, 20))
+    seen = np.repeat(rng.random((count, 22, 20)) < 0.7, 3, axis=1)
+    return np.where(seen, x, np.nan), found, rng.uniform(0.005, 0.1, x.shape), seen.astype(float)
+
+
+def awake() -> FaultNet:
     torch.manual_seed(0)
     network = FaultNet(FaultNetConfig(frames=20, features=8)).eval()
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
-    rng = np.random.default_rng(0)
-    x, found = rng.normal(scale=0.5, size=(2, 3, 66, 20))
-    observed, sigma = (rng.random((3, 66, 20)) < 0.7).astype(float), rng.uniform(0.005, 0.1, (3, 66, 20))
-    parts = (torch.from_numpy(part).float() for part in (x, found, sigma, observed))
+    return network
+
+
+def test_the_live_fault_network_is_the_trained_one() -> None:
+    network, look = awake(), looks(3)
     with torch.inference_mode():
-        odds = network(*parts, torch.full((3,), 0.02)).numpy()
-    x[observed == 0] = np.nan
-    np.testing.assert_allclose(LiveFaultNet(network, 0.02, 4)(x, found, sigma, observed), odds, atol=1e-4)
+        odds = network(torch.from_numpy(tell(*look, 0.02, network.mean.numpy()))).numpy()
+    live = LiveFaultNet(network, 0.02, 4)
+    np.testing.assert_allclose(live(*look), odds, atol=1e-4)
+    np.testing.assert_allclose(live(*(part[1:] for part in look)), odds[1:], atol=1e-4)
 
 
-def test_what_was_not_observed_is_not_read_and_a_joint_not_seen_of_late_has_no_odds() -> None:
-    torch.manual_seed(0)
-    network = FaultNet(FaultNetConfig(frames=20, features=8)).eval()
-    x, found, sigma, observed = (torch.rand(2, 66, 20) + 0.1 for _ in range(4))
-    observed = (observed > 0.4).float()
-    observed.unflatten(1, (22, 3))[:] = observed.unflatten(1, (22, 3))[:, :, :1]  # joints are seen whole
+def test_the_fault_network_is_told_of_what_was_seen_alone() -> None:
+    x, found, sigma, observed = looks(2)
+    mean = np.linspace(-1.0, 1.0, 66)
+    told = tell(x, found, sigma, observed, np.array([0.01, 0.02]), mean)
+    seen = observed > 0
+    expected = [
+        np.where(seen, (x - mean[:, None]) / 0.2, 0.0), np.where(seen, np.arcsinh((x - found) / OFF_SCALE), 0.0),
+        np.log(sigma / OFF_SCALE), observed,
+    ]  # fmt: skip
+    np.testing.assert_allclose(told[..., :80], np.concatenate(expected, axis=-1), rtol=1e-5, atol=1e-6)
+    shaken = np.diff(x, n=2, axis=-1)[..., -RECENT:]
+    rough = np.nansum(shaken**2, axis=-1) / np.maximum(np.isfinite(shaken).sum(axis=-1), 1)
+    np.testing.assert_allclose(told[..., 80], 0.5 * np.log(rough / ROUGH_SCALE**2 + 1e-3), rtol=1e-5)
+    np.testing.assert_allclose(told[..., 81], np.tile(np.log([[1.0], [2.0]]), 66), atol=1e-6)
+
+
+def test_a_joint_not_seen_of_late_has_no_odds_and_a_stuck_one_high_ones() -> None:
+    observed = np.ones((2, 66, 20))
     observed[0, 3 * J["neck"] : 3 * J["neck"] + 3, -RECENT:] = 0
-    odds = joint_odds(network, x, found, sigma, observed, 0.01)
-    assert odds.shape == (2, 22)
-    assert np.flatnonzero(np.isinf(odds[0])).tolist() == [J["neck"]]
-    hidden = torch.where(observed > 0, x, torch.nan)
-    np.testing.assert_array_equal(joint_odds(network, hidden, found, sigma, observed, 0.01), odds)
-    alone = joint_odds(network, x[1:], found[1:], sigma[1:], observed[1:], 0.01)
-    np.testing.assert_allclose(alone, odds[1:], atol=1e-5)
+    stuck = np.zeros((2, 22), dtype=bool)
+    stuck[:, J["neck"]] = True
+    odds = judged(np.zeros((2, 22)), observed, stuck)
+    assert odds[0, J["neck"]] == -np.inf
+    assert odds[1, J["neck"]] == STUCK_ODDS
+    assert (np.delete(odds, J["neck"], axis=1) == 0).all()
 
 
 def test_the_scale_is_the_decimals_of_the_rate_among_clean_windows() -> None:
