@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from prior.filters import FixedLagRTS, Smoothed
@@ -189,6 +191,7 @@ class Gate:
         return bad & window.measured[:, None]
 
 
+@njit(cache=True)
 def stuck(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(B, 22) joints that a tracker has lost and of which it repeats the last answer.
 
@@ -197,15 +200,33 @@ def stuck(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
     Args:
         positions: (B, T, 22, 3) metres as the sensor gave them, NaN where it did not; the last frames count.
     """
-    recent = positions[:, -RECENT - 1 :]
-    with np.errstate(invalid="ignore"):
-        same = np.abs(np.diff(recent, axis=1)).max(axis=-1) < SAME
-    new = ~(same.mean(axis=-1, keepdims=True) > 0.5)
-    repeated = (same & new).sum(axis=1) > 0.5 * np.maximum(new.sum(axis=1), _LEAST_NEW)
-    shaken = np.diff(recent, n=2, axis=1) ** 2
-    seen = np.isfinite(shaken)
-    noise = np.sqrt(np.where(seen, shaken, 0.0).sum(axis=(1, 3)) / 6 / np.maximum(seen.sum(axis=(1, 3)), 1))
-    return repeated & (np.median(noise, axis=-1, keepdims=True) > LEAST_NOISE)
+    count, frames, joints, _ = positions.shape
+    found = np.zeros((count, joints), dtype=np.bool_)
+    for b in range(count):
+        recent = positions[b, max(frames - RECENT - 1, 0) :]
+        new, repeated, noise = 0, np.zeros(joints), np.zeros(joints)
+        for t in range(1, len(recent)):
+            same = np.ones(joints)
+            for joint in range(joints):
+                for axis in range(3):
+                    if not abs(recent[t, joint, axis] - recent[t - 1, joint, axis]) < SAME:
+                        same[joint] = 0.0
+            if same.mean() <= 0.5:
+                new += 1
+                repeated += same
+        if not (repeated > 0.5 * max(new, _LEAST_NEW)).any():
+            continue
+        for joint in range(joints):
+            square, seen = 0.0, 0
+            for t in range(2, len(recent)):
+                shaken = recent[t, joint] - 2 * recent[t - 1, joint] + recent[t - 2, joint]
+                if np.isfinite(shaken).all():
+                    square += (shaken**2).sum()
+                    seen += 3
+            noise[joint] = math.sqrt(square / 6 / max(seen, 1))
+        if np.median(noise) > LEAST_NOISE:
+            found[b] = repeated > 0.5 * max(new, _LEAST_NEW)
+    return found
 
 
 _PARENT = np.maximum(np.array(PARENTS), 0)
