@@ -91,7 +91,7 @@ def impute_all(
         guess[b] = _guess(positions[b], sizes[b], clean[b], observed[b], line[b])
     live = LiveHGVAE(model, SENSOR_SIGMA, SLOW, 1)
     hung = standardise(model, guess)
-    completed = model.completed(hung, torch.from_numpy(observed).float(), SLOW)
+    completed, _ = model.completed(hung, torch.from_numpy(observed).float(), SLOW)
     guess_m, completed_m = (x.double().numpy() * SCALE + mean for x in (hung, completed))
     found = {"mean": np.where(masks, mean, truth), "hold": hold, "line": line, "guess": guess_m}
     if model.completion:

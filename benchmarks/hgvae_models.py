@@ -26,8 +26,16 @@ _NODES = (1, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 54, JOINT_NODES)
 
 
 def of_depth(depth: int) -> HGVAEConfig:
-    """16 levels, of which the lowest ``depth`` are random: the same parameters at every depth."""
-    return HGVAEConfig(features=32, levels=tuple(Level(n, 16) for n in _NODES), stochastic=depth)
+    """16 levels, of which the lowest ``depth`` are random: the same parameters at every depth.
+
+    With many latents a node, the finest level alone can say all there is to say of a window.
+    """
+    return HGVAEConfig(features=32, levels=tuple(Level(n, 3) for n in _NODES), stochastic=depth)
+
+
+DEPTH_RATE = 8e-3
+"""Adam's rate for models with the branches of `of_depth` closed at first: at 1e-3 all depths are still learning to walk
+when an hour is over, and which one is ahead says nothing of depth."""
 
 
 LEAST_SIGMA = 0.05
@@ -78,16 +86,23 @@ def action_name(name: str) -> str:
 
 
 def train(
-    config: HGVAEConfig, windows: Windows, directory: Path, steps: int, batch: int = 32, least_sigma: float = 0.0
+    config: HGVAEConfig,
+    windows: Windows,
+    directory: Path,
+    steps: int,
+    batch: int = 32,
+    least_sigma: float = 0.0,
+    rate: float = 1e-3,
 ) -> HGVAE:
     """By the evidence lower bound alone, as the paper; a run of the same name in ``directory`` is taken up again.
 
-    ``least_sigma``, metres, is the least standard deviation that the likelihood takes the model to state.
+    ``least_sigma``, metres, is the least standard deviation that the likelihood takes the model to state; ``rate`` is
+    Adam's at the start.
     """
     torch.manual_seed(0)
     model = HGVAE(config)
     model.mean.copy_(mean_tracks(windows, config.frames, count=500))
-    optimiser = torch.optim.Adam(model.parameters(), lr=1e-3)
+    optimiser = torch.optim.Adam(model.parameters(), lr=rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     run = TrainingRun(
         directory, {"model": model, "optimiser": optimiser, "schedule": schedule}, steps, every=max(steps // 8, 1)
@@ -102,7 +117,7 @@ def train(
         else:
             positions, sizes = windows.draw(batch, config.frames, rng)
         whole = Batch.of(model, positions, positions, sizes)
-        drawn = model(whole.x, whole.observed, spread=torch.ones(batch, 1), action=action)
+        drawn = model(whole.x, whole.believed, spread=torch.ones(batch, 1), action=action)
         if least_sigma:
             log_var = drawn.tracks.log_var.clamp(min=2 * math.log(least_sigma / SCALE))
             drawn = drawn._replace(tracks=drawn.tracks._replace(log_var=log_var))

@@ -87,7 +87,7 @@ def started(model: nn.Module, name: str, start: str | None) -> str:
         model.load_state_dict(load_weights(start, name)[0])
     except RuntimeError as error:
         raise ValueError(f"start: expected weights of {name}, of this size, got '{start}': {error}") from error
-    return f", started from the weights '{start}'"
+    return f", started from the weights '{Path(start).stem}'"
 
 
 def _write_whole(path: Path, content: bytes) -> None:

@@ -36,9 +36,10 @@ def slow_errors(count: int, rng: Rng) -> Floats:
 
 def add_noise(positions: Floats, rng: Rng, slow: Floats) -> Floats:
     """Windows (B, T, 22, 3) with noise from frame to frame, of some joints more than of others, up to 10 cm, and with
-    errors ``slow`` (B,) that last or change slowly; see `slow_errors`."""
+    errors ``slow`` (B,) that last or change slowly; see `slow_errors`. Half of those without such errors have none."""
     count, frames, joints, _ = positions.shape
     fast = 10 ** rng.uniform(-3.3, -1.0, (count, 1, 1, 1)) * np.exp(0.4 * rng.standard_normal((count, 1, joints, 1)))
+    fast[(slow == 0) & (rng.random(count) < 0.5)] = 0.0
     phase = rng.uniform(0.0, 2 * np.pi, (count, 1, joints, 3))
     turns = rng.uniform(0.0, SLOW_HZ, (count, 1, joints, 3)) * np.arange(frames)[:, None, None] / FPS
     bias = np.sqrt(2.0) * slow[:, None, None, None] * np.cos(phase + 2 * np.pi * turns)

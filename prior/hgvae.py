@@ -6,9 +6,9 @@ learned adjacency mix nodes, contract them to fewer on the way up and expand the
 deterministic stream of all nodes, to which every stochastic level, from the single top node down to one latent for
 each track, adds what it knows.
 
-Beyond the paper: the encoder is told which entries were observed, and the others are guessed by a network of their own
-(`prior.completion_net`), so that one pass already completes a window; and the cosine transform may be cut off at its
-lower coefficients, which makes the live model small.
+Beyond the paper: the encoder is told how far to believe each entry, and those not observed are guessed by a network of
+their own (`prior.completion_net`), so that one pass already completes a window; and the cosine transform may be cut off
+at its lower coefficients, which makes the live model small.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from prior.completion_net import CompletionConfig, CompletionNet
+from prior.completion_net import CompletionConfig, CompletionNet, certainty
 from prior.graph import JOINT_NODES, LOG_VAR_RANGE, GraphBlock, GraphLinear
 
 TRACK_LOG_VAR = -4.0
@@ -167,29 +167,32 @@ class HGVAE(nn.Module):
         return [cast("DecoderLevel", level) for level in self.down]
 
     @torch.no_grad()
-    def completed(self, x: Tensor, observed: Tensor, slow: NDArray[np.floating] | float) -> Tensor:
-        """(B, N, T) windows with a better guess of what was not observed.
+    def completed(self, x: Tensor, observed: Tensor, slow: NDArray[np.floating] | float) -> tuple[Tensor, Tensor]:
+        """(B, N, T) windows with a better guess of what was not observed, and how far to believe each entry.
 
         Args:
             x: (B, N, T) tracks; what was not observed holds a guess.
             observed: (B, N, T) 1 where observed, else 0.
             slow: (B,) metres along an axis, the errors of the sensor that last.
         """
-        return self.completion.complete(x, observed, slow)[0] if self.completion else x
+        if self.completion is None:
+            return x, observed
+        completed, log_var = self.completion.complete(x, observed, slow)
+        return completed, certainty(observed, log_var)
 
     def forward(
-        self, x: Tensor, observed: Tensor, *, spread: Tensor | None = None, action: Tensor | None = None
+        self, x: Tensor, believed: Tensor, *, spread: Tensor | None = None, action: Tensor | None = None
     ) -> Pass:
         """Encode and decode windows.
 
         Args:
             x: (B, N, T) tracks; what was not observed holds a guess.
-            observed: (B, N, T) 1 where observed, else 0.
+            believed: (B, N, T) how far to believe each entry: 1 where observed, 0 where nothing is known of it.
             spread: (B, 1) the share of the posterior's standard deviation with which latents are drawn: 1 to draw
                 them, 0 or None to take the means.
             action: (B, actions) one-hot, for a model with actions.
         """
-        read = torch.cat([x @ self.dct.T, observed], dim=-1).transpose(0, 1)
+        read = torch.cat([x @ self.dct.T, believed], dim=-1).transpose(0, 1)
         graph = self.read_block(F.gelu(self.read(read)))
         found: list[Tensor] = []
         for up, block in self.encoder_levels:

@@ -104,10 +104,9 @@ class LiveHGVAE:
         rows = slice(0, len(x))
         deviations = (x - self._mean) / SCALE
         hang_unseen(deviations)
-        if self._completion:
-            self._completion.complete(deviations, observed)
+        believed = self._completion.complete(deviations, observed) if self._completion else observed > 0
         seen = self._net.matrix(self._x, rows)
-        seen[..., : self.frames], seen[..., self.frames :] = deviations, observed > 0
+        seen[..., : self.frames], seen[..., self.frames :] = deviations, believed
         self._trust[rows] = observed
         for number in self._moves:
             self._net.matrix(number, rows)[:] = 0.0

@@ -46,12 +46,14 @@ class Batch(NamedTuple):
     Attributes:
         x: (B, 66, T) what was seen and, elsewhere, the guess, about the model's mean and in its scale.
         observed: (B, 66, T) 1 where seen.
+        believed: (B, 66, T) how far to believe x: 1 where seen; elsewhere 0, if it was not completed.
         target: (B, 66, T) the truth in the same frame.
         counts: (B, 1, T) 1 from the first sighting on; what was before, nobody asks for.
     """
 
     x: Tensor
     observed: Tensor
+    believed: Tensor
     target: Tensor
     counts: Tensor
 
@@ -63,14 +65,15 @@ class Batch(NamedTuple):
         observed = torch.from_numpy(np.stack([t.observed for t in tracks])).float()
         counts = (observed.amax(dim=1, keepdim=True).cumsum(dim=-1) > 0).float()
         x = standardise(model, np.stack([t.x for t in tracks]))
-        return cls(x, observed, standardise(model, np.stack(true)), counts)
+        return cls(x, observed, observed, standardise(model, np.stack(true)), counts)
 
     def completed(self, model: HGVAE, slow: Floats | float) -> Batch:
         """The same with the model's guess of what was not seen.
 
         ``slow`` (B,) metres along an axis: the errors of the sensor that last.
         """
-        return self._replace(x=model.completed(self.x, self.observed, slow))
+        x, believed = model.completed(self.x, self.observed, slow)
+        return self._replace(x=x, believed=believed)
 
     def beside(self, other: Batch) -> Batch:
         """Both, one after the other."""

@@ -157,7 +157,7 @@ def _look(model: HGVAE, seen: Floats, sizes: Floats, slow: Floats | float) -> tu
     (B, 66, T) metres, and what was observed; ``slow`` (B,) metres, the errors of the sensor that last."""
     tracks = to_tracks(seen, sizes)
     observed = torch.from_numpy(tracks.observed).float()
-    found = model(model.completed(standardise(model, tracks.x), observed, slow), observed).tracks
+    found = model(*model.completed(standardise(model, tracks.x), observed, slow)).tracks
     mean = found.mean.double() * SCALE + model.mean[:, None]
     return tracks.x, mean.numpy(), (0.5 * found.log_var.double()).exp().numpy() * SCALE, tracks.observed
 

@@ -106,8 +106,8 @@ def _elbo(model: HGVAE, windows: Windows, count: int) -> dict[str, float]:
     for start in range(0, count, 128):
         part = slice(start, start + 128)
         whole = Batch.of(model, positions[part], positions[part], sizes[part])
-        likelihood, kl = evidence(model(whole.x, whole.observed, spread=torch.ones(len(whole.x), 1)), whole.target)
-        off = (model(whole.x, whole.observed).tracks.mean - whole.target) * SCALE * 1000
+        likelihood, kl = evidence(model(whole.x, whole.believed, spread=torch.ones(len(whole.x), 1)), whole.target)
+        off = (model(whole.x, whole.believed).tracks.mean - whole.target) * SCALE * 1000
         parts.append(torch.stack([likelihood, kl, off.square().mean(dim=(1, 2))], dim=1))
     likelihood, kl, square = torch.cat(parts).mean(dim=0).tolist()
     return {"log_likelihood": likelihood, "kl": kl, "elbo": likelihood - kl, "mse_mm2": square}
@@ -334,7 +334,8 @@ def _depth(bench: Bench, data: _Data) -> Result:
     records = []
     for depth in models.DEPTHS:
         bench.progress.stop()  # training draws a bar of its own
-        model = models.train(models.of_depth(depth), Windows(data.train), data.runs(bench) / f"depth-{depth}", steps)
+        directory = data.runs(bench) / f"depth-{depth}"
+        model = models.train(models.of_depth(depth), Windows(data.train), directory, steps, rate=models.DEPTH_RATE)
         bench.progress.start()
         records.append({"depth": depth, "parameters": sum(p.numel() for p in model.parameters()),
                         **_elbo(model, Windows(data.val), 64 if bench.quick else 512)})  # fmt: skip

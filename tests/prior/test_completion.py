@@ -5,9 +5,19 @@ import numpy as np
 import pytest
 import torch
 
-from prior.completion_net import NEAR, CompletionConfig, CompletionNet, tell
+from prior.completion_net import (
+    FIRST_HOLD,
+    FIRST_LOG_VAR,
+    LAG,
+    NEAR,
+    SURE,
+    CompletionConfig,
+    CompletionNet,
+    certainty,
+    tell,
+)
 from prior.graph import SCALE
-from prior.skeletons import J
+from prior.skeletons import PARENTS, J
 from prior.track_windows import Windows
 from prior.train_completion import train_completion
 from tests.prior.test_hgvae import SMALL, awake
@@ -25,13 +35,64 @@ def windows(frames: int = 12) -> tuple[np.ndarray, np.ndarray]:
     return deviations, observed
 
 
-def test_a_correction_is_the_smaller_the_nearer_a_sighting_is() -> None:
-    share = tell(*windows(), 0.0, patch=4).share
-    assert (share[0] == 0).all()
-    apart = np.array([1, 2, 3, 2, 1])
-    np.testing.assert_allclose(share[1, TRACKS, 4:9], np.tile(1 - np.exp(-apart / NEAR), (3, 1)), rtol=1e-6)
-    assert (share[2, TRACKS] == 1).all()
-    assert (np.delete(share, range(TRACKS.start, TRACKS.stop), axis=1) == 0).all()
+def test_how_far_apart_from_sightings_a_joint_is() -> None:
+    deviations, observed = windows()
+    observed[0, 0, 7] = 0  # a coordinate alone: the joint was not seen whole
+    apart = tell(deviations, observed, 0.0, patch=4).apart
+    assert apart[0, 0, 7] == 0.5
+    gap = np.arange(1, 6)
+    np.testing.assert_allclose(apart[1, WRIST, 4:9], gap * (6 - gap) / 6, rtol=1e-6)
+    assert (apart[2, WRIST] == -1).all()
+    assert np.count_nonzero(apart) == 1 + 5 + 12
+    observed[1, TRACKS, 9:] = 0
+    assert tell(deviations, observed, 0.0, patch=4).apart[1, WRIST].tolist() == [0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8]
+
+
+def test_how_much_a_joint_moves_is_told_beside_the_one_above() -> None:
+    deviations, observed = windows()
+    deviations[1] = np.tile(deviations[1, :3], (22, 1))  # all go where the pelvis goes: no other moves beside it
+    moved = tell(deviations, observed, 0.0, patch=4).moved
+    way = deviations[0, TRACKS] - deviations[0, 3 * PARENTS[WRIST] : 3 * PARENTS[WRIST] + 3]
+    assert moved[0, WRIST] == pytest.approx(((way[:, LAG:] - way[:, :-LAG]) ** 2).mean(), rel=1e-4)
+    hips = [J["left_hip"], J["right_hip"], J["spine1"]]  # beside the pelvis's path, which is not the pelvis's track
+    assert (np.delete(moved[1], [0, WRIST, *hips]) < 1e-9).all()
+    seen = np.delete(moved[2], WRIST)
+    assert moved[2, WRIST] == pytest.approx(seen.mean(), rel=1e-4)
+
+
+def test_the_longer_ago_and_the_more_it_moves_the_less_the_line_counts() -> None:
+    network = CompletionNet(12, CompletionConfig(patch=4, features=8, blocks=1))
+    written = torch.zeros(1, 3, 88 * 4)
+    written[..., : 66 * 4] = 1.0
+
+    def leaning(moved: float, joint: int = WRIST, above: float = 0.0) -> np.ndarray:
+        apart = torch.zeros(1, 22, 12)
+        apart[0, joint], apart[0, PARENTS[joint]] = torch.arange(12), above
+        with torch.inference_mode():
+            correction, log_var = network.fuse(written, torch.full((1, 22), moved), apart)
+        assert log_var[0, joint, 1:].diff().min() > 0
+        return correction[0, 3 * joint].numpy()
+
+    still, moving = leaning(1e-4), leaning(1e-2)
+    assert still[0] == 0
+    assert (np.diff(still) > 0).all()
+    assert (moving[1:] > still[1:]).all()
+    assert moving[-1] < 1
+    assert (leaning(1e-4, above=5.0)[1:] > still[1:]).all()  # its line hangs from another that nobody saw
+    line = np.exp(FIRST_HOLD[0]) * (1e-4 + np.exp(FIRST_HOLD[2])) * (np.arange(12) / LAG) ** FIRST_HOLD[1]
+    np.testing.assert_allclose(still, line / (line + np.exp(FIRST_LOG_VAR)), rtol=1e-5)
+    never = torch.full((1, 22, 12), -1.0)
+    assert bool((network.fuse(written, torch.zeros(1, 22), never)[0] == 1).all())
+
+
+def test_a_guess_is_believed_by_how_good_it_is() -> None:
+    observed, log_var = torch.zeros(1, 66, 4), torch.full((1, 22, 4), 2 * np.log(SURE / SCALE))
+    observed[:, :3] = 1
+    log_var[:, 2] += np.log(3.0)
+    found = certainty(observed, log_var)
+    assert (found[:, :3] == 1).all()
+    np.testing.assert_allclose(found[:, 3:6], 0.5)
+    np.testing.assert_allclose(found[:, 6:9], 0.25)
 
 
 def test_a_sighting_a_second_ago_is_told_from_none() -> None:
@@ -48,10 +109,14 @@ def test_a_sighting_a_second_ago_is_told_from_none() -> None:
 def test_only_what_was_not_seen_moves() -> None:
     model = awake()
     deviations, observed = windows()
-    completed = model.completed(torch.from_numpy(deviations).float(), torch.from_numpy(observed).float(), 0.01).numpy()
-    moved = np.abs(completed - deviations) > 1e-6
+    observed[0, 3, 5] = 0  # one coordinate of a joint
+    completed, believed = model.completed(
+        torch.from_numpy(deviations).float(), torch.from_numpy(observed).float(), 0.01
+    )
+    moved = np.abs(completed.numpy() - deviations) > 1e-6
     assert not moved[observed == 1].any()
     assert moved[observed == 0].all()
+    assert ((believed == 1).numpy() == (observed == 1)).all()
 
 
 def test_noise_is_told_by_joint_where_it_was_seen_and_of_all_where_it_was_not() -> None:
@@ -59,7 +124,7 @@ def test_noise_is_told_by_joint_where_it_was_seen_and_of_all_where_it_was_not() 
     deviations, observed = np.zeros((1, 66, 12)), np.ones((1, 66, 12))
     deviations[0, TRACKS] = rng.normal(scale=0.02 / SCALE, size=(3, 12))
     observed[0, :3] = 0
-    told = tell(deviations, observed, 0.0, patch=4).nodes[0, :, -24:-2]
+    told = tell(deviations, observed, 0.0, patch=4).nodes[0, :, -46:-24]
     assert (told == told[0]).all()
     assert told[0, WRIST] > told[0, 0] > told[0, J["head"]]
 
@@ -78,6 +143,6 @@ def test_windows_come_in_whole_patches() -> None:
 def test_without_a_network_the_guess_stays_and_there_is_nothing_to_train(tmp_path: Path) -> None:
     model = awake(replace(SMALL, completion=None))
     x, observed = torch.ones(1, 66, 12), torch.zeros(1, 66, 12)
-    assert model.completed(x, observed, 0.0) is x
+    assert model.completed(x, observed, 0.0) == (x, observed)
     with pytest.raises(ValueError, match="completion"):
         train_completion(model, Windows(None), Windows(None), tmp_path, 1, 0)  # type: ignore[arg-type]
