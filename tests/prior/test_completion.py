@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from prior.completion_net import (
-    FIRST_HOLD,
     FIRST_LOG_VAR,
+    GROWTH,
     LAG,
     NEAR,
+    STILL,
     SURE,
     CompletionConfig,
     CompletionNet,
@@ -48,16 +49,22 @@ def test_how_far_apart_from_sightings_a_joint_is() -> None:
     assert tell(deviations, observed, 0.0, patch=4).apart[1, WRIST].tolist() == [0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8]
 
 
-def test_how_much_a_joint_moves_is_told_beside_the_one_above() -> None:
+def test_how_much_a_joint_moves_is_told_beside_the_one_above_and_without_the_noise() -> None:
     deviations, observed = windows()
     deviations[1] = np.tile(deviations[1, :3], (22, 1))  # all go where the pelvis goes: no other moves beside it
-    moved = tell(deviations, observed, 0.0, patch=4).moved
-    way = deviations[0, TRACKS] - deviations[0, 3 * PARENTS[WRIST] : 3 * PARENTS[WRIST] + 3]
-    assert moved[0, WRIST] == pytest.approx(((way[:, LAG:] - way[:, :-LAG]) ** 2).mean(), rel=1e-4)
+    deviations[2] = np.cumsum(deviations[2], axis=-1)
+    told = tell(deviations, observed, np.array([0.0, 0.01, 0.01]), patch=4)
+    assert told.noise[0, WRIST] == pytest.approx(
+        (np.diff(deviations[0, TRACKS], n=2) ** 2).mean() / 6 + (0.002 / SCALE) ** 2, rel=1e-4
+    )
+    assert told.noise[1, J["head"]] > told.noise[1, WRIST] > (0.01 / SCALE) ** 2  # of the gap, nothing is told
     hips = [J["left_hip"], J["right_hip"], J["spine1"]]  # beside the pelvis's path, which is not the pelvis's track
-    assert (np.delete(moved[1], [0, WRIST, *hips]) < 1e-9).all()
-    seen = np.delete(moved[2], WRIST)
-    assert moved[2, WRIST] == pytest.approx(seen.mean(), rel=1e-4)
+    assert (np.delete(told.moved[1], [0, WRIST, *hips]) < 1e-9).all()
+    elbow = PARENTS[WRIST]
+    way = deviations[2, 3 * elbow : 3 * elbow + 3] - deviations[2, 3 * PARENTS[elbow] : 3 * PARENTS[elbow] + 3]
+    moved = ((way[:, LAG:] - way[:, :-LAG]) ** 2).mean() - 2 * (told.noise[2, elbow] - (0.01 / SCALE) ** 2)
+    assert told.moved[2, elbow] == pytest.approx(moved, rel=1e-3)
+    assert told.moved[2, WRIST] > 0  # never seen: as all do
 
 
 def test_the_longer_ago_and_the_more_it_moves_the_less_the_line_counts() -> None:
@@ -65,24 +72,23 @@ def test_the_longer_ago_and_the_more_it_moves_the_less_the_line_counts() -> None
     written = torch.zeros(1, 3, 88 * 4)
     written[..., : 66 * 4] = 1.0
 
-    def leaning(moved: float, joint: int = WRIST, above: float = 0.0) -> np.ndarray:
+    def leaning(moved: float, noise: float = 0.0, above: float = 0.0) -> np.ndarray:
         apart = torch.zeros(1, 22, 12)
-        apart[0, joint], apart[0, PARENTS[joint]] = torch.arange(12), above
+        apart[0, WRIST], apart[0, PARENTS[WRIST]] = torch.arange(12), above
         with torch.inference_mode():
-            correction, log_var = network.fuse(written, torch.full((1, 22), moved), apart)
-        assert log_var[0, joint, 1:].diff().min() > 0
-        return correction[0, 3 * joint].numpy()
+            correction, log_var = network.fuse(written, torch.full((1, 22), moved), torch.full((1, 22), noise), apart)
+        assert log_var[0, WRIST, 1:].diff().min() > 0
+        return correction[0, 3 * WRIST].numpy()
 
-    still, moving = leaning(1e-4), leaning(1e-2)
+    still, moving, noisy, hanging = leaning(1e-4), leaning(1e-2), leaning(1e-4, noise=1e-2), leaning(1e-4, above=5.0)
     assert still[0] == 0
     assert (np.diff(still) > 0).all()
-    assert (moving[1:] > still[1:]).all()
+    assert all((more[1:] > still[1:]).all() for more in (moving, noisy, hanging))
     assert moving[-1] < 1
-    assert (leaning(1e-4, above=5.0)[1:] > still[1:]).all()  # its line hangs from another that nobody saw
-    line = np.exp(FIRST_HOLD[0]) * (1e-4 + np.exp(FIRST_HOLD[2])) * (np.arange(12) / LAG) ** FIRST_HOLD[1]
+    line = (1e-4 + (STILL / SCALE) ** 2) * (np.arange(12) / LAG) ** GROWTH
     np.testing.assert_allclose(still, line / (line + np.exp(FIRST_LOG_VAR)), rtol=1e-5)
     never = torch.full((1, 22, 12), -1.0)
-    assert bool((network.fuse(written, torch.zeros(1, 22), never)[0] == 1).all())
+    assert bool((network.fuse(written, torch.zeros(1, 22), torch.zeros(1, 22), never)[0] == 1).all())
 
 
 def test_a_guess_is_believed_by_how_good_it_is() -> None:
