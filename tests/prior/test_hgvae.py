@@ -169,6 +169,7 @@ def test_what_the_live_model_makes_of_a_window_does_not_depend_on_the_others() -
     model, rng = awake(), np.random.default_rng(0)
     x, observed = rng.normal(scale=0.3, size=(3, 66, 12)), np.ones((3, 66, 12))
     x[2, 30:33] = np.nan  # a joint never seen
+    observed[2, 30:33], observed[1, 30:39, 4:] = 0, 0
     together, alone = LiveHGVAE(model, 0.01, 0.0, most=3), LiveHGVAE(model, 0.01, 0.0, most=1)
     looks = together.look(x, observed)
     found = [(together.score(row), *together.gradient(row)) for row in range(3)]
