@@ -32,7 +32,7 @@ def scored(positions: np.ndarray, **settings) -> list:
     return [c.bodies[0] for m in stream(positions) for c in pipeline.process(m)]
 
 
-def looks(count: int) -> tuple[np.ndarray, ...]:
+def looks(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Windows (count, 66, 20): tracks, NaN where not seen, what is made of them, how surely, and what was seen."""
     rng = np.random.default_rng(0)
     x, found = rng.normal(scale=0.5, size=(2, count, 66, 20))
@@ -54,7 +54,8 @@ def test_the_live_fault_network_is_the_trained_one() -> None:
         odds = network(torch.from_numpy(tell(*look, 0.02, network.mean.numpy()))).numpy()
     live = LiveFaultNet(network, 0.02, 4)
     np.testing.assert_allclose(live(*look), odds, atol=1e-4)
-    np.testing.assert_allclose(live(*(part[1:] for part in look)), odds[1:], atol=1e-4)
+    x, found, sigma, observed = (part[1:] for part in look)
+    np.testing.assert_allclose(live(x, found, sigma, observed), odds[1:], atol=1e-4)
 
 
 def test_the_fault_network_is_told_of_what_was_seen_alone() -> None:
