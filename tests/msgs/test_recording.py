@@ -87,7 +87,7 @@ def test_what_went_in_comes_out_in_the_order_of_stamps(whole: Path):
 
 
 @given(st.lists(st.tuples(ANY, st.integers(0, 2**62)), min_size=1, max_size=8))
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 def test_any_message_at_any_stamp_is_kept(tmp_path_factory: pytest.TempPathFactory, given_: list):
     messages = [Recorded(topic, stamp, message) for (topic, message), stamp in given_]
     directory = record(tmp_path_factory.mktemp("any") / "recording", messages)
@@ -228,7 +228,7 @@ def test_an_error_while_recording_completes_it(tmp_path: Path):
 
 
 @given(data=st.data())
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_a_truncated_recording_gives_what_is_there(
     data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
 ):
@@ -247,7 +247,7 @@ def test_a_truncated_recording_gives_what_is_there(
 
 
 @given(data=st.data())
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 def test_a_damaged_recording_is_an_error_and_never_another_message(
     data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
 ):
