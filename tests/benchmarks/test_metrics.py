@@ -75,7 +75,7 @@ def test_contact_speed_is_horizontal_and_of_each_foot_for_itself() -> None:
     np.testing.assert_allclose(speed[:, 1], [np.nan, np.nan, 0.0])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10**6))
 def test_rigid_alignment_undoes_a_rigid_motion_and_never_mirrors(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -152,7 +152,7 @@ def collect(*stamped: tuple[PoseClean, PoseWorld]) -> NpzCollector:
     return collector
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(share=st.floats(0.0, 1.0), seed=st.integers(0, 1000))
 def test_between_two_grid_times_it_interpolates(share: float, seed: int) -> None:
     turns = Rotation.random(2, rng=np.random.default_rng(seed))

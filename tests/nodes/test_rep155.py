@@ -54,7 +54,7 @@ def about(axis: str, angle: float) -> Rotation:
     return Rotation.from_euler(axis, angle)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 10_000))
 def test_what_the_model_can_say_comes_back(seed: int) -> None:
     """A body that bends only where REP-155's does: its links are where angles and URDF put them."""

@@ -43,7 +43,7 @@ def dense_posterior(values: np.ndarray, stamps: np.ndarray, sigmas: np.ndarray) 
     return mean[::2], np.sqrt(np.diag(covariance)[::2])
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), delay=st.integers(0, 9))
 def test_every_emission_is_the_batch_posterior_given_the_frames_so_far(seed: int, delay: int) -> None:
     positions, stamps, sigmas = stream(seed)

@@ -62,7 +62,7 @@ def test_a_node_is_one_coordinate_of_one_joint_through_all_frames() -> None:
     st.floats(-3, 3), st.floats(-5, 5), st.floats(-5, 5), st.floats(0.5, 1.5),
     st.sets(st.integers(0, 21), max_size=12), st.integers(0, 2**31),
 )  # fmt: skip
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_tracks_do_not_depend_on_where_a_body_is_or_faces(turn, east, north, size, hidden, seed) -> None:
     window = waving(20)
     window[5:15, list(hidden)] = np.nan

@@ -49,7 +49,7 @@ def test_solve_pose_returns_where_its_rotations_put_the_joints() -> None:
 
 
 @given(st.floats(-3.1, 3.1), st.tuples(UNITS, UNITS, UNITS))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_turning_the_world_turns_only_the_root(angle: float, shift: tuple[float, float, float]) -> None:
     positions = fk(random_pose(np.random.default_rng(4), 3))
     turned = positions @ yaw_matrix(angle).T + np.array(shift)
@@ -61,7 +61,7 @@ def test_turning_the_world_turns_only_the_root(angle: float, shift: tuple[float,
 
 
 @given(st.tuples(UNITS, UNITS, UNITS), st.tuples(UNITS, UNITS, UNITS))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_swing_turns_one_direction_into_the_other(a: tuple[float, ...], b: tuple[float, ...]) -> None:
     a_, b_ = np.array(a), np.array(b)
     if min(np.linalg.norm(a_), np.linalg.norm(b_)) < 1e-3:

@@ -152,7 +152,7 @@ def test_surprise_counts_standard_deviations():
     assert f.foot_surprise(0, np.array([0.01, 0.0, 0.0]), 0.01) == pytest.approx(2**-0.5, rel=0.01)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(yaw=st.floats(-np.pi, np.pi), seed=st.integers(0, 1000))
 def test_turns_with_the_world(yaw: float, seed: int):
     turn = yaw_matrix(yaw)
