@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from prior.checkpoint import load_weights, weights_path
@@ -108,21 +109,33 @@ def judged(odds: Floats, observed: Floats, stuck: NDArray[np.bool_]) -> Floats:
 
 
 def decimals(score: Floats, calibration: Calibration, missing: NDArray[np.integer]) -> Floats:
-    """(...) -log10 of the rate at which clean windows score at least so high."""
-    quantiles = _between(missing) @ calibration.quantiles
-    heights = -np.log10(RATES)
-    place = np.sum(score[..., None] > quantiles, axis=-1)
-    low = np.clip(place - 1, 0, len(RATES) - 2)[..., None]
-    below, above = (np.take_along_axis(quantiles, low + k, axis=-1)[..., 0] for k in (0, 1))
-    # beyond the rarest rate measured, the tail goes on as it went between the last two
-    rising = (heights[low[..., 0] + 1] - heights[low[..., 0]]) / np.maximum(above - below, 1e-6)
-    return np.maximum(heights[low[..., 0]] + rising * (score - below), 0.0)
+    """-log10 of the rate at which clean windows score at least so high.
+
+    Args:
+        score: (B, K) of windows or of their joints.
+        calibration: for the sensor.
+        missing: (B,) joints of each window.
+    """
+    told = np.empty(score.shape)
+    _decimals(score, _between(missing) @ calibration.quantiles, -np.log10(RATES), told)
+    return told
 
 
 def _between(missing: NDArray[np.integer]) -> Floats:
-    """(..., M) weights of the two of `MISSING` on either side."""
+    """(B, M) weights of the two of `MISSING` on either side."""
     place = np.interp(missing, MISSING, np.arange(len(MISSING)))
-    return np.maximum(1 - np.abs(place[..., None] - np.arange(len(MISSING))), 0.0)
+    return np.maximum(1 - np.abs(place[:, None] - np.arange(len(MISSING))), 0.0)
+
+
+@njit(cache=True)
+def _decimals(score, quantiles, heights, told):
+    for row in range(len(score)):
+        limits = quantiles[row]
+        for k in range(score.shape[1]):
+            low = min(max((score[row, k] > limits).sum() - 1, 0), len(limits) - 2)
+            # beyond the rarest rate measured, the tail goes on as it went between the last two
+            rising = (heights[low + 1] - heights[low]) / max(limits[low + 1] - limits[low], 1e-6)
+            told[row, k] = max(heights[low] + rising * (score[row, k] - limits[low]), 0.0)
 
 
 class Score:
@@ -160,6 +173,6 @@ class Score:
         tracks, look = encoded.tracks, encoded.look
         odds = self._network(tracks.x, look.mean, look.sigma, tracks.observed)
         odds = judged(odds, tracks.observed, stuck)
-        missing = np.isinf(odds).sum(axis=-1)
-        told = decimals(odds, self._calibration, np.broadcast_to(missing[:, None], odds.shape))
-        return told.max(axis=-1), np.where(np.isinf(odds), np.nan, told)
+        unseen = np.isinf(odds)
+        told = decimals(odds, self._calibration, unseen.sum(axis=-1))
+        return told.max(axis=-1), np.where(unseen, np.nan, told)

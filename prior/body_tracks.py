@@ -24,8 +24,9 @@ _REST = np.zeros((22, 3))
 for _joint, _parent in enumerate(PARENTS[1:], start=1):
     _REST[_joint] = _REST[_parent] + REST_OFFSETS[_joint]
 _PARENT = np.array(PARENTS)
-_LEGS = np.array([J[f"{s}_{n}"] for s in ("left", "right") for n in ("knee", "ankle")])
-_SPINE = np.array([J[n] for n in ("spine1", "spine2", "spine3", "neck")])
+_TALL = np.array([J[n] for n in ("left_knee", "left_ankle", "right_knee", "right_ankle", "spine1", "spine2", "spine3",
+                                 "neck")])  # fmt: skip
+_STANDARD = float(np.linalg.norm(REST_OFFSETS[_TALL], axis=-1).sum())
 _PATH_COEFFICIENTS = 8
 """of the cosine transform of the trunk's path: in a window of 50 frames, all that is slower than 2 Hz"""
 
@@ -48,8 +49,7 @@ class Tracks(NamedTuple):
 
 def body_size(offsets: NDArray[np.floating]) -> NDArray[np.float64]:
     """How much longer than the generic adult's the legs and spine of bones (..., 22, 3) are."""
-    lengths = np.linalg.norm(offsets[..., np.concatenate([_LEGS, _SPINE]), :], axis=-1)
-    return lengths.sum(axis=-1) / np.linalg.norm(REST_OFFSETS[np.concatenate([_LEGS, _SPINE])], axis=-1).sum()
+    return np.sqrt((offsets[..., _TALL, :] ** 2).sum(axis=-1)).sum(axis=-1) / _STANDARD
 
 
 def to_tracks(positions: NDArray[np.float64], size: NDArray[np.floating] | float) -> Tracks:
@@ -80,12 +80,11 @@ def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: NDArray[np.floatin
         tracks: windows of at least so many frames, of
         size: (...), as `body_size` gives it.
     """
-    frames = x.shape[-1]
-    local = np.moveaxis(x.reshape(*x.shape[:-2], 22, 3, frames), -1, -3) * np.asarray(size)[..., None, None, None]
-    c, s = np.cos(tracks.yaw)[..., None, None], np.sin(tracks.yaw)[..., None, None]
-    world = np.stack([c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], -1)
-    world[..., 0, :] += tracks.path.mean(axis=-2, keepdims=True)
-    world[..., 1:, :] += tracks.path[..., -frames:, None, :]
+    batch, frames = x.shape[:-2], x.shape[-1]
+    sizes, world = np.empty(batch), np.empty((*batch, frames, 22, 3))
+    sizes[...] = size
+    flat = np.ascontiguousarray(x).reshape(-1, 66, frames), tracks.path.reshape(-1, *tracks.path.shape[-2:])
+    _from_tracks(*flat, tracks.yaw.ravel(), sizes.ravel(), world.reshape(-1, frames, 22, 3))
     return world
 
 
@@ -148,6 +147,25 @@ def _to_tracks(windows, sizes, low_pass, all_x, all_observed, all_path, yaws):
             for axis in range(3):
                 # relative to the nearest joint above that was ever seen, whose gaps are bridged by now
                 _bridge(x[3 * j + axis], x[3 * parent + axis] if parent > 0 else still)
+
+
+@njit(cache=True)
+def _from_tracks(x, path, yaws, sizes, world):
+    """Of B windows: writes ``world`` (B, K, 22, 3), from tracks (B, 66, K) and paths (B, T, 3)."""
+    frames = x.shape[2]
+    middle = np.empty(3)
+    for window in range(len(x)):
+        c, s = math.cos(yaws[window]), math.sin(yaws[window])
+        for axis in range(3):
+            middle[axis] = path[window, :, axis].mean()
+        for t in range(frames):
+            along = path[window, path.shape[1] - frames + t]
+            for joint in range(22):
+                origin = middle if joint == 0 else along
+                a, b = sizes[window] * x[window, 3 * joint, t], sizes[window] * x[window, 3 * joint + 1, t]
+                world[window, t, joint, 0] = c * a - s * b + origin[0]
+                world[window, t, joint, 1] = s * a + c * b + origin[1]
+                world[window, t, joint, 2] = sizes[window] * x[window, 3 * joint + 2, t] + origin[2]
 
 
 @njit(cache=True)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from prior.skeletons import MIRROR, PARENTS, J
 from prior.window import FPS
@@ -46,15 +47,25 @@ def add_noise(positions: Floats, rng: Rng, slow: Floats) -> Floats:
     return positions + fast * rng.standard_normal((count, frames, joints, 3)) + bias
 
 
-def other_lengths(positions: Floats, sigma: float, rng: Rng) -> Floats:
-    """Windows (B, T, 22, 3) of people whose bones are longer or shorter, each by itself, alike on both sides."""
-    factor = np.exp(sigma * rng.standard_normal((len(positions), len(PARENTS))))
-    factor = np.sqrt(factor * factor[:, MIRROR])[:, None, :, None]
+def other_builds(positions: Floats, lengths: float, turned: float, rng: Rng) -> Floats:
+    """Windows (B, T, 22, 3) of people who are built and who hold themselves otherwise.
+
+    Args:
+        positions: metres.
+        lengths: standard deviation of the logarithm of each bone's length, alike on both sides.
+        turned: radians, by how much each bone is turned about each axis, throughout the window: at most so much
+            standard deviation, in most windows less.
+        rng: of what is drawn.
+    """
+    count, joints = len(positions), len(PARENTS)
+    factor = np.exp(lengths * rng.standard_normal((count, joints)))
+    factor = np.sqrt(factor * factor[:, MIRROR])[..., None, None]
+    angles = turned * rng.uniform(0.0, 1.0, (count, 1, 1)) * rng.standard_normal((count, joints, 3))
+    turns = factor * Rotation.from_rotvec(angles.reshape(-1, 3)).as_matrix().reshape(count, joints, 3, 3)
     other = positions.copy()
     for joint, parent in enumerate(PARENTS[1:], start=1):
-        other[:, :, joint] = other[:, :, parent] + factor[:, :, joint] * (
-            positions[:, :, joint] - positions[:, :, parent]
-        )
+        bone = positions[:, :, joint] - positions[:, :, parent]
+        other[:, :, joint] = other[:, :, parent] + bone @ turns[:, joint].swapaxes(-1, -2)
     return other
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from prior.body_tracks import from_tracks
@@ -29,7 +30,7 @@ NOISE_LEFT = 0.59
 RENEWAL = 0.5
 """How far a frame's answer goes to that of the next window: windows one frame apart disagree, which would be jitter."""
 
-_BESIDE_PELVIS = [J["left_hip"], J["right_hip"], J["spine1"]]
+_BESIDE_PELVIS = np.array([J["left_hip"], J["right_hip"], J["spine1"]])
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,8 @@ class Denoise:
         )
 
 
-def _place_pelvis(found: Floats, seen: Floats) -> None:
+@njit(cache=True)
+def _place_pelvis(found, seen):
     """Move the pelvis to where it lay beside hips and spine, in place.
 
     The other joints' tracks are told about the trunk's path, the pelvis's about that path's mean, so no joint tells
@@ -105,11 +107,21 @@ def _place_pelvis(found: Floats, seen: Floats) -> None:
         found: (B, K, 22, 3) metres, of the newest frames.
         seen: (B, T, 22, 3) metres, NaN where not.
     """
-    beside = seen[:, :, :1] - seen[:, :, _BESIDE_PELVIS]
-    shown = np.isfinite(beside)
-    counts = shown.sum(axis=1)
-    lies = np.where(shown, beside, 0.0).sum(axis=1) / np.maximum(counts, 1)
-    known = counts[..., :1] > 0
-    places = np.where(known, found[:, :, _BESIDE_PELVIS].swapaxes(0, 1) + lies, 0.0).sum(axis=2)
-    among = known.sum(axis=1)
-    found[:, :, 0] = np.where(among > 0, places / np.maximum(among, 1), found[:, :, 0].swapaxes(0, 1)).swapaxes(0, 1)
+    frames, known = seen.shape[1], np.empty(3)
+    for row in range(len(found)):
+        lies, counts = np.zeros((len(_BESIDE_PELVIS), 3)), np.zeros(len(_BESIDE_PELVIS))
+        for k, joint in enumerate(_BESIDE_PELVIS):
+            for t in range(frames):
+                beside = seen[row, t, 0] - seen[row, t, joint]
+                if not np.isnan(beside).any():
+                    lies[k] += beside
+                    counts[k] += 1
+        among = (counts > 0).sum()
+        if among == 0:
+            continue
+        for t in range(found.shape[1]):
+            known[:] = 0.0
+            for k, joint in enumerate(_BESIDE_PELVIS):
+                if counts[k] > 0:
+                    known += (found[row, t, joint] + lies[k] / counts[k]) / among
+            found[row, t, 0] = known

@@ -4,9 +4,11 @@ Both take one frame at a time, work on any number of joints at once (arrays of s
 time between frames, and read a joint with a non-finite coordinate as missing. Nothing here looks at a clock.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
@@ -111,17 +113,22 @@ class FixedLagRTS:
         self._count = 0
 
     def _allocate(self, shape: tuple[int, ...]) -> None:
-        slots, joints = self.delay + 1, shape[:-1]
+        slots, self._joints = self.delay + 1, shape[:-1]
+        count = math.prod(self._joints)
         self._stamps = np.zeros(slots)
         # Of each frame in the ring: its position given all measurements so far, the variance of that, and its
         # covariance with the newest position and velocity. The newest frame's own slot is the filter's state.
-        self._position = np.full((slots, *shape), np.nan)
-        self._variance = np.zeros((slots, *joints))
-        self._with_position = np.zeros((slots, *joints))
-        self._with_velocity = np.zeros((slots, *joints))
-        self._velocity = np.zeros(shape)
-        self._velocity_variance = np.zeros(joints)
-        self._known = np.zeros(joints, dtype=bool)
+        self._position = np.full((slots, count, 3), np.nan)
+        self._variance, self._with_position, self._with_velocity = np.zeros((3, slots, count))
+        self._velocity, self._velocity_variance = np.zeros((count, 3)), np.zeros(count)
+        self._known = np.zeros(count, dtype=bool)
+        self._densities = self._flat(self._density)
+
+    def _flat(self, values: ArrayLike) -> Array:
+        """(N,) one number for each joint, of values that broadcast to the joints; a copy."""
+        flat = np.empty(self._joints)
+        flat[...] = values
+        return flat.ravel()
 
     def update(self, positions: ArrayLike, stamp_s: float, sigma: ArrayLike | None = None) -> Smoothed | None:
         """Take a frame; give the estimate of the frame `delay` before it, or None while there is none.
@@ -129,38 +136,50 @@ class FixedLagRTS:
         positions: (..., 3) metres, non-finite where missing. stamp_s: seconds of capture, increasing.
         sigma: standard deviation of a coordinate in metres, one number or (...); inf counts as missing.
         """
-        measured = np.asarray(positions, dtype=np.float64)
-        noise = np.asarray(self._sigma if sigma is None else sigma, dtype=np.float64) ** 2
+        measured = np.array(positions, dtype=np.float64)
         slot, last = self._count % (self.delay + 1), (self._count - 1) % (self.delay + 1)
         if self._count == 0:
             self._allocate(measured.shape)
         else:
-            _check_frame(measured, stamp_s, self._velocity.shape, self._stamps[last])
-            self._predict(slot, last, stamp_s - self._stamps[last])
+            _check_frame(measured, stamp_s, (*self._joints, 3), self._stamps[last])
+            _predict(
+                slot, last, stamp_s - self._stamps[last], self._densities, self._position, self._variance,
+                self._with_position, self._with_velocity, self._velocity, self._velocity_variance,
+            )  # fmt: skip
         self._stamps[slot] = stamp_s
-        self._correct(slot, measured, np.broadcast_to(noise, measured.shape[:-1]))
+        _correct(
+            slot, measured.reshape(-1, 3), self._flat(self._sigma if sigma is None else sigma),
+            self._initial_velocity_variance, self._position, self._variance, self._with_position, self._with_velocity,
+            self._velocity, self._velocity_variance, self._known,
+        )  # fmt: skip
         self._count += 1
         return self._at(self._count - 1 - self.delay) if self._count > self.delay else None
 
     @property
     def velocity(self) -> Array:
         """(..., 3) m/s at the newest frame; 0 for a joint not seen so far."""
-        return self._velocity
+        return self._velocity.reshape(*self._joints, 3)
 
     def predict(self, stamp_s: float) -> Smoothed | None:
         """Where the joints are expected at `stamp_s`, before they are seen; None before the first frame."""
         if self._count == 0:
             return None
         last = (self._count - 1) % (self.delay + 1)
-        position, variance, _ = self._coast(last, stamp_s - self._stamps[last])
-        return Smoothed(stamp_s, position, np.where(self._known, np.sqrt(variance), np.inf))
+        step = stamp_s - self._stamps[last]
+        variance = self._with_position[last] + step * (
+            2 * self._with_velocity[last] + step * (self._velocity_variance + self._densities * step / 3)
+        )
+        sigma = np.where(self._known, np.sqrt(variance), np.inf)
+        position = self._position[last] + step * self._velocity
+        return Smoothed(stamp_s, position.reshape(*self._joints, 3), sigma.reshape(self._joints))
 
     def forget(self, joints: NDArray[np.bool_]) -> None:
         """Start these joints (...) afresh at their next measurement; estimates still held of them are lost."""
         if self._count:
-            self._known &= ~joints
-            self._position[:, joints] = np.nan
-            self._velocity[joints] = 0.0
+            flat = joints.ravel()
+            self._known &= ~flat
+            self._position[:, flat] = np.nan
+            self._velocity[flat] = 0.0
 
     def flush(self) -> list[Smoothed]:
         """Give the estimates still held, oldest first, and start afresh."""
@@ -168,56 +187,69 @@ class FixedLagRTS:
         self.reset()
         return held
 
-    def _coast(self, last: int, step: float) -> tuple[Array, Array, Array]:
-        """Position after `step` seconds without a measurement, its variance, and its covariance with velocity."""
-        growth = self._density * step
-        covariance = self._with_velocity[last]
-        variance = self._with_position[last] + step * (2 * covariance + step * (self._velocity_variance + growth / 3))
-        covariance = covariance + step * (self._velocity_variance + growth / 2)
-        return self._position[last] + step * self._velocity, variance, covariance
-
-    def _predict(self, slot: int, last: int, step: float) -> None:
-        position, variance, covariance = self._coast(last, step)
-        # The positions of past frames do not move, but their covariance with the newest state does.
-        self._with_position += step * self._with_velocity
-        self._position[slot] = position
-        self._variance[slot] = self._with_position[slot] = variance
-        self._with_velocity[slot] = covariance
-        self._velocity_variance = self._velocity_variance + self._density * step
-
-    def _correct(self, slot: int, measured: Array, noise: Array) -> None:
-        seen = _seen(measured) & np.isfinite(noise)
-        old = seen & self._known
-        position_variance, covariance = self._with_position[slot].copy(), self._with_velocity[slot].copy()
-        precision = np.zeros(noise.shape)
-        np.divide(1.0, position_variance + noise, out=precision, where=old)
-        innovation = np.where(old[..., None], measured - self._position[slot], 0.0)
-        gain = self._with_position * precision
-        velocity_gain = covariance * precision
-
-        self._position += gain[..., None] * innovation
-        self._variance -= gain * self._with_position
-        self._with_position -= gain * position_variance
-        self._with_velocity -= gain * covariance
-        self._velocity += velocity_gain[..., None] * innovation
-        self._velocity_variance = self._velocity_variance - velocity_gain * covariance
-
-        first = seen & ~self._known
-        if first.any():
-            self._position[slot][first] = measured[first]
-            self._with_position[:, first] = self._with_velocity[:, first] = 0.0
-            self._variance[slot][first] = self._with_position[slot][first] = noise[first]
-            self._velocity[first] = 0.0
-            self._velocity_variance[first] = self._initial_velocity_variance
-            self._known |= seen
-
     def _at(self, frame: int) -> Smoothed:
         slot = frame % (self.delay + 1)
         positions = self._position[slot].copy()
         # Rounding may leave the variance of a long-settled frame a hair under zero.
         sigma = np.sqrt(np.maximum(self._variance[slot], 0.0))
-        sigma[np.isnan(positions[..., 0])] = np.inf
-        return Smoothed(float(self._stamps[slot]), positions, sigma)
+        sigma[np.isnan(positions[:, 0])] = np.inf
+        return Smoothed(
+            float(self._stamps[slot]), positions.reshape(*self._joints, 3), sigma.reshape(self._joints)
+        )
+
+
+# The state of `FixedLagRTS`, as its `_allocate` describes it, of N joints and K frames: compiled, for a stage that
+# takes a few frames at a time is all overhead in numpy.
+
+
+@njit(cache=True)
+def _predict(
+    slot, last, step, density, position, variance, with_position, with_velocity, velocity, velocity_variance
+):
+    """Put the frame ``step`` seconds after the last into ``slot``, before it is measured."""
+    for joint in range(len(density)):
+        growth, known = density[joint] * step, velocity_variance[joint]
+        covariance, ahead = with_velocity[last, joint], with_position[last, joint]
+        ahead += step * (2 * covariance + step * (known + growth / 3))
+        # The positions of past frames do not move, but their covariance with the newest state does.
+        for frame in range(len(position)):
+            with_position[frame, joint] += step * with_velocity[frame, joint]
+        for axis in range(3):
+            position[slot, joint, axis] = position[last, joint, axis] + step * velocity[joint, axis]
+        variance[slot, joint] = with_position[slot, joint] = ahead
+        with_velocity[slot, joint] = covariance + step * (known + growth / 2)
+        velocity_variance[joint] += growth
+
+
+@njit(cache=True)
+def _correct(
+    slot, measured, sigma, initial_velocity_variance, position, variance, with_position, with_velocity, velocity,
+    velocity_variance, known,
+):  # fmt: skip
+    """Take in the measurement (N, 3) of the newest frame, which is in ``slot``."""
+    for joint in range(len(measured)):
+        if not (np.isfinite(measured[joint]).all() and np.isfinite(sigma[joint])):
+            continue
+        noise = sigma[joint] ** 2
+        if not known[joint]:
+            known[joint] = True
+            with_position[:, joint] = with_velocity[:, joint] = 0.0
+            position[slot, joint] = measured[joint]
+            variance[slot, joint] = with_position[slot, joint] = noise
+            velocity[joint] = 0.0
+            velocity_variance[joint] = initial_velocity_variance
+            continue
+        own, covariance = with_position[slot, joint], with_velocity[slot, joint]
+        innovation = measured[joint] - position[slot, joint]
+        for frame in range(len(position)):
+            gain = with_position[frame, joint] / (own + noise)
+            position[frame, joint] += gain * innovation
+            variance[frame, joint] -= gain * with_position[frame, joint]
+            with_position[frame, joint] -= gain * own
+            with_velocity[frame, joint] -= gain * covariance
+        gain = covariance / (own + noise)
+        velocity[joint] += gain * innovation
+        velocity_variance[joint] -= gain * covariance
 
 
 class Follower:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from msgs.types import JointState
@@ -13,6 +15,8 @@ from prior.filters import Smoothed
 from prior.pose_solver import fit_pose, place_joints, solve_pose
 from prior.skeletons import JOINTS, PARENTS
 from prior.window import FPS, Estimate, Ring, Window
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,20 @@ def _bones_between() -> NDArray[np.int64]:
 _NEAR = 1 / (1 + _bones_between()) ** 2
 """(22, 22) how much one joint's error tells of another's"""
 
+_PARENT = np.array(PARENTS)
+
+
+class Precision(NamedTuple):
+    """How far to believe whom of a joint's place: the inverse of the variance along an axis, 1/m^2, (S, 22).
+
+    Attributes:
+        seen: the smoother.
+        prior: the prior.
+    """
+
+    seen: Floats
+    prior: Floats
+
 
 class Fuse:
     """Joins a fixed-lag smoother of what was seen with the rotations that the prior decoded for the rest.
@@ -86,44 +104,24 @@ class Fuse:
         s = self._settings
         slots = np.flatnonzero(window.present)
         offsets, decoded = window.offsets[slots], window.decoded[-1 - back][slots]
+        seen, deviation = smoothed.positions[slots], smoothed.sigma[slots]
         unseen_s = self._unseen_s.all[-1 - back][slots]
         held_s = _least_below(unseen_s)
-        seen_weight = 1 / (smoothed.sigma[slots] ** 2 + self._bias_sigma**2)
-        imputed = window.imputed
-        prior_weight = 1 / (s.prior_sigma**2 + (s.prior_drift * np.minimum(held_s, s.fade)) ** 2)
-        known = seen_weight > 0
-        observed = np.where(known[..., None], smoothed.positions[slots], 0.0)
-        share = (seen_weight / (seen_weight + prior_weight))[..., None]
-        body = place_joints(decoded, offsets)
-        # The pelvis goes where it brings the body nearest to all joints seen, not only to itself.
-        body += _weighted_mean(observed - body, share)
-        rotations = decoded
+        precision = Precision(*np.empty((2, *unseen_s.shape)))
+        _weigh(deviation, held_s, self._bias_sigma, s.prior_sigma, s.prior_drift, s.fade, precision)
+        body, rotations = place_joints(decoded, offsets), decoded
+        well = _lay_over(body, seen, precision)
         if s.enabled:
             # What is not seen hangs from what is, in the prior's rotations.
-            well = share > 0.5
-            hung = solve_pose(np.where(well, observed, np.nan), offsets, decoded)[1]
-            body = np.where(well[:, :1], hung, body)
-            if imputed is not None:
-                completed, sigma = imputed.positions[-1 - back][slots], imputed.sigma[-1 - back][slots]
-                # A joint that the sensor does not have hangs: what is imputed of it shakes the joints seen beside it.
-                # Of a frame that was lost whole, the smoother knows more.
-                hidden = unseen_s > unseen_s.min(axis=1, keepdims=True)
-                filled = np.isfinite(completed[..., 0]) & hidden & np.isfinite(unseen_s)
-                beside = _beside_seen(completed, observed, np.where(unseen_s > 0, 0.0, seen_weight))
-                body = np.where(filled[..., None], beside, body)
-                prior_weight = np.where(filled, 1 / (sigma**2 + self._bias_sigma**2), prior_weight)
-                coasting = 1 / ((_COASTING * smoothed.sigma[slots]) ** 2 + self._bias_sigma**2)
-                seen_weight = np.where(filled, coasting, seen_weight)
-                share = (seen_weight / (seen_weight + prior_weight))[..., None]
-            variance = 1 / (seen_weight + prior_weight)
-            mobility = np.minimum(variance, _MOST_MOBILE * variance.min(axis=1, keepdims=True))
-            fitted = fit_pose(body + share * (observed - body), offsets, mobility, decoded, window.give[slots])
-            rotations, body, offsets = fitted
-        placed = known.any(axis=1)
-        state = _states(unseen_s, held_s, s.fade)
-        # of a joint not seen, smoother and prior know the same past: what one says does not make the other surer
-        known_by = np.where(unseen_s > 0, np.maximum(seen_weight, prior_weight), seen_weight + prior_weight)
-        sigma = 1 / np.sqrt(known_by)
+            hung = solve_pose(well, offsets, decoded)[1]
+            body = np.where(np.isfinite(well[:, :1, :1]), hung, body)
+            if window.imputed is not None:
+                completed, sigma = (part[-1 - back][slots] for part in window.imputed)
+                _complete(body, completed, sigma, seen, deviation, unseen_s, self._bias_sigma, precision)
+            mobility = _join(body, seen, precision)
+            rotations, body, offsets = fit_pose(body, offsets, mobility, decoded, window.give[slots])
+        placed = np.isfinite(deviation).any(axis=1)
+        state, sigma = _states(unseen_s, held_s, s.fade), _stated(unseen_s, precision)
         return Estimate(
             stamp_s=smoothed.stamp_s,
             positions=_scatter(window.slots, slots[placed], body[placed], np.nan),
@@ -134,37 +132,118 @@ class Fuse:
         )
 
 
-def _beside_seen(
-    completed: NDArray[np.float64], observed: NDArray[np.float64], weight: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Joints (S, 22, 3) as the model completes them, each moved as the seen ones near it are off there.
-
-    ``weight`` (S, 22) is how far to believe ``observed`` (S, 22, 3), 0 where a joint was not seen.
-    """
-    near = _NEAR * weight[:, None]
-    off = np.where(weight[..., None] > 0, observed - completed, 0.0)
-    return completed + near @ off / np.maximum(near.sum(axis=-1, keepdims=True), 1e-12)
-
-
-def _weighted_mean(vectors: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(S, 1, 3) mean over the joints of (S, 22, 3) by weights (S, 22, 1)."""
-    return (weight * vectors).sum(axis=1, keepdims=True) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
-
-
 def _scatter(slots: int, rows: NDArray[np.intp], values: NDArray[Any], fill: float) -> NDArray[Any]:
     full = np.full((slots, *values.shape[1:]), fill)
     full[rows] = values
     return full
 
 
-def _least_below(unseen_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """For how long neither a joint (S, 22) nor any below it was seen: a joint between two seen is held by them."""
+def _states(unseen_s: Floats, held_s: Floats, fade: float) -> NDArray[np.uint8]:
+    hidden = np.where(held_s <= fade, JointState.IMPUTED, JointState.UNKNOWN)
+    return np.where(unseen_s == 0.0, JointState.REFINED, hidden).astype(np.uint8)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Compiled: of S bodies, `seen` (S, 22, 3) is where the smoother has the joints, NaN of those it knows nothing of,
+# `unseen_s` (S, 22) for how many seconds they were not seen, `body` (S, 22, 3) where the prior has them.
+
+
+@njit(cache=True)
+def _least_below(unseen_s):
+    """(S, 22) for how long neither a joint nor any below it was seen: a joint between two seen is held by them."""
     least = unseen_s.copy()
-    for joint in range(len(PARENTS) - 1, 0, -1):
-        least[:, PARENTS[joint]] = np.minimum(least[:, PARENTS[joint]], least[:, joint])
+    for row in range(len(least)):
+        for joint in range(least.shape[1] - 1, 0, -1):
+            above = _PARENT[joint]
+            least[row, above] = min(least[row, above], least[row, joint])
     return least
 
 
-def _states(unseen_s: NDArray[np.float64], held_s: NDArray[np.float64], fade: float) -> NDArray[np.uint8]:
-    hidden = np.where(held_s <= fade, JointState.IMPUTED, JointState.UNKNOWN)
-    return np.where(unseen_s == 0.0, JointState.REFINED, hidden).astype(np.uint8)
+@njit(cache=True)
+def _weigh(deviation, held_s, bias_sigma, prior_sigma, prior_drift, fade, precision):
+    """Writes how far to believe the smoother, of ``deviation`` (S, 22), and the prior."""
+    for row in range(len(deviation)):
+        for joint in range(deviation.shape[1]):
+            drift = prior_drift * min(held_s[row, joint], fade)
+            precision.seen[row, joint] = 1.0 / (deviation[row, joint] ** 2 + bias_sigma**2)
+            precision.prior[row, joint] = 1.0 / (prior_sigma**2 + drift**2)
+
+
+@njit(cache=True)
+def _lay_over(body, seen, precision):
+    """Moves the body, as a whole, to where it is nearest to all joints seen, not only to the pelvis.
+
+    Returns:
+        (S, 22, 3) the joints that the smoother knows better than the prior; NaN of the others.
+    """
+    well = np.full_like(seen, np.nan)
+    for row in range(len(body)):
+        total, off = 0.0, np.zeros(3)
+        for joint in range(body.shape[1]):
+            by_seen = precision.seen[row, joint]
+            share = by_seen / (by_seen + precision.prior[row, joint])
+            if by_seen > 0.0:
+                total += share
+                for axis in range(3):
+                    off[axis] += share * (seen[row, joint, axis] - body[row, joint, axis])
+                    if share > 0.5:
+                        well[row, joint, axis] = seen[row, joint, axis]
+        for joint in range(body.shape[1]):
+            for axis in range(3):
+                body[row, joint, axis] += off[axis] / max(total, 1e-12)
+    return well
+
+
+@njit(cache=True)
+def _complete(body, completed, sigma, seen, deviation, unseen_s, bias_sigma, precision):
+    """Puts hidden joints where HG-VAE completes them, each moved as the seen ones near it are off there.
+
+    A joint that the sensor does not have hangs: what is imputed of it shakes the joints seen beside it. Of a frame that
+    was lost whole, the smoother knows more.
+    """
+    joints = body.shape[1]
+    for row in range(len(body)):
+        hidden_s = unseen_s[row].min()
+        for joint in range(joints):
+            unseen = unseen_s[row, joint]
+            if not (hidden_s < unseen < np.inf) or math.isnan(completed[row, joint, 0]):
+                continue
+            total, off = 0.0, np.zeros(3)
+            for other in range(joints):
+                if unseen_s[row, other] > 0.0:
+                    continue
+                weight = _NEAR[joint, other] * precision.seen[row, other]
+                total += weight
+                for axis in range(3):
+                    off[axis] += weight * (seen[row, other, axis] - completed[row, other, axis])
+            for axis in range(3):
+                body[row, joint, axis] = completed[row, joint, axis] + off[axis] / max(total, 1e-12)
+            precision.prior[row, joint] = 1.0 / (sigma[row, joint] ** 2 + bias_sigma**2)
+            coasting = _COASTING * deviation[row, joint]
+            precision.seen[row, joint] = 1.0 / (coasting**2 + bias_sigma**2)
+
+
+@njit(cache=True)
+def _join(body, seen, precision):
+    """Puts every joint at the mean of smoother and body, and gives its mobility (S, 22) for the fit to the bones."""
+    variance = 1.0 / (precision.seen + precision.prior)
+    for row in range(len(body)):
+        for joint in range(body.shape[1]):
+            if precision.seen[row, joint] > 0.0:
+                share = precision.seen[row, joint] * variance[row, joint]
+                for axis in range(3):
+                    body[row, joint, axis] += share * (seen[row, joint, axis] - body[row, joint, axis])
+        variance[row] = np.minimum(variance[row], _MOST_MOBILE * variance[row].min())
+    return variance
+
+
+@njit(cache=True)
+def _stated(unseen_s, precision):
+    """(S, 22) standard deviations. Of a joint not seen, smoother and prior know the same past: what one says does not
+    make the other surer."""
+    sigma = np.empty_like(unseen_s)
+    for row in range(len(sigma)):
+        for joint in range(sigma.shape[1]):
+            seen, prior = precision.seen[row, joint], precision.prior[row, joint]
+            sigma[row, joint] = 1.0 / math.sqrt(max(seen, prior) if unseen_s[row, joint] > 0.0 else seen + prior)
+    return sigma

@@ -100,7 +100,7 @@ class Gate:
             positions[window.stuck] = np.nan
         expected = self._filter.predict(stamp)
         if expected is not None:
-            distance = np.sqrt(((positions - expected.positions) ** 2).sum(axis=-1))
+            distance = _apart(positions, expected.positions)
             self._measure_noise(window, distance)
             if s.enabled:
                 self._judge(window, positions, expected, distance)
@@ -120,7 +120,7 @@ class Gate:
         known = np.isfinite(expected.positions[..., 0])
         if (distance > _SWAP_APART).any() or self._swapped.any():
             self._exchange(positions, expected.positions, known)
-            distance = np.sqrt(((positions - expected.positions) ** 2).sum(axis=-1))
+            distance = _apart(positions, expected.positions)
         seen = np.isfinite(positions[..., 0])
         least = np.maximum(s.jump, _JUMP_NOISES * window.noise)[:, None]
         jumped = seen & known & (distance > least + 3 * expected.sigma)
@@ -143,11 +143,10 @@ class Gate:
         The middle one, so that a limb thrown about, or a joint that jumps, says nothing about the sensor. Noise that
         lasts over frames is not seen here; it belongs to the sensor's bias.
         """
-        known = np.isfinite(distance)
-        for slot in np.flatnonzero(known.any(axis=1)):
+        noise = _middle(distance) / _DISTANCE_OF_NOISE
+        for slot in np.flatnonzero(np.isfinite(noise)):
             self._frames[slot] += 1
-            noise = np.median(distance[slot, known[slot]]) / _DISTANCE_OF_NOISE
-            window.noise[slot] += (noise - window.noise[slot]) / min(self._frames[slot], _NOISE_MEMORY)
+            window.noise[slot] += (noise[slot] - window.noise[slot]) / min(self._frames[slot], _NOISE_MEMORY)
 
     def _believe(self, joints: NDArray[np.bool_]) -> None:
         if joints.any():
@@ -159,8 +158,8 @@ class Gate:
         """Put exchanged limbs back: both sides are nearer to where the other was expected."""
         for k, (left, right) in enumerate(_LIMBS):
             pair = np.concatenate([left, right])
-            keep = np.linalg.norm(positions[:, pair] - expected[:, pair], axis=-1).mean(axis=1)
-            swap = np.linalg.norm(positions[:, MIRROR[pair]] - expected[:, pair], axis=-1).mean(axis=1)
+            keep = _apart(positions[:, pair], expected[:, pair]).mean(axis=1)
+            swap = _apart(positions[:, MIRROR[pair]], expected[:, pair]).mean(axis=1)
             with np.errstate(invalid="ignore"):  # a limb with a joint unseen compares as False
                 exchanged = (keep > _SWAP_APART) & (swap < _SWAP_BETTER * keep) & known[:, pair].all(axis=1)
             self._swapped[:, k] = np.where(exchanged, self._swapped[:, k] + 1, 0)
@@ -179,16 +178,8 @@ class Gate:
 
     def _bad_bones(self, window: Window, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
         """(S, 22) joints at the end of a bone of impossible length."""
-        own = np.linalg.norm(window.offsets, axis=-1)
-        length = np.linalg.norm(positions - positions[:, _PARENT], axis=-1)
-        with np.errstate(invalid="ignore"):
-            bad = np.abs(length - own) > np.maximum(
-                self._settings.bone * own, _LEAST_BONE + _BONE_NOISES * window.noise[:, None]
-            )
-        bad[:, 0] = False
-        # A bad bone does not say which end is wrong: where the next bone is bad too, it is the joint between.
-        bad[:, _LEAF] &= ~bad[:, _PARENT][:, _LEAF]
-        return bad & window.measured[:, None]
+        least = _LEAST_BONE + _BONE_NOISES * window.noise
+        return _of_impossible_length(positions, window.offsets, self._settings.bone, least) & window.measured[:, None]
 
 
 @njit(cache=True)
@@ -231,3 +222,47 @@ def stuck(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 _PARENT = np.maximum(np.array(PARENTS), 0)
 _LEAF = np.array([j not in PARENTS for j in range(22)])
+
+
+@njit(cache=True)
+def _apart(a, b):
+    """(S, J) metres between joints (S, J, 3)."""
+    apart = np.empty(a.shape[:2])
+    for row in range(len(a)):
+        for joint in range(a.shape[1]):
+            square = 0.0
+            for axis in range(3):
+                square += (a[row, joint, axis] - b[row, joint, axis]) ** 2
+            apart[row, joint] = math.sqrt(square)
+    return apart
+
+
+@njit(cache=True)
+def _middle(distance):
+    """(S,) the median of what is finite of each row, NaN where nothing is."""
+    middle = np.full(len(distance), np.nan)
+    for row in range(len(distance)):
+        known = distance[row][np.isfinite(distance[row])]
+        if len(known):
+            middle[row] = np.median(known)
+    return middle
+
+
+@njit(cache=True)
+def _of_impossible_length(positions, offsets, share, least):
+    """(S, 22) joints at the end of a bone that differs from the person's own by more than ``share`` of it, and more
+    than ``least`` (S,)."""
+    bad = np.zeros(positions.shape[:2], dtype=np.bool_)
+    for row in range(len(positions)):
+        for joint in range(1, positions.shape[1]):
+            length, own = 0.0, 0.0
+            for axis in range(3):
+                length += (positions[row, joint, axis] - positions[row, _PARENT[joint], axis]) ** 2
+                own += offsets[row, joint, axis] ** 2
+            off = abs(math.sqrt(length) - math.sqrt(own))
+            bad[row, joint] = off > max(share * math.sqrt(own), least[row])
+        for joint in range(1, positions.shape[1]):
+            # A bad bone does not say which end is wrong: where the next bone is bad too, it is the joint between.
+            if _LEAF[joint] and bad[row, _PARENT[joint]]:
+                bad[row, joint] = False
+    return bad

@@ -28,6 +28,10 @@ _LINEAR, _GELU, _SUM, _DENSITY = range(4)
 _FIELDS = 8
 _NONE = -1
 
+_SMALL = 1_000_000
+"""Products up to which OpenBLAS multiplies matrices as they are. Beyond, it rearranges them first, which takes three
+times as long as the rest where there are but ten rows."""
+
 _LINE = 16
 """Numbers in a line of the cache. Matrices begin with one: products of those that do not take a seventh longer."""
 
@@ -248,6 +252,21 @@ def _mix_first(nodes_in, features_in, nodes, features):
 
 
 @njit(cache=True)
+def _multiply(a, weight, product):
+    """Writes ``a @ weight``, in parts small enough for those of BLAS's kernels that do not rearrange matrices first."""
+    rows, inner = a.shape
+    parts = -(-rows * inner * weight.shape[1] // _SMALL)
+    if parts == 1:
+        np.dot(a, weight, product)
+        return
+    width = -(-inner // parts)
+    product[:] = 0
+    for first in range(0, inner, width):
+        part = np.dot(np.ascontiguousarray(a[:, first : first + width]), weight[first : first + width])
+        _add(part.ravel(), _ONE, product.ravel())
+
+
+@njit(cache=True)
 def _forward(steps, shapes, starts, weights, windows, scratch):
     """Do the steps for windows (B, all matrices)."""
     for k in range(len(steps)):
@@ -269,15 +288,16 @@ def _do(step, shapes, starts, weights, values, scratch):
         weight = weights[of_weight : of_weight + features_in * features].reshape(features_in, features)
         product = scratch[2, : out.size].reshape(out.shape)
         if of_adjacency == _NONE:
-            np.dot(a, weight, product)
+            _multiply(a, weight, product)
         else:
             adjacency = weights[of_adjacency : of_adjacency + nodes * nodes_in].reshape(nodes, nodes_in)
             if _mix_first(nodes_in, features_in, nodes, features):
                 mixed = scratch[1, : nodes * features_in].reshape(nodes, features_in)
-                np.dot(np.dot(adjacency, a, mixed), weight, product)
+                _multiply(np.dot(adjacency, a, mixed), weight, product)
             else:
                 weighed = scratch[1, : nodes_in * features].reshape(nodes_in, features)
-                np.dot(adjacency, np.dot(a, weight, weighed), product)
+                _multiply(a, weight, weighed)
+                np.dot(adjacency, weighed, product)
         _add(weights[of_bias : of_bias + out.size], _ONE, product.ravel())
         if plus != _NONE:
             _add(_view(values, shapes, starts, plus).ravel(), _ONE, product.ravel())

@@ -137,11 +137,9 @@ def fit_pose(
     """
     shape = np.shape(positions)
     p, bones = _frames(positions, shape), _frames(offsets, shape)
-    yields, gives = (
-        np.array(np.broadcast_to(of, shape[:-1]), dtype=np.float64, order="C").reshape(p.shape[:-1])
-        for of in (mobility, give)
-    )
-    _constrain(p, bones, yields, gives)
+    yields, gives = np.empty((2, *shape[:-1]))
+    yields[...], gives[...] = mobility, give
+    _constrain(p, bones, yields.reshape(p.shape[:-1]), gives.reshape(p.shape[:-1]))
     local, placed = _initial(fallback, p), np.empty_like(p)
     _solve(p, np.ones(p.shape[:-1], dtype=bool), bones, True, local, placed)
     return local.reshape(*shape, 3), placed.reshape(shape), bones.reshape(shape)
@@ -170,7 +168,9 @@ def _initial(fallback: NDArray[np.floating] | None, positions: Floats) -> Floats
 
 def _frames(values: NDArray[np.floating], shape: tuple[int, ...]) -> Floats:
     """(B, 22, 3) float64 of values that broadcast to ``shape``; a copy, as compiled code takes no read-only arrays."""
-    return np.array(np.broadcast_to(values, shape), dtype=np.float64, order="C").reshape(-1, *shape[-2:])
+    frames = np.empty(shape)
+    frames[...] = values
+    return frames.reshape(-1, *shape[-2:])
 
 
 # ---------------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from prior.completion_net import CompletionNet
-from prior.corruption import add_noise, elsewhere, exchanged, occlude, other_lengths, slow_errors, spoil, stands_still
+from prior.corruption import add_noise, elsewhere, exchanged, occlude, other_builds, slow_errors, spoil, stands_still
 from prior.distributed import share
 from prior.graph import SCALE
 from prior.hgvae import HGVAE
@@ -31,8 +31,8 @@ SPOILT_BY = (stands_still, exchanged, elsewhere)
 SPOILT = 0.3
 """what something seen is plainly wrong by, and the share of the windows in which it is"""
 
-BONES = 0.05
-"""Standard deviation by which each bone is longer or shorter than it was: 22 people are few."""
+BONES, TURNED = 0.05, 0.2
+"""By how much each bone is longer or shorter than it was, and turned, radians (`other_builds`): 22 people are few."""
 
 
 def train_completion(model: HGVAE, train: Windows, val: Windows, directory: Path, iterations: int, seed: int) -> None:
@@ -58,7 +58,7 @@ def train_completion(model: HGVAE, train: Windows, val: Windows, directory: Path
     for _ in run.steps(lambda: {**losses, **evaluate_completion(model, val)}):
         rng = run.random(seed)
         clean, sizes = train.draw(share(BATCH), model.config.frames, rng, STRIDES)
-        clean = other_lengths(clean, BONES, rng)
+        clean = other_builds(clean, BONES, TURNED, rng)
         slow = slow_errors(len(clean), rng)
         seen = occlude(spoil(add_noise(clean, rng, slow), SPOILT_BY, SPOILT, rng), rng)
         off, log_var, hidden = _errors(model, seen, clean, sizes, slow)

@@ -20,14 +20,14 @@ from torch import Tensor
 
 from prior.checkpoint import LICENCES, started, weights_path
 from prior.completion_net import CompletionConfig
-from prior.corruption import add_noise, occlude, slow_errors, spoil
+from prior.corruption import add_noise, occlude, other_builds, slow_errors, spoil
 from prior.distributed import share
 from prior.graph import JOINT_NODES, SCALE
 from prior.hgvae import HGVAE, HGVAEConfig, Level, Pass
 from prior.motion_windows import MotionSet
 from prior.track_windows import STRIDES, Batch, Windows, mean_tracks
 from prior.train_anomaly import train_anomaly
-from prior.train_completion import BATCH, SPOILT_BY, train_completion
+from prior.train_completion import BATCH, BONES, SPOILT_BY, TURNED, train_completion
 from prior.training import TrainingRun
 
 Floats = NDArray[np.float64]
@@ -135,8 +135,9 @@ def fit(
         half = batch // 2
         whole = Batch.of(model, positions[:half], positions[:half], sizes[:half])
         slow = slow_errors(batch - half, rng)
-        seen = occlude(spoil(add_noise(positions[half:], rng, slow), SPOILT_BY, 0.5, rng), rng)
-        both = whole.beside(Batch.of(model, seen, positions[half:], sizes[half:]).completed(model, slow))
+        clean = other_builds(positions[half:], BONES, TURNED, rng)
+        seen = occlude(spoil(add_noise(clean, rng, slow), SPOILT_BY, 0.5, rng), rng)
+        both = whole.beside(Batch.of(model, seen, clean, sizes[half:]).completed(model, slow))
         drawn = model(both.x, both.believed, spread=(torch.arange(batch) < half).float()[:, None])
         density = drawn.tracks.log_density(both.target) * both.counts
         stated = (0.5 * drawn.tracks.log_var[half:]).exp().detach()

@@ -87,12 +87,11 @@ def test_a_joint_not_seen_of_late_has_no_odds_and_a_stuck_one_high_ones() -> Non
 
 def test_the_scale_is_the_decimals_of_the_rate_among_clean_windows() -> None:
     scale = SCALE.at(0.02)
-    missing = np.zeros(len(RATES), dtype=int)
-    np.testing.assert_allclose(decimals(HEIGHTS, scale, missing), -np.log10(RATES), atol=1e-6)
-    beyond = decimals(np.array([7.0, 8.0, 9.0]), scale, missing[:3])
+    missing = np.zeros(1, dtype=int)
+    np.testing.assert_allclose(decimals(HEIGHTS[None], scale, missing)[0], -np.log10(RATES), atol=1e-6)
+    beyond = decimals(np.array([[7.0, 8.0, 9.0]]), scale, missing)[0]
     assert beyond[2] - beyond[1] == pytest.approx(beyond[1] - beyond[0])
-    assert decimals(np.array([-50.0]), scale, missing[:1]) == 0
-    assert decimals(np.array([-np.inf]), scale, missing[:1]) == 0
+    assert (decimals(np.array([[-50.0, -np.inf]]), scale, missing) == 0).all()
 
 
 def test_between_measured_sensors_the_scale_is_between_theirs() -> None:
