@@ -10,7 +10,7 @@ from msgs.types import Message, PoseRaw
 from nodes.launch import Launch, LaunchError
 from nodes.runtime import FRAME_NS, Clock, Node
 from nodes.threads import one_thread
-from prior.pipeline import PriorPipeline, PriorSettings
+from prior.pipeline import PriorPipeline, PriorSettings, load_loops
 from prior.streams import StreamBatch
 
 GATED = ("joints_refused", "limbs_exchanged", "joints_stuck")
@@ -39,6 +39,7 @@ class PriorNode(Node):
         super().__init__(launch, clock)
         one_thread()
         self._pipeline = make_prior(launch.prior, len(launch.server.kiosks))
+        load_loops()
         self._bodies = 0
         self._anomalies = 0
 

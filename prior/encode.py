@@ -65,10 +65,6 @@ class Encode:
         self._model = LiveHGVAE(model, sensor_sigma, slow, slots)
         self._lost = np.zeros(slots, dtype=np.int64)
         self.frames = self._model.frames
-        # loops are compiled at their first call, or loaded: not while a frame waits
-        tracks = to_tracks(np.zeros((1, self.frames, 22, 3)), 1.0)
-        self._model.look(tracks.x, tracks.observed)
-        self._model.gradient(0)
 
     def reset(self, slot: NDArray[np.bool_]) -> None:
         """Forget the bodies in these slots."""

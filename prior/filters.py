@@ -193,9 +193,7 @@ class FixedLagRTS:
         # Rounding may leave the variance of a long-settled frame a hair under zero.
         sigma = np.sqrt(np.maximum(self._variance[slot], 0.0))
         sigma[np.isnan(positions[:, 0])] = np.inf
-        return Smoothed(
-            float(self._stamps[slot]), positions.reshape(*self._joints, 3), sigma.reshape(self._joints)
-        )
+        return Smoothed(float(self._stamps[slot]), positions.reshape(*self._joints, 3), sigma.reshape(self._joints))
 
 
 # The state of `FixedLagRTS`, as its `_allocate` describes it, of N joints and K frames: compiled, for a stage that
@@ -203,9 +201,7 @@ class FixedLagRTS:
 
 
 @njit(cache=True)
-def _predict(
-    slot, last, step, density, position, variance, with_position, with_velocity, velocity, velocity_variance
-):
+def _predict(slot, last, step, density, position, variance, with_position, with_velocity, velocity, velocity_variance):
     """Put the frame ``step`` seconds after the last into ``slot``, before it is measured."""
     for joint in range(len(density)):
         growth, known = density[joint] * step, velocity_variance[joint]

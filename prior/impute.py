@@ -116,8 +116,6 @@ class Impute:
         if settings.steps < 0 or settings.rate <= 0:
             raise ValueError(f"impute: expected steps >= 0 and rate > 0, got {settings.steps} and {settings.rate:g}")
         self._settings, self._counters = settings, counters
-        # compiled now, not while a frame waits
-        _carried(np.zeros((1, 2)), np.ones((1, 2)), CARRY_FRAMES, np.ones(1, dtype=np.int64))
         self.delay_frames = delay_frames
         self._climbs: list[Climb | None] = [None] * slots
         self._frame = 0

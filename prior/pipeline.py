@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs.types import CleanBody, PoseClean, PoseRaw, RawBody
+from msgs.types import CleanBody, Pose, PoseClean, PoseRaw, RawBody
 from prior.anomaly import Score, ScoreSettings
 from prior.bones import Bones, BonesSettings
 from prior.correct import Correct, CorrectSettings
@@ -27,13 +27,14 @@ from prior.fuse import Fuse, FuseSettings
 from prior.gate import Gate, GateSettings
 from prior.identify import Identify, IdentifySettings
 from prior.impute import Impute, ImputeSettings
+from prior.pose_solver import place_joints
 from prior.refine import Refine, RefineSettings
 from prior.resample import Resampler
 from prior.settings import build_settings
-from prior.skeletons import SKELETONS, Skeleton, finite_joints, to_canonical
+from prior.skeletons import CANONICAL, REST_OFFSETS, SKELETONS, J, Skeleton, finite_joints, to_canonical
 from prior.smooth import Smooth, SmoothSettings
 from prior.solve import Solve
-from prior.window import Estimate, Stage, Window
+from prior.window import FPS, Estimate, Stage, Window
 
 MAX_DISTANCE = 30.0
 """Metres from the sensor beyond which a joint is no sighting."""
@@ -318,6 +319,22 @@ class PriorPipeline:
             delay_frames=self.delay_frames,
             bodies=bodies,
         )
+
+
+@cache
+def load_loops() -> None:
+    """Have every stage's compiled loops loaded, or compiled: they are at their first call, and no frame should wait."""
+    pipeline = PriorPipeline(PriorSettings(impute=ImputeSettings(steps=1)))
+    pose = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    standing = place_joints(np.tile(np.eye(3), (22, 1, 1)), REST_OFFSETS).astype(np.float32)
+    for frame in range(40):
+        positions = standing + np.float32(0.001 * frame)
+        if frame == 20:
+            positions[J["left_wrist"]] += 0.5
+        if frame > 30:
+            positions[J["right_wrist"]] = np.nan
+        body = RawBody(0, positions, np.ones(22, dtype=np.float32))
+        pipeline.process(PoseRaw(round(frame * 1e9 / FPS), "", "", CANONICAL.name, pose, False, [body]))
 
 
 @lru_cache(maxsize=8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,50 +58,81 @@ class Refine:
     def update(self, window: Window) -> Window:
         """Write ``window.decoded`` for every body present, all of them in one batch."""
         slots = np.flatnonzero(window.present)
-        frames = window.rotations.all[-self.window :, slots]
         kept = self.window // 2 + 1  # from the centre on; before it, a frame stays as it was decoded
         window.decoded[:-1] = window.decoded[1:]
-        missing = np.isnan(frames[..., 0, 0, 0]).sum(axis=0)  # a body younger than the window repeats its first frame
-        order = np.maximum(np.arange(self.window)[:, None], missing)
-        frames = frames[order, np.arange(len(slots))]
-        if not self._enabled or not len(slots):
-            window.decoded[-kept:, slots] = frames[-kept:]
-            return window
-        # The body faces +x in the centre frame, as in training; only the root's rotation knows.
-        back = yaw_matrix(heading(frames[self.window // 2 - 1, :, 0]))
-        root = back.swapaxes(-1, -2) @ frames[:, :, 0]
-        x = np.empty((len(slots), self.window, 22, 6), dtype=np.float32)
-        for k in range(2):  # the first two columns of each rotation, as `to_6d`
-            x[..., 3 * k : 3 * k + 3] = frames[..., k].swapaxes(0, 1)
-            x[:, :, 0, 3 * k : 3 * k + 3] = root[..., k].swapaxes(0, 1)
-        decoded = rotations_of(self._reconstruct(x)[:, -kept:])
-        decoded[:, :, 0] = back[:, None] @ decoded[:, :, 0]
-        window.decoded[-kept:, slots] = decoded.swapaxes(0, 1)
+        frames = window.rotations.all[-self.window :, slots]
+        _repeat_first(frames)
+        if self._enabled and len(slots):
+            # The body faces +x in the centre frame, as in training; only the root's rotation knows.
+            back = yaw_matrix(heading(frames[self.window // 2 - 1, :, 0]))
+            x = np.empty((len(slots), self.window, 22, 6), dtype=np.float32)
+            _facing_forward(frames, back, x)
+            frames = rotations_of(self._reconstruct(x)[:, -kept:], back)
+        window.decoded[-kept:, slots] = frames[-kept:]
         return window
 
 
-def rotations_of(x: NDArray[np.float32]) -> NDArray[np.float64]:
-    """As `prior.hmvae.from_6d`: (..., 6) to rotation matrices (..., 3, 3)."""
-    rotations = np.empty((*x.shape[:-1], 3, 3))
-    _rotations_of(np.ascontiguousarray(x).reshape(-1, 6), rotations.reshape(-1, 3, 3))
+@njit(cache=True)
+def _repeat_first(frames):
+    """Fill the frames (T, B, 22, 3, 3) before a young body's first with that one."""
+    for row in range(frames.shape[1]):
+        first = 0
+        while first < len(frames) - 1 and math.isnan(frames[first, row, 0, 0, 0]):
+            first += 1
+        for t in range(first):
+            frames[t, row] = frames[first, row]
+
+
+@njit(cache=True)
+def _facing_forward(frames, back, x):
+    """Writes ``x`` (B, T, 22, 6), the first two columns of the rotations (T, B, 22, 3, 3), as `prior.hmvae.to_6d`.
+
+    The root's are turned by the inverse of ``back`` (B, 3, 3).
+    """
+    for row in range(len(x)):
+        for t in range(len(frames)):
+            for column in range(2):
+                for i in range(3):
+                    turned = 0.0
+                    for k in range(3):
+                        turned += back[row, k, i] * frames[t, row, 0, k, column]
+                    x[row, t, 0, 3 * column + i] = turned
+                    for joint in range(1, 22):
+                        x[row, t, joint, 3 * column + i] = frames[t, row, joint, i, column]
+
+
+@njit(cache=True)
+def rotations_of(x, back):
+    """(T, B, 22, 3, 3) rotations of ``x`` (B, T, 22, 6), as `prior.hmvae.from_6d`, the root's turned by ``back``."""
+    rotations = np.empty((x.shape[1], len(x), 22, 3, 3))
+    root = np.empty((3, 3))
+    for row in range(len(x)):
+        for t in range(x.shape[1]):
+            for joint in range(22):
+                _orthonormal(x[row, t, joint], rotations[t, row, joint])
+            root[:] = rotations[t, row, 0]
+            for i in range(3):
+                for j in range(3):
+                    rotations[t, row, 0, i, j] = (
+                        back[row, i, 0] * root[0, j] + back[row, i, 1] * root[1, j] + back[row, i, 2] * root[2, j]
+                    )
     return rotations
 
 
-@njit("(f4[:,::1], f8[:,:,::1])", cache=True)
-def _rotations_of(x, rotations):
-    for k in range(len(x)):
-        r = rotations[k]
-        along = length = rest = 0.0
-        for i in range(3):
-            length += x[k, i] * x[k, i]
-        for i in range(3):
-            r[i, 0] = x[k, i] / max(np.sqrt(length), 1e-12)
-            along += r[i, 0] * x[k, 3 + i]
-        for i in range(3):
-            r[i, 1] = x[k, 3 + i] - along * r[i, 0]
-            rest += r[i, 1] * r[i, 1]
-        for i in range(3):
-            r[i, 1] /= max(np.sqrt(rest), 1e-12)
-        for i in range(3):
-            a, b = (i + 1) % 3, (i + 2) % 3
-            r[i, 2] = r[a, 0] * r[b, 1] - r[b, 0] * r[a, 1]
+@njit(cache=True)
+def _orthonormal(x, r):
+    """Writes the rotation ``r`` (3, 3) whose first two columns are nearest to ``x`` (6,), by Gram and Schmidt."""
+    along = length = rest = 0.0
+    for i in range(3):
+        length += x[i] * x[i]
+    for i in range(3):
+        r[i, 0] = x[i] / max(math.sqrt(length), 1e-12)
+        along += r[i, 0] * x[3 + i]
+    for i in range(3):
+        r[i, 1] = x[3 + i] - along * r[i, 0]
+        rest += r[i, 1] * r[i, 1]
+    for i in range(3):
+        r[i, 1] /= max(math.sqrt(rest), 1e-12)
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        r[i, 2] = r[a, 0] * r[b, 1] - r[b, 0] * r[a, 1]

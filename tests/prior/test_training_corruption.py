@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from prior.corruption import add_noise, exchanged, hide_joints, occlude, other_lengths, sensed, slow_errors, spoil
+from prior.corruption import add_noise, exchanged, hide_joints, occlude, other_builds, sensed, slow_errors, spoil
 from prior.skeletons import MIRROR, PARENTS, J
 from prior.train_anomaly import FAULTS
 from tests.prior.bodies import waving
@@ -14,7 +14,7 @@ def test_the_truth_is_left_alone() -> None:
     for spoilt in (
         occlude(WINDOWS, rng),
         add_noise(WINDOWS, rng, slow_errors(40, rng)),
-        other_lengths(WINDOWS, 0.05, rng),
+        other_builds(WINDOWS, 0.05, 0.2, rng),
         spoil(WINDOWS, FAULTS, 1.0, rng),
         sensed(WINDOWS, 0.01, rng),
         hide_joints(WINDOWS, 3, rng),
@@ -25,11 +25,22 @@ def test_the_truth_is_left_alone() -> None:
 
 
 def test_other_bones_are_as_long_on_both_sides_and_in_every_frame() -> None:
-    other = other_lengths(WINDOWS, 0.1, np.random.default_rng(0))
+    other = other_builds(WINDOWS, 0.1, 0.2, np.random.default_rng(0))
     factor = bone_lengths(other)[..., 1:] / bone_lengths(WINDOWS)[..., 1:]
     assert 0.05 < np.log(factor).std() < 0.15
     np.testing.assert_allclose(factor, factor[:, :1].repeat(50, axis=1))
     np.testing.assert_allclose(factor, factor[..., np.array(MIRROR)[1:] - 1])
+
+
+def test_other_people_hold_each_bone_at_an_angle_of_its_own_throughout() -> None:
+    still = WINDOWS[:, :1].repeat(50, axis=1)
+    other = other_builds(still, 0.0, 0.2, np.random.default_rng(0))
+    np.testing.assert_allclose(other, other[:, :1].repeat(50, axis=1), atol=1e-12)
+    bones, turned = (windows[:, 0, 1:] - windows[:, 0, list(PARENTS[1:])] for windows in (still, other))
+    cosine = (bones * turned).sum(axis=-1) / np.linalg.norm(bones, axis=-1) / np.linalg.norm(turned, axis=-1)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    assert 0.1 < np.sqrt((angle**2).mean()) < 0.25  # 0.2 about two axes, times the root of a third
+    assert (angle.std(axis=1) > 0.01).mean() > 0.8
 
 
 def test_errors_that_last_are_as_large_as_told() -> None:
