@@ -23,7 +23,7 @@ from prior.graph import SCALE
 from prior.hgvae import HGVAE
 from prior.hgvae_live import LiveHGVAE
 from prior.impute import Climb, ImputeSettings, completed_tracks
-from prior.track_windows import Windows, standardise
+from prior.track_windows import Batch, Windows, standardise
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -110,6 +110,28 @@ def impute_all(
     for count in steps:
         found[f"HG-VAE, the paper's ascent, {count} steps"] = ascend_entries(model, line, observed, count)
     return {name: (np.where(masks, x, truth), truth) for name, x in found.items()}
+
+
+@torch.no_grad()
+def whole_joints(model: HGVAE, positions: Floats, sizes: Floats, hidden: Mask) -> dict[str, Floats]:
+    """Windows (B, T, 22, 3) of which joints ``hidden`` (B, 22) are not seen at all, by methods that need one pass.
+
+    Returns:
+        By method: (B,) squared errors in mm^2, summed over axes, frames and hidden joints.
+    """
+    found: dict[str, list[Floats]] = {}
+    for first in range(0, len(positions), 256):
+        part = slice(first, first + 256)
+        seen = np.where(hidden[part, None, :, None], np.nan, positions[part])
+        batch = Batch.of(model, seen, positions[part], sizes[part])
+        done = batch.completed(model, SLOW)
+        passed = model(done.x, done.believed).tracks.mean
+        for name, x in {
+            "mean": torch.zeros_like(batch.x), "guess": batch.x, "completion": done.x, "HG-VAE": passed,
+        }.items():  # fmt: skip
+            off = (x - batch.target).masked_fill(batch.observed > 0, 0.0).double() * (SCALE * 1000)
+            found.setdefault(name, []).append(off.square().sum(dim=(1, 2)).numpy())
+    return {name: np.concatenate(parts) for name, parts in found.items()}
 
 
 def ascend_entries(model: HGVAE, start: Floats, observed: Mask, steps: int) -> Floats:

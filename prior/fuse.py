@@ -107,8 +107,7 @@ class Fuse:
         seen, deviation = smoothed.positions[slots], smoothed.sigma[slots]
         unseen_s = self._unseen_s.all[-1 - back][slots]
         held_s = _least_below(unseen_s)
-        precision = Precision(*np.empty((2, *unseen_s.shape)))
-        _weigh(deviation, held_s, self._bias_sigma, s.prior_sigma, s.prior_drift, s.fade, precision)
+        precision = Precision(*_weigh(deviation, held_s, self._bias_sigma, s.prior_sigma, s.prior_drift, s.fade))
         body, rotations = place_joints(decoded, offsets), decoded
         well = _lay_over(body, seen, precision)
         if s.enabled:
@@ -160,13 +159,15 @@ def _least_below(unseen_s):
 
 
 @njit(cache=True)
-def _weigh(deviation, held_s, bias_sigma, prior_sigma, prior_drift, fade, precision):
-    """Writes how far to believe the smoother, of ``deviation`` (S, 22), and the prior."""
+def _weigh(deviation, held_s, bias_sigma, prior_sigma, prior_drift, fade):
+    """How far to believe the smoother, of ``deviation`` (S, 22), and the prior: the parts of `Precision`."""
+    seen, prior = np.empty_like(deviation), np.empty_like(deviation)
     for row in range(len(deviation)):
         for joint in range(deviation.shape[1]):
             drift = prior_drift * min(held_s[row, joint], fade)
-            precision.seen[row, joint] = 1.0 / (deviation[row, joint] ** 2 + bias_sigma**2)
-            precision.prior[row, joint] = 1.0 / (prior_sigma**2 + drift**2)
+            seen[row, joint] = 1.0 / (deviation[row, joint] ** 2 + bias_sigma**2)
+            prior[row, joint] = 1.0 / (prior_sigma**2 + drift**2)
+    return seen, prior
 
 
 @njit(cache=True)

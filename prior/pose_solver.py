@@ -137,7 +137,7 @@ def fit_pose(
     """
     shape = np.shape(positions)
     p, bones = _frames(positions, shape), _frames(offsets, shape)
-    yields, gives = np.empty((2, *shape[:-1]))
+    yields, gives = np.empty(shape[:-1]), np.empty(shape[:-1])
     yields[...], gives[...] = mobility, give
     _constrain(p, bones, yields.reshape(p.shape[:-1]), gives.reshape(p.shape[:-1]))
     local, placed = _initial(fallback, p), np.empty_like(p)

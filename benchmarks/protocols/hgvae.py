@@ -58,6 +58,7 @@ def run(bench: Bench) -> Result:
         _likelihood(bench, found, data),
         _anomalies(bench, found["default"], data),
         _sweep(bench, found, data),
+        _whole_joints(bench, found, data),
         _prediction(bench, found["default"], data),
         _depth(bench, data),
         _actions(bench, data),
@@ -289,6 +290,61 @@ def _sweep(bench: Bench, found: dict[str, HGVAE], data: _Data) -> Result:
     for axis in (shares, bursts):
         axis.grid(alpha=0.3)
     return Result([table], {"imputation": records}, {"hgvae_imputation": figure})
+
+
+FOUR_JOINTS_DRAWS = 8
+"""of four joints of each window; of one joint, each has its turn"""
+
+
+def _whole_joints(bench: Bench, found: dict[str, HGVAE], data: _Data) -> Result:
+    """Whole joints hidden in every window of the validation people, one after the other, and by person."""
+    motion, windows = data.val, Windows(data.val)
+    people = motion.subject if len(motion.subject) else np.full(len(motion.clip_start) - 1, "all")
+    records: list[dict[str, Any]] = []
+    for name, model in found.items():
+        frames = model.config.frames
+        rows = motion.all_windows(frames, frames)[:: 40 if bench.quick else 1]
+        person = people[np.searchsorted(motion.clip_start, rows[:, 0], side="right") - 1]
+        positions, sizes = windows.clean(rows, np.zeros(len(rows), dtype=bool))
+        rng = np.random.default_rng(0)
+        for count, draws in ((1, 21), (4, FOUR_JOINTS_DRAWS)):
+            sums: dict[tuple[str, str], float] = {}
+            for draw in bench.progress.track(range(draws), description=f"{count} whole joints, {NAMES[name]}"):
+                hidden = np.zeros((len(rows), 22), dtype=bool)
+                if count == 1:
+                    hidden[:, 1 + draw] = True
+                else:
+                    hidden[:, 1:] = rng.permuted(np.tile(np.arange(21) < count, (len(rows), 1)), axis=1)
+                for method, errors in imputation.whole_joints(model, positions, sizes, hidden).items():
+                    for who in np.unique(person):
+                        told = method, str(who)
+                        sums[told] = sums.get(told, 0.0) + float(errors[person == who].sum())
+            entries = 3 * frames * count * draws
+            for method, who in sums:
+                entry = {"weights": NAMES[name], "joints": count, "method": method, "person": who}
+                windows_of = int((person == who).sum())
+                records.append({**entry, "windows": windows_of, "mse_mm2": sums[method, who] / (entries * windows_of)})
+    rows_told = []
+    for weights, count, method in dict.fromkeys((r["weights"], r["joints"], r["method"]) for r in records):
+        own, mean = ([r for r in records if (r["weights"], r["joints"], r["method"]) == (weights, count, m)]
+                     for m in (method, "mean"))  # fmt: skip
+        if weights != NAMES["default"] and method in ("mean", "guess"):
+            continue  # what needs no model stands there already
+        total, of_mean = (sum(r["mse_mm2"] * r["windows"] for r in part) for part in (own, mean))
+        by_person = [100 * (a["mse_mm2"] / b["mse_mm2"] - 1) for a, b in zip(own, mean, strict=True)]
+        rows_told.append([
+            f"{count}", method if weights == NAMES["default"] else f"{method}, {weights}",
+            f"{(total / sum(r['windows'] for r in own)) ** 0.5:.1f}", f"{100 * (total / of_mean - 1):.1f} %",
+            f"{max(by_person):.0f} to {min(by_person):.0f} %",
+        ])  # fmt: skip
+    count = sum(r["windows"] for r in records if r["method"] == "mean" and r["joints"] == 1) // len(found)
+    table = Table(
+        "hgvae-joints", "HG-VAE: whole joints hidden in every window of the validation people",
+        ["joints hidden", "method", "mm RMS", "squared error against the mean's", "by person"], rows_told,
+        f"All {count} windows of 50 frames, one after the other, as they were recorded; one joint: each of 21 in its "
+        f"turn; four: {FOUR_JOINTS_DRAWS} draws a window. In one pass, without ascent.",
+    )  # fmt: skip
+    return Result([table], {"whole_joints": records})
 
 
 @torch.no_grad()

@@ -5,6 +5,7 @@ import torch
 from benchmarks import hgvae_imputation as imputation
 from benchmarks import hgvae_models as models
 from benchmarks.hgvae_faults import BEGINS, FAULTS, LEAST_MOTION
+from prior.body_tracks import in_frame_of, to_tracks
 from prior.hgvae import HGVAE
 from prior.motion_windows import MotionSet
 from prior.skeletons import MIRROR, REST_OFFSETS, J
@@ -70,6 +71,27 @@ def test_every_method_gives_back_what_was_seen_and_peers_are_what_they_are_calle
     assert (found["hold"][0][0, 60, 10:20] == truth[0, 60, 9]).all()
     assert found["line"][0][0, 60, 14] == pytest.approx(truth[0, 60, 9] + 5 / 11 * (truth[0, 60, 20] - truth[0, 60, 9]))
     assert found["mean"][0][0, 63, 0] == pytest.approx(float(model.mean[63]))
+
+
+def test_only_what_is_hidden_counts_as_an_error_of_whole_joints() -> None:
+    torch.manual_seed(0)
+    model = HGVAE(models.of_depth(1)).eval()
+    windows = Windows(windows_of("a"))
+    model.mean.copy_(mean_tracks(windows, 50, count=4))
+    positions, sizes = windows.draw(2, 50, np.random.default_rng(0))
+    hidden = np.zeros((2, 22), dtype=bool)
+    hidden[1, J["left_wrist"]] = True
+    found = imputation.whole_joints(model, positions, sizes, hidden)
+    assert set(found) == {"mean", "guess", "completion", "HG-VAE"}
+    assert all(errors[0] == 0 for errors in found.values())
+    # without a completion network, the guess: the wrist hangs from the elbow as it does in the mean body
+    assert found["completion"][1] == found["guess"][1]
+    seen = np.where(hidden[:, None, :, None], np.nan, positions)[1]
+    tracks = to_tracks(seen, float(sizes[1]))
+    true = in_frame_of(tracks, positions[1], float(sizes[1])) - model.mean.double().numpy()[:, None]
+    wrist, elbow = (slice(3 * J[n], 3 * J[n] + 3) for n in ("left_wrist", "left_elbow"))
+    assert found["mean"][1] == pytest.approx(1e6 * (true[wrist] ** 2).sum(), rel=1e-4)
+    assert found["guess"][1] == pytest.approx(1e6 * ((true[wrist] - true[elbow]) ** 2).sum(), rel=1e-4)
 
 
 def test_the_papers_ascent_never_ends_lower_than_it_began() -> None:
