@@ -40,7 +40,7 @@ gap: where joints jump about by more than"""
 EDGE_NOISE = 0.005
 """metres. Without noise the last frame knows best."""
 
-SIGMA_FOUND = 1.6
+SIGMA_FOUND = 1.2
 """Times the standard deviation that the model states: what limbs hidden for 0.3 to 2 s are off on validation motion."""
 
 

@@ -63,7 +63,7 @@ def train_hgvae(
     model: str = "hgvae",
     iterations: int = 9_000,
     batch: int = 64,
-    learning_rate: float = 1e-3,
+    learning_rate: float = 6e-3,
     seed: int = 0,
     start: str | None = None,
 ) -> Path:
