@@ -19,10 +19,10 @@ from benchmarks.scores import figures, score
 
 CONDITIONS = hidden_joints.CONDITIONS | noisy_joints.CONDITIONS
 GOLDEN = {
-    "arm behind": (10.0, 55.5, 2.5),
-    "0.5 s": (8.7, 55.1, 2.23),
-    "4 cm": (19.6, None, 3.55),
-    "lasting 2 cm, spikes, swaps": (26.2, None, 2.6),
+    "arm behind": (9.7, 53.8, 2.46),
+    "0.5 s": (8.4, 53.2, 2.23),
+    "4 cm": (17.9, None, 3.6),
+    "lasting 2 cm, spikes, swaps": (26.0, None, 2.63),
 }
 WORSE = 1.1
 

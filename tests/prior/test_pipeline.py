@@ -3,12 +3,13 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from numba.core.event import install_recorder
 from scipy.spatial.transform import Rotation
 
 from msgs.codec import encode
 from msgs.types import JointState, Pose, PoseClean, PoseRaw
 from prior.kinematics import forward_kinematics
-from prior.pipeline import PriorPipeline, PriorSettings
+from prior.pipeline import PriorPipeline, PriorSettings, load_loops
 from prior.skeletons import PARENTS, REST_OFFSETS, SKELETONS, J
 from tests.prior.bodies import PERIOD_NS, raw, stream, waving
 
@@ -63,6 +64,18 @@ def test_the_same_stream_gives_the_same_bytes() -> None:
     messages = stream(noisy(60))
     a, b = (b"".join(encode(c) for c in clean(messages)[0]) for _ in range(2))
     assert a == b
+
+
+def test_no_frame_waits_for_a_loop_to_be_compiled_or_loaded() -> None:
+    load_loops()
+    seen = noisy(70)
+    seen[30:45, J["left_wrist"]] = np.nan
+    seen[50] = np.nan
+    seen[60, J["right_ankle"]] += 1.0
+    with install_recorder("numba:compile") as recorder:
+        clean(stream(seen))
+        clean(stream(seen), delay=0)
+    assert not recorder.buffer
 
 
 def test_noise_shrinks_and_bones_stand_still() -> None:
