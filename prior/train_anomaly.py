@@ -27,6 +27,7 @@ from prior.corruption import (
     noisy,
     occlude,
     other_bones,
+    other_builds,
     repeats,
     sensed,
     sides_exchanged,
@@ -56,6 +57,10 @@ LEAST_FAULT = 0.015
 no fault worth the name, and one less off than a fifth of it is none."""
 
 FAULTS = (stands_still, exchanged, sides_exchanged, elsewhere, somebody_elses, other_bones, noisy, jumps)
+BONES, TURNED = 0.05, 0.1
+"""By how much each bone of a window is longer or shorter, and turned, radians (`other_builds`): how
+somebody is built or holds a limb is no fault."""
+
 SPOILT = 0.6
 """share of the windows that has a fault"""
 REPEATED = 0.15
@@ -129,6 +134,7 @@ def fit(
 def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np.random.Generator) -> Tensor:
     """Binary cross-entropy over the joints seen of which it is clear whether they are off."""
     clean, sizes = windows.draw(count, model.config.frames, rng, STRIDES)
+    clean = other_builds(clean, BONES, TURNED, rng)
     sigma = np.exp(rng.uniform(np.log(SENSOR_SIGMAS[0]), np.log(SENSOR_SIGMAS[-1]), count))
     spoilt = spoil(clean, FAULTS, SPOILT, rng)
     fast = rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.8)  # some sensors smooth what they say
