@@ -58,6 +58,9 @@ def _bones_between() -> NDArray[np.int64]:
 _NEAR = 1 / (1 + _bones_between()) ** 2
 """(22, 22) how much one joint's error tells of another's"""
 
+_LEAST_VARIANCE = 1e-10
+"""m^2: a hundredth of a millimetre"""
+
 _PARENT = np.array(PARENTS)
 
 
@@ -159,14 +162,20 @@ def _least_below(unseen_s):
 
 
 @njit(cache=True)
+def _inverse(variance):
+    """Of what is 0, that of `_LEAST_VARIANCE`: settings may say that a sensor or the prior is never wrong."""
+    return 1.0 / max(variance, _LEAST_VARIANCE)
+
+
+@njit(cache=True)
 def _weigh(deviation, held_s, bias_sigma, prior_sigma, prior_drift, fade):
     """How far to believe the smoother, of ``deviation`` (S, 22), and the prior: the parts of `Precision`."""
     seen, prior = np.empty_like(deviation), np.empty_like(deviation)
     for row in range(len(deviation)):
         for joint in range(deviation.shape[1]):
             drift = prior_drift * min(held_s[row, joint], fade)
-            seen[row, joint] = 1.0 / (deviation[row, joint] ** 2 + bias_sigma**2)
-            prior[row, joint] = 1.0 / (prior_sigma**2 + drift**2)
+            seen[row, joint] = _inverse(deviation[row, joint] ** 2 + bias_sigma**2)
+            prior[row, joint] = _inverse(prior_sigma**2 + drift**2)
     return seen, prior
 
 
@@ -219,9 +228,8 @@ def _complete(body, completed, sigma, seen, deviation, unseen_s, bias_sigma, pre
                     off[axis] += weight * (seen[row, other, axis] - completed[row, other, axis])
             for axis in range(3):
                 body[row, joint, axis] = completed[row, joint, axis] + off[axis] / max(total, 1e-12)
-            precision.prior[row, joint] = 1.0 / (sigma[row, joint] ** 2 + bias_sigma**2)
-            coasting = _COASTING * deviation[row, joint]
-            precision.seen[row, joint] = 1.0 / (coasting**2 + bias_sigma**2)
+            precision.prior[row, joint] = _inverse(sigma[row, joint] ** 2 + bias_sigma**2)
+            precision.seen[row, joint] = _inverse((_COASTING * deviation[row, joint]) ** 2 + bias_sigma**2)
 
 
 @njit(cache=True)

@@ -76,7 +76,7 @@ def train_hgvae(
         model: which of `MODELS`.
         iterations: optimiser steps.
         batch: windows a step.
-        learning_rate: of Adam at the start; falls to nothing along a cosine.
+        learning_rate: of Adam at the start, half of it where weights are gone on from; falls to nothing along a cosine.
         seed: of weights and of sampling.
         start: weights to go on from: a set or a path; the fault network beside them is taken up too.
 
@@ -90,15 +90,16 @@ def train_hgvae(
     network = HGVAE(MODELS[model])
     network.mean.copy_(mean_tracks(train, network.config.frames))
     origin = started(network, model, start)
+    rate = learning_rate if start is None else learning_rate / 2
     train_completion(network, train, val, runs / f"{name}-completion", iterations, seed)
-    run = fit(network, train, val, runs / name, iterations, batch, learning_rate, seed)
+    run = fit(network, train, val, runs / name, iterations, batch, rate, seed)
     path = run.ship(name, network, asdict(network.config), {
         "Model": f"HG-VAE, '{model}' of prior/train_hgvae.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject",
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train {model} --weights {weights}`: {iterations} steps of {batch} windows, "
         f"after as many of {BATCH} for its completion network, "
-        f"Adam {learning_rate:g}, seed {seed}{origin}",
+        f"Adam {rate:g}, seed {seed}{origin}",
     })  # fmt: skip
     faults = None if start is None else str(weights_path(start, model).with_suffix(".faults.safetensors"))
     train_anomaly(data, runs, weights, path, -(-iterations // 3), seed, faults)

@@ -86,6 +86,14 @@ def loops() -> dict[str, int]:
     return {f"{f.py_func.__module__}.{f.py_func.__qualname__}": len(f.signatures) for f in found}
 
 
+def test_settings_may_say_that_sensor_and_prior_are_never_wrong() -> None:
+    seen = waving(40)
+    seen[20:, J["left_wrist"]] = np.nan
+    cleaned, _ = clean(stream(seen), bias_sigma=0.0, fuse={"prior_sigma": 0.0, "prior_drift": 0.0})
+    assert np.isfinite(positions(cleaned)).all()
+    assert all(np.isfinite(c.bodies[0].sigma).all() for c in cleaned)
+
+
 def test_noise_shrinks_and_bones_stand_still() -> None:
     truth, seen = waving(420), noisy(420)
     cleaned, _ = clean(stream(seen))
