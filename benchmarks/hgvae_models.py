@@ -28,9 +28,9 @@ _NODES = (1, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 54, JOINT_NODES)
 def of_depth(depth: int) -> HGVAEConfig:
     """16 levels, of which the lowest ``depth`` are random: the same parameters at every depth.
 
-    One latent a node: with many, the finest level alone can say all there is to say of a window.
+    With many latents a node, the finest level alone can say all there is to say of a window.
     """
-    return HGVAEConfig(features=32, levels=tuple(Level(n, 1) for n in _NODES), stochastic=depth)
+    return HGVAEConfig(features=32, levels=tuple(Level(n, 3) for n in _NODES), stochastic=depth)
 
 
 DEPTH_RATE = 8e-3

@@ -56,10 +56,11 @@ def to_tracks(positions: NDArray[np.float64], size: NDArray[np.floating] | float
     """Windows (..., T, 22, 3) metres, z up, NaN where missing, as tracks; ``size`` (...) as `body_size` gives it."""
     batch, frames = positions.shape[:-3], positions.shape[-3]
     windows = np.ascontiguousarray(positions, dtype=np.float64).reshape(-1, frames, 22, 3)
-    sizes = np.array(np.broadcast_to(size, batch), dtype=np.float64).reshape(-1)
+    sizes = np.empty(batch)
+    sizes[...] = size
     x, observed = np.empty((2, len(windows), 66, frames))
     path, yaw = np.empty((len(windows), frames, 3)), np.empty(len(windows))
-    _to_tracks(windows, sizes, _low_pass(frames), x, observed, path, yaw)
+    _to_tracks(windows, sizes.ravel(), _low_pass(frames), x, observed, path, yaw)
     return Tracks(*(part.reshape((*batch, *part.shape[1:])) for part in (x, observed, path, yaw)))
 
 

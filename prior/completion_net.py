@@ -192,7 +192,7 @@ def tell(
     moved, noise = np.empty((2, count, _JOINTS), dtype=np.float32)
     apart = np.empty((count, _JOINTS, frames), dtype=np.float32)
     _tell(deviations.astype(np.float32), observed.astype(np.float32), patch, told, moved, noise, apart)
-    slow = np.broadcast_to(np.maximum(slow, LEAST_SLOW), count)[:, None]
+    slow = np.reshape(np.maximum(slow, LEAST_SLOW), (-1, 1))
     told[..., -1] = np.log(slow / SLOW)
     noise += (slow / SCALE) ** 2
     return Told(told, moved, noise, apart)

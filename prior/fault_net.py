@@ -95,7 +95,7 @@ def tell(
     count, tracks, frames = x.shape
     told = np.empty((count, tracks, 4 * frames + 2), dtype=np.float32)
     _tell(x, found, sigma, observed, mean, told)
-    told[..., -1] = np.broadcast_to(np.log(np.asarray(sensor_sigma) / SENSOR_SCALE), count)[:, None]
+    told[..., -1] = np.reshape(np.log(np.asarray(sensor_sigma) / SENSOR_SCALE), (-1, 1))
     return told
 
 

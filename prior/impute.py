@@ -173,9 +173,9 @@ def completed_tracks(tracks: Tracks, mean: Floats, noise: Floats | float = 0.0) 
     a gap; ``noise`` (...) metres, how much the joints seen jump about."""
     frames = mean.shape[-1]
     off, observed = (part.reshape(-1, frames) for part in (tracks.x - mean, tracks.observed))
-    edge = np.where(np.asarray(noise)[..., None] > EDGE_NOISE, EDGE_FRAMES, 1)
-    edges = np.array(np.broadcast_to(edge, mean.shape[:-1])).reshape(-1)
-    return mean + _carried(off, observed, CARRY_FRAMES, edges).reshape(mean.shape)
+    edges = np.empty(mean.shape[:-1], dtype=np.int64)
+    edges[...] = np.where(np.asarray(noise)[..., None] > EDGE_NOISE, EDGE_FRAMES, 1)
+    return mean + _carried(off, observed, CARRY_FRAMES, edges.ravel()).reshape(mean.shape)
 
 
 @njit(cache=True)
