@@ -22,7 +22,8 @@ from prior.training import TrainingRun
 DEPTHS = (1, 2, 4, 8, 16)
 """Stochastic levels, of the paper's table 1."""
 
-_NODES = (1, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 54, JOINT_NODES)
+_NODES = (1, 8, 24, JOINT_NODES)
+"""of the graphs, each of which has four of the 16 levels"""
 
 
 def of_depth(depth: int) -> HGVAEConfig:
@@ -30,7 +31,8 @@ def of_depth(depth: int) -> HGVAEConfig:
 
     With many latents a node, the finest level alone can say all there is to say of a window.
     """
-    return HGVAEConfig(features=32, levels=tuple(Level(n, 3) for n in _NODES), stochastic=depth)
+    levels = tuple(Level(nodes, 3) for nodes in _NODES for _ in range(4))
+    return HGVAEConfig(features=32, levels=levels, stochastic=depth)
 
 
 DEPTH_RATE = 8e-3
