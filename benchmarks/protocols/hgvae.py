@@ -400,7 +400,8 @@ def _depth(bench: Bench, data: _Data) -> Result:
         ["parameters", "depth", "log p(x|z), nats", "MSE, mm²", "KL, nats", "ELBO, nats"],
         [[f"{r['parameters'] / 1e6:.2f} M", str(r["depth"]), f"{r['log_likelihood']:.0f}", f"{r['mse_mm2']:.1f}",
           f"{r['kl']:.0f}", f"{r['elbo']:.0f}"] for r in records],
-        f"The same 16 levels; those above the lowest so many stay at their prior's mean. {steps} steps of 32 windows "
+        "The same 16 levels, four to each of the paper's graphs; those above the lowest so many stay at their prior's "
+        f"mean. {steps} steps of 32 windows "
         "each, where the paper trains a week.",
     )  # fmt: skip
     return Result([table], {"depth": {"steps": steps, "records": records}})
