@@ -166,8 +166,8 @@ class FixedLagRTS:
             return None
         last = (self._count - 1) % (self.delay + 1)
         step = stamp_s - self._stamps[last]
-        variance = self._with_position[last] + step * (
-            2 * self._with_velocity[last] + step * (self._velocity_variance + self._densities * step / 3)
+        variance = _ahead(
+            step, self._densities, self._with_position[last], self._with_velocity[last], self._velocity_variance
         )
         sigma = np.where(self._known, np.sqrt(variance), np.inf)
         position = self._position[last] + step * self._velocity
@@ -201,12 +201,17 @@ class FixedLagRTS:
 
 
 @njit(cache=True)
+def _ahead(step, density, variance, covariance, velocity_variance):
+    """Variance of a position after ``step`` seconds without a measurement."""
+    return variance + step * (2 * covariance + step * (velocity_variance + density * step / 3))
+
+
+@njit(cache=True)
 def _predict(slot, last, step, density, position, variance, with_position, with_velocity, velocity, velocity_variance):
     """Put the frame ``step`` seconds after the last into ``slot``, before it is measured."""
     for joint in range(len(density)):
-        growth, known = density[joint] * step, velocity_variance[joint]
-        covariance, ahead = with_velocity[last, joint], with_position[last, joint]
-        ahead += step * (2 * covariance + step * (known + growth / 3))
+        growth, known, covariance = density[joint] * step, velocity_variance[joint], with_velocity[last, joint]
+        ahead = _ahead(step, density[joint], with_position[last, joint], covariance, known)
         # The positions of past frames do not move, but their covariance with the newest state does.
         for frame in range(len(position)):
             with_position[frame, joint] += step * with_velocity[frame, joint]
