@@ -1,4 +1,4 @@
-"""How well `prior.calibration` finds a lens and a camera's place, on rendered pictures whose truth is known.
+"""How well `prior.camera.calibration` finds a lens and a camera's place, on rendered pictures whose truth is known.
 
 Pictures are of the board that `steadypose calibrate board` prints: perspective and lens distortion by following every
 pixel's ray, four rays a pixel; then blur, uneven light and noise.
@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.results import RESULTS, Table, save, show
 from msgs.types import Pose
-from prior.calibration import Board, Corners, Intrinsics, calibrate_lens, camera_pose, find_corners, floor_pose
+from prior.camera.calibration import Board, Corners, Intrinsics, calibrate_lens, camera_pose, find_corners, floor_pose
 
 Floats = NDArray[np.float64]
 

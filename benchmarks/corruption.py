@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prior.sim.camera import segment_gap
-from prior.skeletons import MIRROR, J
+from prior.body.skeleton import MIRROR, J
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

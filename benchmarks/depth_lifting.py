@@ -22,13 +22,13 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from benchmarks.results import RESULTS, Table, save, show
-from prior.lift import lift
+from prior.camera.depth_lifting import lift
 from prior.sim import scripts
 from prior.sim.body import REST_HEIGHT, stature
 from prior.sim.depth import Stereo, render, room, spoil
 from prior.sim.motion import Motion
 from prior.sim.sensors import mount
-from prior.skeletons import COCO17
+from prior.body.skeleton import COCO17
 
 Floats = NDArray[np.float64]
 

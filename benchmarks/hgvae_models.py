@@ -14,7 +14,7 @@ from torch import Tensor
 
 from prior.graph import JOINT_NODES, SCALE
 from prior.hgvae import HGVAE, HGVAEConfig, Level
-from prior.motion_windows import MotionSet
+from prior.motion.dataset import MotionSet
 from prior.track_windows import Batch, Windows, mean_tracks
 from prior.train_hgvae import CLIP_ENTRY, evidence
 from prior.training import TrainingRun

@@ -27,7 +27,7 @@ from benchmarks.results import RESULTS, Table, save, show
 from msgs.types import PoseRaw, PoseWorld
 from prior.identify import Identify, IdentifySettings
 from prior.sim.streams import Stream, make, read_manifest
-from prior.skeletons import get_skeleton, to_canonical
+from prior.body.skeleton import get_skeleton, to_canonical
 
 MANIFEST = ROOT / "sim_data" / "manifest.json"
 ROWS = 16

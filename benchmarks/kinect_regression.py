@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from benchmarks.kalman import fixed_lag
 from benchmarks.metrics import body_frame
-from prior.kinematics import rigid_alignment
-from prior.skeletons import KINECT22, J, to_canonical
+from prior.body.kinematics import rigid_alignment
+from prior.body.skeleton import KINECT22, J, to_canonical
 from prior.window import FPS
 
 Floats = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from prior.motion_windows import MotionSet
+from prior.motion.dataset import MotionSet
 from prior.sim.motion import Motion
 from prior.sim.scripts import SCRIPTS
 from prior.window import FPS

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
 from benchmarks.kalman import fixed_lag
-from prior.filters import OneEuroFilter
+from prior.timing.fixed_lag import OneEuroFilter
 from prior.window import FPS
 
 Floats = NDArray[np.float64]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from benchmarks.metrics import acceleration_error, bootstrap, length_variation, position_error, procrustes
 from benchmarks.results import Table
-from prior.skeletons import JOINTS, PARENTS
+from prior.body.skeleton import JOINTS, PARENTS
 from prior.window import FPS
 
 Floats = NDArray[np.float64]

@@ -29,10 +29,10 @@ from nodes.cleaning import stream
 from nodes.npz import NpzCollector
 from nodes.pose_input import RecordingSource
 from nodes.threads import one_thread
-from prior.filters import FixedLagRTS
-from prior.kinematics import rigid_alignment
+from prior.timing.fixed_lag import FixedLagRTS
+from prior.body.kinematics import rigid_alignment
 from prior.pipeline import PriorPipeline, PriorSettings
-from prior.skeletons import PARENTS, SKELETONS, J, to_canonical
+from prior.body.skeleton import PARENTS, SKELETONS, J, to_canonical
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings
 
 Floats = NDArray[np.float64]

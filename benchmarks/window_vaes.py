@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from prior.hmvae import HMVAE, ROTATION_FEATURES, SLOPE, HMVAEConfig, MotionVAE, Posterior
-from prior.motion_windows import MotionSet
+from prior.motion.dataset import MotionSet
 from prior.skeleton_conv import EdgeLinear, SkeletonConv
 from prior.train_hmvae import STRIDES, fit
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs.types import Pose, PoseRaw, RawBody
-from prior.skeletons import AZURE_KINECT32, BLAZEPOSE33, COCO17, ZED38, Skeleton, finite_joints
+from prior.body.skeleton import AZURE_KINECT32, BLAZEPOSE33, COCO17, ZED38, Skeleton, finite_joints
 
 Floats = NDArray[np.float64]
 
@@ -142,7 +142,7 @@ def from_coco(
     Returns:
         bodies in the camera's optical frame, of a camera taken for level.
     """
-    from prior.lift import lift  # compiles: not for those who have no depth image
+    from prior.camera.depth_lifting import lift  # compiles: not for those who have no depth image
 
     joints = len(COCO17.joints)
     points = np.array([detection["keypoints"] for detection in detections], np.float64)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from msgs.types import Pose
 from nodes.launch import Launch, LaunchError
-from prior.calibration import (
+from prior.camera.calibration import (
     LEAST_CORNERS,
     Board,
     CalibrationError,

@@ -288,7 +288,7 @@ def _standing(frame: int) -> PoseRaw:
     import numpy as np
 
     from msgs.types import Pose, PoseRaw, RawBody
-    from prior.skeletons import CANONICAL, PARENTS, REST_OFFSETS, J
+    from prior.body.skeleton import CANONICAL, PARENTS, REST_OFFSETS, J
 
     positions = np.zeros((len(CANONICAL.joints), 3))
     positions[J["pelvis"]] = [2.0, 0.02 * np.sin(frame / 10), 0.95]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs.types import CONTACTS, JOINTS, JointState, Pose
-from prior.skeletons import PARENTS, J
+from prior.body.skeleton import PARENTS, J
 
 # Okabe and Ito's palette: told apart with any kind of colour vision, on white and on black.
 STATE_COLOURS: dict[JointState, str] = {

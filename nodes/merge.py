@@ -12,7 +12,7 @@ from msgs.types import PoseRaw
 from nodes.launch import LaunchError, MergeSettings
 from nodes.live import LiveSource
 from nodes.runtime import TURN_S
-from prior.merge import Merge
+from prior.camera.multi_view import Merge
 
 
 class MergeSource(LiveSource):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from msgs.topics import POSE_RAW
 from msgs.types import JOINTS, Message, Pose, PoseClean, PoseRaw, PoseWorld, RawBody
-from prior.skeletons import SKELETONS
+from prior.body.skeleton import SKELETONS
 
 PERIOD_NS = 1_000_000_000 / 30
 """of the grid the prior answers on"""

@@ -22,9 +22,9 @@ from msgs.types import PoseRaw, RawBody
 from nodes.launch import LaunchError, OakSettings
 from nodes.live import CameraError, CameraSource, count_failure
 from nodes.runtime import TURN_S, Clock
-from prior.level import Level
-from prior.lift import lift
-from prior.skeletons import COCO17
+from prior.camera.gravity import Level
+from prior.camera.depth_lifting import lift
+from prior.body.skeleton import COCO17
 
 Floats = NDArray[np.float64]
 

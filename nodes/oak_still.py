@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from nodes.launch import OakSettings
 from nodes.live import CameraError
 from nodes.oak import APART, DEPTH_FPS, Gravity, accelerometer, aligned_depth, open_device
-from prior.level import Level
+from prior.camera.gravity import Level
 
 SETTLE = 30
 """pairs let pass, while exposure and level settle"""

@@ -33,7 +33,7 @@ from nodes.drawing import (
     facing,
     to_world,
 )
-from prior.skeletons import SKELETONS, J, to_canonical
+from prior.body.skeleton import SKELETONS, J, to_canonical
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

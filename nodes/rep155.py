@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs.types import WorldBody
-from prior.skeletons import PARENTS, J
+from prior.body.skeleton import PARENTS, J
 
 Floats = NDArray[np.float64]
 Links = Mapping[str, tuple[Floats, Floats]]

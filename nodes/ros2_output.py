@@ -25,7 +25,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from msgs.types import Diagnostics, JointState, PoseWorld, Tracking, WorldBody
 from nodes.rep155 import Links, body_name, frames, joint_angles, joint_rotations, measures, urdf
 from nodes.ros2_dds import DdsOutput, body_transforms
-from prior.skeletons import PARENTS, J
+from prior.body.skeleton import PARENTS, J
 
 MARKERS = "steadypose/markers"
 POSES = "steadypose/poses"

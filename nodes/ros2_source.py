@@ -12,7 +12,7 @@ from nodes.launch import LaunchError, Ros2Settings, nearest
 from nodes.live import LiveSource
 from nodes.ros2_bridge import require_ros2
 from nodes.runtime import TURN_S
-from prior.skeletons import SKELETONS
+from prior.body.skeleton import SKELETONS
 
 
 class Ros2Source(LiveSource):

@@ -50,7 +50,7 @@ from nodes.drawing import (
     to_world,
 )
 from nodes.runtime import TURN_S, Node
-from prior.skeletons import SKELETONS, J, to_canonical
+from prior.body.skeleton import SKELETONS, J, to_canonical
 
 if TYPE_CHECKING:
     import rerun as rr

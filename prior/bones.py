@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.kinematics import global_rotations
-from prior.pose_solver import solve_rotations
-from prior.skeletons import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, finite_joints
+from prior.body.kinematics import global_rotations
+from prior.body.inverse_kinematics import solve_rotations
+from prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, finite_joints
 from prior.window import Window
 
 Floats = NDArray[np.float64]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from prior.completion_net import FIRST_LOG_VAR, GROWTH, LAG, STILL, SURE, CompletionNet, tell
 from prior.graph import LOG_VAR_RANGE, SCALE
 from prior.graph_program import Network, Program
-from prior.skeletons import PARENTS
+from prior.body.skeleton import PARENTS
 
 
 class LiveCompletion:

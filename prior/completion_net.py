@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from prior.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE, GraphBlock, GraphLinear
-from prior.skeletons import PARENTS
+from prior.body.skeleton import PARENTS
 
 NEAR = 8.0
 """Frames from a sighting at which half is told of it. What is told falls as 1 / (1 + d / NEAR): by an exponential, an

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from prior.checkpoint import load_weights
 from prior.correction_net import HISTORY, CorrectionConfig, CorrectionNet, features, trunk_frame
-from prior.filters import FixedLagRTS
-from prior.skeletons import finite_joints
+from prior.timing.fixed_lag import FixedLagRTS
+from prior.body.skeleton import finite_joints
 from prior.window import Ring, Window
 
 DENSITY = 1.0

@@ -15,8 +15,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from prior.body_tracks import from_tracks
-from prior.filters import Smoothed
-from prior.skeletons import J
+from prior.timing.fixed_lag import Smoothed
+from prior.body.skeleton import J
 from prior.window import Window
 
 Floats = NDArray[np.float64]

@@ -11,9 +11,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from msgs.types import JointState
-from prior.filters import Smoothed
-from prior.pose_solver import fit_pose, place_joints, solve_pose
-from prior.skeletons import JOINTS, PARENTS
+from prior.timing.fixed_lag import Smoothed
+from prior.body.inverse_kinematics import fit_pose, place_joints, solve_pose
+from prior.body.skeleton import JOINTS, PARENTS
 from prior.window import FPS, Estimate, Ring, Window
 
 Floats = NDArray[np.float64]

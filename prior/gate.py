@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.filters import FixedLagRTS, Smoothed
-from prior.skeletons import MIRROR, PARENTS, J
+from prior.timing.fixed_lag import FixedLagRTS, Smoothed
+from prior.body.skeleton import MIRROR, PARENTS, J
 from prior.window import FPS, Window
 
 RECENT = 15

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from prior.skeleton_conv import EdgeLinear, SkeletonConv, SkeletonPool, SkeletonUnpool, pooling_levels
-from prior.skeletons import PARENTS
+from prior.body.skeleton import PARENTS
 
 ROTATION_FEATURES = 6
 """A joint's features: the first two columns of its local rotation."""

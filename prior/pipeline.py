@@ -27,11 +27,11 @@ from prior.fuse import Fuse, FuseSettings
 from prior.gate import Gate, GateSettings
 from prior.identify import Identify, IdentifySettings
 from prior.impute import Impute, ImputeSettings
-from prior.pose_solver import place_joints
+from prior.body.inverse_kinematics import place_joints
 from prior.refine import Refine, RefineSettings
-from prior.resample import Resampler
+from prior.timing.resample import Resampler
 from prior.settings import build_settings
-from prior.skeletons import CANONICAL, REST_OFFSETS, SKELETONS, J, Skeleton, finite_joints, to_canonical
+from prior.body.skeleton import CANONICAL, REST_OFFSETS, SKELETONS, J, Skeleton, finite_joints, to_canonical
 from prior.smooth import Smooth, SmoothSettings
 from prior.solve import Solve
 from prior.window import FPS, Estimate, Stage, Window

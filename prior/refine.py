@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from prior.checkpoint import load_weights
 from prior.hmvae import HMVAE, HMVAEConfig
 from prior.hmvae_live import LiveHMVAE
-from prior.kinematics import heading, yaw_matrix
+from prior.body.kinematics import heading, yaw_matrix
 from prior.window import Window
 
 

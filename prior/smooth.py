@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.filters import FixedLagRTS, Follower, Smoothed
+from prior.timing.fixed_lag import FixedLagRTS, Follower, Smoothed
 from prior.window import FPS, Window
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.pose_solver import solve_rotations
+from prior.body.inverse_kinematics import solve_rotations
 from prior.window import Window
 
 

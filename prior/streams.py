@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from msgs.types import CleanBody, Pose, PoseClean, PoseRaw
 from prior.identify import Identify
 from prior.pipeline import BACKWARDS_NS, PriorPipeline, PriorSettings
-from prior.resample import PERIOD_NS, Resampler
+from prior.timing.resample import PERIOD_NS, Resampler
 
 PATIENCE_NS = 2 * PERIOD_NS
 """How long a frame waits for those of the other streams: a period, because they come at any time in it, and as much

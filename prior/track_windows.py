@@ -13,7 +13,7 @@ from torch import Tensor
 from prior.body_tracks import body_size, hang_unseen, in_frame_of, to_tracks
 from prior.graph import SCALE
 from prior.hgvae import HGVAE
-from prior.motion_windows import MotionSet, mirror_offsets
+from prior.motion.dataset import MotionSet, mirror_offsets
 
 Floats = NDArray[np.float64]
 

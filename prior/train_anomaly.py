@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from prior.anomaly import MISSING, RATES, SENSOR_SIGMAS, Calibration, judged
 from prior.body_tracks import to_tracks
 from prior.checkpoint import LICENCES, load_weights, started
-from prior.corruption import (
+from prior.motion.corruption import (
     FAST,
     elsewhere,
     exchanged,
@@ -40,7 +40,7 @@ from prior.fault_net import RECENT, FaultNet, FaultNetConfig, tell
 from prior.gate import LEAST_NOISE, stuck
 from prior.graph import SCALE
 from prior.hgvae import HGVAE, HGVAEConfig
-from prior.motion_windows import MotionSet
+from prior.motion.dataset import MotionSet
 from prior.track_windows import STRIDES, Windows, standardise
 from prior.training import TrainingRun
 

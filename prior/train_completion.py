@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from prior.completion_net import CompletionNet
-from prior.corruption import add_noise, elsewhere, exchanged, occlude, other_builds, slow_errors, spoil, stands_still
+from prior.motion.corruption import add_noise, elsewhere, exchanged, occlude, other_builds, slow_errors, spoil, stands_still
 from prior.distributed import share
 from prior.graph import SCALE
 from prior.hgvae import HGVAE

@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from prior.correct import DENSITY, recall
 from prior.correction_net import HISTORY, CorrectionConfig, CorrectionNet, features, mirror_features, trunk_frame
 from prior.distributed import share
-from prior.filters import FixedLagRTS
-from prior.kinematics import rigid_alignment
+from prior.timing.fixed_lag import FixedLagRTS
+from prior.body.kinematics import rigid_alignment
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
-from prior.motion_windows import mirror_offsets
-from prior.skeletons import KINECT22, finite_joints, to_canonical
+from prior.motion.dataset import mirror_offsets
+from prior.body.skeleton import KINECT22, finite_joints, to_canonical
 from prior.training import TrainingRun
 
 HIDE = 0.1

@@ -20,11 +20,11 @@ from torch import Tensor
 
 from prior.checkpoint import LICENCES, started, weights_path
 from prior.completion_net import CompletionConfig
-from prior.corruption import add_noise, occlude, other_builds, slow_errors, spoil
+from prior.motion.corruption import add_noise, occlude, other_builds, slow_errors, spoil
 from prior.distributed import share
 from prior.graph import JOINT_NODES, SCALE
 from prior.hgvae import HGVAE, HGVAEConfig, Level, Pass
-from prior.motion_windows import MotionSet
+from prior.motion.dataset import MotionSet
 from prior.track_windows import STRIDES, Batch, Windows, mean_tracks
 from prior.train_anomaly import train_anomaly
 from prior.train_completion import BATCH, BONES, SPOILT_BY, TURNED, train_completion

@@ -14,8 +14,8 @@ from torch import Tensor
 from prior.checkpoint import LICENCES, started
 from prior.distributed import share
 from prior.hmvae import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
-from prior.kinematics import forward_kinematics
-from prior.motion_windows import MotionSet, data_told, mirror_offsets, mirror_rotations, remove_heading
+from prior.body.kinematics import forward_kinematics
+from prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations, remove_heading
 from prior.training import TrainingRun
 
 JOINT_WEIGHT = 10.0

@@ -13,9 +13,9 @@ from torch.nn import functional as F
 
 from prior.checkpoint import LICENCES, started
 from prior.distributed import share
-from prior.kinematics import CONTACT_JOINTS
-from prior.motion_windows import MotionSet, data_told, yaw_rotation
-from prior.skeletons import MIRROR, J
+from prior.body.kinematics import CONTACT_JOINTS
+from prior.motion.dataset import MotionSet, data_told, yaw_rotation
+from prior.body.skeleton import MIRROR, J
 from prior.training import TrainingRun
 from prior.trajectory_net import FRAME_S, RootMotion, TrajectoryConfig, TrajectoryNet
 

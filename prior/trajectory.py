@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from msgs.types import CleanBody, PoseClean, PoseWorld, WorldBody
 from prior.checkpoint import load_weights
 from prior.ground import Ground
-from prior.kinematics import yaw_matrix
+from prior.body.kinematics import yaw_matrix
 from prior.settings import build_settings
 from prior.trajectory_filter import RootNoise
 from prior.trajectory_net import NewestFrame, TrajectoryConfig, TrajectoryNet

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs.types import CleanBody, JointState, Pose, PoseClean
-from prior.kinematics import CONTACT_JOINTS
+from prior.body.kinematics import CONTACT_JOINTS
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings
 from prior.trajectory_net import FRAME_S
 from prior.trajectory_track import FEET

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from prior.kinematics import CONTACT_JOINTS
+from prior.body.kinematics import CONTACT_JOINTS
 from prior.skeleton_conv import Level, SkeletonConv, SkeletonPool, pooling_levels
-from prior.skeletons import PARENTS
+from prior.body.skeleton import PARENTS
 
 FRAME_S = 1.0 / 30.0
 """Seconds between the frames that the network sees."""

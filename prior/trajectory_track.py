@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from msgs.types import CleanBody, JointState, Tracking, WorldBody
 from prior.ground import Ground
-from prior.kinematics import CONTACT_JOINTS, yaw_matrix
-from prior.skeletons import PARENTS, REST_OFFSETS, J
+from prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
+from prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from prior.trajectory_filter import RootFilter, RootNoise
 from prior.trajectory_net import FRAME_S
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.filters import Smoothed
-from prior.skeletons import REST_OFFSETS
+from prior.timing.fixed_lag import Smoothed
+from prior.body.skeleton import REST_OFFSETS
 
 if TYPE_CHECKING:
     from prior.encode import Encoded

@@ -32,12 +32,12 @@ from prior.anomaly import RATES as QUANTILES
 from prior.anomaly import Calibration, load_fault_net
 from prior.body_tracks import to_tracks
 from prior.checkpoint import WEIGHTS, load_weights
-from prior.corruption import sensed
+from prior.motion.corruption import sensed
 from prior.fault_net import FaultNet
 from prior.graph import SCALE
 from prior.hgvae import HGVAE, HGVAEConfig
-from prior.motion_windows import MotionSet
-from prior.skeletons import PARENTS
+from prior.motion.dataset import MotionSet
+from prior.body.skeleton import PARENTS
 from prior.track_windows import Batch, Windows, standardise
 from prior.train_anomaly import score_windows
 from prior.train_hgvae import evidence

@@ -37,10 +37,10 @@ from benchmarks.metrics import (
 from benchmarks.peers import FILTERS, OFFLINE, Peer
 from benchmarks.results import Table
 from benchmarks.tuning import Tuned, loss, search
-from prior.kinematics import rigid_alignment
+from prior.body.kinematics import rigid_alignment
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
 from prior.pipeline import PriorSettings
-from prior.skeletons import JOINTS, KINECT22, MIRROR, J, to_canonical
+from prior.body.skeleton import JOINTS, KINECT22, MIRROR, J, to_canonical
 from prior.window import FPS
 
 Floats = NDArray[np.float64]

@@ -24,8 +24,8 @@ from benchmarks.results import Table
 from benchmarks.scores import figures, score
 from prior.checkpoint import load_weights
 from prior.hmvae import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
-from prior.kinematics import forward_kinematics
-from prior.motion_windows import remove_heading
+from prior.body.kinematics import forward_kinematics
+from prior.motion.dataset import remove_heading
 
 Floats = NDArray[np.float64]
 

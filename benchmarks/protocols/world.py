@@ -25,9 +25,9 @@ from benchmarks.motion import MotionClips
 from benchmarks.peers import FILTERS, OFFLINE, Peer, missing
 from benchmarks.results import Table
 from benchmarks.scores import figures, interval, score
-from prior.kinematics import CONTACT_JOINTS
+from prior.body.kinematics import CONTACT_JOINTS
 from prior.pipeline import PriorPipeline
-from prior.skeletons import JOINTS
+from prior.body.skeleton import JOINTS
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings
 from prior.trajectory_eval import METHODS, Clip, evaluate_fusion
 

@@ -25,7 +25,7 @@ from prior.motion.clip import Y_UP_TO_Z_UP, Clip, MotionError
 from prior.motion.npz import read_amass, read_expmap
 from prior.motion.tables import BANDAI, BVH_RIGS, CMU_AMC, CMU_BVH, ICLONE, REACTIDLE, Rig
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
-from prior.skeletons import CANONICAL, Skeleton
+from prior.body.skeleton import CANONICAL, Skeleton
 
 CMU_LICENCE = "CMU mocap: free, no resale"
 """Free for all uses, products included; the data itself may not be resold; acknowledge NSF EIA-0196217."""

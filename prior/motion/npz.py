@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from prior.motion.clip import MotionError, forward
 from prior.motion.tables import CMU_BVH, CMU_METRES
-from prior.skeletons import PARENTS, REST_OFFSETS
+from prior.body.skeleton import PARENTS, REST_OFFSETS
 
 
 @contextmanager
@@ -70,7 +70,7 @@ def read_amass(file: IO[bytes]) -> tuple[float, NDArray[np.float64]]:
     """SMPL, SMPL-H or SMPL-X poses as AMASS stores them: ``poses``, ``trans`` and the frame rate.
 
     No body model is used, so that its licence binds nobody: the rotations move the rest skeleton of
-    `prior.skeletons`, a generic adult, whatever the subject's shape. Joint angles are the recording's own, bone
+    `prior.body.skeleton`, a generic adult, whatever the subject's shape. Joint angles are the recording's own, bone
     lengths and the height of the root above the floor are not.
 
     Returns:

@@ -13,11 +13,11 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from prior.kinematics import CONTACT_SPEED, estimate_offsets, label_contacts
+from prior.body.kinematics import CONTACT_SPEED, estimate_offsets, label_contacts
 from prior.motion.clip import Clip
 from prior.motion.datasets import Dropped, Split, WeightSet
-from prior.pose_solver import solve_rotations
-from prior.skeletons import JOINTS, PARENTS, J, finite_joints
+from prior.body.inverse_kinematics import solve_rotations
+from prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
 
 FPS = 30.0
 """Frames a second of everything that is trained on."""

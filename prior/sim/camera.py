@@ -30,7 +30,7 @@ from prior.sim.noise import (
     travelled,
 )
 from prior.sim.sensors import Mount, mount
-from prior.skeletons import JOINTS, J
+from prior.body.skeleton import JOINTS, J
 
 Floats = NDArray[np.float64]
 

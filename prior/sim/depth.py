@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prior.sim.body import CAPSULES, REST_HEIGHT, stature
-from prior.skeletons import J
+from prior.body.skeleton import J
 
 Floats = NDArray[np.float64]
 

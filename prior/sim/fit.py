@@ -22,11 +22,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from prior.kinematics import estimate_offsets, global_rotations
+from prior.body.kinematics import estimate_offsets, global_rotations
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
-from prior.pose_solver import solve_rotations
+from prior.body.inverse_kinematics import solve_rotations
 from prior.sim.noise import KINECT_NOISE, NoiseModel, draw_errors, ray_axes, travelled
-from prior.skeletons import JOINTS, KINECT22, MIRROR, PARENTS, J, to_canonical
+from prior.body.skeleton import JOINTS, KINECT22, MIRROR, PARENTS, J, to_canonical
 
 Floats = NDArray[np.float64]
 

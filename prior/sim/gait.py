@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from prior.kinematics import yaw_matrix
+from prior.body.kinematics import yaw_matrix
 from prior.sim.body import TOE_HEIGHT
 from prior.sim.timing import minimum_jerk
-from prior.skeletons import J
+from prior.body.skeleton import J
 
 Floats = NDArray[np.float64]
 

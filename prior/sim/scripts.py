@@ -15,7 +15,7 @@ from prior.sim.body import random_offsets
 from prior.sim.gait import RATE, Plan, Stand, Turn, Walk, plan
 from prior.sim.motion import SIDES, SIGN, ArmAction, Intent, Motion, Side, perform
 from prior.sim.timing import Key, minimum_jerk, track
-from prior.skeletons import J
+from prior.body.skeleton import J
 
 Floats = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from msgs.recording import RecordingWriter
 from msgs.topics import POSE_RAW, POSE_TRUTH
 from msgs.types import JointState, PoseRaw, PoseWorld, Tracking, WorldBody
-from prior.resample import PERIOD_NS
+from prior.timing.resample import PERIOD_NS
 from prior.sim.camera import Camera, as_tracked, film, sight
 from prior.sim.motion import Motion
 from prior.sim.noise import KINECT_NOISE, NoiseModel

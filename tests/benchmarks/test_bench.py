@@ -20,7 +20,7 @@ from benchmarks.scores import figures as figures_of
 from benchmarks.scores import pivot, score
 from prior.checkpoint import load_weights
 from prior.hmvae import HMVAE, HMVAEConfig
-from prior.skeletons import J
+from prior.body.skeleton import J
 
 
 @pytest.fixture(scope="module")

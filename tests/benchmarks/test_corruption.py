@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from benchmarks.corruption import LIMBS, arm_behind, below, bursts, correlated, gaussian, hide, spiked, swapped
-from prior.skeletons import PARENTS, REST_OFFSETS, J
+from prior.body.skeleton import PARENTS, REST_OFFSETS, J
 
 SHAPE = (300, 6, 22, 3)
 

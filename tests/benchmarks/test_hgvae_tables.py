@@ -7,8 +7,8 @@ from benchmarks import hgvae_models as models
 from benchmarks.hgvae_faults import BEGINS, FAULTS, LEAST_MOTION
 from prior.body_tracks import in_frame_of, to_tracks
 from prior.hgvae import HGVAE
-from prior.motion_windows import MotionSet
-from prior.skeletons import MIRROR, REST_OFFSETS, J
+from prior.motion.dataset import MotionSet
+from prior.body.skeleton import MIRROR, REST_OFFSETS, J
 from prior.track_windows import Windows, mean_tracks, standardise
 from tests.prior.bodies import waving
 

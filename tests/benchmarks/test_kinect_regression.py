@@ -4,8 +4,8 @@ import torch
 from benchmarks.kinect_regression import _OTHER_SIDE, Smoothed, _mirrored, ridge, temporal_convolution
 from benchmarks.metrics import position_error
 from benchmarks.protocols.kinect_vicon import OTHER_SIDE, SCORED
-from prior.kinematics import rigid_alignment
-from prior.skeletons import KINECT22
+from prior.body.kinematics import rigid_alignment
+from prior.body.skeleton import KINECT22
 
 SIZES = np.random.default_rng(0).normal(0, 0.3, (len(SCORED), 3))
 WAYS = np.random.default_rng(2).normal(0, 0.2, (3, 66))

@@ -17,7 +17,7 @@ from benchmarks.metrics import (
     reliability,
     sigma_ratio,
 )
-from prior.kinematics import rigid_alignment
+from prior.body.kinematics import rigid_alignment
 
 
 def walk(seed: int, frames: int = 12, joints: int = 5) -> np.ndarray:

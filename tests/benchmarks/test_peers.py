@@ -14,7 +14,7 @@ from benchmarks.peers import (
     hold_last,
     interpolate,
 )
-from prior.filters import FixedLagRTS
+from prior.timing.fixed_lag import FixedLagRTS
 
 STAMPS = np.arange(40) / 30.0
 NAN = float("nan")

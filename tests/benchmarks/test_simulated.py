@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.simulated import FEET, Track, hold_last, measure, read_tracks, sigma_ratio, smooth
 from msgs.topics import POSE_RAW, POSE_TRUTH
 from msgs.types import Message, Pose, PoseRaw, PoseWorld, RawBody, Tracking, WorldBody
-from prior.skeletons import CANONICAL, PARENTS, REST_OFFSETS, J
+from prior.body.skeleton import CANONICAL, PARENTS, REST_OFFSETS, J
 
 PERIOD_NS = 33_333_333
 

@@ -4,7 +4,7 @@ import torch
 from benchmarks.motion import as_set, simulated_clips
 from benchmarks.window_vaes import CONFIGS, MVAE, TCNVAE, trained
 from prior.hmvae import HMVAE
-from prior.kinematics import forward_kinematics
+from prior.body.kinematics import forward_kinematics
 from prior.skeleton_conv import SkeletonConv
 
 

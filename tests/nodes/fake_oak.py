@@ -21,7 +21,7 @@ from nodes.launch import OakSettings
 from nodes.oak import Host
 from nodes.runtime import Clock
 from prior.sim.depth import Stereo, render, room
-from prior.skeletons import COCO17, REST_OFFSETS
+from prior.body.skeleton import COCO17, REST_OFFSETS
 
 CAMERA = Stereo()
 NETWORK_SIZE = (512, 288)

@@ -23,7 +23,7 @@ from msgs.types import (
     Tracking,
     WorldBody,
 )
-from prior.skeletons import PARENTS, REST_OFFSETS, SKELETONS, J, Skeleton, to_canonical
+from prior.body.skeleton import PARENTS, REST_OFFSETS, SKELETONS, J, Skeleton, to_canonical
 
 FPS = 30.0
 START_NS = 1_000_000_000

@@ -14,7 +14,7 @@ from msgs.codec import decode, encode
 from msgs.topics import POSE_RAW
 from msgs.types import PoseRaw
 from nodes.adapters import from_azure_kinect, from_coco, from_mediapipe, from_zed, pinhole
-from prior.skeletons import AZURE_KINECT32, BLAZEPOSE33, COCO17, JOINTS, SKELETONS, ZED38, Skeleton, to_canonical
+from prior.body.skeleton import AZURE_KINECT32, BLAZEPOSE33, COCO17, JOINTS, SKELETONS, ZED38, Skeleton, to_canonical
 
 STAMP_NS = 1_700_000_000_123_456_789
 STAMP = Made(sec=1_700_000_000, nanosec=123_456_789)

@@ -16,7 +16,7 @@ from nodes.calibrate import draw_floor
 from nodes.cli import main
 from nodes.launch import Launch, LaunchError, checkout
 from nodes.pose_input import PoseInputNode, RecordingSource
-from prior.calibration import Intrinsics, find_corners
+from prior.camera.calibration import Intrinsics, find_corners
 
 LENS = Intrinsics((640, 360), (520.0, 518.0), (322.0, 177.0), (0.03, -0.05, 0.0, 0.0, 0.0))
 EYE = look_at(np.array([-0.1, -0.7, 0.8]), np.array([0.2, 0.1, 0.0]))

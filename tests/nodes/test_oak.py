@@ -28,7 +28,7 @@ from nodes.prior import PriorNode
 from nodes.run import _check
 from nodes.runtime import Clock, SystemClock
 from nodes.trajectory import TrajectoryNode
-from prior.skeletons import COCO17
+from prior.body.skeleton import COCO17
 
 MakeLaunch = Callable[..., Launch]
 BODY = [i for i, name in enumerate(COCO17.joints) if name.split("_")[-1] not in ("nose", "eye", "ear")]

@@ -15,7 +15,7 @@ from nodes.calibrate import CalibrateOak, calibrate
 from nodes.launch import Launch, OakSettings
 from nodes.live import CameraError
 from nodes.oak_still import Still, take
-from prior.calibration import CalibrationError
+from prior.camera.calibration import CalibrationError
 
 UP = np.array([0.0, -np.cos(0.2), np.sin(0.2)])
 

@@ -15,7 +15,7 @@ from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORL
 from msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw
 from nodes import plot as module
 from nodes.plot import PlotError, plot
-from prior.skeletons import J
+from prior.body.skeleton import J
 
 PICTURE = b"\x89PNG"
 

@@ -13,7 +13,7 @@ from synthetic_poses import messages
 
 from msgs.types import PoseWorld, Tracking, WorldBody
 from nodes.rep155 import JOINTS, LINKS, body_name, frames, joint_angles, measures, urdf
-from prior.skeletons import PARENTS, REST_OFFSETS, J
+from prior.body.skeleton import PARENTS, REST_OFFSETS, J
 
 
 def body(turns: dict[str, Rotation], root: Rotation | None = None) -> WorldBody:

@@ -19,7 +19,7 @@ from nodes.adapters import from_pose_array
 from nodes.launch import Launch, LaunchError
 from nodes.live import LiveSource
 from nodes.pose_input import PoseInputNode
-from prior.skeletons import CANONICAL, COCO17, SKELETONS
+from prior.body.skeleton import CANONICAL, COCO17, SKELETONS
 
 PUBLISHER = """
 import sys

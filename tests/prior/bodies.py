@@ -7,8 +7,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from msgs.types import Pose, PoseRaw, RawBody
-from prior.kinematics import forward_kinematics
-from prior.skeletons import REST_OFFSETS, J
+from prior.body.kinematics import forward_kinematics
+from prior.body.skeleton import REST_OFFSETS, J
 
 PERIOD_NS = 33_333_333
 LEAVES = [J[n] for n in ("left_foot", "right_foot", "head", "left_wrist", "right_wrist")]

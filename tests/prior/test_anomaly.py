@@ -19,7 +19,7 @@ from prior.anomaly import (
 from prior.fault_net import OFF_SCALE, RECENT, ROUGH_SCALE, FaultNet, FaultNetConfig, tell
 from prior.fault_net_live import LiveFaultNet
 from prior.pipeline import PriorPipeline, PriorSettings
-from prior.skeletons import MIRROR, PARENTS, J
+from prior.body.skeleton import MIRROR, PARENTS, J
 from prior.window import Window
 from tests.prior.bodies import stream, waving
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from prior.bones import Bones, BonesSettings, estimate_bones
-from prior.filters import Smoothed
-from prior.pose_solver import solve_pose
-from prior.skeletons import MIRROR, REST_OFFSETS, J
+from prior.timing.fixed_lag import Smoothed
+from prior.body.inverse_kinematics import solve_pose
+from prior.body.skeleton import MIRROR, REST_OFFSETS, J
 from prior.window import Window
 from tests.prior.bodies import waving
 

@@ -18,7 +18,7 @@ from benchmarks.calibration import (
     rays,
 )
 from msgs.types import Pose
-from prior.calibration import (
+from prior.camera.calibration import (
     Board,
     CalibrationError,
     Corners,

@@ -18,7 +18,7 @@ from prior.completion_net import (
     tell,
 )
 from prior.graph import SCALE
-from prior.skeletons import PARENTS, J
+from prior.body.skeleton import PARENTS, J
 from prior.track_windows import Windows
 from prior.train_completion import train_completion
 from tests.prior.test_hgvae import SMALL, awake

@@ -12,8 +12,8 @@ from prior.correction_net import (
     mirror_features,
     trunk_frame,
 )
-from prior.kinematics import yaw_matrix
-from prior.skeletons import MIRROR, J
+from prior.body.kinematics import yaw_matrix
+from prior.body.skeleton import MIRROR, J
 from prior.window import Window
 from tests.prior.bodies import waving
 

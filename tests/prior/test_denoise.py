@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from prior.denoise import MODEL_SIGMA, NOISE_LEFT, Denoise, _place_pelvis
-from prior.filters import Smoothed
+from prior.timing.fixed_lag import Smoothed
 from prior.pipeline import PriorPipeline, PriorSettings
-from prior.skeletons import J
+from prior.body.skeleton import J
 from prior.window import Window
 from tests.prior.bodies import stream, waving
 

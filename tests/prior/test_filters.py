@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from prior.filters import FixedLagRTS, Follower, OneEuroFilter
+from prior.timing.fixed_lag import FixedLagRTS, Follower, OneEuroFilter
 
 DENSITY, INITIAL_SPEED = 3.0, 0.7
 

@@ -3,7 +3,7 @@ from collections import Counter
 import numpy as np
 
 from prior.gate import RECENT, Gate, GateSettings, stuck
-from prior.skeletons import MIRROR, J
+from prior.body.skeleton import MIRROR, J
 from prior.window import Window
 from tests.prior.bodies import waving
 

@@ -15,7 +15,7 @@ from prior.completion_net import CompletionConfig
 from prior.graph import GraphBlock, GraphLinear
 from prior.hgvae import HGVAE, Gaussian, HGVAEConfig, Level, dct_matrix
 from prior.hgvae_live import LiveHGVAE
-from prior.skeletons import J
+from prior.body.skeleton import J
 from prior.train_hgvae import train_hgvae
 from tests.prior.bodies import waving
 from tests.prior.test_hmvae import prepared

@@ -9,18 +9,18 @@ from scipy.spatial.transform import Rotation
 from prior.checkpoint import WEIGHTS, load_weights
 from prior.hmvae import HMVAE, HMVAEConfig, Posterior, from_6d, to_6d
 from prior.hmvae_live import LiveHMVAE
-from prior.kinematics import forward_kinematics
-from prior.motion_windows import (
+from prior.body.kinematics import forward_kinematics
+from prior.motion.dataset import (
     MotionSet,
     mirror_offsets,
     mirror_rotations,
     remove_heading,
     yaw_rotation,
 )
-from prior.pose_solver import solve_rotations
+from prior.body.inverse_kinematics import solve_rotations
 from prior.refine import rotations_of
 from prior.skeleton_conv import SkeletonConv
-from prior.skeletons import REST_OFFSETS
+from prior.body.skeleton import REST_OFFSETS
 from prior.train_hmvae import train_hmvae
 from tests.prior.bodies import waving
 

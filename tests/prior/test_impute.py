@@ -4,7 +4,7 @@ import pytest
 from msgs.types import JointState
 from prior.impute import CARRY_FRAMES, _carried
 from prior.pipeline import PriorPipeline, PriorSettings
-from prior.skeletons import J
+from prior.body.skeleton import J
 from tests.prior.bodies import stream, waving
 
 ARM = [J["left_elbow"], J["left_wrist"]]

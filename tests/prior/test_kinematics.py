@@ -3,14 +3,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from prior.kinematics import (
+from prior.body.kinematics import (
     CONTACT_JOINTS,
     estimate_offsets,
     forward_kinematics,
     label_contacts,
 )
-from prior.pose_solver import solve_pose
-from prior.skeletons import PARENTS, REST_OFFSETS, J
+from prior.body.inverse_kinematics import solve_pose
+from prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from tests.prior.bodies import fk, random_pose
 
 

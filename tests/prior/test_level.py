@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msgs.types import Pose
-from prior.level import GRAVITY, Level, level_pose
+from prior.camera.gravity import GRAVITY, Level, level_pose
 
 SECOND_NS = 1_000_000_000
 

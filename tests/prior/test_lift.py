@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from prior.lift import LEAST_CONFIDENCE, lift
+from prior.camera.depth_lifting import LEAST_CONFIDENCE, lift
 from prior.sim.depth import Stereo, render, room, spoil
-from prior.skeletons import COCO17, PARENTS, REST_OFFSETS
+from prior.body.skeleton import COCO17, PARENTS, REST_OFFSETS
 
 CAMERA = Stereo()
 K = {name: index for index, name in enumerate(COCO17.joints)}

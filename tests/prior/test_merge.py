@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msgs.types import Pose, PoseRaw, RawBody
-from prior.merge import ALONG, PERIOD_NS, SOURCE, Merge, Sighting, merge_joints
+from prior.camera.multi_view import ALONG, PERIOD_NS, SOURCE, Merge, Sighting, merge_joints
 from prior.sim.camera import Camera, film
 from prior.sim.noise import KINECT_NOISE, NoiseModel
 from prior.sim.scripts import SCRIPTS

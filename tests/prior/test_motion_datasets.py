@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from prior.motion.clip import Clip, MotionError
 from prior.motion.datasets import DATA_SETS, REPEATS, Dropped, amc_motions, bvh_motion, members
 from prior.motion.tables import BVH_RIGS, CMU_AMC, REACTIDLE
-from prior.skeletons import JOINTS, J
+from prior.body.skeleton import JOINTS, J
 from tests.prior.test_motion_amc import AMC, ASF
 
 # A body of ReActIdle's family, y up, facing +z, left +x: name, depth, offset, end site.

@@ -11,7 +11,7 @@ import pytest
 from prior.motion.clip import MotionError
 from prior.motion.npz import read_amass, read_expmap
 from prior.motion.tables import CMU_BVH, CMU_METRES
-from prior.skeletons import JOINTS, REST_OFFSETS, J
+from prior.body.skeleton import JOINTS, REST_OFFSETS, J
 from tests.prior.test_motion_bvh import turn
 
 # Enough of CMU's tree to reach every joint that the rig wants: name, parent, offset in metres.

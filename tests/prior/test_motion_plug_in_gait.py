@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from prior.motion import plug_in_gait as pig
 from prior.motion.plug_in_gait import calibrate, joint_centres
-from prior.skeletons import JOINTS, J
+from prior.body.skeleton import JOINTS, J
 
 Array = NDArray[np.float64]
 

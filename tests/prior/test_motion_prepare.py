@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from nodes.prepare import PrepareError, find_sources, prepare
-from prior.kinematics import forward_kinematics
+from prior.body.kinematics import forward_kinematics
 from prior.motion.clip import Clip
 from prior.motion.datasets import Dropped
 from prior.motion.prepare import (
@@ -30,7 +30,7 @@ from prior.motion.prepare import (
     stays_on_floor,
     write_prepared,
 )
-from prior.skeletons import CANONICAL, PARENTS, REST_OFFSETS, J
+from prior.body.skeleton import CANONICAL, PARENTS, REST_OFFSETS, J
 from tests.prior.test_motion_datasets import idle_bvh, pack, unpack
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import pytest
 
 from prior.motion.clip import MotionError
 from prior.motion.ui_prmd import load_pairs
-from prior.skeletons import JOINTS, KINECT22, J
+from prior.body.skeleton import JOINTS, KINECT22, J
 from tests.prior.test_motion_plug_in_gait import BENDS, HIP, STILL, recording
 
 MARKERS = recording(BENDS, STILL, np.zeros(3))

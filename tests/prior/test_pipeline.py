@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from msgs.codec import encode
 from msgs.types import JointState, Pose, PoseClean, PoseRaw
-from prior.kinematics import forward_kinematics
+from prior.body.kinematics import forward_kinematics
 from prior.pipeline import PriorPipeline, PriorSettings, load_loops
-from prior.skeletons import PARENTS, REST_OFFSETS, SKELETONS, J
+from prior.body.skeleton import PARENTS, REST_OFFSETS, SKELETONS, J
 from tests.prior.bodies import PERIOD_NS, raw, stream, waving
 
 

@@ -5,9 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from prior.kinematics import forward_kinematics, heading, yaw_matrix
-from prior.pose_solver import fit_pose, place_joints, solve_pose, solve_rotations, swing
-from prior.skeletons import JOINTS, REST_OFFSETS, J
+from prior.body.kinematics import forward_kinematics, heading, yaw_matrix
+from prior.body.inverse_kinematics import fit_pose, place_joints, solve_pose, solve_rotations, swing
+from prior.body.skeleton import JOINTS, REST_OFFSETS, J
 from tests.prior.bodies import fk, random_pose
 
 UNITS = st.floats(-1, 1, allow_nan=False)

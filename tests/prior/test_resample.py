@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from prior.resample import LOOK_AHEAD_NS, MAX_GAP_NS, PERIOD_NS, Resampler
+from prior.timing.resample import LOOK_AHEAD_NS, MAX_GAP_NS, PERIOD_NS, Resampler
 
 SLOTS = 2
 

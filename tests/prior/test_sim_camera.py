@@ -17,7 +17,7 @@ from prior.sim.motion import Intent, Motion, perform
 from prior.sim.noise import NoiseModel
 from prior.sim.scripts import SCRIPTS
 from prior.sim.sensors import mount
-from prior.skeletons import CANONICAL, REST_OFFSETS, J, get_skeleton, to_canonical
+from prior.body.skeleton import CANONICAL, REST_OFFSETS, J, get_skeleton, to_canonical
 
 SILENT = replace(
     NoiseModel.load(), offset=np.zeros((22, 3)), bias=np.zeros((22, 3)), fast=np.zeros((22, 3)), jump_rate=np.zeros(22)

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from prior.kinematics import CONTACT_JOINTS, label_contacts
+from prior.body.kinematics import CONTACT_JOINTS, label_contacts
 from prior.sim.body import TOE_HEIGHT, random_offsets, stature
 from prior.sim.gait import RATE, Stand, Turn, Walk, plan
 from prior.sim.motion import Intent, Motion, perform, two_bone
 from prior.sim.scripts import SCRIPTS
 from prior.sim.timing import Key, minimum_jerk, track
-from prior.skeletons import MIRROR, PARENTS, REST_OFFSETS, J
+from prior.body.skeleton import MIRROR, PARENTS, REST_OFFSETS, J
 
 SEED = 5
 FEET = list(CONTACT_JOINTS[2:6])

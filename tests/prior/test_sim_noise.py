@@ -25,7 +25,7 @@ from prior.sim.noise import (
     travelled,
 )
 from prior.sim.scripts import SCRIPTS
-from prior.skeletons import MIRROR, J
+from prior.body.skeleton import MIRROR, J
 
 MODEL = NoiseModel.load()
 NO_JUMPS = replace(MODEL, jump_rate=np.zeros(22))

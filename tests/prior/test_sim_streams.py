@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from msgs.recording import RecordingReader
 from msgs.types import JointState, PoseRaw, PoseWorld
 from nodes.cli import main
-from prior.kinematics import label_contacts
-from prior.resample import PERIOD_NS
+from prior.body.kinematics import label_contacts
+from prior.timing.resample import PERIOD_NS
 from prior.sim.noise import KINECT_NOISE
 from prior.sim.streams import ManifestError, make, read_manifest, record
-from prior.skeletons import J
+from prior.body.skeleton import J
 
 SIM_DATA = Path(__file__).parents[2] / "sim_data"
 STREAMS = read_manifest(SIM_DATA / "manifest.json")

@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from prior.skeleton_conv import SkeletonConv, SkeletonPool, SkeletonUnpool, pooling_levels
-from prior.skeletons import PARENTS
+from prior.body.skeleton import PARENTS
 
 SMPL24 = (*PARENTS, 20, 21)  # with hands, as the official code has it
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from prior.skeletons import CANONICAL, JOINTS, MIRROR, PARENTS, REST_OFFSETS, SKELETONS, J, get_skeleton, to_canonical
+from prior.body.skeleton import CANONICAL, JOINTS, MIRROR, PARENTS, REST_OFFSETS, SKELETONS, J, get_skeleton, to_canonical
 
 EXPECTED_COUNTS = {
     "smpl22": 22, "coco17": 17, "blazepose33": 33, "h36m17": 17, "kinect22": 22, "azure_kinect32": 32, "zed38": 38,

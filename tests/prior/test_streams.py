@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from msgs.types import Pose, PoseClean, PoseRaw
 from prior.impute import ImputeSettings
 from prior.pipeline import PriorPipeline, PriorSettings
-from prior.resample import PERIOD_NS, Resampler
+from prior.timing.resample import PERIOD_NS, Resampler
 from prior.streams import PATIENCE_NS, StreamBatch
 from tests.prior.bodies import raw, waving
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from prior.corruption import add_noise, exchanged, hide_joints, occlude, other_builds, sensed, slow_errors, spoil
-from prior.skeletons import MIRROR, PARENTS, J
+from prior.motion.corruption import add_noise, exchanged, hide_joints, occlude, other_builds, sensed, slow_errors, spoil
+from prior.body.skeleton import MIRROR, PARENTS, J
 from prior.train_anomaly import FAULTS
 from tests.prior.bodies import waving
 

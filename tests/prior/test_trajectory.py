@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msgs.types import CONTACTS, JOINTS, JointState, Pose, PoseClean, PoseWorld, Tracking
-from prior.kinematics import yaw_matrix
+from prior.body.kinematics import yaw_matrix
 from prior.sim.scripts import walk_turn
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings
 from prior.trajectory_eval import METHODS, SEEN_FRAMES, Clip, evaluate_fusion, observe

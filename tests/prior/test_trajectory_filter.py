@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from prior.kinematics import yaw_matrix
+from prior.body.kinematics import yaw_matrix
 from prior.trajectory_filter import RootFilter, RootNoise
 
 DT = 1 / 30

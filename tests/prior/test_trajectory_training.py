@@ -10,9 +10,9 @@ import torch
 
 from prior import train_trajectory as training
 from prior.checkpoint import load_weights
-from prior.kinematics import yaw_matrix
-from prior.motion_windows import MotionSet
-from prior.skeletons import PARENTS, REST_OFFSETS
+from prior.body.kinematics import yaw_matrix
+from prior.motion.dataset import MotionSet
+from prior.body.skeleton import PARENTS, REST_OFFSETS
 from prior.trajectory_net import TrajectoryConfig, TrajectoryNet
 
 

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from prior.skeletons import REST_OFFSETS
+from prior.body.skeleton import REST_OFFSETS
 from prior.window import Ring, Window
 
 

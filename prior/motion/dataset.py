@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from prior.checkpoint import LICENCES
-from prior.skeletons import MIRROR
+from prior.body.skeleton import MIRROR
 from prior.window import FPS
 
 

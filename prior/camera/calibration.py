@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from msgs.types import Pose
-from prior.level import level_pose
+from prior.camera.gravity import level_pose
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -1,7 +1,7 @@
 """Kinematics of the canonical skeleton: forward (differentiable), a person's bones, headings and contacts.
 
 Rotations are local (child in parent's frame), the root's is its orientation in the frame of the positions. The
-identity everywhere is a T-pose facing +x, left +y, up +z. From positions to rotations: `prior.pose_solver`.
+identity everywhere is a T-pose facing +x, left +y, up +z. From positions to rotations: `prior.body.inverse_kinematics`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from prior.pose_solver import solve_rotations
-from prior.skeletons import JOINTS, PARENTS, REST_OFFSETS, J, finite_joints
+from prior.body.inverse_kinematics import solve_rotations
+from prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J, finite_joints
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from prior.skeletons import MIRROR, PARENTS, J
+from prior.body.skeleton import MIRROR, PARENTS, J
 from prior.window import FPS
 
 Floats = NDArray[np.float64]

@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from msgs.types import Pose, PoseRaw, RawBody
-from prior.skeletons import CANONICAL, SKELETONS, finite_joints, to_canonical
+from prior.body.skeleton import CANONICAL, SKELETONS, finite_joints, to_canonical
 from prior.window import FPS
 
 Floats = NDArray[np.float64]
