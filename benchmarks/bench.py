@@ -19,7 +19,7 @@ from benchmarks.motion import MotionClips, as_set, digest, prepared_clips, prepa
 from benchmarks.peers import PEERS, Peer
 from benchmarks.results import Table
 from benchmarks.tuning import Tuned, search
-from prior.hmvae import MotionVAE
+from prior.models.hmvae.network import MotionVAE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

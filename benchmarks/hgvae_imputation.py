@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from benchmarks.corruption import LIMBS
-from prior.body_tracks import Tracks, from_tracks, in_frame_of, to_tracks
+from prior.models.hgvae.features import Tracks, from_tracks, in_frame_of, to_tracks
 from prior.encode import Encoded
-from prior.graph import SCALE
-from prior.hgvae import HGVAE
-from prior.hgvae_live import LiveHGVAE
+from prior.models.layers.graph import SCALE
+from prior.models.hgvae.network import HGVAE
+from prior.models.hgvae.inference import LiveHGVAE
 from prior.impute import Climb, ImputeSettings, completed_tracks
-from prior.track_windows import Batch, Windows, standardise
+from prior.models.hgvae.windows import Batch, Windows, standardise
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.graph import JOINT_NODES, SCALE
-from prior.hgvae import HGVAE, HGVAEConfig, Level
+from prior.models.layers.graph import JOINT_NODES, SCALE
+from prior.models.hgvae.network import HGVAE, HGVAEConfig, Level
 from prior.motion.dataset import MotionSet
-from prior.track_windows import Batch, Windows, mean_tracks
-from prior.train_hgvae import CLIP_ENTRY, evidence
-from prior.training import TrainingRun
+from prior.models.hgvae.windows import Batch, Windows, mean_tracks
+from prior.models.hgvae.train import CLIP_ENTRY, evidence
+from prior.models.training import TrainingRun
 
 DEPTHS = (1, 2, 4, 8, 16)
 """Stochastic levels, of the paper's table 1."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.peers import missing
 from msgs.types import Pose, PoseClean, PoseRaw, RawBody
 from prior.anomaly import ScoreSettings
-from prior.checkpoint import WEIGHTS
+from prior.models.weights_io import WEIGHTS
 from prior.correct import CorrectSettings
 from prior.denoise import DenoiseSettings
 from prior.encode import EncodeSettings

@@ -194,7 +194,7 @@ class Manifest:
 
 def _models() -> str:
     """What tells the weights that ship from those of another release."""
-    from prior import checkpoint  # brings torch
+    from prior.models import weights_io as checkpoint  # brings torch
 
     files = sorted(file for file in checkpoint.WEIGHTS.iterdir() if file.suffix in (".safetensors", ".json"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]

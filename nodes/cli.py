@@ -22,7 +22,7 @@ COMMANDS = {
     "info": ("nodes.inspect:info", "what is in a recording, or on a topic"),
     "plot": ("nodes.plot:plot", "what happened in a recording, as pictures"),
     "prepare": ("nodes.prepare:prepare", "motion capture into training data"),
-    "train": ("prior.train:train", "train a model of the prior"),
+    "train": ("prior.models.registry:train", "train a model of the prior"),
     "evaluate": ("nodes.evaluate:evaluate", "measure the prior against its tuned peers, by protocol"),
     "simulate": ("nodes.simulate:simulate", "make streams as a depth camera would see them, with their truth"),
     "calibrate": ("nodes.calibrate:calibrate", "a camera's lens and place in the world, into its launch file"),

@@ -239,7 +239,7 @@ def check_torch() -> Iterator[Finding]:
 
 def check_models() -> Iterator[Finding]:
     """The weights that the nodes load, and what a frame costs with them."""
-    from prior.checkpoint import WEIGHTS, load_weights
+    from prior.models.weights_io import WEIGHTS, load_weights
 
     whole = True
     for model in MODELS:

@@ -17,10 +17,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.checkpoint import load_weights, weights_path
+from prior.models.weights_io import load_weights, weights_path
 from prior.encode import Encoded
-from prior.fault_net import RECENT, FaultNet, FaultNetConfig
-from prior.fault_net_live import LiveFaultNet
+from prior.models.hgvae.faults import RECENT, FaultNet, FaultNetConfig
+from prior.models.hgvae.fault_inference import LiveFaultNet
 from prior.window import FPS, Window
 
 Floats = NDArray[np.float64]

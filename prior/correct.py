@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from prior.checkpoint import load_weights
-from prior.correction_net import HISTORY, CorrectionConfig, CorrectionNet, features, trunk_frame
+from prior.models.weights_io import load_weights
+from prior.models.sensor_bias.network import HISTORY, CorrectionConfig, CorrectionNet, features, trunk_frame
 from prior.timing.fixed_lag import FixedLagRTS
 from prior.body.skeleton import finite_joints
 from prior.window import Ring, Window

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.body_tracks import from_tracks
+from prior.models.hgvae.features import from_tracks
 from prior.timing.fixed_lag import Smoothed
 from prior.body.skeleton import J
 from prior.window import Window

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.body_tracks import Tracks, body_size, to_tracks
-from prior.checkpoint import load_weights
-from prior.hgvae import HGVAE, HGVAEConfig
-from prior.hgvae_live import LiveHGVAE, Look
+from prior.models.hgvae.features import Tracks, body_size, to_tracks
+from prior.models.weights_io import load_weights
+from prior.models.hgvae.network import HGVAE, HGVAEConfig
+from prior.models.hgvae.inference import LiveHGVAE, Look
 from prior.window import Window
 
 LEAST_TRUST = 0.1

@@ -21,9 +21,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.body_tracks import Tracks, from_tracks
+from prior.models.hgvae.features import Tracks, from_tracks
 from prior.encode import Encoded
-from prior.hgvae_live import Look
+from prior.models.hgvae.inference import Look
 from prior.window import Imputed, Window
 
 Floats = NDArray[np.float64]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from msgs.types import CleanBody, JointState, Pose, PoseClean
 from prior.body.kinematics import CONTACT_JOINTS
 from prior.trajectory import TrajectoryPipeline, TrajectorySettings
-from prior.trajectory_net import FRAME_S
+from prior.models.root_velocity.network import FRAME_S
 from prior.trajectory_track import FEET
 
 Floats = NDArray[np.float64]

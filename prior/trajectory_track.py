@@ -16,7 +16,7 @@ from prior.ground import Ground
 from prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
 from prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from prior.trajectory_filter import RootFilter, RootNoise
-from prior.trajectory_net import FRAME_S
+from prior.models.root_velocity.network import FRAME_S
 
 Floats = NDArray[np.float64]
 Sigma = TypeVar("Sigma", float, NDArray[np.float64])

@@ -30,17 +30,17 @@ from benchmarks.results import Table
 from msgs.types import JOINTS
 from prior.anomaly import RATES as QUANTILES
 from prior.anomaly import Calibration, load_fault_net
-from prior.body_tracks import to_tracks
-from prior.checkpoint import WEIGHTS, load_weights
+from prior.models.hgvae.features import to_tracks
+from prior.models.weights_io import WEIGHTS, load_weights
 from prior.motion.corruption import sensed
-from prior.fault_net import FaultNet
-from prior.graph import SCALE
-from prior.hgvae import HGVAE, HGVAEConfig
+from prior.models.hgvae.faults import FaultNet
+from prior.models.layers.graph import SCALE
+from prior.models.hgvae.network import HGVAE, HGVAEConfig
 from prior.motion.dataset import MotionSet
 from prior.body.skeleton import PARENTS
-from prior.track_windows import Batch, Windows, standardise
-from prior.train_anomaly import score_windows
-from prior.train_hgvae import evidence
+from prior.models.hgvae.windows import Batch, Windows, standardise
+from prior.models.hgvae.train_faults import score_windows
+from prior.models.hgvae.train import evidence
 
 Floats = NDArray[np.float64]
 

@@ -22,8 +22,8 @@ from benchmarks.bench import Bench, Result
 from benchmarks.ours import weight_sets
 from benchmarks.results import Table
 from benchmarks.scores import figures, score
-from prior.checkpoint import load_weights
-from prior.hmvae import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
+from prior.models.weights_io import load_weights
+from prior.models.hmvae.network import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
 from prior.body.kinematics import forward_kinematics
 from prior.motion.dataset import remove_heading
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.checkpoint import LICENCES
+from prior.models.weights_io import LICENCES
 from prior.body.skeleton import MIRROR
 from prior.window import FPS
 

@@ -18,8 +18,8 @@ from benchmarks.protocols.spoiled import against_best, calibration_table, reliab
 from benchmarks.protocols.streaming import recovery
 from benchmarks.scores import figures as figures_of
 from benchmarks.scores import pivot, score
-from prior.checkpoint import load_weights
-from prior.hmvae import HMVAE, HMVAEConfig
+from prior.models.weights_io import load_weights
+from prior.models.hmvae.network import HMVAE, HMVAEConfig
 from prior.body.skeleton import J
 
 

@@ -5,11 +5,11 @@ import torch
 from benchmarks import hgvae_imputation as imputation
 from benchmarks import hgvae_models as models
 from benchmarks.hgvae_faults import BEGINS, FAULTS, LEAST_MOTION
-from prior.body_tracks import in_frame_of, to_tracks
-from prior.hgvae import HGVAE
+from prior.models.hgvae.features import in_frame_of, to_tracks
+from prior.models.hgvae.network import HGVAE
 from prior.motion.dataset import MotionSet
 from prior.body.skeleton import MIRROR, REST_OFFSETS, J
-from prior.track_windows import Windows, mean_tracks, standardise
+from prior.models.hgvae.windows import Windows, mean_tracks, standardise
 from tests.prior.bodies import waving
 
 

@@ -3,9 +3,9 @@ import torch
 
 from benchmarks.motion import as_set, simulated_clips
 from benchmarks.window_vaes import CONFIGS, MVAE, TCNVAE, trained
-from prior.hmvae import HMVAE
+from prior.models.hmvae.network import HMVAE
 from prior.body.kinematics import forward_kinematics
-from prior.skeleton_conv import SkeletonConv
+from prior.models.layers.skeleton_conv import SkeletonConv
 
 
 def in_use(model: torch.nn.Module) -> int:

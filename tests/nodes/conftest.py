@@ -25,9 +25,9 @@ from msgs.types import Pose, PoseRaw, RawBody
 from nodes.launch import Launch
 from nodes.ros2_bridge import PACKAGES
 from nodes.runtime import Node
-from prior.checkpoint import save_weights
-from prior.hmvae import HMVAE, HMVAEConfig
-from prior.trajectory_net import TrajectoryConfig, TrajectoryNet
+from prior.models.weights_io import save_weights
+from prior.models.hmvae.network import HMVAE, HMVAEConfig
+from prior.models.root_velocity.network import TrajectoryConfig, TrajectoryNet
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -141,7 +141,7 @@ def test_a_path_too_long_for_sockets(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 
 def test_missing_weights_are_missing_and_nothing_is_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from prior import checkpoint
+    from prior.models import weights_io as checkpoint
 
     monkeypatch.setattr(checkpoint, "WEIGHTS", tmp_path / "weights")
     findings = module._examine(module.check_models)
@@ -150,7 +150,7 @@ def test_missing_weights_are_missing_and_nothing_is_timed(monkeypatch: pytest.Mo
 
 
 def test_damaged_weights_are_not_taken_for_whole(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from prior import checkpoint
+    from prior.models import weights_io as checkpoint
 
     for model in module.MODELS:
         (tmp_path / f"{model}-default.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0garbage!")

@@ -16,8 +16,8 @@ from prior.anomaly import (
     judged,
     load_fault_net,
 )  # fmt: skip
-from prior.fault_net import OFF_SCALE, RECENT, ROUGH_SCALE, FaultNet, FaultNetConfig, tell
-from prior.fault_net_live import LiveFaultNet
+from prior.models.hgvae.faults import OFF_SCALE, RECENT, ROUGH_SCALE, FaultNet, FaultNetConfig, tell
+from prior.models.hgvae.fault_inference import LiveFaultNet
 from prior.pipeline import PriorPipeline, PriorSettings
 from prior.body.skeleton import MIRROR, PARENTS, J
 from prior.window import Window

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from prior.completion_net import (
+from prior.models.hgvae.completion import (
     FIRST_LOG_VAR,
     GROWTH,
     LAG,
@@ -17,10 +17,10 @@ from prior.completion_net import (
     certainty,
     tell,
 )
-from prior.graph import SCALE
+from prior.models.layers.graph import SCALE
 from prior.body.skeleton import PARENTS, J
-from prior.track_windows import Windows
-from prior.train_completion import train_completion
+from prior.models.hgvae.windows import Windows
+from prior.models.hgvae.train_completion import train_completion
 from tests.prior.test_hgvae import SMALL, awake
 
 WRIST = J["left_wrist"]

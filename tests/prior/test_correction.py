@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from prior.correct import Correct, CorrectSettings, recall
-from prior.correction_net import (
+from prior.models.sensor_bias.network import (
     FEATURES,
     HISTORY,
     CorrectionConfig,

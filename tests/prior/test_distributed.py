@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from prior.distributed import share
-from prior.training import TrainingRun
+from prior.models.distributed import share
+from prior.models.training import TrainingRun
 
 STEPS, BATCH, RATE, SEED = 6, 8, 0.1, 3
 
@@ -101,6 +101,6 @@ def test_alone_nothing_changes(tmp_path: Path):
 
 
 def test_a_batch_that_cannot_be_shared_out_is_refused(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("prior.distributed.processes", lambda: 3)
+    monkeypatch.setattr("prior.models.distributed.processes", lambda: 3)
     with pytest.raises(ValueError, match="multiple of the 3 processes"):
         share(64)

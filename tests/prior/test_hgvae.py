@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from prior.anomaly import load_fault_net
-from prior.body_tracks import from_tracks, hang_unseen, in_frame_of, to_tracks
-from prior.checkpoint import WEIGHTS, load_weights
-from prior.completion_net import CompletionConfig
-from prior.graph import GraphBlock, GraphLinear
-from prior.hgvae import HGVAE, Gaussian, HGVAEConfig, Level, dct_matrix
-from prior.hgvae_live import LiveHGVAE
+from prior.models.hgvae.features import from_tracks, hang_unseen, in_frame_of, to_tracks
+from prior.models.weights_io import WEIGHTS, load_weights
+from prior.models.hgvae.completion import CompletionConfig
+from prior.models.layers.graph import GraphBlock, GraphLinear
+from prior.models.hgvae.network import HGVAE, Gaussian, HGVAEConfig, Level, dct_matrix
+from prior.models.hgvae.inference import LiveHGVAE
 from prior.body.skeleton import J
-from prior.train_hgvae import train_hgvae
+from prior.models.hgvae.train import train_hgvae
 from tests.prior.bodies import waving
 from tests.prior.test_hmvae import prepared
 
@@ -204,10 +204,10 @@ def test_the_gradient_of_the_live_score_is_that_of_its_differences() -> None:
 
 
 def test_training_writes_weights_their_card_and_their_scale(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("prior.checkpoint.WEIGHTS", tmp_path / "weights")
+    monkeypatch.setattr("prior.models.weights_io.WEIGHTS", tmp_path / "weights")
     config = replace(SMALL, frames=20)
-    monkeypatch.setattr("prior.train_hgvae.MODELS", {"hgvae": config})
-    monkeypatch.setattr("prior.train_anomaly.WINDOWS", 16)
+    monkeypatch.setattr("prior.models.hgvae.train.MODELS", {"hgvae": config})
+    monkeypatch.setattr("prior.models.hgvae.train_faults.WINDOWS", 16)
     path = train_hgvae(prepared(tmp_path / "m.npz"), tmp_path / "runs", iterations=2, batch=4)
     state, stored = load_weights(str(path), "hgvae")
     HGVAE(HGVAEConfig.from_dict(stored)).load_state_dict(state)

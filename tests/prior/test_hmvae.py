@@ -6,9 +6,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from prior.checkpoint import WEIGHTS, load_weights
-from prior.hmvae import HMVAE, HMVAEConfig, Posterior, from_6d, to_6d
-from prior.hmvae_live import LiveHMVAE
+from prior.models.weights_io import WEIGHTS, load_weights
+from prior.models.hmvae.network import HMVAE, HMVAEConfig, Posterior, from_6d, to_6d
+from prior.models.hmvae.inference import LiveHMVAE
 from prior.body.kinematics import forward_kinematics
 from prior.motion.dataset import (
     MotionSet,
@@ -19,9 +19,9 @@ from prior.motion.dataset import (
 )
 from prior.body.inverse_kinematics import solve_rotations
 from prior.refine import rotations_of
-from prior.skeleton_conv import SkeletonConv
+from prior.models.layers.skeleton_conv import SkeletonConv
 from prior.body.skeleton import REST_OFFSETS
-from prior.train_hmvae import train_hmvae
+from prior.models.hmvae.train import train_hmvae
 from tests.prior.bodies import waving
 
 
@@ -146,7 +146,7 @@ def test_a_missing_split_and_a_missing_file_are_said(tmp_path: Path) -> None:
 
 
 def test_training_resumes_where_it_was_killed_and_ends_the_same(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("prior.checkpoint.WEIGHTS", tmp_path / "weights")
+    monkeypatch.setattr("prior.models.weights_io.WEIGHTS", tmp_path / "weights")
     data = prepared(tmp_path / "m.npz")
     whole = train_hmvae(data, tmp_path / "a", iterations=6, batch=4).read_bytes()
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch import nn
 
-from prior.skeleton_conv import SkeletonConv, SkeletonPool, SkeletonUnpool, pooling_levels
+from prior.models.layers.skeleton_conv import SkeletonConv, SkeletonPool, SkeletonUnpool, pooling_levels
 from prior.body.skeleton import PARENTS
 
 SMPL24 = (*PARENTS, 20, 21)  # with hands, as the official code has it

@@ -3,7 +3,7 @@ import pytest
 
 from prior.motion.corruption import add_noise, exchanged, hide_joints, occlude, other_builds, sensed, slow_errors, spoil
 from prior.body.skeleton import MIRROR, PARENTS, J
-from prior.train_anomaly import FAULTS
+from prior.models.hgvae.train_faults import FAULTS
 from tests.prior.bodies import waving
 
 WINDOWS = np.stack([waving(50, speed=1.0 + 0.05 * k) for k in range(40)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from prior.trajectory_net import NewestFrame, RootMotion, TrajectoryConfig, TrajectoryNet
+from prior.models.root_velocity.network import NewestFrame, RootMotion, TrajectoryConfig, TrajectoryNet
 
 
 @pytest.fixture

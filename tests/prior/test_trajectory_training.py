@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from prior import train_trajectory as training
-from prior.checkpoint import load_weights
+from prior.models.root_velocity import train as training
+from prior.models.weights_io import load_weights
 from prior.body.kinematics import yaw_matrix
 from prior.motion.dataset import MotionSet
 from prior.body.skeleton import PARENTS, REST_OFFSETS
-from prior.trajectory_net import TrajectoryConfig, TrajectoryNet
+from prior.models.root_velocity.network import TrajectoryConfig, TrajectoryNet
 
 
 def rest_pose() -> np.ndarray:
@@ -107,7 +107,7 @@ def test_calibration_finds_the_size_of_the_errors(prepared: Path, monkeypatch: p
 
 
 def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("prior.checkpoint.WEIGHTS", tmp_path / "weights")
+    monkeypatch.setattr("prior.models.weights_io.WEIGHTS", tmp_path / "weights")
     state, config = load_weights(str(training.train_trajectory(prepared, tmp_path / "a", iterations=4, batch=4)), "")
     TrajectoryNet(TrajectoryConfig.from_dict(config)).load_state_dict(state)
     assert (tmp_path / "weights/trajectory-default.md").read_text().startswith("# trajectory-default")

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor, nn
 
 from prior.correct import DENSITY, recall
-from prior.correction_net import HISTORY, CorrectionConfig, CorrectionNet, features, mirror_features, trunk_frame
-from prior.distributed import share
+from prior.models.sensor_bias.network import HISTORY, CorrectionConfig, CorrectionNet, features, mirror_features, trunk_frame
+from prior.models.distributed import share
 from prior.timing.fixed_lag import FixedLagRTS
 from prior.body.kinematics import rigid_alignment
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
 from prior.motion.dataset import mirror_offsets
 from prior.body.skeleton import KINECT22, finite_joints, to_canonical
-from prior.training import TrainingRun
+from prior.models.training import TrainingRun
 
 HIDE = 0.1
 """Share of training frames with joints hidden, so that the network can do without some."""
@@ -74,7 +74,7 @@ def train_correction(
         schedule.step()
         losses.append(1000 * loss.item())
     return run.ship(f"correction-{weights}", net, asdict(config), {
-        "Model": "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses (prior/correction_net.py)",
+        "Model": "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses (prior/models/sensor_bias/network.py)",
         "Data": f"UI-PRMD, Kinect beside Vicon: {', '.join(TRAIN_SUBJECTS)}",
         "Licence": "Apache-2.0; the data is in the public domain (PDDL 1.0)",
         "Training": f"`steadypose train correction --data ui_prmd.npz`: {iterations} steps of {batch}, seed {seed}",

@@ -2,7 +2,7 @@
 
 Half of each batch is the paper's: clean windows, every entry observed, latents drawn, KL warmed up. The other half
 teaches the encoder what a camera does: entries are hidden, and guessed by the completion network, which is trained
-first (`prior.train_completion`); the rest is noisy or plainly wrong; and the likelihood of the true window, at the
+first (`prior.models.hgvae.train_completion`); the rest is noisy or plainly wrong; and the likelihood of the true window, at the
 means of the latents, is all that counts. One pass then completes a window and says how sure it is; what was seen where
 the model would not have put it is an anomaly.
 """
@@ -18,17 +18,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.checkpoint import LICENCES, started, weights_path
-from prior.completion_net import CompletionConfig
+from prior.models.weights_io import LICENCES, started, weights_path
+from prior.models.hgvae.completion import CompletionConfig
 from prior.motion.corruption import add_noise, occlude, other_builds, slow_errors, spoil
-from prior.distributed import share
-from prior.graph import JOINT_NODES, SCALE
-from prior.hgvae import HGVAE, HGVAEConfig, Level, Pass
+from prior.models.distributed import share
+from prior.models.layers.graph import JOINT_NODES, SCALE
+from prior.models.hgvae.network import HGVAE, HGVAEConfig, Level, Pass
 from prior.motion.dataset import MotionSet
-from prior.track_windows import STRIDES, Batch, Windows, mean_tracks
-from prior.train_anomaly import train_anomaly
-from prior.train_completion import BATCH, BONES, SPOILT_BY, TURNED, train_completion
-from prior.training import TrainingRun
+from prior.models.hgvae.windows import STRIDES, Batch, Windows, mean_tracks
+from prior.models.hgvae.train_faults import train_anomaly
+from prior.models.hgvae.train_completion import BATCH, BONES, SPOILT_BY, TURNED, train_completion
+from prior.models.training import TrainingRun
 
 Floats = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ def train_hgvae(
     train_completion(network, train, val, runs / f"{name}-completion", iterations, seed)
     run = fit(network, train, val, runs / name, iterations, batch, rate, seed)
     path = run.ship(name, network, asdict(network.config), {
-        "Model": f"HG-VAE, '{model}' of prior/train_hgvae.py",
+        "Model": f"HG-VAE, '{model}' of prior/models/hgvae/train.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject",
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train {model} --weights {weights}`: {iterations} steps of {batch} windows, "
@@ -142,7 +142,7 @@ def fit(
         drawn = model(both.x, both.believed, spread=(torch.arange(batch) < half).float()[:, None])
         density = drawn.tracks.log_density(both.target) * both.counts
         stated = (0.5 * drawn.tracks.log_var[half:]).exp().detach()
-        density[half:] = density[half:] * (stated / stated.mean())  # as in `prior.train_completion`, and for its reason
+        density[half:] = density[half:] * (stated / stated.mean())  # as in `prior.models.hgvae.train_completion`, and for its reason
         likelihood = density.flatten(1).sum(dim=1)
         kl = drawn.kl[:half].sum() / batch
         beta = min(KL_START + (1 - KL_START) * step / (WARM_UP * iterations), 1.0)

@@ -8,9 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.completion_net import FIRST_LOG_VAR, GROWTH, LAG, STILL, SURE, CompletionNet, tell
-from prior.graph import LOG_VAR_RANGE, SCALE
-from prior.graph_program import Network, Program
+from prior.models.hgvae.completion import FIRST_LOG_VAR, GROWTH, LAG, STILL, SURE, CompletionNet, tell
+from prior.models.layers.graph import LOG_VAR_RANGE, SCALE
+from prior.models.layers.compiled_graph import Network, Program
 from prior.body.skeleton import PARENTS
 
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from prior.skeleton_conv import EdgeLinear, SkeletonConv, SkeletonPool, SkeletonUnpool, pooling_levels
+from prior.models.layers.skeleton_conv import EdgeLinear, SkeletonConv, SkeletonPool, SkeletonUnpool, pooling_levels
 from prior.body.skeleton import PARENTS
 
 ROTATION_FEATURES = 6

@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from prior.anomaly import MISSING, RATES, SENSOR_SIGMAS, Calibration, judged
-from prior.body_tracks import to_tracks
-from prior.checkpoint import LICENCES, load_weights, started
+from prior.models.hgvae.features import to_tracks
+from prior.models.weights_io import LICENCES, load_weights, started
 from prior.motion.corruption import (
     FAST,
     elsewhere,
@@ -35,14 +35,14 @@ from prior.motion.corruption import (
     spoil,
     stands_still,
 )
-from prior.distributed import share
-from prior.fault_net import RECENT, FaultNet, FaultNetConfig, tell
+from prior.models.distributed import share
+from prior.models.hgvae.faults import RECENT, FaultNet, FaultNetConfig, tell
 from prior.gate import LEAST_NOISE, stuck
-from prior.graph import SCALE
-from prior.hgvae import HGVAE, HGVAEConfig
+from prior.models.layers.graph import SCALE
+from prior.models.hgvae.network import HGVAE, HGVAEConfig
 from prior.motion.dataset import MotionSet
-from prior.track_windows import STRIDES, Windows, standardise
-from prior.training import TrainingRun
+from prior.models.hgvae.windows import STRIDES, Windows, standardise
+from prior.models.training import TrainingRun
 
 Floats = NDArray[np.float64]
 
@@ -89,8 +89,8 @@ def train_anomaly(
     origin = started(network, "hgvae", start)
     run = fit(network, model, train, val, runs / f"{path.stem}-faults", iterations, seed)
     run.ship(f"{path.stem}.faults", network, asdict(network.config), {
-        "Model": f"fault network beside {path.name}, prior/fault_net.py",
-        "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, spoilt by prior/train_anomaly.py",
+        "Model": f"fault network beside {path.name}, prior/models/hgvae/faults.py",
+        "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, spoilt by prior/models/hgvae/train_faults.py",
         "Licence": LICENCES[weights],
         "Training": f"with the HG-VAE, by `steadypose train`: {iterations} steps of {BATCH} windows, seed {seed}"
         f"{origin}",

@@ -11,12 +11,12 @@ import roma
 import torch
 from torch import Tensor
 
-from prior.checkpoint import LICENCES, started
-from prior.distributed import share
-from prior.hmvae import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
+from prior.models.weights_io import LICENCES, started
+from prior.models.distributed import share
+from prior.models.hmvae.network import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
 from prior.body.kinematics import forward_kinematics
 from prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations, remove_heading
-from prior.training import TrainingRun
+from prior.models.training import TrainingRun
 
 JOINT_WEIGHT = 10.0
 """lambda of equation 5."""
@@ -73,7 +73,7 @@ def train_hmvae(
     origin = started(model, "hmvae", start)
     run = fit(model, train, val, runs / f"hmvae-{weights}", iterations, batch, learning_rate, STRIDES, seed)
     return run.ship(f"hmvae-{weights}", model, asdict(config), {
-        "Model": "HM-VAE, window 8, 22 joints (prior/hmvae.py)",
+        "Model": "HM-VAE, window 8, 22 joints (prior/models/hmvae/network.py)",
         "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train hmvae --weights {weights} --iterations {iterations}`: "

@@ -14,13 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.completion_net import CompletionNet
+from prior.models.hgvae.completion import CompletionNet
 from prior.motion.corruption import add_noise, elsewhere, exchanged, occlude, other_builds, slow_errors, spoil, stands_still
-from prior.distributed import share
-from prior.graph import SCALE
-from prior.hgvae import HGVAE
-from prior.track_windows import STRIDES, Batch, Windows
-from prior.training import TrainingRun
+from prior.models.distributed import share
+from prior.models.layers.graph import SCALE
+from prior.models.hgvae.network import HGVAE
+from prior.models.hgvae.windows import STRIDES, Batch, Windows
+from prior.models.training import TrainingRun
 
 Floats = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from prior.body.kinematics import CONTACT_JOINTS
-from prior.skeleton_conv import Level, SkeletonConv, SkeletonPool, pooling_levels
+from prior.models.layers.skeleton_conv import Level, SkeletonConv, SkeletonPool, pooling_levels
 from prior.body.skeleton import PARENTS
 
 FRAME_S = 1.0 / 30.0

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.body_tracks import body_size, hang_unseen, in_frame_of, to_tracks
-from prior.graph import SCALE
-from prior.hgvae import HGVAE
+from prior.models.hgvae.features import body_size, hang_unseen, in_frame_of, to_tracks
+from prior.models.layers.graph import SCALE
+from prior.models.hgvae.network import HGVAE
 from prior.motion.dataset import MotionSet, mirror_offsets
 
 Floats = NDArray[np.float64]

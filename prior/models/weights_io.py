@@ -14,7 +14,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from prior.distributed import writes
+from prior.models.distributed import writes
 
 WEIGHTS = Path(__file__).parent / "weights"
 """Where the weights lie: ``MODEL-SET.safetensors``, each with ``MODEL-SET.md``, its card."""

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from prior.body_tracks import hang_unseen
-from prior.completion_live import LiveCompletion
-from prior.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE
-from prior.graph_program import Floats, Network, Program
-from prior.hgvae import HGVAE, TRACK_LOG_VAR
+from prior.models.hgvae.features import hang_unseen
+from prior.models.hgvae.completion_inference import LiveCompletion
+from prior.models.layers.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE
+from prior.models.layers.compiled_graph import Floats, Network, Program
+from prior.models.hgvae.network import HGVAE, TRACK_LOG_VAR
 
 
 class Look(NamedTuple):
@@ -98,7 +98,7 @@ class LiveHGVAE:
         """Encode and decode windows. The model stands at them until it looks again; a window's row is its place here.
 
         Args:
-            x: (B, 66, T) metres of a standard body; see `prior.body_tracks`. NaN for a joint never seen.
+            x: (B, 66, T) metres of a standard body; see `prior.models.hgvae.features`. NaN for a joint never seen.
             observed: (B, 66, T) how far to believe each entry: 0 where there was none, at most 1.
         """
         rows = slice(0, len(x))

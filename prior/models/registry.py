@@ -8,7 +8,7 @@ from typing import Literal
 
 import torch
 
-from prior.distributed import join, neighbours, writes
+from prior.models.distributed import join, neighbours, writes
 
 
 def train(
@@ -46,15 +46,15 @@ def train(
     join()
     torch.set_num_threads(max(threads // neighbours(), 1))
     if model == "hmvae":
-        from prior.train_hmvae import train_hmvae as train_model
+        from prior.models.hmvae.train import train_hmvae as train_model
     elif model == "hgvae":
-        from prior.train_hgvae import train_hgvae as train_model
+        from prior.models.hgvae.train import train_hgvae as train_model
     elif model == "hgvae-wide":
-        from prior.train_hgvae import train_hgvae_wide as train_model
+        from prior.models.hgvae.train import train_hgvae_wide as train_model
     elif model == "trajectory":
-        from prior.train_trajectory import train_trajectory as train_model
+        from prior.models.root_velocity.train import train_trajectory as train_model
     else:
-        from prior.train_correction import train_correction as train_model
+        from prior.models.sensor_bias.train import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")
     if iterations is not None:
         train_model = partial(train_model, iterations=iterations)
