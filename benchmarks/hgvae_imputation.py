@@ -18,11 +18,11 @@ from torch import Tensor, nn
 
 from benchmarks.corruption import LIMBS
 from prior.models.hgvae.features import Tracks, from_tracks, in_frame_of, to_tracks
-from prior.encode import Encoded
+from prior.clean.reconstruct import Encoded
 from prior.models.layers.graph import SCALE
 from prior.models.hgvae.network import HGVAE
 from prior.models.hgvae.inference import LiveHGVAE
-from prior.impute import Climb, ImputeSettings, completed_tracks
+from prior.clean.impute import Climb, ImputeSettings, completed_tracks
 from prior.models.hgvae.windows import Batch, Windows, standardise
 
 Floats = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Whether people keep their ids when they cross and hide each other: what `prior.identify` makes of unnumbered bodies.
+"""Whether people keep their ids when they cross and hide each other: what `prior.clean.identify` makes of unnumbered bodies.
 
 Streams are made from seeds by the project's simulator; their tracker knows who is who, so each sighting's person is
 known. The methods get the bodies of each frame in random order and without ids.
@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.machine import ROOT
 from benchmarks.results import RESULTS, Table, save, show
 from msgs.types import PoseRaw, PoseWorld
-from prior.identify import Identify, IdentifySettings
+from prior.clean.identify import Identify, IdentifySettings
 from prior.sim.streams import Stream, make, read_manifest
 from prior.body.skeleton import get_skeleton, to_canonical
 

@@ -20,7 +20,7 @@ from benchmarks.kalman import fixed_lag
 from benchmarks.metrics import body_frame
 from prior.body.kinematics import rigid_alignment
 from prior.body.skeleton import KINECT22, J, to_canonical
-from prior.window import FPS
+from prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

@@ -34,8 +34,8 @@ from msgs.topics import POSE_RAW, POSE_WORLD
 from msgs.types import Diagnostics, PoseRaw, RawBody
 from nodes.runtime import FRAME_NS, Timeline
 from nodes.threads import one_thread
-from prior.pipeline import PriorPipeline, PriorSettings
-from prior.trajectory import TrajectoryPipeline, TrajectorySettings
+from prior.clean.pipeline import PriorPipeline, PriorSettings
+from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 CROWDS = (1, 4, 8)
 LIVE_CROWDS = (1, 4, 8)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from prior.motion.dataset import MotionSet
 from prior.sim.motion import Motion
 from prior.sim.scripts import SCRIPTS
-from prior.window import FPS
+from prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

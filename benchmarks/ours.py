@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from benchmarks.peers import missing
 from msgs.types import Pose, PoseClean, PoseRaw, RawBody
-from prior.anomaly import ScoreSettings
+from prior.clean.score import ScoreSettings
 from prior.models.weights_io import WEIGHTS
-from prior.correct import CorrectSettings
-from prior.denoise import DenoiseSettings
-from prior.encode import EncodeSettings
-from prior.fuse import FuseSettings
-from prior.impute import ImputeSettings
-from prior.pipeline import PriorPipeline, PriorSettings
-from prior.refine import RefineSettings
+from prior.clean.correct import CorrectSettings
+from prior.clean.denoise import DenoiseSettings
+from prior.clean.reconstruct import EncodeSettings
+from prior.clean.fuse import FuseSettings
+from prior.clean.impute import ImputeSettings
+from prior.clean.pipeline import PriorPipeline, PriorSettings
+from prior.clean.refine import RefineSettings
 
 Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from benchmarks.kalman import fixed_lag
 from prior.timing.fixed_lag import OneEuroFilter
-from prior.window import FPS
+from prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

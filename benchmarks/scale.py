@@ -29,9 +29,9 @@ from msgs.types import PoseRaw
 from nodes.cleaning import clean_recording
 from nodes.runtime import FRAME_NS
 from nodes.threads import one_thread
-from prior.pipeline import PriorSettings
-from prior.streams import StreamBatch
-from prior.trajectory import TrajectoryPipeline, TrajectorySettings
+from prior.clean.pipeline import PriorSettings
+from prior.clean.batch import StreamBatch
+from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 KIOSKS = (1, 4, 8, 16)
 NETWORK_NS = 3_000_000

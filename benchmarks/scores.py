@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.metrics import acceleration_error, bootstrap, length_variation, position_error, procrustes
 from benchmarks.results import Table
 from prior.body.skeleton import JOINTS, PARENTS
-from prior.window import FPS
+from prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

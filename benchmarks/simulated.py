@@ -31,9 +31,9 @@ from nodes.pose_input import RecordingSource
 from nodes.threads import one_thread
 from prior.timing.fixed_lag import FixedLagRTS
 from prior.body.kinematics import rigid_alignment
-from prior.pipeline import PriorPipeline, PriorSettings
+from prior.clean.pipeline import PriorPipeline, PriorSettings
 from prior.body.skeleton import PARENTS, SKELETONS, J, to_canonical
-from prior.trajectory import TrajectoryPipeline, TrajectorySettings
+from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 Floats = NDArray[np.float64]
 

@@ -261,7 +261,7 @@ def _self_test() -> Finding:
     import numpy as np
 
     from nodes.threads import one_thread
-    from prior.pipeline import PriorPipeline, PriorSettings
+    from prior.clean.pipeline import PriorPipeline, PriorSettings
 
     one_thread()
     pipeline = PriorPipeline(PriorSettings())

@@ -2,8 +2,8 @@
 
 A launch file is TOML, one section a subject, and read strictly: a key that does not exist is an error that names
 the nearest one that does. Every section may be left out; the defaults play nothing but run. ``[prior]`` and
-``[trajectory]`` are passed on as they are to the stages they configure (`prior.pipeline.PriorSettings`,
-`prior.trajectory.TrajectorySettings`), which check them just as strictly, so that reading a launch file needs no torch.
+``[trajectory]`` are passed on as they are to the stages they configure (`prior.clean.pipeline.PriorSettings`,
+`prior.world.pipeline.TrajectorySettings`), which check them just as strictly, so that reading a launch file needs no torch.
 """
 
 from __future__ import annotations

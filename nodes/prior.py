@@ -10,8 +10,8 @@ from msgs.types import Message, PoseRaw
 from nodes.launch import Launch, LaunchError
 from nodes.runtime import FRAME_NS, Clock, Node
 from nodes.threads import one_thread
-from prior.pipeline import PriorPipeline, PriorSettings, load_loops
-from prior.streams import StreamBatch
+from prior.clean.pipeline import PriorPipeline, PriorSettings, load_loops
+from prior.clean.batch import StreamBatch
 
 GATED = ("joints_refused", "limbs_exchanged", "joints_stuck")
 """counts of what the gate found in the sensor's joints: its daily work, and no fault of a message"""

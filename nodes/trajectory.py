@@ -10,7 +10,7 @@ from msgs.types import Message, PoseClean
 from nodes.launch import Launch, LaunchError
 from nodes.runtime import FRAME_NS, Clock, Node
 from nodes.threads import one_thread
-from prior.trajectory import TrajectoryPipeline, TrajectorySettings
+from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 
 def make_trajectory(settings: Mapping[str, Any]) -> TrajectoryPipeline:

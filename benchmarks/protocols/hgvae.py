@@ -28,8 +28,8 @@ from benchmarks.machine import ROOT
 from benchmarks.motion import as_set, digest
 from benchmarks.results import Table
 from msgs.types import JOINTS
-from prior.anomaly import RATES as QUANTILES
-from prior.anomaly import Calibration, load_fault_net
+from prior.clean.score import RATES as QUANTILES
+from prior.clean.score import Calibration, load_fault_net
 from prior.models.hgvae.features import to_tracks
 from prior.models.weights_io import WEIGHTS, load_weights
 from prior.motion.corruption import sensed

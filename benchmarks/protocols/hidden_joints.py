@@ -18,7 +18,7 @@ from benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
 from benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
 from benchmarks.results import Table
 from benchmarks.scores import pivot
-from prior.window import FPS
+from prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

@@ -39,9 +39,9 @@ from benchmarks.results import Table
 from benchmarks.tuning import Tuned, loss, search
 from prior.body.kinematics import rigid_alignment
 from prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
-from prior.pipeline import PriorSettings
+from prior.clean.pipeline import PriorSettings
 from prior.body.skeleton import JOINTS, KINECT22, MIRROR, J, to_canonical
-from prior.window import FPS
+from prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from benchmarks.motion import MotionClips
 from benchmarks.peers import OFFLINE, PEERS, Peer, missing, raw
 from benchmarks.results import Table
 from benchmarks.scores import figures, score
-from prior.window import FPS
+from prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

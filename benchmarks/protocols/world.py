@@ -3,7 +3,7 @@
 Two questions. Seen through noise that lasts (2 cm), the floor known, where is the body, and do its feet skate? Each
 foot counts for itself: a measure that asks for both to be still at once (RoHM's) forgives any walk. And when the
 trunk is hidden for two seconds at a time, how far has the root gone astray, by 10 m of path
-(`prior.trajectory_eval`)?
+(`benchmarks.root_drift`)?
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from benchmarks.peers import FILTERS, OFFLINE, Peer, missing
 from benchmarks.results import Table
 from benchmarks.scores import figures, interval, score
 from prior.body.kinematics import CONTACT_JOINTS
-from prior.pipeline import PriorPipeline
+from prior.clean.pipeline import PriorPipeline
 from prior.body.skeleton import JOINTS
-from prior.trajectory import TrajectoryPipeline, TrajectorySettings
-from prior.trajectory_eval import METHODS, Clip, evaluate_fusion
+from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from benchmarks.root_drift import METHODS, Clip, evaluate_fusion
 
 Floats = NDArray[np.float64]
 

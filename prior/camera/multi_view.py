@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from msgs.types import Pose, PoseRaw, RawBody
 from prior.body.skeleton import CANONICAL, SKELETONS, finite_joints, to_canonical
-from prior.window import FPS
+from prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from prior.models.weights_io import LICENCES
 from prior.body.skeleton import MIRROR
-from prior.window import FPS
+from prior.clean.frame import FPS
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from prior.anomaly import (
+from prior.clean.score import (
     MISSING,
     RATES,
     SENSOR_SIGMAS,
@@ -18,9 +18,9 @@ from prior.anomaly import (
 )  # fmt: skip
 from prior.models.hgvae.faults import OFF_SCALE, RECENT, ROUGH_SCALE, FaultNet, FaultNetConfig, tell
 from prior.models.hgvae.fault_inference import LiveFaultNet
-from prior.pipeline import PriorPipeline, PriorSettings
+from prior.clean.pipeline import PriorPipeline, PriorSettings
 from prior.body.skeleton import MIRROR, PARENTS, J
-from prior.window import Window
+from prior.clean.frame import Window
 from tests.prior.bodies import stream, waving
 
 HEIGHTS = np.linspace(0.0, 7.0, len(RATES))

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from prior.bones import Bones, BonesSettings, estimate_bones
+from prior.clean.person import Bones, BonesSettings, estimate_bones
 from prior.timing.fixed_lag import Smoothed
 from prior.body.inverse_kinematics import solve_pose
 from prior.body.skeleton import MIRROR, REST_OFFSETS, J
-from prior.window import Window
+from prior.clean.frame import Window
 from tests.prior.bodies import waving
 
 BIAS, NOISE = 0.02, 0.01

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from prior.correct import Correct, CorrectSettings, recall
+from prior.clean.correct import Correct, CorrectSettings, recall
 from prior.models.sensor_bias.network import (
     FEATURES,
     HISTORY,
@@ -14,7 +14,7 @@ from prior.models.sensor_bias.network import (
 )
 from prior.body.kinematics import yaw_matrix
 from prior.body.skeleton import MIRROR, J
-from prior.window import Window
+from prior.clean.frame import Window
 from tests.prior.bodies import waving
 
 CAMERA = np.array([-3.0, 0.5, 1.2])

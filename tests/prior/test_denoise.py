@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from prior.denoise import MODEL_SIGMA, NOISE_LEFT, Denoise, _place_pelvis
+from prior.clean.denoise import MODEL_SIGMA, NOISE_LEFT, Denoise, _place_pelvis
 from prior.timing.fixed_lag import Smoothed
-from prior.pipeline import PriorPipeline, PriorSettings
+from prior.clean.pipeline import PriorPipeline, PriorSettings
 from prior.body.skeleton import J
-from prior.window import Window
+from prior.clean.frame import Window
 from tests.prior.bodies import stream, waving
 
 

@@ -2,9 +2,9 @@ from collections import Counter
 
 import numpy as np
 
-from prior.gate import RECENT, Gate, GateSettings, stuck
+from prior.clean.gate import RECENT, Gate, GateSettings, stuck
 from prior.body.skeleton import MIRROR, J
-from prior.window import Window
+from prior.clean.frame import Window
 from tests.prior.bodies import waving
 
 WRIST, KNEE = J["left_wrist"], J["right_knee"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from prior.ground import GUESS_SIGMA, PATIENCE_S, Ground
+from prior.world.ground import GUESS_SIGMA, PATIENCE_S, Ground
 
 DT = 1 / 30
 

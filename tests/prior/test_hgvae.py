@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from prior.anomaly import load_fault_net
+from prior.clean.score import load_fault_net
 from prior.models.hgvae.features import from_tracks, hang_unseen, in_frame_of, to_tracks
 from prior.models.weights_io import WEIGHTS, load_weights
 from prior.models.hgvae.completion import CompletionConfig

@@ -18,7 +18,7 @@ from prior.motion.dataset import (
     yaw_rotation,
 )
 from prior.body.inverse_kinematics import solve_rotations
-from prior.refine import rotations_of
+from prior.clean.refine import rotations_of
 from prior.models.layers.skeleton_conv import SkeletonConv
 from prior.body.skeleton import REST_OFFSETS
 from prior.models.hmvae.train import train_hmvae

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from benchmarks.identity import MANIFEST, all_hidden, identified, nearest, score, source, watch
-from prior.identify import Identify, IdentifySettings
-from prior.pipeline import PriorPipeline, PriorSettings
+from prior.clean.identify import Identify, IdentifySettings
+from prior.clean.pipeline import PriorPipeline, PriorSettings
 from prior.sim.streams import read_manifest
 from tests.prior.bodies import PERIOD_NS, raw, waving
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from msgs.types import JointState
-from prior.impute import CARRY_FRAMES, _carried
-from prior.pipeline import PriorPipeline, PriorSettings
+from prior.clean.impute import CARRY_FRAMES, _carried
+from prior.clean.pipeline import PriorPipeline, PriorSettings
 from prior.body.skeleton import J
 from tests.prior.bodies import stream, waving
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from msgs.codec import encode
 from msgs.types import JointState, Pose, PoseClean, PoseRaw
 from prior.body.kinematics import forward_kinematics
-from prior.pipeline import PriorPipeline, PriorSettings, load_loops
+from prior.clean.pipeline import PriorPipeline, PriorSettings, load_loops
 from prior.body.skeleton import PARENTS, REST_OFFSETS, SKELETONS, J
 from tests.prior.bodies import PERIOD_NS, raw, stream, waving
 

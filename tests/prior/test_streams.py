@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msgs.types import Pose, PoseClean, PoseRaw
-from prior.impute import ImputeSettings
-from prior.pipeline import PriorPipeline, PriorSettings
+from prior.clean.impute import ImputeSettings
+from prior.clean.pipeline import PriorPipeline, PriorSettings
 from prior.timing.resample import PERIOD_NS, Resampler
-from prior.streams import PATIENCE_NS, StreamBatch
+from prior.clean.batch import PATIENCE_NS, StreamBatch
 from tests.prior.bodies import raw, waving
 
 NOW_NS = 100_000 * PERIOD_NS

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from msgs.types import CONTACTS, JOINTS, JointState, Pose, PoseClean, PoseWorld, Tracking
 from prior.body.kinematics import yaw_matrix
 from prior.sim.scripts import walk_turn
-from prior.trajectory import TrajectoryPipeline, TrajectorySettings
-from prior.trajectory_eval import METHODS, SEEN_FRAMES, Clip, evaluate_fusion, observe
+from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from benchmarks.root_drift import METHODS, SEEN_FRAMES, Clip, evaluate_fusion, observe
 
 FRAME_NS = 33_333_333
 

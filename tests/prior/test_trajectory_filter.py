@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from prior.body.kinematics import yaw_matrix
-from prior.trajectory_filter import RootFilter, RootNoise
+from prior.world.root_filter import RootFilter, RootNoise
 
 DT = 1 / 30
 

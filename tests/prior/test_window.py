@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from prior.body.skeleton import REST_OFFSETS
-from prior.window import Ring, Window
+from prior.clean.frame import Ring, Window
 
 
 @given(st.integers(1, 9), st.lists(st.floats(-9, 9), max_size=40))

@@ -15,7 +15,7 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
-from prior.anomaly import MISSING, RATES, SENSOR_SIGMAS, Calibration, judged
+from prior.clean.score import MISSING, RATES, SENSOR_SIGMAS, Calibration, judged
 from prior.models.hgvae.features import to_tracks
 from prior.models.weights_io import LICENCES, load_weights, started
 from prior.motion.corruption import (
@@ -37,7 +37,7 @@ from prior.motion.corruption import (
 )
 from prior.models.distributed import share
 from prior.models.hgvae.faults import RECENT, FaultNet, FaultNetConfig, tell
-from prior.gate import LEAST_NOISE, stuck
+from prior.clean.gate import LEAST_NOISE, stuck
 from prior.models.layers.graph import SCALE
 from prior.models.hgvae.network import HGVAE, HGVAEConfig
 from prior.motion.dataset import MotionSet

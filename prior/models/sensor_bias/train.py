@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from prior.correct import DENSITY, recall
+from prior.clean.correct import DENSITY, recall
 from prior.models.sensor_bias.network import HISTORY, CorrectionConfig, CorrectionNet, features, mirror_features, trunk_frame
 from prior.models.distributed import share
 from prior.timing.fixed_lag import FixedLagRTS

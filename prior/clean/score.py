@@ -18,10 +18,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from prior.models.weights_io import load_weights, weights_path
-from prior.encode import Encoded
+from prior.clean.reconstruct import Encoded
 from prior.models.hgvae.faults import RECENT, FaultNet, FaultNetConfig
 from prior.models.hgvae.fault_inference import LiveFaultNet
-from prior.window import FPS, Window
+from prior.clean.frame import FPS, Window
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prior.body.inverse_kinematics import solve_rotations
-from prior.window import Window
+from prior.clean.frame import Window
 
 
 class Solve:

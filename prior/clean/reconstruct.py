@@ -12,7 +12,7 @@ from prior.models.hgvae.features import Tracks, body_size, to_tracks
 from prior.models.weights_io import load_weights
 from prior.models.hgvae.network import HGVAE, HGVAEConfig
 from prior.models.hgvae.inference import LiveHGVAE, Look
-from prior.window import Window
+from prior.clean.frame import Window
 
 LEAST_TRUST = 0.1
 """in a joint that passed the gate"""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from prior.body.kinematics import global_rotations
 from prior.body.inverse_kinematics import solve_rotations
 from prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, finite_joints
-from prior.window import Window
+from prior.clean.frame import Window
 
 Floats = NDArray[np.float64]
 

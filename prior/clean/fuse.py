@@ -14,7 +14,7 @@ from msgs.types import JointState
 from prior.timing.fixed_lag import Smoothed
 from prior.body.inverse_kinematics import fit_pose, place_joints, solve_pose
 from prior.body.skeleton import JOINTS, PARENTS
-from prior.window import FPS, Estimate, Ring, Window
+from prior.clean.frame import FPS, Estimate, Ring, Window
 
 Floats = NDArray[np.float64]
 

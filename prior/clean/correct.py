@@ -12,7 +12,7 @@ from prior.models.weights_io import load_weights
 from prior.models.sensor_bias.network import HISTORY, CorrectionConfig, CorrectionNet, features, trunk_frame
 from prior.timing.fixed_lag import FixedLagRTS
 from prior.body.skeleton import finite_joints
-from prior.window import Ring, Window
+from prior.clean.frame import Ring, Window
 
 DENSITY = 1.0
 """m²/s³, of the causal smoother before the network: its answer must not jitter with its input."""

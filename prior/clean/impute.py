@@ -22,9 +22,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from prior.models.hgvae.features import Tracks, from_tracks
-from prior.encode import Encoded
+from prior.clean.reconstruct import Encoded
 from prior.models.hgvae.inference import Look
-from prior.window import Imputed, Window
+from prior.clean.frame import Imputed, Window
 
 Floats = NDArray[np.float64]
 

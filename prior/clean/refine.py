@@ -13,7 +13,7 @@ from prior.models.weights_io import load_weights
 from prior.models.hmvae.network import HMVAE, HMVAEConfig
 from prior.models.hmvae.inference import LiveHMVAE
 from prior.body.kinematics import heading, yaw_matrix
-from prior.window import Window
+from prior.clean.frame import Window
 
 
 @dataclass(frozen=True)

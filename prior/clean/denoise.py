@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from prior.models.hgvae.features import from_tracks
 from prior.timing.fixed_lag import Smoothed
 from prior.body.skeleton import J
-from prior.window import Window
+from prior.clean.frame import Window
 
 Floats = NDArray[np.float64]
 

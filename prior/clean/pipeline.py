@@ -18,23 +18,23 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs.types import CleanBody, Pose, PoseClean, PoseRaw, RawBody
-from prior.anomaly import Score, ScoreSettings
-from prior.bones import Bones, BonesSettings
-from prior.correct import Correct, CorrectSettings
-from prior.denoise import Denoise, DenoiseSettings
-from prior.encode import Encode, EncodeSettings
-from prior.fuse import Fuse, FuseSettings
-from prior.gate import Gate, GateSettings
-from prior.identify import Identify, IdentifySettings
-from prior.impute import Impute, ImputeSettings
+from prior.clean.score import Score, ScoreSettings
+from prior.clean.person import Bones, BonesSettings
+from prior.clean.correct import Correct, CorrectSettings
+from prior.clean.denoise import Denoise, DenoiseSettings
+from prior.clean.reconstruct import Encode, EncodeSettings
+from prior.clean.fuse import Fuse, FuseSettings
+from prior.clean.gate import Gate, GateSettings
+from prior.clean.identify import Identify, IdentifySettings
+from prior.clean.impute import Impute, ImputeSettings
 from prior.body.inverse_kinematics import place_joints
-from prior.refine import Refine, RefineSettings
+from prior.clean.refine import Refine, RefineSettings
 from prior.timing.resample import Resampler
 from prior.settings import build_settings
 from prior.body.skeleton import CANONICAL, REST_OFFSETS, SKELETONS, J, Skeleton, finite_joints, to_canonical
-from prior.smooth import Smooth, SmoothSettings
-from prior.solve import Solve
-from prior.window import FPS, Estimate, Stage, Window
+from prior.clean.smooth import Smooth, SmoothSettings
+from prior.clean.solve import Solve
+from prior.clean.frame import FPS, Estimate, Stage, Window
 
 MAX_DISTANCE = 30.0
 """Metres from the sensor beyond which a joint is no sighting."""

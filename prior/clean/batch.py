@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs.types import CleanBody, Pose, PoseClean, PoseRaw
-from prior.identify import Identify
-from prior.pipeline import BACKWARDS_NS, PriorPipeline, PriorSettings
+from prior.clean.identify import Identify
+from prior.clean.pipeline import BACKWARDS_NS, PriorPipeline, PriorSettings
 from prior.timing.resample import PERIOD_NS, Resampler
 
 PATIENCE_NS = 2 * PERIOD_NS

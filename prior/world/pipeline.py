@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from msgs.types import CleanBody, PoseClean, PoseWorld, WorldBody
 from prior.models.weights_io import load_weights
-from prior.ground import Ground
+from prior.world.ground import Ground
 from prior.body.kinematics import yaw_matrix
 from prior.settings import build_settings
-from prior.trajectory_filter import RootNoise
+from prior.world.root_filter import RootNoise
 from prior.models.root_velocity.network import NewestFrame, TrajectoryConfig, TrajectoryNet
-from prior.trajectory_track import BodyTrack, Motion, Sighting, rotation, sightings
+from prior.world.body_track import BodyTrack, Motion, Sighting, rotation, sightings
 
 Floats = NDArray[np.float64]
 

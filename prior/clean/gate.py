@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from prior.timing.fixed_lag import FixedLagRTS, Smoothed
 from prior.body.skeleton import MIRROR, PARENTS, J
-from prior.window import FPS, Window
+from prior.clean.frame import FPS, Window
 
 RECENT = 15
 """Frames in which a joint that repeats itself must do so mostly."""

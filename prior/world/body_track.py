@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs.types import CleanBody, JointState, Tracking, WorldBody
-from prior.ground import Ground
+from prior.world.ground import Ground
 from prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
 from prior.body.skeleton import PARENTS, REST_OFFSETS, J
-from prior.trajectory_filter import RootFilter, RootNoise
+from prior.world.root_filter import RootFilter, RootNoise
 from prior.models.root_velocity.network import FRAME_S
 
 Floats = NDArray[np.float64]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prior.timing.fixed_lag import FixedLagRTS, Follower, Smoothed
-from prior.window import FPS, Window
+from prior.clean.frame import FPS, Window
 
 
 @dataclass(frozen=True)

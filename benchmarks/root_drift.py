@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from msgs.types import CleanBody, JointState, Pose, PoseClean
 from prior.body.kinematics import CONTACT_JOINTS
-from prior.trajectory import TrajectoryPipeline, TrajectorySettings
+from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 from prior.models.root_velocity.network import FRAME_S
-from prior.trajectory_track import FEET
+from prior.world.body_track import FEET
 
 Floats = NDArray[np.float64]
 
