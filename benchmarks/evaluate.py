@@ -12,7 +12,7 @@ from rich.progress import Progress
 from benchmarks.bench import Bench, Result
 from benchmarks.protocols import PROTOCOLS
 from benchmarks.results import RESULTS, save, show
-from nodes.threads import one_thread
+from nodes.graph.threads import one_thread
 
 
 def evaluate(protocol: str, *, quick: bool, mocap: Path | None, data: Path, out: Path | None) -> None:

@@ -32,8 +32,8 @@ from benchmarks.running import START_S, running
 from msgs.recording import RecordingReader, RecordingWriter
 from msgs.topics import POSE_RAW, POSE_WORLD
 from msgs.types import Diagnostics, PoseRaw, RawBody
-from nodes.runtime import FRAME_NS, Timeline
-from nodes.threads import one_thread
+from nodes.graph.runtime import FRAME_NS, Timeline
+from nodes.graph.threads import one_thread
 from prior.clean.pipeline import PriorPipeline, PriorSettings
 from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 

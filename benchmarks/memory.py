@@ -16,7 +16,7 @@ from benchmarks.machine import ROOT
 from benchmarks.results import RESULTS, Table, save, show
 from benchmarks.running import running
 from msgs.types import Diagnostics
-from nodes.launch import POSE_NODES
+from nodes.graph.launch import POSE_NODES
 
 
 @dataclass(frozen=True)

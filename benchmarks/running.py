@@ -13,9 +13,9 @@ from rich.console import Console
 from msgs.topics import DIAGNOSTICS, POSE_WORLD
 from msgs.transport import Subscriber
 from msgs.types import Message
-from nodes.launch import POSE_NODES, Launch
-from nodes.runtime import SystemClock
-from nodes.supervisor import Supervisor
+from nodes.graph.launch import POSE_NODES, Launch
+from nodes.graph.runtime import SystemClock
+from nodes.graph.supervisor import Supervisor
 
 START_S = 60.0
 """what the nodes get to come up"""

@@ -26,9 +26,9 @@ from benchmarks.results import RESULTS, Table, save, show
 from msgs.recording import RecordingReader
 from msgs.topics import POSE_RAW
 from msgs.types import PoseRaw
-from nodes.cleaning import clean_recording
-from nodes.runtime import FRAME_NS
-from nodes.threads import one_thread
+from nodes.commands.cleaning import clean_recording
+from nodes.graph.runtime import FRAME_NS
+from nodes.graph.threads import one_thread
 from prior.clean.pipeline import PriorSettings
 from prior.clean.batch import StreamBatch
 from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings

@@ -25,10 +25,10 @@ from benchmarks.machine import ROOT
 from benchmarks.metrics import acceleration_error, contact_speed, length_variation, position_error
 from benchmarks.results import RESULTS, Table, save, show
 from msgs.types import CONTACTS, Message, Pose, PoseClean, PoseRaw, PoseWorld
-from nodes.cleaning import stream
-from nodes.npz import NpzCollector
-from nodes.pose_input import RecordingSource
-from nodes.threads import one_thread
+from nodes.commands.cleaning import stream
+from nodes.sources.npz import NpzCollector
+from nodes.sources.pose_input import RecordingSource
+from nodes.graph.threads import one_thread
 from prior.timing.fixed_lag import FixedLagRTS
 from prior.body.kinematics import rigid_alignment
 from prior.clean.pipeline import PriorPipeline, PriorSettings

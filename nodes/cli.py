@@ -14,20 +14,20 @@ from importlib.metadata import version
 
 #: name: (where, what it does)
 COMMANDS = {
-    "run": ("nodes.run:run", "start the nodes of a launch file, watch them, show how they do"),
-    "node": ("nodes.node:node", "one node, for another machine or a supervisor such as systemd"),
-    "clean": ("nodes.clean:clean", "clean a recording or .npz offline, with the nodes' own code"),
-    "echo": ("nodes.inspect:echo", "print the messages of a topic or recording"),
-    "hz": ("nodes.inspect:hz", "measure the rate of a topic or recording"),
-    "info": ("nodes.inspect:info", "what is in a recording, or on a topic"),
-    "plot": ("nodes.plot:plot", "what happened in a recording, as pictures"),
-    "prepare": ("nodes.prepare:prepare", "motion capture into training data"),
+    "run": ("nodes.commands.run:run", "start the nodes of a launch file, watch them, show how they do"),
+    "node": ("nodes.commands.node:node", "one node, for another machine or a supervisor such as systemd"),
+    "clean": ("nodes.commands.clean:clean", "clean a recording or .npz offline, with the nodes' own code"),
+    "echo": ("nodes.commands.inspect:echo", "print the messages of a topic or recording"),
+    "hz": ("nodes.commands.inspect:hz", "measure the rate of a topic or recording"),
+    "info": ("nodes.commands.inspect:info", "what is in a recording, or on a topic"),
+    "plot": ("nodes.commands.plot:plot", "what happened in a recording, as pictures"),
+    "prepare": ("nodes.commands.prepare:prepare", "motion capture into training data"),
     "train": ("prior.models.registry:train", "train a model of the prior"),
-    "evaluate": ("nodes.evaluate:evaluate", "measure the prior against its tuned peers, by protocol"),
-    "simulate": ("nodes.simulate:simulate", "make streams as a depth camera would see them, with their truth"),
-    "calibrate": ("nodes.calibrate:calibrate", "a camera's lens and place in the world, into its launch file"),
-    "doctor": ("nodes.doctor:doctor", "what is missing on this machine, and how to get it"),
-    "keys": ("nodes.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),
+    "evaluate": ("nodes.commands.evaluate:evaluate", "measure the prior against its tuned peers, by protocol"),
+    "simulate": ("nodes.commands.simulate:simulate", "make streams as a depth camera would see them, with their truth"),
+    "calibrate": ("nodes.commands.calibrate:calibrate", "a camera's lens and place in the world, into its launch file"),
+    "doctor": ("nodes.commands.doctor:doctor", "what is missing on this machine, and how to get it"),
+    "keys": ("nodes.commands.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),
 }
 
 USAGE_ERROR = 2

@@ -22,9 +22,9 @@ from synthetic_poses import walker
 from msgs.recording import RecordingWriter
 from msgs.topics import POSE_RAW
 from msgs.types import Pose, PoseRaw, RawBody
-from nodes.launch import Launch
-from nodes.ros2_bridge import PACKAGES
-from nodes.runtime import Node
+from nodes.graph.launch import Launch
+from nodes.sinks.ros2.bridge import PACKAGES
+from nodes.graph.runtime import Node
 from prior.models.weights_io import save_weights
 from prior.models.hmvae.network import HMVAE, HMVAEConfig
 from prior.models.root_velocity.network import TrajectoryConfig, TrajectoryNet

@@ -17,9 +17,9 @@ os.environ.setdefault("DEPTHAI_LEVEL", "error")
 
 import depthai as dai
 
-from nodes.launch import OakSettings
-from nodes.oak import Host
-from nodes.runtime import Clock
+from nodes.graph.launch import OakSettings
+from nodes.sources.oak import Host
+from nodes.graph.runtime import Clock
 from prior.sim.depth import Stereo, render, room
 from prior.body.skeleton import COCO17, REST_OFFSETS
 
@@ -180,7 +180,7 @@ def plugged(
 
 
 def opener(make: Callable[[Clock], list[tuple[str, dai.Buffer]]]):
-    """A stand-in for `nodes.oak.connect`."""
+    """A stand-in for `nodes.sources.oak.connect`."""
 
     @contextmanager
     def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:

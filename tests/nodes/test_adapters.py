@@ -13,7 +13,7 @@ from synthetic_poses import sensor_joints, walker
 from msgs.codec import decode, encode
 from msgs.topics import POSE_RAW
 from msgs.types import PoseRaw
-from nodes.adapters import from_azure_kinect, from_coco, from_mediapipe, from_zed, pinhole
+from nodes.sources.adapters import from_azure_kinect, from_coco, from_mediapipe, from_zed, pinhole
 from prior.body.skeleton import AZURE_KINECT32, BLAZEPOSE33, COCO17, JOINTS, SKELETONS, ZED38, Skeleton, to_canonical
 
 STAMP_NS = 1_700_000_000_123_456_789

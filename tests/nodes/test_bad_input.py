@@ -15,11 +15,11 @@ from conftest import raw, record, running, until, walking
 from msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
 from msgs.transport import Publisher, Subscriber
 from msgs.types import Diagnostics, Pose, PoseClean, PoseRaw, PoseWorld, RawBody
-from nodes.clean import clean
-from nodes.cleaning import stream
-from nodes.launch import Launch
-from nodes.prior import PriorNode, make_prior
-from nodes.trajectory import TrajectoryNode, make_trajectory
+from nodes.commands.clean import clean
+from nodes.commands.cleaning import stream
+from nodes.graph.launch import Launch
+from nodes.graph.prior_node import PriorNode, make_prior
+from nodes.graph.trajectory_node import TrajectoryNode, make_trajectory
 
 BEFORE, AFTER = 10, 12
 SECOND_NS = 1_000_000_000

@@ -16,11 +16,11 @@ from conftest import record, walk
 from rich.console import Console
 
 from msgs.types import JOINTS
-from nodes import batch
-from nodes.batch import Job, _Worker, find_recordings, is_folder_of_recordings, on_cores, plan, work
-from nodes.clean import clean
-from nodes.cleaning import clean_recording
-from nodes.launch import LaunchError
+from nodes.commands import batch
+from nodes.commands.batch import Job, _Worker, find_recordings, is_folder_of_recordings, on_cores, plan, work
+from nodes.commands.clean import clean
+from nodes.commands.cleaning import clean_recording
+from nodes.graph.launch import LaunchError
 
 FRAMES = 15
 
@@ -159,7 +159,7 @@ def test_an_output_is_whole_or_not_there(tmp_path: Path, settings, monkeypatch: 
     def fail(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("nodes.cleaning.RecordingWriter.write", fail)
+    monkeypatch.setattr("nodes.commands.cleaning.RecordingWriter.write", fail)
     with pytest.raises(OSError, match="no space"):
         clean_recording(source, tmp_path / "out", settings, replace=True)
     with pytest.raises(LaunchError, match="expected a new directory"):

@@ -12,10 +12,10 @@ from conftest import VirtualClock, raw, walking
 
 from benchmarks.calibration import BOARD, depth_points, error, held_poses, look_at, picture, rays
 from msgs.types import Pose, PoseRaw
-from nodes.calibrate import draw_floor
+from nodes.commands.calibrate import draw_floor
 from nodes.cli import main
-from nodes.launch import Launch, LaunchError, checkout
-from nodes.pose_input import PoseInputNode, RecordingSource
+from nodes.graph.launch import Launch, LaunchError, checkout
+from nodes.sources.pose_input import PoseInputNode, RecordingSource
 from prior.camera.calibration import Intrinsics, find_corners
 
 LENS = Intrinsics((640, 360), (520.0, 518.0), (322.0, 177.0), (0.03, -0.05, 0.0, 0.0, 0.0))

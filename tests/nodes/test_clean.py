@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from msgs.recording import RecordingReader
 from msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from msgs.types import CleanBody, JointState, Pose, PoseClean, PoseWorld, Tracking, WorldBody
-from nodes.clean import clean
-from nodes.launch import LaunchError
-from nodes.npz import PERIOD_NS, NpzCollector, NpzError
+from nodes.commands.clean import clean
+from nodes.graph.launch import LaunchError
+from nodes.sources.npz import PERIOD_NS, NpzCollector, NpzError
 
 FRAMES = 40
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from nodes.cli import COMMANDS, USAGE_ERROR, main
-from nodes.launch import LISTENS
-from nodes.node import CLASSES
+from nodes.graph.launch import LISTENS
+from nodes.commands.node import CLASSES
 
 
 def python(code: str) -> str:
@@ -81,7 +81,7 @@ def test_a_bad_npz_is_said_in_a_line(capsys, tmp_path: Path) -> None:
 
 
 def test_a_bug_keeps_its_traceback(monkeypatch) -> None:
-    monkeypatch.setattr("nodes.keys.create_keys", lambda _: 1 / 0)
+    monkeypatch.setattr("nodes.commands.keys.create_keys", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(["keys", "somewhere"])
 

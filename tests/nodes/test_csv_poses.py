@@ -9,8 +9,8 @@ import pytest
 from conftest import walk
 
 from msgs.types import PoseRaw
-from nodes.csv_poses import CsvError, CsvSource
-from nodes.pose_input import open_source
+from nodes.sources.csv import CsvError, CsvSource
+from nodes.sources.pose_input import open_source
 from prior.body.skeleton import JOINTS
 
 HEADER = "stamp," + ",".join(f"{joint}_{axis}" for joint in JOINTS for axis in "xyz")

@@ -12,8 +12,8 @@ from types import SimpleNamespace as Made
 
 import pytest
 
-from nodes import doctor as module
-from nodes.doctor import INSTALL, Finding, Verdict, doctor
+from nodes.commands import doctor as module
+from nodes.commands.doctor import INSTALL, Finding, Verdict, doctor
 
 
 def verdicts(check) -> dict[str, Verdict]:
@@ -169,7 +169,7 @@ def test_the_prior_is_timed_on_a_body_that_stands(monkeypatch: pytest.MonkeyPatc
 
 
 def test_missing_streams_say_what_to_play_instead(monkeypatch: pytest.MonkeyPatch) -> None:
-    from nodes import pose_input
+    from nodes.sources import pose_input
 
     def gone(path: Path) -> None:
         raise pose_input.LaunchError(f"{path} does not exist")

@@ -7,7 +7,7 @@ from benchmarks import window_vaes
 from benchmarks.bench import Bench, Result
 from benchmarks.evaluate import evaluate as run
 from benchmarks.protocols import PROTOCOLS
-from nodes.evaluate import evaluate
+from nodes.commands.evaluate import evaluate
 
 
 def test_the_command_knows_every_protocol_and_asks_for_what_it_needs() -> None:

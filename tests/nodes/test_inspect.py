@@ -16,8 +16,8 @@ from msgs.recording import RecordingWriter
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from msgs.transport import Publisher
 from msgs.types import CleanBody, Diagnostics, Level, PoseClean, PoseRaw
-from nodes import inspect
-from nodes.inspect import InspectError, Rate, echo, hz, info, measure
+from nodes.commands import inspect
+from nodes.commands.inspect import InspectError, Rate, echo, hz, info, measure
 
 DEADLINE_S = 20.0
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.launch import Launch, LaunchError, checkout, find
+from nodes.graph.launch import Launch, LaunchError, checkout, find
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from conftest import VirtualClock, raw, walking
 
 from msgs.types import PoseRaw
-from nodes.live import CameraSource
+from nodes.sources.camera import CameraSource
 
 
 class Flickering:

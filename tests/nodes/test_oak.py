@@ -19,15 +19,15 @@ from scipy.spatial.transform import Rotation
 from msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
 from msgs.transport import Subscriber
 from msgs.types import JOINTS, Diagnostics, PoseRaw, PoseWorld
-from nodes import oak
-from nodes.launch import Launch, LaunchError, OakSettings
-from nodes.live import PAUSES_S
-from nodes.oak import FRAME_ID, QUEUE, SILENT_S, Host, OakSource
-from nodes.pose_input import PoseInputNode, open_input
-from nodes.prior import PriorNode
-from nodes.run import _check
-from nodes.runtime import Clock, SystemClock
-from nodes.trajectory import TrajectoryNode
+from nodes.sources import oak
+from nodes.graph.launch import Launch, LaunchError, OakSettings
+from nodes.sources.camera import PAUSES_S
+from nodes.sources.oak import FRAME_ID, QUEUE, SILENT_S, Host, OakSource
+from nodes.sources.pose_input import PoseInputNode, open_input
+from nodes.graph.prior_node import PriorNode
+from nodes.commands.run import _check
+from nodes.graph.runtime import Clock, SystemClock
+from nodes.graph.trajectory_node import TrajectoryNode
 from prior.body.skeleton import COCO17
 
 MakeLaunch = Callable[..., Launch]

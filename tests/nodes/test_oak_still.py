@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from fake_oak import CAMERA, Player, depth_frame, moment, readings
 
-from nodes import oak_still
-from nodes.calibrate import CalibrateOak, calibrate
-from nodes.launch import Launch, OakSettings
-from nodes.live import CameraError
-from nodes.oak_still import Still, take
+from nodes.sources import oak_still
+from nodes.commands.calibrate import CalibrateOak, calibrate
+from nodes.graph.launch import Launch, OakSettings
+from nodes.sources.camera import CameraError
+from nodes.sources.oak_still import Still, take
 from prior.camera.calibration import CalibrationError
 
 UP = np.array([0.0, -np.cos(0.2), np.sin(0.2)])

@@ -13,8 +13,8 @@ from synthetic_poses import messages
 from msgs.recording import RecordingWriter
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw
-from nodes import plot as module
-from nodes.plot import PlotError, plot
+from nodes.commands import plot as module
+from nodes.commands.plot import PlotError, plot
 from prior.body.skeleton import J
 
 PICTURE = b"\x89PNG"

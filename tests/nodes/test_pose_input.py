@@ -15,9 +15,9 @@ from conftest import START_NS, VirtualClock, raw, record, walk, walking
 from msgs.recording import RecordingError, RecordingWriter
 from msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_TRUTH
 from msgs.types import Message, PoseRaw, PoseWorld
-from nodes.launch import Launch, LaunchError
-from nodes.npz import NpzError, NpzSource
-from nodes.pose_input import LEAP_NS, PoseInputNode, RecordingSource, open_source
+from nodes.graph.launch import Launch, LaunchError
+from nodes.sources.npz import NpzError, NpzSource
+from nodes.sources.pose_input import LEAP_NS, PoseInputNode, RecordingSource, open_source
 
 MakeLaunch = Callable[..., Launch]
 SECOND_NS = 1_000_000_000

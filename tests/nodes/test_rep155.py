@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from synthetic_poses import messages
 
 from msgs.types import PoseWorld, Tracking, WorldBody
-from nodes.rep155 import JOINTS, LINKS, body_name, frames, joint_angles, measures, urdf
+from nodes.sinks.ros2.rep155 import JOINTS, LINKS, body_name, frames, joint_angles, measures, urdf
 from prior.body.skeleton import PARENTS, REST_OFFSETS, J
 
 

@@ -13,12 +13,12 @@ from msgs.codec import encode
 from msgs.recording import RecordingReader
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from msgs.types import Diagnostics
-from nodes.clean import clean
-from nodes.launch import Launch
-from nodes.pose_input import PoseInputNode
-from nodes.prior import PriorNode
-from nodes.recorder import RecorderNode
-from nodes.trajectory import TrajectoryNode
+from nodes.commands.clean import clean
+from nodes.graph.launch import Launch
+from nodes.sources.pose_input import PoseInputNode
+from nodes.graph.prior_node import PriorNode
+from nodes.sinks.recorder import RecorderNode
+from nodes.graph.trajectory_node import TrajectoryNode
 
 FRAMES = 60
 NODES = '["pose_input", "prior", "trajectory", "recorder"]'

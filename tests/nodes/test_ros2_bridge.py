@@ -17,9 +17,9 @@ from synthetic_poses import messages
 from msgs.topics import DIAGNOSTICS, POSE_WORLD
 from msgs.transport import Publisher
 from msgs.types import Diagnostics, Level, PoseWorld, Tracking
-from nodes.launch import Launch, LaunchError
-from nodes.rep155 import JOINTS, LINKS, frames
-from nodes.ros2_bridge import Ros2BridgeNode, require_ros2
+from nodes.graph.launch import Launch, LaunchError
+from nodes.sinks.ros2.rep155 import JOINTS, LINKS, frames
+from nodes.sinks.ros2.bridge import Ros2BridgeNode, require_ros2
 
 LISTENER = """
 import json, sys
@@ -151,7 +151,7 @@ def _pose(transform: dict[str, dict[str, float]]) -> np.ndarray:
 
 @pytest.mark.usefixtures("ros")
 def test_bodies_that_cannot_be_shown_are_left_out(worlds: list[PoseWorld]) -> None:
-    from nodes.ros2_output import RosOutput
+    from nodes.sinks.ros2.output import RosOutput
 
     message = worlds[0]
     with RosOutput() as output:
@@ -167,6 +167,6 @@ def test_bodies_that_cannot_be_shown_are_left_out(worlds: list[PoseWorld]) -> No
 
 
 def test_without_ros_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nodes.ros2_bridge.find_spec", lambda name: None)
+    monkeypatch.setattr("nodes.sinks.ros2.bridge.find_spec", lambda name: None)
     with pytest.raises(LaunchError, match=r"steadypose\[ros2\]"):
         require_ros2()

@@ -15,10 +15,10 @@ from synthetic_poses import walker
 from msgs.topics import POSE_RAW
 from msgs.transport import Subscriber
 from msgs.types import PoseRaw
-from nodes.adapters import from_pose_array
-from nodes.launch import Launch, LaunchError
-from nodes.live import LiveSource
-from nodes.pose_input import PoseInputNode
+from nodes.sources.adapters import from_pose_array
+from nodes.graph.launch import Launch, LaunchError
+from nodes.sources.camera import LiveSource
+from nodes.sources.pose_input import PoseInputNode
 from prior.body.skeleton import CANONICAL, COCO17, SKELETONS
 
 PUBLISHER = """

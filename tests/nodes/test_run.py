@@ -16,9 +16,9 @@ from rich.console import Console
 from msgs.recording import RecordingReader
 from msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from msgs.types import Diagnostics, Level, PoseClean, PoseRaw, PoseWorld
-from nodes.launch import Launch
-from nodes.run import STUCK_NS, _Run, line, table
-from nodes.supervisor import BACKOFF_S, STEADY_S, Child, Supervisor
+from nodes.graph.launch import Launch
+from nodes.commands.run import STUCK_NS, _Run, line, table
+from nodes.graph.supervisor import BACKOFF_S, STEADY_S, Child, Supervisor
 
 FOREVER = "import signal; signal.pause()"
 Start = Callable[[str], Child]

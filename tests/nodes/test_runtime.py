@@ -11,8 +11,8 @@ from conftest import START_NS, VirtualClock, raw, running, until, walking
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW
 from msgs.transport import SEND_HIGH_WATER, Publisher, Subscriber
 from msgs.types import Diagnostics, Level, Message, PoseClean, PoseRaw
-from nodes.launch import Launch
-from nodes.runtime import READ_AHEAD, Inbox, Node, Timeline
+from nodes.graph.launch import Launch
+from nodes.graph.runtime import READ_AHEAD, Inbox, Node, Timeline
 
 MakeLaunch = Callable[..., Launch]
 

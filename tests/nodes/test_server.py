@@ -15,9 +15,9 @@ from msgs.keys import create_keys
 from msgs.topics import POSE_RAW, POSE_WORLD
 from msgs.transport import Publisher, Subscriber
 from msgs.types import PoseRaw, PoseWorld
-from nodes.launch import Launch, LaunchError
-from nodes.prior import PriorNode
-from nodes.trajectory import TrajectoryNode
+from nodes.graph.launch import Launch, LaunchError
+from nodes.graph.prior_node import PriorNode
+from nodes.graph.trajectory_node import TrajectoryNode
 
 FRAMES = 25
 

@@ -14,7 +14,7 @@ from fake_oak import CAMERA, moment
 from msgs.topics import POSE_RAW
 from msgs.transport import Subscriber
 from msgs.types import PoseRaw
-from nodes.csv_poses import CsvSource
+from nodes.sources.csv import CsvSource
 
 DOCS = Path(__file__).parents[2] / "docs"
 BLOCKS = dict(re.findall(r"^```(python|csv)\n(.*?)^```$", (DOCS / "sources.md").read_text(), re.MULTILINE | re.DOTALL))

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from msgs.topics import POSE_RAW, POSE_WORLD
 from msgs.transport import Publisher, Subscriber
 from msgs.types import Pose, PoseRaw, PoseWorld, RawBody
-from nodes.launch import Launch, LaunchError, MergeSettings
-from nodes.merge import MergeSource
-from nodes.pose_input import PoseInputNode
-from nodes.prior import PriorNode
-from nodes.trajectory import TrajectoryNode
+from nodes.graph.launch import Launch, LaunchError, MergeSettings
+from nodes.sources.merge import MergeSource
+from nodes.sources.pose_input import PoseInputNode
+from nodes.graph.prior_node import PriorNode
+from nodes.graph.trajectory_node import TrajectoryNode
 
 FRAMES = 30
 PLACES = {

@@ -22,10 +22,10 @@ from synthetic_poses import CAMERA, messages, walker
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from msgs.transport import Publisher
 from msgs.types import Diagnostics, JointState, Level, Pose, PoseClean, PoseRaw, RawBody, Tracking
-from nodes import viewer
-from nodes.drawing import STATE_COLOURS
-from nodes.launch import Launch, TransportSettings
-from nodes.viewer import PoseView, ViewerError, ViewerNode, ViewerServer
+from nodes.sinks import viewer
+from nodes.sinks.drawing import STATE_COLOURS
+from nodes.graph.launch import Launch, TransportSettings
+from nodes.sinks.viewer import PoseView, ViewerError, ViewerNode, ViewerServer
 
 rr = pytest.importorskip("rerun", reason="the optional extra `view` is not installed")
 

@@ -13,11 +13,11 @@ import pytest
 from conftest import VirtualClock
 
 from msgs.types import PoseRaw
-from nodes import webcam
-from nodes.launch import CalibrationSettings, Launch, LaunchError, WebcamSettings
-from nodes.live import PAUSES_S
-from nodes.runtime import SystemClock
-from nodes.webcam import Lens, WebcamSource, require_mediapipe
+from nodes.sources import webcam
+from nodes.graph.launch import CalibrationSettings, Launch, LaunchError, WebcamSettings
+from nodes.sources.camera import PAUSES_S
+from nodes.graph.runtime import SystemClock
+from nodes.sources.webcam import Lens, WebcamSource, require_mediapipe
 
 SIZE = (320, 240)
 NOT_CALIBRATED = CalibrationSettings()

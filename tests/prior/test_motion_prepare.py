@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from nodes.prepare import PrepareError, find_sources, prepare
+from nodes.commands.prepare import PrepareError, find_sources, prepare
 from prior.body.kinematics import forward_kinematics
 from prior.motion.clip import Clip
 from prior.motion.datasets import Dropped

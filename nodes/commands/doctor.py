@@ -194,7 +194,7 @@ def check_clock() -> Iterator[Finding]:
 
 def check_messages() -> Iterator[Finding]:
     """The directory of the ipc sockets, and a message there and back."""
-    from nodes.launch import TransportSettings
+    from nodes.graph.launch import TransportSettings
 
     directory = TransportSettings().ipc_directory
     longest = len(os.fsencode(directory / "trajectory"))
@@ -260,7 +260,7 @@ def _self_test() -> Finding:
     """A body that stands for a hundred frames, through the prior."""
     import numpy as np
 
-    from nodes.threads import one_thread
+    from nodes.graph.threads import one_thread
     from prior.clean.pipeline import PriorPipeline, PriorSettings
 
     one_thread()
@@ -303,8 +303,8 @@ def _standing(frame: int) -> PoseRaw:
 def check_streams() -> Iterator[Finding]:
     """What the default launch file plays."""
     from msgs.recording import RecordingReader
-    from nodes.launch import Launch, checkout
-    from nodes.pose_input import open_source
+    from nodes.graph.launch import Launch, checkout
+    from nodes.sources.pose_input import open_source
 
     fix = "git checkout -- sim_data launch, or play your own: steadypose run --input RECORDING"
     recording = Path(Launch.read("replay").input.recording).resolve()

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs.types import PoseRaw
-from nodes.adapters import from_mediapipe, pinhole
-from nodes.launch import CalibrationSettings, LaunchError, WebcamSettings
-from nodes.live import CameraError, CameraSource, count_failure
-from nodes.runtime import Clock
+from nodes.sources.adapters import from_mediapipe, pinhole
+from nodes.graph.launch import CalibrationSettings, LaunchError, WebcamSettings
+from nodes.sources.camera import CameraError, CameraSource, count_failure
+from nodes.graph.runtime import Clock
 
 MODEL = (
     "https://storage.googleapis.com/mediapipe-models/pose_landmarker/pose_landmarker_full/float16/latest/"

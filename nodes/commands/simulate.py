@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from nodes.launch import checkout
+from nodes.graph.launch import checkout
 from prior.sim.streams import ManifestError, read_manifest, record
 
 

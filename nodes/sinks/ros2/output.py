@@ -23,8 +23,8 @@ from std_msgs.msg import ColorRGBA, Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from msgs.types import Diagnostics, JointState, PoseWorld, Tracking, WorldBody
-from nodes.rep155 import Links, body_name, frames, joint_angles, joint_rotations, measures, urdf
-from nodes.ros2_dds import DdsOutput, body_transforms
+from nodes.sinks.ros2.rep155 import Links, body_name, frames, joint_angles, joint_rotations, measures, urdf
+from nodes.sinks.ros2.dds import DdsOutput, body_transforms
 from prior.body.skeleton import PARENTS, J
 
 MARKERS = "steadypose/markers"

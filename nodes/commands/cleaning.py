@@ -15,10 +15,10 @@ import numpy as np
 from msgs.recording import RecordingWriter
 from msgs.topics import POSE_CLEAN, POSE_WORLD
 from msgs.types import Message, PoseClean, PoseRaw, PoseWorld
-from nodes.launch import LaunchError
-from nodes.npz import NpzCollector
-from nodes.pose_input import open_source, with_end
-from nodes.recorder import Filing
+from nodes.graph.launch import LaunchError
+from nodes.sources.npz import NpzCollector
+from nodes.sources.pose_input import open_source, with_end
+from nodes.sinks.recorder import Filing
 
 
 class Cleaner(Protocol):
@@ -95,9 +95,9 @@ def clean_recording(
         raise LaunchError(f"{out} exists: expected a new directory to write the recording to")
     frames = open_source(source)
     # these bring torch, which takes seconds: not before it is known that there is something to do
-    from nodes.prior import make_prior
-    from nodes.threads import one_thread
-    from nodes.trajectory import make_trajectory
+    from nodes.graph.prior_node import make_prior
+    from nodes.graph.threads import one_thread
+    from nodes.graph.trajectory_node import make_trajectory
 
     one_thread()
     prior, trajectory = make_prior(settings["prior"]), make_trajectory(settings["trajectory"])

@@ -34,7 +34,7 @@ import numpy as np
 from msgs.topics import DIAGNOSTICS
 from msgs.transport import Publisher, Subscriber
 from msgs.types import Diagnostics, Level, Message
-from nodes.launch import LISTENS, Launch
+from nodes.graph.launch import LISTENS, Launch
 
 logger = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from typing import Protocol
 
 from msgs.types import PoseRaw
-from nodes.runtime import TURN_S, Clock
+from nodes.graph.runtime import TURN_S, Clock
 
 logger = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from msgs.types import Pose
-from nodes.launch import Launch, LaunchError
+from nodes.graph.launch import Launch, LaunchError
 from prior.camera.calibration import (
     LEAST_CORNERS,
     Board,
@@ -33,7 +33,7 @@ from prior.camera.calibration import (
 )
 
 if TYPE_CHECKING:
-    from nodes.oak_still import Still
+    from nodes.sources.oak_still import Still
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -291,7 +291,7 @@ def _calibrate_floor(step: CalibrateFloor) -> None:
 
 def _calibrate_oak(step: CalibrateOak) -> None:
     launch = _check_launch(step.launch)
-    from nodes.oak_still import take_with_camera  # brings depthai
+    from nodes.sources.oak_still import take_with_camera  # brings depthai
 
     try:
         still = take_with_camera(launch.input.oak)

@@ -9,16 +9,16 @@ from typing import Annotated
 
 import tyro
 
-from nodes.launch import LISTENS, Launch, LaunchError, nearest
+from nodes.graph.launch import LISTENS, Launch, LaunchError, nearest
 
 #: name: the class that is the node
 CLASSES = {
-    "pose_input": "nodes.pose_input:PoseInputNode",
-    "prior": "nodes.prior:PriorNode",
-    "trajectory": "nodes.trajectory:TrajectoryNode",
-    "ros2_bridge": "nodes.ros2_bridge:Ros2BridgeNode",
-    "recorder": "nodes.recorder:RecorderNode",
-    "viewer": "nodes.viewer:ViewerNode",
+    "pose_input": "nodes.sources.pose_input:PoseInputNode",
+    "prior": "nodes.graph.prior_node:PriorNode",
+    "trajectory": "nodes.graph.trajectory_node:TrajectoryNode",
+    "ros2_bridge": "nodes.sinks.ros2.bridge:Ros2BridgeNode",
+    "recorder": "nodes.sinks.recorder:RecorderNode",
+    "viewer": "nodes.sinks.viewer:ViewerNode",
 }
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 from msgs.topics import POSE_CLEAN
 from msgs.types import Message, PoseRaw
-from nodes.launch import Launch, LaunchError
-from nodes.runtime import FRAME_NS, Clock, Node
-from nodes.threads import one_thread
+from nodes.graph.launch import Launch, LaunchError
+from nodes.graph.runtime import FRAME_NS, Clock, Node
+from nodes.graph.threads import one_thread
 from prior.clean.pipeline import PriorPipeline, PriorSettings, load_loops
 from prior.clean.batch import StreamBatch
 

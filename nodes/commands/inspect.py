@@ -27,7 +27,7 @@ from msgs.recording import RecordingReader
 from msgs.topics import TOPICS
 from msgs.transport import Subscriber
 from msgs.types import JOINTS, Diagnostics, JointState, Message, PoseClean, PoseRaw, WorldBody
-from nodes.launch import LISTENS, Launch, TransportSettings, nearest
+from nodes.graph.launch import LISTENS, Launch, TransportSettings, nearest
 
 TURN_S = 0.1
 HZ_EVERY_S = 1.0

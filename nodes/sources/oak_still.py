@@ -9,9 +9,9 @@ import depthai as dai
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.launch import OakSettings
-from nodes.live import CameraError
-from nodes.oak import APART, DEPTH_FPS, Gravity, accelerometer, aligned_depth, open_device
+from nodes.graph.launch import OakSettings
+from nodes.sources.camera import CameraError
+from nodes.sources.oak import APART, DEPTH_FPS, Gravity, accelerometer, aligned_depth, open_device
 from prior.camera.gravity import Level
 
 SETTLE = 30

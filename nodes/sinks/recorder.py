@@ -7,8 +7,8 @@ from pathlib import Path
 from msgs.recording import RecordingWriter
 from msgs.topics import DIAGNOSTICS
 from msgs.types import Diagnostics, Message
-from nodes.launch import Launch, LaunchError
-from nodes.runtime import Clock, Node
+from nodes.graph.launch import Launch, LaunchError
+from nodes.graph.runtime import Clock, Node
 
 QUIET_S = 0.3
 """nothing came for so long: all that was on its way is here"""

@@ -26,9 +26,9 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from nodes.cleaning import clean_recording
+from nodes.commands.cleaning import clean_recording
 from nodes.cli import is_for_user
-from nodes.launch import LaunchError
+from nodes.graph.launch import LaunchError
 
 MANIFEST = "manifest.jsonl"
 FILES = (".npz", ".csv")
@@ -303,8 +303,8 @@ def on_ray(jobs: Iterable[Job], settings: Settings) -> Iterator[tuple[Job, dict[
 
 def _check(settings: Settings) -> None:
     """Find here what every recording would stumble over."""
-    from nodes.prior import make_prior
-    from nodes.trajectory import make_trajectory
+    from nodes.graph.prior_node import make_prior
+    from nodes.graph.trajectory_node import make_trajectory
 
     make_prior(settings["prior"])
     make_trajectory(settings["trajectory"])

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from msgs.recording import RecordingReader
 from msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from msgs.types import CONTACTS, JOINTS, Diagnostics, JointState, PoseClean, PoseRaw, PoseWorld, Tracking
-from nodes.drawing import (
+from nodes.sinks.drawing import (
     ALARM_COLOUR,
     ALL_BONES,
     CLEAN_COLOUR,

@@ -9,9 +9,9 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from nodes.batch import clean_folder, is_folder_of_recordings
-from nodes.cleaning import clean_recording
-from nodes.launch import LaunchError, apply_override
+from nodes.commands.batch import clean_folder, is_folder_of_recordings
+from nodes.commands.cleaning import clean_recording
+from nodes.graph.launch import LaunchError, apply_override
 
 
 def clean(

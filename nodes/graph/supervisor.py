@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 
-from nodes.runtime import SUPERVISOR, Clock
+from nodes.graph.runtime import SUPERVISOR, Clock
 
 BACKOFF_S = (0.5, 1.0, 2.0, 4.0, 8.0)
 """before each start after a crash in a row; one crash more, and the node has failed"""

@@ -9,9 +9,9 @@ from msgs.keys import Keys
 from msgs.topics import POSE_RAW
 from msgs.transport import Subscriber
 from msgs.types import PoseRaw
-from nodes.launch import LaunchError, MergeSettings
-from nodes.live import LiveSource
-from nodes.runtime import TURN_S
+from nodes.graph.launch import LaunchError, MergeSettings
+from nodes.sources.camera import LiveSource
+from nodes.graph.runtime import TURN_S
 from prior.camera.multi_view import Merge
 
 

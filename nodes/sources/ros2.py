@@ -7,11 +7,11 @@ from collections.abc import Generator
 from typing import Any
 
 from msgs.types import PoseRaw
-from nodes.adapters import from_azure_kinect, from_pose_array
-from nodes.launch import LaunchError, Ros2Settings, nearest
-from nodes.live import LiveSource
-from nodes.ros2_bridge import require_ros2
-from nodes.runtime import TURN_S
+from nodes.sources.adapters import from_azure_kinect, from_pose_array
+from nodes.graph.launch import LaunchError, Ros2Settings, nearest
+from nodes.sources.camera import LiveSource
+from nodes.sinks.ros2.bridge import require_ros2
+from nodes.graph.runtime import TURN_S
 from prior.body.skeleton import SKELETONS
 
 

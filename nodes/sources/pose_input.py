@@ -13,11 +13,11 @@ from msgs.keys import Keys
 from msgs.recording import RecordingError, RecordingReader
 from msgs.topics import POSE_RAW, POSE_TRUTH
 from msgs.types import Diagnostics, Message, PoseRaw
-from nodes.csv_poses import CsvSource
-from nodes.launch import InputSettings, Launch, LaunchError
-from nodes.live import LiveSource
-from nodes.npz import NpzSource
-from nodes.runtime import TURN_S, Clock, Node, Timeline
+from nodes.sources.csv import CsvSource
+from nodes.graph.launch import InputSettings, Launch, LaunchError
+from nodes.sources.camera import LiveSource
+from nodes.sources.npz import NpzSource
+from nodes.graph.runtime import TURN_S, Clock, Node, Timeline
 
 LEAP_NS = 15_000_000_000
 """a step of stamps, either way, that is no pause but another clock: it is not waited for"""
@@ -95,18 +95,18 @@ def open_input(settings: InputSettings, clock: Clock, keys: Keys | None = None) 
         return open_source(settings.recording)
     # these bring libraries that a replay does without
     if settings.source == "oak":
-        from nodes.oak import OakSource
+        from nodes.sources.oak import OakSource
 
         return OakSource(settings.oak, clock)
     if settings.source == "ros2":
-        from nodes.ros2_source import Ros2Source
+        from nodes.sources.ros2 import Ros2Source
 
         return Ros2Source(settings.ros2)
     if settings.source == "merge":
-        from nodes.merge import MergeSource
+        from nodes.sources.merge import MergeSource
 
         return MergeSource(settings.merge, keys)
-    from nodes.webcam import WebcamSource
+    from nodes.sources.webcam import WebcamSource
 
     return WebcamSource(settings.webcam, settings.calibration, clock)
 

@@ -18,10 +18,10 @@ from rich.text import Text
 from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from msgs.transport import Subscriber
 from msgs.types import Diagnostics, Level
-from nodes.launch import LISTENS, Launch, LaunchError
-from nodes.pose_input import open_input
-from nodes.runtime import Clock, SystemClock
-from nodes.supervisor import Supervisor
+from nodes.graph.launch import LISTENS, Launch, LaunchError
+from nodes.sources.pose_input import open_input
+from nodes.graph.runtime import Clock, SystemClock
+from nodes.graph.supervisor import Supervisor
 
 LINE_NS = 5_000_000_000
 """between lines where there is no terminal for a table"""
@@ -85,11 +85,11 @@ def _check(launch: Launch) -> None:
     if "recorder" in launch.nodes and Path(launch.recorder.directory).exists():
         raise LaunchError(f"{launch.recorder.directory} exists: expected a new directory to record to")
     if "viewer" in launch.nodes:
-        from nodes.viewer import require_rerun
+        from nodes.sinks.viewer import require_rerun
 
         require_rerun()
     if "ros2_bridge" in launch.nodes:
-        from nodes.ros2_bridge import require_ros2
+        from nodes.sinks.ros2.bridge import require_ros2
 
         require_ros2()
 

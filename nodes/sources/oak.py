@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs.types import PoseRaw, RawBody
-from nodes.launch import LaunchError, OakSettings
-from nodes.live import CameraError, CameraSource, count_failure
-from nodes.runtime import TURN_S, Clock
+from nodes.graph.launch import LaunchError, OakSettings
+from nodes.sources.camera import CameraError, CameraSource, count_failure
+from nodes.graph.runtime import TURN_S, Clock
 from prior.camera.gravity import Level
 from prior.camera.depth_lifting import lift
 from prior.body.skeleton import COCO17

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from msgs.keys import create_keys
-from nodes.launch import LaunchError
+from nodes.graph.launch import LaunchError
 
 
 def keys(directory: Path) -> None:

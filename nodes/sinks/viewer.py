@@ -36,7 +36,7 @@ from msgs.types import (
     Tracking,
     WorldBody,
 )
-from nodes.drawing import (
+from nodes.sinks.drawing import (
     ALARM_COLOUR,
     ALL_BONES,
     CONTACT_COLOUR,
@@ -49,7 +49,7 @@ from nodes.drawing import (
     facing,
     to_world,
 )
-from nodes.runtime import TURN_S, Node
+from nodes.graph.runtime import TURN_S, Node
 from prior.body.skeleton import SKELETONS, J, to_canonical
 
 if TYPE_CHECKING:
