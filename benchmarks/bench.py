@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from benchmarks import ours, smoothnet, window_vaes
+from benchmarks import ours
+from benchmarks.peers import smoothnet
+from benchmarks.peers import window_vaes
 from benchmarks.machine import ROOT
 from benchmarks.motion import MotionClips, as_set, digest, prepared_clips, prepared_set, simulated_clips
-from benchmarks.peers import PEERS, Peer
+from benchmarks.peers.filters import PEERS, Peer
 from benchmarks.results import Table
 from benchmarks.tuning import Tuned, search
 from prior.models.hmvae.network import MotionVAE

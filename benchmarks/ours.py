@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.peers import missing
+from benchmarks.peers.filters import missing
 from msgs.types import Pose, PoseClean, PoseRaw, RawBody
 from prior.clean.score import ScoreSettings
 from prior.models.weights_io import WEIGHTS

@@ -20,10 +20,10 @@ from sklearn.decomposition import PCA
 from sklearn.metrics import roc_auc_score, roc_curve
 from sklearn.neighbors import KNeighborsClassifier
 
-from benchmarks import hgvae_imputation as imputation
-from benchmarks import hgvae_models as models
+from benchmarks.hgvae import imputation
+from benchmarks.hgvae import models
 from benchmarks.bench import Bench, Result
-from benchmarks.hgvae_faults import FAULTS, HELD, held
+from benchmarks.hgvae.faults import FAULTS, HELD, held
 from benchmarks.machine import ROOT
 from benchmarks.motion import as_set, digest
 from benchmarks.results import Table

@@ -22,7 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import figures, kinect_regression, ours, smoothnet
+from benchmarks import figures, ours
+from benchmarks.peers import kinect_regression
+from benchmarks.peers import smoothnet
 from benchmarks.bench import Bench, Result, over_seeds, tune, tuning_log
 from benchmarks.metrics import (
     acceleration_error,
@@ -34,7 +36,7 @@ from benchmarks.metrics import (
     reliability,
     sigma_ratio,
 )
-from benchmarks.peers import FILTERS, OFFLINE, Peer
+from benchmarks.peers.filters import FILTERS, OFFLINE, Peer
 from benchmarks.results import Table
 from benchmarks.tuning import Tuned, loss, search
 from prior.body.kinematics import rigid_alignment

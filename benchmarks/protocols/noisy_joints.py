@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from benchmarks import figures
 from benchmarks.bench import Bench, Result
 from benchmarks.corruption import correlated, gaussian, spiked, swapped
-from benchmarks.peers import FILTERS
+from benchmarks.peers.filters import FILTERS
 from benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
 from benchmarks.scores import pivot
 

@@ -3,7 +3,7 @@
 Windows are encoded and decoded as refinement does (equations 10 and 11): of 8 frames, on which the model that ships
 was trained, and of 64, either in windows that long or pieced together from 8, side by side or by sliding and keeping
 centre frames (equation 12). The paper's peers, a VAE without the hierarchy and one without the skeleton, are trained
-here, and HM-VAE once more exactly as they are (`benchmarks.window_vaes`). Joints are placed by forward kinematics on
+here, and HM-VAE once more exactly as they are (`benchmarks.peers.window_vaes`). Joints are placed by forward kinematics on
 the person's bones with the pelvis at the origin, so that errors are of the pose with its orientation, not of its
 place. The trivial peer repeats the window's centre frame.
 """
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks import window_vaes
+from benchmarks.peers import window_vaes
 from benchmarks.bench import Bench, Result
 from benchmarks.ours import weight_sets
 from benchmarks.results import Table

@@ -12,7 +12,7 @@ from benchmarks.bench import Answer, Bench, answers, over_seeds, tune, tuning_lo
 from benchmarks.metrics import bootstrap_ratio, position_error, reliability, sigma_ratio
 from benchmarks.motion import MotionClips
 from benchmarks.ours import OURS
-from benchmarks.peers import OFFLINE, PEERS, Peer, missing
+from benchmarks.peers.filters import OFFLINE, PEERS, Peer, missing
 from benchmarks.results import Table
 from benchmarks.scores import Scores, figures, pivot, score
 

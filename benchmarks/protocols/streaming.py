@@ -3,7 +3,7 @@
 Joints carry 2 cm of independent noise. A method is tuned once, on the steady stream, and meets every other condition
 with that. Lost frames are asked for like any other: who gets no frame must still say where the body is. Stamps that
 jitter are true: the body was where the truth is at that time, and an answer is compared with the truth at its own
-stamp. Compute times are those of `benchmarks.latency`.
+stamp. Compute times are those of `benchmarks.systems.latency`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from benchmarks.bench import Answer, Bench, Result, answers, over_seeds, tune, t
 from benchmarks.corruption import LIMBS, bursts, gaussian, hide
 from benchmarks.metrics import found_delay
 from benchmarks.motion import MotionClips
-from benchmarks.peers import OFFLINE, PEERS, Peer, missing, raw
+from benchmarks.peers.filters import OFFLINE, PEERS, Peer, missing, raw
 from benchmarks.results import Table
 from benchmarks.scores import figures, score
 from prior.clean.frame import FPS

@@ -22,7 +22,7 @@ from benchmarks.bench import Bench, Result, peers_of, tune, tuning_log
 from benchmarks.corruption import correlated
 from benchmarks.metrics import contact_speed, position_error
 from benchmarks.motion import MotionClips
-from benchmarks.peers import FILTERS, OFFLINE, Peer, missing
+from benchmarks.peers.filters import FILTERS, OFFLINE, Peer, missing
 from benchmarks.results import Table
 from benchmarks.scores import figures, interval, score
 from prior.body.kinematics import CONTACT_JOINTS

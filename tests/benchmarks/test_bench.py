@@ -7,12 +7,13 @@ import pytest
 from matplotlib.figure import Figure
 from rich.progress import Progress
 
-from benchmarks import figures, ours, smoothnet
+from benchmarks import figures, ours
+from benchmarks.peers import smoothnet
 from benchmarks.bench import Bench, over_seeds
 from benchmarks.corruption import gaussian, hide
 from benchmarks.metrics import position_error
 from benchmarks.motion import MotionClips, simulated_clips
-from benchmarks.peers import OFFLINE, Peer, missing
+from benchmarks.peers.filters import OFFLINE, Peer, missing
 from benchmarks.protocols.reconstruction import slide
 from benchmarks.protocols.spoiled import against_best, calibration_table, reliability_bins, run_conditions
 from benchmarks.protocols.streaming import recovery

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import depth_lifting
-from benchmarks.depth_lifting import Args, Picture, main, measure, median, ours, pictures
+from benchmarks.systems import depth_lifting
+from benchmarks.systems.depth_lifting import Args, Picture, main, measure, median, ours, pictures
 
 
 @pytest.fixture(scope="module")

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import hgvae_imputation as imputation
-from benchmarks import hgvae_models as models
-from benchmarks.hgvae_faults import BEGINS, FAULTS, LEAST_MOTION
+from benchmarks.hgvae import imputation
+from benchmarks.hgvae import models
+from benchmarks.hgvae.faults import BEGINS, FAULTS, LEAST_MOTION
 from prior.models.hgvae.features import in_frame_of, to_tracks
 from prior.models.hgvae.network import HGVAE
 from prior.motion.dataset import MotionSet

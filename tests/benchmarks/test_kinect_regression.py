@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from benchmarks.kinect_regression import _OTHER_SIDE, Smoothed, _mirrored, ridge, temporal_convolution
+from benchmarks.peers.kinect_regression import _OTHER_SIDE, Smoothed, _mirrored, ridge, temporal_convolution
 from benchmarks.metrics import position_error
 from benchmarks.protocols.kinect_vicon import OTHER_SIDE, SCORED
 from prior.body.kinematics import rigid_alignment

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.peers import constant_velocity, gaussian_hampel, one_euro
+from benchmarks.peers.filters import constant_velocity, gaussian_hampel, one_euro
 from benchmarks.protocols.kinect_vicon import SCORED, Clip, align, learn_offset, run_filter, score
 
 REST = np.array(

@@ -4,8 +4,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from benchmarks.latency import SPACING, crowd, percentiles
-from benchmarks.memory import growth
+from benchmarks.systems.latency import SPACING, crowd, percentiles
+from benchmarks.systems.memory import growth
 from msgs.types import Pose, PoseRaw, RawBody
 
 

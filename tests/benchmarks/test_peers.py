@@ -3,8 +3,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmarks.kalman import fixed_lag, process_noise, transition
-from benchmarks.peers import (
+from benchmarks.peers.kalman import fixed_lag, process_noise, transition
+from benchmarks.peers.filters import (
     FILTERS,
     OFFLINE,
     PEERS,

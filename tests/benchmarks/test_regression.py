@@ -13,7 +13,7 @@ from rich.progress import Progress
 from benchmarks import ours
 from benchmarks.bench import Bench
 from benchmarks.motion import MotionClips
-from benchmarks.peers import missing
+from benchmarks.peers.filters import missing
 from benchmarks.protocols import hidden_joints, noisy_joints
 from benchmarks.scores import figures, score
 

@@ -24,7 +24,7 @@ def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tm
     once = readme.read_text()
     assert "| ours | 0.5 | 3 |" in once
     assert "| method | p50 | a\\|b |" in once
-    assert "`python -m benchmarks.latency --quick input`" in once
+    assert "`python -m benchmarks.systems.latency --quick input`" in once
     assert "old" not in once
     assert once.startswith("# Title\n")
     assert once.endswith("<!-- /results -->\ntail\n")

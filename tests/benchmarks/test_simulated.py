@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulated import FEET, Track, hold_last, measure, read_tracks, sigma_ratio, smooth
+from benchmarks.systems.simulated import FEET, Track, hold_last, measure, read_tracks, sigma_ratio, smooth
 from msgs.topics import POSE_RAW, POSE_TRUTH
 from msgs.types import Message, Pose, PoseRaw, PoseWorld, RawBody, Tracking, WorldBody
 from prior.body.skeleton import CANONICAL, PARENTS, REST_OFFSETS, J

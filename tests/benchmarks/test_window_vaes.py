@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from benchmarks.motion import as_set, simulated_clips
-from benchmarks.window_vaes import CONFIGS, MVAE, TCNVAE, trained
+from benchmarks.peers.window_vaes import CONFIGS, MVAE, TCNVAE, trained
 from prior.models.hmvae.network import HMVAE
 from prior.body.kinematics import forward_kinematics
 from prior.models.layers.skeleton_conv import SkeletonConv

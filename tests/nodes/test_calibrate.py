@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import VirtualClock, raw, walking
 
-from benchmarks.calibration import BOARD, depth_points, error, held_poses, look_at, picture, rays
+from benchmarks.systems.calibration import BOARD, depth_points, error, held_poses, look_at, picture, rays
 from msgs.types import Pose, PoseRaw
 from nodes.commands.calibrate import draw_floor
 from nodes.cli import main

@@ -3,7 +3,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from benchmarks import window_vaes
+from benchmarks.peers import window_vaes
 from benchmarks.bench import Bench, Result
 from benchmarks.evaluate import evaluate as run
 from benchmarks.protocols import PROTOCOLS

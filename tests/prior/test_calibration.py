@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.calibration import (
+from benchmarks.systems.calibration import (
     BOARD,
     LENS,
     corners_of,

@@ -4,7 +4,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from benchmarks.identity import MANIFEST, all_hidden, identified, nearest, score, source, watch
+from benchmarks.systems.identity import MANIFEST, all_hidden, identified, nearest, score, source, watch
 from prior.clean.identify import Identify, IdentifySettings
 from prior.clean.pipeline import PriorPipeline, PriorSettings
 from prior.sim.streams import read_manifest

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.importers import MIRROR, compare
+from benchmarks.systems.importers import MIRROR, compare
 from prior.motion.prepare import FPS
 from tests.prior.test_motion_prepare import standing
 

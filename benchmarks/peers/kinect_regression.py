@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sklearn.linear_model import Ridge
 from torch import Tensor, nn
 
-from benchmarks.kalman import fixed_lag
+from benchmarks.peers.kalman import fixed_lag
 from benchmarks.metrics import body_frame
 from prior.body.kinematics import rigid_alignment
 from prior.body.skeleton import KINECT22, J, to_canonical

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from benchmarks.kalman import fixed_lag
+from benchmarks.peers.kalman import fixed_lag
 from prior.timing.fixed_lag import OneEuroFilter
 from prior.clean.frame import FPS
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from benchmarks.corruption import LIMBS, correlated, gaussian, hide, spiked
 from benchmarks.motion import MotionClips
-from benchmarks.peers import hold_last, missing
+from benchmarks.peers.filters import hold_last, missing
 
 Floats = NDArray[np.float64]
 

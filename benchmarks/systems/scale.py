@@ -20,7 +20,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.latency import WARM_UP, crowd, percentiles
+from benchmarks.systems.latency import WARM_UP, crowd, percentiles
 from benchmarks.machine import ROOT
 from benchmarks.results import RESULTS, Table, save, show
 from msgs.recording import RecordingReader
