@@ -18,6 +18,6 @@ if [ ! -e "$stamp" ] || [ uv.lock -nt "$stamp" ] || [ pyproject.toml -nt "$stamp
     fi
     .uv/bin/uv sync --frozen --inexact --compile-bytecode --extra view --python "$python"
     # numba compiles its loops once; else the first stream would wait for it
-    .venv/bin/python -c "import prior.lift, prior.trajectory_filter; from prior.pipeline import load_loops; load_loops()"
+    .venv/bin/python -c "import steadypose.prior.camera.depth_lifting, steadypose.prior.world.root_filter; from steadypose.prior.clean.pipeline import load_loops; load_loops()"
     touch "$stamp"
 fi

@@ -13,15 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from benchmarks import ours
-from benchmarks.peers import smoothnet
-from benchmarks.peers import window_vaes
-from benchmarks.machine import ROOT
-from benchmarks.motion import MotionClips, as_set, digest, prepared_clips, prepared_set, simulated_clips
-from benchmarks.peers.filters import PEERS, Peer
-from benchmarks.results import Table
-from benchmarks.tuning import Tuned, search
-from prior.models.hmvae.network import MotionVAE
+from steadypose.benchmarks import ours
+from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_clips, prepared_set, simulated_clips
+from steadypose.benchmarks.peers import smoothnet, window_vaes
+from steadypose.benchmarks.peers.filters import PEERS, Peer
+from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.tuning import Tuned, search
+from steadypose.prior.models.hmvae.network import MotionVAE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,8 +10,8 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.sim.camera import segment_gap
-from prior.body.skeleton import MIRROR, J
+from steadypose.prior.body.skeleton import MIRROR, J
+from steadypose.prior.sim.camera import segment_gap
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

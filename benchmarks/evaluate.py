@@ -9,10 +9,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.bench import Bench, Result
-from benchmarks.protocols import PROTOCOLS
-from benchmarks.results import RESULTS, save, show
-from nodes.graph.threads import one_thread
+from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.protocols import PROTOCOLS
+from steadypose.benchmarks.results import RESULTS, save, show
+from steadypose.nodes.graph.threads import one_thread
 
 
 def evaluate(protocol: str, *, quick: bool, mocap: Path | None, data: Path, out: Path | None) -> None:
@@ -28,7 +28,7 @@ def evaluate(protocol: str, *, quick: bool, mocap: Path | None, data: Path, out:
                 console.print("kinect_vicon: left out, it needs --mocap", highlight=False)
                 continue
             started = time.perf_counter()
-            result: Result = importlib.import_module(f"benchmarks.protocols.{name}").run(bench)
+            result: Result = importlib.import_module(f"steadypose.benchmarks.protocols.{name}").run(bench)
             seconds = time.perf_counter() - started
             for task in progress.task_ids:
                 progress.remove_task(task)

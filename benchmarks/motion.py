@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from prior.motion.dataset import MotionSet
-from prior.sim.motion import Motion
-from prior.sim.scripts import SCRIPTS
-from prior.clean.frame import FPS
+from steadypose.prior.clean.frame import FPS
+from steadypose.prior.motion.dataset import MotionSet
+from steadypose.prior.sim.motion import Motion
+from steadypose.prior.sim.scripts import SCRIPTS
 
 Floats = NDArray[np.float64]
 

@@ -9,17 +9,17 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.peers.filters import missing
-from msgs.types import Pose, PoseClean, PoseRaw, RawBody
-from prior.clean.score import ScoreSettings
-from prior.models.weights_io import WEIGHTS
-from prior.clean.correct import CorrectSettings
-from prior.clean.denoise import DenoiseSettings
-from prior.clean.reconstruct import EncodeSettings
-from prior.clean.fuse import FuseSettings
-from prior.clean.impute import ImputeSettings
-from prior.clean.pipeline import PriorPipeline, PriorSettings
-from prior.clean.refine import RefineSettings
+from steadypose.benchmarks.peers.filters import missing
+from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
+from steadypose.prior.clean.correct import CorrectSettings
+from steadypose.prior.clean.denoise import DenoiseSettings
+from steadypose.prior.clean.fuse import FuseSettings
+from steadypose.prior.clean.impute import ImputeSettings
+from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+from steadypose.prior.clean.reconstruct import EncodeSettings
+from steadypose.prior.clean.refine import RefineSettings
+from steadypose.prior.clean.score import ScoreSettings
+from steadypose.prior.models.weights_io import WEIGHTS
 
 Floats = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from benchmarks.machine import ROOT
-from benchmarks.results import RESULTS, load
+from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.results import RESULTS, load
 
 _BLOCK = re.compile(r"(<!-- results:(?P<name>[\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
 

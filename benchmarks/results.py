@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from benchmarks.machine import ROOT, describe
+from steadypose.benchmarks.machine import ROOT, describe
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -63,9 +63,11 @@ def save(
         tables: for the README.
         data: figures; JSON types.
         directory: where to.
-        program: what makes it; ``python -m benchmarks.NAME`` if left out.
+        program: what makes it; ``python -m steadypose.benchmarks.NAME`` if left out.
     """
-    command = shlex.join([*(program or ("python", "-m", f"benchmarks.{name}")), *(_portable(a) for a in arguments)])
+    command = shlex.join(
+        [*(program or ("python", "-m", f"steadypose.benchmarks.{name}")), *(_portable(a) for a in arguments)]
+    )
     path = directory / f"{name}.json"
     content = {"benchmark": name, "command": command, "machine": describe()}
     content |= {"tables": [asdict(t) for t in tables], **data}

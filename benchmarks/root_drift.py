@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs.types import CleanBody, JointState, Pose, PoseClean
-from prior.body.kinematics import CONTACT_JOINTS
-from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
-from prior.models.root_velocity.network import FRAME_S
-from prior.world.body_track import FEET
+from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
+from steadypose.prior.body.kinematics import CONTACT_JOINTS
+from steadypose.prior.models.root_velocity.network import FRAME_S
+from steadypose.prior.world.body_track import FEET
+from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 Floats = NDArray[np.float64]
 

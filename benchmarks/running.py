@@ -10,12 +10,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from msgs.topics import DIAGNOSTICS, POSE_WORLD
-from msgs.transport import Subscriber
-from msgs.types import Message
-from nodes.graph.launch import POSE_NODES, Launch
-from nodes.graph.runtime import SystemClock
-from nodes.graph.supervisor import Supervisor
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_WORLD
+from steadypose.msgs.transport import Subscriber
+from steadypose.msgs.types import Message
+from steadypose.nodes.graph.launch import POSE_NODES, Launch
+from steadypose.nodes.graph.runtime import SystemClock
+from steadypose.nodes.graph.supervisor import Supervisor
 
 START_S = 60.0
 """what the nodes get to come up"""

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.metrics import acceleration_error, bootstrap, length_variation, position_error, procrustes
-from benchmarks.results import Table
-from prior.body.skeleton import JOINTS, PARENTS
-from prior.clean.frame import FPS
+from steadypose.benchmarks.metrics import acceleration_error, bootstrap, length_variation, position_error, procrustes
+from steadypose.benchmarks.results import Table
+from steadypose.prior.body.skeleton import JOINTS, PARENTS
+from steadypose.prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from msgs.topics import TOPICS
-from msgs.types import (
+from steadypose.msgs.topics import TOPICS
+from steadypose.msgs.types import (
     CleanBody,
     Diagnostics,
     Level,

@@ -28,9 +28,9 @@ from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import TypesysError, get_types_from_msg
 
-from msgs.codec import DecodeError, decode, encode, typestore, wire_type
-from msgs.topics import TOPICS, check_topic
-from msgs.types import Message
+from steadypose.msgs.codec import DecodeError, decode, encode, typestore, wire_type
+from steadypose.msgs.topics import TOPICS, check_topic
+from steadypose.msgs.types import Message
 
 CHUNK_NS = 500_000_000
 CHUNK_BYTES = 2**18

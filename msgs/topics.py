@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from msgs.types import Diagnostics, Message, PoseClean, PoseRaw, PoseWorld
+from steadypose.msgs.types import Diagnostics, Message, PoseClean, PoseRaw, PoseWorld
 
 POSE_RAW = "pose/raw"
 POSE_CLEAN = "pose/clean"

@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Self
 
 import zmq
 
-from msgs.codec import DecodeError, decode, encode, typestore
-from msgs.keys import Keys
-from msgs.topics import TOPICS, check_topic
-from msgs.types import Message
+from steadypose.msgs.codec import DecodeError, decode, encode, typestore
+from steadypose.msgs.keys import Keys
+from steadypose.msgs.topics import TOPICS, check_topic
+from steadypose.msgs.types import Message
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator

@@ -14,20 +14,29 @@ from importlib.metadata import version
 
 #: name: (where, what it does)
 COMMANDS = {
-    "run": ("nodes.commands.run:run", "start the nodes of a launch file, watch them, show how they do"),
-    "node": ("nodes.commands.node:node", "one node, for another machine or a supervisor such as systemd"),
-    "clean": ("nodes.commands.clean:clean", "clean a recording or .npz offline, with the nodes' own code"),
-    "echo": ("nodes.commands.inspect:echo", "print the messages of a topic or recording"),
-    "hz": ("nodes.commands.inspect:hz", "measure the rate of a topic or recording"),
-    "info": ("nodes.commands.inspect:info", "what is in a recording, or on a topic"),
-    "plot": ("nodes.commands.plot:plot", "what happened in a recording, as pictures"),
-    "prepare": ("nodes.commands.prepare:prepare", "motion capture into training data"),
-    "train": ("prior.models.registry:train", "train a model of the prior"),
-    "evaluate": ("nodes.commands.evaluate:evaluate", "measure the prior against its tuned peers, by protocol"),
-    "simulate": ("nodes.commands.simulate:simulate", "make streams as a depth camera would see them, with their truth"),
-    "calibrate": ("nodes.commands.calibrate:calibrate", "a camera's lens and place in the world, into its launch file"),
-    "doctor": ("nodes.commands.doctor:doctor", "what is missing on this machine, and how to get it"),
-    "keys": ("nodes.commands.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),
+    "run": ("steadypose.nodes.commands.run:run", "start the nodes of a launch file, watch them, show how they do"),
+    "node": ("steadypose.nodes.commands.node:node", "one node, for another machine or a supervisor such as systemd"),
+    "clean": ("steadypose.nodes.commands.clean:clean", "clean a recording or .npz offline, with the nodes' own code"),
+    "echo": ("steadypose.nodes.commands.inspect:echo", "print the messages of a topic or recording"),
+    "hz": ("steadypose.nodes.commands.inspect:hz", "measure the rate of a topic or recording"),
+    "info": ("steadypose.nodes.commands.inspect:info", "what is in a recording, or on a topic"),
+    "plot": ("steadypose.nodes.commands.plot:plot", "what happened in a recording, as pictures"),
+    "prepare": ("steadypose.nodes.commands.prepare:prepare", "motion capture into training data"),
+    "train": ("steadypose.prior.models.registry:train", "train a model of the prior"),
+    "evaluate": (
+        "steadypose.nodes.commands.evaluate:evaluate",
+        "measure the prior against its tuned peers, by protocol",
+    ),
+    "simulate": (
+        "steadypose.nodes.commands.simulate:simulate",
+        "make streams as a depth camera would see them, with their truth",
+    ),
+    "calibrate": (
+        "steadypose.nodes.commands.calibrate:calibrate",
+        "a camera's lens and place in the world, into its launch file",
+    ),
+    "doctor": ("steadypose.nodes.commands.doctor:doctor", "what is missing on this machine, and how to get it"),
+    "keys": ("steadypose.nodes.commands.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),
 }
 
 USAGE_ERROR = 2
@@ -96,7 +105,7 @@ def usage() -> str:
 
 def is_for_user(error: Exception) -> bool:
     """Errors of this project's own, and of files, say what to do; any other is a bug and keeps its traceback."""
-    return isinstance(error, OSError) or type(error).__module__.partition(".")[0] in ("msgs", "prior", "nodes")
+    return isinstance(error, OSError) or type(error).__module__.startswith("steadypose.")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.body.skeleton import MIRROR, PARENTS, J
+from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
 
 Floats = NDArray[np.float64]
 Fault = Callable[[Floats, np.random.Generator], tuple[Floats, NDArray[np.bool_]]]

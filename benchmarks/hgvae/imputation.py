@@ -16,14 +16,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from benchmarks.corruption import LIMBS
-from prior.models.hgvae.features import Tracks, from_tracks, in_frame_of, to_tracks
-from prior.clean.reconstruct import Encoded
-from prior.models.layers.graph import SCALE
-from prior.models.hgvae.network import HGVAE
-from prior.models.hgvae.inference import LiveHGVAE
-from prior.clean.impute import Climb, ImputeSettings, completed_tracks
-from prior.models.hgvae.windows import Batch, Windows, standardise
+from steadypose.benchmarks.corruption import LIMBS
+from steadypose.prior.clean.impute import Climb, ImputeSettings, completed_tracks
+from steadypose.prior.clean.reconstruct import Encoded
+from steadypose.prior.models.hgvae.features import Tracks, from_tracks, in_frame_of, to_tracks
+from steadypose.prior.models.hgvae.inference import LiveHGVAE
+from steadypose.prior.models.hgvae.network import HGVAE
+from steadypose.prior.models.hgvae.windows import Batch, Windows, standardise
+from steadypose.prior.models.layers.graph import SCALE
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

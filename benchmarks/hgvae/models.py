@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.models.layers.graph import JOINT_NODES, SCALE
-from prior.models.hgvae.network import HGVAE, HGVAEConfig, Level
-from prior.motion.dataset import MotionSet
-from prior.models.hgvae.windows import Batch, Windows, mean_tracks
-from prior.models.hgvae.train import CLIP_ENTRY, evidence
-from prior.models.training import TrainingRun
+from steadypose.prior.models.hgvae.network import HGVAE, HGVAEConfig, Level
+from steadypose.prior.models.hgvae.train import CLIP_ENTRY, evidence
+from steadypose.prior.models.hgvae.windows import Batch, Windows, mean_tracks
+from steadypose.prior.models.layers.graph import JOINT_NODES, SCALE
+from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.motion.dataset import MotionSet
 
 DEPTHS = (1, 2, 4, 8, 16)
 """Stochastic levels, of the paper's table 1."""

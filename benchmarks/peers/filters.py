@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from benchmarks.peers.kalman import fixed_lag
-from prior.timing.fixed_lag import OneEuroFilter
-from prior.clean.frame import FPS
+from steadypose.benchmarks.peers.kalman import fixed_lag
+from steadypose.prior.clean.frame import FPS
+from steadypose.prior.timing.fixed_lag import OneEuroFilter
 
 Floats = NDArray[np.float64]
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from sklearn.linear_model import Ridge
 from torch import Tensor, nn
 
-from benchmarks.peers.kalman import fixed_lag
-from benchmarks.metrics import body_frame
-from prior.body.kinematics import rigid_alignment
-from prior.body.skeleton import KINECT22, J, to_canonical
-from prior.clean.frame import FPS
+from steadypose.benchmarks.metrics import body_frame
+from steadypose.benchmarks.peers.kalman import fixed_lag
+from steadypose.prior.body.kinematics import rigid_alignment
+from steadypose.prior.body.skeleton import KINECT22, J, to_canonical
+from steadypose.prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from benchmarks.corruption import LIMBS, correlated, gaussian, hide, spiked
-from benchmarks.motion import MotionClips
-from benchmarks.peers.filters import hold_last, missing
+from steadypose.benchmarks.corruption import LIMBS, correlated, gaussian, hide, spiked
+from steadypose.benchmarks.motion import MotionClips
+from steadypose.benchmarks.peers.filters import hold_last, missing
 
 Floats = NDArray[np.float64]
 

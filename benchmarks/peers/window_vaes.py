@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from prior.models.hmvae.network import HMVAE, ROTATION_FEATURES, SLOPE, HMVAEConfig, MotionVAE, Posterior
-from prior.motion.dataset import MotionSet
-from prior.models.layers.skeleton_conv import EdgeLinear, SkeletonConv
-from prior.models.hmvae.train import STRIDES, fit
+from steadypose.prior.models.hmvae.network import HMVAE, ROTATION_FEATURES, SLOPE, HMVAEConfig, MotionVAE, Posterior
+from steadypose.prior.models.hmvae.train import STRIDES, fit
+from steadypose.prior.models.layers.skeleton_conv import EdgeLinear, SkeletonConv
+from steadypose.prior.motion.dataset import MotionSet
 
 CONFIGS: Mapping[int, HMVAEConfig] = {
     8: HMVAEConfig(),

@@ -20,27 +20,26 @@ from sklearn.decomposition import PCA
 from sklearn.metrics import roc_auc_score, roc_curve
 from sklearn.neighbors import KNeighborsClassifier
 
-from benchmarks.hgvae import imputation
-from benchmarks.hgvae import models
-from benchmarks.bench import Bench, Result
-from benchmarks.hgvae.faults import FAULTS, HELD, held
-from benchmarks.machine import ROOT
-from benchmarks.motion import as_set, digest
-from benchmarks.results import Table
-from msgs.types import JOINTS
-from prior.clean.score import RATES as QUANTILES
-from prior.clean.score import Calibration, load_fault_net
-from prior.models.hgvae.features import to_tracks
-from prior.models.weights_io import WEIGHTS, load_weights
-from prior.motion.corruption import sensed
-from prior.models.hgvae.faults import FaultNet
-from prior.models.layers.graph import SCALE
-from prior.models.hgvae.network import HGVAE, HGVAEConfig
-from prior.motion.dataset import MotionSet
-from prior.body.skeleton import PARENTS
-from prior.models.hgvae.windows import Batch, Windows, standardise
-from prior.models.hgvae.train_faults import score_windows
-from prior.models.hgvae.train import evidence
+from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.hgvae import imputation, models
+from steadypose.benchmarks.hgvae.faults import FAULTS, HELD, held
+from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.motion import as_set, digest
+from steadypose.benchmarks.results import Table
+from steadypose.msgs.types import JOINTS
+from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.clean.score import RATES as QUANTILES
+from steadypose.prior.clean.score import Calibration, load_fault_net
+from steadypose.prior.models.hgvae.faults import FaultNet
+from steadypose.prior.models.hgvae.features import to_tracks
+from steadypose.prior.models.hgvae.network import HGVAE, HGVAEConfig
+from steadypose.prior.models.hgvae.train import evidence
+from steadypose.prior.models.hgvae.train_faults import score_windows
+from steadypose.prior.models.hgvae.windows import Batch, Windows, standardise
+from steadypose.prior.models.layers.graph import SCALE
+from steadypose.prior.models.weights_io import WEIGHTS, load_weights
+from steadypose.prior.motion.corruption import sensed
+from steadypose.prior.motion.dataset import MotionSet
 
 Floats = NDArray[np.float64]
 

@@ -12,13 +12,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import figures
-from benchmarks.bench import Bench, Result
-from benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
-from benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
-from benchmarks.results import Table
-from benchmarks.scores import pivot
-from prior.clean.frame import FPS
+from steadypose.benchmarks import figures
+from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
+from steadypose.benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
+from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.scores import pivot
+from steadypose.prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

@@ -22,11 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import figures, ours
-from benchmarks.peers import kinect_regression
-from benchmarks.peers import smoothnet
-from benchmarks.bench import Bench, Result, over_seeds, tune, tuning_log
-from benchmarks.metrics import (
+from steadypose.benchmarks import figures, ours
+from steadypose.benchmarks.bench import Bench, Result, over_seeds, tune, tuning_log
+from steadypose.benchmarks.metrics import (
     acceleration_error,
     body_frame,
     bootstrap,
@@ -36,14 +34,15 @@ from benchmarks.metrics import (
     reliability,
     sigma_ratio,
 )
-from benchmarks.peers.filters import FILTERS, OFFLINE, Peer
-from benchmarks.results import Table
-from benchmarks.tuning import Tuned, loss, search
-from prior.body.kinematics import rigid_alignment
-from prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
-from prior.clean.pipeline import PriorSettings
-from prior.body.skeleton import JOINTS, KINECT22, MIRROR, J, to_canonical
-from prior.clean.frame import FPS
+from steadypose.benchmarks.peers import kinect_regression, smoothnet
+from steadypose.benchmarks.peers.filters import FILTERS, OFFLINE, Peer
+from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.tuning import Tuned, loss, search
+from steadypose.prior.body.kinematics import rigid_alignment
+from steadypose.prior.body.skeleton import JOINTS, KINECT22, MIRROR, J, to_canonical
+from steadypose.prior.clean.frame import FPS
+from steadypose.prior.clean.pipeline import PriorSettings
+from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
 
 Floats = NDArray[np.float64]
 

@@ -11,12 +11,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import figures
-from benchmarks.bench import Bench, Result
-from benchmarks.corruption import correlated, gaussian, spiked, swapped
-from benchmarks.peers.filters import FILTERS
-from benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
-from benchmarks.scores import pivot
+from steadypose.benchmarks import figures
+from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.corruption import correlated, gaussian, spiked, swapped
+from steadypose.benchmarks.peers.filters import FILTERS
+from steadypose.benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
+from steadypose.benchmarks.scores import pivot
 
 Floats = NDArray[np.float64]
 

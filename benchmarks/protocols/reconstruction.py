@@ -3,8 +3,8 @@
 Windows are encoded and decoded as refinement does (equations 10 and 11): of 8 frames, on which the model that ships
 was trained, and of 64, either in windows that long or pieced together from 8, side by side or by sliding and keeping
 centre frames (equation 12). The paper's peers, a VAE without the hierarchy and one without the skeleton, are trained
-here, and HM-VAE once more exactly as they are (`benchmarks.peers.window_vaes`). Joints are placed by forward kinematics on
-the person's bones with the pelvis at the origin, so that errors are of the pose with its orientation, not of its
+here, and HM-VAE once more exactly as they are (`benchmarks.peers.window_vaes`). Joints are placed by forward kinematics
+on the person's bones with the pelvis at the origin, so that errors are of the pose with its orientation, not of its
 place. The trivial peer repeats the window's centre frame.
 """
 
@@ -17,15 +17,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.peers import window_vaes
-from benchmarks.bench import Bench, Result
-from benchmarks.ours import weight_sets
-from benchmarks.results import Table
-from benchmarks.scores import figures, score
-from prior.models.weights_io import load_weights
-from prior.models.hmvae.network import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
-from prior.body.kinematics import forward_kinematics
-from prior.motion.dataset import remove_heading
+from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.ours import weight_sets
+from steadypose.benchmarks.peers import window_vaes
+from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.scores import figures, score
+from steadypose.prior.body.kinematics import forward_kinematics
+from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
+from steadypose.prior.models.weights_io import load_weights
+from steadypose.prior.motion.dataset import remove_heading
 
 Floats = NDArray[np.float64]
 

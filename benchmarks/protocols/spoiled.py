@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.bench import Answer, Bench, answers, over_seeds, tune, tuning_log
-from benchmarks.metrics import bootstrap_ratio, position_error, reliability, sigma_ratio
-from benchmarks.motion import MotionClips
-from benchmarks.ours import OURS
-from benchmarks.peers.filters import OFFLINE, PEERS, Peer, missing
-from benchmarks.results import Table
-from benchmarks.scores import Scores, figures, pivot, score
+from steadypose.benchmarks.bench import Answer, Bench, answers, over_seeds, tune, tuning_log
+from steadypose.benchmarks.metrics import bootstrap_ratio, position_error, reliability, sigma_ratio
+from steadypose.benchmarks.motion import MotionClips
+from steadypose.benchmarks.ours import OURS
+from steadypose.benchmarks.peers.filters import OFFLINE, PEERS, Peer, missing
+from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.scores import Scores, figures, pivot, score
 
 Floats = NDArray[np.float64]
 Condition = Callable[[Floats, np.random.Generator], Floats]

@@ -16,15 +16,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from benchmarks import figures as pictures
-from benchmarks.bench import Answer, Bench, Result, answers, over_seeds, tune, tuning_log
-from benchmarks.corruption import LIMBS, bursts, gaussian, hide
-from benchmarks.metrics import found_delay
-from benchmarks.motion import MotionClips
-from benchmarks.peers.filters import OFFLINE, PEERS, Peer, missing, raw
-from benchmarks.results import Table
-from benchmarks.scores import figures, score
-from prior.clean.frame import FPS
+from steadypose.benchmarks import figures as pictures
+from steadypose.benchmarks.bench import Answer, Bench, Result, answers, over_seeds, tune, tuning_log
+from steadypose.benchmarks.corruption import LIMBS, bursts, gaussian, hide
+from steadypose.benchmarks.metrics import found_delay
+from steadypose.benchmarks.motion import MotionClips
+from steadypose.benchmarks.peers.filters import OFFLINE, PEERS, Peer, missing, raw
+from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.scores import figures, score
+from steadypose.prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

@@ -17,19 +17,19 @@ import roma
 import torch
 from numpy.typing import NDArray
 
-from benchmarks import ours
-from benchmarks.bench import Bench, Result, peers_of, tune, tuning_log
-from benchmarks.corruption import correlated
-from benchmarks.metrics import contact_speed, position_error
-from benchmarks.motion import MotionClips
-from benchmarks.peers.filters import FILTERS, OFFLINE, Peer, missing
-from benchmarks.results import Table
-from benchmarks.scores import figures, interval, score
-from prior.body.kinematics import CONTACT_JOINTS
-from prior.clean.pipeline import PriorPipeline
-from prior.body.skeleton import JOINTS
-from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
-from benchmarks.root_drift import METHODS, Clip, evaluate_fusion
+from steadypose.benchmarks import ours
+from steadypose.benchmarks.bench import Bench, Result, peers_of, tune, tuning_log
+from steadypose.benchmarks.corruption import correlated
+from steadypose.benchmarks.metrics import contact_speed, position_error
+from steadypose.benchmarks.motion import MotionClips
+from steadypose.benchmarks.peers.filters import FILTERS, OFFLINE, Peer, missing
+from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.root_drift import METHODS, Clip, evaluate_fusion
+from steadypose.benchmarks.scores import figures, interval, score
+from steadypose.prior.body.kinematics import CONTACT_JOINTS
+from steadypose.prior.body.skeleton import JOINTS
+from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 Floats = NDArray[np.float64]
 

@@ -20,9 +20,17 @@ from rich.console import Console
 from rich.progress import track
 from scipy.spatial.transform import Rotation
 
-from benchmarks.results import RESULTS, Table, save, show
-from msgs.types import Pose
-from prior.camera.calibration import Board, Corners, Intrinsics, calibrate_lens, camera_pose, find_corners, floor_pose
+from steadypose.benchmarks.results import RESULTS, Table, save, show
+from steadypose.msgs.types import Pose
+from steadypose.prior.camera.calibration import (
+    Board,
+    Corners,
+    Intrinsics,
+    calibrate_lens,
+    camera_pose,
+    find_corners,
+    floor_pose,
+)
 
 Floats = NDArray[np.float64]
 

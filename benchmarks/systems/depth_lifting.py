@@ -21,14 +21,14 @@ from rich.console import Console
 from rich.progress import track
 from scipy.spatial.transform import Rotation
 
-from benchmarks.results import RESULTS, Table, save, show
-from prior.camera.depth_lifting import lift
-from prior.sim import scripts
-from prior.sim.body import REST_HEIGHT, stature
-from prior.sim.depth import Stereo, render, room, spoil
-from prior.sim.motion import Motion
-from prior.sim.sensors import mount
-from prior.body.skeleton import COCO17
+from steadypose.benchmarks.results import RESULTS, Table, save, show
+from steadypose.prior.body.skeleton import COCO17
+from steadypose.prior.camera.depth_lifting import lift
+from steadypose.prior.sim import scripts
+from steadypose.prior.sim.body import REST_HEIGHT, stature
+from steadypose.prior.sim.depth import Stereo, render, room, spoil
+from steadypose.prior.sim.motion import Motion
+from steadypose.prior.sim.sensors import mount
 
 Floats = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Whether people keep their ids when they cross and hide each other: what `prior.clean.identify` makes of unnumbered bodies.
+"""Whether people keep their ids when they cross and hide each other: `prior.clean.identify` on unnumbered bodies.
 
 Streams are made from seeds by the project's simulator; their tracker knows who is who, so each sighting's person is
 known. The methods get the bodies of each frame in random order and without ids.
@@ -22,12 +22,12 @@ from rich.console import Console
 from rich.progress import track
 from scipy.spatial.transform import Rotation
 
-from benchmarks.machine import ROOT
-from benchmarks.results import RESULTS, Table, save, show
-from msgs.types import PoseRaw, PoseWorld
-from prior.clean.identify import Identify, IdentifySettings
-from prior.sim.streams import Stream, make, read_manifest
-from prior.body.skeleton import get_skeleton, to_canonical
+from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.results import RESULTS, Table, save, show
+from steadypose.msgs.types import PoseRaw, PoseWorld
+from steadypose.prior.body.skeleton import get_skeleton, to_canonical
+from steadypose.prior.clean.identify import Identify, IdentifySettings
+from steadypose.prior.sim.streams import Stream, make, read_manifest
 
 MANIFEST = ROOT / "sim_data" / "manifest.json"
 ROWS = 16

@@ -35,14 +35,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.interpolate import CubicSpline
 
-from benchmarks.results import RESULTS, Table, save, show
-from prior.body.kinematics import rigid_alignment
-from prior.motion.clip import Y_UP_TO_Z_UP, MotionError
-from prior.motion.datasets import CMU_FPS, REPEATS, amc_motions, bvh_motion, members
-from prior.motion.npz import read_expmap
-from prior.motion.prepare import FPS, resample
-from prior.motion.tables import CMU_AMC, CMU_BVH, ICLONE
-from prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, Skeleton, to_canonical
+from steadypose.benchmarks.results import RESULTS, Table, save, show
+from steadypose.prior.body.kinematics import rigid_alignment
+from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, Skeleton, to_canonical
+from steadypose.prior.motion.clip import Y_UP_TO_Z_UP, MotionError
+from steadypose.prior.motion.datasets import CMU_FPS, REPEATS, amc_motions, bvh_motion, members
+from steadypose.prior.motion.npz import read_expmap
+from steadypose.prior.motion.prepare import FPS, resample
+from steadypose.prior.motion.tables import CMU_AMC, CMU_BVH, ICLONE
 
 Floats = NDArray[np.float64]
 

@@ -26,16 +26,16 @@ from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.machine import ROOT
-from benchmarks.results import RESULTS, Table, save, show
-from benchmarks.running import START_S, running
-from msgs.recording import RecordingReader, RecordingWriter
-from msgs.topics import POSE_RAW, POSE_WORLD
-from msgs.types import Diagnostics, PoseRaw, RawBody
-from nodes.graph.runtime import FRAME_NS, Timeline
-from nodes.graph.threads import one_thread
-from prior.clean.pipeline import PriorPipeline, PriorSettings
-from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.results import RESULTS, Table, save, show
+from steadypose.benchmarks.running import START_S, running
+from steadypose.msgs.recording import RecordingReader, RecordingWriter
+from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
+from steadypose.msgs.types import Diagnostics, PoseRaw, RawBody
+from steadypose.nodes.graph.runtime import FRAME_NS, Timeline
+from steadypose.nodes.graph.threads import one_thread
+from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 CROWDS = (1, 4, 8)
 LIVE_CROWDS = (1, 4, 8)

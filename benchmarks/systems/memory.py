@@ -12,11 +12,11 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.machine import ROOT
-from benchmarks.results import RESULTS, Table, save, show
-from benchmarks.running import running
-from msgs.types import Diagnostics
-from nodes.graph.launch import POSE_NODES
+from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.results import RESULTS, Table, save, show
+from steadypose.benchmarks.running import running
+from steadypose.msgs.types import Diagnostics
+from steadypose.nodes.graph.launch import POSE_NODES
 
 
 @dataclass(frozen=True)

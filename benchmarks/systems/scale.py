@@ -20,18 +20,18 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.systems.latency import WARM_UP, crowd, percentiles
-from benchmarks.machine import ROOT
-from benchmarks.results import RESULTS, Table, save, show
-from msgs.recording import RecordingReader
-from msgs.topics import POSE_RAW
-from msgs.types import PoseRaw
-from nodes.commands.cleaning import clean_recording
-from nodes.graph.runtime import FRAME_NS
-from nodes.graph.threads import one_thread
-from prior.clean.pipeline import PriorSettings
-from prior.clean.batch import StreamBatch
-from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.results import RESULTS, Table, save, show
+from steadypose.benchmarks.systems.latency import WARM_UP, crowd, percentiles
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.commands.cleaning import clean_recording
+from steadypose.nodes.graph.runtime import FRAME_NS
+from steadypose.nodes.graph.threads import one_thread
+from steadypose.prior.clean.batch import StreamBatch
+from steadypose.prior.clean.pipeline import PriorSettings
+from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 KIOSKS = (1, 4, 8, 16)
 NETWORK_NS = 3_000_000

@@ -21,19 +21,19 @@ from rich.console import Console
 from rich.progress import Progress
 from scipy.spatial.transform import Rotation
 
-from benchmarks.machine import ROOT
-from benchmarks.metrics import acceleration_error, contact_speed, length_variation, position_error
-from benchmarks.results import RESULTS, Table, save, show
-from msgs.types import CONTACTS, Message, Pose, PoseClean, PoseRaw, PoseWorld
-from nodes.commands.cleaning import stream
-from nodes.sources.npz import NpzCollector
-from nodes.sources.pose_input import RecordingSource
-from nodes.graph.threads import one_thread
-from prior.timing.fixed_lag import FixedLagRTS
-from prior.body.kinematics import rigid_alignment
-from prior.clean.pipeline import PriorPipeline, PriorSettings
-from prior.body.skeleton import PARENTS, SKELETONS, J, to_canonical
-from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.metrics import acceleration_error, contact_speed, length_variation, position_error
+from steadypose.benchmarks.results import RESULTS, Table, save, show
+from steadypose.msgs.types import CONTACTS, Message, Pose, PoseClean, PoseRaw, PoseWorld
+from steadypose.nodes.commands.cleaning import stream
+from steadypose.nodes.graph.threads import one_thread
+from steadypose.nodes.sources.npz import NpzCollector
+from steadypose.nodes.sources.pose_input import RecordingSource
+from steadypose.prior.body.kinematics import rigid_alignment
+from steadypose.prior.body.skeleton import PARENTS, SKELETONS, J, to_canonical
+from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+from steadypose.prior.timing.fixed_lag import FixedLagRTS
+from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 Floats = NDArray[np.float64]
 

@@ -26,9 +26,9 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from nodes.commands.cleaning import clean_recording
-from nodes.cli import is_for_user
-from nodes.graph.launch import LaunchError
+from steadypose.nodes.cli import is_for_user
+from steadypose.nodes.commands.cleaning import clean_recording
+from steadypose.nodes.graph.launch import LaunchError
 
 MANIFEST = "manifest.jsonl"
 FILES = (".npz", ".csv")
@@ -194,7 +194,7 @@ class Manifest:
 
 def _models() -> str:
     """What tells the weights that ship from those of another release."""
-    from prior.models import weights_io as checkpoint  # brings torch
+    from steadypose.prior.models import weights_io as checkpoint  # brings torch
 
     files = sorted(file for file in checkpoint.WEIGHTS.iterdir() if file.suffix in (".safetensors", ".json"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
@@ -303,8 +303,8 @@ def on_ray(jobs: Iterable[Job], settings: Settings) -> Iterator[tuple[Job, dict[
 
 def _check(settings: Settings) -> None:
     """Find here what every recording would stumble over."""
-    from nodes.graph.prior_node import make_prior
-    from nodes.graph.trajectory_node import make_trajectory
+    from steadypose.nodes.graph.prior_node import make_prior
+    from steadypose.nodes.graph.trajectory_node import make_trajectory
 
     make_prior(settings["prior"])
     make_trajectory(settings["trajectory"])

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from rich.progress import track
 from scipy.spatial.transform import Rotation
 
-from msgs.types import Pose
-from nodes.graph.launch import Launch, LaunchError
-from prior.camera.calibration import (
+from steadypose.msgs.types import Pose
+from steadypose.nodes.graph.launch import Launch, LaunchError
+from steadypose.prior.camera.calibration import (
     LEAST_CORNERS,
     Board,
     CalibrationError,
@@ -33,7 +33,7 @@ from prior.camera.calibration import (
 )
 
 if TYPE_CHECKING:
-    from nodes.sources.oak_still import Still
+    from steadypose.nodes.sources.oak_still import Still
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -291,7 +291,7 @@ def _calibrate_floor(step: CalibrateFloor) -> None:
 
 def _calibrate_oak(step: CalibrateOak) -> None:
     launch = _check_launch(step.launch)
-    from nodes.sources.oak_still import take_with_camera  # brings depthai
+    from steadypose.nodes.sources.oak_still import take_with_camera  # brings depthai
 
     try:
         still = take_with_camera(launch.input.oak)

@@ -9,9 +9,9 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from nodes.commands.batch import clean_folder, is_folder_of_recordings
-from nodes.commands.cleaning import clean_recording
-from nodes.graph.launch import LaunchError, apply_override
+from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
+from steadypose.nodes.commands.cleaning import clean_recording
+from steadypose.nodes.graph.launch import LaunchError, apply_override
 
 
 def clean(

@@ -12,13 +12,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from msgs.recording import RecordingWriter
-from msgs.topics import POSE_CLEAN, POSE_WORLD
-from msgs.types import Message, PoseClean, PoseRaw, PoseWorld
-from nodes.graph.launch import LaunchError
-from nodes.sources.npz import NpzCollector
-from nodes.sources.pose_input import open_source, with_end
-from nodes.sinks.recorder import Filing
+from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
+from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
+from steadypose.nodes.graph.launch import LaunchError
+from steadypose.nodes.sinks.recorder import Filing
+from steadypose.nodes.sources.npz import NpzCollector
+from steadypose.nodes.sources.pose_input import open_source, with_end
 
 
 class Cleaner(Protocol):
@@ -95,9 +95,9 @@ def clean_recording(
         raise LaunchError(f"{out} exists: expected a new directory to write the recording to")
     frames = open_source(source)
     # these bring torch, which takes seconds: not before it is known that there is something to do
-    from nodes.graph.prior_node import make_prior
-    from nodes.graph.threads import one_thread
-    from nodes.graph.trajectory_node import make_trajectory
+    from steadypose.nodes.graph.prior_node import make_prior
+    from steadypose.nodes.graph.threads import one_thread
+    from steadypose.nodes.graph.trajectory_node import make_trajectory
 
     one_thread()
     prior, trajectory = make_prior(settings["prior"]), make_trajectory(settings["trajectory"])

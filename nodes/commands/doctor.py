@@ -19,7 +19,7 @@ from rich.table import Table
 
 # what is looked for is imported where it is looked for: a doctor who needs it all could not say what is missing
 if TYPE_CHECKING:
-    from msgs.types import PoseRaw
+    from steadypose.msgs.types import PoseRaw
 
 INSTALL = "in the checkout: rm -f .venv/.installed && ./steadypose doctor"
 """installs whatever is missing, then looks again"""
@@ -31,7 +31,7 @@ EXTRAS = {
     "webcam": "a webcam as the source",
 }
 """what is optional, by the extra that it takes"""
-PROJECT = Path(__file__).parent.parent / "pyproject.toml"
+PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 TOLD = ("torch", "numpy", "rosbags", "pyzmq", "depthai")
 """packages whose versions matter when something is wrong"""
 MODELS = ("hmvae", "hgvae", "trajectory")
@@ -194,7 +194,7 @@ def check_clock() -> Iterator[Finding]:
 
 def check_messages() -> Iterator[Finding]:
     """The directory of the ipc sockets, and a message there and back."""
-    from nodes.graph.launch import TransportSettings
+    from steadypose.nodes.graph.launch import TransportSettings
 
     directory = TransportSettings().ipc_directory
     longest = len(os.fsencode(directory / "trajectory"))
@@ -215,8 +215,8 @@ def check_messages() -> Iterator[Finding]:
 
 def _round_trip(endpoint: str) -> float:
     """Seconds that a message takes from a publisher to a subscriber."""
-    from msgs.topics import POSE_RAW
-    from msgs.transport import Publisher, Subscriber
+    from steadypose.msgs.topics import POSE_RAW
+    from steadypose.msgs.transport import Publisher, Subscriber
 
     name = "doctor"
     with Publisher(endpoint) as publisher, Subscriber(endpoint, POSE_RAW, name=name) as subscriber:
@@ -239,7 +239,7 @@ def check_torch() -> Iterator[Finding]:
 
 def check_models() -> Iterator[Finding]:
     """The weights that the nodes load, and what a frame costs with them."""
-    from prior.models.weights_io import WEIGHTS, load_weights
+    from steadypose.prior.models.weights_io import WEIGHTS, load_weights
 
     whole = True
     for model in MODELS:
@@ -260,8 +260,8 @@ def _self_test() -> Finding:
     """A body that stands for a hundred frames, through the prior."""
     import numpy as np
 
-    from nodes.graph.threads import one_thread
-    from prior.clean.pipeline import PriorPipeline, PriorSettings
+    from steadypose.nodes.graph.threads import one_thread
+    from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
 
     one_thread()
     pipeline = PriorPipeline(PriorSettings())
@@ -287,8 +287,8 @@ def _standing(frame: int) -> PoseRaw:
     """A body in a T-pose, two metres in front of the world's origin, that sways a little."""
     import numpy as np
 
-    from msgs.types import Pose, PoseRaw, RawBody
-    from prior.body.skeleton import CANONICAL, PARENTS, REST_OFFSETS, J
+    from steadypose.msgs.types import Pose, PoseRaw, RawBody
+    from steadypose.prior.body.skeleton import CANONICAL, PARENTS, REST_OFFSETS, J
 
     positions = np.zeros((len(CANONICAL.joints), 3))
     positions[J["pelvis"]] = [2.0, 0.02 * np.sin(frame / 10), 0.95]
@@ -302,9 +302,9 @@ def _standing(frame: int) -> PoseRaw:
 
 def check_streams() -> Iterator[Finding]:
     """What the default launch file plays."""
-    from msgs.recording import RecordingReader
-    from nodes.graph.launch import Launch, checkout
-    from nodes.sources.pose_input import open_source
+    from steadypose.msgs.recording import RecordingReader
+    from steadypose.nodes.graph.launch import Launch, checkout
+    from steadypose.nodes.sources.pose_input import open_source
 
     fix = "git checkout -- sim_data launch, or play your own: steadypose run --input RECORDING"
     recording = Path(Launch.read("replay").input.recording).resolve()

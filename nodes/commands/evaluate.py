@@ -27,6 +27,6 @@ def evaluate(
             stand in.
         out: folder to write to.
     """
-    from benchmarks.evaluate import evaluate as run
+    from steadypose.benchmarks.evaluate import evaluate as run
 
     run(protocol, quick=quick, mocap=mocap, data=data, out=out)

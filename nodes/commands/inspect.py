@@ -21,13 +21,13 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from msgs.codec import wire_type
-from msgs.keys import load_keys
-from msgs.recording import RecordingReader
-from msgs.topics import TOPICS
-from msgs.transport import Subscriber
-from msgs.types import JOINTS, Diagnostics, JointState, Message, PoseClean, PoseRaw, WorldBody
-from nodes.graph.launch import LISTENS, Launch, TransportSettings, nearest
+from steadypose.msgs.codec import wire_type
+from steadypose.msgs.keys import load_keys
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import TOPICS
+from steadypose.msgs.transport import Subscriber
+from steadypose.msgs.types import JOINTS, Diagnostics, JointState, Message, PoseClean, PoseRaw, WorldBody
+from steadypose.nodes.graph.launch import LISTENS, Launch, TransportSettings, nearest
 
 TURN_S = 0.1
 HZ_EVERY_S = 1.0

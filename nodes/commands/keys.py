@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from msgs.keys import create_keys
-from nodes.graph.launch import LaunchError
+from steadypose.msgs.keys import create_keys
+from steadypose.nodes.graph.launch import LaunchError
 
 
 def keys(directory: Path) -> None:

@@ -9,16 +9,16 @@ from typing import Annotated
 
 import tyro
 
-from nodes.graph.launch import LISTENS, Launch, LaunchError, nearest
+from steadypose.nodes.graph.launch import LISTENS, Launch, LaunchError, nearest
 
 #: name: the class that is the node
 CLASSES = {
-    "pose_input": "nodes.sources.pose_input:PoseInputNode",
-    "prior": "nodes.graph.prior_node:PriorNode",
-    "trajectory": "nodes.graph.trajectory_node:TrajectoryNode",
-    "ros2_bridge": "nodes.sinks.ros2.bridge:Ros2BridgeNode",
-    "recorder": "nodes.sinks.recorder:RecorderNode",
-    "viewer": "nodes.sinks.viewer:ViewerNode",
+    "pose_input": "steadypose.nodes.sources.pose_input:PoseInputNode",
+    "prior": "steadypose.nodes.graph.prior_node:PriorNode",
+    "trajectory": "steadypose.nodes.graph.trajectory_node:TrajectoryNode",
+    "ros2_bridge": "steadypose.nodes.sinks.ros2.bridge:Ros2BridgeNode",
+    "recorder": "steadypose.nodes.sinks.recorder:RecorderNode",
+    "viewer": "steadypose.nodes.sinks.viewer:ViewerNode",
 }
 
 

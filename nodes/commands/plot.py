@@ -16,10 +16,10 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from msgs.recording import RecordingReader
-from msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
-from msgs.types import CONTACTS, JOINTS, Diagnostics, JointState, PoseClean, PoseRaw, PoseWorld, Tracking
-from nodes.sinks.drawing import (
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from steadypose.msgs.types import CONTACTS, JOINTS, Diagnostics, JointState, PoseClean, PoseRaw, PoseWorld, Tracking
+from steadypose.nodes.sinks.drawing import (
     ALARM_COLOUR,
     ALL_BONES,
     CLEAN_COLOUR,
@@ -33,7 +33,7 @@ from nodes.sinks.drawing import (
     facing,
     to_world,
 )
-from prior.body.skeleton import SKELETONS, J, to_canonical
+from steadypose.prior.body.skeleton import SKELETONS, J, to_canonical
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from prior.motion.datasets import DATA_SETS, DataSet, Dropped
-from prior.motion.prepare import FPS, Prepared, prepare_clip, write_prepared
+from steadypose.prior.motion.datasets import DATA_SETS, DataSet, Dropped
+from steadypose.prior.motion.prepare import FPS, Prepared, prepare_clip, write_prepared
 
 
 class PrepareError(ValueError):

@@ -15,13 +15,13 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
-from msgs.transport import Subscriber
-from msgs.types import Diagnostics, Level
-from nodes.graph.launch import LISTENS, Launch, LaunchError
-from nodes.sources.pose_input import open_input
-from nodes.graph.runtime import Clock, SystemClock
-from nodes.graph.supervisor import Supervisor
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.transport import Subscriber
+from steadypose.msgs.types import Diagnostics, Level
+from steadypose.nodes.graph.launch import LISTENS, Launch, LaunchError
+from steadypose.nodes.graph.runtime import Clock, SystemClock
+from steadypose.nodes.graph.supervisor import Supervisor
+from steadypose.nodes.sources.pose_input import open_input
 
 LINE_NS = 5_000_000_000
 """between lines where there is no terminal for a table"""
@@ -85,11 +85,11 @@ def _check(launch: Launch) -> None:
     if "recorder" in launch.nodes and Path(launch.recorder.directory).exists():
         raise LaunchError(f"{launch.recorder.directory} exists: expected a new directory to record to")
     if "viewer" in launch.nodes:
-        from nodes.sinks.viewer import require_rerun
+        from steadypose.nodes.sinks.viewer import require_rerun
 
         require_rerun()
     if "ros2_bridge" in launch.nodes:
-        from nodes.sinks.ros2.bridge import require_ros2
+        from steadypose.nodes.sinks.ros2.bridge import require_ros2
 
         require_ros2()
 

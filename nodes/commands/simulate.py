@@ -7,8 +7,8 @@ from typing import Annotated
 
 import tyro
 
-from nodes.graph.launch import checkout
-from prior.sim.streams import ManifestError, read_manifest, record
+from steadypose.nodes.graph.launch import checkout
+from steadypose.prior.sim.streams import ManifestError, read_manifest, record
 
 
 def simulate(

@@ -3,7 +3,8 @@
 A launch file is TOML, one section a subject, and read strictly: a key that does not exist is an error that names
 the nearest one that does. Every section may be left out; the defaults play nothing but run. ``[prior]`` and
 ``[trajectory]`` are passed on as they are to the stages they configure (`prior.clean.pipeline.PriorSettings`,
-`prior.world.pipeline.TrajectorySettings`), which check them just as strictly, so that reading a launch file needs no torch.
+`prior.world.pipeline.TrajectorySettings`), which check them just as strictly, so that reading a launch file needs no
+torch.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from msgs.keys import Keys, load_keys
-from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
-from msgs.types import Pose
-from prior.settings import build_settings
+from steadypose import PACKAGE
+from steadypose.msgs.keys import Keys, load_keys
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
+from steadypose.msgs.types import Pose
+from steadypose.prior.settings import build_settings
 
 #: The graph: each node, and for every node it listens to the topics it takes from there.
 LISTENS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
@@ -377,7 +379,7 @@ def checkout(*parts: str) -> Path:
     Raises:
         LaunchError: it is not there, as in an install that is not editable.
     """
-    path = Path(__file__).resolve().parent.parent.joinpath(*parts)
+    path = PACKAGE.joinpath(*parts)
     if not path.exists():
         raise LaunchError(
             f"{path} does not exist: launch files and sim_data belong to the checkout. Install from it with "

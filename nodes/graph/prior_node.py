@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from msgs.topics import POSE_CLEAN
-from msgs.types import Message, PoseRaw
-from nodes.graph.launch import Launch, LaunchError
-from nodes.graph.runtime import FRAME_NS, Clock, Node
-from nodes.graph.threads import one_thread
-from prior.clean.pipeline import PriorPipeline, PriorSettings, load_loops
-from prior.clean.batch import StreamBatch
+from steadypose.msgs.topics import POSE_CLEAN
+from steadypose.msgs.types import Message, PoseRaw
+from steadypose.nodes.graph.launch import Launch, LaunchError
+from steadypose.nodes.graph.runtime import FRAME_NS, Clock, Node
+from steadypose.nodes.graph.threads import one_thread
+from steadypose.prior.clean.batch import StreamBatch
+from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings, load_loops
 
 GATED = ("joints_refused", "limbs_exchanged", "joints_stuck")
 """counts of what the gate found in the sensor's joints: its daily work, and no fault of a message"""

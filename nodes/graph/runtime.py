@@ -31,10 +31,10 @@ from typing import ClassVar, Protocol, Self
 
 import numpy as np
 
-from msgs.topics import DIAGNOSTICS
-from msgs.transport import Publisher, Subscriber
-from msgs.types import Diagnostics, Level, Message
-from nodes.graph.launch import LISTENS, Launch
+from steadypose.msgs.topics import DIAGNOSTICS
+from steadypose.msgs.transport import Publisher, Subscriber
+from steadypose.msgs.types import Diagnostics, Level, Message
+from steadypose.nodes.graph.launch import LISTENS, Launch
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 
-from nodes.graph.runtime import SUPERVISOR, Clock
+from steadypose.nodes.graph.runtime import SUPERVISOR, Clock
 
 BACKOFF_S = (0.5, 1.0, 2.0, 4.0, 8.0)
 """before each start after a crash in a row; one crash more, and the node has failed"""
@@ -114,7 +114,7 @@ class Supervisor:
             arguments: of ``steadypose node NAME``, the same for all.
             say: where a line from a node, or about it, goes; called from several threads.
         """
-        command = [sys.executable, "-m", "nodes.cli", "node"]
+        command = [sys.executable, "-m", "steadypose.nodes.cli", "node"]
         self.children = {
             name: Child(name, [*command, name, *arguments], clock, say)
             for name in sorted(nodes, key=ORDER.index, reverse=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from msgs.topics import POSE_WORLD
-from msgs.types import Message, PoseClean
-from nodes.graph.launch import Launch, LaunchError
-from nodes.graph.runtime import FRAME_NS, Clock, Node
-from nodes.graph.threads import one_thread
-from prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.msgs.topics import POSE_WORLD
+from steadypose.msgs.types import Message, PoseClean
+from steadypose.nodes.graph.launch import Launch, LaunchError
+from steadypose.nodes.graph.runtime import FRAME_NS, Clock, Node
+from steadypose.nodes.graph.threads import one_thread
+from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 
 def make_trajectory(settings: Mapping[str, Any]) -> TrajectoryPipeline:

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs.types import CONTACTS, JOINTS, JointState, Pose
-from prior.body.skeleton import PARENTS, J
+from steadypose.msgs.types import CONTACTS, JOINTS, JointState, Pose
+from steadypose.prior.body.skeleton import PARENTS, J
 
 # Okabe and Ito's palette: told apart with any kind of colour vision, on white and on black.
 STATE_COLOURS: dict[JointState, str] = {

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from msgs.recording import RecordingWriter
-from msgs.topics import DIAGNOSTICS
-from msgs.types import Diagnostics, Message
-from nodes.graph.launch import Launch, LaunchError
-from nodes.graph.runtime import Clock, Node
+from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.topics import DIAGNOSTICS
+from steadypose.msgs.types import Diagnostics, Message
+from steadypose.nodes.graph.launch import Launch, LaunchError
+from steadypose.nodes.graph.runtime import Clock, Node
 
 QUIET_S = 0.3
 """nothing came for so long: all that was on its way is here"""

@@ -23,8 +23,8 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
-from msgs.types import (
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from steadypose.msgs.types import (
     CleanBody,
     Diagnostics,
     JointState,
@@ -36,7 +36,8 @@ from msgs.types import (
     Tracking,
     WorldBody,
 )
-from nodes.sinks.drawing import (
+from steadypose.nodes.graph.runtime import TURN_S, Node
+from steadypose.nodes.sinks.drawing import (
     ALARM_COLOUR,
     ALL_BONES,
     CONTACT_COLOUR,
@@ -49,8 +50,7 @@ from nodes.sinks.drawing import (
     facing,
     to_world,
 )
-from nodes.graph.runtime import TURN_S, Node
-from prior.body.skeleton import SKELETONS, J, to_canonical
+from steadypose.prior.body.skeleton import SKELETONS, J, to_canonical
 
 if TYPE_CHECKING:
     import rerun as rr

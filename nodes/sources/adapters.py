@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs.types import Pose, PoseRaw, RawBody
-from prior.body.skeleton import AZURE_KINECT32, BLAZEPOSE33, COCO17, ZED38, Skeleton, finite_joints
+from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.prior.body.skeleton import AZURE_KINECT32, BLAZEPOSE33, COCO17, ZED38, Skeleton, finite_joints
 
 Floats = NDArray[np.float64]
 
@@ -142,7 +142,7 @@ def from_coco(
     Returns:
         bodies in the camera's optical frame, of a camera taken for level.
     """
-    from prior.camera.depth_lifting import lift  # compiles: not for those who have no depth image
+    from steadypose.prior.camera.depth_lifting import lift  # compiles: not for those who have no depth image
 
     joints = len(COCO17.joints)
     points = np.array([detection["keypoints"] for detection in detections], np.float64)

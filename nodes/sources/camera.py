@@ -9,8 +9,8 @@ from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager
 from typing import Protocol
 
-from msgs.types import PoseRaw
-from nodes.graph.runtime import TURN_S, Clock
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.graph.runtime import TURN_S, Clock
 
 logger = logging.getLogger(__name__)
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Generator
 
-from msgs.keys import Keys
-from msgs.topics import POSE_RAW
-from msgs.transport import Subscriber
-from msgs.types import PoseRaw
-from nodes.graph.launch import LaunchError, MergeSettings
-from nodes.sources.camera import LiveSource
-from nodes.graph.runtime import TURN_S
-from prior.camera.multi_view import Merge
+from steadypose.msgs.keys import Keys
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.transport import Subscriber
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.graph.launch import LaunchError, MergeSettings
+from steadypose.nodes.graph.runtime import TURN_S
+from steadypose.nodes.sources.camera import LiveSource
+from steadypose.prior.camera.multi_view import Merge
 
 
 class MergeSource(LiveSource):

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs.topics import POSE_RAW
-from msgs.types import JOINTS, Message, Pose, PoseClean, PoseRaw, PoseWorld, RawBody
-from prior.body.skeleton import SKELETONS
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.types import JOINTS, Message, Pose, PoseClean, PoseRaw, PoseWorld, RawBody
+from steadypose.prior.body.skeleton import SKELETONS
 
 PERIOD_NS = 1_000_000_000 / 30
 """of the grid the prior answers on"""

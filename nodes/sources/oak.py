@@ -18,13 +18,13 @@ import depthai as dai
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs.types import PoseRaw, RawBody
-from nodes.graph.launch import LaunchError, OakSettings
-from nodes.sources.camera import CameraError, CameraSource, count_failure
-from nodes.graph.runtime import TURN_S, Clock
-from prior.camera.gravity import Level
-from prior.camera.depth_lifting import lift
-from prior.body.skeleton import COCO17
+from steadypose.msgs.types import PoseRaw, RawBody
+from steadypose.nodes.graph.launch import LaunchError, OakSettings
+from steadypose.nodes.graph.runtime import TURN_S, Clock
+from steadypose.nodes.sources.camera import CameraError, CameraSource, count_failure
+from steadypose.prior.body.skeleton import COCO17
+from steadypose.prior.camera.depth_lifting import lift
+from steadypose.prior.camera.gravity import Level
 
 Floats = NDArray[np.float64]
 

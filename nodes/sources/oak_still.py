@@ -9,10 +9,10 @@ import depthai as dai
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.graph.launch import OakSettings
-from nodes.sources.camera import CameraError
-from nodes.sources.oak import APART, DEPTH_FPS, Gravity, accelerometer, aligned_depth, open_device
-from prior.camera.gravity import Level
+from steadypose.nodes.graph.launch import OakSettings
+from steadypose.nodes.sources.camera import CameraError
+from steadypose.nodes.sources.oak import APART, DEPTH_FPS, Gravity, accelerometer, aligned_depth, open_device
+from steadypose.prior.camera.gravity import Level
 
 SETTLE = 30
 """pairs let pass, while exposure and level settle"""

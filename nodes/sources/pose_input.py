@@ -9,15 +9,15 @@ from contextlib import closing
 from pathlib import Path
 from typing import Protocol
 
-from msgs.keys import Keys
-from msgs.recording import RecordingError, RecordingReader
-from msgs.topics import POSE_RAW, POSE_TRUTH
-from msgs.types import Diagnostics, Message, PoseRaw
-from nodes.sources.csv import CsvSource
-from nodes.graph.launch import InputSettings, Launch, LaunchError
-from nodes.sources.camera import LiveSource
-from nodes.sources.npz import NpzSource
-from nodes.graph.runtime import TURN_S, Clock, Node, Timeline
+from steadypose.msgs.keys import Keys
+from steadypose.msgs.recording import RecordingError, RecordingReader
+from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
+from steadypose.msgs.types import Diagnostics, Message, PoseRaw
+from steadypose.nodes.graph.launch import InputSettings, Launch, LaunchError
+from steadypose.nodes.graph.runtime import TURN_S, Clock, Node, Timeline
+from steadypose.nodes.sources.camera import LiveSource
+from steadypose.nodes.sources.csv import CsvSource
+from steadypose.nodes.sources.npz import NpzSource
 
 LEAP_NS = 15_000_000_000
 """a step of stamps, either way, that is no pause but another clock: it is not waited for"""
@@ -95,18 +95,18 @@ def open_input(settings: InputSettings, clock: Clock, keys: Keys | None = None) 
         return open_source(settings.recording)
     # these bring libraries that a replay does without
     if settings.source == "oak":
-        from nodes.sources.oak import OakSource
+        from steadypose.nodes.sources.oak import OakSource
 
         return OakSource(settings.oak, clock)
     if settings.source == "ros2":
-        from nodes.sources.ros2 import Ros2Source
+        from steadypose.nodes.sources.ros2 import Ros2Source
 
         return Ros2Source(settings.ros2)
     if settings.source == "merge":
-        from nodes.sources.merge import MergeSource
+        from steadypose.nodes.sources.merge import MergeSource
 
         return MergeSource(settings.merge, keys)
-    from nodes.sources.webcam import WebcamSource
+    from steadypose.nodes.sources.webcam import WebcamSource
 
     return WebcamSource(settings.webcam, settings.calibration, clock)
 

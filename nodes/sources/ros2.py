@@ -6,13 +6,13 @@ from collections import deque
 from collections.abc import Generator
 from typing import Any
 
-from msgs.types import PoseRaw
-from nodes.sources.adapters import from_azure_kinect, from_pose_array
-from nodes.graph.launch import LaunchError, Ros2Settings, nearest
-from nodes.sources.camera import LiveSource
-from nodes.sinks.ros2.bridge import require_ros2
-from nodes.graph.runtime import TURN_S
-from prior.body.skeleton import SKELETONS
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.graph.launch import LaunchError, Ros2Settings, nearest
+from steadypose.nodes.graph.runtime import TURN_S
+from steadypose.nodes.sinks.ros2.bridge import require_ros2
+from steadypose.nodes.sources.adapters import from_azure_kinect, from_pose_array
+from steadypose.nodes.sources.camera import LiveSource
+from steadypose.prior.body.skeleton import SKELETONS
 
 
 class Ros2Source(LiveSource):

@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs.types import PoseRaw
-from nodes.sources.adapters import from_mediapipe, pinhole
-from nodes.graph.launch import CalibrationSettings, LaunchError, WebcamSettings
-from nodes.sources.camera import CameraError, CameraSource, count_failure
-from nodes.graph.runtime import Clock
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.graph.launch import CalibrationSettings, LaunchError, WebcamSettings
+from steadypose.nodes.graph.runtime import Clock
+from steadypose.nodes.sources.adapters import from_mediapipe, pinhole
+from steadypose.nodes.sources.camera import CameraError, CameraSource, count_failure
 
 MODEL = (
     "https://storage.googleapis.com/mediapipe-models/pose_landmarker/pose_landmarker_full/float16/latest/"

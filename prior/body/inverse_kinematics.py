@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.body.skeleton import PARENTS, J, finite_joints
+from steadypose.prior.body.skeleton import PARENTS, J, finite_joints
 
 Floats = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from prior.body.inverse_kinematics import solve_rotations
-from prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J, finite_joints
+from steadypose.prior.body.inverse_kinematics import solve_rotations
+from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J, finite_joints
 
 Floats = NDArray[np.float64]
 

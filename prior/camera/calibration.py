@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from msgs.types import Pose
-from prior.camera.gravity import level_pose
+from steadypose.msgs.types import Pose
+from steadypose.prior.camera.gravity import level_pose
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

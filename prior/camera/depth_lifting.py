@@ -28,7 +28,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.body.skeleton import COCO17
+from steadypose.prior.body.skeleton import COCO17
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs.types import Pose
+from steadypose.msgs.types import Pose
 
 Floats = NDArray[np.float64]
 

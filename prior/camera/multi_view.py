@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from msgs.types import Pose, PoseRaw, RawBody
-from prior.body.skeleton import CANONICAL, SKELETONS, finite_joints, to_canonical
-from prior.clean.frame import FPS
+from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.prior.body.skeleton import CANONICAL, SKELETONS, finite_joints, to_canonical
+from steadypose.prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs.types import CleanBody, Pose, PoseClean, PoseRaw
-from prior.clean.identify import Identify
-from prior.clean.pipeline import BACKWARDS_NS, PriorPipeline, PriorSettings
-from prior.timing.resample import PERIOD_NS, Resampler
+from steadypose.msgs.types import CleanBody, Pose, PoseClean, PoseRaw
+from steadypose.prior.clean.identify import Identify
+from steadypose.prior.clean.pipeline import BACKWARDS_NS, PriorPipeline, PriorSettings
+from steadypose.prior.timing.resample import PERIOD_NS, Resampler
 
 PATIENCE_NS = 2 * PERIOD_NS
 """How long a frame waits for those of the other streams: a period, because they come at any time in it, and as much

@@ -14,10 +14,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.models.hgvae.features import from_tracks
-from prior.timing.fixed_lag import Smoothed
-from prior.body.skeleton import J
-from prior.clean.frame import Window
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.frame import Window
+from steadypose.prior.models.hgvae.features import from_tracks
+from steadypose.prior.timing.fixed_lag import Smoothed
 
 Floats = NDArray[np.float64]
 

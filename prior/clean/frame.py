@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.timing.fixed_lag import Smoothed
-from prior.body.skeleton import REST_OFFSETS
+from steadypose.prior.body.skeleton import REST_OFFSETS
+from steadypose.prior.timing.fixed_lag import Smoothed
 
 if TYPE_CHECKING:
-    from prior.clean.reconstruct import Encoded
+    from steadypose.prior.clean.reconstruct import Encoded
 
 FPS = 30.0
 """Frames a second of the prior's grid, of prepared motion and of every model."""
@@ -107,7 +107,7 @@ class Window:
             none.
         rotations: ring of (S, 22, 3, 3) local, solved from the positions.
         encoded: what HG-VAE makes of the windows of the bodies present; None if there is no body or no such stage.
-        anomaly: (S,) how unlike human motion the last half second is; see `prior.clean.score`. NaN if it was not scored.
+        anomaly: (S,) how unlike human motion the last half second is (`prior.clean.score`); NaN if not scored.
         anomaly_flag: (S,) whether it is too much so.
         joint_anomaly: (S, 22) the same joint by joint; NaN where not seen.
         imputed: the last frames as HG-VAE completes them, or None while there is no such stage.

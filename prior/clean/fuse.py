@@ -10,11 +10,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from msgs.types import JointState
-from prior.timing.fixed_lag import Smoothed
-from prior.body.inverse_kinematics import fit_pose, place_joints, solve_pose
-from prior.body.skeleton import JOINTS, PARENTS
-from prior.clean.frame import FPS, Estimate, Ring, Window
+from steadypose.msgs.types import JointState
+from steadypose.prior.body.inverse_kinematics import fit_pose, place_joints, solve_pose
+from steadypose.prior.body.skeleton import JOINTS, PARENTS
+from steadypose.prior.clean.frame import FPS, Estimate, Ring, Window
+from steadypose.prior.timing.fixed_lag import Smoothed
 
 Floats = NDArray[np.float64]
 

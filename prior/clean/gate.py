@@ -10,9 +10,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.timing.fixed_lag import FixedLagRTS, Smoothed
-from prior.body.skeleton import MIRROR, PARENTS, J
-from prior.clean.frame import FPS, Window
+from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
+from steadypose.prior.clean.frame import FPS, Window
+from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
 
 RECENT = 15
 """Frames in which a joint that repeats itself must do so mostly."""

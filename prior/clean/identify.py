@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from prior.timing.fixed_lag import FixedLagRTS
-from prior.body.skeleton import J, finite_joints
+from steadypose.prior.body.skeleton import J, finite_joints
+from steadypose.prior.timing.fixed_lag import FixedLagRTS
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

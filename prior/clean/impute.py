@@ -21,10 +21,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.models.hgvae.features import Tracks, from_tracks
-from prior.clean.reconstruct import Encoded
-from prior.models.hgvae.inference import Look
-from prior.clean.frame import Imputed, Window
+from steadypose.prior.clean.frame import Imputed, Window
+from steadypose.prior.clean.reconstruct import Encoded
+from steadypose.prior.models.hgvae.features import Tracks, from_tracks
+from steadypose.prior.models.hgvae.inference import Look
 
 Floats = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.body.kinematics import global_rotations
-from prior.body.inverse_kinematics import solve_rotations
-from prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, finite_joints
-from prior.clean.frame import Window
+from steadypose.prior.body.inverse_kinematics import solve_rotations
+from steadypose.prior.body.kinematics import global_rotations
+from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, finite_joints
+from steadypose.prior.clean.frame import Window
 
 Floats = NDArray[np.float64]
 

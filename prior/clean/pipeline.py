@@ -17,24 +17,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs.types import CleanBody, Pose, PoseClean, PoseRaw, RawBody
-from prior.clean.score import Score, ScoreSettings
-from prior.clean.person import Bones, BonesSettings
-from prior.clean.correct import Correct, CorrectSettings
-from prior.clean.denoise import Denoise, DenoiseSettings
-from prior.clean.reconstruct import Encode, EncodeSettings
-from prior.clean.fuse import Fuse, FuseSettings
-from prior.clean.gate import Gate, GateSettings
-from prior.clean.identify import Identify, IdentifySettings
-from prior.clean.impute import Impute, ImputeSettings
-from prior.body.inverse_kinematics import place_joints
-from prior.clean.refine import Refine, RefineSettings
-from prior.timing.resample import Resampler
-from prior.settings import build_settings
-from prior.body.skeleton import CANONICAL, REST_OFFSETS, SKELETONS, J, Skeleton, finite_joints, to_canonical
-from prior.clean.smooth import Smooth, SmoothSettings
-from prior.clean.solve import Solve
-from prior.clean.frame import FPS, Estimate, Stage, Window
+from steadypose.msgs.types import CleanBody, Pose, PoseClean, PoseRaw, RawBody
+from steadypose.prior.body.inverse_kinematics import place_joints
+from steadypose.prior.body.skeleton import CANONICAL, REST_OFFSETS, SKELETONS, J, Skeleton, finite_joints, to_canonical
+from steadypose.prior.clean.correct import Correct, CorrectSettings
+from steadypose.prior.clean.denoise import Denoise, DenoiseSettings
+from steadypose.prior.clean.frame import FPS, Estimate, Stage, Window
+from steadypose.prior.clean.fuse import Fuse, FuseSettings
+from steadypose.prior.clean.gate import Gate, GateSettings
+from steadypose.prior.clean.identify import Identify, IdentifySettings
+from steadypose.prior.clean.impute import Impute, ImputeSettings
+from steadypose.prior.clean.person import Bones, BonesSettings
+from steadypose.prior.clean.reconstruct import Encode, EncodeSettings
+from steadypose.prior.clean.refine import Refine, RefineSettings
+from steadypose.prior.clean.score import Score, ScoreSettings
+from steadypose.prior.clean.smooth import Smooth, SmoothSettings
+from steadypose.prior.clean.solve import Solve
+from steadypose.prior.settings import build_settings
+from steadypose.prior.timing.resample import Resampler
 
 MAX_DISTANCE = 30.0
 """Metres from the sensor beyond which a joint is no sighting."""

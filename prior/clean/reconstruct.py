@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.models.hgvae.features import Tracks, body_size, to_tracks
-from prior.models.weights_io import load_weights
-from prior.models.hgvae.network import HGVAE, HGVAEConfig
-from prior.models.hgvae.inference import LiveHGVAE, Look
-from prior.clean.frame import Window
+from steadypose.prior.clean.frame import Window
+from steadypose.prior.models.hgvae.features import Tracks, body_size, to_tracks
+from steadypose.prior.models.hgvae.inference import LiveHGVAE, Look
+from steadypose.prior.models.hgvae.network import HGVAE, HGVAEConfig
+from steadypose.prior.models.weights_io import load_weights
 
 LEAST_TRUST = 0.1
 """in a joint that passed the gate"""

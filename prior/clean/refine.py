@@ -9,11 +9,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.models.weights_io import load_weights
-from prior.models.hmvae.network import HMVAE, HMVAEConfig
-from prior.models.hmvae.inference import LiveHMVAE
-from prior.body.kinematics import heading, yaw_matrix
-from prior.clean.frame import Window
+from steadypose.prior.body.kinematics import heading, yaw_matrix
+from steadypose.prior.clean.frame import Window
+from steadypose.prior.models.hmvae.inference import LiveHMVAE
+from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig
+from steadypose.prior.models.weights_io import load_weights
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def _repeat_first(frames):
 
 @njit(cache=True)
 def _facing_forward(frames, back, x):
-    """Writes ``x`` (B, T, 22, 6), the first two columns of the rotations (T, B, 22, 3, 3), as `prior.models.hmvae.network.to_6d`.
+    """Writes ``x`` (B, T, 22, 6), the first two columns of the rotations (T, B, 22, 3, 3), as `to_6d` of the network.
 
     The root's are turned by the inverse of ``back`` (B, 3, 3).
     """
@@ -103,7 +103,7 @@ def _facing_forward(frames, back, x):
 
 @njit(cache=True)
 def rotations_of(x, back):
-    """(T, B, 22, 3, 3) rotations of ``x`` (B, T, 22, 6), as `prior.models.hmvae.network.from_6d`, the root's turned by ``back``."""
+    """(T, B, 22, 3, 3) rotations of ``x`` (B, T, 22, 6), as `from_6d` of the network, the root's turned by ``back``."""
     rotations = np.empty((x.shape[1], len(x), 22, 3, 3))
     root = np.empty((3, 3))
     for row in range(len(x)):

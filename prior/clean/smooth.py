@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.timing.fixed_lag import FixedLagRTS, Follower, Smoothed
-from prior.clean.frame import FPS, Window
+from steadypose.prior.clean.frame import FPS, Window
+from steadypose.prior.timing.fixed_lag import FixedLagRTS, Follower, Smoothed
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.body.inverse_kinematics import solve_rotations
-from prior.clean.frame import Window
+from steadypose.prior.body.inverse_kinematics import solve_rotations
+from steadypose.prior.clean.frame import Window
 
 
 class Solve:

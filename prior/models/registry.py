@@ -8,7 +8,7 @@ from typing import Literal
 
 import torch
 
-from prior.models.distributed import join, neighbours, writes
+from steadypose.prior.models.distributed import join, neighbours, writes
 
 
 def train(
@@ -24,7 +24,7 @@ def train(
     """Train a model of the prior on prepared motion.
 
     With torchrun, several processes or machines share each batch; the first of them writes:
-    `torchrun --nproc-per-node 2 -m nodes.cli train hmvae`.
+    `torchrun --nproc-per-node 2 -m steadypose.nodes.cli train hmvae`.
 
     Takes about an hour on two cores, shows its progress, draws its curves as it goes, and resumes where it was if
     it is killed and started again. The weights, with a card that says how they were made, replace those in
@@ -46,15 +46,15 @@ def train(
     join()
     torch.set_num_threads(max(threads // neighbours(), 1))
     if model == "hmvae":
-        from prior.models.hmvae.train import train_hmvae as train_model
+        from steadypose.prior.models.hmvae.train import train_hmvae as train_model
     elif model == "hgvae":
-        from prior.models.hgvae.train import train_hgvae as train_model
+        from steadypose.prior.models.hgvae.train import train_hgvae as train_model
     elif model == "hgvae-wide":
-        from prior.models.hgvae.train import train_hgvae_wide as train_model
+        from steadypose.prior.models.hgvae.train import train_hgvae_wide as train_model
     elif model == "trajectory":
-        from prior.models.root_velocity.train import train_trajectory as train_model
+        from steadypose.prior.models.root_velocity.train import train_trajectory as train_model
     else:
-        from prior.models.sensor_bias.train import train_correction as train_model
+        from steadypose.prior.models.sensor_bias.train import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")
     if iterations is not None:
         train_model = partial(train_model, iterations=iterations)

@@ -14,8 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import nn
 from torch.optim import Optimizer
 
-from prior.models import weights_io as checkpoint
-from prior.models.distributed import average_gradients, from_first, processes, rank, writes
+from steadypose.prior.models import weights_io as checkpoint
+from steadypose.prior.models.distributed import average_gradients, from_first, processes, rank, writes
 
 
 class TrainingRun:

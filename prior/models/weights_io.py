@@ -14,9 +14,10 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from prior.models.distributed import writes
+from steadypose import PACKAGE
+from steadypose.prior.models.distributed import writes
 
-WEIGHTS = Path(__file__).parent / "weights"
+WEIGHTS = PACKAGE / "prior" / "weights"
 """Where the weights lie: ``MODEL-SET.safetensors``, each with ``MODEL-SET.md``, its card."""
 
 

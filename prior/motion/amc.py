@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from prior.motion.clip import MotionError, forward
+from steadypose.prior.motion.clip import MotionError, forward
 
 INCH = 0.0254
 """Metres. An ASF gives lengths in inches times its ``length`` unit."""

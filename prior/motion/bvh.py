@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from prior.motion.clip import MotionError, forward
+from steadypose.prior.motion.clip import MotionError, forward
 
 
 @dataclass

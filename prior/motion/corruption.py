@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from prior.body.skeleton import MIRROR, PARENTS, J
-from prior.clean.frame import FPS
+from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
+from steadypose.prior.clean.frame import FPS
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator

@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.models.weights_io import LICENCES
-from prior.body.skeleton import MIRROR
-from prior.clean.frame import FPS
+from steadypose.prior.body.skeleton import MIRROR
+from steadypose.prior.clean.frame import FPS
+from steadypose.prior.models.weights_io import LICENCES
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.motion.amc import Asf, read_amc, read_asf
-from prior.motion.bvh import Bvh, read_bvh
-from prior.motion.clip import Y_UP_TO_Z_UP, Clip, MotionError
-from prior.motion.npz import read_amass, read_expmap
-from prior.motion.tables import BANDAI, BVH_RIGS, CMU_AMC, CMU_BVH, ICLONE, REACTIDLE, Rig
-from prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
-from prior.body.skeleton import CANONICAL, Skeleton
+from steadypose.prior.body.skeleton import CANONICAL, Skeleton
+from steadypose.prior.motion.amc import Asf, read_amc, read_asf
+from steadypose.prior.motion.bvh import Bvh, read_bvh
+from steadypose.prior.motion.clip import Y_UP_TO_Z_UP, Clip, MotionError
+from steadypose.prior.motion.npz import read_amass, read_expmap
+from steadypose.prior.motion.tables import BANDAI, BVH_RIGS, CMU_AMC, CMU_BVH, ICLONE, REACTIDLE, Rig
+from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
 
 CMU_LICENCE = "CMU mocap: free, no resale"
 """Free for all uses, products included; the data itself may not be resold; acknowledge NSF EIA-0196217."""

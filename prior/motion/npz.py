@@ -13,9 +13,9 @@ from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from prior.motion.clip import MotionError, forward
-from prior.motion.tables import CMU_BVH, CMU_METRES
-from prior.body.skeleton import PARENTS, REST_OFFSETS
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
+from steadypose.prior.motion.clip import MotionError, forward
+from steadypose.prior.motion.tables import CMU_BVH, CMU_METRES
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.body.skeleton import JOINTS
+from steadypose.prior.body.skeleton import JOINTS
 
 MARKER_RADIUS = 0.007
 """Metres from the skin to a marker's centre (14 mm markers)."""

@@ -13,11 +13,11 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from prior.body.kinematics import CONTACT_SPEED, estimate_offsets, label_contacts
-from prior.motion.clip import Clip
-from prior.motion.datasets import Dropped, Split, WeightSet
-from prior.body.inverse_kinematics import solve_rotations
-from prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
+from steadypose.prior.body.inverse_kinematics import solve_rotations
+from steadypose.prior.body.kinematics import CONTACT_SPEED, estimate_offsets, label_contacts
+from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
+from steadypose.prior.motion.clip import Clip
+from steadypose.prior.motion.datasets import Dropped, Split, WeightSet
 
 FPS = 30.0
 """Frames a second of everything that is trained on."""

@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from prior.body.skeleton import Skeleton
+from steadypose.prior.body.skeleton import Skeleton
 
 CMU_METRES = 0.0254 / 0.45
 """The size of CMU's unit: an inch, scaled by the 0.45 of its ASF files."""

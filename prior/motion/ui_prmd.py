@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.motion.clip import Y_UP_TO_Z_UP, MotionError
-from prior.motion.npz import open_npz
-from prior.motion.plug_in_gait import calibrate, joint_centres
+from steadypose.prior.motion.clip import Y_UP_TO_Z_UP, MotionError
+from steadypose.prior.motion.npz import open_npz
+from steadypose.prior.motion.plug_in_gait import calibrate, joint_centres
 
 TRAIN_SUBJECTS = ("s01", "s02", "s03", "s04", "s05", "s06")
 VALIDATION_SUBJECTS = ("s07", "s08")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.body.skeleton import JOINTS, MIRROR, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import JOINTS, MIRROR, REST_OFFSETS, J
 
 Floats = NDArray[np.float64]
 

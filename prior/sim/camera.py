@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
-from msgs.types import Pose, PoseRaw, RawBody
-from prior.sim.body import CAPSULES, REST_HEIGHT, stature
-from prior.sim.motion import Motion
-from prior.sim.noise import (
+from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.prior.body.skeleton import JOINTS, J
+from steadypose.prior.sim.body import CAPSULES, REST_HEIGHT, stature
+from steadypose.prior.sim.motion import Motion
+from steadypose.prior.sim.noise import (
     SWAP_GROUPS,
     NoiseModel,
     confidence_of,
@@ -29,8 +30,7 @@ from prior.sim.noise import (
     swapped,
     travelled,
 )
-from prior.sim.sensors import Mount, mount
-from prior.body.skeleton import JOINTS, J
+from steadypose.prior.sim.sensors import Mount, mount
 
 Floats = NDArray[np.float64]
 

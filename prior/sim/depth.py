@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.sim.body import CAPSULES, REST_HEIGHT, stature
-from prior.body.skeleton import J
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.sim.body import CAPSULES, REST_HEIGHT, stature
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ frame of the joint's bone, the median over all clips). What is left is the error
 simulation: noise is drawn for the same motions, goes through the same alignment, and each parameter is scaled by
 the ratio of its own statistic in real to that in simulated errors, until they agree.
 
-    python -m prior.sim.fit PATH/TO/ui_prmd.npz
+    python -m steadypose.prior.sim.fit PATH/TO/ui_prmd.npz
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from prior.body.kinematics import estimate_offsets, global_rotations
-from prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
-from prior.body.inverse_kinematics import solve_rotations
-from prior.sim.noise import KINECT_NOISE, NoiseModel, draw_errors, ray_axes, travelled
-from prior.body.skeleton import JOINTS, KINECT22, MIRROR, PARENTS, J, to_canonical
+from steadypose.prior.body.inverse_kinematics import solve_rotations
+from steadypose.prior.body.kinematics import estimate_offsets, global_rotations
+from steadypose.prior.body.skeleton import JOINTS, KINECT22, MIRROR, PARENTS, J, to_canonical
+from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
+from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel, draw_errors, ray_axes, travelled
 
 Floats = NDArray[np.float64]
 
@@ -407,7 +407,7 @@ def main() -> None:
         "subjects": list(TRAIN_SUBJECTS),
         "clips": len(clips),
         "left_out": "movement m03 of s01, where the Kinect lost the legs",
-        "command": "python -m prior.sim.fit ui_prmd.npz --picture docs/images/kinect-noise.png",
+        "command": "python -m steadypose.prior.sim.fit ui_prmd.npz --picture docs/images/kinect-noise.png",
         "metres": {who: {k: round(v, 4) for k, v in row.items()} for who, row in table.items()},
     }
     model.save(arguments.out, about)

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from prior.body.kinematics import yaw_matrix
-from prior.sim.body import TOE_HEIGHT
-from prior.sim.timing import minimum_jerk
-from prior.body.skeleton import J
+from steadypose.prior.body.kinematics import yaw_matrix
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.sim.body import TOE_HEIGHT
+from steadypose.prior.sim.timing import minimum_jerk
 
 Floats = NDArray[np.float64]
 

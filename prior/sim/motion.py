@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, yaw_matrix
-from prior.sim.body import TOE_HEIGHT
-from prior.sim.gait import RATE, FootTrack, Plan, foot_track
-from prior.sim.timing import drift
-from prior.body.skeleton import JOINTS, J
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, yaw_matrix
+from steadypose.prior.body.skeleton import JOINTS, J
+from steadypose.prior.sim.body import TOE_HEIGHT
+from steadypose.prior.sim.gait import RATE, FootTrack, Plan, foot_track
+from steadypose.prior.sim.timing import drift
 
 Floats = NDArray[np.float64]
 Side = Literal["left", "right"]

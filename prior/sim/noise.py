@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.body.skeleton import MIRROR, J
+from steadypose.prior.body.skeleton import MIRROR, J
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, get_skeleton
+from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, get_skeleton
 
 Floats = NDArray[np.float64]
 

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs.recording import RecordingWriter
-from msgs.topics import POSE_RAW, POSE_TRUTH
-from msgs.types import JointState, PoseRaw, PoseWorld, Tracking, WorldBody
-from prior.timing.resample import PERIOD_NS
-from prior.sim.camera import Camera, as_tracked, film, sight
-from prior.sim.motion import Motion
-from prior.sim.noise import KINECT_NOISE, NoiseModel
-from prior.sim.scripts import SCRIPTS
-from prior.sim.sensors import mount
+from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
+from steadypose.msgs.types import JointState, PoseRaw, PoseWorld, Tracking, WorldBody
+from steadypose.prior.sim.camera import Camera, as_tracked, film, sight
+from steadypose.prior.sim.motion import Motion
+from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
+from steadypose.prior.sim.scripts import SCRIPTS
+from steadypose.prior.sim.sensors import mount
+from steadypose.prior.timing.resample import PERIOD_NS
 
 START_NS = 1_750_000_000_000_000_000
 """Stamp of a stream's second 0: any moment will do, as long as it is the same every time."""

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs.types import CleanBody, JointState, Tracking, WorldBody
-from prior.world.ground import Ground
-from prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
-from prior.body.skeleton import PARENTS, REST_OFFSETS, J
-from prior.world.root_filter import RootFilter, RootNoise
-from prior.models.root_velocity.network import FRAME_S
+from steadypose.msgs.types import CleanBody, JointState, Tracking, WorldBody
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.prior.models.root_velocity.network import FRAME_S
+from steadypose.prior.world.ground import Ground
+from steadypose.prior.world.root_filter import RootFilter, RootNoise
 
 Floats = NDArray[np.float64]
 Sigma = TypeVar("Sigma", float, NDArray[np.float64])

@@ -17,14 +17,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from msgs.types import CleanBody, PoseClean, PoseWorld, WorldBody
-from prior.models.weights_io import load_weights
-from prior.world.ground import Ground
-from prior.body.kinematics import yaw_matrix
-from prior.settings import build_settings
-from prior.world.root_filter import RootNoise
-from prior.models.root_velocity.network import NewestFrame, TrajectoryConfig, TrajectoryNet
-from prior.world.body_track import BodyTrack, Motion, Sighting, rotation, sightings
+from steadypose.msgs.types import CleanBody, PoseClean, PoseWorld, WorldBody
+from steadypose.prior.body.kinematics import yaw_matrix
+from steadypose.prior.models.root_velocity.network import NewestFrame, TrajectoryConfig, TrajectoryNet
+from steadypose.prior.models.weights_io import load_weights
+from steadypose.prior.settings import build_settings
+from steadypose.prior.world.body_track import BodyTrack, Motion, Sighting, rotation, sightings
+from steadypose.prior.world.ground import Ground
+from steadypose.prior.world.root_filter import RootNoise
 
 Floats = NDArray[np.float64]
 

@@ -7,21 +7,21 @@ import pytest
 from matplotlib.figure import Figure
 from rich.progress import Progress
 
-from benchmarks import figures, ours
-from benchmarks.peers import smoothnet
-from benchmarks.bench import Bench, over_seeds
-from benchmarks.corruption import gaussian, hide
-from benchmarks.metrics import position_error
-from benchmarks.motion import MotionClips, simulated_clips
-from benchmarks.peers.filters import OFFLINE, Peer, missing
-from benchmarks.protocols.reconstruction import slide
-from benchmarks.protocols.spoiled import against_best, calibration_table, reliability_bins, run_conditions
-from benchmarks.protocols.streaming import recovery
-from benchmarks.scores import figures as figures_of
-from benchmarks.scores import pivot, score
-from prior.models.weights_io import load_weights
-from prior.models.hmvae.network import HMVAE, HMVAEConfig
-from prior.body.skeleton import J
+from steadypose.benchmarks import figures, ours
+from steadypose.benchmarks.bench import Bench, over_seeds
+from steadypose.benchmarks.corruption import gaussian, hide
+from steadypose.benchmarks.metrics import position_error
+from steadypose.benchmarks.motion import MotionClips, simulated_clips
+from steadypose.benchmarks.peers import smoothnet
+from steadypose.benchmarks.peers.filters import OFFLINE, Peer, missing
+from steadypose.benchmarks.protocols.reconstruction import slide
+from steadypose.benchmarks.protocols.spoiled import against_best, calibration_table, reliability_bins, run_conditions
+from steadypose.benchmarks.protocols.streaming import recovery
+from steadypose.benchmarks.scores import figures as figures_of
+from steadypose.benchmarks.scores import pivot, score
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig
+from steadypose.prior.models.weights_io import load_weights
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +144,7 @@ def test_conditions_give_records_that_tables_and_pictures_are_made_of(clips: Mot
 
 
 def test_the_best_peer_is_another_for_each_error(clips: MotionClips) -> None:
-    from benchmarks.bench import Answer
+    from steadypose.benchmarks.bench import Answer
 
     hidden = missing(clips.positions)
     answers = {

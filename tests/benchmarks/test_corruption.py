@@ -1,8 +1,18 @@
 import numpy as np
 import pytest
 
-from benchmarks.corruption import LIMBS, arm_behind, below, bursts, correlated, gaussian, hide, spiked, swapped
-from prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.benchmarks.corruption import (
+    LIMBS,
+    arm_behind,
+    below,
+    bursts,
+    correlated,
+    gaussian,
+    hide,
+    spiked,
+    swapped,
+)
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 
 SHAPE = (300, 6, 22, 3)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.systems import depth_lifting
-from benchmarks.systems.depth_lifting import Args, Picture, main, measure, median, ours, pictures
+from steadypose.benchmarks.systems import depth_lifting
+from steadypose.benchmarks.systems.depth_lifting import Args, Picture, main, measure, median, ours, pictures
 
 
 @pytest.fixture(scope="module")

@@ -1,16 +1,15 @@
 import numpy as np
 import pytest
 import torch
+from tests.helpers.bodies import waving
 
-from benchmarks.hgvae import imputation
-from benchmarks.hgvae import models
-from benchmarks.hgvae.faults import BEGINS, FAULTS, LEAST_MOTION
-from prior.models.hgvae.features import in_frame_of, to_tracks
-from prior.models.hgvae.network import HGVAE
-from prior.motion.dataset import MotionSet
-from prior.body.skeleton import MIRROR, REST_OFFSETS, J
-from prior.models.hgvae.windows import Windows, mean_tracks, standardise
-from tests.prior.bodies import waving
+from steadypose.benchmarks.hgvae import imputation, models
+from steadypose.benchmarks.hgvae.faults import BEGINS, FAULTS, LEAST_MOTION
+from steadypose.prior.body.skeleton import MIRROR, REST_OFFSETS, J
+from steadypose.prior.models.hgvae.features import in_frame_of, to_tracks
+from steadypose.prior.models.hgvae.network import HGVAE
+from steadypose.prior.models.hgvae.windows import Windows, mean_tracks, standardise
+from steadypose.prior.motion.dataset import MotionSet
 
 
 def windows_of(*actions: str) -> MotionSet:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.peers.filters import constant_velocity, gaussian_hampel, one_euro
-from benchmarks.protocols.kinect_vicon import SCORED, Clip, align, learn_offset, run_filter, score
+from steadypose.benchmarks.peers.filters import constant_velocity, gaussian_hampel, one_euro
+from steadypose.benchmarks.protocols.kinect_vicon import SCORED, Clip, align, learn_offset, run_filter, score
 
 REST = np.array(
     [[0.0, 0.0, 1.6]]

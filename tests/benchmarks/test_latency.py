@@ -4,9 +4,9 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from benchmarks.systems.latency import SPACING, crowd, percentiles
-from benchmarks.systems.memory import growth
-from msgs.types import Pose, PoseRaw, RawBody
+from steadypose.benchmarks.systems.latency import SPACING, crowd, percentiles
+from steadypose.benchmarks.systems.memory import growth
+from steadypose.msgs.types import Pose, PoseRaw, RawBody
 
 
 def frames(count: int) -> list[PoseRaw]:

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from benchmarks.metrics import (
+from steadypose.benchmarks.metrics import (
     acceleration_error,
     body_frame,
     bootstrap,
@@ -17,7 +17,7 @@ from benchmarks.metrics import (
     reliability,
     sigma_ratio,
 )
-from prior.body.kinematics import rigid_alignment
+from steadypose.prior.body.kinematics import rigid_alignment
 
 
 def walk(seed: int, frames: int = 12, joints: int = 5) -> np.ndarray:

@@ -3,8 +3,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmarks.peers.kalman import fixed_lag, process_noise, transition
-from benchmarks.peers.filters import (
+from steadypose.benchmarks.peers.filters import (
     FILTERS,
     OFFLINE,
     PEERS,
@@ -14,7 +13,8 @@ from benchmarks.peers.filters import (
     hold_last,
     interpolate,
 )
-from prior.timing.fixed_lag import FixedLagRTS
+from steadypose.benchmarks.peers.kalman import fixed_lag, process_noise, transition
+from steadypose.prior.timing.fixed_lag import FixedLagRTS
 
 STAMPS = np.arange(40) / 30.0
 NAN = float("nan")

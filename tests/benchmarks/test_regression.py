@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from benchmarks import ours
-from benchmarks.bench import Bench
-from benchmarks.motion import MotionClips
-from benchmarks.peers.filters import missing
-from benchmarks.protocols import hidden_joints, noisy_joints
-from benchmarks.scores import figures, score
+from steadypose.benchmarks import ours
+from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.motion import MotionClips
+from steadypose.benchmarks.peers.filters import missing
+from steadypose.benchmarks.protocols import hidden_joints, noisy_joints
+from steadypose.benchmarks.scores import figures, score
 
 CONDITIONS = hidden_joints.CONDITIONS | noisy_joints.CONDITIONS
 GOLDEN = {

@@ -4,9 +4,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from benchmarks.machine import describe
-from benchmarks.report import Args, fill, main
-from benchmarks.results import Table, load, save, show
+from steadypose.benchmarks.machine import describe
+from steadypose.benchmarks.report import Args, fill, main
+from steadypose.benchmarks.results import Table, load, save, show
 
 TABLE = Table("speed", "Speed, ms", ["method", "p50", "a|b"], [["raw", "1.0", "2"], ["ours", "0.5", "3"]], "A note.")
 TEXT = "# Title\n<!-- results:speed -->\nold\n<!-- /results -->\ntail\n"
@@ -24,7 +24,7 @@ def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tm
     once = readme.read_text()
     assert "| ours | 0.5 | 3 |" in once
     assert "| method | p50 | a\\|b |" in once
-    assert "`python -m benchmarks.systems.latency --quick input`" in once
+    assert "`python -m steadypose.benchmarks.systems.latency --quick input`" in once
     assert "old" not in once
     assert once.startswith("# Title\n")
     assert once.endswith("<!-- /results -->\ntail\n")

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.systems.simulated import FEET, Track, hold_last, measure, read_tracks, sigma_ratio, smooth
-from msgs.topics import POSE_RAW, POSE_TRUTH
-from msgs.types import Message, Pose, PoseRaw, PoseWorld, RawBody, Tracking, WorldBody
-from prior.body.skeleton import CANONICAL, PARENTS, REST_OFFSETS, J
+from steadypose.benchmarks.systems.simulated import FEET, Track, hold_last, measure, read_tracks, sigma_ratio, smooth
+from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
+from steadypose.msgs.types import Message, Pose, PoseRaw, PoseWorld, RawBody, Tracking, WorldBody
+from steadypose.prior.body.skeleton import CANONICAL, PARENTS, REST_OFFSETS, J
 
 PERIOD_NS = 33_333_333
 

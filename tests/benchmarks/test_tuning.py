@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.tuning import search
+from steadypose.benchmarks.tuning import search
 
 
 def test_every_search_spends_its_budget_and_no_more() -> None:

@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from benchmarks.motion import as_set, simulated_clips
-from benchmarks.peers.window_vaes import CONFIGS, MVAE, TCNVAE, trained
-from prior.models.hmvae.network import HMVAE
-from prior.body.kinematics import forward_kinematics
-from prior.models.layers.skeleton_conv import SkeletonConv
+from steadypose.benchmarks.motion import as_set, simulated_clips
+from steadypose.benchmarks.peers.window_vaes import CONFIGS, MVAE, TCNVAE, trained
+from steadypose.prior.body.kinematics import forward_kinematics
+from steadypose.prior.models.hmvae.network import HMVAE
+from steadypose.prior.models.layers.skeleton_conv import SkeletonConv
 
 
 def in_use(model: torch.nn.Module) -> int:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msg_strategies import ANY, EXAMPLES, clean, diagnostics, raw
+from tests.helpers.msg_strategies import ANY, EXAMPLES, clean, diagnostics, raw
 
-from msgs.codec import DecodeError, decode, encode, typestore, wire_type
-from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, TOPICS
-from msgs.types import Message
+from steadypose.msgs.codec import DecodeError, decode, encode, typestore, wire_type
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, TOPICS
+from steadypose.msgs.types import Message
 
 PAYLOADS = {topic: encode(message) for topic, message in EXAMPLES.items()}
 TOPIC_NAMES = st.sampled_from(list(TOPICS))

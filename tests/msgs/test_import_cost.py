@@ -8,7 +8,7 @@ from pathlib import Path
 
 MEASURE = """
 import json, re, sys, time
-import msgs.codec, msgs.keys, msgs.recording, msgs.topics, msgs.transport, msgs.types
+import steadypose.msgs.codec, msgs.keys, msgs.recording, msgs.topics, msgs.transport, msgs.types
 # not getrusage: its maximum begins with that of the process which started this one
 rss_kib = int(re.search(r"VmHWM:\\s+(\\d+) kB", open("/proc/self/status").read())[1])
 print(json.dumps({"modules": list(sys.modules), "cpu_s": time.process_time(), "rss_mib": rss_kib / 1024}))

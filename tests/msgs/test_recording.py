@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from mcap.records import Chunk, McapRecord
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
-from msg_strategies import ANY, EXAMPLES, raw
 from rosbags.highlevel import AnyReader
+from tests.helpers.msg_strategies import ANY, EXAMPLES, raw
 
-from msgs.codec import DEFINITIONS, decode, encode, typestore, wire_type
-from msgs.recording import Recorded, RecordingError, RecordingReader, RecordingWriter
-from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
-from msgs.types import Message
+from steadypose.msgs.codec import DEFINITIONS, decode, encode, typestore, wire_type
+from steadypose.msgs.recording import Recorded, RecordingError, RecordingReader, RecordingWriter
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
+from steadypose.msgs.types import Message
 
 START_NS = 1_700_000_000_000_000_000
 FRAME_NS = 33_333_333
@@ -157,8 +157,8 @@ def test_rosbags_reads_the_values(whole: Path):
 WRITE_UNTIL_KILLED = """
 import itertools, sys
 sys.path.insert(0, sys.argv[2])
-from msg_strategies import diagnostics, raw
-from msgs.recording import RecordingWriter
+from tests.helpers.msg_strategies import diagnostics, raw
+from steadypose.msgs.recording import RecordingWriter
 writer = RecordingWriter(sys.argv[1])
 for frame in itertools.count():
     stamp = frame * 33_333_333
@@ -170,7 +170,7 @@ for frame in itertools.count():
 
 def test_a_killed_writer_loses_less_than_the_last_second(tmp_path: Path):
     directory = tmp_path / "recording"
-    command = [sys.executable, "-c", WRITE_UNTIL_KILLED, directory, Path(__file__).parent]
+    command = [sys.executable, "-c", WRITE_UNTIL_KILLED, directory, Path(__file__).parents[2]]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
         assert writer.stdout
         written = 0

@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from msg_strategies import raw, world
+from tests.helpers.msg_strategies import raw, world
 
-from msgs.recording import RecordingWriter
-from msgs.topics import POSE_RAW, POSE_WORLD
-from msgs.transport import Publisher, Subscriber
+from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
+from steadypose.msgs.transport import Publisher, Subscriber
 
 PAGE = Path(__file__).parents[2] / "docs" / "subscribe.md"
 SUBSCRIBER, PUBLISHER, READER = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)

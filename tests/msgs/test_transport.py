@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 import zmq
-from msg_strategies import EXAMPLES, diagnostics, raw
+from tests.helpers.msg_strategies import EXAMPLES, diagnostics, raw
 
-from msgs import transport
-from msgs.codec import encode
-from msgs.keys import Keys, create_keys, load_keys
-from msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
-from msgs.transport import MAX_FRAME, Publisher, Subscriber, TransportError
+from steadypose.msgs import transport
+from steadypose.msgs.codec import encode
+from steadypose.msgs.keys import Keys, create_keys, load_keys
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.transport import MAX_FRAME, Publisher, Subscriber, TransportError
 
 SOON_S = 20.0
 """for what must happen; the machine may be busy"""

@@ -5,12 +5,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from msg_strategies import EXAMPLES, clean, diagnostics, raw, world
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
+from tests.helpers.msg_strategies import EXAMPLES, clean, diagnostics, raw, world
 
-from msgs.codec import DEFINITIONS
-from msgs.types import CONTACTS, JOINTS, CleanBody, JointState, Pose, PoseClean, PoseRaw, RawBody, Tracking, WorldBody
+from steadypose.msgs.codec import DEFINITIONS
+from steadypose.msgs.types import (
+    CONTACTS,
+    JOINTS,
+    CleanBody,
+    JointState,
+    Pose,
+    PoseClean,
+    PoseRaw,
+    RawBody,
+    Tracking,
+    WorldBody,
+)
 
 
 @pytest.mark.parametrize(

@@ -17,17 +17,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from synthetic_poses import walker
+from tests.helpers.synthetic_poses import walker
 
-from msgs.recording import RecordingWriter
-from msgs.topics import POSE_RAW
-from msgs.types import Pose, PoseRaw, RawBody
-from nodes.graph.launch import Launch
-from nodes.sinks.ros2.bridge import PACKAGES
-from nodes.graph.runtime import Node
-from prior.models.weights_io import save_weights
-from prior.models.hmvae.network import HMVAE, HMVAEConfig
-from prior.models.root_velocity.network import TrajectoryConfig, TrajectoryNet
+from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.runtime import Node
+from steadypose.nodes.sinks.ros2.bridge import PACKAGES
+from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig
+from steadypose.prior.models.root_velocity.network import TrajectoryConfig, TrajectoryNet
+from steadypose.prior.models.weights_io import save_weights
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -135,7 +135,7 @@ def another_python(script: str, folder: Path, *arguments: str) -> Iterator[subpr
     """A Python process with this script, ended with the block at the latest."""
     file = folder / "script.py"
     file.write_text(script)
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "src")}
     with subprocess.Popen([sys.executable, file, *arguments], env=environment, stdout=subprocess.PIPE, text=True) as it:
         try:
             yield it

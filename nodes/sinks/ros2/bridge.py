@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-from msgs.types import Diagnostics, Message, PoseWorld
-from nodes.graph.launch import Launch, LaunchError
-from nodes.graph.runtime import Clock, Node
+from steadypose.msgs.types import Diagnostics, Message, PoseWorld
+from steadypose.nodes.graph.launch import Launch, LaunchError
+from steadypose.nodes.graph.runtime import Clock, Node
 
 PACKAGES = ("rclpy", "rmw_fastrtps_cpp", "visualization_msgs", "diagnostic_msgs", "sensor_msgs", "cyclonedds")
 
@@ -34,7 +34,7 @@ class Ros2BridgeNode(Node):
         self._bodies = 0
 
     def work(self) -> None:
-        from nodes.sinks.ros2.output import RosOutput
+        from steadypose.nodes.sinks.ros2.output import RosOutput
 
         with RosOutput() as self._ros:
             super().work()

@@ -24,7 +24,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 from scipy.spatial.transform import Rotation
 
-from nodes.sinks.ros2.rep155 import Links
+from steadypose.nodes.sinks.ros2.rep155 import Links
 
 QOS = Qos(Policy.Reliability.Reliable(duration(milliseconds=100)), Policy.History.KeepLast(100))
 """as tf2's own broadcaster"""

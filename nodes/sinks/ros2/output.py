@@ -22,10 +22,10 @@ from sensor_msgs.msg import JointState as JointAngles
 from std_msgs.msg import ColorRGBA, Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from msgs.types import Diagnostics, JointState, PoseWorld, Tracking, WorldBody
-from nodes.sinks.ros2.rep155 import Links, body_name, frames, joint_angles, joint_rotations, measures, urdf
-from nodes.sinks.ros2.dds import DdsOutput, body_transforms
-from prior.body.skeleton import PARENTS, J
+from steadypose.msgs.types import Diagnostics, JointState, PoseWorld, Tracking, WorldBody
+from steadypose.nodes.sinks.ros2.dds import DdsOutput, body_transforms
+from steadypose.nodes.sinks.ros2.rep155 import Links, body_name, frames, joint_angles, joint_rotations, measures, urdf
+from steadypose.prior.body.skeleton import PARENTS, J
 
 MARKERS = "steadypose/markers"
 POSES = "steadypose/poses"

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs.types import WorldBody
-from prior.body.skeleton import PARENTS, J
+from steadypose.msgs.types import WorldBody
+from steadypose.prior.body.skeleton import PARENTS, J
 
 Floats = NDArray[np.float64]
 Links = Mapping[str, tuple[Floats, Floats]]

@@ -4,9 +4,9 @@ HG-VAE's own encoder learns this badly: a node is one coordinate of one joint, a
 likelihood of what was seen to the millimetre drowns what was hidden by decimetres. Here a node is a part of the
 window's time and its features are the whole body, so that a knee follows from hip, ankle and the other leg.
 
-People mostly hold still what they held still: then the line beside the joint above (`prior.models.hgvae.features`) is right to
-the millimetre, and no network is. So what the network corrects is fused with that line, each by its variance; the
-line's grows with the time from a sighting and with how much this joint of this person has moved while it was seen.
+People mostly hold still what they held still: then the line beside the joint above (`prior.models.hgvae.features`) is
+right to the millimetre, and no network is. So what the network corrects is fused with that line, each by its variance;
+the line's grows with the time from a sighting and with how much this joint of this person has moved while it was seen.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from prior.models.layers.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE, GraphBlock, GraphLinear
-from prior.body.skeleton import PARENTS
+from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.models.layers.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE, GraphBlock, GraphLinear
 
 NEAR = 8.0
 """Frames from a sighting at which half is told of it. What is told falls as 1 / (1 + d / NEAR): by an exponential, an

@@ -8,10 +8,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.models.hgvae.completion import FIRST_LOG_VAR, GROWTH, LAG, STILL, SURE, CompletionNet, tell
-from prior.models.layers.graph import LOG_VAR_RANGE, SCALE
-from prior.models.layers.compiled_graph import Network, Program
-from prior.body.skeleton import PARENTS
+from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.models.hgvae.completion import FIRST_LOG_VAR, GROWTH, LAG, STILL, SURE, CompletionNet, tell
+from steadypose.prior.models.layers.compiled_graph import Network, Program
+from steadypose.prior.models.layers.graph import LOG_VAR_RANGE, SCALE
 
 
 class LiveCompletion:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from prior.models.hgvae.faults import FaultNet, tell
-from prior.models.layers.graph import JOINT_NODES
-from prior.models.layers.compiled_graph import Network, Program
+from steadypose.prior.models.hgvae.faults import FaultNet, tell
+from steadypose.prior.models.layers.compiled_graph import Network, Program
+from steadypose.prior.models.layers.graph import JOINT_NODES
 
 Floats = NDArray[np.float64]
 

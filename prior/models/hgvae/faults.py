@@ -3,7 +3,8 @@
 How unlikely a window is under a generative model tells noise from motion, but not a hand that stands still from one
 that rests, and it takes a dance for a fault. The best test between two hypotheses is the ratio of their likelihoods
 (Neyman and Pearson), and that is what a classifier learns: this one reads what was seen, where HG-VAE would have put it
-and how sure it was, and is taught by clean motion and by motion with what trackers get wrong (`prior.models.hgvae.train_faults`).
+and how sure it was, and is taught by clean motion and by motion with what trackers get wrong
+(`prior.models.hgvae.train_faults`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from prior.models.layers.graph import JOINT_NODES, SCALE, GraphBlock, GraphLinear
+from steadypose.prior.models.layers.graph import JOINT_NODES, SCALE, GraphBlock, GraphLinear
 
 RECENT = 15
 """Frames that are scored: what is wrong now must not be watered down by what was right."""

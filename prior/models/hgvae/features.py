@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 
 _TRUNK = np.array([J[n] for n in ("pelvis", "left_hip", "right_hip", "spine1", "spine2", "spine3", "neck",
                                   "left_shoulder", "right_shoulder")])  # fmt: skip

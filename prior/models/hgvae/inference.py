@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from prior.models.hgvae.features import hang_unseen
-from prior.models.hgvae.completion_inference import LiveCompletion
-from prior.models.layers.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE
-from prior.models.layers.compiled_graph import Floats, Network, Program
-from prior.models.hgvae.network import HGVAE, TRACK_LOG_VAR
+from steadypose.prior.models.hgvae.completion_inference import LiveCompletion
+from steadypose.prior.models.hgvae.features import hang_unseen
+from steadypose.prior.models.hgvae.network import HGVAE, TRACK_LOG_VAR
+from steadypose.prior.models.layers.compiled_graph import Floats, Network, Program
+from steadypose.prior.models.layers.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE
 
 
 class Look(NamedTuple):

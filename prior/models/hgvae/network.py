@@ -7,8 +7,8 @@ deterministic stream of all nodes, to which every stochastic level, from the sin
 each track, adds what it knows.
 
 Beyond the paper: the encoder is told how far to believe each entry, and those not observed are guessed by a network of
-their own (`prior.models.hgvae.completion`), so that one pass already completes a window; and the cosine transform may be cut off
-at its lower coefficients, which makes the live model small.
+their own (`prior.models.hgvae.completion`), so that one pass already completes a window; and the cosine transform may
+be cut off at its lower coefficients, which makes the live model small.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from prior.models.hgvae.completion import CompletionConfig, CompletionNet, certainty
-from prior.models.layers.graph import JOINT_NODES, LOG_VAR_RANGE, GraphBlock, GraphLinear
+from steadypose.prior.models.hgvae.completion import CompletionConfig, CompletionNet, certainty
+from steadypose.prior.models.layers.graph import JOINT_NODES, LOG_VAR_RANGE, GraphBlock, GraphLinear
 
 TRACK_LOG_VAR = -4.0
 """Log-variance of tracks that the network's zero stands for: 2.7 cm"""

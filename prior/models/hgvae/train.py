@@ -2,9 +2,9 @@
 
 Half of each batch is the paper's: clean windows, every entry observed, latents drawn, KL warmed up. The other half
 teaches the encoder what a camera does: entries are hidden, and guessed by the completion network, which is trained
-first (`prior.models.hgvae.train_completion`); the rest is noisy or plainly wrong; and the likelihood of the true window, at the
-means of the latents, is all that counts. One pass then completes a window and says how sure it is; what was seen where
-the model would not have put it is an anomaly.
+first (`prior.models.hgvae.train_completion`); the rest is noisy or plainly wrong; and the likelihood of the true
+window, at the means of the latents, is all that counts. One pass then completes a window and says how sure it is; what
+was seen where the model would not have put it is an anomaly.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.models.weights_io import LICENCES, started, weights_path
-from prior.models.hgvae.completion import CompletionConfig
-from prior.motion.corruption import add_noise, occlude, other_builds, slow_errors, spoil
-from prior.models.distributed import share
-from prior.models.layers.graph import JOINT_NODES, SCALE
-from prior.models.hgvae.network import HGVAE, HGVAEConfig, Level, Pass
-from prior.motion.dataset import MotionSet
-from prior.models.hgvae.windows import STRIDES, Batch, Windows, mean_tracks
-from prior.models.hgvae.train_faults import train_anomaly
-from prior.models.hgvae.train_completion import BATCH, BONES, SPOILT_BY, TURNED, train_completion
-from prior.models.training import TrainingRun
+from steadypose.prior.models.distributed import share
+from steadypose.prior.models.hgvae.completion import CompletionConfig
+from steadypose.prior.models.hgvae.network import HGVAE, HGVAEConfig, Level, Pass
+from steadypose.prior.models.hgvae.train_completion import BATCH, BONES, SPOILT_BY, TURNED, train_completion
+from steadypose.prior.models.hgvae.train_faults import train_anomaly
+from steadypose.prior.models.hgvae.windows import STRIDES, Batch, Windows, mean_tracks
+from steadypose.prior.models.layers.graph import JOINT_NODES, SCALE
+from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.weights_io import LICENCES, started, weights_path
+from steadypose.prior.motion.corruption import add_noise, occlude, other_builds, slow_errors, spoil
+from steadypose.prior.motion.dataset import MotionSet
 
 Floats = NDArray[np.float64]
 
@@ -142,7 +142,9 @@ def fit(
         drawn = model(both.x, both.believed, spread=(torch.arange(batch) < half).float()[:, None])
         density = drawn.tracks.log_density(both.target) * both.counts
         stated = (0.5 * drawn.tracks.log_var[half:]).exp().detach()
-        density[half:] = density[half:] * (stated / stated.mean())  # as in `prior.models.hgvae.train_completion`, and for its reason
+        density[half:] = density[half:] * (
+            stated / stated.mean()
+        )  # as in `prior.models.hgvae.train_completion`, and for its reason
         likelihood = density.flatten(1).sum(dim=1)
         kl = drawn.kl[:half].sum() / batch
         beta = min(KL_START + (1 - KL_START) * step / (WARM_UP * iterations), 1.0)

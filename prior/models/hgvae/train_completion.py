@@ -14,13 +14,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.models.hgvae.completion import CompletionNet
-from prior.motion.corruption import add_noise, elsewhere, exchanged, occlude, other_builds, slow_errors, spoil, stands_still
-from prior.models.distributed import share
-from prior.models.layers.graph import SCALE
-from prior.models.hgvae.network import HGVAE
-from prior.models.hgvae.windows import STRIDES, Batch, Windows
-from prior.models.training import TrainingRun
+from steadypose.prior.models.distributed import share
+from steadypose.prior.models.hgvae.completion import CompletionNet
+from steadypose.prior.models.hgvae.network import HGVAE
+from steadypose.prior.models.hgvae.windows import STRIDES, Batch, Windows
+from steadypose.prior.models.layers.graph import SCALE
+from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.motion.corruption import (
+    add_noise,
+    elsewhere,
+    exchanged,
+    occlude,
+    other_builds,
+    slow_errors,
+    spoil,
+    stands_still,
+)
 
 Floats = NDArray[np.float64]
 

@@ -15,10 +15,17 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
-from prior.clean.score import MISSING, RATES, SENSOR_SIGMAS, Calibration, judged
-from prior.models.hgvae.features import to_tracks
-from prior.models.weights_io import LICENCES, load_weights, started
-from prior.motion.corruption import (
+from steadypose.prior.clean.gate import LEAST_NOISE, stuck
+from steadypose.prior.clean.score import MISSING, RATES, SENSOR_SIGMAS, Calibration, judged
+from steadypose.prior.models.distributed import share
+from steadypose.prior.models.hgvae.faults import RECENT, FaultNet, FaultNetConfig, tell
+from steadypose.prior.models.hgvae.features import to_tracks
+from steadypose.prior.models.hgvae.network import HGVAE, HGVAEConfig
+from steadypose.prior.models.hgvae.windows import STRIDES, Windows, standardise
+from steadypose.prior.models.layers.graph import SCALE
+from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.weights_io import LICENCES, load_weights, started
+from steadypose.prior.motion.corruption import (
     FAST,
     elsewhere,
     exchanged,
@@ -35,14 +42,7 @@ from prior.motion.corruption import (
     spoil,
     stands_still,
 )
-from prior.models.distributed import share
-from prior.models.hgvae.faults import RECENT, FaultNet, FaultNetConfig, tell
-from prior.clean.gate import LEAST_NOISE, stuck
-from prior.models.layers.graph import SCALE
-from prior.models.hgvae.network import HGVAE, HGVAEConfig
-from prior.motion.dataset import MotionSet
-from prior.models.hgvae.windows import STRIDES, Windows, standardise
-from prior.models.training import TrainingRun
+from steadypose.prior.motion.dataset import MotionSet
 
 Floats = NDArray[np.float64]
 
@@ -90,7 +90,7 @@ def train_anomaly(
     run = fit(network, model, train, val, runs / f"{path.stem}-faults", iterations, seed)
     run.ship(f"{path.stem}.faults", network, asdict(network.config), {
         "Model": f"fault network beside {path.name}, prior/models/hgvae/faults.py",
-        "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, spoilt by prior/models/hgvae/train_faults.py",
+        "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, spoilt as in train_faults.py",
         "Licence": LICENCES[weights],
         "Training": f"with the HG-VAE, by `steadypose train`: {iterations} steps of {BATCH} windows, seed {seed}"
         f"{origin}",

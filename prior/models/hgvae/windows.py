@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from prior.models.hgvae.features import body_size, hang_unseen, in_frame_of, to_tracks
-from prior.models.layers.graph import SCALE
-from prior.models.hgvae.network import HGVAE
-from prior.motion.dataset import MotionSet, mirror_offsets
+from steadypose.prior.models.hgvae.features import body_size, hang_unseen, in_frame_of, to_tracks
+from steadypose.prior.models.hgvae.network import HGVAE
+from steadypose.prior.models.layers.graph import SCALE
+from steadypose.prior.motion.dataset import MotionSet, mirror_offsets
 
 Floats = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from prior.models.hmvae.network import HMVAE, ROTATION_FEATURES, SLOPE
-from prior.models.layers.skeleton_conv import SkeletonConv, SkeletonPool, SkeletonUnpool
+from steadypose.prior.models.hmvae.network import HMVAE, ROTATION_FEATURES, SLOPE
+from steadypose.prior.models.layers.skeleton_conv import SkeletonConv, SkeletonPool, SkeletonUnpool
 
 Floats = NDArray[np.float32]
 

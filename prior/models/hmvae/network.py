@@ -17,8 +17,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from prior.models.layers.skeleton_conv import EdgeLinear, SkeletonConv, SkeletonPool, SkeletonUnpool, pooling_levels
-from prior.body.skeleton import PARENTS
+from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.models.layers.skeleton_conv import (
+    EdgeLinear,
+    SkeletonConv,
+    SkeletonPool,
+    SkeletonUnpool,
+    pooling_levels,
+)
 
 ROTATION_FEATURES = 6
 """A joint's features: the first two columns of its local rotation."""

@@ -11,12 +11,12 @@ import roma
 import torch
 from torch import Tensor
 
-from prior.models.weights_io import LICENCES, started
-from prior.models.distributed import share
-from prior.models.hmvae.network import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
-from prior.body.kinematics import forward_kinematics
-from prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations, remove_heading
-from prior.models.training import TrainingRun
+from steadypose.prior.body.kinematics import forward_kinematics
+from steadypose.prior.models.distributed import share
+from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
+from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.weights_io import LICENCES, started
+from steadypose.prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations, remove_heading
 
 JOINT_WEIGHT = 10.0
 """lambda of equation 5."""

@@ -19,7 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from prior.models.layers.graph import LOG_VAR_RANGE, GraphBlock, GraphLinear
+from steadypose.prior.models.layers.graph import LOG_VAR_RANGE, GraphBlock, GraphLinear
 
 Floats = NDArray[np.float32]
 

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from prior.body.kinematics import CONTACT_JOINTS
-from prior.models.layers.skeleton_conv import Level, SkeletonConv, SkeletonPool, pooling_levels
-from prior.body.skeleton import PARENTS
+from steadypose.prior.body.kinematics import CONTACT_JOINTS
+from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.models.layers.skeleton_conv import Level, SkeletonConv, SkeletonPool, pooling_levels
 
 FRAME_S = 1.0 / 30.0
 """Seconds between the frames that the network sees."""

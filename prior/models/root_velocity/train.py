@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from prior.models.weights_io import LICENCES, started
-from prior.models.distributed import share
-from prior.body.kinematics import CONTACT_JOINTS
-from prior.motion.dataset import MotionSet, data_told, yaw_rotation
-from prior.body.skeleton import MIRROR, J
-from prior.models.training import TrainingRun
-from prior.models.root_velocity.network import FRAME_S, RootMotion, TrajectoryConfig, TrajectoryNet
+from steadypose.prior.body.kinematics import CONTACT_JOINTS
+from steadypose.prior.body.skeleton import MIRROR, J
+from steadypose.prior.models.distributed import share
+from steadypose.prior.models.root_velocity.network import FRAME_S, RootMotion, TrajectoryConfig, TrajectoryNet
+from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.weights_io import LICENCES, started
+from steadypose.prior.motion.dataset import MotionSet, data_told, yaw_rotation
 
 WINDOW = 48
 """Frames of a training window, 1.6 s."""
@@ -125,7 +125,7 @@ def train_trajectory(
         schedule.step()
     config = calibrate(model, val)
     return run.ship(f"trajectory-{weights}", model, asdict(config), {
-        "Model": f"root velocity and contacts, {config.context} frames of context, 22 joints (prior/models/root_velocity/network.py)",
+        "Model": f"root velocity and contacts, {config.context} frames of context, 22 joints",
         "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train trajectory --weights {weights} --iterations {iterations}`: "

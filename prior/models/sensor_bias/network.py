@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from prior.body.skeleton import MIRROR, J, finite_joints
+from steadypose.prior.body.skeleton import MIRROR, J, finite_joints
 
 Floats = NDArray[np.float64]
 

@@ -10,15 +10,22 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from prior.clean.correct import DENSITY, recall
-from prior.models.sensor_bias.network import HISTORY, CorrectionConfig, CorrectionNet, features, mirror_features, trunk_frame
-from prior.models.distributed import share
-from prior.timing.fixed_lag import FixedLagRTS
-from prior.body.kinematics import rigid_alignment
-from prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
-from prior.motion.dataset import mirror_offsets
-from prior.body.skeleton import KINECT22, finite_joints, to_canonical
-from prior.models.training import TrainingRun
+from steadypose.prior.body.kinematics import rigid_alignment
+from steadypose.prior.body.skeleton import KINECT22, finite_joints, to_canonical
+from steadypose.prior.clean.correct import DENSITY, recall
+from steadypose.prior.models.distributed import share
+from steadypose.prior.models.sensor_bias.network import (
+    HISTORY,
+    CorrectionConfig,
+    CorrectionNet,
+    features,
+    mirror_features,
+    trunk_frame,
+)
+from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.motion.dataset import mirror_offsets
+from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
+from steadypose.prior.timing.fixed_lag import FixedLagRTS
 
 HIDE = 0.1
 """Share of training frames with joints hidden, so that the network can do without some."""
@@ -74,7 +81,7 @@ def train_correction(
         schedule.step()
         losses.append(1000 * loss.item())
     return run.ship(f"correction-{weights}", net, asdict(config), {
-        "Model": "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses (prior/models/sensor_bias/network.py)",
+        "Model": "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses",
         "Data": f"UI-PRMD, Kinect beside Vicon: {', '.join(TRAIN_SUBJECTS)}",
         "Licence": "Apache-2.0; the data is in the public domain (PDDL 1.0)",
         "Training": f"`steadypose train correction --data ui_prmd.npz`: {iterations} steps of {batch}, seed {seed}",

@@ -1,0 +1,199 @@
+"""`steadypose clean`: what it writes, and at which stamps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import START_NS, record, walk
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean, PoseWorld, Tracking, WorldBody
+from steadypose.nodes.commands.clean import clean
+from steadypose.nodes.graph.launch import LaunchError
+from steadypose.nodes.sources.npz import PERIOD_NS, NpzCollector, NpzError
+
+FRAMES = 40
+
+
+@pytest.fixture
+def options(weights: dict[str, str]) -> tuple[str, ...]:
+    return tuple(f"{key.removeprefix('prior.')}={value}" for key, value in weights.items())
+
+
+def write_npz(path: Path, bodies: int = 1, **more: object) -> Path:
+    positions = np.array([frame.bodies[0].positions for frame in walk(FRAMES, bodies)])
+    np.savez(path, **({"positions": positions, "skeleton": "smpl22", "fps": 30.0} | more))  # type: ignore[arg-type]
+    return path
+
+
+def load(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path) as file:
+        return dict(file)
+
+
+def test_npz_to_npz(tmp_path: Path, options: tuple[str, ...]) -> None:
+    clean(write_npz(tmp_path / "in.npz"), tmp_path / "out.npz", settings=options)
+    out = load(tmp_path / "out.npz")
+    assert {name: array.shape for name, array in out.items()} == {
+        "stamp_ns": (FRAMES,),
+        "positions": (FRAMES, 22, 3),
+        "rotations": (FRAMES, 22, 4),
+        "state": (FRAMES, 22),
+        "sigma": (FRAMES, 22),
+        "anomaly": (FRAMES,),
+        "anomaly_flag": (FRAMES,),
+        "contacts": (FRAMES, 8),
+        "root_velocity": (FRAMES, 3),
+        "world_positions": (FRAMES, 22, 3),
+        "joint_names": (22,),
+    }
+    for name in ("positions", "rotations", "sigma", "contacts", "root_velocity", "world_positions"):
+        assert np.isfinite(out[name]).all(), f"{name}: both ends are answered too"
+    assert (out["state"] != JointState.UNKNOWN).all()
+    np.testing.assert_array_equal(out["stamp_ns"], np.round(np.arange(FRAMES) * 1e9 / 30))
+    np.testing.assert_allclose(np.linalg.norm(out["rotations"], axis=-1), 1.0, atol=1e-5)
+
+
+def test_jittered_stamps_come_back_as_they_were(tmp_path: Path, options: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(1)
+    stamps = START_NS + np.cumsum(rng.integers(25_000_000, 42_000_000, FRAMES))
+    clean(write_npz(tmp_path / "in.npz", stamp_ns=stamps), tmp_path / "out.npz", settings=options)
+    out = load(tmp_path / "out.npz")
+    np.testing.assert_array_equal(out["stamp_ns"], stamps)
+    assert np.isfinite(out["positions"]).all()
+
+
+def test_a_recording_and_its_npz_give_the_same_numbers(tmp_path: Path, options: tuple[str, ...]) -> None:
+    frames = walk(FRAMES, bodies=2)
+    record(tmp_path / "in", frames)
+    clean(tmp_path / "in", tmp_path / "out", settings=options)
+    clean(tmp_path / "in", tmp_path / "out.npz", settings=options)
+    out = load(tmp_path / "out.npz")
+    assert out["body_id"].tolist() == [0, 1]
+    assert out["positions"].shape == (FRAMES, 2, 22, 3)
+    with RecordingReader(tmp_path / "out") as reader:
+        messages = list(reader)
+    raws = [m.message for m in messages if m.topic == POSE_RAW]
+    assert raws[:-1] == frames
+    cleans = [m.message for m in messages if isinstance(m.message, PoseClean) and not m.message.end_of_stream]
+    assert [m.topic for m in messages if m.topic in (POSE_CLEAN, POSE_WORLD)].count(POSE_CLEAN) == len(cleans) + 1
+    # the first grid time is the first stamp, so there nothing is interpolated
+    np.testing.assert_array_equal(out["positions"][0, 1], cleans[0].bodies[1].positions)
+
+
+def test_settings_reach_the_stages(tmp_path: Path, options: tuple[str, ...]) -> None:
+    source = write_npz(tmp_path / "in.npz")
+    clean(source, tmp_path / "a.npz", settings=options)
+    clean(source, tmp_path / "b.npz", settings=(*options, "bones.enabled=false"))
+    clean(source, tmp_path / "c.npz", delay=0, settings=options)
+    a, b, c = (load(tmp_path / f"{name}.npz")["positions"] for name in "abc")
+    assert np.abs(a - b).max() > 1e-3
+    assert np.abs(a - c).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ({"settings": ("refine.enabeld=false",)}, "did you mean 'enabled'"),
+        ({"settings": ("trajectory.contact=false",)}, "contacts"),
+        ({"settings": ("delay",)}, "expected section.key=value"),
+        ({"delay": 99}, "expected 0 to 16 frames"),
+        ({"weights": "nothing"}, "no weights 'nothing'"),
+        ({"out": Path("in.npz")}, "another path"),
+        ({"out": Path("nowhere/out.npz")}, "to exist"),
+        ({"source": Path("nowhere.npz")}, "does not exist"),
+    ],
+)
+def test_what_cannot_be_done_is_said(tmp_path: Path, monkeypatch, options, arguments: dict, expected: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_npz(Path("in.npz"))
+    given_settings = (*options, *arguments.pop("settings", ())) if "weights" not in arguments else ()
+    asked = {"source": Path("in.npz"), "out": Path("out.npz"), "settings": given_settings} | arguments
+    with pytest.raises(LaunchError, match=expected):
+        clean(**asked)
+    assert not Path("out.npz").exists()
+
+
+def test_a_broken_input_leaves_no_output(tmp_path: Path) -> None:
+    (tmp_path / "in.npz").write_bytes(b"")
+    with pytest.raises(NpzError):
+        clean(tmp_path / "in.npz", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def answers(stamp_ns: int, position: float, turn: Rotation, body: int = 0) -> tuple[PoseClean, PoseWorld]:
+    positions = np.full((22, 3), position)
+    rotations = np.tile(turn.as_quat(), (22, 1))
+    state = np.full(22, JointState.SEEN if position < 0.5 else JointState.IMPUTED)
+    ones, zeros = np.ones(22), np.zeros((22, 3))
+    sensor = Pose.identity()
+    made = CleanBody(body, positions, rotations, state, ones * position, position, False, ones, ones, zeros, ones)
+    placed = WorldBody(
+        body, zeros[0], turn.as_quat(), np.full(3, position), np.eye(6), positions, rotations, state, ones, np.ones(8),
+        Tracking.OK,
+    )  # fmt: skip
+    return (
+        PoseClean(stamp_ns, "camera", "test", sensor, True, 4, [made]),
+        PoseWorld(stamp_ns, "world", "test", np.array([0.0, 0.0, 1.0, 0.0]), [placed]),
+    )
+
+
+def collect(*stamped: tuple[PoseClean, PoseWorld]) -> NpzCollector:
+    collector = NpzCollector()
+    for pair in stamped:
+        for message in pair:
+            collector.add(message)
+    return collector
+
+
+@settings(max_examples=30)
+@given(share=st.floats(0.0, 1.0), seed=st.integers(0, 1000))
+def test_between_two_grid_times_it_interpolates(share: float, seed: int) -> None:
+    turns = Rotation.random(2, rng=np.random.default_rng(seed))
+    period = round(PERIOD_NS)
+    collector = collect(answers(START_NS, 0.0, turns[0]), answers(START_NS + period, 1.0, turns[1]))
+    stamp = START_NS + round(share * period)
+    out = collector.arrays(np.array([stamp]))
+    exact = (stamp - START_NS) / period
+    for name in ("positions", "world_positions", "root_velocity", "sigma", "anomaly"):
+        np.testing.assert_allclose(out[name], exact, atol=1e-6)
+    expected = Slerp([0, 1], turns)(exact)
+    got = Rotation.from_quat(out["rotations"][0, 5])
+    assert (got * expected.inv()).magnitude() < 1e-3
+    assert (out["state"][0] == (JointState.SEEN if exact <= 0.5 else JointState.IMPUTED)).all()
+
+
+def test_a_gap_is_not_filled() -> None:
+    still = Rotation.identity()
+    second = 1_000_000_000
+    collector = collect(answers(START_NS, 0.0, still), answers(START_NS + second, 1.0, still))
+    out = collector.arrays(START_NS + np.array([-second, -20_000_000, 20_000_000, second // 2, second]))
+    np.testing.assert_array_equal(out["positions"][:, 0, 0], [np.nan, 0.0, 0.0, np.nan, 1.0])
+    assert out["state"][3].tolist() == [JointState.UNKNOWN] * 22
+    assert not out["anomaly_flag"].any()
+
+
+def test_a_body_that_comes_later_is_unknown_before() -> None:
+    still = Rotation.identity()
+    collector = collect(
+        answers(START_NS, 0.25, still),
+        answers(START_NS + 10**9, 0.25, still),
+        answers(START_NS + 10**9, 0.75, still, 7),
+    )
+    out = collector.arrays(START_NS + np.array([0, 10**9]))
+    assert out["body_id"].tolist() == [0, 7]
+    np.testing.assert_array_equal(out["positions"][:, :, 0, 0], [[0.25, np.nan], [0.25, 0.75]])
+    assert out["state"][0, 1].tolist() == [JointState.UNKNOWN] * 22
+
+
+def test_without_any_body_there_is_still_a_row_for_each_stamp() -> None:
+    out = NpzCollector().arrays(np.array([START_NS, START_NS + 1]))
+    assert out["positions"].shape == (2, 22, 3)
+    assert np.isnan(out["positions"]).all()
+    assert "body_id" not in out

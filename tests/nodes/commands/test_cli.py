@@ -1,0 +1,100 @@
+"""The command: what it lists, what it imports, and how it fails."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from steadypose.nodes.cli import COMMANDS, USAGE_ERROR, main
+from steadypose.nodes.commands.node import CLASSES
+from steadypose.nodes.graph.launch import LISTENS
+
+
+def python(code: str) -> str:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+
+
+def test_help_lists_every_command_and_imports_almost_nothing() -> None:
+    out = python(
+        "import sys; from steadypose.nodes.cli import main; main(['--help']);"
+        "print(*(m for m in ('torch', 'numpy', 'tyro', 'rich', 'zmq') if m in sys.modules), sep='', end='')"
+    )
+    for name, (_, what) in COMMANDS.items():
+        assert f"  {name}" in out
+        assert what in out
+    assert out.endswith("bundled stream.\n"), "and none of those modules"
+
+
+@pytest.mark.parametrize("command", ["run", "node", "keys", "echo", "info"])
+def test_what_needs_no_torch_does_not_import_it(command: str) -> None:
+    code = f"""
+import sys
+from steadypose.nodes.cli import main
+try:
+    main([{command!r}, "--help"])
+except SystemExit as end:
+    assert end.code == 0
+print("torch" in sys.modules)
+"""
+    assert python(code).endswith("False\n")
+
+
+def test_every_command_and_node_is_where_it_is_said_to_be() -> None:
+    assert set(CLASSES) == set(LISTENS)
+    for place in (*(where for where, _ in COMMANDS.values()), *CLASSES.values()):
+        module, name = place.split(":")
+        spec = find_spec(module)
+        assert spec is not None, module
+        assert spec.origin is not None
+        text = Path(spec.origin).read_text()
+        assert f"def {name}(" in text or f"class {name}(" in text, place
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["cleen"], "did you mean 'clean'"),
+        (["xyzzy"], "there are run, node"),
+        (["clean", "nowhere.npz", "out.npz"], "nowhere.npz does not exist"),
+        (["run", "nolaunch"], "no launch file 'nolaunch'"),
+        (["run", "--input", "nowhere"], "does not exist"),
+        (["run", "--set", "input.rat=3"], "did you mean 'rate'"),
+        (["node", "priro"], "did you mean 'prior'"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_a_line(capsys, arguments: list[str], expected: str) -> None:
+    assert main(arguments) == USAGE_ERROR
+    err = capsys.readouterr().err
+    assert expected in err
+    assert "Traceback" not in err
+
+
+def test_a_bad_npz_is_said_in_a_line(capsys, tmp_path: Path) -> None:
+    np.savez(tmp_path / "in.npz", positions=np.zeros((3, 22)), skeleton="smpl22", fps=30)
+    assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == USAGE_ERROR
+    assert "expected shape (T, 22, 3) for smpl22, got (3, 22)" in capsys.readouterr().err
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch) -> None:
+    monkeypatch.setattr("steadypose.nodes.commands.keys.create_keys", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(["keys", "somewhere"])
+
+
+def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+    command = f"{sys.executable} -m steadypose.nodes.cli --help | true"
+    done = subprocess.run(["bash", "-o", "pipefail", "-c", command], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_keys_are_made_once(capsys, tmp_path: Path) -> None:
+    assert main(["keys", str(tmp_path / "keys")]) == 0
+    secret = tmp_path / "keys" / "own.key_secret"
+    assert secret.stat().st_mode & 0o077 == 0
+    assert main(["keys", str(tmp_path / "keys")]) == USAGE_ERROR
+    assert "exists already" in capsys.readouterr().err

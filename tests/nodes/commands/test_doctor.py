@@ -1,0 +1,219 @@
+"""The doctor: what is found on a machine that lacks something, and the exit status."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace as Made
+
+import pytest
+
+from steadypose.nodes.commands import doctor as module
+from steadypose.nodes.commands.doctor import INSTALL, Finding, Verdict, doctor
+
+
+def verdicts(check) -> dict[str, Verdict]:
+    return {finding.what: finding.verdict for finding in module._examine(check)}
+
+
+def only(check) -> Finding:
+    (finding,) = module._examine(check)
+    return finding
+
+
+def with_checks(monkeypatch: pytest.MonkeyPatch, *findings: Finding) -> None:
+    def check() -> Iterator[Finding]:
+        yield from findings
+
+    monkeypatch.setattr(module, "CHECKS", (check,))
+
+
+def test_exit_status_says_whether_the_main_job_can_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fine = Finding("Python", Verdict.GOOD, "3.11.7")
+    note = Finding("optional: view", Verdict.NOTE, "not installed", "install [this]")
+    with_checks(monkeypatch, fine, note)
+    assert doctor() == 0
+    assert "install [this]" in capsys.readouterr().out
+    with_checks(monkeypatch, fine, Finding("weights of hmvae", Verdict.BAD, "none", "train them"))
+    assert doctor() == 1
+    out = capsys.readouterr().out
+    assert "train them" in out
+    assert "cannot work yet: weights of hmvae" in out
+
+
+def test_a_check_that_breaks_is_a_finding_and_the_others_go_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def check_broken() -> Iterator[Finding]:
+        raise ImportError("libusb is gone")
+        yield
+
+    def check_fine() -> Iterator[Finding]:
+        yield Finding("fine", Verdict.GOOD, "yes")
+
+    monkeypatch.setattr(module, "CHECKS", (check_broken, check_fine))
+    assert doctor() == 1
+    out = capsys.readouterr().out
+    assert "ImportError: libusb is gone" in out
+    assert "fine" in out
+
+
+def test_packages_are_there() -> None:
+    assert verdicts(module.check_packages)["packages"] is Verdict.GOOD
+
+
+def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lacking(name: str) -> str:
+        if name in ("pyzmq", "rerun-sdk"):
+            raise importlib.metadata.PackageNotFoundError(name)
+        return "0.0.1" if name == "numpy" else importlib.metadata.version(name)
+
+    monkeypatch.setattr(module, "version", lacking)
+    findings = {finding.what: finding for finding in module.check_packages()}
+    extra = findings["optional: view"]
+    assert extra.verdict is Verdict.NOTE
+    assert extra.found.startswith("the picture in the browser: rerun-sdk not installed, expected >=")
+    assert extra.fix.endswith("uv sync --frozen --inexact --extra view")
+    packages = findings["packages"]
+    assert packages.verdict is Verdict.BAD
+    assert "pyzmq not installed, expected >=27" in packages.found
+    assert "numpy 0.0.1, expected >=1.26" in packages.found
+    assert packages.fix == INSTALL
+
+
+def test_what_a_pull_brought_is_missed_though_nothing_was_installed_anew(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pulled = module.PROJECT.read_text().replace("dependencies = [", 'dependencies = [\n  "brandnew>=1",', 1)
+    monkeypatch.setattr(module, "PROJECT", tmp_path / "pyproject.toml")
+    module.PROJECT.write_text(pulled)
+    finding = next(iter(module.check_packages()))
+    assert (finding.verdict, finding.found) == (Verdict.BAD, "brandnew not installed, expected >=1")
+
+
+def test_every_extra_is_told_what_for() -> None:
+    project = tomllib.loads(module.PROJECT.read_text())
+    assert set(project["project"]["optional-dependencies"]) == set(module.EXTRAS)
+
+
+def test_another_python_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module.sys, "version_info", (3, 13, 1))
+    finding = only(module.check_python)
+    assert finding.verdict is Verdict.BAD
+    assert finding.found == "3.13.1"
+
+
+def test_a_busy_processor_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module.os, "getloadavg", lambda: (64.0, 0.0, 0.0))
+    monkeypatch.setattr(module.os, "sched_getaffinity", lambda _: {0, 1})
+    assert verdicts(module.check_processor)["processor"] is Verdict.NOTE
+    monkeypatch.setattr(module.os, "getloadavg", lambda: (0.2, 0.0, 0.0))
+    assert verdicts(module.check_processor)["processor"] is Verdict.GOOD
+
+
+def test_a_message_makes_its_way_and_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    finding = only(module.check_messages)
+    assert finding.verdict is Verdict.GOOD
+    assert str(tmp_path / "steadypose") in finding.found
+    assert not list((tmp_path / "steadypose").iterdir())
+
+
+def test_a_directory_that_cannot_be_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "file"))
+    finding = only(module.check_messages)
+    assert finding.verdict is Verdict.BAD
+    assert "cannot write" in finding.found
+
+
+def test_a_path_too_long_for_sockets(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / ("x" * 100)))
+    finding = only(module.check_messages)
+    assert finding.verdict is Verdict.BAD
+    assert "too long" in finding.found
+
+
+def test_missing_weights_are_missing_and_nothing_is_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from steadypose.prior.models import weights_io as checkpoint
+
+    monkeypatch.setattr(checkpoint, "WEIGHTS", tmp_path / "weights")
+    findings = module._examine(module.check_models)
+    assert [finding.verdict for finding in findings] == [Verdict.BAD] * 3
+    assert [finding.fix.split("steadypose train ")[1] for finding in findings] == ["hmvae", "hgvae", "trajectory"]
+
+
+def test_damaged_weights_are_not_taken_for_whole(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from steadypose.prior.models import weights_io as checkpoint
+
+    for model in module.MODELS:
+        (tmp_path / f"{model}-default.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0garbage!")
+    monkeypatch.setattr(checkpoint, "WEIGHTS", tmp_path)
+    assert set(verdicts(module.check_models).values()) == {Verdict.BAD}
+
+
+def test_the_prior_is_timed_on_a_body_that_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "FRAMES", 40)
+    for target_ms, expected in ((1e9, Verdict.GOOD), (0.0, Verdict.NOTE)):
+        monkeypatch.setattr(module, "TARGET_MS", target_ms)
+        monkeypatch.setattr(module, "BUDGET_MS", max(target_ms, 1e6))
+        finding = module._self_test()
+        assert finding.verdict is expected
+        assert "ms a frame" in finding.found
+
+
+def test_missing_streams_say_what_to_play_instead(monkeypatch: pytest.MonkeyPatch) -> None:
+    from steadypose.nodes.sources import pose_input
+
+    def gone(path: Path) -> None:
+        raise pose_input.LaunchError(f"{path} does not exist")
+
+    monkeypatch.setattr(pose_input, "open_source", gone)
+    finding = only(module.check_streams)
+    assert finding.verdict is Verdict.BAD
+    assert "--input" in finding.fix
+
+
+def test_no_camera_is_fine() -> None:
+    assert only(module.check_camera).verdict is Verdict.GOOD
+
+
+def test_an_oak_without_usb_rights_gets_its_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+    import depthai
+
+    monkeypatch.setattr(depthai.Device, "getAllAvailableDevices", staticmethod(list))
+    monkeypatch.setattr(module, "Path", lambda _: Made(glob=lambda _: [Made(read_text=lambda: "03e7\n")]))
+    finding = only(module.check_camera)
+    assert finding.verdict is Verdict.NOTE
+    assert finding.found == "1 plugged in that cannot be opened"
+    assert "/etc/udev/rules.d" in finding.fix
+    monkeypatch.setattr(depthai.Device, "getAllAvailableDevices", lambda: [Made(getDeviceId=lambda: "14442C")])
+    assert only(module.check_camera).found == "14442C"
+
+
+def test_webcams_that_may_not_be_used_name_the_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(module, "DEVICES", tmp_path)
+    assert only(module.check_webcam).found == "none"
+    (tmp_path / "video0").write_text("")
+    assert (only(module.check_webcam).verdict, only(module.check_webcam).found) == (Verdict.GOOD, "video0")
+    monkeypatch.setattr(module.os, "access", lambda *_: False)
+    finding = only(module.check_webcam)
+    assert finding.verdict is Verdict.NOTE
+    assert "usermod -aG video" in finding.fix
+
+
+def test_it_needs_nothing_that_it_looks_for() -> None:
+    code = (
+        "import sys; sys.modules.update(dict.fromkeys(('torch', 'zmq', 'numpy', 'rosbags', 'depthai')));"
+        "from steadypose.nodes.commands.doctor import CHECKS, _examine; "
+        "print([f.verdict.name for c in CHECKS for f in _examine(c)])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("BAD") >= 4

@@ -1,0 +1,183 @@
+"""echo, hz and info: on recordings, and on topics over real sockets."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+from tests.helpers.synthetic_poses import messages
+
+from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.transport import Publisher
+from steadypose.msgs.types import CleanBody, Diagnostics, Level, PoseClean, PoseRaw
+from steadypose.nodes.commands import inspect
+from steadypose.nodes.commands.inspect import InspectError, Rate, echo, hz, info, measure
+
+DEADLINE_S = 20.0
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    with RecordingWriter(tmp_path / "bag") as writer:
+        for topic, message in messages(1.0, bodies=2):
+            writer.write(topic, message, message.stamp_ns)
+        report = Diagnostics(2 * 10**9, "prior", Level.WARN, "1 dropped or refused", {"queue": "2"})
+        writer.write(DIAGNOSTICS, report, report.stamp_ns)
+    return tmp_path / "bag"
+
+
+def published(endpoint: str, command: Callable[[], object]) -> object:
+    """Run a command in a thread while poses are published at ``endpoint``, until it ends; what it returns."""
+    results: list[object] = []
+    stream = list(messages(0.5))
+    thread = threading.Thread(target=lambda: results.append(command()), daemon=True)
+    with Publisher(endpoint) as publisher:
+        thread.start()
+        for turn, (topic, message) in enumerate(itertools.cycle(stream)):
+            assert turn < DEADLINE_S * 1000, "the command did not end"
+            publisher.publish(topic, message)
+            thread.join(0.001)
+            if not thread.is_alive():
+                break
+    (result,) = results
+    return result
+
+
+def test_echo_gives_a_line_a_message_and_a_line_a_body(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    echo(str(recording), count=3, topics=(POSE_RAW, POSE_CLEAN))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "pose/raw    1.000  made-up  azure_kinect32  2 bodies"
+    assert lines[1].startswith("  0: 32 of 32 joints")
+    assert lines[3].startswith("pose/clean  1.000  made-up  delay 4  2 bodies")
+    assert "3 seen, 18 refined, 1 imputed; sigma up to 6.0 cm; anomaly" in lines[4]
+    assert len(lines) == 9
+
+
+def test_echo_tells_of_the_world_and_of_nodes(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    echo(str(recording), topics=(POSE_WORLD, DIAGNOSTICS))
+    out = capsys.readouterr().out
+    assert "0.50 m/s, ok" in out
+    assert out.splitlines()[-1] == "diagnostics 2.000  prior: WARN 1 dropped or refused"
+
+
+def test_echo_in_full_is_yaml_with_every_field(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    echo(str(recording), count=1, full=True, topics=(POSE_CLEAN,))
+    echo(str(recording), count=1, full=True, topics=(DIAGNOSTICS,))
+    clean, report = YAML(typ="safe").load_all(capsys.readouterr().out)
+    expected = next(m for _, m in messages(1.0, bodies=2) if isinstance(m, PoseClean))
+    assert clean["stamp_ns"] == expected.stamp_ns
+    assert clean["sensor_pose"]["orientation"] == pytest.approx(expected.sensor_pose.orientation, rel=1e-4)
+    body = clean["bodies"][1]
+    assert set(body) == set(CleanBody.__dataclass_fields__)
+    assert body["state"]["spine1"] == "IMPUTED"
+    assert body["positions"]["left_wrist"] == pytest.approx(expected.bodies[1].positions[20], rel=1e-3)
+    assert np.isnan(body["raw_positions"]["spine1"]).all()
+    assert report["values"] == {"queue": "2"}
+
+
+def test_echo_of_a_topic_counts_to_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = f"ipc://{tmp_path}/prior"
+    published(endpoint, lambda: echo(POSE_CLEAN, count=2, endpoints=(endpoint,)))
+    headings = [line for line in capsys.readouterr().out.splitlines() if not line.startswith(" ")]
+    assert len(headings) == 2
+    assert all(heading.startswith("pose/clean") for heading in headings)
+
+
+def test_echo_finds_a_topic_through_a_launch_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    launch = tmp_path / "here.toml"
+    launch.write_text(f'[transport]\ndirectory = "{tmp_path}"\n')
+    published(f"ipc://{tmp_path}/trajectory", lambda: echo(POSE_WORLD, count=1, launch=str(launch)))
+    assert capsys.readouterr().out.startswith("pose/world")
+
+
+def test_hz_of_a_recording_is_that_of_its_stamps(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    hz(str(recording), topics=(POSE_RAW,))
+    assert "average rate: 30.000 Hz  min: 0.0333 s  max: 0.0333 s" in capsys.readouterr().out
+
+
+def test_hz_of_a_topic_ends_after_its_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = f"ipc://{tmp_path}/input"
+    published(endpoint, lambda: hz(POSE_RAW, count=10, endpoints=(endpoint,)))
+    assert "window: 10" in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_rate_of_uneven_times() -> None:
+    rate = Rate.of([0.0, 0.1, 0.2, 0.5])
+    assert rate.mean_hz == pytest.approx(6.0)
+    assert (rate.shortest_s, rate.longest_s) == (pytest.approx(0.1), pytest.approx(0.3))
+    assert rate.deviation_s == pytest.approx(np.std([0.1, 0.1, 0.3]))
+    assert np.isnan(Rate.of([1.0]).mean_hz)
+
+
+def test_measuring_tells_once_a_second_and_looks_back_no_further_than_the_window() -> None:
+    slow_then_fast = [*np.arange(0, 10, 0.1), *np.arange(10, 20, 0.05)]
+    rates = list(measure(iter(slow_then_fast), window_s=2.0))
+    assert len(rates) == pytest.approx(20, abs=1)
+    assert rates[5].mean_hz == pytest.approx(10.0, rel=0.01)
+    assert rates[-1].mean_hz == pytest.approx(20.0, rel=0.01)
+    assert rates[-1].count == pytest.approx(41, abs=1)
+
+
+def test_info_of_a_recording(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert info(str(recording)) == 0
+    out = capsys.readouterr().out
+    assert "pose/raw: steadypose_msgs/msg/PoseRaw\n    30 messages, 30.00 Hz, longest gap 33 ms" in out
+    assert "source made-up; frame camera; skeleton azure_kinect32; bodies 0, 1" in out
+    assert "delay 4 frames" in out
+    assert "diagnostics: diagnostic_msgs/msg/DiagnosticArray\n    1 message\n    nodes prior" in out
+
+
+def test_info_of_a_recording_cut_short_says_so(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (file,) = recording.glob("*.mcap")
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) * 2 // 3])
+    assert info(str(recording)) == 0
+    assert "cut short" in capsys.readouterr().out
+
+
+def test_info_of_a_topic(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inspect, "INFO_S", 0.5)
+    endpoint = f"ipc://{tmp_path}/input"
+    silent = f"ipc://{tmp_path}/nobody"
+    assert published(endpoint, lambda: info(POSE_RAW, endpoints=(endpoint, silent))) == 0
+    out = capsys.readouterr().out
+    assert f"{endpoint}: " in out
+    assert "skeleton azure_kinect32" in out
+    assert f"{silent}: 0 messages" in out
+
+
+def test_info_of_a_topic_that_nobody_publishes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inspect, "INFO_S", 0.1)
+    assert info(POSE_RAW, endpoints=(f"ipc://{tmp_path}/nobody",)) == 1
+    assert "is `steadypose run` running?" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        (lambda bag: echo("pose/clen"), "did you mean 'pose/clean'"),
+        (lambda bag: hz("no/where"), "no topic or recording"),
+        (lambda bag: echo(bag, topics=("pose/x",)), "no topic 'pose/x'"),
+        (lambda bag: echo(POSE_RAW, topics=(POSE_CLEAN,)), "chooses from a recording"),
+    ],
+)
+def test_what_is_not_there_is_named(recording: Path, command: Callable[[str], None], expected: str) -> None:
+    with pytest.raises(InspectError, match=expected):
+        command(str(recording))
+
+
+def test_a_body_of_which_nothing_is_seen_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RecordingWriter(tmp_path / "bag") as writer:
+        message = next(m for _, m in messages(0.1) if isinstance(m, PoseRaw))
+        message.bodies[0].positions[:] = np.nan
+        writer.write(POSE_RAW, message, message.stamp_ns)
+    echo(str(tmp_path / "bag"))
+    assert "0 of 32 joints" in capsys.readouterr().out

@@ -1,0 +1,144 @@
+"""The picture of a recording: what is read for it, and that it is drawn whatever the recording has."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tests.helpers.synthetic_poses import messages
+
+from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw
+from steadypose.nodes.commands import plot as module
+from steadypose.nodes.commands.plot import PlotError, plot
+from steadypose.prior.body.skeleton import J
+
+PICTURE = b"\x89PNG"
+
+
+def record(directory: Path, topics: Collection[str], seconds: float = 3.0, **options) -> Path:
+    with RecordingWriter(directory) as writer:
+        for topic, message in messages(seconds, **options):
+            if topic in topics:
+                writer.write(topic, message, message.stamp_ns)
+    return directory
+
+
+@pytest.mark.parametrize(
+    "topics",
+    [
+        {POSE_RAW},
+        {POSE_CLEAN},
+        {POSE_WORLD, POSE_TRUTH},
+        {POSE_RAW, POSE_CLEAN, POSE_WORLD, POSE_TRUTH},
+    ],
+    ids=lambda topics: "+".join(sorted(topic.removeprefix("pose/") for topic in topics)),
+)
+@pytest.mark.filterwarnings("error")
+def test_draws_what_there_is(tmp_path: Path, topics: set[str]) -> None:
+    plot(record(tmp_path / "bag", topics), tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").read_bytes().startswith(PICTURE)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("frames", [1, 2])
+def test_draws_a_recording_of_a_frame_or_two(tmp_path: Path, frames: int) -> None:
+    recording = record(tmp_path / "bag", {POSE_RAW, POSE_CLEAN, POSE_WORLD, POSE_TRUTH}, (4 + frames) / 30)
+    plot(recording, tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").read_bytes().startswith(PICTURE)
+
+
+@pytest.mark.filterwarnings("error")
+def test_draws_frames_in_which_nothing_is_seen(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "bag") as writer:
+        for topic, message in messages(1.0):
+            if isinstance(message, PoseRaw):
+                message.bodies[0].positions[:] = np.nan
+            if isinstance(message, PoseClean):
+                message.bodies[0].raw_positions[:] = np.nan
+                message.bodies[0].anomaly = np.nan
+            writer.write(topic, message, message.stamp_ns)
+    plot(tmp_path / "bag", tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").read_bytes().startswith(PICTURE)
+
+
+def test_reads_bodies_errors_and_troubles(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "bag") as writer:
+        for topic, message in messages(2.0, bodies=2):
+            writer.write(topic, message, message.stamp_ns)
+        values = {"dropped.late": "3", "queue": "1", "refused.undecodable": "2"}
+        writer.write(DIAGNOSTICS, Diagnostics(3 * 10**9, "prior", Level.WARN, "", values), 3 * 10**9)
+    story = module._read(tmp_path / "bag")
+    assert story.troubles == {"prior dropped.late": 3, "prior refused.undecodable": 2}
+    assert set(story.tracks[POSE_CLEAN]) == {0, 1}
+    for body in (0, 1):
+        errors = module._errors(story, body)
+        assert errors[POSE_RAW].mean.mean() == pytest.approx(0.032, abs=0.004), "2 cm of noise along each axis"
+        assert errors[POSE_CLEAN].mean.mean() == pytest.approx(0.0048, abs=0.0006)
+        assert errors[POSE_WORLD].mean.mean() == pytest.approx(0.0048, abs=0.0006)
+        assert np.isnan(errors[POSE_RAW].by_joint[J["spine1"]]), "a joint that the sensor lacks has no error"
+
+
+def test_a_body_is_compared_with_the_person_who_stands_there(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "bag") as writer:
+        for topic, message in messages(1.0, bodies=2):
+            if isinstance(message, PoseRaw):
+                for body in message.bodies:
+                    body.id = 7 - body.id
+            writer.write(topic, message, message.stamp_ns)
+    story = module._read(tmp_path / "bag")
+    assert module._errors(story, 7)[POSE_RAW].mean.max() < 0.1
+
+
+def test_a_camera_whose_place_is_unknown_is_put_where_it_fits(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "bag") as writer:
+        for topic, message in messages(3.0):
+            if isinstance(message, PoseRaw):
+                message.calibrated = False
+                turned = Rotation.from_euler("z", 50, degrees=True) * Rotation.from_quat(
+                    message.sensor_pose.orientation
+                )
+                message.sensor_pose = Pose(np.array([5.0, 6.0, 7.0]), turned.as_quat())
+            writer.write(topic, message, message.stamp_ns)
+    errors = module._errors(module._read(tmp_path / "bag"), 0)
+    assert errors[POSE_RAW].mean.mean() == pytest.approx(0.032, abs=0.004)
+
+
+def test_no_error_where_the_truth_is_silent(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "bag") as writer:
+        for topic, message in messages(3.0):
+            if topic != POSE_TRUTH or not 2e9 < message.stamp_ns < 3e9:
+                writer.write(topic, message, message.stamp_ns)
+    story = module._read(tmp_path / "bag")
+    times = module._errors(story, 0)[POSE_RAW].time
+    assert not ((times > 1.1) & (times < 1.9)).any()
+
+
+def test_shows_the_joints_that_were_most_often_missing(tmp_path: Path) -> None:
+    story = module._read(record(tmp_path / "bag", {POSE_CLEAN}, 4.0))
+    track = story.track(POSE_CLEAN, 0)
+    assert track is not None
+    assert module._busiest(track)[0] == J["left_wrist"]
+
+
+@pytest.mark.parametrize(
+    ("output", "options", "expected"),
+    [
+        ("picture.gif", {}, "ending in .png, .svg or .pdf"),
+        ("nowhere/picture.png", {}, "no directory; make it first"),
+        ("picture.png", {"body": 9}, r"expected one of \[0\], got 9"),
+    ],
+)
+def test_what_cannot_be_drawn_says_why(tmp_path: Path, output: str, options: dict, expected: str) -> None:
+    recording = record(tmp_path / "bag", {POSE_RAW}, 0.2)
+    with pytest.raises(PlotError, match=expected):
+        plot(recording, tmp_path / output, **options)
+
+
+def test_a_recording_without_bodies_says_so(tmp_path: Path) -> None:
+    with pytest.raises(PlotError, match="found none"):
+        plot(record(tmp_path / "bag", {POSE_RAW}, 0.2, bodies=0), tmp_path / "picture.png")

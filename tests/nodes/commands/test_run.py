@@ -1,0 +1,293 @@
+"""Processes watched and started again, and the whole command from a recording to a recording."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from conftest import VirtualClock, record, until, walk
+from rich.console import Console
+
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.types import Diagnostics, Level, PoseClean, PoseRaw, PoseWorld
+from steadypose.nodes.commands.run import STUCK_NS, _Run, line, table
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.supervisor import BACKOFF_S, STEADY_S, Child, Supervisor
+
+FOREVER = "import signal; signal.pause()"
+Start = Callable[[str], Child]
+
+
+@pytest.fixture
+def said() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def start(clock: VirtualClock, said: list[str]) -> Iterator[Start]:
+    children: list[Child] = []
+
+    def start(code: str) -> Child:
+        child = Child("prior", [sys.executable, "-c", code], clock, said.append)
+        children.append(child)
+        return child
+
+    yield start
+    for child in children:
+        child.stop()
+
+
+def ended(child: Child) -> None:
+    """Wait for the process, and let the child see it."""
+    child._process.wait(30)
+    child.poll()
+
+
+def test_a_node_that_ends_well_stays_ended(start: Start) -> None:
+    child = start("")
+    ended(child)
+    assert child.state == "ended"
+
+
+def test_a_node_that_crashes_starts_again_a_little_later_each_time(
+    start: Start, clock: VirtualClock, said: list[str]
+) -> None:
+    child = start("raise SystemExit(7)")
+    for restarts, pause_s in enumerate(BACKOFF_S):
+        ended(child)
+        assert child.state == "crashed"
+        clock.time_ns += round((pause_s - 0.01) * 1e9)
+        child.poll()
+        assert (child.state, child.restarts) == ("crashed", restarts)
+        clock.time_ns += 20_000_000
+        child.poll()
+        assert (child.state, child.restarts) == ("running", restarts + 1)
+    ended(child)
+    assert child.state == "failed", "enough is enough"
+    assert said[0] == "prior: ended with status 7; starting it again in 0.5 s"
+
+
+def test_a_node_that_ran_for_a_while_gets_new_chances(start: Start, clock: VirtualClock) -> None:
+    child = start("raise SystemExit(7)")
+    for _ in range(2 * len(BACKOFF_S)):
+        clock.time_ns += round((STEADY_S + 1) * 1e9)
+        ended(child)
+        assert child.state == "crashed"
+        clock.time_ns += round(BACKOFF_S[0] * 1e9)
+        child.poll()
+
+
+def test_a_killed_node_starts_again(start: Start, clock: VirtualClock, said: list[str]) -> None:
+    child = start(FOREVER)
+    child._process.kill()
+    ended(child)
+    assert "SIGKILL" in said[0]
+    clock.time_ns += 10**9
+    child.poll()
+    assert child.state == "running"
+
+
+def test_a_node_that_cannot_do_what_is_asked_is_not_started_again(start: Start) -> None:
+    child = start("raise SystemExit(2)")
+    ended(child)
+    assert child.state == "failed"
+    assert child.restarts == 0
+
+
+def test_what_a_node_prints_is_passed_on(start: Start, said: list[str]) -> None:
+    ended(start("import sys; print('one'); print('two', file=sys.stderr)"))
+    until(lambda: sorted(said) == ["one", "two"])
+
+
+def test_stopping_is_kind_first(start: Start) -> None:
+    child = start(
+        "import signal, sys; signal.signal(15, lambda *_: sys.exit(0)); print('up', flush=True); signal.pause()"
+    )
+    child.stop()
+    assert child.state == "ended"
+    assert child._process.returncode in (0, -signal.SIGTERM), "by itself, or before it could"
+
+
+class Processes:
+    """In a supervisor's place: children that are in whatever state the test says."""
+
+    class _Child:
+        restarts = 0
+        state = "running"
+
+    def __init__(self, *names: str) -> None:
+        self.children = {name: self._Child() for name in names}
+        self.failed: list[str] = []
+
+
+def news(node: str, ended: str = "", level: Level = Level.OK, **values: str) -> tuple[str, Diagnostics]:
+    named = {key.replace("__", ".", 1).replace("__", "/"): value for key, value in values.items()}
+    return "diagnostics", Diagnostics(1, node, level, "", {"state": "running", "ended": ended, **named})
+
+
+NODES = ["pose_input", "prior", "trajectory", "recorder"]
+
+
+@pytest.fixture
+def watched(clock: VirtualClock, make_launch: Callable[..., Launch]) -> tuple[_Run, Supervisor]:
+    launch = make_launch(nodes='["pose_input", "prior", "trajectory", "recorder"]')
+    return _Run(launch, [], Console(quiet=True), clock), Processes(*NODES)  # type: ignore[return-value]
+
+
+def test_a_run_is_over_when_the_end_has_come_everywhere(watched: tuple[_Run, Supervisor]) -> None:
+    run, processes = watched
+    assert run._verdict(processes) is None
+    processes.children["pose_input"].state = "ended"
+    run._take(news("pose_input", POSE_RAW))
+    run._take(news("prior", f"{POSE_CLEAN} {POSE_RAW}"))
+    run._take(news("trajectory", f"{POSE_CLEAN} {POSE_WORLD}"))
+    assert run._verdict(processes) is None, "the recorder has not heard it yet"
+    run._take(news("recorder", f"{POSE_CLEAN} {POSE_RAW} {POSE_WORLD}"))
+    assert run._verdict(processes) == 0
+
+
+def test_a_run_whose_end_got_lost_does_not_wait_forever(watched: tuple[_Run, Supervisor], clock: VirtualClock) -> None:
+    run, processes = watched
+    processes.children["pose_input"].state = "ended"
+    for _ in range(3):
+        clock.time_ns += STUCK_NS
+        run._take(news("prior", count__pose=str(clock.time_ns)))
+        assert run._verdict(processes) is None, "it is still at work"
+    clock.time_ns += STUCK_NS + 1
+    run._take(news("prior", count__pose=run._news["prior"].values["count.pose"]))
+    assert run._verdict(processes) == 1
+
+
+def test_a_run_ends_when_a_node_cannot_run(watched: tuple[_Run, Supervisor]) -> None:
+    run, processes = watched
+    processes.failed.append("prior")
+    assert run._verdict(processes) == 1
+
+
+def test_the_table_and_the_line_show_what_there_is_to_see() -> None:
+    told = [
+        news("pose_input", rate__pose__raw="30.04", count__pose__raw="300"),
+        news(
+            "prior", level=Level.WARN, bodies="2", anomalies="1", delay_frames="4", refused__unknown_skeleton="5",
+            latency_ms__p50="3.14", latency_ms__p99="9.87", rate__pose__clean="29.98",
+        ),
+    ]  # fmt: skip
+    latest = {message.node: message for _, message in told}
+    processes: Supervisor = Processes(*NODES)  # type: ignore[assignment]
+    console = Console(width=140, record=True, quiet=True)
+    console.quiet = False
+    with console.capture() as capture:
+        console.print(table(NODES, latest, processes))
+    shown = capture.get()
+    for text in ("30.0", "3.1/9.9", "133", "unknown_skeleton 5", "flagged", "starting"):
+        assert text in shown
+    assert "restarts" not in shown, "nothing to say there"
+    assert "pose/clean 30.0 Hz, 3.1/9.9 ms, 0 dropped, 5 refused" in line(NODES, latest, processes)
+
+
+def steadypose(*arguments: str, folder: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "steadypose.nodes.cli", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"XDG_RUNTIME_DIR": str(folder)},
+    )
+
+
+def children(process: subprocess.Popen[str]) -> dict[str, int]:
+    """The process ids of a run's nodes, by name."""
+    found = {}
+    for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
+        _, _, after = Path(f"/proc/{child}/cmdline").read_text().partition("\0node\0")
+        found[after.partition("\0")[0]] = int(child)
+    return found
+
+
+def poses_recorded(directory: Path) -> bool:
+    """Whether a recording in the making has grown beyond its header."""
+    files = list(directory.glob("*.mcap"))
+    return bool(files) and files[0].stat().st_size > 50_000
+
+
+def test_from_a_recording_to_a_recording_though_the_prior_is_killed_on_the_way(
+    tmp_path: Path, folder: Path, weights: dict[str, str]
+) -> None:
+    record(tmp_path / "in", walk(150))
+    settings = [part for key, value in weights.items() for part in ("--set", f"{key}={value}")]
+    where = ["--input", str(tmp_path / "in"), "--record", str(tmp_path / "out")]
+    process = steadypose("run", *where, *settings, folder=folder)
+    try:
+        until(lambda: poses_recorded(tmp_path / "out"), timeout_s=240)
+        os.kill(children(process)["prior"], signal.SIGKILL)
+        output, _ = process.communicate(timeout=240)
+    finally:
+        process.kill()
+    assert process.returncode == 0, output
+    assert "prior: ended with SIGKILL; starting it again" in output
+    with RecordingReader(tmp_path / "out") as reader:
+        assert reader.complete
+        assert reader.count(POSE_RAW) == 151, "the recorder heard every frame"
+        assert 20 < reader.count(POSE_CLEAN) < 152
+        assert reader.count(POSE_CLEAN) == reader.count(POSE_WORLD)
+        for topic in (POSE_RAW, POSE_CLEAN, POSE_WORLD):
+            *_, last = reader.messages([topic])
+            assert isinstance(last.message, PoseRaw | PoseClean | PoseWorld)
+            assert last.message.end_of_stream
+
+
+def test_ctrl_c_ends_all_and_completes_the_recording(tmp_path: Path, folder: Path) -> None:
+    record(tmp_path / "in", walk(60))
+    where = ["--input", str(tmp_path / "in"), "--record", str(tmp_path / "out"), "--loop"]
+    process = steadypose("run", *where, "--set", 'nodes=["pose_input"]', folder=folder)
+    try:
+        until(lambda: poses_recorded(tmp_path / "out"), timeout_s=120)
+        nodes = children(process)
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0, output
+    assert set(nodes) == {"pose_input", "recorder"}
+    assert not [pid for pid in nodes.values() if Path(f"/proc/{pid}").exists()]
+    with RecordingReader(tmp_path / "out") as reader:
+        assert reader.complete
+
+
+def test_nodes_do_not_outlive_a_run_that_is_killed(tmp_path: Path, folder: Path) -> None:
+    record(tmp_path / "in", walk(60))
+    where = ["--input", str(tmp_path / "in"), "--record", str(tmp_path / "out"), "--loop"]
+    process = steadypose("run", *where, "--set", 'nodes=["pose_input"]', folder=folder)
+    try:
+        until(lambda: poses_recorded(tmp_path / "out"), timeout_s=120)
+        nodes = children(process)
+    finally:
+        process.kill()
+        process.communicate()
+    until(lambda: not any(running(pid) for pid in nodes.values()))
+    with RecordingReader(tmp_path / "out") as reader:
+        assert reader.complete
+
+
+def running(pid: int) -> bool:
+    """Whether a process works still; one that ended and that nobody has asked about does not."""
+    try:
+        return ") Z" not in Path(f"/proc/{pid}/stat").read_text()
+    except FileNotFoundError:
+        return False
+
+
+def test_a_node_that_cannot_start_ends_the_run(tmp_path: Path, folder: Path) -> None:
+    record(tmp_path / "in", walk(5))
+    settings = ["--set", 'nodes=["pose_input"]', "--set", "transport.endpoints.pose_input=tcp://0.0.0.0:7101"]
+    process = steadypose("run", "--input", str(tmp_path / "in"), *settings, folder=folder)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert "expected keys, got none" in output
+    assert "Traceback" not in output

@@ -1,0 +1,90 @@
+"""Launch files are read strictly, and say what to write instead."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from steadypose.nodes.graph.launch import Launch, LaunchError, checkout, find
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    def write(text: str) -> Path:
+        path = tmp_path / "mine.toml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_an_empty_file_is_a_launch(write) -> None:
+    launch = Launch.read(write(""))
+    assert launch.nodes == ["pose_input", "prior", "trajectory"]
+    assert launch.input.rate == 1.0
+    assert launch.transport.endpoint("prior").startswith("ipc://")
+
+
+@pytest.mark.parametrize("name", ["replay", "kiosk"])
+def test_the_projects_own_files_are_found_by_name(name: str) -> None:
+    launch = Launch.read(name)
+    assert Path(launch.input.recording).parent.resolve() == checkout("sim_data")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[inptu]", "did you mean 'input'"),
+        ("[input]\nrecordin = 'x'", "did you mean 'recording'"),
+        ("[input]\nrate = 'fast'", "expected float such as 1.0, got 'fast'"),
+        ("[input]\nloop = 1", "loop"),
+        ("input = 3", "expected a section"),
+        ("nodes = ['priro']", "did you mean 'prior'"),
+        ("[recorder]\ntopics = ['pose/row']", "did you mean 'pose/raw'"),
+        ("[transport.endpoints]\nprio = 'tcp://127.0.0.1:1'", "did you mean 'prior'"),
+        ("[transport.endpoints]\nprior = 7101", "expected an address"),
+        ("[transport]\nqueue = 0", "queue: expected 1 frame or more, got 0"),
+        ("[input]\nrate = nan", r"rate: expected 0 \(as fast as possible\) or more, got nan"),
+        ("[input]\nrate = inf", "rate: expected 0"),
+        ("[input.merge]\ncameras = [7111, 7112]", "cameras: expected addresses such as tcp://.*, got 7111"),
+        ("[server]\nkiosks = [7111]", "kiosks: expected addresses such as tcp://.*, got 7111"),
+        ("[viewer]\nport = 65535", "port: expected 1 to 65534, got 65535"),
+        ("[input", "is not TOML"),
+    ],
+)
+def test_what_is_wrong_is_named_with_what_would_be_right(write, text: str, expected: str) -> None:
+    with pytest.raises(LaunchError, match=expected):
+        Launch.read(write(text))
+
+
+def test_a_missing_file_names_those_there_are() -> None:
+    with pytest.raises(LaunchError, match="did you mean 'replay'"):
+        find("repaly")
+    with pytest.raises(LaunchError, match="no launch file at"):
+        find("/nowhere/x.toml")
+
+
+def test_paths_start_at_the_file_and_overrides_win(write, tmp_path: Path) -> None:
+    path = write("[input]\nrecording = 'walk'\nrate = 2")
+    launch = Launch.read(path, ["input.rate=0", "prior.refine.enabled=false", "recorder.directory=/somewhere/out"])
+    assert launch.input.recording == str(tmp_path / "walk")
+    assert launch.input.rate == 0.0
+    assert launch.prior == {"refine": {"enabled": False}}
+    assert launch.recorder.directory == "/somewhere/out"
+
+
+@pytest.mark.parametrize("override", ["input.rate", "=3", "input.rate.x=3"])
+def test_an_override_that_sets_nothing_is_refused(write, override: str) -> None:
+    with pytest.raises(LaunchError):
+        Launch.read(write("[input]\nrate = 1"), [override])
+
+
+def test_who_must_hear_whom(write) -> None:
+    launch = Launch.read(write("nodes = ['pose_input', 'prior', 'trajectory', 'recorder', 'viewer']"))
+    assert launch.listeners("pose_input") == {"prior", "recorder"}
+    assert launch.listeners("prior") == {"trajectory", "recorder"}
+    assert launch.listeners("trajectory") == {"recorder"}
+    assert launch.listeners("recorder") == frozenset()
+    live = Launch.read(write("[transport]\nlossless = false"))
+    assert live.listeners("pose_input") == frozenset(), "a camera waits for nobody"

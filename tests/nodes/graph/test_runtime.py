@@ -1,0 +1,223 @@
+"""What every node does: take, give, wait for its listeners, count what went wrong, and say so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from conftest import START_NS, VirtualClock, raw, running, until, walking
+
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW
+from steadypose.msgs.transport import SEND_HIGH_WATER, Publisher, Subscriber
+from steadypose.msgs.types import Diagnostics, Level, Message, PoseClean, PoseRaw
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.runtime import READ_AHEAD, Inbox, Node, Timeline
+
+MakeLaunch = Callable[..., Launch]
+
+
+def clean(message: PoseRaw) -> PoseClean:
+    return PoseClean(
+        stamp_ns=message.stamp_ns,
+        frame_id=message.frame_id,
+        source=message.source,
+        sensor_pose=message.sensor_pose,
+        calibrated=message.calibrated,
+        delay_frames=0,
+        bodies=[],
+        end_of_stream=message.end_of_stream,
+    )
+
+
+class Echo(Node):
+    """In the prior's place: answers every frame, but for those whose skeleton it is told to stumble over."""
+
+    name = "prior"
+
+    def handle(self, topic: str, message: Message) -> None:
+        if isinstance(message, PoseRaw):
+            if message.skeleton == "bad":
+                raise ArithmeticError("stumbled")
+            self.publish(POSE_CLEAN, clean(message))
+
+
+class Listener:
+    """A test's own subscriber, which keeps what comes."""
+
+    def __init__(self, launch: Launch, node: str, topics: list[str], name: str = "") -> None:
+        self._subscriber = Subscriber(launch.transport.endpoint(node), topics, name=name)
+        self.got: list[Message] = []
+
+    def take(self, timeout_s: float = 0.2) -> bool:
+        received = self._subscriber.receive(timeout_s)
+        if received:
+            self.got.append(received[1])
+        return received is not None
+
+    def take_until(self, condition: Callable[[], bool]) -> None:
+        until(lambda: self.take(0.05) and condition())
+
+    def close(self) -> None:
+        self._subscriber.close()
+
+
+class Script:
+    """In a subscriber's place: gives what it was given."""
+
+    def __init__(self, messages: list[tuple[str, Message]]) -> None:
+        self.messages = messages
+
+    def receive(self, timeout_s: float) -> tuple[str, Message] | None:
+        return self.messages.pop(0) if self.messages else None
+
+
+def frames(count: int) -> list[tuple[str, Message]]:
+    return [(POSE_RAW, raw(i)) for i in range(count)]
+
+
+def test_a_late_node_keeps_the_newest_frames_and_counts_the_others() -> None:
+    inbox = Inbox(Script(frames(20)), limit=3)  # type: ignore[arg-type]
+    assert [m.stamp_ns for _, m in iter(lambda: inbox.next(0), None)] == [raw(i).stamp_ns for i in (17, 18, 19)]
+    assert inbox.overrun == 17
+
+
+def test_a_late_node_keeps_the_end_of_the_stream_and_the_news() -> None:
+    end = raw(5)
+    end.end_of_stream = True
+    news = Diagnostics(0, "pose_input", Level.OK, "")
+    script = [*frames(5), (POSE_RAW, end), (DIAGNOSTICS, news), *frames(5)]
+    inbox = Inbox(Script(script), limit=2)  # type: ignore[arg-type]
+    assert [m for _, m in iter(lambda: inbox.next(0), None)] == [end, news]
+    assert inbox.overrun == 10
+
+
+def test_a_source_faster_than_reading_does_not_keep_a_node_from_working() -> None:
+    class Endless(Script):
+        def receive(self, timeout_s: float) -> tuple[str, Message]:
+            return POSE_RAW, raw(0)
+
+    assert Inbox(Endless([]), limit=3).next(0) is not None  # type: ignore[arg-type]
+
+
+def test_a_lossless_node_leaves_the_rest_to_the_sender() -> None:
+    script = Script(frames(500))
+    inbox = Inbox(script, limit=None)  # type: ignore[arg-type]
+    assert inbox.next(0) is not None
+    assert len(script.messages) == 500 - READ_AHEAD
+    assert len(list(iter(lambda: inbox.next(0), None))) == 499
+    assert inbox.overrun == 0
+
+
+def test_every_frame_arrives_though_the_listener_comes_last(make_launch: MakeLaunch) -> None:
+    launch = make_launch(nodes='["prior", "trajectory"]')
+    node = Echo(launch)
+    with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
+        news = Listener(launch, "prior", [DIAGNOSTICS])
+        news.take_until(lambda: news.got[-1].values["state"] == "waiting for trajectory")  # type: ignore[union-attr]
+        assert "prior" not in source.listeners, "it must not listen before it is heard"
+        trajectory = Listener(launch, "prior", [POSE_CLEAN], name="trajectory")
+        assert source.wait_for_listeners({"prior"}, timeout_s=10)
+        for i in range(50):
+            source.publish(POSE_RAW, raw(i))
+        trajectory.take_until(lambda: len(trajectory.got) == 50)
+        assert [m.stamp_ns for m in trajectory.got] == [raw(i).stamp_ns for i in range(50)]
+        trajectory.close()
+        news.close()
+
+
+def test_the_stream_halts_while_a_listener_is_away(make_launch: MakeLaunch) -> None:
+    launch = make_launch(nodes='["prior", "trajectory"]')
+    node = Echo(launch)
+    with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
+        first = Listener(launch, "prior", [POSE_CLEAN], name="trajectory")
+        assert source.wait_for_listeners({"prior"}, timeout_s=10)
+        source.publish(POSE_RAW, raw(0))
+        first.take_until(lambda: len(first.got) == 1)
+        first.close()
+        until(lambda: "trajectory" not in node._publisher.listeners)
+        for i in range(1, 10):
+            source.publish(POSE_RAW, raw(i))
+        again = Listener(launch, "prior", [POSE_CLEAN], name="trajectory")
+        again.take_until(lambda: len(again.got) == 9)
+        assert again.got[0].stamp_ns == raw(1).stamp_ns
+        again.close()
+
+
+def test_a_message_that_fails_is_counted_and_the_next_one_is_served(make_launch: MakeLaunch, caplog) -> None:
+    launch = make_launch(nodes='["prior"]')
+    node = Echo(launch)
+    with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
+        listener = Listener(launch, "prior", [POSE_CLEAN], name="test")
+        assert source.wait_for_listeners({"prior"}, timeout_s=10)
+        until(lambda: "test" in node._publisher.listeners)
+        for i in range(6):
+            source.publish(POSE_RAW, raw(i, skeleton="bad" if i % 2 else "smpl22"))
+        listener.take_until(lambda: len(listener.got) == 3)
+        listener.close()
+    assert node.counts["refused.ArithmeticError"] == 3
+    assert sum("stumbled" in (record.exc_text or "") for record in caplog.records) == 1, "logged once"
+    report = node.diagnostics()
+    assert report.values["refused.ArithmeticError"] == "3"
+
+
+def test_latency_is_counted_from_capture_and_less_the_delay(make_launch: MakeLaunch, clock: VirtualClock) -> None:
+    node = Echo(make_launch(nodes='["prior"]'), clock)
+    node.timeline = Timeline(START_NS, clock.time_ns, rate=2.0)
+    with Publisher(node.launch.transport.endpoint("prior")) as node._publisher:
+        node._inbox = None
+        clock.time_ns += 1_000_000_000
+        for late_ms in range(1, 101):
+            # two seconds of capture are one second of a replay at twice the rate
+            stamp = START_NS + 2_000_000_000 - 2 * late_ms * 1_000_000
+            node.publish(POSE_CLEAN, clean(raw(0, stamp_ns=stamp)), delay_ns=1_000_000)
+        values = node.diagnostics().values
+    expected = np.percentile(np.arange(0, 100), (50, 95, 99))
+    got = [float(values[f"latency_ms.p{p}"]) for p in (50, 95, 99)]
+    np.testing.assert_allclose(got, expected, atol=1e-3)
+
+
+def test_rates_are_of_the_last_second(make_launch: MakeLaunch, clock: VirtualClock) -> None:
+    node = Echo(make_launch(nodes='["prior"]'), clock)
+    with Publisher(node.launch.transport.endpoint("prior")) as node._publisher:
+        node._inbox = None
+        for _ in range(30):
+            node.publish(POSE_CLEAN, clean(raw(0)))
+        clock.time_ns += 1_000_000_000
+        assert float(node.diagnostics().values[f"rate.{POSE_CLEAN}"]) == pytest.approx(30.0)
+        clock.time_ns += 1_000_000_000
+        assert float(node.diagnostics().values[f"rate.{POSE_CLEAN}"]) == 0.0
+
+
+def test_a_timeline_goes_through_diagnostics_and_back() -> None:
+    timeline = Timeline(START_NS, 12345, 0.1)
+    assert Timeline.from_values(timeline.values()) == timeline
+    assert Timeline.from_values({"timeline.stamp_ns": "x"}) is None
+    assert Timeline.from_values({}) is None
+    for rate in ("0", "-1", "nan", "inf"):
+        assert Timeline.from_values(timeline.values() | {"timeline.rate": rate}) is None, rate
+
+
+def test_a_node_stops_though_it_waits_for_a_listener_who_never_comes(make_launch: MakeLaunch) -> None:
+    node = Echo(make_launch(nodes='["prior", "trajectory"]'))
+    with running(node) as threads:
+        until(lambda: node._state.startswith("waiting"))
+        node.stop()
+        threads[0].join(10)
+        assert not threads[0].is_alive()
+
+
+def test_a_node_stops_though_its_listener_does_not_read(make_launch: MakeLaunch) -> None:
+    launch = make_launch(nodes='["prior"]')
+    node = Echo(launch)
+    with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
+        assert source.wait_for_listeners({"prior"}, timeout_s=10)
+        deaf = Subscriber(launch.transport.endpoint("prior"), [POSE_CLEAN], high_water=1, name="deaf")
+        until(lambda: "deaf" in node._publisher.listeners)
+        message = raw(0, walking(0))
+        while source.publish(POSE_RAW, message, timeout_s=0.3) or node._published[POSE_CLEAN] < SEND_HIGH_WATER:
+            assert node._published[POSE_CLEAN] < 10 * SEND_HIGH_WATER, "nothing holds the node up"
+        node.stop()
+        until(lambda: node._state == "stopped")
+        deaf.close()
+    assert node.counts[f"dropped.stopped {POSE_CLEAN}"] == 1

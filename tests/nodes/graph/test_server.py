@@ -1,0 +1,92 @@
+"""One server for several kiosks, over real sockets: each hears its own, by its own clock."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from conftest import VirtualClock, running, until, walk
+
+from steadypose.msgs.keys import create_keys
+from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
+from steadypose.msgs.transport import Publisher, Subscriber
+from steadypose.msgs.types import PoseRaw, PoseWorld
+from steadypose.nodes.graph.launch import Launch, LaunchError
+from steadypose.nodes.graph.prior_node import PriorNode
+from steadypose.nodes.graph.trajectory_node import TrajectoryNode
+
+FRAMES = 25
+
+
+def kiosk(name: str, bodies: int, ahead_ns: int) -> list[PoseRaw]:
+    """A kiosk's stream, its clock so far ahead."""
+    return [dataclasses.replace(m, source=name, stamp_ns=m.stamp_ns + ahead_ns) for m in walk(FRAMES, bodies)]
+
+
+@pytest.mark.parametrize("secret", [False, True])
+def test_two_kiosks_and_a_server(
+    make_launch: Callable[..., Launch], tmp_path: Path, weights: dict[str, str], clock: VirtualClock, secret: bool
+) -> None:
+    streams = {"door": kiosk("door", 1, 0), "desk": kiosk("desk", 2, 3_600_000_000_000)}
+    # kiosks and server have the same keys
+    keys = create_keys(tmp_path / "keys") if secret else None
+    answers: dict[str, list[PoseWorld]] = defaultdict(list)
+    with ExitStack() as stack:
+        door, desk = (stack.enter_context(Publisher("tcp://127.0.0.1:*", keys=keys)) for _ in streams)
+        launch = make_launch(
+            weights,
+            nodes='["prior", "trajectory"]',
+            server__kiosks=str([door.endpoint, desk.endpoint]),
+            transport__lossless="false",
+            transport__queue=100,
+            transport__keys=tmp_path / "keys" if secret else "",
+        )
+        prior, trajectory = PriorNode(launch, clock), TrajectoryNode(launch, clock)
+        stack.enter_context(running(prior, trajectory))
+        heard = Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD, keys=keys, name="test")
+        subscriber = stack.enter_context(heard)
+        for publisher in (door, desk):
+            assert publisher.wait_for_listeners({"prior"}, timeout_s=20)
+        until(lambda: {"trajectory"} <= prior._publisher.listeners)
+        until(lambda: {"test"} <= trajectory._publisher.listeners)
+        for k in range(FRAMES):
+            clock.time_ns += 33_333_333
+            for publisher, name in ((door, "door"), (desk, "desk")):
+                publisher.publish(POSE_RAW, streams[name][k])
+            until(lambda k=k: len(prior._compute_ns) == 2 * (k + 1))
+
+        def answered() -> bool:
+            while received := subscriber.receive(0):
+                assert isinstance(received[1], PoseWorld)
+                answers[received[1].source].append(received[1])
+            return len(answers) == 2 and all(len(found) >= FRAMES - 6 for found in answers.values())
+
+        until(answered)
+    assert prior.status()["streams"] == "2"
+    for name, bodies in (("door", 1), ("desk", 2)):
+        captured = {round(m.stamp_ns / 1e6) for m in streams[name]}
+        assert {round(m.stamp_ns / 1e6) for m in answers[name]} <= captured, "stamps are of its own clock"
+        assert {body.id for m in answers[name] for body in m.bodies} == set(range(bodies))
+        assert all(len(m.bodies) == bodies for m in answers[name])
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"nodes": '["pose_input", "prior"]'}, "have their own pose_input"),
+        ({"nodes": '["prior"]', "transport__lossless": "true"}, "lossless = false"),
+    ],
+)
+def test_what_a_server_cannot_be(make_launch: Callable[..., Launch], settings: dict[str, str], expected: str) -> None:
+    with pytest.raises(LaunchError, match=expected):
+        make_launch(server__kiosks='["tcp://127.0.0.1:1"]', **({"transport__lossless": "false"} | settings))
+
+
+def test_the_launch_files_belong_together() -> None:
+    server, own = Launch.read("server"), Launch.read("kiosk")
+    assert own.transport.endpoint("pose_input") in server.addresses("pose_input")
+    assert own.nodes == ["pose_input"]

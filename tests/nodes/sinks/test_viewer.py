@@ -1,0 +1,308 @@
+"""The viewer: what is drawn of a message, and the server that shows it."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.helpers.synthetic_poses import CAMERA, messages, walker
+
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from steadypose.msgs.transport import Publisher
+from steadypose.msgs.types import Diagnostics, JointState, Level, Pose, PoseClean, PoseRaw, RawBody, Tracking
+from steadypose.nodes.graph.launch import Launch, TransportSettings
+from steadypose.nodes.sinks import viewer
+from steadypose.nodes.sinks.drawing import STATE_COLOURS
+from steadypose.nodes.sinks.viewer import PoseView, ViewerError, ViewerNode, ViewerServer
+
+rr = pytest.importorskip("rerun", reason="the optional extra `view` is not installed")
+
+
+class Log:
+    """Stands in for a Rerun recording: keeps what is drawn, where and when."""
+
+    def __init__(self) -> None:
+        self.drawn: list[tuple[float, str, Any]] = []
+        self.blueprints = 0
+        self.disconnected = False
+        self._now = 0.0
+
+    def set_time(self, timeline: str, *, duration: np.timedelta64) -> None:
+        self._now = float(duration / np.timedelta64(1, "s"))
+
+    def log(self, path: str, what: Any, *, static: bool = False) -> None:
+        if not static:
+            self.drawn.append((self._now, path, what))
+
+    def send_blueprint(self, blueprint: Any) -> None:
+        self.blueprints += 1
+
+    def disconnect(self) -> None:
+        self.disconnected = True
+
+    def last(self, path: str) -> Any:
+        return next(what for _, found, what in reversed(self.drawn) if found == path)
+
+    def times(self, path: str) -> list[float]:
+        return [time for time, found, _ in self.drawn if found == path]
+
+
+@pytest.fixture
+def log() -> Log:
+    return Log()
+
+
+@pytest.fixture
+def view(log: Log) -> PoseView:
+    return PoseView(log)  # type: ignore[arg-type]
+
+
+def points(archetype: Any) -> np.ndarray:
+    return np.array(archetype.positions.as_arrow_array().to_pylist(), dtype=float).reshape(-1, 3)
+
+
+def colours(archetype: Any) -> set[str]:
+    return {f"#{int(colour) >> 8:06x}" for colour in archetype.colors.as_arrow_array().to_pylist()}
+
+
+def only(stream, *topics: str):
+    return [(topic, message) for topic, message in stream if topic in topics]
+
+
+def test_raw_and_clean_stand_upright_at_the_same_place(view: PoseView, log: Log) -> None:
+    for topic, message in messages(0.5):
+        view.log(topic, message)
+    positions, _, _ = walker(10 / 30)
+    raw = points(log.last("raw/made-up/0/joints"))
+    clean = points(log.last("clean/made-up/0/joints"))
+    assert clean == pytest.approx(positions, abs=0.02)
+    assert raw[:, 2].max() == pytest.approx(positions[:, 2].max(), abs=0.15)
+    assert np.linalg.norm(raw.mean(axis=0) - clean.mean(axis=0)) < 0.4
+
+
+def test_bones_have_the_colours_of_their_states(view: PoseView, log: Log) -> None:
+    for topic, message in messages(1.0):
+        view.log(topic, message)
+    before = colours(log.last("clean/made-up/0/bones"))
+    (_, message), *_ = only(messages(0.5), POSE_CLEAN)
+    assert isinstance(message, PoseClean)
+    message.bodies[0].state[:] = JointState.IMPUTED
+    view.log(POSE_CLEAN, message)
+    assert {STATE_COLOURS[JointState.SEEN], STATE_COLOURS[JointState.REFINED]} <= before
+    assert colours(log.last("clean/made-up/0/bones")) == {STATE_COLOURS[JointState.IMPUTED]}
+    assert len(log.last("clean/made-up/0/sigma").half_sizes.as_arrow_array()) == 22
+
+
+def test_missing_joints_are_not_drawn(view: PoseView, log: Log) -> None:
+    (_, message), *_ = only(messages(0.1), POSE_RAW)
+    assert isinstance(message, PoseRaw)
+    message.bodies[0].positions[3:] = np.nan
+    view.log(POSE_RAW, message)
+    assert len(points(log.last("raw/made-up/0/joints"))) == 3
+
+
+def test_a_body_that_left_is_cleared(view: PoseView, log: Log) -> None:
+    for topic, message in only(messages(0.5, bodies=2), POSE_WORLD):
+        view.log(topic, message)
+    leaving = [m for _, m in only(messages(0.6, bodies=2), POSE_WORLD)][-1]
+    leaving.bodies.pop()  # type: ignore[union-attr]
+    view.log(POSE_WORLD, leaving)
+    assert isinstance(log.last("world/made-up/1"), rr.Clear)
+
+
+def test_tracking_and_path_are_told_in_the_world(view: PoseView, log: Log) -> None:
+    stream = only(messages(14.0), POSE_WORLD)
+    stream[-1][1].bodies[0].tracking = Tracking.COASTING  # type: ignore[union-attr]
+    for topic, message in stream:
+        view.log(topic, message)
+    assert log.last("world/made-up/0/label").labels.as_arrow_array().to_pylist() == ["0 · coasting"]
+    way = log.last("world/made-up/0/path").strips.as_arrow_array().to_pylist()[0]
+    assert len(way) == pytest.approx(viewer.PATH_SECONDS * 30, abs=2)
+
+
+def test_truth_is_drawn_thin_and_draws_no_rate(view: PoseView, log: Log) -> None:
+    for topic, message in only(messages(0.2), POSE_TRUTH):
+        view.log(topic, message)
+    assert {path for _, path, _ in log.drawn} == {"world/truth/made-up/0/bones"}
+
+
+def test_truth_is_left_out_where_the_cameras_place_is_unknown(view: PoseView, log: Log) -> None:
+    for topic, message in only(messages(0.2), POSE_RAW, POSE_TRUTH):
+        if isinstance(message, PoseRaw):
+            message.calibrated = False
+        view.log(topic, message)
+    assert not log.times("world/truth/made-up/0/bones")
+    assert log.times("raw/made-up/0/bones")
+
+
+def test_rates_are_the_nodes_own(view: PoseView, log: Log) -> None:
+    report = Diagnostics(0, "prior", Level.OK, "", {"rate.pose/clean": "29.97", "queue": "0"})
+    view.log(DIAGNOSTICS, report)
+    assert not log.drawn, "before the first pose there is no time to draw a rate at"
+    for topic, message in only(messages(0.5), POSE_CLEAN):
+        view.log(topic, message)
+    view.log(DIAGNOSTICS, report)
+    assert log.last("plots/rates/pose/clean").scalars.as_arrow_array().to_pylist() == [29.97]
+    assert log.times("plots/rates/pose/clean") == [pytest.approx(0.3333, abs=0.04)]
+
+
+def test_anomaly_is_drawn_once_there_is_a_score(view: PoseView, log: Log) -> None:
+    stream = only(messages(1.0), POSE_CLEAN)
+    for _, message in stream[:5]:
+        message.bodies[0].anomaly = np.nan  # type: ignore[union-attr]
+    for topic, message in stream[:5]:
+        view.log(topic, message)
+    blueprints = log.blueprints
+    assert not log.times("plots/anomaly/made-up/0")
+    for topic, message in stream[5:]:
+        view.log(topic, message)
+    assert len(log.times("plots/anomaly/made-up/0")) == len(stream) - 5
+    assert log.blueprints == blueprints + 1
+
+
+def test_time_goes_on_when_stamps_jump_back(view: PoseView, log: Log) -> None:
+    for _ in range(2):
+        for topic, message in only(messages(3.0), POSE_CLEAN):
+            view.log(topic, message)
+    times = log.times("clean/made-up/0/bones")
+    assert np.all(np.diff(times) >= 0)
+    assert times[-1] == pytest.approx(2 * 2.83, abs=0.1)
+
+
+def test_the_eye_follows_a_walker_and_not_a_joint_far_away(view: PoseView, log: Log) -> None:
+    stream = only(messages(4.0), POSE_RAW)
+    stream[60][1].bodies[0].positions[:] = 1e4  # type: ignore[union-attr]
+    for topic, message in stream:
+        view.log(topic, message)
+    positions, _, _ = walker(4.0)
+    assert points(log.last("raw/focus"))[0][:2] == pytest.approx(positions[0, :2], abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (lambda m: setattr(m, "skeleton", "octopus8"), "unknown skeleton 'octopus8'"),
+        (lambda m: setattr(m.bodies[0], "positions", np.zeros((3, 3), np.float32)), "has 32 joints, got 3"),
+        (lambda m: setattr(m, "sensor_pose", Pose(np.zeros(3), np.zeros(4))), "norm"),
+    ],
+)
+def test_what_cannot_be_drawn_says_why(view: PoseView, spoil, expected: str) -> None:
+    (topic, message), *_ = only(messages(0.1), POSE_RAW)
+    spoil(message)
+    with pytest.raises(ValueError, match=expected):
+        view.log(topic, message)
+
+
+def test_nothing_seen_and_nonsense_are_drawn_without_complaint(view: PoseView) -> None:
+    nothing = RawBody(0, np.full((32, 3), np.nan, np.float32), np.zeros(32, np.float32))
+    nonsense = RawBody(1, np.full((32, 3), np.inf, np.float32), np.full(32, np.nan, np.float32))
+    view.log(POSE_RAW, PoseRaw(0, "", "", "azure_kinect32", CAMERA, False, [nothing, nonsense]))
+
+
+def free_ports() -> int:
+    """A port that is free together with the next."""
+    while True:
+        with socket.socket() as first, socket.socket() as second:
+            first.bind((viewer.HOST, 0))
+            port = first.getsockname()[1]
+            try:
+                second.bind((viewer.HOST, port + 1))
+            except OSError:
+                continue
+            return port
+
+
+def test_the_server_shows_a_page_on_this_machine_alone() -> None:
+    port = free_ports()
+    with ViewerServer(port) as server:
+        page = urllib.request.urlopen(server.url, timeout=10).read()
+        assert b"rerun" in page.lower()
+        for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
+            address, state = line.split()[1], line.split()[3]
+            if state == "0A" and int(address.split(":")[1], 16) in (port, port + 1):
+                assert address.startswith("0100007F"), "listens beyond 127.0.0.1"
+        with pytest.raises(ViewerError, match=f"port {port} is not to be had"):
+            ViewerServer(port)
+    ViewerServer(port).close()
+
+
+def test_the_server_goes_with_a_node_that_is_killed() -> None:
+    port = free_ports()
+    code = (
+        "from steadypose.nodes.sinks.viewer import ViewerServer; "
+        f"s = ViewerServer({port}); print(s._process.pid, flush=True); input()"
+    )
+    node = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert node.stdout is not None
+    pid = int(node.stdout.readline())
+    watch = os.pidfd_open(pid)
+    node.send_signal(signal.SIGKILL)
+    node.wait()
+    assert select.select([watch], [], [], 10.0)[0], "the server outlived its node"
+
+
+class Server:
+    """Stands in for `ViewerServer`: no process."""
+
+    url = "http://somewhere"
+    stopped = False
+
+    def __init__(self, port: int) -> None: ...
+
+    def __enter__(self) -> Server:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def check(self) -> None:
+        if self.stopped:
+            raise RuntimeError("stopped")
+
+
+def test_the_node_draws_what_is_published_and_ends_with_its_server(
+    tmp_path: Path, log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(viewer, "ViewerServer", Server)
+    monkeypatch.setattr(viewer, "connect", lambda server: log)
+    launch = Launch(transport=TransportSettings(directory=str(tmp_path)))
+    node = ViewerNode(launch)
+    raised: list[RuntimeError] = []
+
+    def run() -> None:
+        try:
+            node.run()
+        except RuntimeError as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    with Publisher(launch.transport.endpoint("prior")) as publisher:
+        thread.start()
+        for topic, message in only(itertools.islice(itertools.cycle(messages(1.0)), 20_000), POSE_CLEAN):
+            publisher.publish(topic, message)
+            thread.join(0.005)
+            if any(path.startswith("clean/") for _, path, _ in log.drawn):
+                break
+        monkeypatch.setattr(Server, "stopped", True)
+        thread.join(10.0)
+    assert log.last("clean/made-up/0/bones") is not None
+    assert raised, "with its server gone the node ends, to be started again"
+    assert log.disconnected
+
+
+def test_without_rerun_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(viewer, "find_spec", lambda name: None if name == "rerun" else found(name))
+    with pytest.raises(ViewerError, match="--extra view"):
+        ViewerServer(free_ports())

@@ -1,0 +1,278 @@
+"""The OAK camera's part on this machine, driven by real depthai pipelines without a camera."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+
+import depthai as dai
+import numpy as np
+import pytest
+from conftest import VirtualClock, running
+from scipy.spatial.transform import Rotation
+from tests.helpers.fake_oak import CAMERA, Moment, Player, detections, moment, opener, plugged, script
+
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
+from steadypose.msgs.transport import Subscriber
+from steadypose.msgs.types import JOINTS, Diagnostics, PoseRaw, PoseWorld
+from steadypose.nodes.commands.run import _check
+from steadypose.nodes.graph.launch import Launch, LaunchError, OakSettings
+from steadypose.nodes.graph.prior_node import PriorNode
+from steadypose.nodes.graph.runtime import Clock, SystemClock
+from steadypose.nodes.graph.trajectory_node import TrajectoryNode
+from steadypose.nodes.sources import oak
+from steadypose.nodes.sources.camera import PAUSES_S
+from steadypose.nodes.sources.oak import FRAME_ID, QUEUE, SILENT_S, Host, OakSource
+from steadypose.nodes.sources.pose_input import PoseInputNode, open_input
+from steadypose.prior.body.skeleton import COCO17
+
+MakeLaunch = Callable[..., Launch]
+BODY = [i for i, name in enumerate(COCO17.joints) if name.split("_")[-1] not in ("nose", "eye", "ear")]
+
+
+@pytest.fixture(scope="module")
+def walk() -> list[Moment]:
+    return [moment(frame, people=2) for frame in range(4)]
+
+
+def take(host: Host, frames: int) -> list[PoseRaw]:
+    return list(itertools.islice((frame for frame in host.frames() if frame), frames))
+
+
+def test_people_are_lifted_where_they_stand(walk: list[Moment]) -> None:
+    with plugged(script(walk), SystemClock()) as host:
+        frames = take(host, len(walk))
+    assert [frame.frame_id for frame in frames] == [FRAME_ID] * len(walk)
+    assert {frame.skeleton for frame in frames} == {"coco17"}
+    for frame, truth in zip(frames, walk, strict=True):
+        assert [body.id for body in frame.bodies] == [0, 1]
+        for body, joints in zip(frame.bodies, truth.joints, strict=True):
+            seen = body.confidence > 0
+            np.testing.assert_allclose(
+                CAMERA.project(body.positions[seen].astype(float)), CAMERA.project(joints[seen]), atol=0.6
+            )
+            error = np.linalg.norm(body.positions - joints, axis=-1)[BODY]
+            assert np.isfinite(error).sum() >= 8
+            assert np.nanmedian(error) < 0.04
+
+
+def test_stamps_are_of_capture(walk: list[Moment]) -> None:
+    before = time.time_ns()
+    messages = script(walk)
+    after = time.time_ns()
+    with plugged(messages, SystemClock()) as host:
+        stamps = [frame.stamp_ns for frame in take(host, len(walk))]
+    assert before - 5_000_000 < stamps[0] < after + 5_000_000, "wall time at which the first frame was made"
+    np.testing.assert_allclose(np.diff(stamps) / 1e9, 1 / 30, atol=1e-5)
+
+
+@pytest.mark.parametrize("milliseconds", [-15, 12, 16])
+def test_colour_and_depth_need_not_be_captured_together(walk: list[Moment], milliseconds: int) -> None:
+    with plugged(script(walk, depth_late=timedelta(milliseconds=milliseconds)), SystemClock()) as host:
+        stamps = [frame.stamp_ns for frame in take(host, len(walk) - 1)]
+    np.testing.assert_allclose(np.diff(stamps) / 1e9, 1 / 30, atol=1e-5)
+
+
+def test_the_imu_levels_the_camera(walk: list[Moment]) -> None:
+    tilt = Rotation.from_euler("xz", [20, -5], degrees=True)
+    up = tilt.apply([0.0, -1.0, 0.0])
+    mounted = Rotation.from_euler("y", 90, degrees=True)
+    with plugged(script(walk, up=mounted.inv().apply(up).tolist()), SystemClock(), mounted.as_matrix()) as host:
+        frame = take(host, len(walk))[-1]
+        measured = host.level.measured
+    assert measured
+    turned = Rotation.from_quat(frame.sensor_pose.orientation).apply(up)
+    np.testing.assert_allclose(turned, [0.0, 0.0, 1.0], atol=1e-3)
+    assert not frame.calibrated
+
+
+def test_without_an_imu_the_camera_is_taken_for_level(walk: list[Moment]) -> None:
+    source = OakSource(OakSettings(), SystemClock(), opener(lambda _: script(walk)))
+    frames = source.frames()
+    frame = next(frame for frame in frames if frame)
+    assert source.status()["camera.level"] == "taken for level"
+    np.testing.assert_allclose(
+        Rotation.from_quat(frame.sensor_pose.orientation).apply([0.0, -1.0, 0.0]), [0.0, 0.0, 1.0], atol=1e-9
+    )
+    frames.close()
+
+
+def test_frames_reach_subscribers_and_diagnostics_tell(make_launch: MakeLaunch, walk: list[Moment]) -> None:
+    # in the place of the prior, which a lossless node waits for
+    launch = make_launch(nodes='["pose_input", "prior"]', input__source="oak")
+    source = OakSource(launch.input.oak, SystemClock(), opener(lambda _: script(walk)))
+    node = PoseInputNode(launch, SystemClock(), source)
+    launch.transport.ipc_directory.mkdir(exist_ok=True)
+    got: list[PoseRaw] = []
+    news: dict[str, str] = {}
+    address = launch.transport.endpoint("pose_input")
+    with Subscriber(address, [POSE_RAW, DIAGNOSTICS], name="prior") as subscriber, running(node):
+        end = time.monotonic() + 20
+        while (len(got) < 2 or news.get("camera") != "streaming") and time.monotonic() < end:
+            received = subscriber.receive(1)
+            if received and isinstance(received[1], PoseRaw):
+                got.append(received[1])
+            elif received and isinstance(received[1], Diagnostics):
+                news = received[1].values
+    assert len(got) >= 2, "over a real socket"
+    assert all(len(frame.bodies) == 2 for frame in got)
+    assert (news["camera"], news["state"]) == ("streaming", "running")
+    assert news["camera.name"] == "oak-test"
+    assert int(news["timeline.stamp_ns"]) == int(news["timeline.wall_ns"])
+
+
+def test_from_the_camera_to_the_world(make_launch: MakeLaunch, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(oak, "QUEUE", 1000)  # these frames come faster than any camera's
+    scene = [moment(frame) for frame in range(24)]
+    launch = make_launch(input__source="oak")
+    source = OakSource(launch.input.oak, SystemClock(), opener(lambda _: script(scene)))
+    nodes = [PoseInputNode(launch, SystemClock(), source), PriorNode(launch), TrajectoryNode(launch)]
+    worlds: list[PoseWorld] = []
+    with Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD) as subscriber, running(*nodes):
+        end = time.monotonic() + 120
+        while len(worlds) < 12 and time.monotonic() < end:
+            received = subscriber.receive(1)
+            if received and isinstance(received[1], PoseWorld) and received[1].bodies:
+                worlds.append(received[1])
+    assert len(worlds) == 12
+    hips = [COCO17.index("left_hip"), COCO17.index("right_hip")]
+    middle = np.mean([one.joints[0][hips].mean(axis=0) for one in scene], axis=0)
+    for world in worlds[4:]:
+        seen = world.bodies[0].positions[[JOINTS.index("left_hip"), JOINTS.index("right_hip")]].mean(axis=0)
+        # a level camera: its x is the world's, its depth the world's y; how high it stands nobody told it
+        np.testing.assert_allclose(seen[:2], middle[[0, 2]], atol=0.12)
+        heights = world.bodies[0].positions[:, 2] - seen[2]
+        assert np.nanmax(heights) == pytest.approx(0.6, abs=0.25), "upright: the neck, or the head"
+        assert np.nanmin(heights) == pytest.approx(-0.9, abs=0.2), "the feet"
+
+
+def test_it_goes_on_when_the_camera_is_plugged_in_again(clock: VirtualClock, walk: list[Moment]) -> None:
+    def pull(pipeline: dai.Pipeline, player: Player) -> None:
+        player.done.wait(10)
+        taken.wait(10)
+        pipeline.stop()
+
+    taken = threading.Event()
+
+    @contextmanager
+    def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
+        with plugged(script(walk[:2]), clock, unplug=pull) as host:
+            yield host
+
+    source = OakSource(OakSettings(), clock, connect)
+    frames, states = [], []
+    for frame in source.frames():
+        states.append(source.status()["camera"])
+        if frame:
+            frames.append(frame)
+            if len(frames) % 2 == 0:
+                taken.set()
+        else:
+            taken.clear()
+        if len(frames) == 4:
+            break
+    taken.set()
+    assert source.status()["camera.connections"] == "2"
+    assert source.refused["camera lost"] == 1
+    assert any("camera lost" in state for state in states)
+    assert sum(clock.slept_ns) / 1e9 == pytest.approx(PAUSES_S[0], abs=0.2)
+
+
+def test_it_looks_for_a_camera_at_growing_intervals(clock: VirtualClock) -> None:
+    tries: list[float] = []
+
+    @contextmanager
+    def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
+        tries.append(clock.now_ns() / 1e9)
+        raise RuntimeError("no camera found")
+        yield
+
+    source = OakSource(OakSettings(), clock, connect)
+    frames = source.frames()
+    while len(tries) < len(PAUSES_S) + 2:
+        assert next(frames) is None
+    np.testing.assert_allclose(np.diff(tries), [*PAUSES_S, PAUSES_S[-1]], atol=0.2)
+    assert "no camera found; next try in" in source.status()["camera"]
+    assert source.status()["state"] == source.status()["camera"], "what `steadypose run` shows of the node"
+
+
+def test_a_camera_that_falls_silent_is_given_up(clock: VirtualClock, walk: list[Moment]) -> None:
+    with plugged(script(walk[:1]), clock) as host:
+        frames = host.frames()
+        assert next(frame for frame in frames if frame)
+        assert next(frames) is None
+        clock.time_ns += round((SILENT_S + 0.1) * 1e9)
+        assert list(frames) == []
+
+
+def test_a_program_that_is_late_gets_the_newest_frames(walk: list[Moment]) -> None:
+    moments = [walk[index % len(walk)] for index in range(QUEUE + 3)]
+    messages = script(moments)
+    with plugged(messages, SystemClock()) as host:
+        end = time.monotonic() + 20
+        while host.counts["late"] < 3 and time.monotonic() < end:
+            time.sleep(0)  # the pipeline's threads run
+        stamps = [frame.stamp_ns for frame in take(host, QUEUE)]
+    assert host.counts["late"] == 3
+    assert len(stamps) == QUEUE
+    assert stamps == sorted(stamps)
+
+
+def test_what_is_no_skeleton_is_counted_and_the_next_frame_comes(walk: list[Moment]) -> None:
+    messages = script([walk[0]] * 4)
+    bare = dai.ImgFrame()  # no image, and nothing is said of its camera
+    few = detections(walk[0])
+    few.detections = few.detections[:1]
+    points = few.detections[0]
+    points.setKeypoints(dai.KeypointsList([dai.Keypoint()] * 5))
+    few.detections = [points]
+    wild = detections(walk[0])
+    people = wild.detections
+    keypoints = people[0].getKeypoints()
+    for keypoint, x in zip(keypoints, (np.nan, np.inf, -1e30, 1e30), strict=False):
+        keypoint.imageCoordinates = dai.Point3f(float(x), 0.5, 0.0)
+    people[0].setKeypoints(dai.KeypointsList(keypoints))
+    wild.detections = people
+    for place, message in ((1, bare), (2, few), (4, wild)):
+        name, whole = messages[place]
+        message.setTimestamp(whole.getTimestamp())
+        message.setSequenceNum(place // 2)
+        messages[place] = (name, message)
+    with plugged(messages, SystemClock()) as host:
+        frames = take(host, 3)
+    counts = host.counts
+    assert sum(n for cause, n in counts.items() if cause.startswith("frame: ")) == 1, counts
+    assert counts.total() - 1 == counts["person without the 17 key points of COCO"] == 1, counts
+    for cause in counts:  # as `diagnostics` reads them while the pipeline counts
+        host._skeletons.counts[f"{cause} again"] += 1
+    assert [len(frame.bodies) for frame in frames] == [0, 2, 2]
+    assert np.isnan(frames[1].bodies[0].positions[:4]).all()
+    assert np.isfinite(frames[1].bodies[0].positions[5]).all()
+
+
+def test_settings_that_cannot_be_used_say_so(make_launch: MakeLaunch, tmp_path) -> None:
+    with pytest.raises(LaunchError, match=r"archive: expected a file that is an NN archive"):
+        OakSource(OakSettings(archive=str(tmp_path / "none.tar.xz")), SystemClock())
+    with pytest.raises(LaunchError, match="confidence between 0 and 1"):
+        OakSource(OakSettings(confidence=50.0), SystemClock())
+    with pytest.raises(LaunchError, match=r"fps of 0 .* or more"):
+        OakSource(OakSettings(fps=float("nan")), SystemClock())
+    with pytest.raises(LaunchError, match=r"source: expected .*oak.*, got 'oka', did you mean 'oak'"):
+        make_launch(input__source="oka")
+
+
+def test_the_launch_file_can_be_run_without_a_camera_being_there() -> None:
+    launch = Launch.read("oak")
+    assert not launch.transport.lossless
+    assert isinstance(open_input(launch.input, SystemClock()), OakSource)
+    _check(launch)
+
+
+def test_without_a_camera_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(oak.dai.Device, "getAllAvailableDevices", staticmethod(list))
+    with pytest.raises(RuntimeError, match="no camera found"), oak.connect(OakSettings(), SystemClock()):
+        pass

@@ -1,0 +1,260 @@
+"""The input node keeps the pace of the capture, on a clock that does not wait."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import START_NS, VirtualClock, raw, record, walk, walking
+
+from steadypose.msgs.recording import RecordingError, RecordingWriter
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_TRUTH
+from steadypose.msgs.types import Message, PoseRaw, PoseWorld
+from steadypose.nodes.graph.launch import Launch, LaunchError
+from steadypose.nodes.sources.npz import NpzError, NpzSource
+from steadypose.nodes.sources.pose_input import LEAP_NS, PoseInputNode, RecordingSource, open_source
+
+MakeLaunch = Callable[..., Launch]
+SECOND_NS = 1_000_000_000
+
+
+class Frames:
+    """A source that gives the messages it was given."""
+
+    def __init__(self, stamps_ns: list[int]) -> None:
+        self.refused: Counter[str] = Counter()
+        self._stamps_ns = stamps_ns
+
+    def __iter__(self) -> Iterator[tuple[str, Message]]:
+        return iter((POSE_RAW, raw(0, walking(0), stamp_ns=stamp)) for stamp in self._stamps_ns)
+
+
+class Sent:
+    """In a publisher's place: notes what is sent, when."""
+
+    listeners: frozenset[str] = frozenset()
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self._clock = clock
+        self.at: list[tuple[int, Message]] = []
+
+    def publish(self, topic: str, message: Message, timeout_s: float) -> bool:
+        if topic != DIAGNOSTICS:
+            self.at.append((self._clock.time_ns, message))
+        return True
+
+
+def play(launch: Launch, clock: VirtualClock, source: Frames, frames: int | None = None) -> list[tuple[int, PoseRaw]]:
+    """Everything the node sends, or the first ``frames``, each with the time it was sent at."""
+    node = PoseInputNode(launch, clock, source)
+    sent = node._publisher = Sent(clock)  # type: ignore[assignment]
+    node._inbox = None
+    if frames is not None:
+        keep = sent.publish
+
+        def publish(topic: str, message: Message, timeout_s: float) -> bool:
+            if len(sent.at) >= frames:
+                node.stop()
+            return keep(topic, message, timeout_s)
+
+        sent.publish = publish  # type: ignore[method-assign]
+    node.work()
+    return [(at, message) for at, message in sent.at if isinstance(message, PoseRaw)][:frames]
+
+
+def waits(sent: list[tuple[int, PoseRaw]]) -> list[float]:
+    """Seconds between one message and the next."""
+    return [(b - a) / 1e9 for (a, _), (b, _) in pairwise(sent)]
+
+
+@pytest.fixture
+def launch(make_launch: MakeLaunch) -> Launch:
+    return make_launch(nodes='["pose_input"]')
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.0, 0.5])
+def test_frames_come_at_the_rate_asked_for(launch: Launch, clock: VirtualClock, rate: float) -> None:
+    steps = np.random.default_rng(0).integers(20, 60, 50) * 1_000_000
+    stamps = [int(s) for s in START_NS + np.cumsum(steps)]
+    launch = replace(launch, input=replace(launch.input, rate=rate))
+    sent = play(launch, clock, Frames(stamps))
+    assert [m.stamp_ns for _, m in sent] == [*stamps, stamps[-1]], "stamps are as captured"
+    np.testing.assert_allclose(waits(sent[:-1]), np.diff(stamps) / 1e9 / rate, atol=1e-6)
+
+
+def test_rate_zero_waits_for_nothing(launch: Launch, clock: VirtualClock) -> None:
+    launch = replace(launch, input=replace(launch.input, rate=0.0))
+    play(launch, clock, Frames([START_NS + i * SECOND_NS for i in range(10)]))
+    assert not clock.slept_ns
+
+
+def test_the_end_is_marked_once(launch: Launch, clock: VirtualClock) -> None:
+    sent = play(launch, clock, Frames([START_NS, START_NS + SECOND_NS]))
+    assert [m.end_of_stream for _, m in sent] == [False, False, True]
+    assert sent[-1][1].bodies == []
+
+
+def test_a_pause_of_ten_seconds_is_a_pause(launch: Launch, clock: VirtualClock) -> None:
+    sent = play(launch, clock, Frames([START_NS, START_NS + 10 * SECOND_NS]))
+    assert waits(sent)[0] == pytest.approx(10.0)
+
+
+def test_a_clock_that_was_set_is_not_waited_for(launch: Launch, clock: VirtualClock) -> None:
+    hour = 3600 * SECOND_NS
+    stamps = [START_NS, START_NS + hour, START_NS + hour + SECOND_NS, START_NS, START_NS + SECOND_NS]
+    sent = play(launch, clock, Frames(stamps))
+    assert hour > LEAP_NS
+    assert waits(sent)[:4] == pytest.approx([0.0, 1.0, 0.0, 1.0])
+
+
+def test_stamps_that_repeat_or_step_back_come_at_once(launch: Launch, clock: VirtualClock) -> None:
+    sent = play(launch, clock, Frames([START_NS + SECOND_NS, START_NS + SECOND_NS, START_NS]))
+    assert waits(sent)[:2] == [0.0, 0.0]
+
+
+def test_a_loop_goes_on_with_rising_stamps(launch: Launch, clock: VirtualClock) -> None:
+    launch = replace(launch, input=replace(launch.input, loop=True))
+    sent = play(launch, clock, Frames([START_NS, START_NS + SECOND_NS]), frames=7)
+    seconds = [(m.stamp_ns - START_NS) / 1e9 for _, m in sent]
+    assert seconds == [0, 1, 2, 3, 4, 5, 6]
+    assert not any(m.end_of_stream for _, m in sent)
+    assert waits(sent) == pytest.approx([1.0] * 6)
+
+
+def test_the_nodes_are_told_which_stamp_is_played_when(launch: Launch, clock: VirtualClock) -> None:
+    node = PoseInputNode(launch, clock, Frames([START_NS, START_NS + SECOND_NS]))
+    node._publisher, node._inbox = Sent(clock), None  # type: ignore[assignment]
+    start_ns = clock.time_ns
+    node.work()
+    assert node.timeline is not None
+    assert node.timeline.wall(START_NS + SECOND_NS) == start_ns + SECOND_NS
+
+
+def test_a_recording_gives_raw_and_truth_and_not_what_was_made_of_them(tmp_path: Path) -> None:
+    truth = PoseWorld(START_NS, "world", "test", np.array([0.0, 0.0, 1.0, 0.0]), [])
+    frames = walk(3)
+    with RecordingWriter(tmp_path / "r") as writer:
+        writer.write(POSE_TRUTH, truth, START_NS)
+        for frame in [*frames, replace(frames[-1], bodies=[], end_of_stream=True)]:
+            writer.write(POSE_RAW, frame, frame.stamp_ns)
+    source = RecordingSource(tmp_path / "r")
+    assert list(source) == [(POSE_TRUTH, truth), *((POSE_RAW, frame) for frame in frames)]
+
+
+def test_a_truncated_recording_is_played_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = record(tmp_path / "r", walk(300))
+    file = next(path.glob("*.mcap"))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    source = open_source(path)
+    played = list(source)
+    assert 100 < len(played) < 200
+    assert played == [(POSE_RAW, frame) for frame in walk(300)[: len(played)]]
+    assert source.refused.total() > 0
+
+
+def test_recordings_that_cannot_be_played_say_why(tmp_path: Path, make_launch: MakeLaunch) -> None:
+    with pytest.raises(LaunchError, match="does not exist"):
+        open_source(tmp_path / "nowhere")
+    with pytest.raises(LaunchError, match="give --input"):
+        open_source("")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RecordingError, match="found none"):
+        open_source(tmp_path / "empty")
+    with RecordingWriter(tmp_path / "nothing"):
+        pass
+    with pytest.raises(RecordingError, match="holds no message"):
+        open_source(tmp_path / "nothing")
+    with RecordingWriter(tmp_path / "others") as writer:
+        writer.write(POSE_TRUTH, PoseWorld(START_NS, "world", "t", np.zeros(4), []), START_NS)
+    with pytest.raises(RecordingError, match=r"expected messages on pose/raw, got pose/truth"):
+        open_source(tmp_path / "others")
+    (tmp_path / "x.npz").write_bytes(b"PK\3\4 no zip")
+    with pytest.raises(NpzError, match="cannot be read"):
+        open_source(tmp_path / "x.npz")
+    with pytest.raises(LaunchError, match="rate: expected 0"):
+        PoseInputNode(make_launch(input__rate=-1), None, Frames([]))
+
+
+GOOD = {"positions": np.zeros((5, 22, 3)), "skeleton": np.array("smpl22"), "fps": np.array(30.0)}
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"positions": None}, "expected an array 'positions'"),
+        ({"skeleton": None}, "expected an array 'skeleton'"),
+        ({"skeleton": np.array("smpl23")}, "expected one of smpl22"),
+        ({"skeleton": np.array(3)}, "expected one text"),
+        ({"positions": np.zeros((5, 17, 3))}, r"expected shape \(T, 22, 3\) for smpl22, got \(5, 17, 3\)"),
+        ({"positions": np.zeros((5, 22))}, "expected shape"),
+        ({"positions": np.zeros((0, 22, 3))}, "at least one frame"),
+        ({"positions": np.full((5, 22, 3), "x")}, "expected numbers"),
+        ({"positions": np.full((5, 22, 3), None)}, "cannot be read"),
+        ({"fps": None}, "expected stamp_ns"),
+        ({"fps": np.array(0)}, "fps: expected one number above 0"),
+        ({"fps": np.array([30, 30])}, "fps: expected one number"),
+        ({"fps": np.array(1e-9)}, "5 frames at 1e-09 a second last longer than stamps can tell"),
+        ({"stamp_ns": np.arange(4)}, "stamp_ns: expected 5 integers"),
+        ({"stamp_ns": np.arange(5.0)}, "stamp_ns: expected 5 integers"),
+        ({"stamp_ns": np.arange(5) - 1}, "-1 to 3"),
+        ({"stamp_ns": np.arange(5) + 2**61}, "under 2147483648000000000, .* to 2305843009213693956"),
+        ({"stamp_ns": np.full(5, 2**63 + 5, np.uint64)}, "stamp_ns: expected 5 integers"),
+        ({"confidence": np.ones((5, 17))}, r"confidence: expected \(5, 22\)"),
+        ({"up": np.array("x")}, "up: expected one of"),
+    ],
+)
+def test_an_npz_that_is_not_poses_says_what_was_expected(tmp_path: Path, change: dict, expected: str) -> None:
+    arrays = {name: array for name, array in (GOOD | change).items() if array is not None}
+    np.savez(tmp_path / "x.npz", **arrays)
+    with pytest.raises(NpzError, match=expected):
+        NpzSource(tmp_path / "x.npz")
+
+
+def test_an_npz_with_damaged_bytes_says_that_it_cannot_be_read(tmp_path: Path) -> None:
+    """zipfile, zlib and numpy's parser of headers each complain in their own way."""
+    path, rng, refused = tmp_path / "x.npz", np.random.default_rng(0), 0
+    for save in (np.savez, np.savez_compressed):
+        save(path, **GOOD)  # type: ignore[arg-type]
+        whole = path.read_bytes()
+        for _ in range(300):
+            damaged = bytearray(whole)
+            for place in rng.integers(len(whole), size=rng.integers(1, 9)):
+                damaged[place] = rng.integers(256)
+            path.write_bytes(damaged)
+            try:
+                list(NpzSource(path))
+            except NpzError:
+                refused += 1
+    assert refused > 500
+
+
+def test_an_npz_gives_a_message_a_row(tmp_path: Path) -> None:
+    positions = np.random.default_rng(0).normal(size=(4, 17, 3))
+    positions[2, 5] = np.nan
+    stamps = START_NS + np.array([0, 30, 70, 100]) * 1_000_000
+    np.savez(tmp_path / "x.npz", positions=positions, skeleton="coco17", stamp_ns=stamps, up="-y")
+    messages = [m for _, m in NpzSource(tmp_path / "x.npz") if isinstance(m, PoseRaw)]
+    assert [m.stamp_ns for m in messages] == stamps.tolist()
+    np.testing.assert_array_equal([m.bodies[0].positions for m in messages], positions.astype(np.float32))
+    assert messages[2].bodies[0].confidence[5] == 0.0
+    assert messages[2].bodies[0].confidence.sum() == 16
+    assert messages[0].skeleton == "coco17"
+    assert not messages[0].calibrated
+    np.testing.assert_allclose(messages[0].sensor_pose.orientation, [-np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+
+
+def test_a_damaged_frame_of_a_recording_is_counted(tmp_path: Path) -> None:
+    path = record(tmp_path / "r", walk(3))
+    file = next(path.glob("*.mcap"))
+    data = file.read_bytes()
+    # a skeleton's name of a billion letters
+    at = data.index(b"smpl22") - 4
+    file.write_bytes(data[:at] + b"\xff\xff\xff\x3f" + data[at + 4 :])
+    source = open_source(path)
+    assert len(list(source)) < 3
+    assert source.refused.total() > 0

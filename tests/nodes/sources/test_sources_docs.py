@@ -1,0 +1,70 @@
+"""What docs/sources.md prints runs as it is printed."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from tests.helpers.fake_oak import CAMERA, moment
+
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.transport import Subscriber
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.sources.csv import CsvSource
+
+DOCS = Path(__file__).parents[3] / "docs"
+BLOCKS = dict(re.findall(r"^```(python|csv)\n(.*?)^```$", (DOCS / "sources.md").read_text(), re.MULTILINE | re.DOTALL))
+SOON_S = 30.0
+
+# the reader's own detector and depth camera
+DETECTOR = """
+import time
+import numpy as np
+
+scene = np.load("scene.npz")
+
+def detect():
+    time.sleep(0.01)
+    points = np.column_stack([scene["pixels"], np.full(17, 0.9)])
+    return [{"keypoints": points.ravel().tolist()}], scene["depth"], scene["intrinsics"], time.time()
+"""
+
+
+def test_the_publisher_publishes(tmp_path: Path) -> None:
+    scene = moment(3)
+    pixels = CAMERA.project(scene.joints[0])
+    np.savez(tmp_path / "scene.npz", pixels=pixels, depth=scene.depth, intrinsics=CAMERA.intrinsics)
+    (tmp_path / "camera.py").write_text(DETECTOR)
+    (tmp_path / "publisher.py").write_text(BLOCKS["python"])
+    address = f"ipc://{tmp_path}/pose_input"
+    root = str(DOCS.parent / "src")
+    with (
+        Subscriber(address, POSE_RAW) as subscriber,
+        subprocess.Popen(
+            [sys.executable, "publisher.py", address], cwd=tmp_path, env=os.environ | {"PYTHONPATH": root}
+        ) as process,
+    ):
+        received = subscriber.receive(SOON_S)
+        process.kill()
+    assert received
+    frame = received[1]
+    assert isinstance(frame, PoseRaw)
+    assert frame.source == "my camera"
+    error = np.linalg.norm(frame.bodies[0].positions - scene.joints[0], axis=-1)[5:]
+    assert np.nanmedian(error) < 0.04
+    assert len([line for line in BLOCKS["python"].splitlines() if line.strip()]) <= 12
+
+
+def test_the_csv_is_read(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text(BLOCKS["csv"])
+    source = CsvSource(tmp_path / "x.csv")
+    frames = [message for _, message in source if isinstance(message, PoseRaw)]
+    assert not source.refused
+    assert [frame.stamp_ns for frame in frames] == [0, 33_000_000]
+    assert frames[0].skeleton == "coco17"
+    np.testing.assert_allclose(frames[0].bodies[0].positions[9], [0.41, 0.12, 2.93], atol=1e-6)
+    assert np.isnan(frames[1].bodies[0].positions[10]).all()

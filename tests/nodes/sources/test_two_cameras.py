@@ -1,0 +1,129 @@
+"""Two cameras to one stream of bodies in the world, over real sockets."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import VirtualClock, running, until, walk
+from scipy.spatial.transform import Rotation
+
+from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
+from steadypose.msgs.transport import Publisher, Subscriber
+from steadypose.msgs.types import Pose, PoseRaw, PoseWorld, RawBody
+from steadypose.nodes.graph.launch import Launch, LaunchError, MergeSettings
+from steadypose.nodes.graph.prior_node import PriorNode
+from steadypose.nodes.graph.trajectory_node import TrajectoryNode
+from steadypose.nodes.sources.merge import MergeSource
+from steadypose.nodes.sources.pose_input import PoseInputNode
+
+FRAMES = 30
+PLACES = {
+    "left": Pose(np.array([-2.0, 0.0, 1.4]), Rotation.from_euler("xz", [-1.7, -1.2]).as_quat()),
+    "right": Pose(np.array([3.0, 1.0, 1.2]), Rotation.from_euler("xz", [-1.8, 1.3]).as_quat()),
+}
+
+
+def filmed(camera: str, hidden: range) -> list[PoseRaw]:
+    """Two walkers as a camera at its place has them, without the joints hidden from it."""
+    place = PLACES[camera]
+    turn = Rotation.from_quat(place.orientation).inv()
+    messages = []
+    for m in walk(FRAMES, bodies=2):
+        bodies = [
+            RawBody(k, turn.apply(np.asarray(b.positions) - place.position), b.confidence)
+            for k, b in enumerate(m.bodies if camera == "left" else m.bodies[::-1])
+        ]
+        for body in bodies:
+            body.positions[hidden] = np.nan
+        messages.append(dataclasses.replace(m, source=camera, bodies=bodies, sensor_pose=place, calibrated=True))
+    return messages
+
+
+def test_two_cameras_become_one_world(
+    make_launch: Callable[..., Launch], folder: Path, weights: dict[str, str], clock: VirtualClock
+) -> None:
+    addresses = {name: f"ipc://{folder}/{name}" for name in PLACES}
+    launch = make_launch(
+        weights,
+        input__source="merge",
+        input__merge__cameras=str(list(addresses.values())),
+        prior__identify__enabled="true",
+        transport__lossless="false",
+        transport__queue=100,
+    )
+    views = {"left": filmed("left", range(18, 20)), "right": filmed("right", range(4, 6))}
+    nodes = PoseInputNode(launch, clock), PriorNode(launch, clock), TrajectoryNode(launch, clock)
+    merged: list[PoseRaw] = []
+    worlds: list[PoseWorld] = []
+    with (
+        Publisher(addresses["left"]) as left,
+        Publisher(addresses["right"]) as right,
+        running(*nodes),
+        Subscriber(
+            [launch.transport.endpoint(name) for name in ("pose_input", "trajectory")],
+            [POSE_RAW, POSE_WORLD],
+            name="test",
+        ) as subscriber,
+    ):
+        for publisher in (left, right):
+            assert publisher.wait_for_listeners({"merge"}, timeout_s=20)
+        until(lambda: {"prior", "test"} <= nodes[0]._publisher.listeners)
+        until(lambda: {"trajectory"} <= nodes[1]._publisher.listeners)
+        until(lambda: {"test"} <= nodes[2]._publisher.listeners)
+        for k in range(FRAMES):
+            clock.time_ns += 33_333_333
+            left.publish(POSE_RAW, views["left"][k])
+            right.publish(POSE_RAW, views["right"][k])
+            until(lambda k=k: nodes[0]._source._heard.total() == 2 * (k + 1))  # type: ignore[union-attr]
+
+        def answered() -> bool:
+            while received := subscriber.receive(0):
+                kind = received[1]
+                (merged if isinstance(kind, PoseRaw) else worlds).append(kind)  # type: ignore[arg-type]
+            return len(merged) >= FRAMES - 3 and len(worlds) >= FRAMES - 10
+
+        until(answered)
+    assert all(m.source == "merged" and m.frame_id == "world" and m.calibrated for m in merged)
+    truth = {m.stamp_ns: [b.positions for b in m.bodies] for m in walk(FRAMES, bodies=2)}
+    for m in merged[2:]:  # who comes first is not kept waiting for cameras nobody has heard of
+        nearest = truth[min(truth, key=lambda stamp: abs(stamp - m.stamp_ns))]
+        assert len(m.bodies) == 2
+        for positions in nearest:
+            away = min(float(np.abs(body.positions - positions).max()) for body in m.bodies)
+            assert away < 0.15, "complete, though neither camera saw all, and where the walker is"
+    ids = [sorted(body.id for body in world.bodies) for world in worlds if world.bodies]
+    assert ids[-1] == [1, 2]
+    assert nodes[0].status()["camera"] == "2 of 2 cameras heard"
+
+
+def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path) -> None:
+    addresses = [f"ipc://{folder}/{name}" for name in PLACES]
+    source = MergeSource(MergeSettings(addresses), None)
+    frames, (first, *_, last) = source.frames(), filmed("left", range(0))
+    with Publisher(addresses[0]) as camera:
+        assert next(frames) is None
+        assert camera.wait_for_listeners({"merge"}, timeout_s=20)
+        camera.publish(POSE_RAW, first)
+        camera._sequence[POSE_RAW] += 3  # which nobody heard
+        camera.publish(POSE_RAW, last)
+        until(lambda: (next(frames), source._heard.total())[1] == 2)
+    assert source.status()["dropped.lost pose/raw"] == "3"
+    frames.close()
+
+
+@pytest.mark.parametrize("cameras", ["[]", '["tcp://127.0.0.1:7111"]', '["ipc:///a", "ipc:///a"]'])
+def test_fewer_than_two_cameras_are_refused(make_launch: Callable[..., Launch], cameras: str) -> None:
+    launch = make_launch(input__source="merge", input__merge__cameras=cameras)
+    with pytest.raises(LaunchError, match="two input nodes or more"):
+        PoseInputNode(launch)
+
+
+def test_the_launch_file_that_ships_reads() -> None:
+    launch = Launch.read("two_cameras")
+    assert len(launch.input.merge.cameras) == 2
+    assert not launch.transport.lossless
+    assert launch.prior == {"identify": {"enabled": True}}

@@ -1,0 +1,176 @@
+"""A webcam: real video through OpenCV, with a landmarker in MediaPipe's place that sees a person in every picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace as Made
+
+import cv2
+import numpy as np
+import pytest
+from conftest import VirtualClock
+
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.graph.launch import CalibrationSettings, Launch, LaunchError, WebcamSettings
+from steadypose.nodes.graph.runtime import SystemClock
+from steadypose.nodes.sources import webcam
+from steadypose.nodes.sources.camera import PAUSES_S
+from steadypose.nodes.sources.webcam import Lens, WebcamSource, require_mediapipe
+
+SIZE = (320, 240)
+NOT_CALIBRATED = CalibrationSettings()
+FRAMES = 5
+
+
+@pytest.fixture
+def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A film of five pictures, each brighter than the last, in the place of camera 3."""
+    path = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, SIZE)
+    for index in range(FRAMES):
+        writer.write(np.full((SIZE[1], SIZE[0], 3), (40 * index, 0, 0), np.uint8))
+    writer.release()
+    opened = cv2.VideoCapture
+    monkeypatch.setattr(webcam.cv2, "VideoCapture", lambda number: opened(str(path)) if number == 3 else opened())
+    return path
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> str:
+    path = tmp_path / "pose.task"
+    path.write_bytes(b"a model")
+    return str(path)
+
+
+class Seen:
+    """Sees one body two metres ahead, and notes the pictures."""
+
+    def __init__(self) -> None:
+        self.pictures: list[tuple[np.ndarray, int]] = []
+
+    @contextmanager
+    def landmarker(self, settings: WebcamSettings) -> Iterator[webcam.Landmarker]:
+        yield self.look
+
+    def look(self, image: np.ndarray, milliseconds: int) -> Made:
+        self.pictures.append((image[0, 0], milliseconds))
+        body = np.random.default_rng(0).normal(0, 0.3, (33, 3))
+        height, width = image.shape[:2]
+        focal = width / 2 / np.tan(WebcamSettings.field_of_view / 2)
+        x, y, z = (body + [0.1, 0.2, 2.5]).T
+        world = [Made(x=x, y=y, z=z, visibility=0.9) for x, y, z in body]
+        places = np.column_stack([0.5 + focal * x / z / width, 0.5 + focal * y / z / height])
+        return Made(pose_world_landmarks=[world], pose_landmarks=[[Made(x=u, y=v) for u, v in places]])
+
+
+def test_each_picture_gives_the_bodies_in_it(video: Path, model: str) -> None:
+    seen = Seen()
+    source = WebcamSource(WebcamSettings(camera=3, model=model), NOT_CALIBRATED, SystemClock(), seen.landmarker)
+    frames: list[PoseRaw] = []
+    for frame in source.frames():
+        if frame is None:
+            break  # the film is over: the camera is gone
+        frames.append(frame)
+        assert source.status()["camera"] in ("streaming", "waiting for the first frame")
+    assert len(frames) == FRAMES
+    assert source.refused["camera lost"] == 1
+    stamps = [frame.stamp_ns for frame in frames]
+    assert stamps == sorted(stamps)
+    for frame in frames:
+        assert (frame.skeleton, frame.source, len(frame.bodies)) == ("blazepose33", "webcam-3", 1)
+        np.testing.assert_allclose(frame.bodies[0].positions.mean(axis=0), [0.1, 0.2, 2.5], atol=0.2)
+    colours, milliseconds = zip(*seen.pictures, strict=True)
+    assert [int(colour[2]) > int(colour[0]) for colour in colours[2:]] == [True] * 3, "RGB, not OpenCV's BGR"
+    assert list(milliseconds) == sorted(set(milliseconds)), "MediaPipe wants them to rise"
+
+
+def test_a_picture_that_fails_is_counted_and_the_next_one_comes(video: Path, model: str) -> None:
+    class Stumbles(Seen):
+        def look(self, image: np.ndarray, milliseconds: int) -> Made:
+            found = super().look(image, milliseconds)
+            if len(self.pictures) == 2:
+                found.pose_world_landmarks[0].pop()
+            elif len(self.pictures) == 4:
+                cv2.cvtColor(image[:0], cv2.COLOR_BGR2RGB)  # nothing, where a picture is expected
+            return found
+
+    source = WebcamSource(WebcamSettings(camera=3, model=model), NOT_CALIBRATED, SystemClock(), Stumbles().landmarker)
+    frames = source.frames()
+    assert [next(frames) is not None for _ in range(FRAMES)] == [True, False, True, False, True]
+    status = source.status()
+    assert (status["dropped.camera frame: ValueError"], status["dropped.camera frame: error"]) == ("1", "1")
+    assert not source.refused
+
+
+def test_a_lens_that_is_calibrated_is_used_for_pictures_of_any_size() -> None:
+    told = CalibrationSettings([640, 480], [500.0, 510.0], [330.0, 235.0], [-0.3, 0.1, 0.0, 0.0, 0.0])
+    guessed, lens, half = (
+        Lens(size, 1.05, calibration)
+        for size, calibration in (((640, 480), NOT_CALIBRATED), ((640, 480), told), ((320, 240), told))
+    )
+    assert guessed.intrinsics[0, 0] == pytest.approx(320 / np.tan(0.525))
+    points = np.array([[x, y, 2.0] for x in (-1.0, -0.3, 0.5, 1.0) for y in (-0.7, 0.1, 0.6)])
+    for one, size in ((lens, (640, 480)), (half, (320, 240))):
+        scale = size[0] / 640
+        matrix = np.array([[500.0, 0, 330.0], [0, 510.0, 235.0], [0, 0, 1]])
+        bent = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(told.distortion))[0].reshape(-1, 2)
+        straight = points @ one.intrinsics.T
+        straight = straight[:, :2] / straight[:, 2:]
+        for (x, y), expected in zip((bent + 0.5) * scale - 0.5, straight, strict=True):
+            picture = np.zeros((size[1], size[0], 3), np.float32)
+            cv2.circle(picture, (round(x), round(y)), 3, (1.0, 1.0, 1.0), -1)
+            shown = np.argwhere(one.straightened(picture)[..., 0] > 0.5)[:, ::-1].mean(axis=0)
+            np.testing.assert_allclose(shown, expected, atol=1.0)
+    image = np.zeros((480, 640, 3), np.uint8)
+    assert guessed.straightened(image) is image
+    with pytest.raises(LaunchError, match="for pictures of 640 x 480, the camera gives 1280 x 720; calibrate it"):
+        Lens((1280, 720), 1.05, told)
+
+
+def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str, clock: VirtualClock) -> None:
+    source = WebcamSource(WebcamSettings(camera=4, model=model), NOT_CALIBRATED, clock, Seen().landmarker)
+    frames = source.frames()
+    for _ in range(30):
+        assert next(frames) is None
+    assert "camera 4 cannot be opened" in source.status()["camera"]
+    assert sum(clock.slept_ns) > PAUSES_S[0] * 1e9
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        (WebcamSettings(bodies=0), "bodies of 1 or more"),
+        (WebcamSettings(camera=-1), "camera of 0 or more"),
+        (WebcamSettings(field_of_view=60.0), "field_of_view in radians"),
+        (WebcamSettings(), r"a \.task file, got ''; download one, such as https"),
+        (WebcamSettings(model="gone.task"), "got 'gone.task'; download one"),
+    ],
+)
+def test_settings_that_cannot_be_used_say_so(settings: WebcamSettings, expected: str) -> None:
+    with pytest.raises(LaunchError, match=expected):
+        WebcamSource(settings, NOT_CALIBRATED, SystemClock(), Seen().landmarker)
+
+
+def test_without_mediapipe_it_says_what_to_install(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(webcam, "find_spec", lambda name: None)
+    with pytest.raises(LaunchError, match="--extra webcam"):
+        WebcamSource(WebcamSettings(model=model), NOT_CALIBRATED, SystemClock())
+
+
+def test_the_launch_file_names_what_to_download() -> None:
+    launch = Launch.read("webcam")
+    assert launch.input.source == "webcam"
+    assert not launch.transport.lossless
+    assert launch.input.webcam.model.endswith("launch/pose_landmarker_full.task")
+
+
+def test_mediapipe_itself_refuses_a_file_that_is_no_model(model: str) -> None:
+    pytest.importorskip("mediapipe")
+    require_mediapipe()
+    with (
+        pytest.raises(LaunchError, match=r"MediaPipe cannot use .* as a pose landmarker"),
+        webcam.landmarker(WebcamSettings(model=model)),
+    ):
+        pass

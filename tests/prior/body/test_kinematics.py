@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import fk, random_pose
+
+from steadypose.prior.body.inverse_kinematics import solve_pose
+from steadypose.prior.body.kinematics import (
+    CONTACT_JOINTS,
+    estimate_offsets,
+    forward_kinematics,
+    label_contacts,
+)
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+
+
+def naive_fk(rotations: np.ndarray, offsets: np.ndarray, root: np.ndarray) -> np.ndarray:
+    positions, world = np.zeros((22, 3)), np.zeros((22, 3, 3))
+    for joint, parent in enumerate(PARENTS):
+        if parent < 0:
+            positions[joint], world[joint] = root, rotations[joint]
+        else:
+            positions[joint] = positions[parent] + world[parent] @ offsets[joint]
+            world[joint] = world[parent] @ rotations[joint]
+    return positions
+
+
+def test_forward_kinematics_agrees_with_a_walk_down_the_tree() -> None:
+    rng = np.random.default_rng(0)
+    rotations = Rotation.random(6 * 22, rng=rng).as_matrix().reshape(2, 3, 22, 3, 3)
+    offsets = rng.normal(size=(2, 3, 22, 3))
+    root = rng.normal(size=(2, 3, 3))
+    got, _ = forward_kinematics(*(torch.from_numpy(a) for a in (rotations, offsets, root)))
+    for index in np.ndindex(2, 3):
+        assert np.allclose(got[index], naive_fk(rotations[index], offsets[index], root[index]))
+
+
+def test_forward_kinematics_is_differentiable() -> None:
+    rotations = torch.eye(3, dtype=torch.float64).repeat(1, 22, 1, 1).requires_grad_()
+    offsets = torch.from_numpy(REST_OFFSETS).requires_grad_()
+    assert torch.autograd.gradcheck(lambda r, o: forward_kinematics(r, o)[0], (rotations, offsets))
+
+
+def test_the_rest_pose_stands_in_a_t_and_faces_x() -> None:
+    rest = fk(np.broadcast_to(np.eye(3), (22, 3, 3)).copy())
+    assert rest[J["left_wrist"], 1] > 0.5
+    assert rest[J["right_wrist"], 1] < -0.5
+    assert rest[J["head"], 2] > 0.5 > -0.8 > rest[J["left_ankle"], 2]
+    assert rest[J["left_foot"], 0] > rest[J["left_ankle"], 0] + 0.1
+
+
+def test_bones_are_recovered_from_noisy_poses() -> None:
+    rng = np.random.default_rng(6)
+    bones = REST_OFFSETS * rng.uniform(0.8, 1.2, size=(22, 1))
+    positions = fk(random_pose(rng, 300, spread=0.2), bones) + rng.normal(size=(300, 22, 3)) * 0.015
+    positions[:20] += rng.normal(size=(20, 22, 3)) * 0.5  # outliers
+    estimate = estimate_offsets(positions)
+    error = np.linalg.norm(estimate, axis=-1) - np.linalg.norm(bones, axis=-1)
+    assert np.abs(error[1:]).max() < 0.012
+
+
+def test_bones_between_joints_that_are_never_seen_span_the_gap() -> None:
+    bones = REST_OFFSETS * 1.1
+    positions = fk(random_pose(np.random.default_rng(7), 50, spread=0.1), bones)
+    unseen = [J["spine1"], J["spine2"], J["left_collar"], J["right_collar"]]
+    positions[:, unseen] = np.nan
+    estimate = estimate_offsets(positions)
+    chain = [J["spine1"], J["spine2"], J["spine3"]]
+    assert np.linalg.norm(estimate[chain].sum(axis=0)) == pytest.approx(
+        np.linalg.norm(bones[chain].sum(axis=0)), rel=0.02
+    )
+    placed = solve_pose(positions, estimate)[1]
+    assert np.nanmedian(np.linalg.norm(placed - positions, axis=-1)[:, J["left_shoulder"]]) < 0.01
+
+
+def test_contacts_do_not_depend_on_the_frame_rate() -> None:
+    heel = CONTACT_JOINTS.index(J["left_ankle"])
+    for fps in (30.0, 60.0, 120.0):
+        time = np.arange(0, 2, 1 / fps)
+        positions = np.tile(fk(np.broadcast_to(np.eye(3), (22, 3, 3)).copy()), (len(time), 1, 1)) + [0, 0, 0.96]
+        positions[:, J["left_ankle"], 0] += np.where(time > 1, (time - 1) * 0.3, 0)  # slides at 0.3 m/s after 1 s
+        contacts = label_contacts(positions, fps)
+        assert contacts[time < 0.9, heel].all()
+        assert not contacts[time > 1.1, heel].any()
+    assert not label_contacts(positions + [0, 0, 0.2], fps).any()
+    assert label_contacts(positions[:1], fps).shape == (1, 8)

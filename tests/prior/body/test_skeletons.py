@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+
+from steadypose.prior.body.skeleton import (
+    CANONICAL,
+    JOINTS,
+    MIRROR,
+    PARENTS,
+    REST_OFFSETS,
+    SKELETONS,
+    J,
+    get_skeleton,
+    to_canonical,
+)
+
+EXPECTED_COUNTS = {
+    "smpl22": 22, "coco17": 17, "blazepose33": 33, "h36m17": 17, "kinect22": 22, "azure_kinect32": 32, "zed38": 38,
+    "openpose25": 25,
+}  # fmt: skip
+
+
+def test_every_promised_skeleton_is_there_with_its_joints() -> None:
+    assert {name: len(s.joints) for name, s in SKELETONS.items()} == EXPECTED_COUNTS
+    for skeleton in SKELETONS.values():
+        assert len(set(skeleton.joints)) == len(skeleton.joints)
+
+
+@pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=lambda s: s.name)
+def test_weights_make_means(skeleton) -> None:
+    sums = skeleton.to_canonical.sum(axis=1)
+    assert np.allclose(sums[skeleton.observable], 1.0)
+    assert np.all(sums[~skeleton.observable] == 0.0)
+
+
+@pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=lambda s: s.name)
+def test_left_joints_come_from_left_joints(skeleton) -> None:
+    for joint, row in zip(JOINTS, skeleton.to_canonical, strict=True):
+        sources = [skeleton.joints[k].lower() for k in np.flatnonzero(row)]
+        if joint.startswith("left"):
+            assert not any("right" in s or s.startswith("r") for s in sources), (joint, sources)
+        if joint.startswith("right"):
+            assert not any("left" in s or s.startswith("l") for s in sources), (joint, sources)
+
+
+def test_the_tree_is_symmetric_and_breadth_first() -> None:
+    assert all(p < j for j, p in enumerate(PARENTS))
+    assert np.array_equal(MIRROR[MIRROR], np.arange(22))
+    assert np.allclose(REST_OFFSETS[MIRROR] * [1, -1, 1], REST_OFFSETS)
+
+
+def test_a_joint_with_a_missing_source_is_unobserved_and_confidence_is_the_least() -> None:
+    coco = get_skeleton("coco17")
+    positions = np.random.default_rng(0).normal(size=(5, 17, 3))
+    confidence = np.full((5, 17), 0.9)
+    confidence[:, coco.index("left_hip")] = 0.4
+    positions[2, coco.index("right_hip"), 1] = np.inf
+    mapped, trust = to_canonical(coco, positions, confidence)
+    assert np.allclose(mapped[0, 0], (positions[0, coco.index("left_hip")] + positions[0, coco.index("right_hip")]) / 2)
+    assert trust[0, 0] == pytest.approx(0.4)
+    assert np.isnan(mapped[2, 0]).all()
+    assert trust[2, 0] == 0.0
+    assert np.isfinite(mapped[2, J["left_hip"]]).all()
+    assert np.isnan(mapped[:, J["spine2"]]).all()
+
+
+def test_canonical_maps_to_itself() -> None:
+    positions = np.random.default_rng(1).normal(size=(22, 3))
+    assert np.allclose(to_canonical(CANONICAL, positions)[0], positions)
+
+
+def test_unknown_names_say_what_is_known() -> None:
+    with pytest.raises(KeyError, match="coco17"):
+        get_skeleton("coco18")
+    with pytest.raises(KeyError, match="left_elbow"):
+        get_skeleton("coco17").index("elbow")

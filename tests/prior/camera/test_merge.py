@@ -1,0 +1,201 @@
+"""Several cameras as one: simulated views of one motion, and what can go wrong with them."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import waving
+
+from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.prior.camera.multi_view import ALONG, PERIOD_NS, SOURCE, Merge, Sighting, merge_joints
+from steadypose.prior.sim.camera import Camera, film
+from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
+from steadypose.prior.sim.scripts import SCRIPTS
+from steadypose.prior.sim.streams import START_NS
+
+BODY = waving(60)
+FRONT, BACK = Camera((0.0, 0.0, 1.3), (2.8, 0.0, 1.0)), Camera((5.6, 0.3, 1.5), (2.8, 0.0, 1.0), fps=27.0)
+
+
+def seen(
+    camera: str, stamp_ns: int, *bodies: np.ndarray, eye: tuple[float, float, float] = (0, 0, 1), **more: object
+) -> PoseRaw:
+    """What a camera at ``eye`` that looks along the world's axes sees."""
+    place = np.array(eye, np.float64)
+    raws = [RawBody(k, body - place, np.ones(22)) for k, body in enumerate(bodies)]
+    message = PoseRaw(stamp_ns, "camera", camera, "smpl22", Pose(place, np.array([0, 0, 0, 1.0])), True, raws)
+    return dataclasses.replace(message, **more)
+
+
+def play(messages: list[PoseRaw]) -> tuple[list[PoseRaw], Merge]:
+    merge = Merge()
+    return [merged for m in sorted(messages, key=lambda m: m.stamp_ns) for merged in merge.update(m)], merge
+
+
+@pytest.fixture(scope="module")
+def two_views() -> tuple[list[PoseRaw], list[PoseRaw], Callable[[np.ndarray], np.ndarray]]:
+    """Somebody who walks about, filmed from both sides of the room, and where his joints really are."""
+    person = SCRIPTS["walk_turn"](np.random.default_rng(4))[0]
+    keep = person.times <= 6.0
+    cut = {name: getattr(person, name)[keep] for name in ("times", "root", "rotations", "contacts")}
+    person, noise = dataclasses.replace(person, **cut), NoiseModel.load(KINECT_NOISE)
+    front, back = (
+        film([person], camera, noise, np.random.default_rng(seed), name, START_NS)
+        for seed, (name, camera) in enumerate((("front", FRONT), ("back", BACK)))
+    )
+    return front, back, lambda stamps_ns: person.at((stamps_ns - START_NS) / 1e9).positions
+
+
+def test_two_views_are_nearer_to_the_truth_than_one_and_lose_fewer_joints(two_views) -> None:
+    """Than one on average: most of a sensor's error is a bias of its session, and one of two cameras has less of it."""
+    front, back, truth = two_views
+
+    def figures(messages: list[PoseRaw]) -> tuple[float, float]:
+        """Metres, median over joints seen, and how many are seen of a body that is there."""
+        merged, _ = play(messages)
+        joints = np.array([m.bodies[0].positions for m in merged if m.bodies])
+        away = np.linalg.norm(joints - truth(np.array([m.stamp_ns for m in merged if m.bodies])), axis=-1)
+        observed = np.isfinite(away)
+        return float(np.nanmedian(away)), float(observed.sum(axis=1).mean())
+
+    both, one, other = figures([*front, *back]), figures(front), figures(back)
+    assert both[0] < 0.85 * (one[0] + other[0]) / 2
+    assert both[1] > max(one[1], other[1])
+
+
+def test_one_body_comes_out_at_every_moment_of_the_grid_in_order(two_views) -> None:
+    front, back, _ = two_views
+    merged, merge = play([*front, *back])
+    stamps = np.array([m.stamp_ns for m in merged])
+    assert (np.diff(stamps) == PERIOD_NS).all()
+    assert all(len(m.bodies) == 1 for m in merged)
+    assert {(m.source, m.calibrated, m.skeleton) for m in merged} == {(SOURCE, True, "smpl22")}
+    assert not +merge.counters
+
+
+def test_bodies_are_interpolated_to_the_moment() -> None:
+    """Somebody who slides along at 1 m/s, filmed by two cameras out of step, in different orders."""
+    messages = []
+    for k in range(30):
+        for camera, offset_ns, flip in (("a", 3_000_000, 1), ("b", 19_000_000, -1)):
+            stamp = k * 35_000_000 + offset_ns
+            bodies = [BODY[0] + [stamp * 1e-9, 0.0, 0.0], BODY[0] + [0.0, 1.5 + stamp * 1e-9, 0.0]][::flip]
+            messages.append(seen(camera, stamp, *bodies))
+    merged, _ = play(messages)
+    assert len(merged) > 25
+    for m in merged[1:]:
+        x = sorted(float(body.positions[0, 0] - BODY[0, 0, 0]) for body in m.bodies)
+        assert x == pytest.approx([0.0, m.stamp_ns * 1e-9], abs=1e-5)
+
+
+def test_where_a_camera_was_blind_for_a_while_it_says_nothing() -> None:
+    """Somebody who slides along at 2 m/s; one of the cameras skips a fifth of a second."""
+    moves = [(k * PERIOD_NS, BODY[0] + [2.0 * k / 30, 0.0, 0.0]) for k in range(30)]
+    messages = [seen("a", stamp, body) for stamp, body in moves]
+    messages += [seen("b", stamp + 1, body, eye=(0, 4, 1)) for k, (stamp, body) in enumerate(moves) if not 10 < k < 16]
+    merged, _ = play(messages)
+    assert len(merged) > 25
+    for m in merged[1:]:
+        assert m.bodies[0].positions[0, 0] - BODY[0, 0, 0] == pytest.approx(2.0 * m.stamp_ns * 1e-9, abs=1e-5)
+
+
+def test_a_camera_errs_along_its_line_of_sight() -> None:
+    """Two cameras at right angles: each is believed across its own line of sight."""
+    truth = np.tile([2.0, 2.0, 1.0], (22, 1))
+    along_x = Sighting(truth + [0.1, 0.0, 0.0], np.ones(22), np.array([0.0, 2.0, 1.0]))
+    along_y = Sighting(truth + [0.0, 0.1, 0.0], np.ones(22), np.array([2.0, 0.0, 1.0]))
+    joints, confidence = merge_joints([along_x, along_y])
+    share = ALONG**-2 / (1 + ALONG**-2)
+    assert joints - truth == pytest.approx(np.tile([0.1 * share, 0.1 * share, 0.0], (22, 1)), abs=1e-3)
+    assert (confidence == 1.0).all()
+
+
+def test_with_errors_that_are_independent_two_views_are_better_than_either() -> None:
+    rng, place, eyes = np.random.default_rng(0), np.tile([3.0, 0.0, 1.0], (22, 1)), ([0.0, 0.0, 1.0], [3.0, 3.0, 1.0])
+
+    def error(cameras: int) -> float:
+        away = []
+        for _ in range(200):
+            noise = [rng.normal(0.0, axis, (22, 3)) for axis in ([0.04, 0.02, 0.02], [0.02, 0.04, 0.02])]
+            views = [Sighting(place + n, np.ones(22), np.array(e)) for n, e in zip(noise, eyes, strict=True)]
+            away.append(merge_joints(views[:cameras])[0] - place)
+        return float(np.sqrt(np.mean(np.square(away))))
+
+    # of 4, 2, 2 cm: precisions 1/16 + 1/4 along both horizontal axes, 1/4 + 1/4 up
+    assert error(2) / error(1) == pytest.approx(np.sqrt((3.2 + 3.2 + 2.0) / (16.0 + 4.0 + 4.0)), rel=0.03)
+
+
+def test_confidence_weighs_and_what_is_apart_is_not_averaged() -> None:
+    place = np.tile([3.0, 0.0, 1.0], (22, 1))
+    eyes = np.array([0.0, 0.0, 1.0]), np.array([6.0, 0.0, 1.0])
+    sure = Sighting(place, np.full(22, 0.9), eyes[0])
+    unsure = Sighting(place + [0.0, 0.1, 0.0], np.full(22, 0.3), eyes[1])
+    joints, confidence = merge_joints([sure, unsure])
+    assert joints[0, 1] == pytest.approx(0.1 * 0.3**2 / (0.9**2 + 0.3**2), rel=1e-2)
+    assert confidence[0] == pytest.approx(1.0 - 0.1 * 0.7)
+    far = dataclasses.replace(unsure, joints=place + [0.0, 0.5, 0.0])
+    joints, confidence = merge_joints([sure, far])
+    assert joints == pytest.approx(place)
+    assert confidence == pytest.approx(np.full(22, 0.9))
+    blind = dataclasses.replace(unsure, joints=np.full((22, 3), np.nan), confidence=np.zeros(22))
+    assert merge_joints([sure, blind])[0] == pytest.approx(place)
+    assert np.isnan(merge_joints([blind, blind])[0]).all()
+
+
+def test_two_people_stay_two_and_each_is_one() -> None:
+    near = [BODY[0], BODY[0] + [0.6, 0.0, 0.0]]
+    rng = np.random.default_rng(0)
+    messages = []
+    for k in range(10):
+        noisy = [body + rng.normal(0.0, 0.03, (22, 3)) for body in near]
+        messages += [seen("a", k * PERIOD_NS, *noisy), seen("b", k * PERIOD_NS + 1, *noisy[::-1], eye=(4, 0, 1))]
+    merged, _ = play(messages)
+    assert [len(m.bodies) for m in merged[2:]] == [2] * len(merged[2:])
+
+
+def test_a_camera_that_goes_is_waited_for_a_moment_only() -> None:
+    messages = [seen("a", k * PERIOD_NS, BODY[k]) for k in range(40)]
+    messages += [seen("b", k * PERIOD_NS + 1000, BODY[k]) for k in range(20)]
+    merged, _ = play(messages)
+    assert [m.stamp_ns for m in merged][-1] == 39 * PERIOD_NS
+    assert len(merged) >= 39
+
+
+def test_what_cannot_be_used_is_counted_by_camera() -> None:
+    good = [seen("a", k * PERIOD_NS, BODY[k]) for k in range(5)]
+    bad = [
+        seen("b", 1, BODY[0], calibrated=False),
+        seen("b", 2, BODY[0], skeleton="octopus"),
+        seen("b", 3, BODY[0], sensor_pose=Pose(np.zeros(3), np.zeros(4))),
+        seen("b", 4, skeleton="coco17", bodies=[RawBody(0, BODY[0], np.ones(22))]),
+        seen("a", 4 * PERIOD_NS, BODY[0]),
+        seen("c", 5 * PERIOD_NS, np.full((22, 3), np.inf), np.full((22, 3), 1e30), *[BODY[0]] * 200),
+    ]
+    merged, merge = play([*good, *bad])
+    assert merged
+    assert {cause: n for cause, n in merge.counters.items() if n} == {
+        "not calibrated, b": 2,
+        "unknown skeleton, b": 1,
+        "wrong joint count, b": 1,
+        "late or repeated, a": 1,
+    }
+
+
+def test_cameras_whose_clocks_were_set_back_start_anew() -> None:
+    merge = Merge()
+    ahead = 3_600_000_000_000
+    for k in range(5):
+        merge.update(seen("a", ahead + k * PERIOD_NS, BODY[k]))
+    merged = [m for k in range(60) for m in merge.update(seen("a", k * PERIOD_NS, BODY[k % 60]))]
+    assert merged[-1].stamp_ns == 59 * PERIOD_NS
+
+
+def test_a_turned_camera_is_turned_back() -> None:
+    turn = Rotation.from_rotvec([0.3, -0.8, 0.5])
+    pose = Pose(np.array([1.0, 2.0, 1.5]), turn.as_quat())
+    body = RawBody(0, turn.inv().apply(BODY[0] - pose.position), np.ones(22))
+    merged, _ = play([dataclasses.replace(seen("a", 10 * PERIOD_NS), sensor_pose=pose, bodies=[body])])
+    assert merged[0].bodies[0].positions == pytest.approx(BODY[0], abs=1e-5)
+    assert merged[0].sensor_pose == Pose.identity()

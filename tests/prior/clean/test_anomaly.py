@@ -1,0 +1,156 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from tests.helpers.bodies import stream, waving
+
+from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
+from steadypose.prior.clean.frame import Window
+from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+from steadypose.prior.clean.score import (
+    MISSING,
+    RATES,
+    SENSOR_SIGMAS,
+    STUCK_ODDS,
+    Calibration,
+    Score,
+    ScoreSettings,
+    decimals,
+    judged,
+    load_fault_net,
+)  # fmt: skip
+from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
+from steadypose.prior.models.hgvae.faults import OFF_SCALE, RECENT, ROUGH_SCALE, FaultNet, FaultNetConfig, tell
+
+HEIGHTS = np.linspace(0.0, 7.0, len(RATES))
+SCALE = Calibration(np.broadcast_to(HEIGHTS, (len(MISSING), len(SENSOR_SIGMAS), len(RATES))))
+
+
+def scored(positions: np.ndarray, **settings) -> list:
+    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0, **settings}))
+    return [c.bodies[0] for m in stream(positions) for c in pipeline.process(m)]
+
+
+def looks(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Windows (count, 66, 20): tracks, NaN where not seen, what is made of them, how surely, and what was seen."""
+    rng = np.random.default_rng(0)
+    x, found = rng.normal(scale=0.5, size=(2, count, 66, 20))
+    seen = np.repeat(rng.random((count, 22, 20)) < 0.7, 3, axis=1)
+    return np.where(seen, x, np.nan), found, rng.uniform(0.005, 0.1, x.shape), seen.astype(float)
+
+
+def awake() -> FaultNet:
+    torch.manual_seed(0)
+    network = FaultNet(FaultNetConfig(frames=20, features=8)).eval()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    return network
+
+
+def test_the_live_fault_network_is_the_trained_one() -> None:
+    network, look = awake(), looks(3)
+    with torch.inference_mode():
+        odds = network(torch.from_numpy(tell(*look, 0.02, network.mean.numpy()))).numpy()
+    live = LiveFaultNet(network, 0.02, 4)
+    np.testing.assert_allclose(live(*look), odds, atol=1e-4)
+    x, found, sigma, observed = (part[1:] for part in look)
+    np.testing.assert_allclose(live(x, found, sigma, observed), odds[1:], atol=1e-4)
+
+
+def test_the_fault_network_is_told_of_what_was_seen_alone() -> None:
+    x, found, sigma, observed = looks(2)
+    mean = np.linspace(-1.0, 1.0, 66)
+    told = tell(x, found, sigma, observed, np.array([0.01, 0.02]), mean)
+    seen = observed > 0
+    expected = [
+        np.where(seen, (x - mean[:, None]) / 0.2, 0.0), np.where(seen, np.arcsinh((x - found) / OFF_SCALE), 0.0),
+        np.log(sigma / OFF_SCALE), observed,
+    ]  # fmt: skip
+    np.testing.assert_allclose(told[..., :80], np.concatenate(expected, axis=-1), rtol=1e-5, atol=1e-6)
+    shaken = np.diff(x, n=2, axis=-1)[..., -RECENT:]
+    rough = np.nansum(shaken**2, axis=-1) / np.maximum(np.isfinite(shaken).sum(axis=-1), 1)
+    np.testing.assert_allclose(told[..., 80], 0.5 * np.log(rough / ROUGH_SCALE**2 + 1e-3), rtol=1e-5)
+    np.testing.assert_allclose(told[..., 81], np.tile(np.log([[1.0], [2.0]]), 66), atol=1e-6)
+
+
+def test_a_joint_not_seen_of_late_has_no_odds_and_a_stuck_one_high_ones() -> None:
+    observed = np.ones((2, 66, 20))
+    observed[0, 3 * J["neck"] : 3 * J["neck"] + 3, -RECENT:] = 0
+    stuck = np.zeros((2, 22), dtype=bool)
+    stuck[:, J["neck"]] = True
+    odds = judged(np.zeros((2, 22)), observed, stuck)
+    assert odds[0, J["neck"]] == -np.inf
+    assert odds[1, J["neck"]] == STUCK_ODDS
+    assert (np.delete(odds, J["neck"], axis=1) == 0).all()
+
+
+def test_the_scale_is_the_decimals_of_the_rate_among_clean_windows() -> None:
+    scale = SCALE.at(0.02)
+    missing = np.zeros(1, dtype=int)
+    np.testing.assert_allclose(decimals(HEIGHTS[None], scale, missing)[0], -np.log10(RATES), atol=1e-6)
+    beyond = decimals(np.array([[7.0, 8.0, 9.0]]), scale, missing)[0]
+    assert beyond[2] - beyond[1] == pytest.approx(beyond[1] - beyond[0])
+    assert (decimals(np.array([[-50.0, -np.inf]]), scale, missing) == 0).all()
+
+
+def test_between_measured_sensors_the_scale_is_between_theirs() -> None:
+    quantiles = np.zeros_like(SCALE.quantiles)
+    quantiles[:, 1] = 1.0
+    middle = Calibration(quantiles).at(float(np.sqrt(SENSOR_SIGMAS[1] * SENSOR_SIGMAS[2])))
+    np.testing.assert_allclose(middle.quantiles, 0.5)
+
+
+def test_the_weights_that_ship_find_the_wrist_of_which_the_last_answer_is_repeated() -> None:
+    assert load_fault_net("default").config.frames == 50
+    moving = waving(90, speed=2.0)
+    moving += np.random.default_rng(0).normal(0.0, 0.005, moving.shape)
+    frozen = moving.copy()
+    frozen[60:, J["left_wrist"]] = moving[59, J["left_wrist"]]
+    gate_off = {"gate": {"enabled": False}, "bones": {"enabled": False}}
+    clean, spoilt = scored(moving, **gate_off)[-1], scored(frozen, **gate_off)[-1]
+    assert spoilt.anomaly > clean.anomaly + 1
+    assert np.nanargmax(spoilt.joint_anomaly) == J["left_wrist"]
+
+
+def test_clean_motion_is_no_anomaly_and_frames_are_scored_alike_twice() -> None:
+    clean = waving(90)
+    bodies = scored(clean)
+    assert not any(b.anomaly_flag for b in bodies)
+    assert [b.anomaly for b in bodies] == [b.anomaly for b in scored(clean)]
+
+
+def test_exchanged_arms_raise_the_flag_which_goes_down_after_they_are_over() -> None:
+    """The gate is off: it would put them back."""
+    spoilt = waving(200)
+    arms = [J[f"{side}_{n}"] for n in ("elbow", "wrist") for side in ("left", "right")]
+    spoilt[60:100, arms] = spoilt[60:100][:, MIRROR[arms]]
+    bodies = scored(spoilt, gate={"enabled": False}, bones={"enabled": False})
+    flags = np.array([b.anomaly_flag for b in bodies])
+    assert not flags[:60].any()
+    assert flags[60:90].any()
+    assert not flags[165:].any()
+    worst = bodies[int(np.argmax([b.anomaly for b in bodies]))]
+    assert np.nanargmax(worst.joint_anomaly) in {*arms, *(PARENTS[j] for j in arms)}
+    assert np.nanmax(worst.joint_anomaly) == pytest.approx(worst.anomaly, rel=1e-5)
+
+
+def test_a_flag_is_held_until_it_has_been_quiet_for_a_while() -> None:
+    stage = Score(ScoreSettings(false_alarms=0.01, hold=0.1), "default", 0.02, 1)
+    window = Window(4, 1)
+    told = iter([0.0, 2.5, 1.5, 0.9, 0.9, 0.9, 0.9, 2.5])
+    window.encoded = SimpleNamespace(slots=np.array([0]))  # type: ignore[assignment]
+    stage._score = lambda *_: (np.array([next(told)]), np.zeros((1, 22)))  # type: ignore[method-assign]
+    flags = [bool(stage.update(window).anomaly_flag[0]) for _ in range(8)]
+    assert flags == [False, True, True, True, True, False, False, True]
+
+
+def test_switched_off_nothing_is_scored() -> None:
+    bodies = scored(waving(30), score={"enabled": False})
+    assert np.isnan([b.anomaly for b in bodies]).all()
+    assert not any(b.anomaly_flag for b in bodies)
+
+
+def test_an_impossible_rate_is_refused() -> None:
+    with pytest.raises(ValueError, match="false_alarms"):
+        PriorPipeline(PriorSettings.from_dict({"score": {"false_alarms": 0.0}}))

@@ -1,0 +1,103 @@
+import numpy as np
+import pytest
+from tests.helpers.bodies import stream, waving
+
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.denoise import MODEL_SIGMA, NOISE_LEFT, Denoise, _place_pelvis
+from steadypose.prior.clean.frame import Window
+from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+from steadypose.prior.timing.fixed_lag import Smoothed
+
+
+def answers(seen: np.ndarray, delay: int = 4, **settings) -> np.ndarray:
+    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": delay, "bias_sigma": 0.002, **settings}))
+    messages = [c for m in stream(seen) for c in pipeline.process(m)] + pipeline.flush()
+    return np.stack([m.bodies[0].positions for m in messages])
+
+
+def error_mm(found: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.linalg.norm(found - truth, axis=-1)[30:].mean() * 1000)
+
+
+@pytest.mark.parametrize(("delay", "share"), [(0, 0.85), (4, 0.95)])
+def test_in_noise_the_answer_is_nearer_to_the_truth(delay: int, share: float) -> None:
+    truth = waving(120)
+    seen = truth + np.random.default_rng(0).normal(0.0, 0.04, truth.shape)
+    with_it = error_mm(answers(seen, delay), truth)
+    assert with_it < share * error_mm(answers(seen, delay, denoise={"enabled": False}), truth)
+
+
+def test_without_noise_the_smoother_is_left_alone() -> None:
+    truth = waving(90)
+    np.testing.assert_allclose(answers(truth), answers(truth, denoise={"enabled": False}), atol=1e-3)
+
+
+def test_the_last_frames_are_denoised_as_the_others() -> None:
+    truth = waving(100)
+    seen = truth + np.random.default_rng(1).normal(0.0, 0.04, truth.shape)
+    found = answers(seen)
+    assert len(found) == len(truth)
+    plain = answers(seen, denoise={"enabled": False})
+    assert (np.linalg.norm(found - plain, axis=-1)[-4:].mean(axis=1) > 0.002).all()
+
+
+def test_lost_frames_do_not_make_the_answer_flicker() -> None:
+    """A body that is away for a frame now and then, in noise: as smooth as one that is not."""
+    truth = waving(150)
+    seen = truth + np.random.default_rng(3).normal(0.0, 0.02, truth.shape)
+    flickering = seen.copy()
+    flickering[20:149:7] = np.nan
+    flickering[[60, 61, 90, 91, 92]] = np.nan
+
+    def shaken(found: np.ndarray) -> float:
+        return float(np.linalg.norm(np.diff(found - truth, n=2, axis=0), axis=-1)[30:].mean())
+
+    steady = answers(seen)
+    assert len(answers(flickering)) == len(truth)
+    assert shaken(answers(flickering)) < 1.3 * shaken(steady)
+    assert error_mm(answers(flickering), truth) < 1.15 * error_mm(steady, truth)
+
+
+def test_the_weight_is_that_of_least_variance() -> None:
+    """Of estimates with noise n and own + sqrt(NOISE_LEFT) n', correlated as the better of the two demands."""
+    stage = Denoise(measurement_sigma=0.02, delay_frames=0, slots=1)
+    window = Window(4, 1)
+    window.noise[:] = 0.04
+    window.positions.push(np.zeros((1, 22, 3)))
+    stage._found[:] = 1.0
+    smoothed = Smoothed(0.0, np.zeros((1, 22, 3)), np.full((1, 22), 0.012))
+    share = stage.denoised(window, smoothed, 0).positions[0, 0, 0]
+    first, second, both = 0.012**2, NOISE_LEFT * 0.012**2 + MODEL_SIGMA**2, NOISE_LEFT * 0.012**2
+    variance = [(1 - w) ** 2 * first + w**2 * second + 2 * w * (1 - w) * both for w in np.linspace(0, 1, 10_001)]
+    assert share == pytest.approx(np.argmin(variance) / 10_000, abs=2e-4)
+    assert stage.denoised(window, smoothed, 0).sigma[0, 0] == pytest.approx(np.sqrt(min(variance)), rel=1e-3)
+
+
+def test_hidden_joints_and_bodies_that_left_are_not_touched() -> None:
+    stage = Denoise(measurement_sigma=0.02, delay_frames=0, slots=2)
+    window = Window(4, 2)
+    window.noise[:] = 0.04
+    seen = np.zeros((2, 22, 3))
+    seen[0, J["left_wrist"]] = np.nan
+    window.positions.push(seen)
+    stage._found[:] = 1.0
+    stage.reset(np.array([False, True]))
+    smoothed = Smoothed(0.0, np.zeros((2, 22, 3)), np.full((2, 22), 0.012))
+    moved = stage.denoised(window, smoothed, 0).positions[..., 0]
+    assert moved[0, J["left_wrist"]] == 0
+    assert (moved[0, : J["left_wrist"]] > 0).all()
+    assert (moved[1] == 0).all()
+
+
+def test_the_pelvis_goes_where_it_lay_beside_hips_and_spine() -> None:
+    truth = waving(50)
+    seen = truth.copy()
+    seen[10:, J["left_hip"]] = np.nan
+    found = truth[None, -3:].copy()
+    found[:, :, 0] += 0.05
+    before = found.copy()
+    _place_pelvis(found, seen[None])
+    assert np.abs(found[:, :, 0] - truth[-3:, 0]).max() < 0.02
+    np.testing.assert_array_equal(found[:, :, 1:], before[:, :, 1:])
+    _place_pelvis(before, np.full((1, 50, 22, 3), np.nan))
+    np.testing.assert_array_equal(before[:, :, 0], truth[None, -3:, 0] + 0.05)

@@ -1,0 +1,142 @@
+import dataclasses
+from collections import Counter
+
+import numpy as np
+import pytest
+from tests.helpers.bodies import PERIOD_NS, raw, waving
+
+from steadypose.benchmarks.systems.identity import MANIFEST, all_hidden, identified, nearest, score, source, watch
+from steadypose.prior.clean.identify import Identify, IdentifySettings
+from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+from steadypose.prior.sim.streams import read_manifest
+
+START_NS = 1_700_000_000_000_000_000
+FRAMES = 120
+SHORT, TALL = waving(FRAMES, scale=0.9), waving(FRAMES, scale=1.1)
+
+
+def stage(rows: int = 8, **settings: float) -> Identify:
+    return Identify(IdentifySettings(enabled=True, **settings), rows, Counter())
+
+
+def ids(identify: Identify, index: int, *bodies: np.ndarray) -> list[int | None]:
+    joints = np.array(bodies).reshape(-1, 22, 3)
+    return identify.update(START_NS + index * PERIOD_NS, joints, np.ones(joints.shape[:2]))
+
+
+def at(body: np.ndarray, index: int, x: float, y: float = 0.0) -> np.ndarray:
+    return body[index] + [x, y, 0.0]
+
+
+def test_the_order_of_bodies_in_a_frame_does_not_matter() -> None:
+    identify, rng, names = stage(), np.random.default_rng(0), []
+    for index in range(30):
+        bodies = [at(SHORT, index, 0.0), at(TALL, index, 1.0), at(SHORT, index, 2.0)]
+        order = rng.permutation(3)
+        given = ids(identify, index, *(bodies[k] for k in order))
+        names.append([given[k] for k in np.argsort(order)])
+    assert sorted(names[-1], key=str) == [1, 2, 3]
+    assert names[10:] == [names[-1]] * 20
+
+
+def test_somebody_new_gets_an_id_after_the_birth_delay_and_a_ghost_none() -> None:
+    identify = stage(birth=0.25)
+    given = [ids(identify, index, at(SHORT, index, 0.0)) for index in range(12)]
+    assert given == [[None]] * 8 + [[1]] * 4
+    ghosts = [ids(identify, 12 + k, at(SHORT, 12 + k, 0.0), at(TALL, k, 2.0)) for k in range(5)]
+    assert ghosts == [[1, None]] * 5
+    assert [ids(identify, 40 + k, at(SHORT, 40 + k, 0.0)) for k in range(20)] == [[1]] * 20
+
+
+def test_who_walks_behind_a_pillar_comes_out_as_the_same() -> None:
+    identify, given = stage(), []
+    for index in range(60):  # 1 m/s
+        given = ids(identify, index, *([] if 20 <= index < 50 else [at(SHORT, index, index / 30)]))
+    assert given == [1]
+
+
+def test_who_is_away_for_longer_than_death_comes_back_as_somebody_new() -> None:
+    for away, expected in ((40, 1), (80, 2)):
+        identify, given = stage(death=2.0), []
+        for index in [*range(20), *range(20 + away, 40 + away)]:
+            if index == 20 + away:
+                for empty in range(20, index):
+                    ids(identify, empty)
+            given = ids(identify, index, at(SHORT, index % FRAMES, 0.0))
+        assert given == [expected]
+
+
+def test_where_places_do_not_tell_bones_do() -> None:
+    """Two stand side by side, vanish for a second, and have changed places when they are seen again."""
+    for changed in (False, True):
+        identify, given, again = stage(), [], []
+        for index in range(60):
+            given = ids(identify, index, at(SHORT, index, 0.0), at(TALL, index, 0.5))
+        assert sorted(given, key=str) == [1, 2]
+        for index in range(60, 100):
+            places = (0.5, 0.0) if changed else (0.0, 0.5)
+            seen = [] if index < 90 else [at(SHORT, index, places[0]), at(TALL, index, places[1])]
+            again = ids(identify, index, *seen)
+        assert again == given
+
+
+def test_a_body_detected_twice_is_one_person() -> None:
+    identify, given = stage(), []
+    for index in range(30):
+        given = ids(identify, index, at(SHORT, index, 0.0), at(SHORT, index, 0.05, 0.05))
+    assert sorted(given, key=str) == [1, None]
+
+
+def test_what_a_hostile_source_sends_is_survived_and_counted() -> None:
+    counters: Counter[str] = Counter()
+    identify = Identify(IdentifySettings(enabled=True), 8, counters)
+    crowd, given = [at(SHORT, 0, float(k)) for k in range(50)], []
+    for index in range(12):
+        given = ids(identify, index, *crowd)
+    assert given == [*range(1, 9)] + [None] * 42
+    assert counters["too_many_bodies"] == 12 * 42
+    nothing = np.full((22, 3), np.nan)
+    assert ids(identify, 12, nothing, nothing) == [None, None]
+    assert ids(identify, 5, crowd[0]) == [None]  # stamps went back: a new stream
+    assert ids(identify, 10**9, crowd[0]) == [None]  # and far ahead
+    assert [ids(identify, 10**9 + 1 + k, crowd[0])[0] for k in range(9)][-1] == 9, "ids are never given again"
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ({"birth": -1.0}, "birth: expected 0 to 60 seconds"),
+        ({"death": float("nan")}, "death: expected 0.25 to 60 seconds"),
+        ({"death": 0.0}, "death: expected 0.25 to 60 seconds"),  # with which nobody would ever get an id
+    ],
+)
+def test_settings_that_cannot_be_are_refused(setting: dict[str, float], expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
+        PriorSettings.from_dict({"identify": setting})
+
+
+def test_the_pipeline_gives_unnumbered_bodies_ids_and_passes_a_trackers_on() -> None:
+    def run(**settings: object) -> list[set[int]]:
+        pipeline = PriorPipeline(PriorSettings.from_dict(settings))
+        messages = []
+        for index in range(60):
+            bodies = [SHORT[index], TALL[index] + [1.5, 0.0, 0.0]]
+            if index % 2:
+                bodies.reverse()
+            messages += pipeline.process(raw(START_NS + index * PERIOD_NS, dict(zip((7, 8), bodies, strict=True))))
+        return [{b.id for b in m.bodies if b.positions[0, 0] > 0.75} for m in messages if m.bodies]
+
+    assert run(identify={"enabled": True})[-20:] in ([{1}] * 20, [{2}] * 20)
+    assert len({tuple(i) for i in run()}) > 1, "the source's ids are passed on as they are"
+
+
+def test_nobody_changes_ids_in_the_crossing_streams() -> None:
+    """That of sim_data, and one in which the hindmost is hidden for two seconds and, then, both at once."""
+    filmed = read_manifest(MANIFEST)["crossing"]
+    hidden = watch(dataclasses.replace(filmed, script="hidden_crossing"))
+    for frames in (watch(filmed), hidden, all_hidden(hidden)):
+        figures = score(frames, identified(IdentifySettings(enabled=True)))
+        assert figures["switches"] == 0
+        assert figures["named"] > 0.85 * figures["sightings"]
+    assert score(hidden, source)["switches"] > 0
+    assert score(hidden, nearest())["switches"] > 0

@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+from tests.helpers.bodies import stream, waving
+
+from steadypose.msgs.types import JointState
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.impute import CARRY_FRAMES, _carried
+from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+
+ARM = [J["left_elbow"], J["left_wrist"]]
+
+
+def hidden_arm(frames: int = 90, start: int = 50) -> np.ndarray:
+    seen = waving(frames)
+    seen[start:, ARM] = np.nan
+    return seen
+
+
+def answers(seen: np.ndarray, **settings) -> tuple[list, PriorPipeline]:
+    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0, **settings}))
+    return [c.bodies[0] for m in stream(seen) for c in pipeline.process(m)], pipeline
+
+
+def error(bodies: list, frames: slice) -> float:
+    found = np.array([b.positions for b in bodies])
+    return float(np.linalg.norm(found - waving(len(bodies)), axis=-1)[frames][:, ARM].mean())
+
+
+def test_what_the_model_was_off_is_carried_into_a_gap_from_both_sides_and_fades() -> None:
+    off = np.zeros((2, 6))
+    observed = np.ones((2, 6))
+    off[0, 1], off[0, 4] = 1.0, 2.0
+    observed[0, 2:4] = 0
+    observed[1, 3:] = 0
+    off[1, 2] = 1.0
+    carried = _carried(off, observed, CARRY_FRAMES, np.ones(2, dtype=np.int64))
+    near, far = np.exp(-1 / CARRY_FRAMES), np.exp(-2 / CARRY_FRAMES)
+    assert carried[0, 2] == pytest.approx(2 / 3 * near + 1 / 3 * 2 * far)
+    np.testing.assert_allclose(carried[1, 3:], np.exp(-np.arange(1, 4) / CARRY_FRAMES))
+    np.testing.assert_array_equal(carried[observed > 0], off[observed > 0])
+
+
+def test_beside_a_gap_the_mean_of_some_frames_is_carried_and_none_beyond_the_next_gap() -> None:
+    off = np.array([[5.0, 1.0, 3.0, 0.0, 8.0, 0.0, 6.0, 9.0]])
+    observed = np.array([[1.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 1.0]])
+    carried = _carried(off, observed, 1e9, np.array([2]))
+    np.testing.assert_allclose(carried[0, [3, 5]], [(2.0 + 8.0) / 2, (8.0 + 7.5) / 2])
+
+
+def test_a_hidden_arm_is_imputed_better_than_held_and_marked() -> None:
+    bodies, _ = answers(hidden_arm())
+    held = np.linalg.norm(waving(90)[51:65][:, ARM] - waving(90)[49][ARM], axis=-1).mean()
+    assert error(bodies, slice(51, 65)) < held
+    assert all((b.state[ARM] == JointState.IMPUTED).all() for b in bodies[50:])
+    assert all(np.isnan(b.raw_positions[ARM]).all() for b in bodies[50:])
+
+
+def test_the_same_stream_is_imputed_alike_bit_for_bit() -> None:
+    first, second = (answers(hidden_arm(), impute={"steps": 2})[0] for _ in range(2))
+    assert all((a.positions == b.positions).all() for a, b in zip(first, second, strict=True))
+
+
+def test_other_bodies_do_not_change_what_is_imputed() -> None:
+    alone, _ = answers(hidden_arm(70), impute={"steps": 1})
+    messages = stream(hidden_arm(70))
+    for message, other in zip(messages, stream(waving(70) + [2.0, 0.0, 0.0]), strict=True):
+        body = other.bodies[0]
+        body.id = 5
+        body.positions[ARM] = np.nan
+        message.bodies.append(body)
+    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0, "impute": {"steps": 1}}))
+    beside = [c.bodies[0] for m in messages for c in pipeline.process(m)]
+    assert all(np.allclose(a.positions, b.positions, atol=1e-6) for a, b in zip(alone, beside, strict=True))
+
+
+def test_a_node_in_a_hurry_does_without_the_climb_and_counts_it() -> None:
+    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0, "impute": {"steps": 1}}))
+    for k, message in enumerate(stream(hidden_arm(60))):
+        pipeline.process(message, hurry=k % 2 == 1)
+    assert pipeline.counters["imputation_skipped"] == 5
+
+
+def test_switched_off_hidden_joints_follow_the_refinement_model() -> None:
+    off, _ = answers(hidden_arm(), impute={"enabled": False}, score={"enabled": False})
+    scored, _ = answers(hidden_arm(), impute={"enabled": False})
+    assert all((a.positions == b.positions).all() for a, b in zip(off, scored, strict=True))
+    assert all((b.state[ARM] == JointState.IMPUTED).all() for b in off[50:])
+
+
+@pytest.mark.parametrize("wrong", [{"steps": -1}, {"rate": 0.0}])
+def test_impossible_settings_are_refused(wrong: dict) -> None:
+    with pytest.raises(ValueError, match="impute"):
+        PriorPipeline(PriorSettings.from_dict({"impute": wrong}))

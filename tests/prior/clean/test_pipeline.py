@@ -1,0 +1,290 @@
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+import torch
+from numba.core.dispatcher import Dispatcher
+from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import PERIOD_NS, raw, stream, waving
+
+from steadypose.msgs.codec import encode
+from steadypose.msgs.types import JointState, Pose, PoseClean, PoseRaw
+from steadypose.prior.body.kinematics import forward_kinematics
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, SKELETONS, J
+from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings, load_loops
+
+
+def clean(messages: list[PoseRaw], **settings) -> tuple[list[PoseClean], PriorPipeline]:
+    pipeline = PriorPipeline(PriorSettings.from_dict(settings))
+    cleaned = [c for m in messages for c in pipeline.process(m)]
+    return cleaned + pipeline.flush(), pipeline
+
+
+def positions(cleaned: list[PoseClean]) -> np.ndarray:
+    return np.array([c.bodies[0].positions for c in cleaned])
+
+
+def noisy(frames: int, sigma: float = 0.02) -> np.ndarray:
+    return waving(frames) + np.random.default_rng(0).normal(size=(frames, 22, 3)) * sigma
+
+
+@pytest.mark.parametrize("delay", [0, 1, 4, 12])
+@pytest.mark.parametrize("frames", [1, 3, 8, 30])
+def test_every_frame_is_answered_once_in_order_however_short_the_stream(delay: int, frames: int) -> None:
+    messages = stream(waving(frames))
+    cleaned, _ = clean(messages, delay=delay)
+    assert [c.stamp_ns for c in cleaned] == [m.stamp_ns for m in messages]
+    assert np.isfinite(positions(cleaned)).all()
+    assert all(c.delay_frames == delay for c in cleaned)
+
+
+@pytest.mark.parametrize("delay", [0, 2, 4, 8])
+def test_an_answer_leaves_exactly_its_delay_after_its_frame(delay: int) -> None:
+    pipeline = PriorPipeline(PriorSettings(delay=delay))
+    for k, message in enumerate(stream(waving(20))):
+        assert [c.stamp_ns for c in pipeline.process(message)] == (
+            [] if k < delay else [message.stamp_ns - delay * PERIOD_NS]
+        )
+
+
+def test_a_delay_beyond_twice_the_window_is_refused() -> None:
+    with pytest.raises(ValueError, match="0 to 16 frames"):
+        PriorPipeline(PriorSettings(delay=17))
+
+
+def test_with_a_longer_delay_a_frame_keeps_what_it_was_decoded_to_as_the_centre() -> None:
+    settings = {"fuse": {"enabled": False}, "bones": {"enabled": False}}
+    messages = stream(waving(30))
+    centre, late = (clean(messages, delay=delay, **settings)[0] for delay in (4, 10))
+    for a, b in list(zip(centre, late, strict=True))[:20]:
+        assert np.allclose(a.bodies[0].rotations, b.bodies[0].rotations, atol=1e-6)
+
+
+def test_the_same_stream_gives_the_same_bytes() -> None:
+    messages = stream(noisy(60))
+    a, b = (b"".join(encode(c) for c in clean(messages)[0]) for _ in range(2))
+    assert a == b
+
+
+def test_no_frame_waits_for_a_loop_to_be_compiled_or_loaded() -> None:
+    load_loops()
+    seen = noisy(70)
+    seen[30:45, J["left_wrist"]] = np.nan
+    seen[50] = np.nan
+    seen[60, J["right_ankle"]] += 1.0
+    loaded = loops()
+    clean(stream(seen))
+    clean(stream(seen), delay=0)
+    assert loops() == loaded
+
+
+def loops() -> dict[str, int]:
+    """Of every compiled function of the prior, for how many kinds of arguments it is loaded."""
+    found = [value for name, module in list(sys.modules.items()) if name.startswith("prior.")
+             for value in vars(module).values() if isinstance(value, Dispatcher)]  # fmt: skip
+    return {f"{f.py_func.__module__}.{f.py_func.__qualname__}": len(f.signatures) for f in found}
+
+
+def test_settings_may_say_that_sensor_and_prior_are_never_wrong() -> None:
+    seen = waving(40)
+    seen[20:, J["left_wrist"]] = np.nan
+    cleaned, _ = clean(stream(seen), bias_sigma=0.0, fuse={"prior_sigma": 0.0, "prior_drift": 0.0})
+    assert np.isfinite(positions(cleaned)).all()
+    assert all(np.isfinite(c.bodies[0].sigma).all() for c in cleaned)
+
+
+def test_noise_shrinks_and_bones_stand_still() -> None:
+    truth, seen = waving(420), noisy(420)
+    cleaned, _ = clean(stream(seen))
+    settled = slice(340, None)
+    got = positions(cleaned)[settled]
+    before = np.linalg.norm(seen - truth, axis=-1)[settled].mean()
+    assert np.linalg.norm(got - truth[settled], axis=-1).mean() < 0.75 * before
+    jitter = np.abs(np.diff(got, n=2, axis=0)).mean() / np.abs(np.diff(seen[settled], n=2, axis=0)).mean()
+    assert jitter < 0.35
+    forearm = np.linalg.norm(got[:, J["left_wrist"]] - got[:, J["left_elbow"]], axis=-1)
+    assert np.ptp(forearm) < 1e-4
+    assert forearm.mean() == pytest.approx(np.linalg.norm(REST_OFFSETS[J["left_wrist"]]), abs=0.01)
+
+
+def test_rotations_and_bones_place_the_joints_where_they_are_said_to_be() -> None:
+    cleaned, _ = clean(stream(noisy(40)))
+    body = cleaned[-1].bodies[0]
+    assert np.allclose(body.bone_lengths[0], 0)
+    rotations = torch.from_numpy(Rotation.from_quat(body.rotations).as_matrix())
+    bones = np.linalg.norm(body.positions - body.positions[[max(p, 0) for p in PARENTS]], axis=-1)
+    assert np.allclose(bones, body.bone_lengths, atol=1e-4)
+    unit = np.where(body.bone_lengths[:, None] > 0, REST_OFFSETS, 0.0)
+    elbow = forward_kinematics(rotations, torch.from_numpy(unit))[1][J["left_elbow"]].numpy()
+    direction = body.positions[J["left_wrist"]] - body.positions[J["left_elbow"]]
+    assert np.allclose(elbow @ [0, 1, 0], direction / np.linalg.norm(direction), atol=1e-3)
+
+
+@pytest.mark.parametrize("up", ["y", "-y"])
+def test_the_answer_is_in_the_sensors_frame(up: str) -> None:
+    pose = Pose.from_up(up)
+    turn = Rotation.from_quat(pose.orientation)
+    world = noisy(30)
+    seen = turn.inv().apply(world.reshape(-1, 3)).reshape(world.shape)
+    upright, _ = clean(stream(world))
+    tilted, _ = clean(stream(seen, pose=pose))
+    assert np.allclose(turn.apply(positions(tilted).reshape(-1, 3)).reshape(world.shape), positions(upright), atol=1e-4)
+
+
+def test_a_hidden_arm_is_imputed_near_the_truth_and_says_it_is_less_sure() -> None:
+    truth = waving(120)
+    arm = [J["left_elbow"], J["left_wrist"]]
+    seen = noisy(120, 0.01)
+    seen[60:75][:, arm] = np.nan
+    cleaned, _ = clean(stream(seen))
+    hidden = [c.bodies[0] for c in cleaned[60:75]]
+    assert all((b.state[arm] == JointState.IMPUTED).all() for b in hidden)
+    assert all(np.isnan(b.raw_positions[arm]).all() for b in hidden)
+    assert (cleaned[50].bodies[0].state == JointState.REFINED).all()
+    assert (hidden[10].sigma[arm] > 1.1 * cleaned[50].bodies[0].sigma[arm]).all()
+    error = np.linalg.norm(positions(cleaned)[60:75] - truth[60:75], axis=-1)[:, arm]
+    assert error.mean() < 0.15
+
+
+def test_a_joint_hidden_for_seconds_is_unknown() -> None:
+    seen = waving(150)
+    seen[30:, J["left_wrist"]] = np.nan
+    cleaned, _ = clean(stream(seen))
+    assert cleaned[60].bodies[0].state[J["left_wrist"]] == JointState.IMPUTED
+    assert cleaned[149].bodies[0].state[J["left_wrist"]] == JointState.UNKNOWN
+
+
+def test_what_a_sensor_lacks_is_held_between_its_neighbours_or_unknown_never_seen() -> None:
+    coco = SKELETONS["coco17"]
+    mapped = np.zeros((20, 17, 3))
+    truth = waving(20)
+    for k, name in enumerate(coco.joints):
+        mapped[:, k] = (
+            truth[:, J[name]] if name in J else truth[:, J["head"]] + [0.08, 0.03 if "left" in name else -0.03, 0]
+        )
+    cleaned, _ = clean(stream(mapped, skeleton="coco17"))
+    state = cleaned[15].bodies[0].state
+    assert state[J["spine2"]] == JointState.IMPUTED
+    assert state[J["left_foot"]] == JointState.UNKNOWN
+    assert state[J["left_elbow"]] == JointState.REFINED
+    assert np.linalg.norm(positions(cleaned)[15] - truth[15], axis=-1)[J["left_wrist"]] < 0.05
+
+
+def test_bodies_do_not_disturb_each_other() -> None:
+    a, b = noisy(60), noisy(60) + [2.0, 0, 0]
+    together = [raw(10**18 + k * PERIOD_NS, {1: a[k], 2: b[k]}) for k in range(60)]
+    alone, _ = clean([raw(10**18 + k * PERIOD_NS, {1: a[k]}) for k in range(60)])
+    both, _ = clean(together)
+    assert [[x.id for x in c.bodies] for c in both] == [[1, 2]] * 60
+    assert np.allclose(positions(both), positions(alone), atol=1e-5)
+
+
+def test_a_body_that_leaves_is_dropped_and_its_place_is_free() -> None:
+    p = waving(90)
+    messages = [
+        raw(10**18 + k * PERIOD_NS, {1: p[k]} | ({k // 30 + 2: p[k] + [1, 1, 0]} if k % 30 < 8 else {}))
+        for k in range(90)
+    ]
+    cleaned, pipeline = clean(messages, max_bodies=2)
+    assert {b.id for c in cleaned for b in c.bodies} == {1, 2, 3, 4}
+    assert pipeline.counters["too_many_bodies"] == 0
+    first = next(c for c in cleaned if any(b.id == 3 for b in c.bodies))
+    assert np.allclose(next(b for b in first.bodies if b.id == 3).positions, p[30] + [1, 1, 0], atol=0.05)
+
+
+class TestBadInput:
+    """Counted, never raised; and good frames after it are answered as if nothing had been."""
+
+    def test_nan_infinity_and_ten_kilometres_are_missing_joints(self) -> None:
+        p = waving(60)
+        bad = p.copy()
+        bad[20, 3], bad[21, 4], bad[22, 5] = np.nan, np.inf, 10_000.0
+        cleaned, pipeline = clean(stream(bad))
+        assert len(cleaned) == 60
+        assert np.linalg.norm(positions(cleaned) - p, axis=-1).max() < 0.15
+        assert pipeline.counters["joints_too_far"] == 1
+        assert cleaned[22].bodies[0].state[5] == JointState.IMPUTED
+
+    def test_a_body_wholly_away_or_wholly_missing_is_not_followed(self) -> None:
+        for value in (np.nan, 10_000.0):
+            cleaned, pipeline = clean(stream(np.full((20, 22, 3), value)))
+            assert all(not c.bodies for c in cleaned)
+            assert pipeline.counters["body_too_little_seen"] == 20
+
+    def test_wrong_counts_and_unknown_skeletons(self) -> None:
+        _, pipeline = clean([
+            raw(1, {1: np.zeros((0, 3))}),
+            raw(2, {1: np.zeros((21, 3))}),
+            raw(3, {1: waving(1)[0]}, skeleton="martian"),
+        ])  # fmt: skip
+        assert pipeline.counters["wrong_joint_count"] == 2
+        assert pipeline.counters["unknown_skeleton"] == 1
+
+    def test_stamps_that_repeat_or_come_late_are_dropped(self) -> None:
+        messages = stream(waving(30))
+        late = [*messages[:10], messages[9], messages[7], *messages[10:]]
+        cleaned, pipeline = clean(late)
+        assert b"".join(map(encode, cleaned)) == b"".join(map(encode, clean(messages)[0]))
+        assert pipeline.counters["stamp_repeated"] == 1
+        assert pipeline.counters["stamp_out_of_order"] == 1
+
+    @pytest.mark.parametrize(("jump_s", "cause"), [(-3600, "stamp_jumped_back"), (10, "stream_gap")])
+    def test_a_jump_of_the_stamps_ends_one_stream_and_starts_another(self, jump_s: int, cause: str) -> None:
+        first, second = stream(waving(30)), stream(waving(30), start_ns=10**18 + PERIOD_NS * 30 + jump_s * 10**9)
+        cleaned, pipeline = clean(first + second)
+        assert [c.stamp_ns for c in cleaned] == [m.stamp_ns for m in first + second]
+        assert b"".join(map(encode, cleaned)) == b"".join(map(encode, clean(first)[0] + clean(second)[0]))
+        assert pipeline.counters[cause] == 1
+
+    def test_the_same_body_twice_in_a_message_counts_once(self) -> None:
+        message = raw(10**18, {1: waving(1)[0]})
+        doubled = dataclasses.replace(message, bodies=message.bodies * 2)
+        cleaned, pipeline = clean([doubled])
+        assert len(cleaned[0].bodies) == 1
+        assert pipeline.counters["body_id_repeated"] == 1
+
+    def test_confidences_that_are_no_numbers(self) -> None:
+        messages = stream(waving(10))
+        messages[5].bodies[0].confidence[:] = [np.nan, np.inf, -np.inf, -1, 2, *[1.0] * 17]
+        cleaned, _ = clean(messages)
+        assert len(cleaned) == 10
+        assert np.isfinite(positions(cleaned)).all()
+
+
+def test_end_of_stream_flushes_and_is_passed_on() -> None:
+    pipeline = PriorPipeline(PriorSettings())
+    messages = stream(waving(10))
+    for message in messages:
+        pipeline.process(message)
+    last = pipeline.process(dataclasses.replace(messages[-1], bodies=[], end_of_stream=True))
+    assert [c.end_of_stream for c in last] == [False] * 4 + [True]
+    assert pipeline.flush() == []
+
+
+@pytest.mark.parametrize("stage", ["gate", "bones", "refine", "fuse"])
+def test_each_stage_can_be_switched_off(stage: str) -> None:
+    cleaned, _ = clean(stream(noisy(60)), **{stage: {"enabled": False}})
+    assert np.isfinite(positions(cleaned)).all()
+    assert len(cleaned) == 60
+
+
+def test_settings_are_read_strictly() -> None:
+    assert PriorSettings.from_dict({"delay": 2, "gate": {"jump": 1}}).gate.jump == 1.0
+    with pytest.raises(ValueError, match="did you mean 'delay'"):
+        PriorSettings.from_dict({"dellay": 2})
+    with pytest.raises(ValueError, match=r"prior\.gate"):
+        PriorSettings.from_dict({"gate": {"jmup": 2.0}})
+    with pytest.raises(ValueError, match="expected int"):
+        PriorSettings.from_dict({"delay": "four"})
+    with pytest.raises(ValueError, match="expected float"):
+        PriorSettings.from_dict({"timeout": True})
+
+
+def test_a_body_wholly_hidden_for_a_moment_stays_about_where_it_was() -> None:
+    truth = waving(60) + [3.0, -2.0, 0.0]
+    seen = truth.copy()
+    seen[30:42] = np.nan
+    cleaned, _ = clean(stream(seen))
+    error = np.linalg.norm(positions(cleaned) - truth[: len(cleaned)], axis=-1)
+    assert error[30:42].max() < 0.4

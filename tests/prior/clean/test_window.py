@@ -1,0 +1,47 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from steadypose.prior.body.skeleton import REST_OFFSETS
+from steadypose.prior.clean.frame import Ring, Window
+
+
+@given(st.integers(1, 9), st.lists(st.floats(-9, 9), max_size=40))
+def test_a_ring_is_the_tail_of_what_was_pushed(frames: int, values: list[float]) -> None:
+    ring = Ring(frames, (2,))
+    for value in values:
+        ring.push(np.array([value, -value]))
+    tail = ([np.nan] * frames + values)[-frames:]
+    assert np.array_equal(ring.all[:, 0], tail, equal_nan=True)
+    assert np.array_equal(ring.newest, ring.all[-1], equal_nan=True)
+
+
+def test_a_ring_never_allocates() -> None:
+    ring = Ring(4, (3,))
+    where = ring._data.ctypes.data
+    for k in range(20):
+        ring.push(np.full(3, k))
+        assert np.shares_memory(ring.all, ring._data)
+    assert ring._data.ctypes.data == where
+
+
+def test_a_frame_amended_stays_so_as_the_ring_turns() -> None:
+    ring = Ring(3, (2, 1))
+    for k in range(5):
+        ring.push(np.full((2, 1), float(k)))
+    ring.amend(1, 0, np.array([9.0]))
+    assert ring.all[:, :, 0].tolist() == [[2.0, 2.0], [9.0, 3.0], [4.0, 4.0]]
+    ring.push(np.full((2, 1), 5.0))
+    assert ring.all[:, :, 0].tolist() == [[9.0, 3.0], [4.0, 4.0], [5.0, 5.0]]
+
+
+def test_clearing_a_slot_leaves_the_others() -> None:
+    window = Window(4, 3)
+    window.positions.push(np.ones((3, 22, 3)))
+    window.offsets[:] = 1.0
+    window.present[:] = True
+    window.clear(np.array([False, True, False]))
+    assert np.isnan(window.positions.newest[1]).all()
+    assert (window.positions.newest[[0, 2]] == 1).all()
+    assert window.present.tolist() == [True, False, True]
+    assert np.array_equal(window.offsets[1], REST_OFFSETS)

@@ -1,0 +1,190 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import waving
+
+from steadypose.prior.body.inverse_kinematics import solve_rotations
+from steadypose.prior.body.kinematics import forward_kinematics
+from steadypose.prior.body.skeleton import REST_OFFSETS
+from steadypose.prior.clean.refine import rotations_of
+from steadypose.prior.models.hmvae.inference import LiveHMVAE
+from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig, Posterior, from_6d, to_6d
+from steadypose.prior.models.hmvae.train import train_hmvae
+from steadypose.prior.models.layers.skeleton_conv import SkeletonConv
+from steadypose.prior.models.weights_io import WEIGHTS, load_weights
+from steadypose.prior.motion.dataset import (
+    MotionSet,
+    mirror_offsets,
+    mirror_rotations,
+    remove_heading,
+    yaw_rotation,
+)
+
+
+def random_rotations(*shape: int) -> torch.Tensor:
+    count = int(np.prod(shape))
+    return torch.from_numpy(Rotation.random(count, rng=np.random.default_rng(0)).as_matrix()).reshape(*shape, 3, 3)
+
+
+def test_six_numbers_are_the_first_two_columns_and_back() -> None:
+    rotations = random_rotations(5, 22)
+    assert torch.equal(to_6d(rotations)[0, 0], torch.cat([rotations[0, 0, :, 0], rotations[0, 0, :, 1]]))
+    assert torch.allclose(from_6d(to_6d(rotations)), rotations)
+    x = to_6d(rotations) * 3 + 0.05
+    turned = random_rotations(5).numpy()
+    found = rotations_of(x.float().numpy()[:, None], turned)[0]
+    expected = from_6d(x).numpy()
+    np.testing.assert_allclose(found[:, 1:], expected[:, 1:], atol=1e-5)
+    np.testing.assert_allclose(found[:, 0], turned @ expected[:, 0], atol=1e-5)
+    stretched = from_6d(x)
+    assert torch.allclose(stretched.mT @ stretched, torch.eye(3, dtype=torch.float64).expand_as(stretched), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("config", "local", "deep"),
+    [
+        (HMVAEConfig(), (2, 12, 6), (2, 7, 6)),
+        (HMVAEConfig(64, 15, (2, 2, 2, 2), 12, 24), (2, 12, 12), (2, 7, 24)),
+    ],
+)
+def test_the_papers_two_window_lengths_have_the_official_latents(config, local, deep) -> None:
+    model = HMVAE(config)
+    x = torch.randn(2, config.window, 22, 6)
+    posterior = model.encode(x)
+    assert posterior.local_mean.shape == local
+    assert posterior.global_mean.shape == deep
+    assert model.decode(*posterior.sample()).shape == x.shape
+
+
+@pytest.mark.parametrize("config", [HMVAEConfig(), HMVAEConfig(64, 15, (2, 2, 2, 2), 12, 24)])
+@pytest.mark.parametrize("bodies", [1, 3])
+def test_the_live_model_reconstructs_as_the_trained_one(config, bodies) -> None:
+    model = HMVAE(config).eval()
+    for parameter in model.parameters():  # biases start at zero, where a slip in folding them would not show
+        torch.nn.init.normal_(parameter, std=0.05)
+    x = torch.randn(bodies, config.window, 22, 6)
+    for module in model.modules():
+        if isinstance(module, SkeletonConv):
+            module.weight.data *= module.mask
+    found = LiveHMVAE(model)(x.numpy())
+    np.testing.assert_allclose(found, model.reconstruct(x).detach().numpy(), rtol=1e-4, atol=1e-4)
+
+
+def test_a_window_that_the_strides_do_not_divide_is_refused() -> None:
+    with pytest.raises(ValueError, match="cannot be strided"):
+        HMVAE(HMVAEConfig(window=6))
+
+
+def test_kl_agrees_with_torch_and_is_summed_over_dimensions_only() -> None:
+    mean, log_var = torch.randn(3, 7, 6), torch.randn(3, 7, 6)
+    zero = torch.zeros(3, 12, 6)
+    local, deep = Posterior(zero, zero, mean, log_var).kl()
+    normal = torch.distributions.Normal(mean, (0.5 * log_var).exp())
+    reference = torch.distributions.kl_divergence(normal, torch.distributions.Normal(0.0, 1.0)).sum(-1).mean()
+    assert local == 0
+    assert torch.allclose(deep, reference, atol=1e-5)
+
+
+def test_mirroring_rotations_mirrors_positions() -> None:
+    rotations = random_rotations(4, 22)
+    offsets = torch.from_numpy(REST_OFFSETS * np.random.default_rng(0).uniform(0.8, 1.2, (22, 1)))
+    plain, _ = forward_kinematics(rotations, offsets)
+    mirrored, _ = forward_kinematics(mirror_rotations(rotations), mirror_offsets(offsets))
+    assert torch.allclose(mirrored, mirror_offsets(plain))
+
+
+def test_heading_is_removed_and_given_back() -> None:
+    rotations = random_rotations(3, 8, 22)
+    turned, back = remove_heading(rotations, 3)
+    left = turned[:, 3, 0, :, 1]
+    assert torch.allclose(torch.atan2(-left[:, 0], left[:, 1]), torch.zeros(3, dtype=torch.float64), atol=1e-9)
+    assert torch.allclose(back[:, None] @ turned[:, :, 0], rotations[:, :, 0])
+    spun = rotations.clone()
+    spun[:, :, 0] = yaw_rotation(torch.tensor([1.0], dtype=torch.float64)) @ spun[:, :, 0]
+    assert torch.allclose(remove_heading(spun, 3)[0], turned)
+
+
+def prepared(path: Path, clips: int = 4) -> Path:
+    """A file in the layout of `steadypose prepare`, of synthetic motion."""
+    positions = np.concatenate([waving(80, speed=1 + 0.1 * k) for k in range(clips)])
+    rotations = solve_rotations(positions, REST_OFFSETS)
+    np.savez(
+        path,
+        positions=positions.astype(np.float32),
+        rotations=Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(-1, 22, 4).astype(np.float32),
+        offsets=np.tile(REST_OFFSETS, (clips, 1, 1)).astype(np.float32),
+        contacts=np.zeros((80 * clips, 8), dtype=bool),
+        clip_start=np.arange(clips + 1) * 80,
+        split=np.array(["train"] * (clips - 1) + ["val"]),
+        set=np.array(["default"] * clips),
+        subject=np.array([f"person {k}" for k in range(clips)]),
+        action=np.array(["waving"] * clips),
+    )
+    return path
+
+
+def test_sampled_windows_stay_inside_their_clips(tmp_path: Path) -> None:
+    motion = MotionSet.load(prepared(tmp_path / "m.npz"), "default", "train")
+    rows = motion.sample(500, 8, (1, 2, 3), np.random.default_rng(0))
+    assert rows.shape == (500, 8)
+    assert (rows // 80 == rows[:, :1] // 80).all()
+    assert set(np.unique(np.diff(rows, axis=1))) == {1, 2, 3}
+    assert len(motion.all_windows(8, 1)) == 3 * 73
+
+
+def test_a_missing_split_and_a_missing_file_are_said(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="steadypose prepare"):
+        MotionSet.load(tmp_path / "none.npz", "default", "train")
+    with pytest.raises(ValueError, match="test"):
+        MotionSet.load(prepared(tmp_path / "m.npz"), "default", "test")
+    with pytest.raises(ValueError, match="expected one of default, research, got 'kinect_v2'"):
+        MotionSet.load(prepared(tmp_path / "m.npz"), "kinect_v2", "train")
+
+
+def test_training_resumes_where_it_was_killed_and_ends_the_same(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("steadypose.prior.models.weights_io.WEIGHTS", tmp_path / "weights")
+    data = prepared(tmp_path / "m.npz")
+    whole = train_hmvae(data, tmp_path / "a", iterations=6, batch=4).read_bytes()
+
+    steps = iter(range(100))
+    original = torch.optim.Adam.step
+
+    def dies(*args, **keywords):
+        if next(steps) == 4:
+            raise KeyboardInterrupt
+        return original(*args, **keywords)
+
+    monkeypatch.setattr(torch.optim.Adam, "step", dies)
+    with pytest.raises(KeyboardInterrupt):
+        train_hmvae(data, tmp_path / "b", iterations=6, batch=4)
+    monkeypatch.setattr(torch.optim.Adam, "step", original)
+    assert train_hmvae(data, tmp_path / "b", iterations=6, batch=4).read_bytes() == whole
+    assert [c["step"] for c in json.loads((tmp_path / "b/hmvae-default/curves.json").read_text())] == [1, 2, 3, 4, 5, 6]
+    assert (tmp_path / "b/hmvae-default/curves.png").stat().st_size > 1000
+
+
+def test_unknown_weights_name_those_there_are() -> None:
+    with pytest.raises(FileNotFoundError, match="default"):
+        load_weights("nonsense", "hmvae")
+
+
+def test_the_weights_that_ship_reconstruct_motion_they_never_saw() -> None:
+    """Golden figure: a regression of the weights, the layers or the solver moves it."""
+    state, config = load_weights("default", "hmvae")
+    model = HMVAE(HMVAEConfig.from_dict(config)).eval()
+    model.load_state_dict(state)
+    rotations = torch.from_numpy(solve_rotations(waving(120), REST_OFFSETS)).float()
+    windows, _ = remove_heading(rotations.unfold(0, 8, 1).movedim(-1, 1), 3)
+    with torch.inference_mode():
+        decoded = from_6d(model.reconstruct(to_6d(windows)))
+    offsets = torch.from_numpy(REST_OFFSETS).float()
+    error = forward_kinematics(decoded, offsets)[0] - forward_kinematics(windows, offsets)[0]
+    assert 1000 * error.norm(dim=-1)[:, 3].mean().item() == pytest.approx(GOLDEN_CENTRE_MM, abs=1.0)
+    assert (WEIGHTS / "hmvae-default.md").is_file()
+
+
+GOLDEN_CENTRE_MM = 33.3

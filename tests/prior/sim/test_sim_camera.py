@@ -1,0 +1,215 @@
+"""The simulated camera: who is hidden, who is in view, and where the joints are said to be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from steadypose.prior.body.skeleton import CANONICAL, REST_OFFSETS, J, get_skeleton, to_canonical
+from steadypose.prior.sim.camera import FRAME_ID, Camera, film, segment_gap, sight
+from steadypose.prior.sim.gait import Stand, Turn, Walk, plan
+from steadypose.prior.sim.motion import Intent, Motion, perform
+from steadypose.prior.sim.noise import NoiseModel
+from steadypose.prior.sim.scripts import SCRIPTS
+from steadypose.prior.sim.sensors import mount
+
+SILENT = replace(
+    NoiseModel.load(), offset=np.zeros((22, 3)), bias=np.zeros((22, 3)), fast=np.zeros((22, 3)), jump_rate=np.zeros(22)
+)
+LEVEL = Camera((0.0, 0.0, 1.2), (3.0, 0.0, 1.2), skeleton="smpl22", drop_rate=0.0)
+
+
+@cache
+def waving() -> Motion:
+    (motion,) = SCRIPTS["wave_hidden_arm"](np.random.default_rng(5))
+    return motion
+
+
+def standing(x: float, y: float, seconds: float = 3.0, facing: float = np.pi) -> Motion:
+    return perform(Intent(plan((x, y), facing, [Stand(seconds)])), REST_OFFSETS, np.random.default_rng(0))
+
+
+def filmed(people: list[Motion], camera: Camera = LEVEL, noise: NoiseModel = SILENT, seed: int = 0) -> list:
+    return film(people, camera, noise, np.random.default_rng(seed), "test", 0)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Line of sight
+
+
+def test_a_hand_behind_the_back_is_hidden_and_one_beside_the_head_is_not() -> None:
+    before, behind = waving().at(np.array([0.2])), waving().at(np.array([5.0]))
+    eye = np.array([0.0, 0.0, 1.4])
+    assert sight(before.positions, [before], eye).hidden[0, J["right_wrist"]] < 0.1
+    hidden = sight(behind.positions, [behind], eye).hidden[0]
+    assert hidden[J["right_wrist"]] > 0.9
+    assert hidden[J["left_wrist"]] < 0.1
+    assert hidden[J["head"]] < 0.1
+
+
+def test_from_behind_the_same_hand_is_in_plain_sight() -> None:
+    behind = waving().at(np.array([5.0]))
+    assert sight(behind.positions, [behind], np.array([5.0, 0.0, 1.4])).hidden[0, J["right_wrist"]] < 0.1
+
+
+def test_a_body_hides_the_one_behind_it_and_not_the_other_way_about() -> None:
+    near, far = (standing(x, 0.0).at(np.array([1.0])) for x in (2.0, 3.0))
+    eye = np.array([0.0, 0.0, 1.2])
+    assert sight(far.positions, [near, far], eye).hidden[0, J["spine2"]] > 0.9
+    assert sight(near.positions, [near, far], eye).hidden[0, J["spine2"]] < 0.1
+    depth = sight(far.positions, [near, far], eye).in_front[0, J["spine2"]]
+    assert 1.7 < depth < 2.0, "the surface of the nearer body"
+
+
+points = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
+
+
+@given(points, points, points, points)
+def test_the_gap_between_segments_is_the_least_distance(
+    p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray
+) -> None:
+    gap, along = segment_gap(p, q, a, b)
+    grid = np.linspace(0, 1, 81)
+    on_first = p + grid[:, None] * (q - p)
+    on_second = a + grid[:, None] * (b - a)
+    brute = np.linalg.norm(on_first[:, None] - on_second[None], axis=-1).min()
+    coarse = (np.linalg.norm(q - p) + np.linalg.norm(b - a)) / 80
+    assert gap <= brute + 1e-6
+    assert gap >= brute - coarse
+    assert 0 <= along <= 1
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Frames
+
+
+def test_joints_are_in_the_optical_frame_of_the_pose_that_is_told() -> None:
+    camera = replace(LEVEL, position=(0.2, -0.4, 1.7), look_at=(2.5, 0.1, 0.8), roll=0.1)
+    motion = standing(2.5, 0.0)
+    frames = filmed([motion], camera)
+    frame = frames[len(frames) // 2]
+    assert frame.frame_id == FRAME_ID
+    body = frame.bodies[0].positions.astype(float)
+    assert (body[:, 2] > 1.0).all(), "z is forward"
+    assert body[J["head"], 1] < body[J["pelvis"], 1], "y is down"
+    assert body[J["left_hip"], 0] > body[J["right_hip"], 0], "the left of who faces the camera is on the right"
+    world = Rotation.from_quat(frame.sensor_pose.orientation).apply(body) + frame.sensor_pose.position
+    truth = motion.at(np.array([frame.stamp_ns / 1e9])).positions[0]
+    assert np.nanmedian(np.linalg.norm(world - truth, axis=-1)) < 1e-5
+
+
+def test_an_uncalibrated_camera_tells_only_which_way_is_up() -> None:
+    camera = replace(LEVEL, position=(1.0, 2.0, 1.5), look_at=(2.0, 4.0, 1.0), roll=0.2, calibrated=False)
+    pose = camera.told_pose()
+    np.testing.assert_array_equal(pose.position, np.zeros(3))
+    told = Rotation.from_quat(pose.orientation).as_matrix()
+    np.testing.assert_allclose(told[2], camera.orientation[2], atol=1e-12)
+    assert told[1, 2] == pytest.approx(0.0, abs=1e-12), "it says nothing of its heading"
+
+
+def test_times_jitter_about_the_rate_and_frames_are_lost() -> None:
+    camera = replace(LEVEL, fps=24.0, stamp_jitter=0.005, drop_rate=0.05)
+    times = camera.capture_times(400.0, np.random.default_rng(0))
+    steps = np.diff(times)
+    assert steps.min() > 0
+    assert np.median(steps) == pytest.approx(1 / 24, rel=0.05)
+    assert 0.02 < 1 - len(times) / (399.8 * 24) < 0.09
+    assert steps.std() > 0.005
+
+
+def test_who_leaves_the_view_is_gone_and_comes_back_as_somebody_new() -> None:
+    out_and_in = [Stand(0.5), Walk([(2.6, 2.6)], 1.2), Turn(np.pi, 2.8), Walk([(2.6, 0.0)], 1.2), Stand(0.5)]
+    motion = perform(Intent(plan((2.6, 0.0), np.pi / 2, out_and_in)), REST_OFFSETS, np.random.default_rng(0))
+    camera = replace(LEVEL, skeleton="blazepose33")
+    frames = filmed([motion], camera, NoiseModel.load())
+    there = np.array([len(f.bodies) for f in frames])
+    changes = np.flatnonzero(np.diff(there))
+    assert there[0] == there[-1] == 1
+    assert len(changes) == 2, "out and in"
+    assert [frames[k].bodies[0].id for k in (0, -1)] == [1, 2]
+    for f in frames:
+        for body in f.bodies:
+            seen = np.isfinite(body.positions).all(axis=1)
+            assert ((body.confidence > 0) == seen).all()
+            aside, _, ahead = body.positions[seen].T
+            assert np.median(np.abs(aside / ahead)) < np.tan(camera.field_of_view[0] / 2)
+
+
+def test_parts_out_of_view_are_lost_one_by_one() -> None:
+    frames = filmed([standing(1.2, 0.0)], replace(LEVEL, position=(0.0, 0.0, 1.4), look_at=(3.0, 0.0, 1.4)))
+    for f in frames[5:]:
+        seen = np.isfinite(f.bodies[0].positions).all(axis=1)
+        assert seen[J["neck"]]
+        assert not seen[[J["left_ankle"], J["right_ankle"], J["left_foot"]]].any()
+
+
+def test_who_is_wholly_hidden_is_not_reported() -> None:
+    near, far = standing(1.5, 0.0), standing(2.6, 0.0)
+    frames = filmed([near, far])
+    assert all(len(f.bodies) == 1 for f in frames)
+
+
+def test_a_hidden_hand_is_lost_or_less_sure() -> None:
+    frames = filmed([waving()], LEVEL, NoiseModel.load())
+    at = np.array([f.stamp_ns / 1e9 for f in frames])
+    hand = J["right_wrist"]
+    hidden = [f.bodies[0] for f, t in zip(frames, at, strict=True) if 3.0 < t < 7.0]
+    shown = [f.bodies[0] for f, t in zip(frames, at, strict=True) if t < 0.6]
+    sure = [np.mean([b.confidence[hand] for b in bodies]) for bodies in (hidden, shown)]
+    assert sure[0] < 0.5 * sure[1]
+
+
+def test_distance_makes_the_quick_noise_worse() -> None:
+    noise = replace(NoiseModel.load(), jump_rate=np.zeros(22), session_spread=0.0)
+
+    def shake(x: float) -> float:
+        bodies = [f.bodies[0].positions for f in filmed([standing(x, 0.0)], LEVEL, noise) if f.bodies]
+        return float(np.nanmedian(np.abs(np.diff(np.array(bodies), 2, axis=0))))
+
+    assert shake(4.0) > 1.5 * shake(2.0)
+
+
+def test_the_same_seed_films_the_same() -> None:
+    first, second, other = (filmed([waving()], LEVEL, NoiseModel.load(), seed) for seed in (3, 3, 4))
+    assert first == second
+    assert first != other
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Sensors
+
+
+@pytest.mark.parametrize("name", ["smpl22", "coco17", "blazepose33", "kinect22"])
+def test_a_sensors_joints_map_back_to_the_canonical_ones(name: str) -> None:
+    skeleton, on_body = get_skeleton(name), mount(name)
+    body = standing(2.0, 0.0).at(np.array([1.0]))
+    sensed = on_body.positions(body.positions, body.orientations, 1.0)
+    canonical, _ = to_canonical(skeleton, sensed)
+    off = np.linalg.norm(canonical - body.positions, axis=-1)[0]
+    limbs = [
+        j for j in range(22) if CANONICAL.joints[j].endswith(("hip", "knee", "ankle", "shoulder", "elbow", "wrist"))
+    ]
+    assert off[limbs].max() < 1e-9
+    assert np.nanmax(off) < 0.13, "what is the mean of others lies near"
+
+
+@pytest.mark.parametrize("name", ["coco17", "blazepose33", "kinect22"])
+def test_counterparts_are_the_same_joint_of_the_other_side(name: str) -> None:
+    skeleton, on_body = get_skeleton(name), mount(name)
+    np.testing.assert_array_equal(on_body.mirror[on_body.mirror], np.arange(len(skeleton.joints)))
+    for joint, other in zip(skeleton.joints, (skeleton.joints[m] for m in on_body.mirror), strict=True):
+        swapped = joint.replace("left", "#").replace("right", "left").replace("#", "right")
+        if name == "kinect22" and joint not in ("Waist", "Spine", "Chest", "Neck", "Head", "HeadTip"):
+            swapped = ("R" if joint[0] == "L" else "L") + joint[1:]
+        assert other == swapped
+
+
+def test_a_sensor_that_cannot_be_placed_is_refused() -> None:
+    with pytest.raises(ValueError, match="cannot simulate skeleton 'zed38'"):
+        mount("zed38")

@@ -1,0 +1,212 @@
+"""The noise model: what its parameters promise, and that it is like the Kinect it was fitted to."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+
+from steadypose.prior.body.skeleton import MIRROR, J
+from steadypose.prior.sim.fit import Clip, align, errors, statistics
+from steadypose.prior.sim.fit import simulate as simulate_clips
+from steadypose.prior.sim.noise import (
+    KINECT_NOISE,
+    SWAP_GROUPS,
+    NoiseModel,
+    confidence_of,
+    corrupt,
+    draw_errors,
+    exchange_sides,
+    ray_axes,
+    swapped,
+    travelled,
+)
+from steadypose.prior.sim.scripts import SCRIPTS
+
+MODEL = NoiseModel.load()
+NO_JUMPS = replace(MODEL, jump_rate=np.zeros(22))
+
+
+def evenly(seconds: float, fps: float, speed: float = 0.0, batch: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Travel (batch, T, 22) and dt (T,) of joints that all move at one speed."""
+    frames = round(seconds * fps)
+    return np.full((batch, frames, 22), speed / fps), np.full(frames, 1 / fps)
+
+
+def test_the_same_seed_draws_the_same_noise() -> None:
+    motion = SCRIPTS["reach"](np.random.default_rng(0))[0].positions[::4]
+    first, second, other = (corrupt(motion, np.random.default_rng(s), MODEL) for s in (1, 1, 2))
+    np.testing.assert_array_equal(first[0], second[0])
+    np.testing.assert_array_equal(first[1], second[1])
+    assert not np.array_equal(first[0], other[0])
+
+
+def test_a_still_joint_keeps_its_bias_and_a_moving_one_loses_it() -> None:
+    still, moving = (
+        draw_errors(*evenly(6.0, 30.0, speed, batch=64), np.random.default_rng(0), NO_JUMPS).steady
+        for speed in (0.0, 0.5)
+    )
+    np.testing.assert_allclose(still[:, -1], still[:, 30], atol=0.002)
+    changed = np.median(np.abs(moving[:, -1] - moving[:, 30]))
+    assert changed > 0.005
+
+
+@pytest.mark.parametrize("fps", [15.0, 60.0])
+def test_noise_is_a_matter_of_seconds_not_of_frames(fps: float) -> None:
+    def spread(rate: float) -> tuple[float, float]:
+        drawn = draw_errors(*evenly(4.0, rate, 0.3, batch=300), np.random.default_rng(0), MODEL)
+        return float(np.median(np.abs(drawn.quick))), float(np.median(np.abs(drawn.steady)))
+
+    assert spread(fps) == pytest.approx(spread(30.0), rel=0.15)
+
+
+def test_fast_joints_are_noisier() -> None:
+    slow, fast = (
+        np.median(np.abs(draw_errors(*evenly(2.0, 30.0, v, batch=100), np.random.default_rng(0), NO_JUMPS).quick))
+        for v in (0.02, 0.8)
+    )
+    assert fast > 3 * slow
+
+
+def test_jumps_come_as_often_as_said_and_end() -> None:
+    quiet = replace(
+        MODEL, fast=np.zeros((22, 3)), offset=np.zeros((22, 3)), bias=np.zeros((22, 3)), session_spread=0.0,
+        jump_rate=np.full(22, 0.2),
+    )  # fmt: skip
+    drawn = draw_errors(*evenly(60.0, 30.0, batch=4), np.random.default_rng(0), quiet).quick
+    displaced = np.linalg.norm(drawn, axis=-1)
+    begins = ((displaced[:, 1:] > 0) & (displaced[:, :-1] != displaced[:, 1:])).sum() / (4 * 22 * 60.0)
+    assert begins == pytest.approx(0.2, rel=0.1)
+    assert displaced[displaced > 0].min() >= quiet.jump_least * (1 - 1e-9)
+    mean = quiet.jump_short_share * quiet.jump_short + (1 - quiet.jump_short_share) * quiet.jump_long
+    assert (displaced > 0).mean() == pytest.approx(0.2 * mean, rel=0.25)
+
+
+def test_noise_has_heavy_tails_and_memory() -> None:
+    motion = np.stack([SCRIPTS["reach"](np.random.default_rng(s))[0].positions[::4] for s in range(2)])
+    noisy, _ = corrupt(motion, np.random.default_rng(3), MODEL)
+    error = noisy - motion
+    size = np.linalg.norm(error, axis=-1)
+    assert 0.015 < np.median(size) < 0.06
+    assert 2.5 < np.percentile(size, 95) / np.median(size) < 7.0, "1.6 for a Gaussian"
+    centred = error - error.mean(axis=1, keepdims=True)
+    assert (centred[:, 1:] * centred[:, :-1]).sum() / (centred**2).sum() > 0.5
+
+
+def test_confidence_tells_something_but_not_all() -> None:
+    motion = SCRIPTS["walk_turn"](np.random.default_rng(0))[0].positions[::4]
+    noisy, confidence = corrupt(motion, np.random.default_rng(0), MODEL)
+    assert confidence.min() >= 0
+    assert confidence.max() <= 1
+    relation = spearmanr(confidence.ravel(), np.linalg.norm(noisy - motion, axis=-1).ravel()).statistic  # type: ignore[union-attr]
+    assert -0.85 < relation < -0.25
+    small, large = (confidence_of(np.full(1000, s), np.random.default_rng(0)).mean() for s in (0.01, 0.3))
+    assert small > 0.8
+    assert large < 0.2
+
+
+def test_windows_may_come_in_any_batch_and_as_short_as_one_frame() -> None:
+    for shape in ((1, 22, 3), (8, 22, 3), (2, 3, 8, 22, 3)):
+        noisy, confidence = corrupt(np.zeros(shape), np.random.default_rng(0), MODEL)
+        assert noisy.shape == shape
+        assert confidence.shape == shape[:-1]
+        assert np.isfinite(noisy).all()
+
+
+def test_swaps_exchange_whole_limbs_for_a_moment() -> None:
+    positions = np.random.default_rng(0).normal(size=(900, 22, 3))
+    when = swapped(np.full(900, 1 / 30), (), np.random.default_rng(1), temptation=20.0)
+    seen = exchange_sides(positions, when)
+    for group, joints in SWAP_GROUPS.items():
+        active = when[group]
+        assert 0 < active.mean() < 0.3
+        for joint in joints:
+            np.testing.assert_array_equal(seen[active, joint], positions[active, MIRROR[joint]])
+            np.testing.assert_array_equal(seen[~active, joint], positions[~active, joint])
+    np.testing.assert_array_equal(seen[:, J["head"]], positions[:, J["head"]])
+
+
+def test_ray_axes_are_right_handed() -> None:
+    rays = np.random.default_rng(0).normal(size=(50, 3))
+    axes = ray_axes(rays)
+    np.testing.assert_allclose(axes @ np.swapaxes(axes, -1, -2), np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-12)
+    np.testing.assert_allclose(ray_axes(np.array([1.0, 0.0, 0.0])), [[1, 0, 0], [0, -1, 0], [0, 0, 1]], atol=1e-12)
+
+
+def test_the_fit_looks_like_the_kinect_it_was_fitted_to() -> None:
+    figures = json.loads(KINECT_NOISE.read_text())
+    assert figures["subjects"] == ["s01", "s02", "s03", "s04", "s05", "s06"]
+    real, simulated = figures["metres"]["kinect"], figures["metres"]["simulated"]
+    for name in ("median", "p95", "second_difference_mean", "second_difference_median"):
+        assert simulated[name] == pytest.approx(real[name], rel=0.2), name
+    for name in ("worst_jump_p50", "worst_jump_p90", "worst_jump_p99"):
+        assert 0.5 < simulated[name] / real[name] < 1.8, name
+    assert simulated["autocorrelation_lag1"] == pytest.approx(real["autocorrelation_lag1"], abs=0.05)
+
+
+def test_a_file_of_another_making_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "noise.json"
+    MODEL.save(path, {"what": "a copy"})
+    again = NoiseModel.load(path)
+    np.testing.assert_allclose(again.fast, MODEL.fast)
+    content = json.loads(path.read_text())
+    del content["parameters"]["fast"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="expected parameters"):
+        NoiseModel.load(path)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# The fit's own tools, on motion of our own
+
+
+def own_clips(count: int) -> list[Clip]:
+    clips = []
+    for seed in range(count):
+        truth = SCRIPTS["walk_turn"](np.random.default_rng(seed))[0].positions[::4][:300] - [0.0, 0.0, 1.0]
+        clips.append(Clip(30.0, truth, truth))
+    return clips
+
+
+def test_alignment_is_not_turned_by_wild_joints() -> None:
+    rng = np.random.default_rng(0)
+    fixed = rng.normal(size=(400, 3))
+    angle = 0.7
+    rotation = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    moving = (fixed - [1.0, 2.0, 3.0]) @ rotation
+    moving[::10] += rng.normal(0, 1.0, moving[::10].shape)
+    moving[5] = np.nan
+    found, shift = align(moving, fixed)
+    np.testing.assert_allclose(found, rotation, atol=0.01)
+    np.testing.assert_allclose(shift, [1.0, 2.0, 3.0], atol=0.02)
+
+
+def test_statistics_follow_the_parameters_they_stand_for() -> None:
+    clips = own_clips(3)
+    base = statistics(simulate_clips(clips, NO_JUMPS, np.random.default_rng(0)))
+    louder = statistics(simulate_clips(clips, replace(NO_JUMPS, fast=2 * MODEL.fast), np.random.default_rng(0)))
+    farther = statistics(
+        simulate_clips(clips, replace(NO_JUMPS, offset=3 * MODEL.offset, bias=3 * MODEL.bias), np.random.default_rng(0))
+    )
+    assert 1.2 < (louder.fast / base.fast).mean() < 2.1
+    assert (louder.total / base.total).mean() < 1.2
+    assert (farther.total / base.total).mean() > 1.8
+
+
+def test_errors_are_what_was_added_but_for_the_alignment() -> None:
+    clip = own_clips(1)[0]
+    error = np.zeros(clip.truth.shape)
+    error[:, J["left_wrist"]] = [0.0, 0.0, 0.1]
+    measured = errors(replace(clip, kinect=clip.truth + error))
+    assert np.linalg.norm(measured, axis=-1).max() == pytest.approx(0.1, abs=0.03)
+    assert np.median(np.linalg.norm(measured, axis=-1)) < 0.02
+
+
+def test_travel_counts_from_frame_to_frame() -> None:
+    positions = np.zeros((3, 22, 3))
+    positions[1:, :, 0], positions[2, :, 1] = 0.3, 0.4
+    np.testing.assert_allclose(travelled(positions)[:, 0], [0.3, 0.3, 0.4])

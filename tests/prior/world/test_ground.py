@@ -1,0 +1,71 @@
+"""The floor found from standing feet."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from steadypose.prior.world.ground import GUESS_SIGMA, PATIENCE_S, Ground
+
+DT = 1 / 30
+
+
+def stand(ground: Ground, height: float, seconds: float, noise: float = 0.01, seed: int = 0) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(round(seconds / DT)):
+        ground.observe(height + noise * rng.normal(), 0.02, DT)
+
+
+def test_calibrated_floor_is_at_zero_from_the_start():
+    ground = Ground(calibrated=True)
+    assert ground.known
+    np.testing.assert_array_equal(ground.plane, [0, 0, 1, 0])
+
+
+def test_uncalibrated_floor_is_unknown_then_found():
+    ground = Ground(calibrated=False)
+    assert not ground.known
+    ground.guess(-1.3)
+    assert ground.sigma == pytest.approx(GUESS_SIGMA)
+    stand(ground, -1.2, seconds=10)
+    assert ground.height == pytest.approx(-1.2, abs=0.01)
+    assert ground.sigma < 0.01
+    np.testing.assert_allclose(ground.plane, [0, 0, 1, -ground.height])
+
+
+def test_guesses_do_not_move_a_known_floor():
+    ground = Ground(calibrated=True)
+    ground.guess(-1.0)
+    assert ground.height == 0.0
+
+
+def test_once_sure_it_is_slow():
+    ground = Ground(calibrated=False)
+    stand(ground, 0.0, seconds=20)
+    before = ground.height
+    stand(ground, 0.04, seconds=1)
+    assert 0 < ground.height - before < 0.01
+
+
+def test_a_step_is_not_the_floor():
+    ground = Ground(calibrated=False)
+    stand(ground, 0.0, seconds=10)
+    stand(ground, 0.2, seconds=0.8 * PATIENCE_S)
+    assert ground.height == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_a_floor_that_nobody_touches_is_given_up_unless_calibrated(calibrated: bool):
+    ground = Ground(calibrated)
+    stand(ground, 0.0, seconds=10)
+    stand(ground, 0.3, seconds=PATIENCE_S + 10)
+    assert ground.height == pytest.approx(0.0 if calibrated else 0.3, abs=0.02)
+
+
+def test_feet_under_the_floor_are_believed_in_time_but_not_at_once():
+    ground = Ground(calibrated=False)
+    stand(ground, 0.0, seconds=20)
+    ground.observe(-0.2, 0.02, DT)
+    assert abs(ground.height) < 0.03
+    stand(ground, -0.2, seconds=4)
+    assert ground.height == pytest.approx(-0.2, abs=0.02)
