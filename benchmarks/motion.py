@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from steadypose.prior.clean.frame import FPS
 from steadypose.prior.motion.dataset import MotionSet
 from steadypose.prior.sim.motion import Motion
 from steadypose.prior.sim.scripts import SCRIPTS
+from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 

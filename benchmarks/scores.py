@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from steadypose.benchmarks.metrics import acceleration_error, bootstrap, length_variation, position_error, procrustes
 from steadypose.benchmarks.results import Table
 from steadypose.prior.body.skeleton import JOINTS, PARENTS
-from steadypose.prior.clean.frame import FPS
+from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
 from steadypose.benchmarks.peers.kalman import fixed_lag
-from steadypose.prior.clean.frame import FPS
 from steadypose.prior.timing.fixed_lag import OneEuroFilter
+from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 

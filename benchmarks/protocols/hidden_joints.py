@@ -18,7 +18,7 @@ from steadypose.benchmarks.corruption import arm_behind, below, bursts, gaussian
 from steadypose.benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import pivot
-from steadypose.prior.clean.frame import FPS
+from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 

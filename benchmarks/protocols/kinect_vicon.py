@@ -40,9 +40,9 @@ from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.tuning import Tuned, loss, search
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.skeleton import JOINTS, KINECT22, MIRROR, J, to_canonical
-from steadypose.prior.clean.frame import FPS
 from steadypose.prior.clean.pipeline import PriorSettings
 from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
+from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.peers.filters import OFFLINE, PEERS, Peer, missing, raw
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import figures, score
-from steadypose.prior.clean.frame import FPS
+from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
 from steadypose.prior.body.skeleton import CANONICAL, SKELETONS, finite_joints, to_canonical
-from steadypose.prior.clean.frame import FPS
+from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 

@@ -9,10 +9,11 @@ import torch
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.clean.frame import Ring, Window
+from steadypose.prior.clean.frame import Window
 from steadypose.prior.models.sensor_bias.network import HISTORY, CorrectionConfig, CorrectionNet, features, trunk_frame
 from steadypose.prior.models.weights_io import load_weights
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
+from steadypose.prior.timing.ring import Ring
 
 DENSITY = 1.0
 """m²/s³, of the causal smoother before the network: its answer must not jitter with its input."""

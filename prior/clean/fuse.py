@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from steadypose.msgs.types import JointState
 from steadypose.prior.body.inverse_kinematics import fit_pose, place_joints, solve_pose
 from steadypose.prior.body.skeleton import JOINTS, PARENTS
-from steadypose.prior.clean.frame import FPS, Estimate, Ring, Window
+from steadypose.prior.clean.frame import Estimate, Window
 from steadypose.prior.timing.fixed_lag import Smoothed
+from steadypose.prior.timing.rate import FPS
+from steadypose.prior.timing.ring import Ring
 
 Floats = NDArray[np.float64]
 

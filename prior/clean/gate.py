@@ -11,8 +11,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
-from steadypose.prior.clean.frame import FPS, Window
+from steadypose.prior.clean.frame import Window
 from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
+from steadypose.prior.timing.rate import FPS
 
 RECENT = 15
 """Frames in which a joint that repeats itself must do so mostly."""

@@ -22,7 +22,7 @@ from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.skeleton import CANONICAL, REST_OFFSETS, SKELETONS, J, Skeleton, finite_joints, to_canonical
 from steadypose.prior.clean.correct import Correct, CorrectSettings
 from steadypose.prior.clean.denoise import Denoise, DenoiseSettings
-from steadypose.prior.clean.frame import FPS, Estimate, Stage, Window
+from steadypose.prior.clean.frame import Estimate, Stage, Window
 from steadypose.prior.clean.fuse import Fuse, FuseSettings
 from steadypose.prior.clean.gate import Gate, GateSettings
 from steadypose.prior.clean.identify import Identify, IdentifySettings
@@ -34,6 +34,7 @@ from steadypose.prior.clean.score import Score, ScoreSettings
 from steadypose.prior.clean.smooth import Smooth, SmoothSettings
 from steadypose.prior.clean.solve import Solve
 from steadypose.prior.settings import build_settings
+from steadypose.prior.timing.rate import FPS
 from steadypose.prior.timing.resample import Resampler
 
 MAX_DISTANCE = 30.0

@@ -17,11 +17,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from steadypose.prior.clean.frame import FPS, Window
+from steadypose.prior.clean.frame import Window
 from steadypose.prior.clean.reconstruct import Encoded
 from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
 from steadypose.prior.models.hgvae.faults import RECENT, FaultNet, FaultNetConfig
 from steadypose.prior.models.weights_io import load_weights, weights_path
+from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 

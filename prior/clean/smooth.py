@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.clean.frame import FPS, Window
+from steadypose.prior.clean.frame import Window
 from steadypose.prior.timing.fixed_lag import FixedLagRTS, Follower, Smoothed
+from steadypose.prior.timing.rate import FPS
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
-from steadypose.prior.clean.frame import FPS
+from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from steadypose.prior.body.skeleton import MIRROR
-from steadypose.prior.clean.frame import FPS
 from steadypose.prior.models.weights_io import LICENCES
+from steadypose.prior.timing.rate import FPS
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.clean.frame import FPS
+from steadypose.prior.timing.rate import FPS
 
 PERIOD_NS = round(1e9 / FPS)
 MAX_GAP_NS = 150_000_000

@@ -3,7 +3,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.clean.frame import Ring, Window
+from steadypose.prior.clean.frame import Window
+from steadypose.prior.timing.ring import Ring
 
 
 @given(st.integers(1, 9), st.lists(st.floats(-9, 9), max_size=40))
