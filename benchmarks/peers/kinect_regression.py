@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from steadypose.benchmarks.metrics import body_frame
 from steadypose.benchmarks.peers.kalman import fixed_lag
 from steadypose.prior.body.kinematics import rigid_alignment
-from steadypose.prior.body.skeleton import KINECT22, J, to_canonical
+from steadypose.prior.body.layouts import KINECT22, to_canonical
+from steadypose.prior.body.skeleton import J
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]

@@ -22,7 +22,7 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.results import RESULTS, Table, save, show
-from steadypose.prior.body.skeleton import COCO17
+from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.camera.depth_lifting import lift
 from steadypose.prior.sim import scripts
 from steadypose.prior.sim.body import REST_HEIGHT, stature

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.msgs.types import PoseRaw, PoseWorld
-from steadypose.prior.body.skeleton import get_skeleton, to_canonical
+from steadypose.prior.body.layouts import get_skeleton, to_canonical
 from steadypose.prior.clean.identify import Identify, IdentifySettings
 from steadypose.prior.sim.streams import Stream, make, read_manifest
 

@@ -37,7 +37,8 @@ from scipy.interpolate import CubicSpline
 
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.prior.body.kinematics import rigid_alignment
-from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, Skeleton, to_canonical
+from steadypose.prior.body.layouts import Skeleton, to_canonical
+from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J
 from steadypose.prior.motion.clip import Y_UP_TO_Z_UP, MotionError
 from steadypose.prior.motion.datasets import CMU_FPS, REPEATS, amc_motions, bvh_motion, members
 from steadypose.prior.motion.npz import read_expmap

@@ -288,7 +288,8 @@ def _standing(frame: int) -> PoseRaw:
     import numpy as np
 
     from steadypose.msgs.types import Pose, PoseRaw, RawBody
-    from steadypose.prior.body.skeleton import CANONICAL, PARENTS, REST_OFFSETS, J
+    from steadypose.prior.body.layouts import CANONICAL
+    from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 
     positions = np.zeros((len(CANONICAL.joints), 3))
     positions[J["pelvis"]] = [2.0, 0.02 * np.sin(frame / 10), 0.95]

@@ -50,7 +50,8 @@ from steadypose.nodes.sinks.drawing import (
     facing,
     to_world,
 )
-from steadypose.prior.body.skeleton import SKELETONS, J, to_canonical
+from steadypose.prior.body.layouts import SKELETONS, to_canonical
+from steadypose.prior.body.skeleton import J
 
 if TYPE_CHECKING:
     import rerun as rr

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
-from steadypose.prior.body.skeleton import AZURE_KINECT32, BLAZEPOSE33, COCO17, ZED38, Skeleton, finite_joints
+from steadypose.prior.body.layouts import AZURE_KINECT32, BLAZEPOSE33, COCO17, ZED38, Skeleton
+from steadypose.prior.body.skeleton import finite_joints
 
 Floats = NDArray[np.float64]
 

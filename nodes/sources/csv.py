@@ -6,7 +6,7 @@ A header and one row for each frame, or, with several bodies, for each body in i
     0.000, 0.183, 1.402, 2.918, 0.301, ...
 
 ``stamp`` is in seconds, of capture; positions in metres, empty or ``nan`` where missing. Joints have the names of a
-skeleton (`prior.body.skeleton`), in any order; those without columns are unobserved. Further columns:
+skeleton (`prior.body.layouts`), in any order; those without columns are unobserved. Further columns:
 ``JOINT_confidence``, 0 to 1, and ``body``, a whole number that tells bodies of the same stamp apart. Lines before the
 header may say ``# skeleton: NAME``, where the joints' names fit several, and ``# up: z`` (the default), ``y`` or
 ``-y``.
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Message, Pose, PoseRaw, RawBody
-from steadypose.prior.body.skeleton import SKELETONS, Skeleton
+from steadypose.prior.body.layouts import SKELETONS, Skeleton
 
 AXES = ("x", "y", "z")
 LATEST_S = 2.0**31

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import JOINTS, Message, Pose, PoseClean, PoseRaw, PoseWorld, RawBody
-from steadypose.prior.body.skeleton import SKELETONS
+from steadypose.prior.body.layouts import SKELETONS
 
 PERIOD_NS = 1_000_000_000 / 30
 """of the grid the prior answers on"""

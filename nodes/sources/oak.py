@@ -22,7 +22,7 @@ from steadypose.msgs.types import PoseRaw, RawBody
 from steadypose.nodes.graph.launch import LaunchError, OakSettings
 from steadypose.nodes.graph.runtime import TURN_S, Clock
 from steadypose.nodes.sources.camera import CameraError, CameraSource, count_failure
-from steadypose.prior.body.skeleton import COCO17
+from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.camera.depth_lifting import lift
 from steadypose.prior.camera.gravity import Level
 

@@ -12,7 +12,7 @@ from steadypose.nodes.graph.runtime import TURN_S
 from steadypose.nodes.sinks.ros2.bridge import require_ros2
 from steadypose.nodes.sources.adapters import from_azure_kinect, from_pose_array
 from steadypose.nodes.sources.camera import LiveSource
-from steadypose.prior.body.skeleton import SKELETONS
+from steadypose.prior.body.layouts import SKELETONS
 
 
 class Ros2Source(LiveSource):

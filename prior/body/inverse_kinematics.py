@@ -11,33 +11,22 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import PARENTS, J, finite_joints
+from steadypose.prior.body.skeleton import CHILDREN, COLLARS, HIPS, PARENT, PARENTS, SHOULDERS, J, finite_joints
 
 Floats = NDArray[np.float64]
 
-_CHILDREN: tuple[tuple[int, ...], ...] = tuple(
-    tuple(c for c, p in enumerate(PARENTS) if p == joint) for joint in range(len(PARENTS))
-)
-_PARENT = np.array(PARENTS)
-
 # What shows the frame of pelvis and chest, best first: a left-right pair, and a place above, the middle of two joints.
-_TRUNK = np.array([J["pelvis"], J["spine3"]])
-_TRUNK_LEFT = np.array(
+_RIGID_PARTS = np.array([J["pelvis"], J["spine3"]])
+_PART_LEFT = np.array([[HIPS, SHOULDERS], [SHOULDERS, COLLARS]])
+_PART_UP = np.array(
     [
-        [(J["left_hip"], J["right_hip"]), (J["left_shoulder"], J["right_shoulder"])],
-        [(J["left_shoulder"], J["right_shoulder"]), (J["left_collar"], J["right_collar"])],
-    ]
-)
-_SHOULDERS = (J["left_shoulder"], J["right_shoulder"])
-_TRUNK_UP = np.array(
-    [
-        [(J["spine3"],) * 2, (J["spine2"],) * 2, (J["neck"],) * 2, _SHOULDERS],
+        [(J["spine3"],) * 2, (J["spine2"],) * 2, (J["neck"],) * 2, SHOULDERS],
         [(J["neck"],) * 2, (J["head"],) * 2, (J["head"],) * 2, (J["head"],) * 2],
     ]
 )
 # What is rigid on constant bones: every bone, and what pelvis and chest carry. The frame of each is in its first three.
-_PELVIS_GROUP = (J["left_hip"], J["right_hip"], J["spine1"], J["pelvis"])
-_CHEST_GROUP = (J["left_collar"], J["right_collar"], J["neck"], J["spine3"])
+_PELVIS_GROUP = (*HIPS, J["spine1"], J["pelvis"])
+_CHEST_GROUP = (*COLLARS, J["neck"], J["spine3"])
 _RIGID = np.array(
     sorted(
         {(joint, parent) for joint, parent in enumerate(PARENTS) if parent >= 0}
@@ -48,18 +37,18 @@ _RIGID_FRAME = np.array([_PELVIS_GROUP[:3], _CHEST_GROUP[:3]])
 _SWEEPS = 20
 
 # Where the pelvis is upright below, when it is hidden itself: the middle of two joints, best first.
-_BELOW = np.array([(J["left_hip"], J["right_hip"]), (J["spine3"],) * 2, (J["neck"],) * 2, _SHOULDERS])
+_BELOW = np.array([HIPS, (J["spine3"],) * 2, (J["neck"],) * 2, SHOULDERS])
 
 
 def _aims() -> NDArray[np.intp]:
     """(22, 4) joints to aim at, nearest first, as far as the chain below does not branch; -1 for none."""
     aims = np.full((len(PARENTS), 4), -1)
-    for joint in set(range(len(PARENTS))) - set(_TRUNK.tolist()):
+    for joint in set(range(len(PARENTS))) - set(_RIGID_PARTS.tolist()):
         below = joint
         for k in range(4):
-            if len(_CHILDREN[below]) != 1:
+            if len(CHILDREN[below]) != 1:
                 break
-            below = _CHILDREN[below][0]
+            below = CHILDREN[below][0]
             aims[joint, k] = below
     return aims
 
@@ -68,9 +57,9 @@ _AIM = _aims()
 
 # The hinge axes in the rest pose, about which elbows and knees flex (right-hand rule, flexion positive).
 _HINGE = np.zeros((len(PARENTS), 3))
-_HINGE[[J["left_hip"], J["right_hip"]]] = (0.0, 1.0, 0.0)
-_HINGE[J["left_shoulder"]] = (0.0, 0.0, -1.0)
-_HINGE[J["right_shoulder"]] = (0.0, 0.0, 1.0)
+_HINGE[list(HIPS)] = (0.0, 1.0, 0.0)
+_HINGE[SHOULDERS[0]] = (0.0, 0.0, -1.0)
+_HINGE[SHOULDERS[1]] = (0.0, 0.0, 1.0)
 # The sine of the bend below which the plane of a limb says nothing of its twist, and above which it says all.
 _BEND_NONE, _BEND_FULL = 0.1, 0.35
 
@@ -114,7 +103,7 @@ def fit_pose(
     offsets: NDArray[np.floating],
     mobility: NDArray[np.floating],
     fallback: NDArray[np.floating] | None = None,
-    give: NDArray[np.floating] | float = 0.0,
+    length_variance: NDArray[np.floating] | float = 0.0,
 ) -> tuple[Floats, Floats, Floats]:
     """Rotations and positions of the pose on these bones that is nearest to the positions.
 
@@ -129,7 +118,7 @@ def fit_pose(
         offsets: (22, 3) or (..., 22, 3) metres, the person's bones.
         mobility: (..., 22) how easily each joint yields: its variance, in any unit.
         fallback: (..., 22, 3, 3) local rotations of the leaves, which no position shows; identity if left out.
-        give: (..., 22) how easily the bone above each joint yields: the variance of its length, in that unit.
+        length_variance: (..., 22) how easily the bone above each joint yields: of its length, in that unit.
 
     Returns:
         local rotations (..., 22, 3, 3), the positions (..., 22, 3) where they put the joints, metres, and the bones
@@ -137,9 +126,9 @@ def fit_pose(
     """
     shape = np.shape(positions)
     p, bones = _frames(positions, shape), _frames(offsets, shape)
-    yields, gives = np.empty(shape[:-1]), np.empty(shape[:-1])
-    yields[...], gives[...] = mobility, give
-    _constrain(p, bones, yields.reshape(p.shape[:-1]), gives.reshape(p.shape[:-1]))
+    yields, variance = np.empty(shape[:-1]), np.empty(shape[:-1])
+    yields[...], variance[...] = mobility, length_variance
+    _constrain(p, bones, yields.reshape(p.shape[:-1]), variance.reshape(p.shape[:-1]))
     local, placed = _initial(fallback, p), np.empty_like(p)
     _solve(p, np.ones(p.shape[:-1], dtype=bool), bones, True, local, placed)
     return local.reshape(*shape, 3), placed.reshape(shape), bones.reshape(shape)
@@ -281,9 +270,9 @@ def _pelvis(p, seen, rest):
 @njit(cache=True)
 def _trunk(which, p, seen, rest, here):
     """Whether the frame shows pelvis (0) or chest (1), and its rotation in the frame of the positions."""
-    joint = _TRUNK[which]
-    for left, right in _TRUNK_LEFT[which]:
-        for a, b in _TRUNK_UP[which]:
+    joint = _RIGID_PARTS[which]
+    for left, right in _PART_LEFT[which]:
+        for a, b in _PART_UP[which]:
             if seen[left] and seen[right] and seen[a] and seen[b]:
                 shown = _frame(p[left] - p[right], (p[a] + p[b]) / 2.0 - here)
                 at_rest = _frame(rest[left] - rest[right], (rest[a] + rest[b]) / 2.0 - rest[joint])
@@ -295,27 +284,27 @@ def _trunk(which, p, seen, rest, here):
 def _rigid_trunk(which, p, rest, here):
     """The rotation of pelvis (0) or chest (1) in the frame of the positions, from the joints it carries."""
     left, right, up = _RIGID_FRAME[which]
-    at_rest = _frame(rest[left] - rest[right], rest[up] - rest[_TRUNK[which]])
+    at_rest = _frame(rest[left] - rest[right], rest[up] - rest[_RIGID_PARTS[which]])
     return _product(_frame(p[left] - p[right], p[up] - here), at_rest.T)
 
 
 @njit("(f8[:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,::1])", cache=True)
-def _constrain(positions, offsets, mobility, give):
-    """Of B frames: moves ``positions`` (B, 22, 3) until what is rigid has its lengths, and ``offsets`` as they give."""
-    rest = np.empty((len(_PARENT), 3))
+def _constrain(positions, offsets, mobility, length_variance):
+    """Of B frames: moves ``positions`` (B, 22, 3) until what is rigid has its lengths; ``offsets`` within theirs."""
+    rest = np.empty((len(PARENT), 3))
     length = np.empty(len(_RIGID))
     compliance = np.empty(len(_RIGID))
     force = np.empty(len(_RIGID))
     for frame in range(len(positions)):
         p, yields = positions[frame], mobility[frame]
         rest[0] = 0.0
-        for joint in range(1, len(_PARENT)):
-            rest[joint] = rest[_PARENT[joint]] + offsets[frame, joint]
+        for joint in range(1, len(PARENT)):
+            rest[joint] = rest[PARENT[joint]] + offsets[frame, joint]
         for k in range(len(_RIGID)):
             bone = rest[_RIGID[k, 0]] - rest[_RIGID[k, 1]]
             length[k] = np.sqrt(_dot(bone, bone))
             a, b = _RIGID[k]
-            compliance[k] = give[frame, a] + (0.0 if b == _PARENT[a] else give[frame, b])
+            compliance[k] = length_variance[frame, a] + (0.0 if b == PARENT[a] else length_variance[frame, b])
             force[k] = 0.0
         for _ in range(_SWEEPS):
             for k in range(len(_RIGID)):
@@ -332,7 +321,7 @@ def _constrain(positions, offsets, mobility, give):
                     p[b, i] += yields[b] * along
         for k in range(len(_RIGID)):
             a, b = _RIGID[k]
-            if b == _PARENT[a]:
+            if b == PARENT[a]:
                 stretch = 1.0 + compliance[k] * force[k] / max(length[k], 1e-9)
                 for i in range(3):
                     offsets[frame, a, i] *= stretch
@@ -347,11 +336,11 @@ def _twist(joint, p, seen, above, turn, bone):
         return turn
     bone = _normalised(bone)
     normal = _cross(bone, _normalised(_turned_back(above, p[end] - p[middle])))
-    trust = (np.sqrt(_dot(normal, normal)) - _BEND_NONE) / (_BEND_FULL - _BEND_NONE)
-    trust = min(max(trust, 0.0), 1.0)
+    share = (np.sqrt(_dot(normal, normal)) - _BEND_NONE) / (_BEND_FULL - _BEND_NONE)
+    share = min(max(share, 0.0), 1.0)
     hinge = _turned(turn, _HINGE[joint])
     angle = np.arctan2(_dot(_cross(hinge, normal), bone), _dot(hinge, normal))
-    return _product(_about(bone, angle * trust * trust * (3.0 - 2.0 * trust)), turn)
+    return _product(_about(bone, angle * share * share * (3.0 - 2.0 * share)), turn)
 
 
 @njit("(f8[:,:,::1], b1[:,::1], f8[:,:,::1], b1, f8[:,:,:,::1], f8[:,:,::1])", cache=True)
@@ -361,23 +350,23 @@ def _solve(positions, observed, offsets, rigid, local, placed):
     ``rigid``: the positions lie on these bones, so the joints next to pelvis and chest show their frames. Measured
     ones do not, and those further apart show them better.
     """
-    joints = len(_PARENT)
+    joints = len(PARENT)
     rest = np.empty((joints, 3))
     world = np.empty((joints, 3, 3))
     for frame in range(len(positions)):
         p, seen, bones = positions[frame], observed[frame], offsets[frame]
         rest[0] = 0.0
         for joint in range(1, joints):
-            rest[joint] = rest[_PARENT[joint]] + bones[joint]
+            rest[joint] = rest[PARENT[joint]] + bones[joint]
         for joint in range(joints):
             if joint == 0:
                 above, here = np.eye(3), _pelvis(p, seen, rest)
             else:
-                above = world[_PARENT[joint]]
-                here = placed[frame, _PARENT[joint]] + _turned(above, bones[joint])
+                above = world[PARENT[joint]]
+                here = placed[frame, PARENT[joint]] + _turned(above, bones[joint])
             placed[frame, joint] = here
-            for which in range(len(_TRUNK)):
-                if joint == _TRUNK[which]:
+            for which in range(len(_RIGID_PARTS)):
+                if joint == _RIGID_PARTS[which]:
                     if rigid:
                         solved, orientation = True, _rigid_trunk(which, p, rest, here)
                     else:
@@ -398,11 +387,11 @@ def _solve(positions, observed, offsets, rigid, local, placed):
 @njit("(f8[:,:,:,::1], f8[:,:,::1], f8[:,:,::1])", cache=True)
 def _place(local, offsets, placed):
     """Of B frames: writes ``placed`` (B, 22, 3)."""
-    world = np.empty((len(_PARENT), 3, 3))
+    world = np.empty((len(PARENT), 3, 3))
     for frame in range(len(local)):
         placed[frame, 0] = 0.0
         world[0] = local[frame, 0]
-        for joint in range(1, len(_PARENT)):
-            above = world[_PARENT[joint]]
-            placed[frame, joint] = placed[frame, _PARENT[joint]] + _turned(above, offsets[frame, joint])
+        for joint in range(1, len(PARENT)):
+            above = world[PARENT[joint]]
+            placed[frame, joint] = placed[frame, PARENT[joint]] + _turned(above, offsets[frame, joint])
             world[joint] = _product(above, local[frame, joint])

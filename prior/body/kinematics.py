@@ -1,7 +1,8 @@
-"""Kinematics of the canonical skeleton: forward (differentiable), a person's bones, headings and contacts.
+"""Kinematics of the canonical skeleton: forward (differentiable), headings and contacts.
 
 Rotations are local (child in parent's frame), the root's is its orientation in the frame of the positions. The
-identity everywhere is a T-pose facing +x, left +y, up +z. From positions to rotations: `prior.body.inverse_kinematics`.
+identity everywhere is a T-pose facing +x, left +y, up +z. From positions to rotations:
+`prior.body.inverse_kinematics`; a person's bones: `prior.body.bone_lengths`.
 """
 
 from __future__ import annotations
@@ -14,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J, finite_joints
+from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
 
 Floats = NDArray[np.float64]
 
@@ -71,68 +71,6 @@ def forward_kinematics(rotations: Tensor, offsets: Tensor, root: Tensor | None =
         positions.append(positions[-1][..., parents, :] + (orientation @ offsets[..., level, :, :]).squeeze(-1))
         orientations.append(orientation @ rotations[..., level, :, :])
     return torch.cat(positions, dim=-2), torch.cat(orientations, dim=-3)
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# A person's bones
-
-
-def estimate_offsets(positions: NDArray[np.floating]) -> Floats:
-    """This person's bones from a set of poses, robustly.
-
-    Bone lengths are medians over the frames. The directions of the rest pose are kept, but for the bones that
-    leave the pelvis and the chest rigidly (hips, neck, collars), whose directions differ from sensor to sensor:
-    there the median vector in the trunk's frame is taken. A joint that is never seen is placed by scaling the
-    rest pose between its neighbours seen.
-
-    Args:
-        positions: (T, 22, 3) metres, NaN where unobserved.
-
-    Returns:
-        (22, 3) metres, each joint in its parent's frame.
-    """
-    p = np.asarray(positions, dtype=np.float64)
-    offsets = REST_OFFSETS.copy()
-    seen = np.asarray(finite_joints(p).any(axis=0))
-    for joint, ancestor in _seen_bones(seen):
-        path = _path(ancestor, joint)
-        lengths = np.linalg.norm(p[:, joint] - p[:, ancestor], axis=-1)
-        if np.isfinite(lengths).any():
-            scale = np.nanmedian(lengths) / np.linalg.norm(REST_OFFSETS[path].sum(axis=0))
-            offsets[path] *= scale
-    world = global_rotations(solve_rotations(p, offsets))
-    for trunk, children in ((0, (J["left_hip"], J["right_hip"])), (J["spine3"], (J["neck"], *_COLLARS))):
-        for joint in children:
-            end = joint if joint not in _COLLARS or seen[joint] else joint + _COLLAR_TO_SHOULDER
-            vectors = np.einsum("tji,tj->ti", world[:, trunk], p[:, end] - p[:, trunk])
-            usable = finite_joints(vectors)
-            if usable.any():
-                offsets[joint] = np.median(vectors[usable], axis=0) - (offsets[end] if end != joint else 0.0)
-    return offsets
-
-
-_COLLARS = (J["left_collar"], J["right_collar"])
-_COLLAR_TO_SHOULDER = J["left_shoulder"] - J["left_collar"]
-
-
-def _seen_bones(seen: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """(joint, nearest seen ancestor) of each joint that is ever seen."""
-    pairs: list[tuple[int, int]] = []
-    for joint in range(1, len(PARENTS)):
-        ancestor = PARENTS[joint]
-        while ancestor > 0 and not seen[ancestor]:
-            ancestor = PARENTS[ancestor]
-        if seen[joint] and seen[ancestor]:
-            pairs.append((joint, ancestor))
-    return pairs
-
-
-def _path(ancestor: int, joint: int) -> list[int]:
-    path = []
-    while joint != ancestor:
-        path.append(joint)
-        joint = PARENTS[joint]
-    return path
 
 
 def global_rotations(local: Floats) -> Floats:

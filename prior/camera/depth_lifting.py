@@ -13,7 +13,7 @@ the skin depends on how far the trunk is turned, and a trunk seen from the side 
 follows from the width of the hips, and from which arm and leg are nearer. Any other joint of which the depth is absent,
 at odds with the body, or another joint's is unobserved: NaN.
 
-Key points are those of COCO-17 (`prior.body.skeleton.COCO17`).
+Key points are those of COCO-17 (`prior.body.layouts.COCO17`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import COCO17
+from steadypose.prior.body.layouts import COCO17
 
 Floats = NDArray[np.float64]
 

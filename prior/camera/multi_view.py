@@ -16,7 +16,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
-from steadypose.prior.body.skeleton import CANONICAL, SKELETONS, finite_joints, to_canonical
+from steadypose.prior.body.layouts import CANONICAL, SKELETONS, to_canonical
+from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import J
+from steadypose.prior.body.skeleton import HIPS, J
 from steadypose.prior.clean.frame import Window
 from steadypose.prior.models.hgvae.features import from_tracks
 from steadypose.prior.timing.fixed_lag import Smoothed
@@ -30,7 +30,7 @@ NOISE_LEFT = 0.59
 RENEWAL = 0.5
 """How far a frame's answer goes to that of the next window: windows one frame apart disagree, which would be jitter."""
 
-_BESIDE_PELVIS = np.array([J["left_hip"], J["right_hip"], J["spine1"]])
+_BESIDE_PELVIS = np.array([*HIPS, J["spine1"]])
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ class Window:
         imputed: the last frames as HG-VAE completes them, or None while there is no such stage.
         present: (S,) which slots hold a body.
         offsets: (S, 22, 3) metres, each person's bones.
-        give: (S, 22) metres^2, variance of each bone's length that is still to be learned away; 0 of a generic adult's.
+        length_variance: (S, 22) metres^2, of each bone, still to be learned away; 0 of a generic adult's.
         measured: (S,) whether these are the person's own, not yet those of a generic adult.
         decoded: (D, S, 22, 3, 3) local rotations of the last frames, from the refinement model.
         out: the estimate of the frame ``delay`` before the newest, or None while there is none.
@@ -94,7 +94,7 @@ class Window:
         self.imputed: Imputed | None = None
         self.present = np.zeros(slots, dtype=bool)
         self.offsets = np.tile(REST_OFFSETS, (slots, 1, 1))
-        self.give = np.zeros((slots, 22))
+        self.length_variance = np.zeros((slots, 22))
         self.measured = np.zeros(slots, dtype=bool)
         self.decoded = np.broadcast_to(np.eye(3), (decoded_frames or frames, slots, 22, 3, 3)).copy()
         self.out: Estimate | None = None
@@ -108,7 +108,7 @@ class Window:
         self.anomaly_flag &= ~slot
         self.noise[slot] = 0.0
         self.offsets[slot] = REST_OFFSETS
-        self.give[slot] = 0.0
+        self.length_variance[slot] = 0.0
         self.decoded[:, slot] = np.eye(3)
 
 

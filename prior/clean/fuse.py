@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import JointState
 from steadypose.prior.body.inverse_kinematics import fit_pose, place_joints, solve_pose
-from steadypose.prior.body.skeleton import JOINTS, PARENTS
+from steadypose.prior.body.skeleton import JOINTS, PARENT, PARENTS
 from steadypose.prior.clean.frame import Estimate, Window
 from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS
@@ -62,8 +62,6 @@ _NEAR = 1 / (1 + _bones_between()) ** 2
 
 _LEAST_VARIANCE = 1e-10
 """m^2: a hundredth of a millimetre"""
-
-_PARENT = np.array(PARENTS)
 
 
 class Precision(NamedTuple):
@@ -123,7 +121,7 @@ class Fuse:
                 completed, sigma = (part[-1 - back][slots] for part in window.imputed)
                 _complete(body, completed, sigma, seen, deviation, unseen_s, self._bias_sigma, precision)
             mobility = _join(body, seen, precision)
-            rotations, body, offsets = fit_pose(body, offsets, mobility, decoded, window.give[slots])
+            rotations, body, offsets = fit_pose(body, offsets, mobility, decoded, window.length_variance[slots])
         placed = np.isfinite(deviation).any(axis=1)
         state, sigma = _states(unseen_s, held_s, s.fade), _stated(unseen_s, precision)
         return Estimate(
@@ -158,7 +156,7 @@ def _least_below(unseen_s):
     least = unseen_s.copy()
     for row in range(len(least)):
         for joint in range(least.shape[1] - 1, 0, -1):
-            above = _PARENT[joint]
+            above = PARENT[joint]
             least[row, above] = min(least[row, above], least[row, joint])
     return least
 

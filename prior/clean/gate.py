@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
+from steadypose.prior.body.skeleton import CHILDREN, MIRROR, PARENT, limbs
 from steadypose.prior.clean.frame import Window
 from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
 from steadypose.prior.timing.rate import FPS
@@ -48,10 +48,7 @@ class GateSettings:
 
 
 # Limbs that detectors exchange: whole arms and whole legs, on both sides.
-_LIMBS = tuple(
-    (np.array([J[f"left_{j}"] for j in limb]), np.array([J[f"right_{j}"] for j in limb]))
-    for limb in (("elbow", "wrist"), ("knee", "ankle", "foot"))
-)
+_EXCHANGED = tuple(np.concatenate(limbs(chain)) for chain in (("elbow", "wrist"), ("knee", "ankle", "foot")))
 _SWAP_APART = 0.15  # metres between expected and seen, mean of a limb's joints, below which no exchange is suspected
 _SWAP_BETTER = 0.4  # an exchange must bring the joints this much nearer to where they were expected
 _JUMP_NOISES = 7.0  # times the noise: one sighting in a thousand is further from where it was expected
@@ -75,7 +72,7 @@ class Gate:
         self._counters = counters
         self._filter = FixedLagRTS(0, acceleration_density=8.0, measurement_sigma=0.015)
         self._refused = np.zeros((slots, 22))
-        self._swapped = np.zeros((slots, len(_LIMBS)))
+        self._swapped = np.zeros((slots, len(_EXCHANGED)))
         self._frames = np.zeros(slots, dtype=np.int64)
 
     def reset(self, slot: NDArray[np.bool_]) -> None:
@@ -157,8 +154,7 @@ class Gate:
         self, positions: NDArray[np.float64], expected: NDArray[np.float64], known: NDArray[np.bool_]
     ) -> None:
         """Put exchanged limbs back: both sides are nearer to where the other was expected."""
-        for k, (left, right) in enumerate(_LIMBS):
-            pair = np.concatenate([left, right])
+        for k, pair in enumerate(_EXCHANGED):
             keep = _apart(positions[:, pair], expected[:, pair]).mean(axis=1)
             swap = _apart(positions[:, MIRROR[pair]], expected[:, pair]).mean(axis=1)
             with np.errstate(invalid="ignore"):  # a limb with a joint unseen compares as False
@@ -221,8 +217,7 @@ def stuck(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
     return found
 
 
-_PARENT = np.maximum(np.array(PARENTS), 0)
-_LEAF = np.array([j not in PARENTS for j in range(22)])
+_LEAF = np.array([not children for children in CHILDREN])
 
 
 @njit(cache=True)
@@ -258,12 +253,12 @@ def _of_impossible_length(positions, offsets, share, least):
         for joint in range(1, positions.shape[1]):
             length, own = 0.0, 0.0
             for axis in range(3):
-                length += (positions[row, joint, axis] - positions[row, _PARENT[joint], axis]) ** 2
+                length += (positions[row, joint, axis] - positions[row, PARENT[joint], axis]) ** 2
                 own += offsets[row, joint, axis] ** 2
             off = abs(math.sqrt(length) - math.sqrt(own))
             bad[row, joint] = off > max(share * math.sqrt(own), least[row])
         for joint in range(1, positions.shape[1]):
             # A bad bone does not say which end is wrong: where the next bone is bad too, it is the joint between.
-            if _LEAF[joint] and bad[row, _PARENT[joint]]:
+            if _LEAF[joint] and bad[row, PARENT[joint]]:
                 bad[row, joint] = False
     return bad

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from steadypose.prior.body.skeleton import J, finite_joints
+from steadypose.prior.body.skeleton import TRUNK_LANDMARKS, J, finite_joints
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
 
 Floats = NDArray[np.float64]
@@ -74,9 +74,6 @@ MIN_JOINTS = 6
 _FREE, _NAMELESS = 0, -1
 """In place of an id: ids are 1 and up."""
 
-_TRUNK = np.array(
-    [J[n] for n in ("pelvis", "left_hip", "right_hip", "spine3", "neck", "left_shoulder", "right_shoulder")]
-)
 _BONES: tuple[tuple[tuple[str, str], ...], ...] = (
     (("left_hip", "left_knee"), ("right_hip", "right_knee")),
     (("left_knee", "left_ankle"), ("right_knee", "right_ankle")),
@@ -265,7 +262,7 @@ def _bone_lengths(bodies: Floats, confidence: Floats) -> Floats:
 
 def _middle(body: Floats) -> Floats:
     """(3,) metres, the middle of a body's trunk, or of all of it (22, 3) where no joint of the trunk is seen."""
-    trunk = _median(body[_TRUNK])
+    trunk = _median(body[list(TRUNK_LANDMARKS)])
     return trunk if np.isfinite(trunk).all() else _median(body)
 
 

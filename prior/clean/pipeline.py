@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import CleanBody, Pose, PoseClean, PoseRaw, RawBody
 from steadypose.prior.body.inverse_kinematics import place_joints
-from steadypose.prior.body.skeleton import CANONICAL, REST_OFFSETS, SKELETONS, J, Skeleton, finite_joints, to_canonical
+from steadypose.prior.body.layouts import CANONICAL, SKELETONS, Skeleton, to_canonical
+from steadypose.prior.body.skeleton import REST_OFFSETS, J, finite_joints
 from steadypose.prior.clean.correct import Correct, CorrectSettings
 from steadypose.prior.clean.denoise import Denoise, DenoiseSettings
 from steadypose.prior.clean.frame import Estimate, Stage, Window

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import CANONICAL, Skeleton, to_canonical
+from steadypose.prior.body.layouts import CANONICAL, Skeleton, to_canonical
 
 Y_UP_TO_Z_UP: NDArray[np.float64] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Turns a y-up frame into a z-up one by a quarter turn about x (both right-handed)."""

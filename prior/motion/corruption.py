@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
+from steadypose.prior.body.skeleton import MIRROR, PARENTS, J, limbs
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
@@ -19,13 +19,11 @@ Fault = Callable[[Floats, slice, list[int], Floats, Rng], None]
 SLOW_HZ = 0.7
 """how fast a sensor's slow error changes at most"""
 
-_LIMBS = [
-    [J[f"{side}_{n}"] for n in names]
-    for side in ("left", "right")
-    for names in (("wrist",), ("elbow", "wrist"), ("shoulder", "elbow", "wrist"), ("foot",), ("ankle", "foot"),
-                  ("knee", "ankle", "foot"), ("hip", "knee", "ankle", "foot"))
-]  # fmt: skip
-_LOWER = [J[f"{side}_{n}"] for side in ("left", "right") for n in ("hip", "knee", "ankle", "foot")]
+_LIMBS = limbs(
+    ("wrist",), ("elbow", "wrist"), ("shoulder", "elbow", "wrist"),
+    ("foot",), ("ankle", "foot"), ("knee", "ankle", "foot"), ("hip", "knee", "ankle", "foot"),
+)  # fmt: skip
+_LOWER = [joint for leg in limbs(("hip", "knee", "ankle", "foot")) for joint in leg]
 _ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_collar", "left_foot", "right_foot")]
 """joints that many sensors do not have"""
 

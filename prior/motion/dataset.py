@@ -147,12 +147,16 @@ def remove_heading(rotations: Tensor, frame: int) -> tuple[Tensor, Tensor]:
     Returns:
         The turned rotations, and the yaw matrices (B, 3, 3) that turn them back.
     """
-    left = rotations[:, frame, 0, :, 1]
-    yaw = torch.atan2(-left[:, 0], left[:, 1])
-    back = yaw_rotation(yaw)
+    back = yaw_rotation(heading(rotations[:, frame, 0]))
     turned = rotations.clone()
     turned[:, :, 0] = back.transpose(-1, -2)[:, None] @ rotations[:, :, 0]
     return turned, back
+
+
+def heading(root_rotation: Tensor) -> Tensor:
+    """Yaw (...) in radians of root rotations (..., 3, 3): `prior.body.kinematics.heading`, in torch."""
+    left = root_rotation[..., :, 1]
+    return torch.atan2(-left[..., 0], left[..., 1])
 
 
 def yaw_rotation(yaw: Tensor) -> Tensor:

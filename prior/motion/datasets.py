@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import CANONICAL, Skeleton
+from steadypose.prior.body.layouts import CANONICAL, Skeleton
 from steadypose.prior.motion.amc import Asf, read_amc, read_asf
 from steadypose.prior.motion.bvh import Bvh, read_bvh
 from steadypose.prior.motion.clip import Y_UP_TO_Z_UP, Clip, MotionError

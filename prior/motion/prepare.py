@@ -13,8 +13,9 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
+from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.kinematics import CONTACT_SPEED, estimate_offsets, label_contacts
+from steadypose.prior.body.kinematics import CONTACT_SPEED, label_contacts
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
 from steadypose.prior.motion.clip import Clip
 from steadypose.prior.motion.datasets import Dropped, Split, WeightSet

@@ -1,6 +1,6 @@
 """How the skeletons of motion files map to the canonical joints, and their units and axes.
 
-Sensors' tables (`prior.body.skeleton`) leave a joint that is not there unobserved. Training needs complete bodies, so
+Sensors' tables (`prior.body.layouts`) leave a joint that is not there unobserved. Training needs complete bodies, so
 these tables place the joints that a file lacks: within a bone that is there (a point of the spine or the neck is
 a fixed mixture of the bone's ends, so that it moves rigidly with it), and a missing collar in the plane of
 chest, neck and shoulder. The mixtures put each joint at the height the rest skeleton has it, scaled to the
@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from steadypose.prior.body.skeleton import Skeleton
+from steadypose.prior.body.layouts import Skeleton
 
 CMU_METRES = 0.0254 / 0.45
 """The size of CMU's unit: an inch, scaled by the 0.45 of its ASF files."""

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
-from steadypose.prior.body.skeleton import JOINTS, J
+from steadypose.prior.body.skeleton import COLLARS, JOINTS, TRUNK, J
 from steadypose.prior.sim.body import CAPSULES, REST_HEIGHT, stature
 from steadypose.prior.sim.motion import Motion
 from steadypose.prior.sim.noise import (
@@ -176,7 +176,7 @@ def _to_segment(point: Floats, a: Floats, b: Floats) -> Floats:
 # The tracker
 
 _LIMB_ENDS = np.array([n.endswith(("elbow", "wrist", "ankle", "foot", "knee")) for n in JOINTS])
-_TRUNK = np.array([n.strip("123").endswith(("pelvis", "hip", "spine", "neck", "collar", "shoulder")) for n in JOINTS])
+_ON_TRUNK = np.isin(np.arange(len(JOINTS)), [*TRUNK, *COLLARS])
 _BLEED_RATE = 0.25  # a second: how often a limb's end takes the depth of the wall behind it
 _BLEED_BESIDE_RATE = 1.5  # a second: the same for a ray that grazes other flesh
 _BLEED_DURATION = 0.08  # seconds, mean
@@ -277,7 +277,7 @@ def _track(
 
 def as_tracked(hidden: Floats, on_body: Mount) -> Floats:
     """A trunk is tracked as a whole: an arm across it hides none of its joints, a body in front of it all."""
-    trunk = _TRUNK[on_body.joint]
+    trunk = _ON_TRUNK[on_body.joint]
     return np.where(trunk, np.minimum(hidden, hidden[:, trunk].mean(axis=1, keepdims=True)), hidden)
 
 

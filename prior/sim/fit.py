@@ -22,9 +22,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.kinematics import estimate_offsets, global_rotations
-from steadypose.prior.body.skeleton import JOINTS, KINECT22, MIRROR, PARENTS, J, to_canonical
+from steadypose.prior.body.kinematics import global_rotations
+from steadypose.prior.body.layouts import KINECT22, to_canonical
+from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, J
 from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
 from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel, draw_errors, ray_axes, travelled
 

@@ -9,7 +9,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J, get_skeleton
+from steadypose.prior.body.layouts import get_skeleton
+from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J
 
 Floats = NDArray[np.float64]
 

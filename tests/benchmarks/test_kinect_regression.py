@@ -5,7 +5,7 @@ from steadypose.benchmarks.metrics import position_error
 from steadypose.benchmarks.peers.kinect_regression import _OTHER_SIDE, Smoothed, _mirrored, ridge, temporal_convolution
 from steadypose.benchmarks.protocols.kinect_vicon import OTHER_SIDE, SCORED
 from steadypose.prior.body.kinematics import rigid_alignment
-from steadypose.prior.body.skeleton import KINECT22
+from steadypose.prior.body.layouts import KINECT22
 
 SIZES = np.random.default_rng(0).normal(0, 0.3, (len(SCORED), 3))
 WAYS = np.random.default_rng(2).normal(0, 0.2, (3, 66))

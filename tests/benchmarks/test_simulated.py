@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 from steadypose.benchmarks.systems.simulated import FEET, Track, hold_last, measure, read_tracks, sigma_ratio, smooth
 from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Message, Pose, PoseRaw, PoseWorld, RawBody, Tracking, WorldBody
-from steadypose.prior.body.skeleton import CANONICAL, PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.layouts import CANONICAL
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 
 PERIOD_NS = 33_333_333
 

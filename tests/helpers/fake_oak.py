@@ -20,7 +20,8 @@ import depthai as dai
 from steadypose.nodes.graph.launch import OakSettings
 from steadypose.nodes.graph.runtime import Clock
 from steadypose.nodes.sources.oak import Host
-from steadypose.prior.body.skeleton import COCO17, REST_OFFSETS
+from steadypose.prior.body.layouts import COCO17
+from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.sim.depth import Stereo, render, room
 
 CAMERA = Stereo()

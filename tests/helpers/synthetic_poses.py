@@ -23,7 +23,8 @@ from steadypose.msgs.types import (
     Tracking,
     WorldBody,
 )
-from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, SKELETONS, J, Skeleton, to_canonical
+from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 
 FPS = 30.0
 START_NS = 1_000_000_000

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.body.skeleton import PARENT, PARENTS
 from steadypose.prior.models.layers.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE, GraphBlock, GraphLinear
 
 NEAR = 8.0
@@ -73,7 +73,6 @@ def _hanging() -> NDArray[np.float32]:
 
 
 _HANGS = _hanging()
-_PARENT = np.array(PARENTS)
 
 
 @dataclass(frozen=True)
@@ -245,7 +244,7 @@ def _tell_moved(deviations, seen, moved):
     counts = np.zeros(joints)
     moved[:] = 0.0
     for joint in range(joints):
-        above = _PARENT[joint]
+        above = PARENT[joint]
         for t in range(LAG, frames):
             if seen[joint, t] > 0 and seen[joint, t - LAG] > 0:
                 counts[joint] += 1

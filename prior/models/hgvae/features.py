@@ -15,15 +15,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, REST_POSITIONS, SHOULDERS, TRUNK, J
 
-_TRUNK = np.array([J[n] for n in ("pelvis", "left_hip", "right_hip", "spine1", "spine2", "spine3", "neck",
-                                  "left_shoulder", "right_shoulder")])  # fmt: skip
-_SIDES = np.array([(J[f"left_{n}"], J[f"right_{n}"]) for n in ("hip", "shoulder")])
-_REST = np.zeros((22, 3))
-for _joint, _parent in enumerate(PARENTS[1:], start=1):
-    _REST[_joint] = _REST[_parent] + REST_OFFSETS[_joint]
-_PARENT = np.array(PARENTS)
+_SIDES = np.array([HIPS, SHOULDERS])
 _TALL = np.array([J[n] for n in ("left_knee", "left_ankle", "right_knee", "right_ankle", "spine1", "spine2", "spine3",
                                  "neck")])  # fmt: skip
 _STANDARD = float(np.linalg.norm(REST_OFFSETS[_TALL], axis=-1).sum())
@@ -142,9 +136,9 @@ def _to_tracks(windows, sizes, low_pass, all_x, all_observed, all_path, yaws):
                     observed[3 * j + axis, t] = 0.0 if math.isnan(a) else 1.0
             if missing == 0:
                 continue
-            parent = _PARENT[j]
+            parent = PARENT[j]
             while parent > 0 and math.isnan(x[3 * parent, 0]):
-                parent = _PARENT[parent]
+                parent = PARENT[parent]
             for axis in range(3):
                 # relative to the nearest joint above that was ever seen, whose gaps are bridged by now
                 _bridge(x[3 * j + axis], x[3 * parent + axis] if parent > 0 else still)
@@ -173,8 +167,8 @@ def _from_tracks(x, path, yaws, sizes, world):
 def _hang_unseen(deviations):
     """As `hang_unseen`, of (N, 22, 3, T)."""
     for window in deviations:
-        for joint in range(len(_PARENT)):
-            parent = _PARENT[joint]
+        for joint in range(len(PARENT)):
+            parent = PARENT[joint]
             if math.isnan(window[joint, 0, 0]):
                 for axis in range(3):
                     for t in range(window.shape[-1]):
@@ -225,7 +219,7 @@ def _centre(positions, yaw, size):
     centre = np.zeros((frames, 3))
     weight = np.zeros(frames)
     lies, seen = np.zeros(3), np.zeros(3)
-    for j in _TRUNK:
+    for j in TRUNK:
         seen[:] = 0.0
         count = 0
         for t in range(frames):
@@ -234,9 +228,9 @@ def _centre(positions, yaw, size):
                     seen[axis] += positions[t, j, axis] - positions[t, 0, axis]
                 count += 1
         # how the joint lies to the pelvis: as it was seen in this window, or as in a generic body
-        lies[0] = size * (c * _REST[j, 0] - s * _REST[j, 1])
-        lies[1] = size * (s * _REST[j, 0] + c * _REST[j, 1])
-        lies[2] = size * _REST[j, 2]
+        lies[0] = size * (c * REST_POSITIONS[j, 0] - s * REST_POSITIONS[j, 1])
+        lies[1] = size * (s * REST_POSITIONS[j, 0] + c * REST_POSITIONS[j, 1])
+        lies[2] = size * REST_POSITIONS[j, 2]
         for axis in range(3):
             if count:
                 lies[axis] = seen[axis] / count

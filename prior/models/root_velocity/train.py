@@ -12,12 +12,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
-from steadypose.prior.body.skeleton import MIRROR, J
+from steadypose.prior.body.skeleton import MIRROR, limbs
 from steadypose.prior.models.distributed import share
 from steadypose.prior.models.root_velocity.network import FRAME_S, RootMotion, TrajectoryConfig, TrajectoryNet
 from steadypose.prior.models.training import TrainingRun
 from steadypose.prior.models.weights_io import LICENCES, started
-from steadypose.prior.motion.dataset import MotionSet, data_told, yaw_rotation
+from steadypose.prior.motion.dataset import MotionSet, data_told, heading, yaw_rotation
 
 WINDOW = 48
 """Frames of a training window, 1.6 s."""
@@ -49,11 +49,7 @@ IMPUTED_SHARE = 0.3
 NLL_WEIGHT, CONTACT_WEIGHT, STILL_WEIGHT = 0.05, 0.1, 0.01
 """Of the standard deviation's likelihood, the contacts' cross-entropy, and their consistency with the velocity."""
 
-_LIMBS = [
-    [J[f"{side}_{part}"] for part in parts]
-    for side in ("left", "right")
-    for parts in (("elbow", "wrist"), ("shoulder", "elbow", "wrist"), ("knee", "ankle", "foot"))
-]
+_LIMBS = limbs(("elbow", "wrist"), ("shoulder", "elbow", "wrist"), ("knee", "ankle", "foot"))
 _MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
 
 
@@ -159,8 +155,7 @@ def _sample(
     )
     positions = positions * _tensor(rng.uniform(*SCALES, (count, 1, 1, 1)))
     facing = frames[torch.arange(count), rng.integers(0, WINDOW, count) + 1]
-    left = motion.rotations[facing, 0, :, 1]
-    yaw = torch.atan2(-left[:, 0], left[:, 1]) + _tensor(rng.normal(0.0, YAW_SD, count))
+    yaw = heading(motion.rotations[facing, 0]) + _tensor(rng.normal(0.0, YAW_SD, count))
     tilt = roma.rotvec_to_rotmat(_tensor(rng.normal(0.0, TILT_SD, (count, 3)) * [1.0, 1.0, 0.0]))
     windows = _mirror_half(_windows(positions, motion.contacts[frames], tilt.mT @ yaw_rotation(yaw)))
     return replace(windows, joints=_corrupt(windows.joints, rng))
@@ -241,8 +236,7 @@ def _validate(model: TrajectoryNet, motion: MotionSet, length: int, count: int) 
     model.eval()
     rows = motion.all_windows(length + 2, step=length)
     rows = rows[:: max(len(rows) // count, 1)]
-    left = motion.rotations[rows[:, length // 2], 0, :, 1]
-    turn = yaw_rotation(torch.atan2(-left[:, 0], left[:, 1]))
+    turn = yaw_rotation(heading(motion.rotations[rows[:, length // 2], 0]))
     windows = _windows(motion.positions[rows], motion.contacts[rows], turn)
     joints = _corrupt(windows.joints, np.random.default_rng(0), noise_sd=0.01)
     windows = replace(windows, joints=joints)

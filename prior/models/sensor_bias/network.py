@@ -15,14 +15,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from steadypose.prior.body.skeleton import MIRROR, J, finite_joints
+from steadypose.prior.body.skeleton import HIPS, MIRROR, SHOULDERS, finite_joints
 
 Floats = NDArray[np.float64]
 
 HISTORY: tuple[int, ...] = (0, 1, 2, 4, 7, 12)
 """Frames ago, at 30 Hz, that the network sees: nothing of the future."""
 
-_CORNERS = (J["left_hip"], J["right_hip"], J["left_shoulder"], J["right_shoulder"])
+_CORNERS = (*HIPS, *SHOULDERS)
 _VECTORS = 22 * len(HISTORY) + 2
 FEATURES = 3 * _VECTORS + 2 + 22
 

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from steadypose.prior.body.kinematics import rigid_alignment
-from steadypose.prior.body.skeleton import KINECT22, finite_joints, to_canonical
+from steadypose.prior.body.layouts import KINECT22, to_canonical
+from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.clean.correct import DENSITY, recall
 from steadypose.prior.models.distributed import share
 from steadypose.prior.models.sensor_bias.network import (

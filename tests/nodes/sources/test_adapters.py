@@ -14,16 +14,8 @@ from steadypose.msgs.codec import decode, encode
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.sources.adapters import from_azure_kinect, from_coco, from_mediapipe, from_zed, pinhole
-from steadypose.prior.body.skeleton import (
-    AZURE_KINECT32,
-    BLAZEPOSE33,
-    COCO17,
-    JOINTS,
-    SKELETONS,
-    ZED38,
-    Skeleton,
-    to_canonical,
-)
+from steadypose.prior.body.layouts import AZURE_KINECT32, BLAZEPOSE33, COCO17, SKELETONS, ZED38, Skeleton, to_canonical
+from steadypose.prior.body.skeleton import JOINTS
 
 STAMP_NS = 1_700_000_000_123_456_789
 STAMP = Made(sec=1_700_000_000, nanosec=123_456_789)

@@ -28,7 +28,7 @@ from steadypose.nodes.sources import oak
 from steadypose.nodes.sources.camera import PAUSES_S
 from steadypose.nodes.sources.oak import FRAME_ID, QUEUE, SILENT_S, Host, OakSource
 from steadypose.nodes.sources.pose_input import PoseInputNode, open_input
-from steadypose.prior.body.skeleton import COCO17
+from steadypose.prior.body.layouts import COCO17
 
 MakeLaunch = Callable[..., Launch]
 BODY = [i for i, name in enumerate(COCO17.joints) if name.split("_")[-1] not in ("nose", "eye", "ear")]

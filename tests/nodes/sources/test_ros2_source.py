@@ -19,7 +19,7 @@ from steadypose.nodes.graph.launch import Launch, LaunchError
 from steadypose.nodes.sources.adapters import from_pose_array
 from steadypose.nodes.sources.camera import LiveSource
 from steadypose.nodes.sources.pose_input import PoseInputNode
-from steadypose.prior.body.skeleton import CANONICAL, COCO17, SKELETONS
+from steadypose.prior.body.layouts import CANONICAL, COCO17, SKELETONS
 
 PUBLISHER = """
 import sys

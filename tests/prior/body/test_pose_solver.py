@@ -146,8 +146,8 @@ def test_a_bone_of_uncertain_length_gives_way_by_its_share_of_the_variance() -> 
     off[:, wrist] += 0.1 * (truth[:, wrist] - truth[:, elbow])
     mobility = np.where(np.isin(np.arange(22), [elbow, wrist]), 1.0, 1e-6)
     mobility[elbow] = 1e-6
-    give = np.where(np.arange(22) == wrist, 1.0, 0.0)
-    rotations, placed, bones = fit_pose(off, REST_OFFSETS, mobility, give=give)
+    variance = np.where(np.arange(22) == wrist, 1.0, 0.0)
+    rotations, placed, bones = fit_pose(off, REST_OFFSETS, mobility, length_variance=variance)
     length = np.linalg.norm(REST_OFFSETS[wrist])
     np.testing.assert_allclose(np.linalg.norm(bones[:, wrist], axis=-1), 1.05 * length, rtol=1e-4)
     np.testing.assert_allclose(np.linalg.norm(placed[:, wrist] - placed[:, elbow], axis=-1), 1.05 * length, rtol=1e-4)

@@ -1,17 +1,8 @@
 import numpy as np
 import pytest
 
-from steadypose.prior.body.skeleton import (
-    CANONICAL,
-    JOINTS,
-    MIRROR,
-    PARENTS,
-    REST_OFFSETS,
-    SKELETONS,
-    J,
-    get_skeleton,
-    to_canonical,
-)
+from steadypose.prior.body.layouts import CANONICAL, SKELETONS, get_skeleton, to_canonical
+from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J
 
 EXPECTED_COUNTS = {
     "smpl22": 22, "coco17": 17, "blazepose33": 33, "h36m17": 17, "kinect22": 22, "azure_kinect32": 32, "zed38": 38,

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from steadypose.prior.body.skeleton import COCO17, PARENTS, REST_OFFSETS
+from steadypose.prior.body.layouts import COCO17
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
 from steadypose.prior.camera.depth_lifting import LEAST_CONFIDENCE, lift
 from steadypose.prior.sim.depth import Stereo, render, room, spoil
 

@@ -1,11 +1,9 @@
 import numpy as np
-import pytest
 from tests.helpers.bodies import waving
 
-from steadypose.prior.body.inverse_kinematics import solve_pose
-from steadypose.prior.body.skeleton import MIRROR, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.clean.frame import Window
-from steadypose.prior.clean.person import Bones, BonesSettings, estimate_bones
+from steadypose.prior.clean.person import Bones, BonesSettings
 from steadypose.prior.timing.fixed_lag import Smoothed
 
 BIAS, NOISE = 0.02, 0.01
@@ -21,48 +19,6 @@ def worst(offsets: np.ndarray, truth: np.ndarray) -> float:
     return float(np.abs(lengths(offsets) - lengths(truth)).max())
 
 
-@pytest.mark.parametrize("scale", [0.75, 1.0, 1.15])
-def test_many_good_samples_give_the_persons_own_bones(scale: float) -> None:
-    offsets = estimate_bones(waving(64, scale, speed=3.0), BIAS, NOISE, 64).offsets
-    assert worst(offsets, scale * REST_OFFSETS) < 0.01
-
-
-def test_one_sample_with_a_limb_guessed_gives_human_bones() -> None:
-    """Seen from the side, the far hip is put 0.4 m away on the wall behind."""
-    positions = waving(1)
-    positions[:, LEFT_HIP] += [0.0, 0.35, 0.0]
-    measured = np.linalg.norm(positions[0, LEFT_HIP] - positions[0, 0])
-    assert measured - lengths(REST_OFFSETS)[LEFT_HIP] > 0.3
-    assert worst(estimate_bones(positions, BIAS, NOISE, 64).offsets, REST_OFFSETS) < 0.07
-
-
-def test_a_person_with_long_legs_is_believed_the_more_the_longer_they_are_seen() -> None:
-    long = REST_OFFSETS.copy()
-    legs = [J[f"{s}_{j}"] for s in ("left", "right") for j in ("knee", "ankle")]
-    long[legs] *= 1.15
-    positions = solve_pose(waving(64, speed=3.0), long)[1]
-    positions = positions + np.random.default_rng(0).normal(size=positions.shape) * 0.01
-    off = [lengths(estimate_bones(positions[:n], BIAS, NOISE, 64).offsets - long)[legs].mean() for n in (1, 8, 64)]
-    assert off[0] > off[1] > off[2]
-    assert off[2] < 0.4 * lengths(long - REST_OFFSETS)[legs].mean()
-
-
-def test_both_sides_are_alike_though_one_is_seen() -> None:
-    positions = waving(64, 1.1)
-    right = [J[f"right_{j}"] for j in ("knee", "ankle", "foot", "elbow", "wrist")]
-    positions[:, right] = np.nan
-    offsets = estimate_bones(positions, BIAS, NOISE, 64).offsets
-    np.testing.assert_allclose(offsets[MIRROR] * [1, -1, 1], offsets, atol=1e-12)
-    assert worst(offsets, 1.1 * REST_OFFSETS) < 0.04
-
-
-def test_a_joint_never_seen_lies_between_its_neighbours() -> None:
-    positions = waving(64, 1.1, speed=3.0)
-    hidden = [J[n] for n in ("spine1", "spine2", "left_collar", "right_collar")]
-    positions[:, hidden] = np.nan
-    assert worst(estimate_bones(positions, BIAS, NOISE, 64).offsets, 1.1 * REST_OFFSETS) < 0.02
-
-
 def test_the_stage_knows_bones_from_the_first_frame_and_then_moves_without_steps() -> None:
     stage, window = Bones(BonesSettings(), BIAS, 2), Window(8, 2)
     window.present[0] = True
@@ -75,28 +31,6 @@ def test_the_stage_knows_bones_from_the_first_frame_and_then_moves_without_steps
     assert np.abs(np.diff(told, axis=0)).max() < 0.005
     assert worst(window.offsets[0], 0.85 * REST_OFFSETS) < 0.03
     np.testing.assert_array_equal(window.offsets[1], REST_OFFSETS)
-
-
-def test_what_noise_explains_averages_out_and_a_good_sensor_is_believed() -> None:
-    """The same samples: nearly this person's bones from motion capture, human ones from a sensor that may err."""
-    long = REST_OFFSETS.copy()
-    legs = [J[f"{s}_{j}"] for s in ("left", "right") for j in ("knee", "ankle")]
-    long[legs] *= 1.15
-    positions = solve_pose(waving(12, speed=3.0), long)[1]
-    positions = positions + np.random.default_rng(0).normal(size=positions.shape) * 0.01
-    off = [
-        np.abs(lengths(estimate_bones(positions, bias, 0.01, 64).offsets - long))[legs].mean() for bias in (0.0, 0.02)
-    ]
-    assert off[0] < 0.005 < 0.02 < off[1]
-
-
-def test_what_is_still_to_be_learned_of_a_bone_falls_with_every_sample_and_ends() -> None:
-    positions = waving(64, speed=3.0)
-    give = np.stack([estimate_bones(positions[:n], BIAS, NOISE, 64).give for n in (1, 8, 32, 64)])
-    assert (np.diff(give[:, 1:], axis=0) < 0).all()
-    assert (give[-1] == 0).all()
-    sure = estimate_bones(positions[:1], 0.0, 0.001, 64).give
-    assert sure.max() < 0.002**2
 
 
 def test_in_a_crowd_everybodys_bones_are_renewed_as_often_as_those_of_one_of_eight() -> None:

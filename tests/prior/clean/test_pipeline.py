@@ -11,7 +11,8 @@ from tests.helpers.bodies import PERIOD_NS, raw, stream, waving
 from steadypose.msgs.codec import encode
 from steadypose.msgs.types import JointState, Pose, PoseClean, PoseRaw
 from steadypose.prior.body.kinematics import forward_kinematics
-from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, SKELETONS, J
+from steadypose.prior.body.layouts import SKELETONS
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings, load_loops
 
 

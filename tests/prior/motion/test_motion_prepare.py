@@ -17,7 +17,8 @@ from tests.prior.motion.test_motion_datasets import idle_bvh, pack, unpack
 
 from steadypose.nodes.commands.prepare import PrepareError, find_sources, prepare
 from steadypose.prior.body.kinematics import forward_kinematics
-from steadypose.prior.body.skeleton import CANONICAL, PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.layouts import CANONICAL
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.motion.clip import Clip
 from steadypose.prior.motion.datasets import Dropped
 from steadypose.prior.motion.prepare import (

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from tests.prior.motion.test_motion_plug_in_gait import BENDS, HIP, STILL, recording
 
-from steadypose.prior.body.skeleton import JOINTS, KINECT22, J
+from steadypose.prior.body.layouts import KINECT22
+from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.motion.clip import MotionError
 from steadypose.prior.motion.ui_prmd import load_pairs
 

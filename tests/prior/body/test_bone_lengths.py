@@ -1,0 +1,107 @@
+import numpy as np
+import pytest
+from tests.helpers.bodies import fk, random_pose, waving
+
+from steadypose.prior.body.bone_lengths import estimate_bones, estimate_offsets
+from steadypose.prior.body.inverse_kinematics import solve_pose
+from steadypose.prior.body.skeleton import MIRROR, REST_OFFSETS, J
+
+BIAS, NOISE = 0.02, 0.01
+LEFT_HIP, RIGHT_KNEE = J["left_hip"], J["right_knee"]
+
+
+def lengths(offsets: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(offsets, axis=-1)
+
+
+def worst(offsets: np.ndarray, truth: np.ndarray) -> float:
+    """Metres, of the bone that is the furthest from its true length."""
+    return float(np.abs(lengths(offsets) - lengths(truth)).max())
+
+
+@pytest.mark.parametrize("scale", [0.75, 1.0, 1.15])
+def test_many_good_samples_give_the_persons_own_bones(scale: float) -> None:
+    offsets = estimate_bones(waving(64, scale, speed=3.0), BIAS, NOISE, 64).offsets
+    assert worst(offsets, scale * REST_OFFSETS) < 0.01
+
+
+def test_one_sample_with_a_limb_guessed_gives_human_bones() -> None:
+    """Seen from the side, the far hip is put 0.4 m away on the wall behind."""
+    positions = waving(1)
+    positions[:, LEFT_HIP] += [0.0, 0.35, 0.0]
+    measured = np.linalg.norm(positions[0, LEFT_HIP] - positions[0, 0])
+    assert measured - lengths(REST_OFFSETS)[LEFT_HIP] > 0.3
+    assert worst(estimate_bones(positions, BIAS, NOISE, 64).offsets, REST_OFFSETS) < 0.07
+
+
+def test_a_person_with_long_legs_is_believed_the_more_the_longer_they_are_seen() -> None:
+    long = REST_OFFSETS.copy()
+    legs = [J[f"{s}_{j}"] for s in ("left", "right") for j in ("knee", "ankle")]
+    long[legs] *= 1.15
+    positions = solve_pose(waving(64, speed=3.0), long)[1]
+    positions = positions + np.random.default_rng(0).normal(size=positions.shape) * 0.01
+    off = [lengths(estimate_bones(positions[:n], BIAS, NOISE, 64).offsets - long)[legs].mean() for n in (1, 8, 64)]
+    assert off[0] > off[1] > off[2]
+    assert off[2] < 0.4 * lengths(long - REST_OFFSETS)[legs].mean()
+
+
+def test_both_sides_are_alike_though_one_is_seen() -> None:
+    positions = waving(64, 1.1)
+    right = [J[f"right_{j}"] for j in ("knee", "ankle", "foot", "elbow", "wrist")]
+    positions[:, right] = np.nan
+    offsets = estimate_bones(positions, BIAS, NOISE, 64).offsets
+    np.testing.assert_allclose(offsets[MIRROR] * [1, -1, 1], offsets, atol=1e-12)
+    assert worst(offsets, 1.1 * REST_OFFSETS) < 0.04
+
+
+def test_a_joint_never_seen_lies_between_its_neighbours() -> None:
+    positions = waving(64, 1.1, speed=3.0)
+    hidden = [J[n] for n in ("spine1", "spine2", "left_collar", "right_collar")]
+    positions[:, hidden] = np.nan
+    assert worst(estimate_bones(positions, BIAS, NOISE, 64).offsets, 1.1 * REST_OFFSETS) < 0.02
+
+
+def test_what_noise_explains_averages_out_and_a_good_sensor_is_believed() -> None:
+    """The same samples: nearly this person's bones from motion capture, human ones from a sensor that may err."""
+    long = REST_OFFSETS.copy()
+    legs = [J[f"{s}_{j}"] for s in ("left", "right") for j in ("knee", "ankle")]
+    long[legs] *= 1.15
+    positions = solve_pose(waving(12, speed=3.0), long)[1]
+    positions = positions + np.random.default_rng(0).normal(size=positions.shape) * 0.01
+    off = [
+        np.abs(lengths(estimate_bones(positions, bias, 0.01, 64).offsets - long))[legs].mean() for bias in (0.0, 0.02)
+    ]
+    assert off[0] < 0.005 < 0.02 < off[1]
+
+
+def test_what_is_still_to_be_learned_of_a_bone_falls_with_every_sample_and_ends() -> None:
+    positions = waving(64, speed=3.0)
+    variance = np.stack([estimate_bones(positions[:n], BIAS, NOISE, 64).length_variance for n in (1, 8, 32, 64)])
+    assert (np.diff(variance[:, 1:], axis=0) < 0).all()
+    assert (variance[-1] == 0).all()
+    sure = estimate_bones(positions[:1], 0.0, 0.001, 64).length_variance
+    assert sure.max() < 0.002**2
+
+
+def test_bones_are_recovered_from_noisy_poses() -> None:
+    rng = np.random.default_rng(6)
+    bones = REST_OFFSETS * rng.uniform(0.8, 1.2, size=(22, 1))
+    positions = fk(random_pose(rng, 300, spread=0.2), bones) + rng.normal(size=(300, 22, 3)) * 0.015
+    positions[:20] += rng.normal(size=(20, 22, 3)) * 0.5  # outliers
+    estimate = estimate_offsets(positions)
+    error = np.linalg.norm(estimate, axis=-1) - np.linalg.norm(bones, axis=-1)
+    assert np.abs(error[1:]).max() < 0.012
+
+
+def test_bones_between_joints_that_are_never_seen_span_the_gap() -> None:
+    bones = REST_OFFSETS * 1.1
+    positions = fk(random_pose(np.random.default_rng(7), 50, spread=0.1), bones)
+    unseen = [J["spine1"], J["spine2"], J["left_collar"], J["right_collar"]]
+    positions[:, unseen] = np.nan
+    estimate = estimate_offsets(positions)
+    chain = [J["spine1"], J["spine2"], J["spine3"]]
+    assert np.linalg.norm(estimate[chain].sum(axis=0)) == pytest.approx(
+        np.linalg.norm(bones[chain].sum(axis=0)), rel=0.02
+    )
+    placed = solve_pose(positions, estimate)[1]
+    assert np.nanmedian(np.linalg.norm(placed - positions, axis=-1)[:, J["left_shoulder"]]) < 0.01
