@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -11,36 +12,41 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from steadypose.prior.motion.datasets import DATA_SETS, DataSet, Dropped
-from steadypose.prior.motion.prepare import FPS, Prepared, prepare_clip, write_prepared
+from steadypose.prior.motion.clip import Clip
+from steadypose.prior.motion.datasets import DATA_SETS, SPLITS, DataSet, Dropped
+from steadypose.prior.motion.prepare import FPS, Prepared, at_speed, prepare_clip, write_prepared
 
 
 class PrepareError(ValueError):
     """There is nothing to prepare; the message says what was looked for."""
 
 
-def prepare(mocap: Path, out: Path = Path("data")) -> None:
+def prepare(mocap: Path, out: Path = Path("data"), speeds: tuple[float, ...] = (1.0,)) -> None:
     """Turn motion capture into training data: 22 joints at 30 Hz, z up, on a floor, with contacts and splits.
 
     Writes prepared.npz, and prepare-report.json, which lists every recording that was left out and why. Validation
-    holds out subjects, or whole recordings where subjects are not known, never frames. Models trained on the set
-    'default' may go into products; 'research' is what only non-commercial models may use.
+    and test hold out people, never frames; what is chosen is chosen on validation, and nothing on test. Models
+    trained on the set 'default' may go into products; 'research' is what only non-commercial models may use, and
+    what these validate on tests the default ones.
 
     What is read, by the name of the archive (.tar.xz, .npz) or folder:
       cmu_amc, cmu_bvh, cmu_expmap   CMU Graphics Lab, free for all uses            default
+      cmu_dance                      the same: salsa; martial arts and dance test   default
       reactidle                      ReActIdle, MIT                                 default
       ui_prmd                        UI-PRMD, the Vicon's joints, public domain     default
       bandai_1, bandai_2             Bandai-Namco, CC BY-NC                         research
       amass                          AMASS' .npz, non-commercial                    research
-      own                            your own BVH; a folder 'val' in it validates   default
+      own                            your own BVH; folders 'val', 'test' hold out   default
 
     Try:
       steadypose prepare mocap/                        all of it, a few minutes
       steadypose prepare mocap/cmu_amc.tar.xz --out /tmp/cmu
+      steadypose prepare mocap/ --speeds 1 1.5 2       fast motion to train on
 
     Args:
         mocap: folder with these, or one of them.
         out: folder to write to.
+        speeds: training recordings of 50 frames a second and more are played once at each of these speeds.
     """
     console = Console()
     sources = find_sources(mocap)
@@ -55,7 +61,7 @@ def prepare(mocap: Path, out: Path = Path("data")) -> None:
         tasks = [progress.add_task(path.name, start=False, total=1.0, count="") for path, _ in sources]
         for task, (path, data_set) in zip(tasks, sources, strict=True):
             progress.start_task(task)
-            _read(path, data_set, result, progress, task)
+            _read(path, data_set, result, progress, task, speeds)
     if not result.prepared:
         raise PrepareError(f"nothing usable in {mocap}; dropped: {len(result.dropped)}")
     out.mkdir(parents=True, exist_ok=True)
@@ -120,11 +126,12 @@ class _Result:
         table = Table(title="Prepared: recordings and hours at 30 Hz")
         for name in ("source", "licence", "weights"):
             table.add_column(name)
-        for name in ("train", "hours", "val", "hours"):
-            table.add_column(name, justify="right")
-        sums: dict[str, list[float]] = defaultdict(lambda: [0, 0.0, 0, 0.0])
+        for split in SPLITS:
+            table.add_column(split, justify="right")
+            table.add_column("hours", justify="right")
+        sums: dict[str, list[float]] = defaultdict(lambda: [0.0] * 2 * len(SPLITS))
         for (source, licence, weights), splits in self.hours().items():
-            row = [*splits.get("train", (0, 0.0)), *splits.get("val", (0, 0.0))]
+            row = [value for split in SPLITS for value in splits.get(split, (0, 0.0))]
             table.add_row(source, licence, weights, *_cells(row))
             sums[weights] = [a + b for a, b in zip(sums[weights], row, strict=True)]
         table.add_section()
@@ -143,10 +150,12 @@ class _Result:
 
 
 def _cells(row: list[float]) -> list[str]:
-    return [f"{row[0]:.0f}", f"{row[1]:.2f}", f"{row[2]:.0f}", f"{row[3]:.2f}"]
+    return [f"{value:.{2 * (place % 2)}f}" for place, value in enumerate(row)]
 
 
-def _read(path: Path, data_set: DataSet, result: _Result, progress: Progress, task: TaskID) -> None:
+def _read(
+    path: Path, data_set: DataSet, result: _Result, progress: Progress, task: TaskID, speeds: Sequence[float]
+) -> None:
     kept = dropped = 0
     reading = True
     seconds = 0.0
@@ -157,8 +166,7 @@ def _read(path: Path, data_set: DataSet, result: _Result, progress: Progress, ta
         progress.update(task, completed=fraction, count=count)
 
     for clip in data_set.read(path, advance):
-        parts = [clip] if isinstance(clip, Dropped) else prepare_clip(clip, data_set.weights, data_set.split(clip))
-        for part in parts:
+        for part in [clip] if isinstance(clip, Dropped) else _played(clip, data_set, speeds):
             if isinstance(part, Dropped):
                 result.dropped.append(part)
                 dropped += 1
@@ -168,3 +176,11 @@ def _read(path: Path, data_set: DataSet, result: _Result, progress: Progress, ta
                 seconds += part.clip.seconds
     reading = False
     advance(1.0)
+
+
+def _played(clip: Clip, data_set: DataSet, speeds: Sequence[float]) -> Iterator[Prepared | Dropped]:
+    """What a recording gives: held out, itself; in training, once at each speed."""
+    split = data_set.split(clip)
+    for speed in speeds if split == "train" else (1.0,):
+        if (played := at_speed(clip, speed)) is not None:
+            yield from prepare_clip(played, data_set.weights, split, speed)

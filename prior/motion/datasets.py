@@ -1,7 +1,7 @@
-"""The data sets that are known: who moves in them, under which licence, and what is held out for validation.
+"""The data sets that are known: who moves in them, under which licence, and what is held out to validate and to test.
 
-What is validated on is never a random choice of frames or clips where the subject is known: the motion model
-would be measured on people it has learnt.
+What is held out is never a random choice of frames or clips where the subject is known: the motion model would be
+measured on people it has learnt. A person is in one split only.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from steadypose.prior.motion.amc import Asf, read_amc, read_asf
 from steadypose.prior.motion.bvh import Bvh, read_bvh
 from steadypose.prior.motion.clip import Y_UP_TO_Z_UP, Clip, MotionError
 from steadypose.prior.motion.npz import read_amass, read_expmap
-from steadypose.prior.motion.tables import BANDAI, BVH_RIGS, CMU_AMC, CMU_BVH, ICLONE, REACTIDLE, Rig
+from steadypose.prior.motion.tables import BANDAI, BVH_RIGS, CMU_AMC, CMU_BVH, CMU_DAZ, ICLONE, REACTIDLE, Rig
 from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
 
 CMU_LICENCE = "CMU mocap: free, no resale"
@@ -36,9 +36,17 @@ CMU_FPS = 120.0
 REST_POSE_SPEED = 30.0
 """m/s. No body does this: a first frame that is left faster is a rest pose that a converter has put in front."""
 
+LEAVING_SPEED, REST_POSE_SECONDS = 5.0, 0.1
+"""m/s, seconds. Converters that filter blend the rest pose into the motion: frames that are left faster than this, so
+soon after it, go too (five of `cmu_dance`'s at 120 Hz)."""
+
 UNREADABLE = "cannot be read"
 
-Split = Literal["train", "val"]
+Split = Literal["train", "val", "test"]
+"""What a recording may be used for: nothing is chosen on ``test``."""
+
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
 WeightSet = Literal["default", "research"]
 
 
@@ -72,7 +80,7 @@ class DataSet:
         files: a pattern (regex) of the names of the files or folders that hold it.
         weights: ``default`` if models trained on it may go into products, else ``research``.
         read: reads a file or folder.
-        split: tells of a clip whether it trains or validates.
+        split: tells of a clip whether it trains, validates or tests.
     """
 
     name: str
@@ -129,9 +137,16 @@ def bvh_motion(text: str, rig: Rig | None = None) -> tuple[Bvh, Skeleton, NDArra
         known = ", ".join(r.skeleton.name for r in rigs)
         raise MotionError(f"expected joints named as in {known} (prior/motion/tables.py), got {bvh.joints[:8]}...")
     positions = _select(rig, bvh.joints, bvh.positions(rig.lost_bones))
-    if len(positions) > 1 and np.abs(positions[1] - positions[0]).max() * bvh.fps > REST_POSE_SPEED:
-        positions = positions[1:]
-    return bvh, rig.skeleton, positions
+    return bvh, rig.skeleton, positions[_rest_frames(positions, bvh.fps) :]
+
+
+def _rest_frames(positions: NDArray[np.float64], fps: float) -> int:
+    """How many frames at the start are a rest pose that a converter has put in front, and the way out of it."""
+    start = positions[: max(2, round(REST_POSE_SECONDS * fps) + 1)]
+    speed = np.abs(np.diff(start, axis=0)).max(axis=(1, 2), initial=0.0) * fps
+    if not len(speed) or speed[0] <= REST_POSE_SPEED:
+        return 0
+    return int(np.flatnonzero(speed > LEAVING_SPEED)[-1]) + 1
 
 
 def _select(rig: Rig, joints: Sequence[str], positions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -268,6 +283,20 @@ def _read_cmu_expmap(path: Path, progress: Progress) -> Iterator[Clip | Dropped]
             yield Clip(name, source, CMU_LICENCE, "unknown", action, fps, CMU_BVH.skeleton, motion)
 
 
+def _read_cmu_dance(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
+    source = "CMU (dance)"
+    for name, content in members(path, (".bvh",), progress):
+        kind = PurePosixPath(name).parent.name
+        title = f"{kind}_{_stem(name)}"
+        try:
+            bvh, skeleton, positions = bvh_motion(content.decode("ascii", "replace"), CMU_DAZ)
+        except MotionError as error:
+            yield Dropped(title, source, UNREADABLE, str(error))
+            continue
+        # All stand on one skeleton; who dances is not told, but no one of one kind is in another.
+        yield Clip(title, source, CMU_LICENCE, kind, kind, bvh.fps, skeleton, positions)
+
+
 def _read_reactidle(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
     for name, content in members(path, (".bvh",), progress):
         stem = _stem(name)
@@ -328,8 +357,11 @@ def _held_out(test: bool) -> Split:
     return "val" if test else "train"
 
 
-CMU_VALIDATION = frozenset(f"02_{take:02d}" for take in range(5, 11))
-"""AMC recordings: subject 02's, but for four that walk, run and jump."""
+CMU_VALIDATION = frozenset({"02"})
+"""Subjects of the AMC recordings; all ten of subject 02's are among them, so that no other archive has more of them."""
+
+DANCE_TRAINING = frozenset({"salsa"})
+"""Kinds, and so people: the others (martial arts, Indian dance) are the test split."""
 
 REACTIDLE_VALIDATION = ("013", "014", "015")
 """Subjects."""
@@ -341,15 +373,16 @@ AMASS_VALIDATION = frozenset({"HumanEva", "MPI_HDM05", "HDM05", "SFU", "MPI_mosh
 """Folders that hold the parts HM-VAE validates on (the names of both of AMASS' releases)."""
 
 DATA_SETS: tuple[DataSet, ...] = (
-    # The unnamed expmap clips may be of subjects 06 and 07, who therefore never validate.
+    # The unnamed expmap clips may be of subjects 06 and 07: all of these train.
     DataSet(
         "CMU (AMC)", r"cmu_amc\b.*", "default", _read_cmu_amc,
-        lambda clip: _held_out(clip.name in CMU_VALIDATION),
+        lambda clip: _held_out(clip.subject in CMU_VALIDATION),
     ),
     DataSet("CMU (BVH)", r"cmu_bvh\b.*", "default", _read_cmu_bvh, lambda _: "train"),
+    DataSet("CMU (expmap)", r"cmu_expmap\b.*", "default", _read_cmu_expmap, lambda _: "train"),
     DataSet(
-        "CMU (expmap)", r"cmu_expmap\b.*", "default", _read_cmu_expmap,
-        lambda clip: _held_out(clip.name.startswith("test_")),
+        "CMU (dance)", r"cmu_dance\b.*", "default", _read_cmu_dance,
+        lambda clip: "train" if clip.subject in DANCE_TRAINING else "test",
     ),
     DataSet(
         "ReActIdle", r"reactidle\b.*", "default", _read_reactidle,
@@ -369,7 +402,7 @@ DATA_SETS: tuple[DataSet, ...] = (
     ),
     DataSet(
         "own", r"own\b.*", "default", _read_own,
-        lambda clip: _held_out("val" in PurePosixPath(clip.name).parts),
+        lambda clip: next((split for split in SPLITS[1:] if split in PurePosixPath(clip.name).parts), "train"),
     ),
 )  # fmt: skip
 """In the order of preparation. What a user puts into a folder ``own`` is theirs to train on: the default set."""

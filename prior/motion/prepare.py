@@ -26,6 +26,9 @@ FPS = 30.0
 CUTOFF = 12.0
 """Hz. 30 frames a second show motion up to 15 Hz; what is faster would come out as slower, and is taken out first."""
 
+FAST_ENOUGH = 50.0
+"""Frames a second of recordings that can be played faster and still show at 30 Hz what the body did."""
+
 MAX_GAP = 0.2
 """Seconds. A joint lost for no longer is interpolated; for longer, the recording is cut there."""
 
@@ -54,7 +57,8 @@ class Prepared:
     Attributes:
         clip: its joints canonical, at 30 Hz, z up, floor at z = 0.
         weights: the set of weights it may train.
-        split: whether it trains or validates.
+        split: whether it trains, validates or tests.
+        speed: at how many times its speed it is played.
         offsets: (22, 3) metres, its subject's bones.
         rotations: (T, 22, 4) local, xyzw.
         contacts: (T, 8).
@@ -68,13 +72,30 @@ class Prepared:
     rotations: NDArray[np.float64]
     contacts: NDArray[np.bool_]
     flat: bool
+    speed: float = 1.0
 
 
-def prepare_clip(clip: Clip, weights: WeightSet, split: Split) -> Iterator[Prepared | Dropped]:
+def at_speed(clip: Clip, speed: float) -> Clip | None:
+    """The clip played faster, named so; None where its frames do not suffice: those at `FAST_ENOUGH` a second do.
+
+    Faster than it was, a motion has frequencies at 30 Hz that its recording at 30 Hz has not.
+    """
+    if speed == 1.0:
+        return clip
+    return replace(clip, name=f"{clip.name} x{speed:g}", fps=clip.fps * speed) if clip.fps >= FAST_ENOUGH else None
+
+
+def prepare_clip(clip: Clip, weights: WeightSet, split: Split, speed: float = 1.0) -> Iterator[Prepared | Dropped]:
     """Resample, find the floor, check and label a recording.
 
     Yields its good parts, and what is left out and why. A recording is cut where joints are lost or do what no body
     does; a part of one is named by the second it begins at.
+
+    Args:
+        clip: as read, or `at_speed`.
+        weights: the set of weights it may train.
+        split: what it is used for.
+        speed: at which it is played, for the accelerations that a body may have.
     """
     clip = clip.canonical()
     if clip.seconds < MIN_SECONDS:
@@ -93,7 +114,7 @@ def prepare_clip(clip: Clip, weights: WeightSet, split: Split) -> Iterator[Prepa
             continue
         positions = resample(filled[start:stop], clip.fps)
         positions[..., 2] -= floor_height(positions)
-        bad, fault = find_faults(positions)
+        bad, fault = find_faults(positions, MAX_ACCELERATION * speed**2)
         if fault:
             yield Dropped(clip.name, clip.source, "cut: impossible motion", fault)
         for first, last in _runs(~bad):
@@ -103,14 +124,14 @@ def prepare_clip(clip: Clip, weights: WeightSet, split: Split) -> Iterator[Prepa
                 yield _too_short(name, clip.source, (last - first) / FPS)
             else:
                 part = replace(clip, name=name, fps=FPS, positions=positions[first:last])
-                yield _label(part, weights, split)
+                yield _label(part, weights, split, speed)
 
 
 def _too_short(name: str, source: str, seconds: float) -> Dropped:
     return Dropped(name, source, f"shorter than {MIN_SECONDS:.0f} s", f"{seconds:.2f} s long")
 
 
-def _label(clip: Clip, weights: WeightSet, split: Split) -> Prepared:
+def _label(clip: Clip, weights: WeightSet, split: Split, speed: float) -> Prepared:
     offsets = estimate_offsets(clip.positions)
     rotations = Rotation.from_matrix(solve_rotations(clip.positions, offsets).reshape(-1, 3, 3)).as_quat()
     return Prepared(
@@ -121,6 +142,7 @@ def _label(clip: Clip, weights: WeightSet, split: Split) -> Prepared:
         rotations=rotations.reshape(*clip.positions.shape[:2], 4),
         contacts=label_contacts(clip.positions, FPS),
         flat=stays_on_floor(clip.positions),
+        speed=speed,
     )
 
 
@@ -194,7 +216,9 @@ def _toes(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     return toes, np.linalg.norm(np.gradient(toes, 1 / FPS, axis=0), axis=-1)
 
 
-def find_faults(positions: NDArray[np.float64]) -> tuple[NDArray[np.bool_], str]:
+def find_faults(
+    positions: NDArray[np.float64], max_acceleration: float = MAX_ACCELERATION
+) -> tuple[NDArray[np.bool_], str]:
     """Frames (T,) of (T, 22, 3) positions at 30 Hz in which a body does what none can, and the worst of it in words.
 
     The words are empty where there is nothing.
@@ -209,10 +233,10 @@ def find_faults(positions: NDArray[np.float64]) -> tuple[NDArray[np.bool_], str]
         words.append(f"the bone to {JOINTS[bone + 1]} is {off}")
         bad |= (change > MAX_BONE_CHANGE).any(axis=1)
     acceleration = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=-1) * FPS**2
-    if acceleration.max() > MAX_ACCELERATION:
+    if acceleration.max() > max_acceleration:
         frame, joint = np.unravel_index(acceleration.argmax(), acceleration.shape)
         words.append(f"{JOINTS[joint]} accelerates by {acceleration[frame, joint]:.0f} m/s² at {frame / FPS:.1f} s")
-        jerked = (acceleration > MAX_ACCELERATION).any(axis=1)
+        jerked = (acceleration > max_acceleration).any(axis=1)
         for shift in range(3):
             bad[shift : shift + len(jerked)] |= jerked
     return bad, "; ".join(words)
@@ -224,7 +248,7 @@ def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:
     Arrays: ``positions`` (N, 22, 3) float32 metres, z up, floor 0, all recordings in a row at 30 Hz; ``rotations``
     (N, 22, 4) float32 local, xyzw; ``contacts`` (N, 8) bool; ``offsets`` (C, 22, 3) float32 metres; ``clip_start``
     (C + 1,) int64; and for each of the C recordings ``name``, ``source``, ``licence``, ``subject``, ``action``,
-    ``split``, ``set``, and ``flat`` (bool, see `Prepared`).
+    ``split``, ``set``, ``flat`` and ``speed`` (see `Prepared`).
     """
     frames = [len(p.clip.positions) for p in prepared]
     arrays = {
@@ -236,6 +260,7 @@ def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:
         "split": np.array([p.split for p in prepared]),
         "set": np.array([p.weights for p in prepared]),
         "flat": np.array([p.flat for p in prepared]),
+        "speed": np.array([p.speed for p in prepared]),
         **{k: np.array([getattr(p.clip, k) for p in prepared]) for k in _TEXTS},
     }
     partial = path.with_name(f"{path.stem}.partial.npz")

@@ -221,5 +221,35 @@ BANDAI = Rig(
     metres=0.01,
 )
 
-BVH_RIGS: tuple[Rig, ...] = (CMU_BVH, ICLONE, REACTIDLE, BANDAI)
+# DAZ's figures, another common form of CMU's database. hip -2.6, abdomen 18.0, chest 29.7, neck 51.9, head 59.0, eyes
+# 67.1 and 8 before the head, shoulders 47.0: torso 0.91 of the rest skeleton's. Toes are the feet's end sites.
+_DAZ_SPINE3 = {"chest": 0.8, "neck": 0.2}
+CMU_DAZ = Rig(
+    _skeleton(
+        "cmu_daz",
+        {
+            "pelvis": {"hip": 0.54, "abdomen": 0.46},
+            "spine1": {"hip": 0.05, "abdomen": 0.95},
+            "spine2": {"abdomen": 0.08, "chest": 0.92},
+            "spine3": _DAZ_SPINE3,
+            "neck": "neck",
+            "head": {"head": 0.57, "leftEye": 0.215, "rightEye": 0.215},
+        },
+        {
+            "hip": "lThigh",
+            "knee": "lShin",
+            "ankle": "lFoot",
+            "foot": "lFoot_end",
+            "collar": _collar(_DAZ_SPINE3, "neck", "lShldr"),
+            "shoulder": "lShldr",
+            "elbow": "lForeArm",
+            "wrist": "lHand",
+        },
+        "^l(?=[A-Z])",
+        "r",
+    ),
+    metres=0.01,
+)
+
+BVH_RIGS: tuple[Rig, ...] = (CMU_BVH, CMU_DAZ, ICLONE, REACTIDLE, BANDAI)
 """The families of BVH files that are recognised by their joints' names."""

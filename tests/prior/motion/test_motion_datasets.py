@@ -132,6 +132,13 @@ def test_a_rest_pose_put_in_front_is_left_out() -> None:
     assert len(bvh_motion(idle_bvh(frames=40))[2]) == 40
 
 
+def test_the_way_out_of_a_rest_pose_is_left_out_too() -> None:
+    rows = idle_bvh(frames=40).splitlines()
+    first = rows.index("Frames: 40") + 2
+    rows[first : first + 2] = ["0 0.9 5 0 0 0", "0 0.9 0.5 0 0 0"]
+    assert len(bvh_motion("\n".join(rows))[2]) == 38
+
+
 def test_a_bvh_of_no_known_family_says_which_names_are() -> None:
     with pytest.raises(MotionError, match=r"iclone.*reactidle.*tables\.py.*'cog'"):
         bvh_motion(idle_bvh().replace("pelvis", "cog"))
@@ -153,16 +160,17 @@ def test_the_splits_are_those_of_the_data_sets() -> None:
     split = {s.name: s.split for s in DATA_SETS}
     assert split["UI-PRMD (Vicon)"](clip("m01_s06_e01", "s06")) == "train"
     assert split["UI-PRMD (Vicon)"](clip("m01_s07_e01", "s07")) == "val"
-    assert split["CMU (AMC)"](clip("02_04", "02")) == "train"
-    assert split["CMU (AMC)"](clip("02_05", "02")) == "val"
+    assert {split["CMU (AMC)"](clip(name, "02")) for name in ("02_01", "02_05", "02_10")} == {"val"}
     assert split["CMU (AMC)"](clip("01_05", "01")) == "train"
-    assert split["CMU (expmap)"](clip("test_walking_1", "unknown")) == "val"
-    assert split["CMU (expmap)"](clip("train_walking_2", "unknown")) == "train"
+    assert {split["CMU (expmap)"](clip(f"{kind}_walking_2", "unknown")) for kind in ("train", "test")} == {"train"}
+    kinds = ("salsa", "martial", "indian")
+    assert [split["CMU (dance)"](clip(f"{kind}_01", kind)) for kind in kinds] == ["train", "test", "test"]
     assert split["CMU (BVH)"](clip("006_12", "06")) == "train"
     assert split["ReActIdle"](clip("014_acted", "014")) == "val"
-    assert split["own"](clip("val/me/1.bvh", "val/me")) == "val"
-    # Whoever validates is not trained on under another name.
-    assert not {kept for left_out, kept in REPEATS.items() if kept.startswith("test_")} & REPEATS.keys()
+    own = ("me/1.bvh", "val/me/1.bvh", "test/you/1.bvh")
+    assert [split["own"](clip(name, "")) for name in own] == ["train", "val", "test"]
+    # Whoever validates is not trained on under another name: of what subject 02 did, the AMC recordings are kept.
+    assert all(kept.startswith("02_") for left_out, kept in REPEATS.items() if left_out.startswith("002_"))
 
 
 def test_a_recording_that_is_there_twice_is_left_out_by_name(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.layouts import CANONICAL
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.motion.clip import Clip
+from steadypose.prior.motion.dataset import MotionSet
 from steadypose.prior.motion.datasets import Dropped
 from steadypose.prior.motion.prepare import (
     FPS,
@@ -209,19 +210,23 @@ def test_the_command_prepares_what_it_finds_and_lists_what_it_leaves_out(
             "acted/003_acted.bvh": idle_bvh(72)[:-200],
         },
     )
-    unpack(mocap / "own", {"me/wave.bvh": idle_bvh(48), "val/you/wave.bvh": idle_bvh(48)})
+    own = {"me/wave.bvh": idle_bvh(240, 120), "val/you/wave.bvh": idle_bvh(48), "test/them/wave.bvh": idle_bvh(48)}
+    unpack(mocap / "own", own)
     (mocap / "holiday.jpg").write_bytes(b"")
-    prepare(mocap, tmp_path / "data")
+    prepare(mocap, tmp_path / "data", (1.0, 1.6))
 
     with np.load(tmp_path / "data" / "prepared.npz") as z:
         assert dict(zip(z["name"].tolist(), z["split"].tolist(), strict=True)) == {
             "001_acted": "train",
             "014_acted": "val",
             "me/wave.bvh": "train",
+            "me/wave.bvh x1.6": "train",
+            "test/them/wave.bvh": "test",
             "val/you/wave.bvh": "val",
         }
         assert set(z["licence"].tolist()) == {"MIT", "own"}
-        np.testing.assert_allclose(np.diff(z["clip_start"]), [89, 89, 59, 59])
+        np.testing.assert_allclose(np.diff(z["clip_start"]), [89, 89, 60, 38, 59, 59])
+        assert z["speed"].tolist() == [1.0, 1.0, 1.0, 1.6, 1.0, 1.0]
     report = json.loads((tmp_path / "data" / "prepare-report.json").read_text())
     assert {(d["name"], d["kind"]) for d in report["dropped"]} == {
         ("002_acted", "shorter than 1 s"),
@@ -243,3 +248,25 @@ def test_nothing_to_prepare_says_what_was_looked_for(tmp_path: Path) -> None:
     with pytest.raises(PrepareError, match="nothing usable"):
         prepare(tmp_path, tmp_path / "data")
     assert not (tmp_path / "data").exists()
+
+
+def test_what_only_research_weights_are_validated_on_tests_the_default_ones(tmp_path: Path) -> None:
+    parts = [p for n in (40, 50, 60, 70) for p in prepare_clip(a_clip(standing(n)), "default", "train")]
+    first, second, third, fourth = (p for p in parts if isinstance(p, Prepared))
+    kept = [
+        first,
+        replace(second, split="test"),
+        replace(third, weights="research", split="val"),
+        replace(fourth, weights="research"),
+    ]
+    path = tmp_path / "prepared.npz"
+    write_prepared(kept, path)
+    frames = {
+        (w, s): len(MotionSet.load(path, w, s).positions) for w in ("default", "research") for s in ("train", "test")
+    }
+    assert frames == {
+        ("default", "train"): 40,
+        ("default", "test"): 110,
+        ("research", "train"): 110,
+        ("research", "test"): 50,
+    }
