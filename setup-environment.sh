@@ -1,23 +1,43 @@
-# Sourced by ./steadypose and ./test: makes .venv match uv.lock. Quick when there is nothing to do.
+# Sourced by ./steadypose and ./test, with $root: the checkout. `install EXTRA...` makes its .venv match uv.lock, with
+# these extras; quick when there is nothing to do. What is installed already stays.
 UV_VERSION=0.13.8
 
-stamp=.venv/.installed
-if [ ! -e "$stamp" ] || [ uv.lock -nt "$stamp" ] || [ pyproject.toml -nt "$stamp" ]; then
-    python=$(command -v python3.11 || command -v python3 || true)
-    if [ -z "$python" ] || ! "$python" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'; then
-        echo "steadypose needs Python 3.11; found: ${python:-none}. On Debian 12: sudo apt install python3 python3-venv" >&2
-        exit 1
+# A Python to install with: 3.11 first, for most was measured on it. A name on the PATH may be a stub that cannot run.
+find_python() {
+    for name in python3.11 python3.12 python3.13 python3.10 python3; do
+        if "$name" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then
+            command -v "$name"
+            return
+        fi
+    done
+    echo "steadypose needs Python 3.10 to 3.13, and found none. On Debian or Ubuntu: sudo apt install python3-venv" >&2
+    return 1
+}
+
+install() {
+    stamp="$root/.venv/.installed-$(echo "$@" | tr ' ' '-')"
+    if [ -e "$stamp" ] && [ ! "$root/uv.lock" -nt "$stamp" ] && [ ! "$root/pyproject.toml" -nt "$stamp" ]; then
+        return
     fi
-    echo "Installing steadypose into .venv (about 6 GB, most of it torch; once)" >&2
-    if [ ! -x .uv/bin/uv ]; then
-        "$python" -m venv .uv || {
-            echo "Python's venv module is missing. On Debian: sudo apt install python3-venv" >&2
+    python=$(find_python)
+    echo "Installing steadypose[$(echo "$@" | tr ' ' ',')] into $root/.venv, once" >&2
+    if [ ! -x "$root/.uv/bin/uv" ]; then
+        "$python" -m venv "$root/.uv" || {
+            echo "Python's venv module is missing. On Debian or Ubuntu: sudo apt install python3-venv" >&2
             exit 1
         }
-        .uv/bin/python -m pip install --quiet --disable-pip-version-check "uv==$UV_VERSION"
+        "$root/.uv/bin/python" -m pip install --quiet --disable-pip-version-check "uv==$UV_VERSION"
     fi
-    .uv/bin/uv sync --frozen --inexact --compile-bytecode --extra view --python "$python"
-    # numba compiles its loops once; else the first stream would wait for it
-    .venv/bin/python -c "import steadypose.prior.camera.depth_lifting, steadypose.prior.world.root_filter; from steadypose.prior.clean.pipeline import load_loops; load_loops()"
+    extras=
+    for extra in "$@"; do
+        extras="$extras --extra $extra"
+    done
+    # shellcheck disable=SC2086  (words, on purpose)
+    (unset VIRTUAL_ENV UV_PROJECT_ENVIRONMENT &&
+        "$root/.uv/bin/uv" sync --project "$root" --frozen --inexact --python "$python" $extras)
+    # loops are compiled once, and bytecode written; else the first stream would wait for both
+    "$root/.venv/bin/python" -c "import steadypose.nodes.commands.run, steadypose.nodes.graph.trajectory_node
+import steadypose.prior.camera.depth_lifting, steadypose.prior.clean.pipeline as prior
+prior.load_loops()"
     touch "$stamp"
-fi
+}

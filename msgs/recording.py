@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import IO, NamedTuple, Self
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
@@ -31,6 +31,9 @@ from rosbags.typesys import TypesysError, get_types_from_msg
 from steadypose.msgs.codec import DecodeError, decode, encode, typestore, wire_type
 from steadypose.msgs.topics import TOPICS, check_topic
 from steadypose.msgs.types import Message
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 CHUNK_NS = 500_000_000
 CHUNK_BYTES = 2**18

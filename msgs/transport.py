@@ -19,7 +19,7 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import Iterable
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import zmq
 
@@ -29,6 +29,7 @@ from steadypose.msgs.topics import TOPICS, check_topic
 from steadypose.msgs.types import Message
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
     from zmq.auth.thread import ThreadAuthenticator
 
 VERSION = 1

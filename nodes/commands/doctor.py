@@ -3,36 +3,52 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import tempfile
 import time
-import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
 
+from steadypose import PACKAGE
+
 # what is looked for is imported where it is looked for: a doctor who needs it all could not say what is missing
 if TYPE_CHECKING:
     from steadypose.msgs.types import PoseRaw
 
-INSTALL = "in the checkout: rm -f .venv/.installed && ./steadypose doctor"
-"""installs whatever is missing, then looks again"""
-INSTALL_EXTRA = "in the checkout: .uv/bin/uv sync --frozen --inexact --extra"
+PYTHONS = ((3, 10), (3, 13))
+"""the oldest and the newest that all packages of an installation come for"""
+PROJECT = PACKAGE.parents[1] / "pyproject.toml"
+"""of a checkout; an installed wheel has none"""
+INSTALL = (
+    "in the checkout: rm -f .venv/.installed-* && ./steadypose doctor"
+    if PROJECT.exists()
+    else "pip install --upgrade --force-reinstall steadypose"
+)
+"""installs whatever is missing"""
+INSTALL_EXTRA = (
+    "in the checkout: .uv/bin/uv sync --frozen --inexact --extra {}"
+    if PROJECT.exists()
+    else "pip install 'steadypose[{}]'"
+)
 EXTRAS = {
+    "dev": "the tests",
+    "oak": "an OAK camera as the source, and calibrating any camera",
     "ray": "steadypose clean --ray, on a cluster",
     "ros2": "the ROS 2 bridge, and skeletons from ROS 2 topics",
-    "view": "the picture in the browser",
+    "train": "steadypose train and evaluate",
+    "view": "the picture in the browser, and steadypose plot",
     "webcam": "a webcam as the source",
 }
 """what is optional, by the extra that it takes"""
-PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
-TOLD = ("torch", "numpy", "rosbags", "pyzmq", "depthai")
+TOLD = ("numpy", "numba", "rosbags", "pyzmq")
 """packages whose versions matter when something is wrong"""
 MODELS = ("hmvae", "hgvae", "trajectory")
 FRAMES = 100
@@ -42,7 +58,7 @@ TARGET_MS = 10.0
 BUDGET_MS = 1000 / 30
 LONGEST_IPC_PATH = 107
 """bytes of a unix socket's path that the system takes"""
-NEEDED_GB = 2.0
+NEEDED_GB = 1.0
 LUXONIS_USB = "03e7"
 UDEV_RULE = (
     f"""echo 'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{LUXONIS_USB}", MODE="0666"' | """
@@ -114,23 +130,43 @@ def _name(check: Callable[[], Iterator[Finding]]) -> str:
 
 def check_python() -> Iterator[Finding]:
     running = ".".join(map(str, sys.version_info[:3]))
-    good = sys.version_info[:2] == (3, 11)
-    fix = "" if good else "install Python 3.11; then in the checkout: rm -rf .venv .uv && ./steadypose doctor"
+    oldest, newest = PYTHONS
+    good = oldest <= sys.version_info[:2] <= newest
+    fix = "" if good else f"install Python {_dotted(oldest)} to {_dotted(newest)}, and steadypose anew with it"
     yield Finding("Python", Verdict.GOOD if good else Verdict.BAD, running, fix)
 
 
+def _dotted(number: tuple[int, int]) -> str:
+    return ".".join(map(str, number))
+
+
 def check_packages() -> Iterator[Finding]:
-    """What the checkout requires, and its optional extras."""
-    # not what the installed distribution says of itself: that is older than the checkout after a pull
-    project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
-    if missing := _missing(project["dependencies"]):
+    """What steadypose requires, and its optional extras."""
+    needed, extras = required()
+    if missing := _missing(needed):
         yield Finding("packages", Verdict.BAD, "; ".join(missing), INSTALL)
     else:
         yield Finding("packages", Verdict.GOOD, ", ".join(f"{name} {version(name)}" for name in TOLD))
-    for extra, wanted in sorted(project["optional-dependencies"].items()):
+    for extra, wanted in sorted(extras.items()):
         if missing := _missing(wanted):
             found = f"{EXTRAS[extra]}: {'; '.join(missing)}"
-            yield Finding(f"optional: {extra}", Verdict.NOTE, found, f"{INSTALL_EXTRA} {extra}")
+            yield Finding(f"optional: {extra}", Verdict.NOTE, found, INSTALL_EXTRA.format(extra))
+
+
+def required() -> tuple[list[str], dict[str, list[str]]]:
+    """What running takes, and what each extra does: of the checkout, or else of the installed wheel."""
+    if PROJECT.exists():
+        # not what the installed distribution says of itself: that is older than the checkout after a pull
+        import tomlkit
+
+        project = tomlkit.parse(PROJECT.read_text(encoding="utf-8")).unwrap()["project"]
+        return project["dependencies"], project["optional-dependencies"]
+    needed: list[str] = []
+    extras: dict[str, list[str]] = {}
+    for requirement in requires("steadypose") or ():
+        extra = re.search(r"""extra\s*==\s*['"]([\w-]+)""", requirement)
+        (extras.setdefault(extra[1], []) if extra else needed).append(requirement)
+    return needed, extras
 
 
 def _missing(wanted: list[str]) -> list[str]:
@@ -139,6 +175,9 @@ def _missing(wanted: list[str]) -> list[str]:
 
     missing = []
     for requirement in map(Requirement, wanted):
+        # the extra that it belongs to is asked about; the machine it is for may be another
+        if requirement.marker and not any(requirement.marker.evaluate({"extra": name}) for name in EXTRAS):
+            continue
         try:
             installed = version(requirement.name)
         except PackageNotFoundError:
@@ -229,17 +268,16 @@ def _round_trip(endpoint: str) -> float:
         return time.perf_counter() - started
 
 
-def check_torch() -> Iterator[Finding]:
-    import torch
-
-    vector = torch.ones(3)
-    assert float(vector @ vector) == 3.0
-    yield Finding("torch", Verdict.GOOD, f"{torch.__version__}, {torch.get_num_threads()} threads; nodes use 1")
+def _restored(what: str) -> str:
+    """How to get back what came with steadypose."""
+    return f"git checkout -- {what}" if PROJECT.exists() else INSTALL
 
 
 def check_models() -> Iterator[Finding]:
     """The weights that the nodes load, and what a frame costs with them."""
-    from steadypose.prior.models.weights_io import WEIGHTS, load_weights
+    import numpy as np
+
+    from steadypose.prior.models.weights_io import load_weights
 
     whole = True
     for model in MODELS:
@@ -247,10 +285,10 @@ def check_models() -> Iterator[Finding]:
             state, _ = load_weights("default", model)
         except (OSError, ValueError, KeyError) as error:
             whole = False
-            fix = f"git checkout -- {WEIGHTS.relative_to(WEIGHTS.parent.parent)}, or steadypose train {model}"
+            fix = f"{_restored('prior/weights')}, or steadypose train {model}"
             yield Finding(f"weights of {model}", Verdict.BAD, str(error).split(". ")[0], fix)
         else:
-            numbers = sum(tensor.numel() for tensor in state.values())
+            numbers = sum(np.asarray(tensor).size for tensor in state.values())
             yield Finding(f"weights of {model}", Verdict.GOOD, f"default, {numbers / 1e6:.2f} million numbers")
     if whole:
         yield _self_test()
@@ -275,7 +313,7 @@ def _self_test() -> Finding:
     p50, p99 = np.percentile(spent_ms[WARM_UP:], (50, 99))
     found = f"{p50:.1f} ms a frame, p99 {p99:.1f} ms, of {BUDGET_MS:.0f}"
     if not bodies or not all(np.isfinite(body.positions).all() for body in bodies):
-        return Finding("prior", Verdict.BAD, "gave no pose for a body that stands still", "git checkout -- prior")
+        return Finding("prior", Verdict.BAD, "gave no pose for a body that stands still", _restored("prior"))
     if p99 > BUDGET_MS:
         return Finding("prior", Verdict.NOTE, found, "too slow for 30 Hz at the moment: free the processor")
     if p99 > TARGET_MS:
@@ -304,17 +342,17 @@ def _standing(frame: int) -> PoseRaw:
 def check_streams() -> Iterator[Finding]:
     """What the default launch file plays."""
     from steadypose.msgs.recording import RecordingReader
-    from steadypose.nodes.graph.launch import Launch, checkout
+    from steadypose.nodes.graph.launch import Launch, bundled
     from steadypose.nodes.sources.pose_input import open_source
 
-    fix = "git checkout -- sim_data launch, or play your own: steadypose run --input RECORDING"
+    fix = f"{_restored('sim_data launch')}, or play your own: steadypose run --input RECORDING"
     recording = Path(Launch.read("replay").input.recording).resolve()
     try:
         open_source(recording)
     except (OSError, ValueError) as error:
         yield Finding("bundled streams", Verdict.BAD, str(error), fix)
         return
-    streams = sorted({file.parent for file in checkout("sim_data").rglob("*.mcap")})
+    streams = sorted({file.parent for file in bundled("sim_data").rglob("*.mcap")})
     seconds = 0.0
     for stream in streams:
         with RecordingReader(stream) as reader:
@@ -326,8 +364,10 @@ def check_camera() -> Iterator[Finding]:
     """OAK cameras: none is fine."""
     # its own warnings are about what is said here better
     os.environ.setdefault("DEPTHAI_LEVEL", "error")
-    import depthai
-
+    try:
+        import depthai
+    except ImportError:  # the extra that brings it is told of above
+        return
     devices = depthai.Device.getAllAvailableDevices()
     plugged = [file for file in Path("/sys/bus/usb/devices").glob("*/idVendor") if _reads(file, LUXONIS_USB)]
     if devices:
@@ -363,7 +403,6 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     check_memory,
     check_clock,
     check_messages,
-    check_torch,
     check_models,
     check_streams,
     check_camera,

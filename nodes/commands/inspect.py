@@ -12,7 +12,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -248,7 +248,7 @@ def _describe_recording(path: Path) -> Iterator[str]:
             contents[topic].add(message)
             stamps[topic].append(stamp_ns / 1e9)
         files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
-        start = datetime.fromtimestamp(recording.start_ns / 1e9, UTC)
+        start = datetime.fromtimestamp(recording.start_ns / 1e9, timezone.utc)
         size = sum(file.stat().st_size for file in files) / 1e6
         yield f"{path}: {recording.duration_s:.2f} s, {size:.2f} MB"
         yield f"from {start:%Y-%m-%d %H:%M:%S.%f} UTC, stamp {recording.start_ns}"

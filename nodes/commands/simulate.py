@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from steadypose.nodes.graph.launch import checkout
+from steadypose.nodes.graph.launch import bundled
 from steadypose.prior.sim.streams import ManifestError, read_manifest, record
 
 
@@ -31,7 +31,7 @@ def simulate(
         stream: names of the streams to make; all of them if left out.
         manifest: what to make; that of sim_data if left out.
     """
-    path = manifest or checkout("sim_data", "manifest.json")
+    path = manifest or bundled("sim_data", "manifest.json")
     known = read_manifest(path)
     if unknown := set(stream) - known.keys():
         raise ManifestError(f"{path} has no stream {', '.join(sorted(unknown))}; it has {', '.join(known)}")

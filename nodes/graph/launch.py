@@ -13,13 +13,13 @@ import difflib
 import math
 import os
 import tempfile
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomllib
 
 from steadypose import PACKAGE
 from steadypose.msgs.keys import Keys, load_keys
@@ -373,18 +373,15 @@ def default_directory() -> Path:
     return Path(runtime) / "steadypose" if runtime else Path(tempfile.gettempdir()) / f"steadypose-{os.getuid()}"
 
 
-def checkout(*parts: str) -> Path:
-    """A path inside the checkout this package runs from: launch files and recorded streams live there.
+def bundled(*parts: str) -> Path:
+    """A path inside the package: launch files, and a recorded stream (in a checkout, all of them) lie there.
 
     Raises:
-        LaunchError: it is not there, as in an install that is not editable.
+        LaunchError: it is not there: the installation is damaged.
     """
     path = PACKAGE.joinpath(*parts)
     if not path.exists():
-        raise LaunchError(
-            f"{path} does not exist: launch files and sim_data belong to the checkout. Install from it with "
-            "`pip install -e .`, or give the path of your own file"
-        )
+        raise LaunchError(f"{path} does not exist, and should have come with steadypose: install it anew")
     return path
 
 
@@ -394,9 +391,9 @@ def find(launch: str | Path) -> Path:
     if path.is_file():
         return path.resolve()
     if path.parent == Path() and not path.suffix:
-        own = sorted(file.stem for file in checkout("launch").glob("*.toml"))
+        own = sorted(file.stem for file in bundled("launch").glob("*.toml"))
         if path.name in own:
-            return checkout("launch", f"{path.name}.toml")
+            return bundled("launch", f"{path.name}.toml")
         raise LaunchError(
             f"no launch file {path.name!r}{nearest(path.name, own)}; there are {', '.join(own)}, or give a path"
         )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rclpy
@@ -26,6 +26,9 @@ from steadypose.msgs.types import Diagnostics, JointState, PoseWorld, Tracking, 
 from steadypose.nodes.sinks.ros2.dds import DdsOutput, body_transforms
 from steadypose.nodes.sinks.ros2.rep155 import Links, body_name, frames, joint_angles, joint_rotations, measures, urdf
 from steadypose.prior.body.skeleton import PARENTS, J
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 MARKERS = "steadypose/markers"
 POSES = "steadypose/poses"

@@ -14,7 +14,7 @@ from steadypose.benchmarks.systems.calibration import BOARD, depth_points, error
 from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.cli import main
 from steadypose.nodes.commands.calibrate import draw_floor
-from steadypose.nodes.graph.launch import Launch, LaunchError, checkout
+from steadypose.nodes.graph.launch import Launch, LaunchError, bundled
 from steadypose.nodes.sources.pose_input import PoseInputNode, RecordingSource
 from steadypose.prior.camera.calibration import Intrinsics, find_corners
 
@@ -176,7 +176,7 @@ def test_a_calibrated_camera_sends_its_place(make_launch: Callable[..., Launch],
     launch = make_launch(
         input__calibration__position="[1.0, 2.0, 1.5]", input__calibration__orientation=f"[{-half}, 0.0, 0.0, {half}]"
     )
-    node = PoseInputNode(launch, clock, RecordingSource(checkout("sim_data", "idle")))
+    node = PoseInputNode(launch, clock, RecordingSource(bundled("sim_data", "idle")))
     message = raw(0, walking(0))
     message.calibrated = False
     placed = node._placed(message)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from steadypose.nodes.graph.launch import Launch, LaunchError, checkout, find
+from steadypose.nodes.graph.launch import Launch, LaunchError, bundled, find
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def test_an_empty_file_is_a_launch(write) -> None:
 @pytest.mark.parametrize("name", ["replay", "kiosk"])
 def test_the_projects_own_files_are_found_by_name(name: str) -> None:
     launch = Launch.read(name)
-    assert Path(launch.input.recording).parent.resolve() == checkout("sim_data")
+    assert Path(launch.input.recording).parent.resolve() == bundled("sim_data").resolve()
 
 
 @pytest.mark.parametrize(
