@@ -20,6 +20,7 @@ from steadypose.benchmarks.peers import smoothnet, window_vaes
 from steadypose.benchmarks.peers.filters import PEERS, Peer
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.tuning import Tuned, search
+from steadypose.prior.clean.pipeline import PriorSettings
 from steadypose.prior.models.hmvae.network import MotionVAE
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ class Bench:
 
     Attributes:
         quick: fewer clips, points and steps, to see that all works.
+        split: of prepared motion that is scored: ``val`` to choose by, ``test`` to report.
         mocap: folder with ui_prmd.npz, or None.
         data: prepared.npz; where it does not exist, people of the project's own generator take its place.
         progress: bars.
@@ -48,6 +50,7 @@ class Bench:
     mocap: Path | None
     data: Path
     progress: Progress
+    split: str = "val"
 
     @property
     def delays(self) -> tuple[int, ...]:
@@ -63,8 +66,8 @@ class Bench:
         return 6 if self.quick else 18
 
     def clips(self, frames: int = 90, most: int = 32) -> MotionClips:
-        """Validation motion."""
-        return self._motion("val", frames, min(most, 12) if self.quick else most)
+        """Motion to score."""
+        return self._motion(self.split, frames, min(most, 12) if self.quick else most)
 
     def training_clips(self) -> MotionClips:
         """Training motion, of other people, for the peers that learn."""
@@ -75,7 +78,7 @@ class Bench:
         self.progress.stop()  # training draws a bar of its own
         try:
             if self.quick or not self.data.is_file():
-                train, val = as_set(self.training_clips()), as_set(self.clips())
+                train, val = as_set(self.training_clips()), as_set(self._motion("val", 90, 12))
                 with tempfile.TemporaryDirectory() as runs:
                     return window_vaes.trained(name, frames, train, val, Path(runs), steps=1)
             train, val = (prepared_set(self.data, split) for split in ("train", "val"))
@@ -87,7 +90,7 @@ class Bench:
     def _motion(self, split: str, frames: int, most: int) -> MotionClips:
         if self.data.is_file():
             return prepared_clips(self.data, split, frames, most)
-        return simulated_clips(frames, min(most, 60), seed=0 if split == "val" else 1)
+        return simulated_clips(frames, min(most, 60), seed=("val", "train", "test").index(split))
 
     @cached_property
     def smoothnets(self) -> list[smoothnet.SmoothNet]:
@@ -126,10 +129,31 @@ class Answer(NamedTuple):
     sigma: Floats | None = None  # (T', C, 22)
 
 
-def peers_of(bench: Bench, peers: Sequence[Peer] = PEERS) -> Iterator[tuple[Peer, int]]:
+class Methods(NamedTuple):
+    """What is compared.
+
+    Attributes:
+        peers: those without training.
+        ours: steadypose's variants.
+        delays: frames.
+        networks: whether the peer that is trained here takes part.
+    """
+
+    peers: Sequence[Peer]
+    ours: Mapping[str, PriorSettings]
+    delays: Sequence[int]
+    networks: bool = True
+
+    @classmethod
+    def all(cls, bench: Bench, peers: Sequence[Peer] = PEERS) -> Methods:
+        """These peers, and every variant of ours."""
+        return cls(peers, ours.OURS, bench.delays)
+
+
+def peers_of(peers: Sequence[Peer], delays: Sequence[int]) -> Iterator[tuple[Peer, int]]:
     """Every peer with every delay that it has."""
     for peer in peers:
-        for delay in bench.delays if peer.delays is None else peer.delays:
+        for delay in delays if peer.delays is None else peer.delays:
             yield peer, delay
 
 
@@ -139,31 +163,33 @@ def answers(
     stamps_s: Floats,
     tuned: Mapping[tuple[str, int], Tuned],
     title: str,
-    peers: Sequence[Peer] = PEERS,
+    methods: Methods | None = None,
 ) -> Iterator[Answer]:
     """All methods over clips (T, C, 22, 3), each with the parameters found for it; a network once for each seed."""
+    methods = methods or Methods.all(bench)
+    delays = methods.delays
 
     def by_peer(peer: Peer, delay: int) -> list[Answer]:
         parameters = tuned[peer.name, delay].parameters
         return [Answer(peer.name, delay, stamps_s, peer.run(seen, stamps_s, delay, **parameters), parameters)]
 
     def by_network(number: int) -> list[Answer]:
-        found = smoothnet.smooth(bench.smoothnets[number], seen, bench.delays)
+        found = smoothnet.smooth(bench.smoothnets[number], seen, delays)
         return [
             Answer("SmoothNet-style", delay, stamps_s, positions, {})
-            for delay, positions in zip(bench.delays, found, strict=True)
+            for delay, positions in zip(delays, found, strict=True)
         ]
 
     def by_us(name: str, delay: int) -> list[Answer]:
-        cleaned = ours.run(ours.OURS[name], seen, stamps_s, delay)
+        cleaned = ours.run(methods.ours[name], seen, stamps_s, delay)
         return [Answer(name, delay, cleaned.stamps_s, cleaned.positions, {}, cleaned.sigma)]
 
-    jobs: list[Callable[[], list[Answer]]] = [partial(by_peer, *one) for one in peers_of(bench, peers)]
-    jobs += [partial(by_network, number) for number in range(len(bench.seeds))]
+    jobs: list[Callable[[], list[Answer]]] = [partial(by_peer, *one) for one in peers_of(methods.peers, delays)]
+    jobs += [partial(by_network, number) for number in range(len(bench.seeds) if methods.networks else 0)]
     jobs += [
         partial(by_us, name, delay)
-        for name, settings in ours.OURS.items()
-        for delay in bench.delays
+        for name, settings in methods.ours.items()
+        for delay in delays
         if ours.available(settings, delay)
     ]
     for job in bench.progress.track(jobs, description=title):
@@ -175,13 +201,15 @@ def tune(
     evaluate: Callable[[Peer, int, Mapping[str, float]], dict[str, float]],
     title: str,
     peers: Sequence[Peer] = PEERS,
+    delays: Sequence[int] | None = None,
 ) -> dict[tuple[str, int], Tuned]:
     """The same search for every peer at every delay; ``evaluate`` gives the figures of a peer's parameters."""
+    every = list(peers_of(peers, bench.delays if delays is None else delays))
     return {
         (peer.name, delay): search(peer.space, partial(evaluate, peer, delay), bench.budget)
-        for peer, delay in bench.progress.track(list(peers_of(bench, peers)), description=f"tuning: {title}")
+        for peer, delay in bench.progress.track(every, description=f"tuning: {title}")
         if peer.space
-    } | {(peer.name, delay): Tuned({}, []) for peer, delay in peers_of(bench, peers) if not peer.space}
+    } | {(peer.name, delay): Tuned({}, []) for peer, delay in every if not peer.space}
 
 
 def tuning_log(tuned: Mapping[tuple[str, int], Tuned]) -> list[dict[str, Any]]:

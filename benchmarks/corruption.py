@@ -29,6 +29,14 @@ def gaussian(truth: Floats, sigma: float, rng: np.random.Generator) -> Floats:
     return truth + rng.normal(0.0, sigma, truth.shape)
 
 
+def along_sight(truth: Floats, sigma: float, rng: np.random.Generator, ratio: float = 3.0) -> Floats:
+    """Independent noise of ``sigma`` metres across the line of sight of a camera at the origin, and ``ratio`` times as
+    much along it: what depth is like."""
+    noise = rng.normal(0.0, sigma, truth.shape)
+    sight = truth / np.linalg.norm(truth, axis=-1, keepdims=True)
+    return truth + noise + (ratio - 1) * (noise * sight).sum(axis=-1, keepdims=True) * sight
+
+
 def correlated(truth: Floats, sigma: float, rng: np.random.Generator, memory: float = 0.9) -> Floats:
     """Stationary AR(1) noise of ``sigma`` metres, with correlation ``memory`` from a frame to the next: what a depth
     camera's errors look like, and what no low-pass filter can tell from motion."""

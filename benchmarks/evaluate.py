@@ -10,22 +10,27 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.benchmarks.bench import Bench, Result
-from steadypose.benchmarks.protocols import PROTOCOLS
+from steadypose.benchmarks.protocols import PROTOCOLS, SENSORS
+from steadypose.benchmarks.provenance import require_committed
 from steadypose.benchmarks.results import RESULTS, save, show
 from steadypose.nodes.graph.threads import one_thread
 
 
-def evaluate(protocol: str, *, quick: bool, mocap: Path | None, data: Path, out: Path | None) -> None:
+def evaluate(protocol: str, *, split: str, quick: bool, mocap: Path | None, data: Path, out: Path | None) -> None:
     """Run one protocol, or all that can be run here; see ``steadypose evaluate --help``."""
-    if protocol == "kinect_vicon" and mocap is None:
-        raise FileNotFoundError("kinect_vicon: expected --mocap DIR, the folder that holds ui_prmd.npz")
+    if protocol in SENSORS and mocap is None:
+        raise FileNotFoundError(f"{protocol}: expected --mocap DIR, the folder that holds {SENSORS[protocol]}")
+    if out is None and split == "test" and not quick:
+        out = RESULTS
+    if out is not None:
+        require_committed(out)
     one_thread()
     console = Console()
     with Progress(console=console, transient=True) as progress:
-        bench = Bench(quick=quick, mocap=mocap, data=data, progress=progress)
+        bench = Bench(quick=quick, mocap=mocap, data=data, progress=progress, split=split)
         for name in PROTOCOLS if protocol == "all" else (protocol,):
-            if name == "kinect_vicon" and mocap is None:
-                console.print("kinect_vicon: left out, it needs --mocap", highlight=False)
+            if name in SENSORS and (mocap is None or not (mocap / SENSORS[name]).is_file()):
+                console.print(f"{name}: left out, it needs {SENSORS[name]} (--mocap)", highlight=False)
                 continue
             started = time.perf_counter()
             result: Result = importlib.import_module(f"steadypose.benchmarks.protocols.{name}").run(bench)
@@ -35,15 +40,19 @@ def evaluate(protocol: str, *, quick: bool, mocap: Path | None, data: Path, out:
             for table in result.tables:
                 show(table, console)
             console.print(f"{name}: {seconds:.0f} s", highlight=False)
-            if out is not None or not quick:
-                console.print(f"wrote {_file(name, bench, result, seconds, out or RESULTS)}", highlight=False)
+            if out is not None:
+                console.print(f"wrote {_file(name, bench, result, seconds, out)}", highlight=False)
+    if out is None:
+        console.print("written nowhere: --out DIR, or --split test without --quick, writes", highlight=False)
 
 
 def _file(name: str, bench: Bench, result: Result, seconds: float, directory: Path) -> Path:
-    options = [name, *(["--quick"] if bench.quick else [])]
-    if name == "kinect_vicon":
+    options = [name, "--split", bench.split, *(["--quick"] if bench.quick else [])]
+    if name in SENSORS:
         options += ["--mocap", "mocap"]
-    content = {"quick": bench.quick, "seeds": bench.seeds, "seconds": round(seconds, 1), **result.data}
+    content = {
+        "quick": bench.quick, "split": bench.split, "seeds": bench.seeds, "seconds": round(seconds, 1), **result.data
+    }  # fmt: skip
     path = save(name, options, result.tables, content, directory, program=("steadypose", "evaluate"))
     for stem, figure in result.figures.items():
         figure.savefig(directory / f"{stem}.png", dpi=110)

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def describe() -> dict[str, str | int | float]:
-    """CPU, cores, memory, load, versions, and the commit that was measured ("-dirty" where files differ from it)."""
+    """CPU, cores, memory, load, versions, and the commit that was measured ("-dirty" where it is `uncommitted`)."""
     return {
         "cpu": _cpu(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 0,
@@ -23,9 +23,15 @@ def describe() -> dict[str, str | int | float]:
         "python": platform.python_version(),
         "torch": version("torch"),
         "numpy": version("numpy"),
-        "commit": _git("describe", "--always", "--dirty", "--abbrev=10"),
+        "commit": _git("rev-parse", "--short=10", "HEAD") + ("-dirty" if uncommitted() else ""),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
     }
+
+
+def uncommitted() -> list[str]:
+    """Files that differ from the commit, results and documents aside: those do not change what is measured."""
+    changed = _git("diff", "--name-only", "HEAD", "--", ".", ":!benchmarks/results", ":!docs", ":!*.md")
+    return [] if changed == "unknown" else changed.split()
 
 
 def _cpu() -> str:

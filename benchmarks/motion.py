@@ -64,10 +64,11 @@ class MotionClips:
 
 
 def prepared_clips(path: Path, split: str, frames: int, most: int) -> MotionClips:
-    """Clips that do not overlap, at most ``most`` of them, spread evenly over the split, from ``prepared.npz``."""
+    """Clips that do not overlap, at most ``most`` of them, from ``prepared.npz``: as many of each source, where it has
+    them, spread evenly over it."""
     motion = prepared_set(path, split)
     rows = motion.all_windows(frames, frames)
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))].T
+    rows = rows[spread(motion.source[np.searchsorted(motion.clip_start, rows[:, 0], side="right") - 1], most)].T
     return MotionClips(
         positions=motion.positions[rows].numpy().astype(np.float64),
         rotations=motion.rotations[rows].numpy().astype(np.float64),
@@ -77,7 +78,17 @@ def prepared_clips(path: Path, split: str, frames: int, most: int) -> MotionClip
     )
 
 
-@lru_cache(maxsize=2)
+def spread(sources: NDArray[np.str_], most: int) -> NDArray[np.intp]:
+    """Which of (N,) to take, in order: at most so many, as many of each source as it has of an even share."""
+    groups = sorted((np.flatnonzero(sources == source) for source in np.unique(sources)), key=len)
+    taken: list[NDArray[np.intp]] = []
+    for number, group in enumerate(groups):
+        share = (most - sum(map(len, taken))) // (len(groups) - number)
+        taken.append(group[np.unique(np.linspace(0, len(group) - 1, min(share, len(group))).round().astype(int))])
+    return np.sort(np.concatenate(taken))
+
+
+@lru_cache(maxsize=3)
 def prepared_set(path: Path, split: str) -> MotionSet:
     """All clips of ``prepared.npz`` that are free for products."""
     return MotionSet.load(path, "default", split)

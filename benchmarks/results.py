@@ -14,8 +14,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from steadypose.benchmarks.machine import ROOT, describe
-
-RESULTS = Path(__file__).parent / "results"
+from steadypose.benchmarks.provenance import RESULTS, require_committed, ships
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,7 @@ def save(
     data: dict[str, Any],
     directory: Path = RESULTS,
     program: Sequence[str] = (),
+    measured: Sequence[str] = ("weights", "settings"),
 ) -> Path:
     """Write ``NAME.json``: the command, the machine, the tables, and ``data``, whatever the benchmark found.
 
@@ -63,13 +63,19 @@ def save(
         tables: for the README.
         data: figures; JSON types.
         directory: where to.
-        program: what makes it; ``python -m steadypose.benchmarks.NAME`` if left out.
+        program: what makes it; ``python -m steadypose.benchmarks.systems.NAME`` if left out.
+        measured: what the figures depend on, of what `ships`: when that changes, they are stale.
+
+    Raises:
+        UncommittedError: see `require_committed`, which is best asked before measuring.
     """
+    require_committed(directory)
     command = shlex.join(
-        [*(program or ("python", "-m", f"steadypose.benchmarks.{name}")), *(_portable(a) for a in arguments)]
+        [*(program or ("python", "-m", f"steadypose.benchmarks.systems.{name}")), *(_portable(a) for a in arguments)]
     )
     path = directory / f"{name}.json"
     content = {"benchmark": name, "command": command, "machine": describe()}
+    content["measured"] = {part: ships()[part] for part in measured}
     content |= {"tables": [asdict(t) for t in tables], **data}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(_nan_to_null(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n")

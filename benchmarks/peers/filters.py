@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
+from steadypose.benchmarks.peers.bank import bank
+from steadypose.benchmarks.peers.beside import beside
 from steadypose.benchmarks.peers.kalman import fixed_lag
 from steadypose.prior.timing.fixed_lag import OneEuroFilter
 from steadypose.prior.timing.rate import FPS
@@ -123,16 +125,18 @@ def butterworth(seen: Floats, stamps_s: Floats, delay: int, cutoff_hz: float) ->
 PEERS: tuple[Peer, ...] = (
     Peer("raw", raw, (0,)),
     Peer("hold last", hold_last, (0,)),
+    Peer("held beside the body", beside, (0,)),
     Peer("linear interpolation", interpolate),
     Peer("One-Euro", one_euro, (0,), {"min_cutoff_hz": (0.1, 10.0), "beta": (0.05, 30.0)}),
     Peer("Kalman, constant velocity", constant_velocity, None, {"density": (0.002, 50.0)}),
     Peer("Kalman, constant acceleration", constant_acceleration, None, {"density": (0.05, 5e4)}),
     Peer("Gaussian + Hampel", gaussian_hampel, None, {"sigma_s": (0.01, 0.4), "threshold": (2.0, 12.0)}),
+    Peer("bank of smoothers", bank),
     Peer("Butterworth, offline", butterworth, (OFFLINE,), {"cutoff_hz": (0.5, 12.0)}),
 )
 """Those without training. With a delay, a Kalman filter is the fixed-lag RTS smoother of its model."""
 
-FILTERS: tuple[Peer, ...] = tuple(peer for peer in PEERS if peer.run not in (hold_last, interpolate))
+FILTERS: tuple[Peer, ...] = tuple(peer for peer in PEERS if peer.run not in (hold_last, interpolate, beside))
 """Where every joint is always given, there are no gaps to fill."""
 
 

@@ -1,20 +1,30 @@
-"""Kalman filters of a constant derivative with fixed-lag Rauch-Tung-Striebel smoothing, for whole clips at once.
+"""Kalman filters of a constant derivative with fixed-lag smoothing, over many joints at once.
 
-Written for comparison, as the textbook has it (Bar-Shalom, Li and Kirubarajan 2001, sections 6.2 and 8.6): a forward
-pass, then one backward sweep for each frame of lag, over all frames together.
+Written for comparison, as the textbook has it (Bar-Shalom, Li and Kirubarajan 2001, sections 6.2 and 8.6). The smoother
+is the filter of a state that the last positions are part of (Anderson and Moore 1979, section 7.3), which is what
+Rauch, Tung and Striebel's backward sweep over these frames gives.
 """
 
 from __future__ import annotations
 
 from math import factorial
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
 _UNKNOWN = (1e3, 1.0, 5.0)
 """Standard deviations of a joint never seen: metres, m/s, m/s²."""
+
+
+class Smoothed(NamedTuple):
+    """What a smoother says of (T, N) joints."""
+
+    positions: Floats  # (T, N, 3) metres, each frame's given the measurements up to ``delay`` frames later
+    log_likelihood: Floats  # (T, N) of each measurement, given those before; 0 where there is none, or none before
 
 
 def transition(order: int, step: float) -> Floats:
@@ -46,46 +56,84 @@ def fixed_lag(
     Returns:
         (T, ..., 3); NaN where a joint had not been seen by then.
     """
+    sigma = np.full(seen.shape[:-1], measurement_sigma)
+    return smooth(seen, stamps_s, delay, order, density, sigma).positions.reshape(seen.shape)
+
+
+def smooth(seen: Floats, stamps_s: Floats, delay: int, order: int, density: float, sigma: Floats) -> Smoothed:
+    """The same with a measurement noise of its own for each sighting, ``sigma`` (T, ...) metres; joints in a row."""
     frames = len(seen)
-    z = seen.reshape(frames, -1, 3)
-    known = np.asarray(np.isfinite(z).all(axis=-1))
-    # Covariances depend on when a joint was seen, not on where: joints seen at the same times share them.
-    patterns, which = np.unique(known, axis=1, return_inverse=True)
+    z = np.ascontiguousarray(seen.reshape(frames, -1, 3))
     steps = np.diff(stamps_s)
-    gains, backward = _gains(patterns, steps, order, density, measurement_sigma)
-    state = np.zeros((order, z.shape[1], 3))
-    filtered, predicted = np.empty((frames, *state.shape)), np.empty((frames, *state.shape))
-    for t in range(frames):
-        if t:
-            state = np.tensordot(transition(order, steps[t - 1]), state, axes=1)
-        predicted[t] = state
-        innovation = np.where(known[t, :, None], z[t] - state[0], 0.0)
-        filtered[t] = state = state + gains[t].T[:, which, None] * innovation
-    smoothed = filtered
-    for _ in range(min(delay, frames - 1)):
-        correction = smoothed[1:] - predicted[1:]
-        moved = [
-            filtered[:-1, i] + sum(backward[:, which, i, j, None] * correction[:, j] for j in range(order))
-            for i in range(order)
-        ]
-        smoothed = np.concatenate([np.stack(moved, axis=1), filtered[-1:]])
-    by_then = np.maximum.accumulate(known)[np.minimum(np.arange(frames) + delay, frames - 1)]
-    return np.where(by_then[..., None], smoothed[:, 0], np.nan).reshape(seen.shape)
+    forward = np.array([transition(order, step) for step in steps]).reshape(-1, order, order)
+    added = np.array([density * process_noise(order, step) for step in steps]).reshape(-1, order, order)
+    variance = np.ascontiguousarray(np.square(sigma).reshape(frames, -1))
+    answers, likelihood = np.full(z.shape, np.nan), np.zeros(z.shape[:2])
+    _smooth(z, variance, forward, added, np.square(_UNKNOWN[:order]), min(delay, frames - 1), answers, likelihood)
+    return Smoothed(answers, likelihood)
 
 
-def _gains(
-    known: NDArray[np.bool_], steps: Floats, order: int, density: float, measurement_sigma: float
-) -> tuple[Floats, Floats]:
-    """Kalman gains (T, P, n) and RTS gains (T-1, P, n, n) of joints that are seen when ``known`` (T, P) says."""
-    covariance = np.broadcast_to(np.diag(np.square(_UNKNOWN[:order])), (known.shape[1], order, order)).copy()
-    gains, backward = [], []
-    for t, seen in enumerate(known):
-        if t:
-            f = transition(order, steps[t - 1])
-            before = covariance
-            covariance = f @ before @ f.T + density * process_noise(order, steps[t - 1])
-            backward.append(before @ f.T @ np.linalg.inv(covariance))
-        gain = covariance[:, :, 0] / (covariance[:, :1, 0] + measurement_sigma**2) * seen[:, None]
-        covariance = covariance - gain[:, :, None] * covariance[:, None, 0]
-        gains.append(gain)
-    return np.stack(gains), np.stack(backward) if backward else np.empty((0, known.shape[1], order, order))
+@njit(cache=True, error_model="numpy")
+def _smooth(z, variance, forward, added, unknown, delay, answers, likelihood):  # pragma: no cover
+    frames, joints, _ = z.shape
+    n, lags = len(unknown), delay + 1
+    place = np.empty((lags, 3))  # of the last frames, by frame number modulo lags
+    cross = np.empty((lags, n))  # their covariance with the newest state
+    state, covariance, ahead = np.empty((n, 3)), np.empty((n, n)), np.empty((n, n))
+    column = np.empty(n)
+    for j in range(joints):
+        state[:] = 0.0
+        covariance[:] = np.diag(unknown)
+        known = False
+        for t in range(frames):
+            if t > 0:
+                f = forward[t - 1]  # upper triangular with ones on the diagonal
+                for i in range(n):
+                    for k in range(i + 1, n):
+                        for axis in range(3):
+                            state[i, axis] += f[i, k] * state[k, axis]
+                for i in range(n):
+                    for k in range(n):
+                        ahead[i, k] = covariance[i, k]
+                        for m in range(i + 1, n):
+                            ahead[i, k] += f[i, m] * covariance[m, k]
+                for i in range(n):
+                    for k in range(n):
+                        covariance[i, k] = ahead[i, k] + added[t - 1, i, k]
+                        for m in range(k + 1, n):
+                            covariance[i, k] += ahead[i, m] * f[k, m]
+                for past in range(min(t, lags)):
+                    for i in range(n):
+                        for k in range(i + 1, n):
+                            cross[past, i] += f[i, k] * cross[past, k]
+            for i in range(n):
+                cross[t % lags, i] = covariance[0, i]
+            for axis in range(3):
+                place[t % lags, axis] = state[0, axis]
+            if np.isfinite(z[t, j, 0]) and np.isfinite(z[t, j, 1]) and np.isfinite(z[t, j, 2]):
+                total = covariance[0, 0] + variance[t, j]
+                a, b, c = z[t, j, 0] - state[0, 0], z[t, j, 1] - state[0, 1], z[t, j, 2] - state[0, 2]
+                if known:
+                    likelihood[t, j] = -1.5 * np.log(total) - 0.5 * (a * a + b * b + c * c) / total
+                known = True
+                for i in range(n):
+                    column[i] = covariance[0, i]
+                for past in range(min(t + 1, lags)):
+                    gain = cross[past, 0] / total
+                    place[past, 0] += gain * a
+                    place[past, 1] += gain * b
+                    place[past, 2] += gain * c
+                    for i in range(n):
+                        cross[past, i] -= gain * column[i]
+                for i in range(n):
+                    gain = column[i] / total
+                    state[i, 0] += gain * a
+                    state[i, 1] += gain * b
+                    state[i, 2] += gain * c
+                    for k in range(n):
+                        covariance[i, k] -= gain * column[k]
+            if known and t >= delay:
+                answers[t - delay, j] = place[(t - delay) % lags]
+        if known:
+            for t in range(max(frames - delay, 0), frames):
+                answers[t, j] = place[t % lags]

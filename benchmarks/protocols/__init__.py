@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 PROTOCOLS: dict[str, str] = {
+    "fidelity": "error by speed of the joint, noise and delay; what is left of a swing",
     "kinect_vicon": "real Kinect against Vicon, by subject",
     "noisy_joints": "independent and correlated noise, spikes, exchanged limbs",
     "hidden_joints": "joints below 0.9 m, an arm behind the body, limbs away for 0.2 to 2 s",
@@ -12,3 +13,6 @@ PROTOCOLS: dict[str, str] = {
     "streaming": "delay found, jitter at matched delay, recovery, lost frames, jittering stamps",
 }
 """Module in this package: what it measures."""
+
+SENSORS = {"kinect_vicon": "ui_prmd.npz"}
+"""Protocols with a sensor's own recordings, and the file of them."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from steadypose.benchmarks import figures as pictures
-from steadypose.benchmarks.bench import Answer, Bench, Result, answers, over_seeds, tune, tuning_log
+from steadypose.benchmarks.bench import Answer, Bench, Methods, Result, answers, over_seeds, tune, tuning_log
 from steadypose.benchmarks.corruption import LIMBS, bursts, gaussian, hide
 from steadypose.benchmarks.metrics import found_delay
 from steadypose.benchmarks.motion import MotionClips
@@ -63,7 +63,7 @@ def run(bench: Bench) -> Result:
     for condition in conditions:
         stamps, seen = observe(clips, condition, truth_at)
         hidden = missing(seen)
-        found = answers(bench, seen, stamps, tuned, condition, STREAMING_PEERS)
+        found = answers(bench, seen, stamps, tuned, condition, Methods.all(bench, STREAMING_PEERS))
         records += over_seeds([_record(answer, condition, truth_at, hidden) for answer in found])
     data = {"data": clips.source, "records": records, "tuning": tuning_log(tuned)}
     return Result([_table(records, clips)], data, {"streaming_jitter": _jitter(records, data["tuning"])})

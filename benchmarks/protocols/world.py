@@ -57,7 +57,7 @@ def run(bench: Bench) -> Result:
 
     tuned = tune(bench, evaluate, "world", peers)
     records: list[dict[str, Any]] = [{"method": "truth", "delay": 0, **measure(clips, clips.positions)}]
-    for peer, delay in peers_of(bench, peers):
+    for peer, delay in peers_of(peers, bench.delays):
         answer = peer.run(seen, clips.stamps_s, delay, **tuned[peer.name, delay].parameters)
         records.append({"method": peer.name, "delay": delay, **measure(clips, answer)})
     for name, settings in bench.progress.track(ours.OURS.items(), description="world"):

@@ -10,23 +10,37 @@ import tyro
 
 def evaluate(
     protocol: Literal[
-        "all", "kinect_vicon", "noisy_joints", "hidden_joints", "reconstruction", "hgvae", "world", "streaming"
+        "all",
+        "fidelity",
+        "kinect_vicon",
+        "noisy_joints",
+        "hidden_joints",
+        "reconstruction",
+        "hgvae",
+        "world",
+        "streaming",
     ],
+    split: Literal["val", "test"] = "val",
     quick: bool = False,
     mocap: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     data: Path = Path("data/prepared.npz"),
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
 ) -> None:
-    """Measure the prior against its tuned peers; figures, tables and pictures go to benchmarks/results.
+    """Measure the prior against its tuned peers: choose on the split 'val', report 'test'.
+
+    Figures, tables and pictures of 'test' go to benchmarks/results, if what is measured is committed; others go to the
+    folder that --out names, or nowhere.
 
     Args:
         protocol: what to measure, or 'all'.
-        quick: a few clips and points, to see that all works; writes nothing, unless told where.
-        mocap: folder with ui_prmd.npz, for the Kinect beside Vicon; without it, that protocol is left out of 'all'.
+        split: of the prepared motion that is scored. Kinect and MediaPipe have none.
+        quick: a few clips and points, to see that all works.
+        mocap: folder with ui_prmd.npz and mediapipe_pose.npz, for the protocols with these sensors; without it, they
+            are left out of 'all'.
         data: prepared motion, as 'steadypose prepare' wrote it; without it, people of the project's own simulator
             stand in.
         out: folder to write to.
     """
     from steadypose.benchmarks.evaluate import evaluate as run
 
-    run(protocol, quick=quick, mocap=mocap, data=data, out=out)
+    run(protocol, split=split, quick=quick, mocap=mocap, data=data, out=out)

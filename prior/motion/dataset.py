@@ -29,6 +29,7 @@ class MotionSet:
         clip_start: (C + 1,) first frame of each clip, and the end.
         subject: (C,) who moves, as the source names people; empty where the clips' origin does not matter.
         action: (C,) what they do, as the source names it; as well.
+        source: (C,) where each is from; as well.
     """
 
     rotations: Tensor
@@ -38,6 +39,7 @@ class MotionSet:
     clip_start: NDArray[np.int64]
     subject: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
     action: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+    source: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
 
     @classmethod
     def load(cls, path: Path, weights: str, split: str, *, flat: bool = False) -> MotionSet:
@@ -77,6 +79,7 @@ class MotionSet:
             clip_start=np.concatenate([[0], np.cumsum(lengths)]),
             subject=data["subject"][wanted],
             action=data["action"][wanted],
+            source=data["source"][wanted],
         )
 
     @property
@@ -96,7 +99,7 @@ class MotionSet:
         lengths = np.diff(self.clip_start)[clips]
         return MotionSet(
             self.rotations[frames], self.positions[frames], self.offsets[frames], self.contacts[frames],
-            np.concatenate([[0], np.cumsum(lengths)]), self.subject[clips], self.action[clips],
+            np.concatenate([[0], np.cumsum(lengths)]), self.subject[clips], self.action[clips], self.source[clips],
         )  # fmt: skip
 
     def sample(

@@ -3,6 +3,8 @@ from functools import partial
 import numpy as np
 import pytest
 
+from steadypose.benchmarks.peers.bank import bank, noise_found
+from steadypose.benchmarks.peers.beside import beside
 from steadypose.benchmarks.peers.filters import (
     FILTERS,
     OFFLINE,
@@ -14,16 +16,26 @@ from steadypose.benchmarks.peers.filters import (
     interpolate,
 )
 from steadypose.benchmarks.peers.kalman import fixed_lag, process_noise, transition
+from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
 
 STAMPS = np.arange(40) / 30.0
 NAN = float("nan")
 
 
-def motion(rng: np.random.Generator, frames: int = 40) -> np.ndarray:
-    """(T, 3, 2, 3) joints of three clips that move smoothly, with 1 cm of noise."""
-    start, speed = rng.normal(size=(2, 3, 2, 3))
-    return start + speed * STAMPS[:frames, None, None, None] + rng.normal(0, 0.01, (frames, 3, 2, 3))
+def motion(rng: np.random.Generator, frames: int = 40, joints: int = 2) -> np.ndarray:
+    """(T, 3, J, 3) joints of three clips that move smoothly, with 1 cm of noise."""
+    start, speed = rng.normal(size=(2, 3, joints, 3))
+    return start + speed * STAMPS[:frames, None, None, None] + rng.normal(0, 0.01, (frames, 3, joints, 3))
+
+
+def rest_pose() -> np.ndarray:
+    """(22, 3) metres."""
+    placed = REST_OFFSETS.copy()
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0:
+            placed[joint] += placed[parent]
+    return placed
 
 
 def line(values: list[float]) -> np.ndarray:
@@ -102,8 +114,9 @@ ONLINE = [peer for peer in PEERS if peer.delays != (OFFLINE,)]
 @pytest.mark.parametrize("peer", ONLINE, ids=lambda peer: peer.name)
 def test_no_answer_knows_more_than_its_delay(peer) -> None:
     delay = 0 if peer.delays else 3
-    seen = motion(np.random.default_rng(4))
+    seen = motion(np.random.default_rng(4), joints=len(JOINTS))
     seen[12:16, 0] = np.nan
+    seen[12:16, 1, 4:9] = np.nan
     parameters = {name: float(np.sqrt(low * high)) for name, (low, high) in peer.space.items()}
     whole = peer.run(seen, STAMPS, delay, **parameters)
     other = seen.copy()
@@ -120,4 +133,43 @@ def test_tuned_filters_beat_raw_on_noise_that_they_are_made_for() -> None:
     seen = truth + rng.normal(0, 0.04, truth.shape)
     error = np.abs(seen - truth).mean()
     assert np.abs(constant_velocity(seen, STAMPS, 4, 1.0) - truth).mean() < 0.5 * error
-    assert {peer.name for peer in PEERS} - {peer.name for peer in FILTERS} == {"hold last", "linear interpolation"}
+    fill_gaps = {"hold last", "held beside the body", "linear interpolation"}
+    assert {peer.name for peer in PEERS} - {peer.name for peer in FILTERS} == fill_gaps
+
+
+def test_the_bank_is_true_to_what_is_clean_and_smooths_what_is_noisy_without_being_told() -> None:
+    rng = np.random.default_rng(6)
+    stamps = np.arange(120) / 30.0
+    wave = 0.3 * np.sin(2 * np.pi * np.array([0.3, 1.0, 3.0]) * stamps[:, None])
+    truth = wave[:, :, None, None] * np.ones((1, 1, 4, 3))
+    assert np.abs(bank(truth, stamps, 4) - truth)[15:].max() < 0.008  # the last one moves at 10 m/s
+    seen = truth + rng.normal(0, 0.03, truth.shape)
+    error, raw = (np.abs(answer - truth)[15:].mean(axis=(0, 2, 3)) for answer in (bank(seen, stamps, 4), seen))
+    assert error[0] < 0.5 * raw[0]
+    assert error[1] < 0.8 * raw[1]
+    assert error[2] < 1.3 * raw[2]
+
+
+def test_the_bank_finds_the_noise() -> None:
+    rng = np.random.default_rng(7)
+    moving = 2.0 * STAMPS[:, None, None, None] * np.ones((1, 2, 5, 3))
+    for sigma in (0.002, 0.05):
+        found = noise_found(moving + rng.normal(0, sigma, moving.shape))[-1]
+        np.testing.assert_allclose(found, sigma, rtol=0.35)
+
+
+def test_a_hidden_joint_stays_beside_the_nearest_seen_one_and_turns_with_the_trunk() -> None:
+    rest = rest_pose()
+    angle = np.linspace(0.0, 1.5, 40)
+    cosine, sine, zero, one = np.cos(angle), np.sin(angle), np.zeros(40), np.ones(40)
+    turn = np.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one], axis=-1).reshape(40, 3, 3)
+    truth = np.einsum("tab,jb->tja", turn, rest)[:, None] + STAMPS[:, None, None, None] * (1.0, 0.5, 0.0)
+    seen = truth.copy()
+    seen[10:, 0, [J["left_knee"], J["left_ankle"], J["left_foot"], J["right_wrist"]]] = np.nan
+    np.testing.assert_allclose(beside(seen, STAMPS, 0), truth, atol=1e-9)
+    gone = truth.copy()
+    gone[10:] = np.nan
+    gone[:, 0, J["head"]] = np.nan
+    answer = beside(gone, STAMPS, 0)
+    assert np.isnan(answer[:, 0, J["head"]]).all()
+    np.testing.assert_allclose(answer[39, 0, 1:15], truth[9, 0, 1:15])

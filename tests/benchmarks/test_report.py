@@ -1,11 +1,15 @@
 import io
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from steadypose.benchmarks import provenance
 from steadypose.benchmarks.machine import describe
-from steadypose.benchmarks.report import Args, fill, main
+from steadypose.benchmarks.provenance import UncommittedError, ships, stale
+from steadypose.benchmarks.report import Args, StaleError, fill, main
 from steadypose.benchmarks.results import Table, load, save, show
 
 TABLE = Table("speed", "Speed, ms", ["method", "p50", "a|b"], [["raw", "1.0", "2"], ["ours", "0.5", "3"]], "A note.")
@@ -43,6 +47,38 @@ def test_blocks_do_not_swallow_each_other(tmp_path: Path) -> None:
     filled = fill(TEXT + "between\n" + TEXT, load(tmp_path))
     assert filled.count("| ours |") == 2
     assert "between" in filled
+
+
+def test_a_result_is_stale_when_weights_or_settings_have_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save("latency", [], [TABLE], {}, tmp_path)
+    save("importers", [], [replace(TABLE, name="files")], {}, tmp_path, measured=())
+    results = load(tmp_path)
+    assert stale(results["latency"]) == stale(results["importers"]) == []
+    assert stale({}) == ["weights", "settings"]
+    monkeypatch.setattr(provenance, "ships", lambda: {"weights": "others", "settings": ships()["settings"]})
+    assert (stale(results["latency"]), stale(results["importers"])) == (["weights"], [])
+    with pytest.raises(StaleError, match=r"systems\.latency.*weights"):
+        fill(TEXT, results)
+    assert "**stale: measured with other weights**" in fill(TEXT, results, allow_stale=True)
+    assert "stale" not in fill("<!-- results:files -->\n<!-- /results -->", results)
+
+
+def test_what_no_commit_can_make_again_is_refused_among_the_results_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(provenance, "uncommitted", lambda: ["prior/clean/fuse.py"])
+    with pytest.raises(UncommittedError, match=r"fuse\.py.*--out"):
+        save("latency", [], [TABLE], {})
+    assert save("latency", [], [TABLE], {}, tmp_path).is_file()
+
+
+def test_results_that_no_longer_hold_are_named() -> None:
+    """Says so without failing: weights change before what is measured with them can."""
+    old = [f"{name} ({', '.join(stale(result))})" for name, result in load().items() if stale(result)]
+    if old:
+        warnings.warn(f"stale results, to be measured again: {'; '.join(old)}", stacklevel=1)
 
 
 def test_the_machine_is_described() -> None:

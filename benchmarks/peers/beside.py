@@ -1,0 +1,61 @@
+"""A peer for hidden joints: each keeps its place beside the nearest joint that is seen, turned with the trunk."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.prior.body.skeleton import PARENTS, J
+
+Floats = NDArray[np.float64]
+
+_ACROSS = tuple((J[f"left_{part}"], J[f"right_{part}"]) for part in ("hip", "shoulder"))
+
+
+def _bones_between() -> Floats:
+    """(22, 22) how many bones lie between two joints."""
+    count = np.where(np.eye(len(PARENTS), dtype=bool), 0.0, np.inf)
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0:
+            count[joint, :joint] = count[:joint, joint] = count[parent, :joint] + 1
+    return count
+
+
+_BONES = _bones_between()
+
+
+def beside(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
+    """As it came; a hidden joint where it was when last seen, beside the nearest that is seen: the fewest bones away,
+    and of several the nearest in space. Where none is seen, all stay; a joint never seen has no answer.
+
+    Args:
+        seen: (T, C, 22, 3) metres, z up, canonical joints, NaN where missing.
+        stamps_s: (T,) seconds.
+        delay: frames, of which no use is made.
+    """
+    answers = seen.copy()
+    clips, joints = seen.shape[1:3]
+    then = np.full((clips, joints, joints, 3), np.nan)  # the pose as it was answered when each joint was last seen
+    for t, frame in enumerate(seen):
+        known = np.isfinite(frame).all(axis=-1)
+        c, j = np.nonzero(~known & np.isfinite(then[..., 0, 0]))
+        was, now, rows = then[c, j], np.where(known[c, :, None], frame[c], np.nan), np.arange(len(c))
+        offset = was[rows, j][:, None] - was
+        apart = _BONES[j] + 1e-3 * np.linalg.norm(offset, axis=-1)
+        nearest = np.where(np.isfinite(apart) & known[c], apart, np.inf).argmin(axis=1)
+        moved = now[rows, nearest] + np.einsum("nab,nb->na", _turned(was, now), offset[rows, nearest])
+        answers[t, c, j] = np.where(known[c].any(axis=1, keepdims=True), moved, was[rows, j])
+        then[known] = np.broadcast_to(answers[t][:, None], then.shape)[known]
+    return answers
+
+
+def _turned(was: Floats, now: Floats) -> Floats:
+    """(N, 3, 3) how hips and shoulders, those seen in both, have turned about z from one pose (N, 22, 3) to another."""
+    before, after = np.zeros((len(was), 2)), np.zeros((len(was), 2))
+    for left, right in _ACROSS:
+        a, b = (pose[:, left, :2] - pose[:, right, :2] for pose in (was, now))
+        both = np.isfinite(a + b).all(axis=1, keepdims=True)
+        before, after = before + np.where(both, a, 0.0), after + np.where(both, b, 0.0)
+    angle = np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], (before * after).sum(axis=1))
+    cosine, sine, zero, one = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
+    return np.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)

@@ -1,0 +1,87 @@
+"""The fidelity protocol's motion, noise and figures."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from rich.progress import Progress
+
+from steadypose.benchmarks import ours
+from steadypose.benchmarks.bench import Answer, Bench, Methods
+from steadypose.benchmarks.corruption import along_sight
+from steadypose.benchmarks.motion import spread
+from steadypose.benchmarks.peers.bank import bank
+from steadypose.benchmarks.peers.filters import Peer, raw
+from steadypose.benchmarks.protocols import fidelity
+from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J
+
+
+def test_noise_is_three_times_as_large_along_the_line_of_sight() -> None:
+    truth = np.tile(np.array([2.0, 1.0, -0.5]), (200, 10, 22, 1))
+    noise = along_sight(truth, 0.01, np.random.default_rng(0)) - truth
+    sight = truth[0, 0, 0] / np.linalg.norm(truth[0, 0, 0])
+    along = noise @ sight
+    across = noise - along[..., None] * sight
+    assert along.std() == pytest.approx(0.03, rel=0.02)
+    assert np.sqrt((across**2).sum(axis=-1).mean() / 2) == pytest.approx(0.01, rel=0.02)
+
+
+@pytest.mark.parametrize("limb", fidelity.SWINGS)
+def test_only_the_limb_swings_on_bones_of_constant_length(limb: str) -> None:
+    swing = fidelity.SWINGS[limb]
+    body = fidelity.swinging(swing, 2.0)
+    moves = np.ptp(body, axis=0).max(axis=-1) > 1e-9
+    assert {JOINTS[j] for j in np.flatnonzero(moves)} == set(swing.moves)
+    bones = np.linalg.norm(body[:, 1:] - body[:, list(PARENTS[1:])], axis=-1)
+    np.testing.assert_allclose(bones, np.tile(np.linalg.norm(REST_OFFSETS[1:], axis=-1), (len(body), 1)), atol=1e-9)
+    reach = np.linalg.norm(np.ptp(body[:, J[swing.moves[-1]]], axis=0))
+    assert 0.15 < reach < 1.0
+
+
+def test_what_is_left_of_a_swing_does_not_ask_for_its_phase() -> None:
+    t = np.arange(120) / 30.0
+    wave = np.sin(2 * np.pi * 2.0 * t)[:, None, None] * np.ones((1, 2, 3))
+    late = np.sin(2 * np.pi * 2.0 * t - 0.7)[:, None, None] * np.ones((1, 2, 3))
+    assert fidelity.left_of_swing(0.4 * late + 3.0, wave, 2.0) == pytest.approx(0.4)
+
+
+def test_errors_are_sorted_by_the_speed_of_the_joint() -> None:
+    frames = 60
+    truth = np.zeros((frames, 1, 2, 3))
+    truth[:, 0, 1, 0] = 3.0 * np.arange(frames) / 30
+    answer = truth + np.array([[[0.0, 0.01, 0.0]], [[0.0, 0.04, 0.0]]]).reshape(1, 1, 2, 3)
+    speed = np.linalg.norm(np.gradient(truth, 1 / 30, axis=0), axis=-1)
+    found = fidelity._by_speed(
+        Answer("m", 0, np.arange(frames) / 30, answer, {}, np.full(answer.shape[:-1], 0.01)), truth, speed
+    )
+    assert {name: b["position_mm"] for name, b in found["by_speed"].items()} == {
+        "0-0.1 m/s": pytest.approx(10.0),
+        "2-4 m/s": pytest.approx(40.0),
+    }
+    assert found["by_speed"]["2-4 m/s"]["found_by_stated"] == pytest.approx(4 / np.sqrt(3), abs=1e-3)
+
+
+def test_clips_are_taken_evenly_from_sources_as_far_as_these_go() -> None:
+    sources = np.array(["a"] * 50 + ["b"] * 3 + ["c"] * 20)
+    taken = spread(sources, 21)
+    assert {s: int((sources[taken] == s).sum()) for s in "abc"} == {"a": 9, "b": 3, "c": 9}
+    assert (np.diff(taken) > 0).all()
+    assert len(spread(sources, 500)) == len(sources)
+
+
+def test_the_protocol_gives_tables_and_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    peers = (Peer("raw", raw, (0,)), Peer("bank of smoothers", bank), Peer("half", lambda seen, _, delay: seen * 0.5))
+    methods = Methods(peers, {"steadypose": ours.OURS["steadypose"]}, (0, 4), networks=False)
+    monkeypatch.setattr(fidelity, "methods", lambda _: methods)
+    with Progress(disable=True) as progress:
+        result = fidelity.run(Bench(quick=True, mocap=None, data=Path("nowhere.npz"), progress=progress))
+    table = next(t for t in result.tables if t.name == "fidelity-speed-4")
+    assert [row[0] for row in table.rows][:4] == [
+        "none: raw", "none: best filter", "none: bank of smoothers", "none: steadypose",
+    ]  # fmt: skip
+    assert table.rows[0][1:] == ["0.0"] * (len(table.columns) - 1)
+    assert all(isinstance(figure, Figure) for figure in result.figures.values())
+    swings = {(s["swing"], s["noise"], s["method"]): s["left_percent"] for s in result.data["swings"]}
+    assert swings["forearm 3 Hz", "none", "raw"] == 100.0
+    assert swings["leg 1 Hz", "none", "bank of smoothers"] == pytest.approx(100.0, abs=2)
