@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
-from steadypose.prior.models.root_velocity.network import FRAME_S
+from steadypose.prior.models.root_velocity.config import FRAME_S
 from steadypose.prior.world.body_track import FEET
 from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 

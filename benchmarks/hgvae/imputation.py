@@ -19,11 +19,12 @@ from torch import Tensor, nn
 from steadypose.benchmarks.corruption import LIMBS
 from steadypose.prior.clean.impute import Climb, ImputeSettings, completed_tracks
 from steadypose.prior.clean.reconstruct import Encoded
+from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.features import Tracks, from_tracks, in_frame_of, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
 from steadypose.prior.models.hgvae.network import HGVAE
 from steadypose.prior.models.hgvae.windows import Batch, Windows, standardise
-from steadypose.prior.models.layers.graph import SCALE
+from steadypose.prior.models.torch_weights import arrays_of
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -89,7 +90,7 @@ def impute_all(
     for b in range(len(truth)):
         hold[b], line[b] = _held(truth[b], observed[b], mean), _line(truth[b], observed[b], mean)
         guess[b] = _guess(positions[b], sizes[b], clean[b], observed[b], line[b])
-    live = LiveHGVAE(model, SENSOR_SIGMA, SLOW, 1)
+    live = LiveHGVAE(model.config, arrays_of(model), SENSOR_SIGMA, SLOW, 1)
     hung = standardise(model, guess)
     completed, _ = model.completed(hung, torch.from_numpy(observed).float(), SLOW)
     guess_m, completed_m = (x.double().numpy() * SCALE + mean for x in (hung, completed))

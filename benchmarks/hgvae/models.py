@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from steadypose.prior.models.hgvae.network import HGVAE, HGVAEConfig, Level
+from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, HGVAEConfig, Level
+from steadypose.prior.models.hgvae.network import HGVAE
 from steadypose.prior.models.hgvae.train import CLIP_ENTRY, evidence
 from steadypose.prior.models.hgvae.windows import Batch, Windows, mean_tracks
-from steadypose.prior.models.layers.graph import JOINT_NODES, SCALE
 from steadypose.prior.models.training import TrainingRun
 from steadypose.prior.motion.dataset import MotionSet
 

@@ -13,8 +13,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from steadypose.prior.models.hmvae.network import HMVAE, ROTATION_FEATURES, SLOPE, HMVAEConfig, MotionVAE, Posterior
+from steadypose.prior.models.hmvae.config import ROTATION_FEATURES, HMVAEConfig
+from steadypose.prior.models.hmvae.network import HMVAE, MotionVAE, Posterior
 from steadypose.prior.models.hmvae.train import STRIDES, fit
+from steadypose.prior.models.layers.dense import SLOPE
 from steadypose.prior.models.layers.skeleton_conv import EdgeLinear, SkeletonConv
 from steadypose.prior.motion.dataset import MotionSet
 

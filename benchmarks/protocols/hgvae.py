@@ -28,16 +28,17 @@ from steadypose.benchmarks.motion import as_set, digest
 from steadypose.benchmarks.results import Table
 from steadypose.msgs.types import JOINTS
 from steadypose.prior.body.skeleton import PARENTS
-from steadypose.prior.clean.score import RATES as QUANTILES
-from steadypose.prior.clean.score import Calibration, load_fault_net
-from steadypose.prior.models.hgvae.faults import FaultNet
+from steadypose.prior.models.hgvae.anomaly import RATES as QUANTILES
+from steadypose.prior.models.hgvae.anomaly import Calibration
+from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig
+from steadypose.prior.models.hgvae.faults import FaultNet, load_fault_net
 from steadypose.prior.models.hgvae.features import to_tracks
-from steadypose.prior.models.hgvae.network import HGVAE, HGVAEConfig
+from steadypose.prior.models.hgvae.network import HGVAE
 from steadypose.prior.models.hgvae.train import evidence
 from steadypose.prior.models.hgvae.train_faults import score_windows
 from steadypose.prior.models.hgvae.windows import Batch, Windows, standardise
-from steadypose.prior.models.layers.graph import SCALE
-from steadypose.prior.models.weights_io import WEIGHTS, load_weights
+from steadypose.prior.models.torch_weights import load_network
+from steadypose.prior.models.weights_io import WEIGHTS
 from steadypose.prior.motion.corruption import sensed
 from steadypose.prior.motion.dataset import MotionSet
 
@@ -92,10 +93,7 @@ class _Data:
 def _model(name: str) -> HGVAE | None:
     if not (WEIGHTS / f"hgvae-{name}.safetensors").is_file():
         return None
-    state, config = load_weights(name, "hgvae")
-    model = HGVAE(HGVAEConfig.from_dict(config))
-    model.load_state_dict(state)
-    return model.eval()
+    return load_network(HGVAE, HGVAEConfig.from_dict, name, "hgvae")
 
 
 @torch.no_grad()

@@ -22,9 +22,10 @@ from steadypose.benchmarks.ours import weight_sets
 from steadypose.benchmarks.peers import window_vaes
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import figures, score
-from steadypose.prior.body.kinematics import forward_kinematics
-from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
-from steadypose.prior.models.weights_io import load_weights
+from steadypose.prior.models.hmvae.config import HMVAEConfig
+from steadypose.prior.models.hmvae.network import HMVAE, MotionVAE, from_6d, to_6d
+from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
+from steadypose.prior.models.torch_weights import load_network
 from steadypose.prior.motion.dataset import remove_heading
 
 Floats = NDArray[np.float64]
@@ -95,10 +96,7 @@ def _table(records: list[dict[str, Any]], clips: int, own_acceleration_mm: float
 
 def shipped(weights: str) -> HMVAE:
     """The refinement model with one of the sets of weights that ship."""
-    state, config = load_weights(weights, "hmvae")
-    model = HMVAE(HMVAEConfig.from_dict(config))
-    model.load_state_dict(state)
-    return model.eval()
+    return load_network(HMVAE, HMVAEConfig.from_dict, weights, "hmvae")
 
 
 @torch.inference_mode()

@@ -1,4 +1,4 @@
-"""Kinematics of the canonical skeleton: forward (differentiable), headings and contacts.
+"""Kinematics of the canonical skeleton: forward, headings and contacts.
 
 Rotations are local (child in parent's frame), the root's is its orientation in the frame of the positions. The
 identity everywhere is a T-pose facing +x, left +y, up +z. From positions to rotations:
@@ -7,13 +7,9 @@ identity everywhere is a T-pose facing +x, left +y, up +z. From positions to rot
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
 
@@ -48,29 +44,25 @@ _STANDING_HEIGHT: Floats = np.array(
 )
 
 
-def forward_kinematics(rotations: Tensor, offsets: Tensor, root: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Joint positions from local rotations and a person's bones.
+def forward_kinematics(rotations: Floats, offsets: Floats, root: Floats) -> tuple[Floats, Floats]:
+    """Joint positions from local rotations and bones; with gradients: `prior.models.layers.torch_kinematics`.
 
     Args:
         rotations: (..., 22, 3, 3) local rotation matrices.
         offsets: (..., 22, 3) metres, each joint in its parent's frame; broadcasts over leading dimensions.
-        root: (..., 3) metres, position of the pelvis; the origin if left out.
+        root: (..., 3) metres, position of the pelvis.
 
     Returns:
         positions (..., 22, 3) metres and global rotations (..., 22, 3, 3), in the frame of the root's rotation.
     """
-    batch = rotations.shape[:-3]
-    offsets = offsets.expand(*batch, *offsets.shape[-2:]).unsqueeze(-1)
-    origin = rotations.new_zeros(*batch, 3) if root is None else root
-    # Lists, not one tensor written in place: autograd needs every level's values kept.
-    positions: list[Tensor] = [origin.unsqueeze(-2)]
-    orientations: list[Tensor] = [rotations[..., :1, :, :]]
-    for above, level in pairwise(LEVELS):
-        parents = [p - above.start for p in PARENTS[level]]
-        orientation = orientations[-1][..., parents, :, :]
-        positions.append(positions[-1][..., parents, :] + (orientation @ offsets[..., level, :, :]).squeeze(-1))
-        orientations.append(orientation @ rotations[..., level, :, :])
-    return torch.cat(positions, dim=-2), torch.cat(orientations, dim=-3)
+    world = global_rotations(rotations)
+    positions = np.empty(rotations.shape[:-1])
+    positions[..., 0, :] = root
+    for level in LEVELS[1:]:
+        parents = list(PARENTS[level])
+        bones = world[..., parents, :, :] @ offsets[..., level, :, None]
+        positions[..., level, :] = positions[..., parents, :] + bones[..., 0]
+    return positions, world
 
 
 def global_rotations(local: Floats) -> Floats:

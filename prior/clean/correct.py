@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.clean.frame import Window
-from steadypose.prior.models.sensor_bias.network import HISTORY, CorrectionConfig, CorrectionNet, features, trunk_frame
-from steadypose.prior.models.weights_io import load_weights
+from steadypose.prior.models.sensor_bias.features import HISTORY, SMOOTHER_DENSITY, features, recall, trunk_frame
+from steadypose.prior.models.sensor_bias.inference import LiveCorrection
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
 from steadypose.prior.timing.ring import Ring
-
-DENSITY = 1.0
-"""m²/s³, of the causal smoother before the network: its answer must not jitter with its input."""
 
 FADE = 0.9
 """A frame's worth of a correction that can no longer be computed, because the trunk is hidden."""
@@ -40,11 +36,8 @@ class Correct:
     delay_frames = 0
 
     def __init__(self, settings: CorrectSettings, slots: int) -> None:
-        state, config = load_weights(settings.sensor, "correction")
-        self._net = CorrectionNet(CorrectionConfig.from_dict(config))
-        self._net.load_state_dict(state)
-        self._net.eval()
-        self._smoother = FixedLagRTS(0, DENSITY)
+        self._net = LiveCorrection.load(settings.sensor, slots)
+        self._smoother = FixedLagRTS(0, SMOOTHER_DENSITY)
         self._history = Ring(HISTORY[-1] + 1, (slots, 22, 3))
         self._correction = np.zeros((slots, 22, 3))
 
@@ -56,7 +49,6 @@ class Correct:
         self._history.clear(slot)
         self._correction[slot] = 0.0
 
-    @torch.inference_mode()
     def update(self, window: Window) -> Window:
         """Correct the newest frame's positions, in place."""
         newest = window.positions.newest
@@ -70,19 +62,7 @@ class Correct:
         self._correction[slots[~known]] *= FADE
         if known.any():
             x = features(history[:, known], window.sensor_position)
-            answer = self._net(torch.from_numpy(x).float()).double().numpy()
-            self._correction[slots[known]] = answer @ frames[known].swapaxes(-1, -2)
+            self._correction[slots[known]] = self._net(x) @ frames[known].swapaxes(-1, -2)
         newest += self._correction
         window.positions.replace(newest)
         return window
-
-
-def recall(frames: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(H, B, 22, 3) of the frames `HISTORY` ago among ``frames`` (T, B, 22, 3), the newest last.
-
-    A body younger than that is remembered as it was first seen.
-    """
-    seen = np.isfinite(frames[..., 0]).any(axis=-1)
-    first = np.where(seen.any(axis=0), seen.argmax(axis=0), len(frames) - 1)
-    rows = np.maximum(len(frames) - 1 - np.array(HISTORY)[:, None], first)
-    return frames[rows, np.arange(frames.shape[1])]

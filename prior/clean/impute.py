@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from steadypose.prior.clean.frame import Imputed, Window
 from steadypose.prior.clean.reconstruct import Encoded
 from steadypose.prior.models.hgvae.features import Tracks, from_tracks
-from steadypose.prior.models.hgvae.inference import Look
+from steadypose.prior.models.hgvae.inference import Reconstruction
 
 Floats = NDArray[np.float64]
 
@@ -75,14 +75,14 @@ class Climb:
         self._second = np.zeros_like(self._moved)
         self._count = 0
 
-    def complete(self, encoded: Encoded, row: int, steps: int) -> Look:
+    def complete(self, encoded: Encoded, row: int, steps: int) -> Reconstruction:
         """What the model makes of the window in this row of ``encoded``: of the points visited, the one of highest
         score.
 
         Each of ``steps`` looks at a point and takes a step from it; where the last one leads is seen in the next frame.
         Without a step, what the climb had gained when it was last looked at is added to the new start.
         """
-        model, start = encoded.model, Look(*(part[row] for part in encoded.look))
+        model, start = encoded.model, Reconstruction(*(part[row] for part in encoded.look))
         best, best_at = start, np.zeros_like(self._moved)
         if not steps:
             return best._replace(mean=best.mean + self._gained)
@@ -90,7 +90,7 @@ class Climb:
         for step in range(steps):
             at = row
             if step or self._moved.any():
-                at = model.elsewhere
+                at = model.scratch_row
                 look, score = model.decode(row, self._moved), model.score(at)
                 if score > best_score:
                     best, best_at, best_score = look, self._moved, score

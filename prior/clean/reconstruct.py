@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from steadypose.prior.clean.frame import Window
 from steadypose.prior.models.hgvae.features import Tracks, body_size, to_tracks
-from steadypose.prior.models.hgvae.inference import LiveHGVAE, Look
-from steadypose.prior.models.hgvae.network import HGVAE, HGVAEConfig
-from steadypose.prior.models.weights_io import load_weights
+from steadypose.prior.models.hgvae.inference import LiveHGVAE, Reconstruction
 
 LEAST_TRUST = 0.1
 """in a joint that passed the gate"""
@@ -49,7 +47,7 @@ class Encoded(NamedTuple):
     tracks: Tracks
     trust: NDArray[np.float64]
     size: NDArray[np.float64]
-    look: Look
+    look: Reconstruction
     model: LiveHGVAE
 
 
@@ -59,10 +57,7 @@ class Encode:
     delay_frames = 0
 
     def __init__(self, settings: EncodeSettings, sensor_sigma: float, slow: float, slots: int) -> None:
-        state, config = load_weights(settings.weights, "hgvae")
-        model = HGVAE(HGVAEConfig.from_dict(config))
-        model.load_state_dict(state)
-        self._model = LiveHGVAE(model, sensor_sigma, slow, slots)
+        self._model = LiveHGVAE.load(settings.weights, sensor_sigma, slow, slots)
         self._lost = np.zeros(slots, dtype=np.int64)
         self.frames = self._model.frames
 
@@ -81,7 +76,7 @@ class Encode:
         tracks = to_tracks(window.positions.all[-self.frames :, slots].swapaxes(0, 1), size)
         confidence = np.clip(window.confidence.all[-self.frames :, slots], LEAST_TRUST, 1.0)
         trust = tracks.observed * np.repeat(confidence.transpose(1, 2, 0), 3, axis=1)
-        look = self._model.look(tracks.x, trust)
+        look = self._model.reconstruct(tracks.x, trust)
         window.encoded = Encoded(slots, tracks, trust, size, look, self._model)
         return window
 

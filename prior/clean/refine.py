@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from steadypose.prior.body.kinematics import heading, yaw_matrix
 from steadypose.prior.clean.frame import Window
 from steadypose.prior.models.hmvae.inference import LiveHMVAE
-from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig
-from steadypose.prior.models.weights_io import load_weights
 
 
 @dataclass(frozen=True)
@@ -41,11 +39,8 @@ class Refine:
 
     def __init__(self, settings: RefineSettings, delay_frames: int) -> None:
         self._enabled = settings.enabled
-        state, config = load_weights(settings.weights, "hmvae")
-        model = HMVAE(HMVAEConfig.from_dict(config))
-        model.load_state_dict(state)
-        self._reconstruct = LiveHMVAE(model)
-        self.window = model.config.window
+        self._reconstruct = LiveHMVAE.load(settings.weights)
+        self.window = self._reconstruct.window
         if not 0 <= delay_frames <= 2 * self.window:
             raise ValueError(
                 f"delay: expected 0 to {2 * self.window} frames (twice the model's window), got {delay_frames}"

@@ -14,8 +14,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import nn
 from torch.optim import Optimizer
 
-from steadypose.prior.models import weights_io as checkpoint
+from steadypose.prior.models import weights_io
 from steadypose.prior.models.distributed import average_gradients, from_first, processes, rank, writes
+from steadypose.prior.models.torch_weights import save_weights
 
 
 class TrainingRun:
@@ -87,9 +88,9 @@ class TrainingRun:
         Returns:
             The path of the weights.
         """
-        path = checkpoint.WEIGHTS / f"{name}.safetensors"
+        path = weights_io.WEIGHTS / f"{name}.safetensors"
         told = {"Validation": ", ".join(f"{k} {v:.4g}" for k, v in self.curves[-1].items()), "Curves": f"`{name}.png`"}
-        checkpoint.save_weights(path, model, config, {**card, **told})
+        save_weights(path, model, config, {**card, **told})
         draw_curves(self.curves, path.with_suffix(".png"))
         return path
 

@@ -18,7 +18,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
@@ -398,7 +397,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=KINECT_NOISE, help="where the parameters go")
     parser.add_argument("--picture", type=Path, help="a picture of real beside simulated errors")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     clips = prepare([p for p in load_pairs(arguments.archive, TRAIN_SUBJECTS) if usable(p)])
     model = fit(clips, report=print)
     simulated = simulate(clips, model, np.random.default_rng(1))

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
@@ -24,13 +23,6 @@ Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 SIGN: Mapping[Side, float] = {"left": 1.0, "right": -1.0}
 """Which way the body's left axis goes."""
-
-
-def pose_bones(rotations: Floats, offsets: Floats, root: Floats) -> tuple[Floats, Floats]:
-    """`forward_kinematics` for numpy: positions (..., 22, 3) and global rotations (..., 22, 3, 3)."""
-    arrays = (torch.from_numpy(np.ascontiguousarray(a)) for a in (rotations, offsets, root))
-    positions, world = forward_kinematics(*arrays)
-    return positions.numpy(), world.numpy()
 
 
 @dataclass(frozen=True)
@@ -53,7 +45,7 @@ class Motion:
 
     @cached_property
     def _posed(self) -> tuple[Floats, Floats]:
-        return pose_bones(self.rotations, self.offsets, self.root)
+        return forward_kinematics(self.rotations, self.offsets, self.root)
 
     @property
     def positions(self) -> Floats:
@@ -303,7 +295,7 @@ def _arm(rotations: Floats, root: Floats, offsets: Floats, side: Side, intent: I
     lengths = _lengths(offsets, f"{side}_elbow", f"{side}_wrist")
 
     def place() -> tuple[Floats, Floats, Floats]:
-        positions, world = pose_bones(rotations, offsets, root)
+        positions, world = forward_kinematics(rotations, offsets, root)
         return positions[:, shoulder], world[:, collar], world[:, J["spine3"]]
 
     at, _, chest = place()

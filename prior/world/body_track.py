@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from steadypose.msgs.types import CleanBody, JointState, Tracking, WorldBody
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
-from steadypose.prior.models.root_velocity.network import FRAME_S
+from steadypose.prior.models.root_velocity.config import FRAME_S
 from steadypose.prior.world.ground import Ground
 from steadypose.prior.world.root_filter import RootFilter, RootNoise
 

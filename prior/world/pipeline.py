@@ -14,13 +14,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import CleanBody, PoseClean, PoseWorld, WorldBody
 from steadypose.prior.body.kinematics import yaw_matrix
-from steadypose.prior.models.root_velocity.network import NewestFrame, TrajectoryConfig, TrajectoryNet
-from steadypose.prior.models.weights_io import load_weights
+from steadypose.prior.models.root_velocity.inference import LiveRootVelocity
 from steadypose.prior.settings import build_settings
 from steadypose.prior.world.body_track import BodyTrack, Motion, Sighting, rotation, sightings
 from steadypose.prior.world.ground import Ground
@@ -161,28 +159,22 @@ class MotionReader:
     """
 
     def __init__(self, weights: str) -> None:
-        state, config = load_weights(weights, "trajectory")
-        self._config = TrajectoryConfig.from_dict(config)
-        net = TrajectoryNet(self._config)
-        net.load_state_dict(state)
-        self._net = NewestFrame(net).eval()
-        horizontal_first = [0, 0, 1]
-        self._scale = CAMERA_ERROR * np.array(self._config.sigma_scale)[horizontal_first]
-        self.memory_s = np.maximum(np.array(self._config.correlation_s)[horizontal_first] / 2.0, CAMERA_MEMORY_S)
+        self._net = LiveRootVelocity.load(weights)
+        config, horizontal_first = self._net.config, [0, 0, 1]
+        self._scale = CAMERA_ERROR * np.array(config.sigma_scale)[horizontal_first]
+        self.memory_s = np.maximum(np.array(config.correlation_s)[horizontal_first] / 2.0, CAMERA_MEMORY_S)
 
     @property
     def context(self) -> int:
         """Frames of motion that it looks at."""
-        return self._config.context
+        return self._net.config.context
 
     def read(self, tracks: Sequence[BodyTrack]) -> list[Motion]:
         """What each track's body does, by its window of motion."""
         if not tracks:
             return []
-        with torch.inference_mode():
-            said = self._net(torch.from_numpy(np.stack([track.window() for track in tracks])).float())
-            contacts = torch.sigmoid(said.contact_logits[:, 0]).numpy()
-            velocity, variance = said.velocity[:, 0].numpy(), torch.exp(2.0 * said.log_sigma[:, 0]).numpy()
+        velocity, log_sigma, contact_logits = self._net(np.stack([track.window() for track in tracks]))
+        contacts, variance = 1.0 / (1.0 + np.exp(-contact_logits)), np.exp(2.0 * log_sigma)
         variance[:, :2] = variance[:, :2].mean(axis=1, keepdims=True)  # the filter's noise must not know the heading
         sigma = np.sqrt(variance) * self._scale
         return [

@@ -20,8 +20,9 @@ from steadypose.benchmarks.protocols.streaming import recovery
 from steadypose.benchmarks.scores import figures as figures_of
 from steadypose.benchmarks.scores import pivot, score
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig
-from steadypose.prior.models.weights_io import load_weights
+from steadypose.prior.models.hmvae.config import HMVAEConfig
+from steadypose.prior.models.hmvae.network import HMVAE
+from steadypose.prior.models.torch_weights import load_tensors
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +113,7 @@ def test_recovery_counts_from_the_first_frame_in_sight(clips: MotionClips) -> No
 def test_sliding_windows_keep_every_frame(clips: MotionClips) -> None:
     import torch
 
-    state, config = load_weights("default", "hmvae")
+    state, config = load_tensors("default", "hmvae")
     model = HMVAE(HMVAEConfig.from_dict(config))
     model.load_state_dict(state)
     rotations = torch.from_numpy(clips.rotations[:24]).float().transpose(0, 1)

@@ -3,9 +3,9 @@ import torch
 
 from steadypose.benchmarks.motion import as_set, simulated_clips
 from steadypose.benchmarks.peers.window_vaes import CONFIGS, MVAE, TCNVAE, trained
-from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.models.hmvae.network import HMVAE
 from steadypose.prior.models.layers.skeleton_conv import SkeletonConv
+from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
 
 
 def in_use(model: torch.nn.Module) -> int:

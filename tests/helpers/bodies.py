@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
@@ -26,7 +25,7 @@ def random_pose(rng: np.random.Generator, frames: int, spread: float = 0.35) -> 
 
 
 def fk(rotations: np.ndarray, offsets: np.ndarray = REST_OFFSETS) -> np.ndarray:
-    return forward_kinematics(torch.from_numpy(rotations), torch.from_numpy(offsets))[0].numpy()
+    return forward_kinematics(rotations, offsets, np.zeros(3))[0]
 
 
 def waving(frames: int, scale: float = 1.0, speed: float = 1.0) -> np.ndarray:
@@ -43,8 +42,9 @@ def waving(frames: int, scale: float = 1.0, speed: float = 1.0) -> np.ndarray:
         vectors[:, J[f"{side}_hip"], 1] = -0.4 - 0.2 * np.sin(t)
         vectors[:, J[f"{side}_knee"], 1] = 0.8 + 0.4 * np.sin(t)
     rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(frames, 22, 3, 3)
-    placed, _ = forward_kinematics(torch.from_numpy(rotations), torch.from_numpy(REST_OFFSETS * scale))
-    positions = placed.numpy() + np.stack([0.1 * np.sin(t), 0.1 * np.cos(t), 0 * t], axis=-1)[:, None]
+    positions = (
+        fk(rotations, REST_OFFSETS * scale) + np.stack([0.1 * np.sin(t), 0.1 * np.cos(t), 0 * t], axis=-1)[:, None]
+    )
     return positions - [0.0, 0.0, positions[..., 2].min() - 0.02]
 
 

@@ -25,9 +25,11 @@ from steadypose.msgs.types import Pose, PoseRaw, RawBody
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.runtime import Node
 from steadypose.nodes.sinks.ros2.bridge import PACKAGES
-from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig
-from steadypose.prior.models.root_velocity.network import TrajectoryConfig, TrajectoryNet
-from steadypose.prior.models.weights_io import save_weights
+from steadypose.prior.models.hmvae.config import HMVAEConfig
+from steadypose.prior.models.hmvae.network import HMVAE
+from steadypose.prior.models.root_velocity.config import TrajectoryConfig
+from steadypose.prior.models.root_velocity.network import TrajectoryNet
+from steadypose.prior.models.torch_weights import save_weights
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.models.hgvae.faults import FaultNet, tell
+from steadypose.prior.models.hgvae.config import JOINT_NODES, FaultNetConfig
+from steadypose.prior.models.hgvae.fault_features import fault_features
 from steadypose.prior.models.layers.compiled_graph import Network, Program
-from steadypose.prior.models.layers.graph import JOINT_NODES
+from steadypose.prior.models.weights_io import Arrays, load_weights, part, weights_path
 
 Floats = NDArray[np.float64]
 
@@ -16,22 +17,35 @@ class LiveFaultNet:
     """A trained `FaultNet`, for one sensor.
 
     Args:
-        model: whose weights are copied.
+        config: its sizes.
+        weights: its state dict.
         sensor_sigma: metres along an axis, what the sensor may be off by.
-        most: windows at once.
+        max_batch: windows at once.
     """
 
-    def __init__(self, model: FaultNet, sensor_sigma: float, most: int) -> None:
+    def __init__(self, config: FaultNetConfig, weights: Arrays, sensor_sigma: float, max_batch: int) -> None:
         p = Program()
-        self._mean, self._sensor_sigma = model.mean.double().numpy(), sensor_sigma
-        self._told = p.matrix(JOINT_NODES, 4 * model.config.frames + 2)
-        graph = p.trunk(self._told, model.read, model.blocks)
-        self._odds = p.layer(graph, model.write)
-        self._net = Network(p, most)
+        self._mean, self._sensor_sigma = weights["mean"].astype(np.float64), sensor_sigma
+        self._features = p.matrix(JOINT_NODES, 4 * config.frames + 2)
+        self._odds = p.layer(p.trunk(self._features, weights), part(weights, "write"))
+        self._net = Network(p, max_batch)
+
+    @classmethod
+    def load(cls, weights: str, sensor_sigma: float, max_batch: int) -> LiveFaultNet:
+        """The one beside HG-VAE's weights of this name.
+
+        Raises:
+            FileNotFoundError: there is none; says which there are.
+        """
+        path = weights_path(weights, "hgvae").with_suffix(".faults.safetensors")
+        arrays, config = load_weights(str(path), "hgvae")
+        return cls(FaultNetConfig.from_dict(config), arrays, sensor_sigma, max_batch)
 
     def __call__(self, x: Floats, found: Floats, sigma: Floats, observed: Floats) -> Floats:
-        """(B, 22) logarithm of the odds that a joint is off; the arguments are those of `tell`."""
+        """(B, 22) logarithm of the odds that a joint is off; the arguments are those of `fault_features`."""
         rows = slice(0, len(x))
-        self._net.matrix(self._told, rows)[:] = tell(x, found, sigma, observed, self._sensor_sigma, self._mean)
+        self._net.matrix(self._features, rows)[:] = fault_features(
+            x, found, sigma, observed, self._sensor_sigma, self._mean
+        )
         self._net.run(self._net.steps, rows)
         return self._net.matrix(self._odds, rows)[..., 0].astype(np.float64)

@@ -7,17 +7,16 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from steadypose.prior.models.hgvae.completion_inference import LiveCompletion
+from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, TRACK_LOG_VAR, HGVAEConfig
 from steadypose.prior.models.hgvae.features import hang_unseen
-from steadypose.prior.models.hgvae.network import HGVAE, TRACK_LOG_VAR
-from steadypose.prior.models.layers.compiled_graph import Floats, Network, Program
-from steadypose.prior.models.layers.graph import JOINT_NODES, LOG_VAR_RANGE, SCALE
+from steadypose.prior.models.layers.compiled_graph import LOG_VAR_RANGE, Floats, Network, Program
+from steadypose.prior.models.weights_io import Arrays, load_weights, part
 
 
-class Look(NamedTuple):
+class Reconstruction(NamedTuple):
     """What the model makes of windows.
 
     Attributes:
@@ -33,69 +32,86 @@ class LiveHGVAE:
     """A trained `HGVAE` with the means of its latents, which may be moved.
 
     Args:
-        model: whose weights are copied; without actions.
+        config: its sizes; without actions.
+        weights: its state dict, which is copied.
         sensor_sigma: metres, standard deviation of an observation.
-        slow: metres, what of it lasts.
-        most: windows that can be looked at, at once.
+        bias_sigma: metres, what of it lasts.
+        max_batch: windows at once.
 
     Attributes:
         frames: T, of a window.
         latents: how many numbers all latents of a window are.
-        elsewhere: the row in which `decode` leaves the window that it decoded last.
+        scratch_row: the row in which `decode` leaves the window that it decoded last.
     """
 
-    def __init__(self, model: HGVAE, sensor_sigma: float, slow: float, most: int) -> None:
-        config, p = model.config, Program()
-        self._completion = LiveCompletion(model.completion, slow, most) if model.completion else None
-        self.frames, self._mean = config.frames, model.mean.numpy().astype(np.float64)[:, None]
+    def __init__(
+        self, config: HGVAEConfig, weights: Arrays, sensor_sigma: float, bias_sigma: float, max_batch: int
+    ) -> None:
+        p = Program()
+        self._completion = None
+        if config.completion:
+            completion = part(weights, "completion")
+            self._completion = LiveCompletion(config.completion, completion, bias_sigma, max_batch)
+        self.frames, self._mean = config.frames, weights["mean"].astype(np.float64)[:, None]
         self._x = p.matrix(JOINT_NODES, 2 * config.frames)  # the tracks, and beside them what was observed
-        kept = config.coefficients
-        weight = torch.cat([model.dct.T @ model.read.weight[:kept], model.read.weight[kept:]])
-        graph = p.gelu(p.linear(self._x, weight, model.read.bias, model.read.adjacency))
-        p.block(graph, model.read_block, onto=graph)
+        kept, dct, read = config.coefficients, weights["dct"], part(weights, "read")
+        weight = np.concatenate([dct.T @ read["weight"][:kept], read["weight"][kept:]])
+        graph = p.gelu(p.linear(self._x, weight, read["bias"], read["adjacency"]))
+        p.block(graph, part(weights, "read_block"), onto=graph)
         # Of a level's joined features, what the encoder has to say: the stream's half of the product comes later.
         features, seen = config.features, []
-        for (up, block), level in zip(model.encoder_levels, reversed(model.decoder_levels), strict=True):
-            graph = p.layer(graph, up)
-            p.block(graph, block, onto=graph)
-            seen.append(p.linear(graph, level.join.weight.T[features:], level.join.bias))
+        levels = [part(weights, f"down.{k}") for k in range(len(config.levels))]
+        for k, level in enumerate(reversed(levels)):
+            graph = p.layer(graph, part(weights, f"up.{k}"))
+            p.block(graph, part(weights, f"encoder.{k}"), onto=graph)
+            seen.append(p.linear(graph, level["join.weight"].T[features:], level["join.bias"]))
         encoder_steps, encoder_matrices = len(p.steps), len(p.shapes)
-        stream = p.linear(p.matrix(1, 1), torch.zeros(1, features), model.start, torch.zeros(JOINT_NODES, 1))
+        nothing, one = np.zeros((1, features), dtype=np.float32), np.zeros((JOINT_NODES, 1), dtype=np.float32)
+        stream = p.linear(p.matrix(1, 1), nothing, weights["start"], one)
         self._moves, self._terms = [], []
-        nothing = torch.zeros(1)
-        for level, found in zip(model.decoder_levels, reversed(seen), strict=True):
-            nodes, latent = level.level
-            above = p.layer(stream, level.contract)
-            joined = p.linear(above, level.join.weight.T[:features], nothing.expand(features), plus=found)
-            p.block(joined, level.posterior_block, onto=joined)
-            head = level.posterior_head
-            mean = p.linear(joined, head.weight.T[:, :latent], head.bias[:latent])
-            if level.top:
+        for k, (level, found) in enumerate(zip(levels, reversed(seen), strict=True)):
+            nodes, latent = config.levels[k]
+            above = p.layer(stream, part(level, "contract"))
+            joined = p.linear(above, level["join.weight"].T[:features], nothing, plus=found)
+            p.block(joined, part(level, "posterior_block"), onto=joined)
+            mean = p.linear(joined, level["posterior_head.weight"].T[:, :latent], level["posterior_head.bias"][:latent])
+            if k == 0:
                 prior = p.matrix(nodes, 2 * latent)
             else:
-                before = p.block(above, level.prior_block, onto=p.matrix(nodes, features))
-                prior = p.linear(before, level.prior_head.weight.T, level.prior_head.bias)
+                before = p.block(above, part(level, "prior_block"), onto=p.matrix(nodes, features))
+                prior = p.linear(before, level["prior_head.weight"].T, level["prior_head.bias"])
             self._moves.append(p.matrix(nodes, latent))
             z = p.sum(mean, self._moves[-1])
             self._terms.append(p.density(z, prior))
-            p.layer(z, level.expand, plus=stream, onto=stream)
-            p.block(stream, level.block, onto=stream)
-        p.block(stream, model.last_block, onto=stream)
+            p.layer(z, part(level, "expand"), plus=stream, onto=stream)
+            p.block(stream, part(level, "block"), onto=stream)
+        p.block(stream, part(weights, "last_block"), onto=stream)
         # the inverse cosine transform of tracks and log-variances, within the last layer
-        weight = torch.cat([part @ model.dct for part in model.write.weight.split(kept, dim=1)], dim=1)
-        shift = torch.tensor([0.0, TRACK_LOG_VAR]).repeat_interleave(config.frames)
-        bias = torch.cat([part @ model.dct for part in model.write.bias.split(kept, dim=1)], dim=1) + shift
-        self._written = p.linear(stream, weight, bias, model.write.adjacency)  # tracks, and their log-variances
-        self._net = Network(p, most + 1)
-        self.elsewhere, self._encoded = most, self._net.places[encoder_matrices][0]
+        write = part(weights, "write")
+        weight = np.concatenate([half @ dct for half in np.split(write["weight"], 2, axis=1)], axis=1)
+        bias = np.concatenate([half @ dct for half in np.split(write["bias"], 2, axis=1)], axis=1)
+        bias[:, self.frames :] += np.float32(TRACK_LOG_VAR)
+        self._written = p.linear(stream, weight, bias, write["adjacency"])  # tracks, and their log-variances
+        self._net = Network(p, max_batch + 1)
+        self.scratch_row, self._encoded = max_batch, self._net.places[encoder_matrices][0]
         self._encoder, self._decoder = self._net.steps[:encoder_steps], self._net.steps[encoder_steps:]
         self._sensor_variance = np.float32((sensor_sigma / SCALE) ** 2)
-        self._trust = np.zeros((most + 1, JOINT_NODES, config.frames), dtype=np.float32)
+        self._trust = np.zeros((max_batch + 1, JOINT_NODES, config.frames), dtype=np.float32)
         self._term_places = [self._net.places[number][0] for number in self._terms]
         self.latents = sum(end - begin for begin, end, _ in (self._net.places[number] for number in self._moves))
 
-    def look(self, x: NDArray[np.float64], observed: NDArray[np.float64]) -> Look:
-        """Encode and decode windows. The model stands at them until it looks again; a window's row is its place here.
+    @classmethod
+    def load(cls, weights: str, sensor_sigma: float, bias_sigma: float, max_batch: int) -> LiveHGVAE:
+        """From the weights of this name.
+
+        Raises:
+            FileNotFoundError: there are none; says which there are.
+        """
+        arrays, config = load_weights(weights, "hgvae")
+        return cls(HGVAEConfig.from_dict(config), arrays, sensor_sigma, bias_sigma, max_batch)
+
+    def reconstruct(self, x: NDArray[np.float64], observed: NDArray[np.float64]) -> Reconstruction:
+        """Encode and decode windows. The model stands at them until the next; a window's row is its place here.
 
         Args:
             x: (B, 66, T) metres of a standard body; see `prior.models.hgvae.features`. NaN for a joint never seen.
@@ -113,16 +129,16 @@ class LiveHGVAE:
         self._net.run(self._encoder, rows)
         return self._decode(rows)
 
-    def decode(self, row: int, moved: NDArray[np.float64]) -> Look:
-        """Decode a window anew in the row `elsewhere`, its latents (n,) moved from where the encoder puts them."""
-        rows, begin = slice(self.elsewhere, self.elsewhere + 1), 0
+    def decode(self, row: int, moved: NDArray[np.float64]) -> Reconstruction:
+        """Decode a window anew in the row `scratch_row`, its latents (n,) moved from where the encoder puts them."""
+        rows, begin = slice(self.scratch_row, self.scratch_row + 1), 0
         self._net.values[rows, : self._encoded] = self._net.values[row, : self._encoded]
         self._trust[rows] = self._trust[row]
         for number in self._moves:
             matrix = self._net.matrix(number, rows)
             matrix[:] = moved[begin : begin + matrix.size].reshape(matrix.shape)
             begin += matrix.size
-        return Look(*(part[0] for part in self._decode(rows)))
+        return Reconstruction(*(part[0] for part in self._decode(rows)))
 
     def score(self, row: int) -> float:
         """Nats, of a window as last decoded: sum over all levels of log p(z | above), the score of section 7, and of
@@ -155,11 +171,11 @@ class LiveHGVAE:
         off = self._net.matrix(self._x, rows)[0, :, : self.frames] - written[:, : self.frames]
         return off, written[:, self.frames :]
 
-    def _decode(self, rows: slice) -> Look:
+    def _decode(self, rows: slice) -> Reconstruction:
         self._net.run(self._decoder, rows)
         written = self._net.matrix(self._written, rows)
         half_log_var = 0.5 * np.clip(written[..., self.frames :], *LOG_VAR_RANGE)
-        return Look(
+        return Reconstruction(
             mean=written[..., : self.frames] * np.float64(SCALE) + self._mean,
             sigma=np.exp(half_log_var) * np.float64(SCALE),
         )

@@ -14,8 +14,7 @@ be cut off at its lower coefficients, which makes the live model small.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -23,56 +22,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from steadypose.prior.models.hgvae.completion import CompletionConfig, CompletionNet, certainty
-from steadypose.prior.models.layers.graph import JOINT_NODES, LOG_VAR_RANGE, GraphBlock, GraphLinear
-
-TRACK_LOG_VAR = -4.0
-"""Log-variance of tracks that the network's zero stands for: 2.7 cm"""
-
+from steadypose.prior.models.hgvae.completion import CompletionNet, belief
+from steadypose.prior.models.hgvae.config import JOINT_NODES, TRACK_LOG_VAR, HGVAEConfig, Level
+from steadypose.prior.models.layers.compiled_graph import LOG_VAR_RANGE
+from steadypose.prior.models.layers.graph import GraphBlock, GraphLinear
 
 FAINT, SURE = 0.25, -4.0
 """How a model begins: the factor on what a level adds to the stream, and the log-variance of the posteriors"""
-
-
-class Level(NamedTuple):
-    """One stochastic level: how many nodes, and how many latent features each has."""
-
-    nodes: int
-    latent: int
-
-
-@dataclass(frozen=True)
-class HGVAEConfig:
-    """The sizes of an HG-VAE.
-
-    Attributes:
-        frames: T, frames of a window at 30 Hz (the paper has 50).
-        coefficients: of the cosine transform that are kept, lowest first (the paper keeps all T).
-        features: F, of every node in the deterministic streams (the paper has 256).
-        levels: stochastic levels, the top one first (the paper: 1, 8, 24 and 54 nodes).
-        stochastic: how many of the levels, counted from the bottom, are random; those above stay at their prior's
-            mean and carry nothing (table 1: depth at equal capacity). None: all.
-        actions: action classes, given one-hot beside the top latent; 0 for a model without.
-        completion: sizes of the network that guesses what was not observed; None for a model without.
-    """
-
-    frames: int = 50
-    coefficients: int = 20
-    features: int = 64
-    levels: tuple[Level, ...] = (Level(1, 64), Level(8, 32), Level(24, 32), Level(JOINT_NODES, 16))
-    stochastic: int | None = None
-    actions: int = 0
-    completion: CompletionConfig | None = None
-
-    @classmethod
-    def from_dict(cls, config: dict[str, Any]) -> HGVAEConfig:
-        """From the JSON of a weights file."""
-        completion = config.get("completion")
-        return cls(**{
-            **config,
-            "levels": tuple(Level(*level) for level in config["levels"]),
-            "completion": completion and CompletionConfig(**completion),
-        })  # fmt: skip
 
 
 def dct_matrix(frames: int) -> Tensor:
@@ -157,28 +113,23 @@ class HGVAE(nn.Module):
     mean: Tensor
 
     @property
-    def encoder_levels(self) -> list[tuple[nn.Module, GraphBlock]]:
-        """What contracts the graph for a level, and the level's block; the bottom level first."""
-        return [(up, cast("GraphBlock", block)) for up, block in zip(self.up, self.encoder, strict=True)]
-
-    @property
     def decoder_levels(self) -> list[DecoderLevel]:
         """The stochastic levels, the top one first."""
         return [cast("DecoderLevel", level) for level in self.down]
 
     @torch.no_grad()
-    def completed(self, x: Tensor, observed: Tensor, slow: NDArray[np.floating] | float) -> tuple[Tensor, Tensor]:
+    def completed(self, x: Tensor, observed: Tensor, bias_sigma: NDArray[np.floating] | float) -> tuple[Tensor, Tensor]:
         """(B, N, T) windows with a better guess of what was not observed, and how far to believe each entry.
 
         Args:
             x: (B, N, T) tracks; what was not observed holds a guess.
             observed: (B, N, T) 1 where observed, else 0.
-            slow: (B,) metres along an axis, the errors of the sensor that last.
+            bias_sigma: (B,) metres along an axis, the errors of the sensor that last.
         """
         if self.completion is None:
             return x, observed
-        completed, log_var = self.completion.complete(x, observed, slow)
-        return completed, certainty(observed, log_var)
+        completed, log_var = self.completion.complete(x, observed, bias_sigma)
+        return completed, belief(observed, log_var)
 
     def forward(
         self, x: Tensor, believed: Tensor, *, spread: Tensor | None = None, action: Tensor | None = None
@@ -195,7 +146,7 @@ class HGVAE(nn.Module):
         read = torch.cat([x @ self.dct.T, believed], dim=-1).transpose(0, 1)
         graph = self.read_block(F.gelu(self.read(read)))
         found: list[Tensor] = []
-        for up, block in self.encoder_levels:
+        for up, block in zip(self.up, self.encoder, strict=True):
             graph = block(up(graph))
             found.append(graph)
         stream = self.start[:, None].expand(-1, len(x), -1)

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from steadypose.prior.models.distributed import share
-from steadypose.prior.models.hgvae.completion import CompletionConfig
-from steadypose.prior.models.hgvae.network import HGVAE, HGVAEConfig, Level, Pass
+from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, CompletionConfig, HGVAEConfig, Level
+from steadypose.prior.models.hgvae.network import HGVAE, Pass
 from steadypose.prior.models.hgvae.train_completion import BATCH, BONES, SPOILT_BY, TURNED, train_completion
 from steadypose.prior.models.hgvae.train_faults import train_anomaly
 from steadypose.prior.models.hgvae.windows import STRIDES, Batch, Windows, mean_tracks
-from steadypose.prior.models.layers.graph import JOINT_NODES, SCALE
+from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingRun
-from steadypose.prior.models.weights_io import LICENCES, started, weights_path
+from steadypose.prior.models.weights_io import LICENCES, weights_path
 from steadypose.prior.motion.corruption import add_noise, occlude, other_builds, slow_errors, spoil
 from steadypose.prior.motion.dataset import MotionSet
 

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from steadypose.prior.models.distributed import share
 from steadypose.prior.models.hgvae.completion import CompletionNet
+from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.network import HGVAE
 from steadypose.prior.models.hgvae.windows import STRIDES, Batch, Windows
-from steadypose.prior.models.layers.graph import SCALE
 from steadypose.prior.models.training import TrainingRun
 from steadypose.prior.motion.corruption import (
     add_noise,

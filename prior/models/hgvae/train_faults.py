@@ -16,15 +16,17 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from steadypose.prior.clean.gate import LEAST_NOISE, stuck
-from steadypose.prior.clean.score import MISSING, RATES, SENSOR_SIGMAS, Calibration, judged
 from steadypose.prior.models.distributed import share
-from steadypose.prior.models.hgvae.faults import RECENT, FaultNet, FaultNetConfig, tell
+from steadypose.prior.models.hgvae.anomaly import MISSING, RATES, SENSOR_SIGMAS, Calibration, judged
+from steadypose.prior.models.hgvae.config import SCALE, FaultNetConfig, HGVAEConfig
+from steadypose.prior.models.hgvae.fault_features import RECENT, fault_features
+from steadypose.prior.models.hgvae.faults import FaultNet
 from steadypose.prior.models.hgvae.features import to_tracks
-from steadypose.prior.models.hgvae.network import HGVAE, HGVAEConfig
+from steadypose.prior.models.hgvae.network import HGVAE
 from steadypose.prior.models.hgvae.windows import STRIDES, Windows, standardise
-from steadypose.prior.models.layers.graph import SCALE
+from steadypose.prior.models.torch_weights import load_network, started
 from steadypose.prior.models.training import TrainingRun
-from steadypose.prior.models.weights_io import LICENCES, load_weights, started
+from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.corruption import (
     FAST,
     elsewhere,
@@ -100,10 +102,7 @@ def train_anomaly(
 
 
 def _model(path: Path) -> HGVAE:
-    state, config = load_weights(str(path), "hgvae")
-    model = HGVAE(HGVAEConfig.from_dict(config))
-    model.load_state_dict(state)
-    return model.eval()
+    return load_network(HGVAE, HGVAEConfig.from_dict, str(path), "hgvae")
 
 
 def fit(
@@ -151,19 +150,21 @@ def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np
     shown = np.isfinite(seen[:, -RECENT:, :, 0]).any(axis=1)
     off = (astray > limit) | lost
     clear = torch.from_numpy(shown & (off | (astray < 0.2 * limit) & (repeated == 0))).float()
-    told = tell(*_look(model, seen, sizes, sigma * np.sqrt(1.0 - fast)), sigma, network.mean.numpy())
-    logits = network(torch.from_numpy(told))
+    reconstructed = _reconstruct(model, seen, sizes, sigma * np.sqrt(1.0 - fast))
+    logits = network(torch.from_numpy(fault_features(*reconstructed, sigma, network.mean.numpy())))
     faulty = torch.from_numpy(off).float()
     return (F.binary_cross_entropy_with_logits(logits, faulty, reduction="none") * clear).sum() / clear.sum()
 
 
 @torch.no_grad()
-def _look(model: HGVAE, seen: Floats, sizes: Floats, slow: Floats | float) -> tuple[Floats, Floats, Floats, Floats]:
+def _reconstruct(
+    model: HGVAE, seen: Floats, sizes: Floats, bias_sigma: Floats | float
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Tracks of windows (B, T, 22, 3) of bodies of sizes (B,), what HG-VAE makes of them and how sure it is, all
-    (B, 66, T) metres, and what was observed; ``slow`` (B,) metres, the errors of the sensor that last."""
+    (B, 66, T) metres, and what was observed; ``bias_sigma`` (B,) metres, the errors of the sensor that last."""
     tracks = to_tracks(seen, sizes)
     observed = torch.from_numpy(tracks.observed).float()
-    found = model(*model.completed(standardise(model, tracks.x), observed, slow)).tracks
+    found = model(*model.completed(standardise(model, tracks.x), observed, bias_sigma)).tracks
     mean = found.mean.double() * SCALE + model.mean[:, None]
     return tracks.x, mean.numpy(), (0.5 * found.log_var.double()).exp().numpy() * SCALE, tracks.observed
 
@@ -171,12 +172,12 @@ def _look(model: HGVAE, seen: Floats, sizes: Floats, slow: Floats | float) -> tu
 @torch.inference_mode()
 def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Floats:
     """(B, 22) odds, `judged`, of windows (B, T, 22, 3) of bodies of sizes (B,)."""
-    slow, mean, parts = sensor_sigma * np.sqrt(1.0 - FAST), network.mean.numpy(), []
+    bias_sigma, mean, parts = sensor_sigma * np.sqrt(1.0 - FAST), network.mean.numpy(), []
     for start in range(0, len(seen), 256):
         some = slice(start, start + 256)
-        look = _look(model, seen[some], sizes[some], slow)
-        odds = network(torch.from_numpy(tell(*look, sensor_sigma, mean)))
-        parts.append(judged(odds.double().numpy(), look[-1], stuck(seen[some])))
+        reconstructed = _reconstruct(model, seen[some], sizes[some], bias_sigma)
+        odds = network(torch.from_numpy(fault_features(*reconstructed, sensor_sigma, mean)))
+        parts.append(judged(odds.double().numpy(), reconstructed[-1], stuck(seen[some])))
     return np.concatenate(parts)
 
 

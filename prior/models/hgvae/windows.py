@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.features import body_size, hang_unseen, in_frame_of, to_tracks
 from steadypose.prior.models.hgvae.network import HGVAE
-from steadypose.prior.models.layers.graph import SCALE
 from steadypose.prior.motion.dataset import MotionSet, mirror_offsets
 
 Floats = NDArray[np.float64]
@@ -67,12 +67,12 @@ class Batch(NamedTuple):
         x = standardise(model, np.stack([t.x for t in tracks]))
         return cls(x, observed, observed, standardise(model, np.stack(true)), counts)
 
-    def completed(self, model: HGVAE, slow: Floats | float) -> Batch:
+    def completed(self, model: HGVAE, bias_sigma: Floats | float) -> Batch:
         """The same with the model's guess of what was not seen.
 
-        ``slow`` (B,) metres along an axis: the errors of the sensor that last.
+        ``bias_sigma`` (B,) metres along an axis: the errors of the sensor that last.
         """
-        x, believed = model.completed(self.x, self.observed, slow)
+        x, believed = model.completed(self.x, self.observed, bias_sigma)
         return self._replace(x=x, believed=believed)
 
     def beside(self, other: Batch) -> Batch:

@@ -11,99 +11,119 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import torch
-from numba import njit
-from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn import functional as F
 
-from steadypose.prior.models.hmvae.network import HMVAE, ROTATION_FEATURES, SLOPE
-from steadypose.prior.models.layers.skeleton_conv import SkeletonConv, SkeletonPool, SkeletonUnpool
-
-Floats = NDArray[np.float32]
-
-FEW_ROWS = 2
-"""Products of so few take half the time without a BLAS, which copies the weights first."""
+from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.models.hmvae.config import CHANNELS, ROTATION_FEATURES, HMVAEConfig
+from steadypose.prior.models.layers.dense import Floats, dense, leaky_relu
+from steadypose.prior.models.layers.edge_graph import mix_edges, pool_matrix, pooling_levels, unpool_matrix
+from steadypose.prior.models.weights_io import Arrays, load_weights, part
 
 
 class LiveHMVAE:
     """A trained `HMVAE`'s reconstruction.
 
     Args:
-        model: whose weights are folded; later changes to it are not seen here.
+        config: its sizes.
+        weights: its state dict, which is folded.
     """
 
-    @torch.no_grad()
-    def __init__(self, model: HMVAE) -> None:
-        config, steps, edges = model.config, model.steps, [len(level.groups) for level in model.levels]
+    def __init__(self, config: HMVAEConfig, weights: Arrays) -> None:
+        self.window = config.window
+        steps, levels, none = config.steps, pooling_levels(PARENTS), np.zeros(1, dtype=np.float32)
+        edges = [len(level.groups) for level in levels]
         self._encoder = []
-        for k, block in enumerate(model.encoder):
-            conv, pool = block  # type: ignore[misc]  (a ModuleList of two)
-            bias = pool(conv.bias[None, :, None])[0, :, 0]
-            self._encoder.append(_TemporalLinear(_pooled(conv, pool), bias, torch.eye(steps[k]), conv))
-        self._local = _Latent(model.to_local.linear, config.local_latent, model.CHANNELS[1])
-        self._deep = _Latent(model.to_global.linear, config.global_latent, model.CHANNELS[-1])
+        for k, level in enumerate(levels):
+            conv, pool = part(weights, f"encoder.{k}.0"), pool_matrix(level.groups)
+            weight = mix_edges(pool, conv["weight"])
+            bias = mix_edges(pool, conv["bias"])
+            self._encoder.append(_TemporalLinear(weight, bias, _stretch(steps[k], 1), config.strides[k]))
+        self._local = _Latent(part(weights, "to_local.linear"), config.local_latent, CHANNELS[1])
+        self._deep = _Latent(part(weights, "to_global.linear"), config.global_latent, CHANNELS[-1])
+        decoder = []
+        for k, level in enumerate(levels):
+            conv = part(weights, f"decoder.{3 - k}.1")
+            weight, stretch = (
+                _unpooled(conv["weight"], unpool_matrix(level.groups)),
+                _stretch(steps[k + 1], config.strides[k]),
+            )
+            decoder.append((weight, conv.get("bias", none), stretch))
+        (last, last_bias, last_stretch), *_, first = decoder
+        stream = last.reshape(len(last), edges[0], 2, -1, last.shape[-1])[
+            :, :, 0
+        ]  # of each edge, the stream's channels
+        decoder[0] = stream.reshape(len(last), -1, last.shape[-1]), none, last_stretch  # the bias comes with z_l
 
-        def from_deep(latent: Tensor) -> Tensor:
-            return _block(model, 3, model.from_global(latent).reshape(len(latent), -1, steps[4]))
+        def from_deep(latent: Floats) -> Floats:
+            return _TemporalLinear(*first)(_expanded(latent, part(weights, "from_global"), steps[4]))
 
-        def from_local(latent: Tensor) -> Tensor:  # beside a stream of zeros
-            features = model.from_local(latent).reshape(len(latent), edges[0], -1, steps[1])
-            joined = torch.cat([torch.zeros_like(features), features], dim=2).flatten(1, 2)
-            return _block(model, 0, joined)
+        def from_local(latent: Floats) -> Floats:  # beside a stream of zeros
+            features = _expanded(latent, part(weights, "from_local"), steps[1])
+            features = features.reshape(*features.shape[:2], edges[0], -1)
+            joined = np.concatenate([np.zeros_like(features), features], axis=-1)
+            return _TemporalLinear(last, last_bias, last_stretch)(joined.reshape(*features.shape[:2], -1))
 
         self._from_deep = _Affine(from_deep, edges[3], config.global_latent)
         self._from_local = _Affine(from_local, edges[0], config.local_latent)
-        self._decoder = []
-        for k, block in zip((2, 1, 0), list(model.decoder)[1:], strict=True):
-            unpool, conv = block  # type: ignore[misc]
-            weight, bias = _unpooled(unpool, conv), conv.bias
-            if k == 0:  # of each edge, the stream's channels; the bias is in the local latent's part
-                weight = weight.unflatten(1, (edges[0], 2, -1))[:, :, 0].flatten(1, 2)
-                bias = None
-            self._decoder.append(_TemporalLinear(weight, bias, _stretch(steps[k + 1], config.strides[k]), conv))
+        self._decoder = [_TemporalLinear(*decoder[k]) for k in (2, 1, 0)]
+
+    @classmethod
+    def load(cls, weights: str) -> LiveHMVAE:
+        """From the weights of this name.
+
+        Raises:
+            FileNotFoundError: there are none; says which there are.
+        """
+        arrays, config = load_weights(weights, "hmvae")
+        return cls(HMVAEConfig.from_dict(config), arrays)
 
     def __call__(self, x: Floats) -> Floats:
         """Decode the posterior's mean of windows (B, T, 22, 6): equations 10 and 11."""
         first, *others = self._encoder
-        features = _leaky(first(x.reshape(*x.shape[:2], -1)))
+        features = leaky_relu(first(x.reshape(*x.shape[:2], -1)))
         local = self._from_local(self._local(features))
         for layer in others:
-            features = _leaky(layer(features))
+            features = leaky_relu(layer(features))
         features = self._from_deep(self._deep(features))
         for layer in self._decoder:
-            features = layer(_leaky(features))
+            features = layer(leaky_relu(features))
         return (features + local).reshape(*x.shape[:2], -1, ROTATION_FEATURES)
 
 
 class _TemporalLinear:
-    """A convolution as two products: ``over_time`` (T' * taps, T) gathers each output frame's inputs."""
+    """A convolution as two products: ``over_time`` (T' * taps, T) gathers each output frame's inputs.
 
-    def __init__(self, weight: Tensor, bias: Tensor | None, stretch: Tensor, conv: SkeletonConv) -> None:
+    Args:
+        weight: (out, in, kernel)
+        bias: (out,) or (1,)
+        stretch: (T', T) what is done over time before; its ends are reflected.
+        stride: in time.
+    """
+
+    def __init__(self, weight: Floats, bias: Floats, stretch: Floats, stride: int = 1) -> None:
         kernel = weight.shape[2]
-        padded = F.pad(stretch.T[None], conv.pad, mode="reflect")[0].T
-        gathered = padded.unfold(0, kernel, conv.stride).transpose(1, 2)  # (T', kernel, T)
-        taps, tap_of = torch.unique(gathered, dim=1, return_inverse=True)
-        merged = weight.new_zeros(len(weight), taps.shape[1], weight.shape[1])
-        merged.index_add_(1, tap_of, weight.transpose(1, 2))
-        self._over_time = np.ascontiguousarray(taps.flatten(0, 1).numpy())
-        self._weight = np.ascontiguousarray(merged.flatten(1).numpy())
-        self._bias = np.zeros(1, dtype=np.float32) if bias is None else bias.detach().numpy().copy()
+        padded = np.pad(stretch, [((kernel - 1) // 2,) * 2, (0, 0)], mode="reflect")
+        gathered = np.lib.stride_tricks.sliding_window_view(padded, kernel, axis=0)[::stride].swapaxes(1, 2)
+        taps, tap_of = np.unique(gathered, axis=1, return_inverse=True)  # (T', kernel, T)
+        merged = np.zeros((len(weight), taps.shape[1], weight.shape[1]), dtype=np.float32)
+        for k, tap in enumerate(tap_of.ravel()):
+            merged[:, tap] += weight[..., k]
+        self._over_time = np.ascontiguousarray(taps.reshape(-1, taps.shape[-1]))
+        self._weight, self._bias = merged.reshape(len(merged), -1), bias
 
     def __call__(self, x: Floats) -> Floats:
         """(B, T, in) to (B, T', out)."""
         windows = (self._over_time @ x).reshape(-1, self._weight.shape[1])
-        return _product(windows, self._weight, self._bias).reshape(len(x), -1, len(self._weight))
+        return dense(windows, self._weight, self._bias).reshape(len(x), -1, len(self._weight))
 
 
 class _Latent:
     """A latent's mean, edge by edge: (B, T, E * C) to (B, E * latent)."""
 
-    def __init__(self, linear: nn.Linear, latent: int, channels: int) -> None:
+    def __init__(self, linear: Arrays, latent: int, channels: int) -> None:
         # The model's features are (C, T) within an edge, these are (T, C).
-        weight = linear.weight[:latent].reshape(latent, channels, -1).transpose(1, 2).flatten(1)
-        self._channels, self._weight = channels, weight.detach().numpy().copy()
-        self._bias = linear.bias[:latent].detach().numpy().copy()
+        weight = linear["weight"][:latent].reshape(latent, channels, -1).swapaxes(1, 2)
+        self._channels, self._weight = channels, weight.reshape(latent, -1)
+        self._bias = linear["bias"][:latent]
 
     def __call__(self, x: Floats) -> Floats:
         edges = x.reshape(*x.shape[:2], -1, self._channels).swapaxes(1, 2).reshape(-1, self._weight.shape[1])
@@ -111,74 +131,39 @@ class _Latent:
 
 
 class _Affine:
-    """What torch makes of a latent, as one product: (B, E * latent) to (B, T, out).
+    """What becomes of a latent, as one product: (B, E * latent) to (B, T, out).
 
     Args:
-        function: affine, (B, E, latent) to (B, out, T).
+        function: affine, (B, E, latent) to (B, T, out).
     """
 
-    def __init__(self, function: Callable[[Tensor], Tensor], edges: int, latent: int) -> None:
+    def __init__(self, function: Callable[[Floats], Floats], edges: int, latent: int) -> None:
         size = edges * latent
-        basis = torch.cat([torch.zeros(1, size), torch.eye(size)]).unflatten(1, (edges, latent))
-        zero, *rows = function(basis).transpose(1, 2)
-        self._shape = tuple(zero.shape)
-        self._weight = (torch.stack(rows) - zero).flatten(1).T.contiguous().numpy()
-        self._bias = zero.flatten().numpy()
+        basis = np.eye(1 + size, size, k=-1, dtype=np.float32).reshape(-1, edges, latent)
+        zero, *rows = function(basis)
+        self._shape = zero.shape
+        self._weight = np.ascontiguousarray((np.stack(rows) - zero).reshape(size, -1).T)
+        self._bias = zero.ravel()
 
     def __call__(self, latent: Floats) -> Floats:
-        return _product(latent, self._weight, self._bias).reshape(-1, *self._shape)
+        return dense(latent, self._weight, self._bias).reshape(-1, *self._shape)
 
 
-def _product(x: Floats, weight: Floats, bias: Floats) -> Floats:
-    """``x @ weight.T + bias``: (N, in) to (N, out)."""
-    if len(x) > FEW_ROWS:
-        return np.ascontiguousarray((weight @ x.T).T) + bias
-    out = np.empty((len(x), len(weight)), dtype=np.float32)
-    _few_rows(np.ascontiguousarray(x), weight, out)
-    return out + bias
+def _unpooled(weight: Floats, unpool: Floats) -> Floats:
+    """(out, pooled in, kernel): a convolution's weight with the unpooling before it."""
+    outputs, _, kernel = weight.shape
+    edges = weight.reshape(outputs, len(unpool), -1, kernel)
+    return np.einsum("oeck,eg->ogck", edges, unpool).reshape(outputs, -1, kernel)
 
 
-@njit("(f4[:,::1], f4[:,::1], f4[:,::1])", cache=True, fastmath=True)
-def _few_rows(x, weight, out):
-    """Writes ``x @ weight.T``: (N, in) and (M, in) to (N, M)."""
-    for j in range(len(weight)):
-        for i in range(len(x)):
-            total = np.float32(0)
-            for k in range(x.shape[1]):
-                total += x[i, k] * weight[j, k]
-            out[i, j] = total
+def _expanded(latent: Floats, linear: Arrays, steps: int) -> Floats:
+    """(B, T, E * C) features of a latent (B, E, d), edge by edge."""
+    features = latent @ linear["weight"].T + linear["bias"]
+    features = features.reshape(*latent.shape[:2], -1, steps)  # (C, T) within an edge
+    return features.transpose(0, 3, 1, 2).reshape(len(latent), steps, -1)
 
 
-def _leaky(x: Floats) -> Floats:
-    return np.maximum(x, np.float32(SLOPE) * x)
-
-
-def _block(model: HMVAE, level: int, features: Tensor) -> Tensor:
-    """A block of the decoder without its activation: features (B, E * C, T) of this level to those of the one below."""
-    unpool, conv = model.decoder[3 - level]  # type: ignore[misc]
-    stride = model.config.strides[level]
-    if stride > 1:
-        features = F.interpolate(features, scale_factor=stride, mode="linear")
-    return conv(unpool(features))
-
-
-@torch.no_grad()
-def _pooled(conv: SkeletonConv, pool: SkeletonPool) -> Tensor:
-    """(pooled out, in, kernel): the convolution's weight with the pooling after it."""
-    outputs, inputs, kernel = conv.weight.shape
-    return pool(conv.weight.reshape(1, outputs, inputs * kernel)).reshape(-1, inputs, kernel)
-
-
-@torch.no_grad()
-def _unpooled(unpool: SkeletonUnpool, conv: SkeletonConv) -> Tensor:
-    """(out, pooled in, kernel): the convolution's weight with the unpooling before it."""
-    outputs, inputs, kernel = conv.weight.shape
-    edges = conv.weight.reshape(outputs, len(unpool.mix), inputs // len(unpool.mix), kernel)
-    return torch.einsum("oeck,eg->ogck", edges, unpool.mix).reshape(outputs, -1, kernel)
-
-
-def _stretch(steps: int, factor: int) -> Tensor:
+def _stretch(steps: int, factor: int) -> Floats:
     """(steps * factor, steps): linear interpolation over time, as `torch.nn.functional.interpolate` does it."""
-    if factor == 1:
-        return torch.eye(steps)
-    return F.interpolate(torch.eye(steps)[None], scale_factor=factor, mode="linear")[0].T
+    places = np.maximum((np.arange(steps * factor) + 0.5) / factor - 0.5, 0.0)
+    return np.maximum(1.0 - np.abs(np.minimum(places, steps - 1)[:, None] - np.arange(steps)), 0.0).astype(np.float32)

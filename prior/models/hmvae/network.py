@@ -10,51 +10,17 @@ official code for windows of 8 (and 64) frames; the pooling comes from our 22-jo
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from steadypose.prior.body.skeleton import PARENTS
-from steadypose.prior.models.layers.skeleton_conv import (
-    EdgeLinear,
-    SkeletonConv,
-    SkeletonPool,
-    SkeletonUnpool,
-    pooling_levels,
-)
-
-ROTATION_FEATURES = 6
-"""A joint's features: the first two columns of its local rotation."""
-
-SLOPE = 0.2
-"""of the LeakyReLU"""
-
-
-@dataclass(frozen=True)
-class HMVAEConfig:
-    """The sizes of an HM-VAE.
-
-    Attributes:
-        window: frames T.
-        kernel: time steps a convolution sees (official: 3 for T = 8, 15 for T = 64).
-        strides: of the four encoder blocks (official: 1, 2, 2, 1 for T = 8; 2, 2, 2, 2 for T = 64).
-        local_latent: dimensions of z_l an edge (official: 6; 12).
-        global_latent: dimensions of z_g an edge (official: 6; 24).
-    """
-
-    window: int = 8
-    kernel: int = 3
-    strides: tuple[int, int, int, int] = (1, 2, 2, 1)
-    local_latent: int = 6
-    global_latent: int = 6
-
-    @classmethod
-    def from_dict(cls, config: dict[str, Any]) -> HMVAEConfig:
-        """From the JSON of a weights file."""
-        return cls(**{**config, "strides": tuple(config["strides"])})
+from steadypose.prior.models.hmvae.config import CHANNELS, ROTATION_FEATURES, HMVAEConfig
+from steadypose.prior.models.layers.dense import SLOPE
+from steadypose.prior.models.layers.edge_graph import pooling_levels
+from steadypose.prior.models.layers.skeleton_conv import EdgeLinear, SkeletonConv, SkeletonPool, SkeletonUnpool
 
 
 class Posterior(NamedTuple):
@@ -111,19 +77,12 @@ class MotionVAE(nn.Module, ABC):
 class HMVAE(MotionVAE):
     """The hierarchical one: skeleton convolutions, a local and a global latent."""
 
-    CHANNELS = (ROTATION_FEATURES, 12, 24, 48, 96)
-
     def __init__(self, config: HMVAEConfig) -> None:
         super().__init__(config.window)
         self.config = config
         self.levels = pooling_levels(PARENTS)
-        steps = [config.window]
-        for stride in config.strides:
-            if steps[-1] % stride:
-                raise ValueError(f"a window of {config.window} frames cannot be strided by {config.strides}")
-            steps.append(steps[-1] // stride)
-        self.steps = steps
-        c = self.CHANNELS
+        steps = self.steps = config.steps
+        c = CHANNELS
         self.encoder = nn.ModuleList(
             nn.ModuleList(
                 [
@@ -167,7 +126,7 @@ class HMVAE(MotionVAE):
         for k, block in zip(reversed(range(4)), self.decoder, strict=True):
             unpool, conv = block  # type: ignore[misc]
             if k == 0:
-                features = _join_edges(features, local_features, self.CHANNELS[1])
+                features = _join_edges(features, local_features, CHANNELS[1])
             if self.config.strides[k] > 1:
                 features = F.interpolate(features, scale_factor=self.config.strides[k], mode="linear")
             features = conv(unpool(features))

@@ -11,11 +11,13 @@ import roma
 import torch
 from torch import Tensor
 
-from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.models.distributed import share
-from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig, MotionVAE, from_6d, to_6d
+from steadypose.prior.models.hmvae.config import HMVAEConfig
+from steadypose.prior.models.hmvae.network import HMVAE, MotionVAE, from_6d, to_6d
+from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
+from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingRun
-from steadypose.prior.models.weights_io import LICENCES, started
+from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations, remove_heading
 
 JOINT_WEIGHT = 10.0

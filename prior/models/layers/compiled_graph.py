@@ -11,17 +11,17 @@ for the next window. So what is found for a window does not depend on the others
 from __future__ import annotations
 
 import math
-from typing import cast
 
 import numpy as np
-import torch
 from numba import njit
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
-from steadypose.prior.models.layers.graph import LOG_VAR_RANGE, GraphBlock, GraphLinear
+from steadypose.prior.models.weights_io import Arrays, part
 
 Floats = NDArray[np.float32]
+
+LOG_VAR_RANGE = (-10.0, 3.0)
+"""of latents and, in units of `prior.models.hgvae.config.SCALE`, of tracks: standard deviations from 1.3 mm to 0.9 m"""
 
 # Steps: the kind, the matrix written, that read, and what else the kind needs (see `_do`).
 _LINEAR, _GELU, _SUM, _DENSITY = range(4)
@@ -54,8 +54,8 @@ class Program:
         self.shapes.append((nodes, features))
         return len(self.shapes) - 1
 
-    def _store(self, values: Tensor) -> int:
-        row = np.ascontiguousarray(values.detach().numpy(), dtype=np.float32).ravel()
+    def _store(self, values: Floats) -> int:
+        row = np.ascontiguousarray(values, dtype=np.float32).ravel()
         self.weights.append(np.pad(row, (0, -len(row) % _LINE)))
         self._used += len(self.weights[-1])
         return self._used - len(self.weights[-1])
@@ -67,9 +67,9 @@ class Program:
     def linear(
         self,
         of: int,
-        weight: Tensor,
-        bias: Tensor,
-        adjacency: Tensor | None = None,
+        weight: Floats,
+        bias: Floats,
+        adjacency: Floats | None = None,
         plus: int = _NONE,
         onto: int = _NONE,
         active: bool = False,
@@ -85,30 +85,38 @@ class Program:
         nodes = self.shapes[of][0] if adjacency is None else len(adjacency)
         out = self.matrix(nodes, weight.shape[1]) if onto == _NONE else onto
         stored = _NONE if adjacency is None else self._store(adjacency)
-        shift = self._store(bias.expand(nodes, -1))
+        shift = self._store(np.broadcast_to(bias, (nodes, weight.shape[1])))
         return self._step(_LINEAR, out, of, self._store(weight), shift, stored, plus, int(active))
 
-    def layer(self, of: int, layer: nn.Module, *, plus: int = _NONE, onto: int = _NONE, active: bool = False) -> int:
-        """A `GraphLinear`, or nothing."""
-        if isinstance(layer, GraphLinear):
-            return self.linear(of, layer.weight, layer.bias, layer.adjacency, plus, onto, active)
-        return of
+    def layer(self, of: int, layer: Arrays, *, plus: int = _NONE, onto: int = _NONE, active: bool = False) -> int:
+        """The weights of a `GraphLinear`; of none, ``of`` itself: the same nodes need no layer between them."""
+        if not layer:
+            return of
+        return self.linear(of, layer["weight"], layer["bias"], layer["adjacency"], plus, onto, active)
 
-    def block(self, of: int, block: GraphBlock, *, onto: int) -> int:
-        """A graph convolutional block, equation 5, written to ``onto``, which may be ``of`` itself."""
-        inner = self.layer(self.layer(of, block.first), block.second, active=True)
-        return self._step(_GELU, onto, inner, self._store(block.alpha.reshape(1)), of)
+    def block(self, of: int, block: Arrays, *, onto: int) -> int:
+        """A graph convolutional block, equation 5, written to ``onto``, which may be ``of`` itself.
 
-    def trunk(self, of: int, read: GraphLinear, blocks: nn.Sequential) -> int:
-        """A layer with its GELU, and `GraphBlock`s one after the other."""
-        graph = self.gelu(self.layer(of, read))
-        for block in blocks:
-            self.block(graph, cast("GraphBlock", block), onto=graph)
+        Args:
+            of: matrix read.
+            block: weights of a `GraphBlock`.
+            onto: matrix written.
+        """
+        inner = self.layer(self.layer(of, part(block, "first")), part(block, "second"), active=True)
+        return self._step(_GELU, onto, inner, self._store(block["alpha"]), of)
+
+    def trunk(self, of: int, weights: Arrays) -> int:
+        """A network's ``read`` with its GELU, and its ``blocks`` one after the other."""
+        graph = self.gelu(self.layer(of, part(weights, "read")))
+        blocks, k = part(weights, "blocks"), 0
+        while block := part(blocks, str(k)):
+            self.block(graph, block, onto=graph)
+            k += 1
         return graph
 
     def gelu(self, of: int) -> int:
         """Of a matrix, by itself."""
-        return self._step(_GELU, self.matrix(*self.shapes[of]), of, self._store(torch.ones(1)), _NONE)
+        return self._step(_GELU, self.matrix(*self.shapes[of]), of, self._store(np.ones(1, dtype=np.float32)), _NONE)
 
     def sum(self, of: int, other: int) -> int:
         """Of two matrices."""
@@ -127,16 +135,16 @@ class Network:
 
     Args:
         program: a network written down; later changes to it are not seen here.
-        most: windows at once, each in its row.
+        max_batch: windows at once, each in its row.
 
     Attributes:
         steps: (N, fields) of the program, in order.
         places: of each matrix, in a row: where it begins and ends, and its shape.
-        values: (most, all matrices) of every window.
+        values: (max_batch, all matrices) of every window.
         gradients: (all matrices) of one window.
     """
 
-    def __init__(self, program: Program, most: int) -> None:
+    def __init__(self, program: Program, max_batch: int) -> None:
         self.steps = np.array(program.steps, dtype=np.int64)
         self._shapes = np.array(program.shapes, dtype=np.int64)
         sizes = self._shapes.prod(axis=1)
@@ -145,7 +153,7 @@ class Network:
         self.places = [*zip(self._starts[:-1].tolist(), ends, program.shapes, strict=True)]
         self._weights = _zeros(sum(map(len, program.weights)))
         np.concatenate(program.weights, out=self._weights)
-        self.values, self.gradients = _zeros(most, self._starts[-1]), _zeros(self._starts[-1])
+        self.values, self.gradients = _zeros(max_batch, self._starts[-1]), _zeros(self._starts[-1])
         self._scratch = _zeros(3, -(-self._shapes.max(axis=0).prod() // _LINE) * _LINE)
 
     def matrix(self, number: int, rows: slice) -> Floats:
@@ -187,7 +195,7 @@ _FAR = np.float32(5)
 """erf is 1 from here on. What is left of its slope would soon be a denormal number, on which processors take 100 times
 as long."""
 _LOG_2PI = np.float32(math.log(2 * math.pi))
-_LEAST, _MOST = (np.float32(end) for end in LOG_VAR_RANGE)
+_LOG_VAR_MIN, _LOG_VAR_MAX = (np.float32(end) for end in LOG_VAR_RANGE)
 _HALF, _ONE = np.float32(0.5), np.float32(1)
 
 
@@ -320,7 +328,7 @@ def _do(step, shapes, starts, weights, values, scratch):
         total = 0.0
         for i in range(nodes_in):
             for j in range(features_in):
-                log_var = min(max(gaussian[i, features_in + j], _LEAST), _MOST)
+                log_var = min(max(gaussian[i, features_in + j], _LOG_VAR_MIN), _LOG_VAR_MAX)
                 off = a[i, j] - gaussian[i, j]
                 total -= _HALF * (log_var + _LOG_2PI + off * off * math.exp(-log_var))
         out[0, 0] = total
@@ -372,9 +380,9 @@ def _undo(step, shapes, starts, weights, values, gradients, scratch):
         for i in range(nodes_in):
             for j in range(features_in):
                 log_var = gaussian[i, features_in + j]
-                scale = math.exp(-min(max(log_var, _LEAST), _MOST))
+                scale = math.exp(-min(max(log_var, _LOG_VAR_MIN), _LOG_VAR_MAX))
                 off = a[i, j] - gaussian[i, j]
                 by_a[i, j] -= by_sum * off * scale
                 by_gaussian[i, j] += by_sum * off * scale
-                if _LEAST < log_var < _MOST:
+                if _LOG_VAR_MIN < log_var < _LOG_VAR_MAX:
                     by_gaussian[i, features_in + j] += by_sum * _HALF * (off * off * scale - _ONE)

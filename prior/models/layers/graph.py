@@ -8,15 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-JOINT_NODES = 66
-"""22 joints, 3 coordinates: node ``3 * joint + axis``."""
-
-SCALE = 0.2
-"""Metres that the networks count as one."""
-
-LOG_VAR_RANGE = (-10.0, 3.0)
-"""of latents and, in units of `SCALE`, of tracks: standard deviations from 1.3 mm to 0.9 m"""
-
 
 class GraphLinear(nn.Module):
     """``S A W + b``: graphs (n_in, B, f_in) to (n_out, B, f_out), equation 4 without its activation.

@@ -14,9 +14,11 @@ from torch.nn import functional as F
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.body.skeleton import MIRROR, limbs
 from steadypose.prior.models.distributed import share
-from steadypose.prior.models.root_velocity.network import FRAME_S, RootMotion, TrajectoryConfig, TrajectoryNet
+from steadypose.prior.models.root_velocity.config import FRAME_S, TrajectoryConfig
+from steadypose.prior.models.root_velocity.network import RootMotion, TrajectoryNet
+from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingRun
-from steadypose.prior.models.weights_io import LICENCES, started
+from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.dataset import MotionSet, data_told, heading, yaw_rotation
 
 WINDOW = 48

@@ -13,16 +13,16 @@ from torch import Tensor, nn
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.clean.correct import DENSITY, recall
 from steadypose.prior.models.distributed import share
-from steadypose.prior.models.sensor_bias.network import (
+from steadypose.prior.models.sensor_bias.features import (
     HISTORY,
+    SMOOTHER_DENSITY,
     CorrectionConfig,
-    CorrectionNet,
     features,
-    mirror_features,
+    recall,
     trunk_frame,
 )
+from steadypose.prior.models.sensor_bias.network import CorrectionNet, mirror_features
 from steadypose.prior.models.training import TrainingRun
 from steadypose.prior.motion.dataset import mirror_offsets
 from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
@@ -99,7 +99,7 @@ def _examples(data: Path, subjects: Collection[str]) -> tuple[Tensor, Tensor]:
 
 def _clip(pair: KinectPair) -> tuple[np.ndarray, np.ndarray]:
     seen, _ = to_canonical(KINECT22, pair.kinect)
-    smoother = FixedLagRTS(0, DENSITY)
+    smoother = FixedLagRTS(0, SMOOTHER_DENSITY)
     answers = [smoother.update(frame, t / pair.fps) for t, frame in enumerate(seen)]
     smoothed = np.stack([a.positions for a in answers if a is not None])
     padded = np.concatenate([np.full((HISTORY[-1], 22, 3), np.nan), smoothed])

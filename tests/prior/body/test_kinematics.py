@@ -9,6 +9,7 @@ from steadypose.prior.body.kinematics import (
     label_contacts,
 )
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.prior.models.layers import torch_kinematics
 
 
 def naive_fk(rotations: np.ndarray, offsets: np.ndarray, root: np.ndarray) -> np.ndarray:
@@ -27,7 +28,9 @@ def test_forward_kinematics_agrees_with_a_walk_down_the_tree() -> None:
     rotations = Rotation.random(6 * 22, rng=rng).as_matrix().reshape(2, 3, 22, 3, 3)
     offsets = rng.normal(size=(2, 3, 22, 3))
     root = rng.normal(size=(2, 3, 3))
-    got, _ = forward_kinematics(*(torch.from_numpy(a) for a in (rotations, offsets, root)))
+    got, orientations = forward_kinematics(rotations, offsets, root)
+    tensors = torch_kinematics.forward_kinematics(*(torch.from_numpy(a) for a in (rotations, offsets, root)))
+    assert all(np.allclose(ours, theirs) for ours, theirs in zip((got, orientations), tensors, strict=True))
     for index in np.ndindex(2, 3):
         assert np.allclose(got[index], naive_fk(rotations[index], offsets[index], root[index]))
 
@@ -35,7 +38,7 @@ def test_forward_kinematics_agrees_with_a_walk_down_the_tree() -> None:
 def test_forward_kinematics_is_differentiable() -> None:
     rotations = torch.eye(3, dtype=torch.float64).repeat(1, 22, 1, 1).requires_grad_()
     offsets = torch.from_numpy(REST_OFFSETS).requires_grad_()
-    assert torch.autograd.gradcheck(lambda r, o: forward_kinematics(r, o)[0], (rotations, offsets))
+    assert torch.autograd.gradcheck(lambda r, o: torch_kinematics.forward_kinematics(r, o)[0], (rotations, offsets))
 
 
 def test_the_rest_pose_stands_in_a_t_and_faces_x() -> None:

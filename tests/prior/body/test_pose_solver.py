@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -18,7 +17,7 @@ def test_placing_agrees_with_the_forward_kinematics_of_the_losses() -> None:
     rotations = Rotation.random(6 * 22, rng=rng).as_matrix().reshape(2, 3, 22, 3, 3)
     offsets = rng.normal(size=(2, 3, 22, 3))
     offsets[..., 0, :] = 0.0
-    expected = forward_kinematics(torch.from_numpy(rotations), torch.from_numpy(offsets))[0]
+    expected = forward_kinematics(rotations, offsets, np.zeros(3))[0]
     assert np.allclose(place_joints(rotations, offsets), expected)
 
 

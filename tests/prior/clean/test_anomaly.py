@@ -8,20 +8,21 @@ from tests.helpers.bodies import stream, waving
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
 from steadypose.prior.clean.frame import Window
 from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
-from steadypose.prior.clean.score import (
+from steadypose.prior.clean.score import Score, ScoreSettings
+from steadypose.prior.models.hgvae.anomaly import (
     MISSING,
     RATES,
     SENSOR_SIGMAS,
     STUCK_ODDS,
     Calibration,
-    Score,
-    ScoreSettings,
     decimals,
     judged,
-    load_fault_net,
-)  # fmt: skip
+)
+from steadypose.prior.models.hgvae.config import FaultNetConfig
+from steadypose.prior.models.hgvae.fault_features import OFF_SCALE, RECENT, ROUGH_SCALE, fault_features
 from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
-from steadypose.prior.models.hgvae.faults import OFF_SCALE, RECENT, ROUGH_SCALE, FaultNet, FaultNetConfig, tell
+from steadypose.prior.models.hgvae.faults import FaultNet, load_fault_net
+from steadypose.prior.models.torch_weights import arrays_of
 
 HEIGHTS = np.linspace(0.0, 7.0, len(RATES))
 SCALE = Calibration(np.broadcast_to(HEIGHTS, (len(MISSING), len(SENSOR_SIGMAS), len(RATES))))
@@ -51,8 +52,8 @@ def awake() -> FaultNet:
 def test_the_live_fault_network_is_the_trained_one() -> None:
     network, look = awake(), looks(3)
     with torch.inference_mode():
-        odds = network(torch.from_numpy(tell(*look, 0.02, network.mean.numpy()))).numpy()
-    live = LiveFaultNet(network, 0.02, 4)
+        odds = network(torch.from_numpy(fault_features(*look, 0.02, network.mean.numpy()))).numpy()
+    live = LiveFaultNet(network.config, arrays_of(network), 0.02, 4)
     np.testing.assert_allclose(live(*look), odds, atol=1e-4)
     x, found, sigma, observed = (part[1:] for part in look)
     np.testing.assert_allclose(live(x, found, sigma, observed), odds[1:], atol=1e-4)
@@ -61,7 +62,7 @@ def test_the_live_fault_network_is_the_trained_one() -> None:
 def test_the_fault_network_is_told_of_what_was_seen_alone() -> None:
     x, found, sigma, observed = looks(2)
     mean = np.linspace(-1.0, 1.0, 66)
-    told = tell(x, found, sigma, observed, np.array([0.01, 0.02]), mean)
+    told = fault_features(x, found, sigma, observed, np.array([0.01, 0.02]), mean)
     seen = observed > 0
     expected = [
         np.where(seen, (x - mean[:, None]) / 0.2, 0.0), np.where(seen, np.arcsinh((x - found) / OFF_SCALE), 0.0),

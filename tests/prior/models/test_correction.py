@@ -5,17 +5,17 @@ from tests.helpers.bodies import waving
 
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import MIRROR, J
-from steadypose.prior.clean.correct import Correct, CorrectSettings, recall
+from steadypose.prior.clean.correct import Correct, CorrectSettings
 from steadypose.prior.clean.frame import Window
-from steadypose.prior.models.sensor_bias.network import (
+from steadypose.prior.models.sensor_bias.features import (
     FEATURES,
     HISTORY,
     CorrectionConfig,
-    CorrectionNet,
     features,
-    mirror_features,
+    recall,
     trunk_frame,
 )
+from steadypose.prior.models.sensor_bias.network import CorrectionNet, mirror_features
 
 CAMERA = np.array([-3.0, 0.5, 1.2])
 

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import torch
 
-from steadypose.prior.distributed import join, rank, share, writes
-from steadypose.prior.training import TrainingRun
+from steadypose.prior.models.distributed import join, rank, share, writes
+from steadypose.prior.models.training import TrainingRun
 
 
 def train(steps):

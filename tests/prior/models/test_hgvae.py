@@ -11,14 +11,15 @@ from tests.helpers.bodies import waving
 from tests.prior.models.test_hmvae import prepared
 
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.clean.score import load_fault_net
-from steadypose.prior.models.hgvae.completion import CompletionConfig
+from steadypose.prior.models.hgvae.config import CompletionConfig, HGVAEConfig, Level
+from steadypose.prior.models.hgvae.faults import load_fault_net
 from steadypose.prior.models.hgvae.features import from_tracks, hang_unseen, in_frame_of, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
-from steadypose.prior.models.hgvae.network import HGVAE, Gaussian, HGVAEConfig, Level, dct_matrix
+from steadypose.prior.models.hgvae.network import HGVAE, Gaussian, dct_matrix
 from steadypose.prior.models.hgvae.train import train_hgvae
 from steadypose.prior.models.layers.graph import GraphBlock, GraphLinear
-from steadypose.prior.models.weights_io import WEIGHTS, load_weights
+from steadypose.prior.models.torch_weights import arrays_of, load_tensors
+from steadypose.prior.models.weights_io import WEIGHTS
 
 SMALL = HGVAEConfig(
     frames=12,
@@ -39,6 +40,10 @@ def awake(config: HGVAEConfig = SMALL, seed: int = 0) -> HGVAE:
         if "adjacency" in name or "weight" in name:
             parameter.data /= parameter.shape[-1] ** 0.5
     return model.requires_grad_(requires_grad=False)
+
+
+def live_form(model: HGVAE, max_batch: int) -> LiveHGVAE:
+    return LiveHGVAE(model.config, arrays_of(model), sensor_sigma=0.01, bias_sigma=0.0, max_batch=max_batch)
 
 
 def test_a_constant_track_has_one_cosine_coefficient_and_the_transform_is_its_own_inverse() -> None:
@@ -151,10 +156,10 @@ def test_generation_draws_as_many_levels_as_asked() -> None:
 
 def test_the_live_model_is_the_trained_one() -> None:
     model = awake()
-    live = LiveHGVAE(model, sensor_sigma=0.01, slow=0.0, most=4)
+    live = live_form(model, 4)
     rng = np.random.default_rng(0)
     x, observed = rng.normal(scale=0.3, size=(3, 66, 12)), (rng.random((3, 66, 12)) < 0.7).astype(float)
-    look = live.look(x, observed)
+    look = live.reconstruct(x, observed)
     scaled = torch.from_numpy((x - model.mean.numpy()[:, None]) / 0.2).float()
     scaled, believed = model.completed(scaled, torch.from_numpy(observed).float(), 0.0)
     found = model(scaled, believed)
@@ -170,34 +175,34 @@ def test_what_the_live_model_makes_of_a_window_does_not_depend_on_the_others() -
     x, observed = rng.normal(scale=0.3, size=(3, 66, 12)), np.ones((3, 66, 12))
     x[2, 30:33] = np.nan  # a joint never seen
     observed[2, 30:33], observed[1, 30:39, 4:] = 0, 0
-    together, alone = LiveHGVAE(model, 0.01, 0.0, most=3), LiveHGVAE(model, 0.01, 0.0, most=1)
-    looks = together.look(x, observed)
+    together, alone = live_form(model, 3), live_form(model, 1)
+    looks = together.reconstruct(x, observed)
     found = [(together.score(row), *together.gradient(row)) for row in range(3)]
     moved = rng.normal(scale=0.1, size=together.latents)
-    elsewhere = together.decode(1, moved)
+    scratch_row = together.decode(1, moved)
     for row in range(3):
-        look = alone.look(x[row : row + 1], observed[row : row + 1])
+        look = alone.reconstruct(x[row : row + 1], observed[row : row + 1])
         assert all((a[0] == b[row]).all() for a, b in zip(look, looks, strict=True))
         assert (alone.score(0), *alone.gradient(0)) == found[row]
         if row == 1:
-            assert all((a == b).all() for a, b in zip(alone.decode(0, moved), elsewhere, strict=True))
+            assert all((a == b).all() for a, b in zip(alone.decode(0, moved), scratch_row, strict=True))
 
 
 def test_the_gradient_of_the_live_score_is_that_of_its_differences() -> None:
-    live = LiveHGVAE(awake(), sensor_sigma=0.01, slow=0.0, most=2)
+    live = live_form(awake(), 2)
     rng = np.random.default_rng(0)
     trust = (rng.random((2, 66, 12)) < 0.7) * rng.uniform(0.2, 1, (2, 66, 12))
-    live.look(rng.normal(scale=0.2, size=(2, 66, 12)), trust)
+    live.reconstruct(rng.normal(scale=0.2, size=(2, 66, 12)), trust)
     at = rng.normal(scale=0.1, size=live.latents)
     live.decode(1, at)
-    gradient = live.gradient(live.elsewhere)
+    gradient = live.gradient(live.scratch_row)
     for k in rng.choice(live.latents, 12, replace=False):
         step = np.zeros(live.latents)
         step[k] = 1e-2
         scores = []
         for end in (at + step, at - step):
             live.decode(1, end)
-            scores.append(live.score(live.elsewhere))
+            scores.append(live.score(live.scratch_row))
         found = (scores[0] - scores[1]) / 2e-2
         # scores of thousands in single precision: differences are good to a few hundredths
         assert gradient[k] == pytest.approx(found, rel=0.02, abs=0.1)
@@ -209,7 +214,7 @@ def test_training_writes_weights_their_card_and_their_scale(tmp_path: Path, monk
     monkeypatch.setattr("steadypose.prior.models.hgvae.train.MODELS", {"hgvae": config})
     monkeypatch.setattr("steadypose.prior.models.hgvae.train_faults.WINDOWS", 16)
     path = train_hgvae(prepared(tmp_path / "m.npz"), tmp_path / "runs", iterations=2, batch=4)
-    state, stored = load_weights(str(path), "hgvae")
+    state, stored = load_tensors(str(path), "hgvae")
     HGVAE(HGVAEConfig.from_dict(stored)).load_state_dict(state)
     assert HGVAEConfig.from_dict(stored) == config
     assert json.loads(path.with_suffix(".anomaly.json").read_text())["quantiles"]
@@ -219,12 +224,12 @@ def test_training_writes_weights_their_card_and_their_scale(tmp_path: Path, monk
 
 def test_the_weights_that_ship_reconstruct_motion_they_never_saw() -> None:
     """Golden figure: a regression of the weights, the layers or the tracks moves it."""
-    state, config = load_weights("default", "hgvae")
+    state, config = load_tensors("default", "hgvae")
     model = HGVAE(HGVAEConfig.from_dict(config)).eval()
     model.load_state_dict(state)
-    live = LiveHGVAE(model, sensor_sigma=0.01, slow=0.0, most=7)
+    live = live_form(model, 7)
     tracks = to_tracks(np.stack([waving(120)[start : start + 50] for start in range(0, 70, 10)]), 1.0)
-    off = live.look(tracks.x, tracks.observed).mean - tracks.x
+    off = live.reconstruct(tracks.x, tracks.observed).mean - tracks.x
     assert 1000 * np.sqrt(np.mean(np.square(off))) == pytest.approx(GOLDEN_RMS_MM, abs=1.0)
     assert (WEIGHTS / "hgvae-default.md").is_file()
 

@@ -8,13 +8,15 @@ from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.clean.refine import rotations_of
+from steadypose.prior.models.hmvae.config import HMVAEConfig
 from steadypose.prior.models.hmvae.inference import LiveHMVAE
-from steadypose.prior.models.hmvae.network import HMVAE, HMVAEConfig, Posterior, from_6d, to_6d
+from steadypose.prior.models.hmvae.network import HMVAE, Posterior, from_6d, to_6d
 from steadypose.prior.models.hmvae.train import train_hmvae
 from steadypose.prior.models.layers.skeleton_conv import SkeletonConv
+from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
+from steadypose.prior.models.torch_weights import arrays_of, load_tensors
 from steadypose.prior.models.weights_io import WEIGHTS, load_weights
 from steadypose.prior.motion.dataset import (
     MotionSet,
@@ -70,7 +72,7 @@ def test_the_live_model_reconstructs_as_the_trained_one(config, bodies) -> None:
     for module in model.modules():
         if isinstance(module, SkeletonConv):
             module.weight.data *= module.mask
-    found = LiveHMVAE(model)(x.numpy())
+    found = LiveHMVAE(model.config, arrays_of(model))(x.numpy())
     np.testing.assert_allclose(found, model.reconstruct(x).detach().numpy(), rtol=1e-4, atol=1e-4)
 
 
@@ -174,7 +176,7 @@ def test_unknown_weights_name_those_there_are() -> None:
 
 def test_the_weights_that_ship_reconstruct_motion_they_never_saw() -> None:
     """Golden figure: a regression of the weights, the layers or the solver moves it."""
-    state, config = load_weights("default", "hmvae")
+    state, config = load_tensors("default", "hmvae")
     model = HMVAE(HMVAEConfig.from_dict(config)).eval()
     model.load_state_dict(state)
     rotations = torch.from_numpy(solve_rotations(waving(120), REST_OFFSETS)).float()

@@ -4,7 +4,8 @@ import torch
 from torch import nn
 
 from steadypose.prior.body.skeleton import PARENTS
-from steadypose.prior.models.layers.skeleton_conv import SkeletonConv, SkeletonPool, SkeletonUnpool, pooling_levels
+from steadypose.prior.models.layers.edge_graph import pooling_levels
+from steadypose.prior.models.layers.skeleton_conv import SkeletonConv, SkeletonPool, SkeletonUnpool
 
 SMPL24 = (*PARENTS, 20, 21)  # with hands, as the official code has it
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from steadypose.prior.models.root_velocity.network import NewestFrame, RootMotion, TrajectoryConfig, TrajectoryNet
+from steadypose.prior.models.root_velocity.config import TrajectoryConfig
+from steadypose.prior.models.root_velocity.inference import LiveRootVelocity
+from steadypose.prior.models.root_velocity.network import RootMotion, TrajectoryNet
+from steadypose.prior.models.torch_weights import arrays_of
 
 
 @pytest.fixture
@@ -44,9 +47,9 @@ def test_depends_on_its_context_and_nothing_before(net: TrajectoryNet):
 @torch.no_grad()
 def test_newest_frame_says_the_same(net: TrajectoryNet):
     joints = window(net, 3)
-    whole, newest = net(joints), NewestFrame(net)(joints)
-    for field in RootMotion._fields:
-        torch.testing.assert_close(getattr(newest, field)[:, 0], getattr(whole, field)[:, -1], atol=1e-4, rtol=1e-4)
+    whole, newest = net(joints), LiveRootVelocity(net.config, arrays_of(net))(joints.numpy())
+    for live, trained in zip(newest, whole, strict=True):
+        torch.testing.assert_close(torch.from_numpy(live), trained[:, -1], atol=1e-4, rtol=1e-4)
 
 
 def test_config_survives_json(net: TrajectoryNet):

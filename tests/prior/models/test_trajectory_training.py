@@ -11,8 +11,9 @@ import torch
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
 from steadypose.prior.models.root_velocity import train as training
-from steadypose.prior.models.root_velocity.network import TrajectoryConfig, TrajectoryNet
-from steadypose.prior.models.weights_io import load_weights
+from steadypose.prior.models.root_velocity.config import TrajectoryConfig
+from steadypose.prior.models.root_velocity.network import TrajectoryNet
+from steadypose.prior.models.torch_weights import load_tensors
 from steadypose.prior.motion.dataset import MotionSet
 
 
@@ -108,7 +109,7 @@ def test_calibration_finds_the_size_of_the_errors(prepared: Path, monkeypatch: p
 
 def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("steadypose.prior.models.weights_io.WEIGHTS", tmp_path / "weights")
-    state, config = load_weights(str(training.train_trajectory(prepared, tmp_path / "a", iterations=4, batch=4)), "")
+    state, config = load_tensors(str(training.train_trajectory(prepared, tmp_path / "a", iterations=4, batch=4)), "")
     TrajectoryNet(TrajectoryConfig.from_dict(config)).load_state_dict(state)
     assert (tmp_path / "weights/trajectory-default.md").read_text().startswith("# trajectory-default")
     assert (tmp_path / "weights/trajectory-default.png").stat().st_size > 0
@@ -123,7 +124,7 @@ def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, 
     monkeypatch.setattr(training, "_loss", killed)
     with pytest.raises(KeyboardInterrupt):
         training.train_trajectory(prepared, tmp_path / "b", iterations=4, batch=4)
-    resumed, _ = load_weights(str(training.train_trajectory(prepared, tmp_path / "b", iterations=4, batch=4)), "")
+    resumed, _ = load_tensors(str(training.train_trajectory(prepared, tmp_path / "b", iterations=4, batch=4)), "")
     assert next(calls) == 5
     for name, tensor in state.items():
         torch.testing.assert_close(resumed[name], tensor, rtol=0, atol=0)

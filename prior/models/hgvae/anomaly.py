@@ -1,0 +1,109 @@
+"""The scale on which windows and joints are told to be odd.
+
+The fault network says of each joint how much more likely it is off than not; the window is as odd as its oddest joint.
+Both are told on one scale: the number of decimals of the rate at which clean motion of people whom the networks have
+not seen scores as high. An anomaly of 2 is met once in a hundred clean windows.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from steadypose.prior.models.hgvae.fault_features import RECENT
+from steadypose.prior.models.weights_io import weights_path
+
+Floats = NDArray[np.float64]
+
+MISSING = (0, 4, 8, 14)
+"""Joints missing at which the scale was measured; between them it is interpolated."""
+
+STUCK_ODDS = 12.0
+"""of a joint of which the last answer is repeated while the others shake, logarithm"""
+
+SENSOR_SIGMAS = (0.003, 0.01, 0.02, 0.04)
+"""Metres along an axis, errors of the sensor at which the scale was measured."""
+
+RATES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002)
+"""of clean windows that score higher than the quantiles kept"""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What clean windows score, by joints missing and error of the sensor.
+
+    Attributes:
+        quantiles: (M, S, R) of the window's score, at `RATES`.
+    """
+
+    quantiles: Floats
+
+    @classmethod
+    def load(cls, weights: str) -> Calibration:
+        """The calibration that belongs to these weights.
+
+        Raises:
+            FileNotFoundError: there is none; says how to make it.
+        """
+        path = weights_path(weights, "hgvae").with_suffix(".anomaly.json")
+        if not path.is_file():
+            raise FileNotFoundError(f"no {path.name} beside the weights: 'steadypose train hgvae' makes both")
+        return cls(np.array(json.loads(path.read_text())["quantiles"]))
+
+    def save(self, path: Path, note: str) -> None:
+        """Write as JSON."""
+        path.write_text(json.dumps({"note": note, "quantiles": np.round(self.quantiles, 4).tolist()}) + "\n")
+
+    def at(self, sensor_sigma: float) -> Calibration:
+        """For one sensor: the same without the axis S."""
+        place = np.interp(np.log(sensor_sigma), np.log(SENSOR_SIGMAS), np.arange(len(SENSOR_SIGMAS)))
+        low = min(int(place), len(SENSOR_SIGMAS) - 2)
+        share = place - low
+        return Calibration((1 - share) * self.quantiles[:, low] + share * self.quantiles[:, low + 1])
+
+
+def judged(odds: Floats, observed: Floats, stuck: NDArray[np.bool_]) -> Floats:
+    """(B, 22) what a fault network says, -inf of joints not seen in the frames that are scored.
+
+    Args:
+        odds: (B, 22) of `FaultNet`.
+        observed: (B, 66, T) more than 0 where seen.
+        stuck: (B, 22) joints of which the sensor repeats its last answer.
+    """
+    seen = (observed[:, ::3, -RECENT:] > 0).any(axis=-1)
+    return np.where(seen, np.where(stuck, np.maximum(odds, STUCK_ODDS), odds), -np.inf)
+
+
+def decimals(score: Floats, calibration: Calibration, missing: NDArray[np.integer]) -> Floats:
+    """-log10 of the rate at which clean windows score at least so high.
+
+    Args:
+        score: (B, K) of windows or of their joints.
+        calibration: for the sensor.
+        missing: (B,) joints of each window.
+    """
+    told = np.empty(score.shape)
+    _decimals(score, _between(missing) @ calibration.quantiles, -np.log10(RATES), told)
+    return told
+
+
+def _between(missing: NDArray[np.integer]) -> Floats:
+    """(B, M) weights of the two of `MISSING` on either side."""
+    place = np.interp(missing, MISSING, np.arange(len(MISSING)))
+    return np.maximum(1 - np.abs(place[:, None] - np.arange(len(MISSING))), 0.0)
+
+
+@njit(cache=True)
+def _decimals(score, quantiles, heights, told):
+    for row in range(len(score)):
+        limits = quantiles[row]
+        for k in range(score.shape[1]):
+            low = min(max((score[row, k] > limits).sum() - 1, 0), len(limits) - 2)
+            # beyond the rarest rate measured, the tail goes on as it went between the last two
+            rising = (heights[low + 1] - heights[low]) / max(limits[low + 1] - limits[low], 1e-6)
+            told[row, k] = max(heights[low] + rising * (score[row, k] - limits[low]), 0.0)

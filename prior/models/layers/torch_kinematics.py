@@ -1,0 +1,36 @@
+"""Forward kinematics with gradients, for training; without: `prior.body.kinematics`."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from steadypose.prior.body.kinematics import LEVELS
+from steadypose.prior.body.skeleton import PARENTS
+
+
+def forward_kinematics(rotations: Tensor, offsets: Tensor, root: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Joint positions from local rotations and a person's bones.
+
+    Args:
+        rotations: (..., 22, 3, 3) local rotation matrices.
+        offsets: (..., 22, 3) metres, each joint in its parent's frame; broadcasts over leading dimensions.
+        root: (..., 3) metres, position of the pelvis; the origin if left out.
+
+    Returns:
+        positions (..., 22, 3) metres and global rotations (..., 22, 3, 3), in the frame of the root's rotation.
+    """
+    batch = rotations.shape[:-3]
+    offsets = offsets.expand(*batch, *offsets.shape[-2:]).unsqueeze(-1)
+    origin = rotations.new_zeros(*batch, 3) if root is None else root
+    # Lists, not one tensor written in place: autograd needs every level's values kept.
+    positions: list[Tensor] = [origin.unsqueeze(-2)]
+    orientations: list[Tensor] = [rotations[..., :1, :, :]]
+    for above, level in pairwise(LEVELS):
+        parents = [p - above.start for p in PARENTS[level]]
+        orientation = orientations[-1][..., parents, :, :]
+        positions.append(positions[-1][..., parents, :] + (orientation @ offsets[..., level, :, :]).squeeze(-1))
+        orientations.append(orientation @ rotations[..., level, :, :])
+    return torch.cat(positions, dim=-2), torch.cat(orientations, dim=-3)

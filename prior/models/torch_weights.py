@@ -1,0 +1,104 @@
+"""Weights as training has them: written with a card that says how they were made, read as tensors."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from steadypose.prior.models.distributed import writes
+from steadypose.prior.models.weights_io import WEIGHTS, Arrays, load_weights
+
+Config = TypeVar("Config")
+N = TypeVar("N", bound=nn.Module)
+
+
+def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, Any]) -> None:
+    """Write weights, in half precision, with their configuration, and the card; on the first process of torchrun.
+
+    Args:
+        path: ends in ``.safetensors``; the card is written beside it as ``.md``.
+        model: its state dict is saved.
+        config: what rebuilds the model, as JSON in the file's metadata.
+        card: heading to content: data, licence, seed, training command, results.
+    """
+    if not writes():
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tensors = {name: tensor.detach().half().contiguous() for name, tensor in model.state_dict().items()}
+    _write_whole(path, save(tensors, metadata={"config": json.dumps(dict(config), sort_keys=True)}))
+    lines = [f"# {path.stem}", ""]
+    for heading, content in {**card, "Commit": _commit(), "Made on": f"{platform.machine()}, torch on CPU"}.items():
+        lines += [f"- **{heading}**: {content}"]
+    _write_whole(path.with_suffix(".md"), ("\n".join(lines) + "\n").encode())
+
+
+def load_tensors(name: str, model: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """As `weights_io.load_weights`: the state dict and the configuration of ``model``."""
+    weights, config = load_weights(name, model)
+    return {key: torch.from_numpy(array) for key, array in weights.items()}, config
+
+
+def arrays_of(network: nn.Module) -> Arrays:
+    """A network's weights as its live form takes them; copies."""
+    return {name: tensor.detach().float().numpy().copy() for name, tensor in network.state_dict().items()}
+
+
+def load_network(
+    network: Callable[[Config], N], config: Callable[[dict[str, Any]], Config], name: str, model: str
+) -> N:
+    """A trained network, in evaluation.
+
+    Args:
+        network: its class, such as `HGVAE`.
+        config: what makes that class's configuration of the JSON of a weights file, such as `HGVAEConfig.from_dict`.
+        name: the weight set, such as ``default``, or a path to a ``.safetensors`` file.
+        model: the model's name, such as ``hgvae``.
+
+    Raises:
+        FileNotFoundError: no such weights; says which there are.
+    """
+    state, stored = load_tensors(name, model)
+    loaded = network(config(stored))
+    loaded.load_state_dict(state)
+    return loaded.eval()
+
+
+def started(model: nn.Module, name: str, start: str | None) -> str:
+    """Load into ``model`` the weights ``start`` of the model ``name``, if there are to be any; what a card says of it.
+
+    Raises:
+        FileNotFoundError: no such weights.
+        ValueError: weights of another model.
+    """
+    if start is None:
+        return ""
+    try:
+        model.load_state_dict(load_tensors(start, name)[0])
+    except RuntimeError as error:
+        raise ValueError(f"start: expected weights of {name}, of this size, got '{start}': {error}") from error
+    return f", started from the weights '{Path(start).stem}'"
+
+
+def _write_whole(path: Path, content: bytes) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(content)
+    os.replace(part, path)
+
+
+def _commit() -> str:
+    try:
+        found = subprocess.run(
+            ["git", "describe", "--always", "--dirty"], cwd=WEIGHTS.parent, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return found.stdout.strip()
