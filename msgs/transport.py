@@ -15,9 +15,11 @@ import math
 import os
 import socket as posix
 import struct
+import tempfile
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Iterable
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -314,6 +316,17 @@ class Subscriber:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
+
+
+def local_directory() -> Path:
+    """Where ipc sockets live unless a launch file says otherwise: private to the user, gone after a reboot."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(runtime) / "steadypose" if runtime else Path(tempfile.gettempdir()) / f"steadypose-{os.getuid()}"
+
+
+def local_address(node: str) -> str:
+    """Where ``node`` (``pose_input``, ``prior``, ``trajectory``) publishes unless a launch file says otherwise."""
+    return f"ipc://{local_directory() / node}"
 
 
 def _milliseconds(seconds: float) -> int:

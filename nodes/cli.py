@@ -39,6 +39,21 @@ COMMANDS = {
     "keys": ("steadypose.nodes.commands.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),
 }
 
+EXTRA_OF = {
+    "cv2": "oak",
+    "cyclonedds": "ros2",
+    "depthai": "oak",
+    "matplotlib": "view",
+    "mediapipe": "webcam",
+    "ray": "ray",
+    "rclpy": "ros2",
+    "rerun": "view",
+    "roma": "train",
+    "sklearn": "train",
+    "torch": "train",
+}
+"""which extra brings a module that not every command needs"""
+
 USAGE_ERROR = 2
 """exit status: what was asked for cannot be done, and will not be the next time either"""
 INTERRUPTED = 130
@@ -81,6 +96,18 @@ def _main(arguments: list[str]) -> int:
         )
     except KeyboardInterrupt:
         return INTERRUPTED
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if missing not in EXTRA_OF:
+            raise
+        extra = EXTRA_OF[missing]
+        print(
+            f"steadypose {name}: needs {missing}, which comes with the extra {extra!r} and is not installed: "
+            f"`pip install 'steadypose[{extra}]'`, or in the checkout "
+            f"`.uv/bin/uv sync --frozen --inexact --extra {extra}`",
+            file=sys.stderr,
+        )
+        return USAGE_ERROR
     except Exception as error:
         if isinstance(error, BrokenPipeError) or not is_for_user(error):
             raise

@@ -275,8 +275,6 @@ def _restored(what: str) -> str:
 
 def check_models() -> Iterator[Finding]:
     """The weights that the nodes load, and what a frame costs with them."""
-    import numpy as np
-
     from steadypose.prior.models.weights_io import load_weights
 
     whole = True
@@ -288,7 +286,7 @@ def check_models() -> Iterator[Finding]:
             fix = f"{_restored('prior/weights')}, or steadypose train {model}"
             yield Finding(f"weights of {model}", Verdict.BAD, str(error).split(". ")[0], fix)
         else:
-            numbers = sum(np.asarray(tensor).size for tensor in state.values())
+            numbers = sum(array.size for array in state.values())
             yield Finding(f"weights of {model}", Verdict.GOOD, f"default, {numbers / 1e6:.2f} million numbers")
     if whole:
         yield _self_test()

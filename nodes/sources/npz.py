@@ -13,7 +13,7 @@ bodies an axis for them comes after time, and ``body_id`` (B,) names them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -52,17 +52,20 @@ class NpzError(ValueError):
     """An ``.npz`` that does not hold poses. The text says what was expected, what came, and what to do."""
 
 
-class NpzSource:
-    """The frames of an ``.npz`` as messages; a source for the input node and for ``steadypose clean``.
+class ArraySource:
+    """The frames of arrays, by their names in an ``.npz``, as messages; a source for `steadypose.clean`.
+
+    Args:
+        path: the file that they are of, or what errors should call them.
+        arrays: as above.
 
     Raises:
         NpzError: an array is missing, or has the wrong form.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         self.path = path
         self.refused: Counter[str] = Counter()
-        arrays = _load(path)
         self._skeleton = _text(path, arrays, "skeleton")
         if self._skeleton not in SKELETONS:
             raise NpzError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {self._skeleton!r}")
@@ -105,6 +108,17 @@ class NpzSource:
                     bodies=[RawBody(id=0, positions=positions, confidence=confidence)],
                 ),
             )
+
+
+class NpzSource(ArraySource):
+    """The frames of an ``.npz`` as messages; a source for the input node and for ``steadypose clean``.
+
+    Raises:
+        NpzError: an array is missing, or has the wrong form.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, _load(path))
 
 
 class NpzCollector:
@@ -208,13 +222,13 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
         raise NpzError(f"{path}: cannot be read as .npz: {error}") from error
 
 
-def _array(path: Path, arrays: dict[str, NDArray[Any]], name: str) -> NDArray[Any]:
+def _array(path: Path, arrays: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
     if name not in arrays:
         raise NpzError(f"{path}: expected an array {name!r}; it has {', '.join(arrays) or 'none that are known'}")
     return arrays[name]
 
 
-def _numbers(path: Path, arrays: dict[str, NDArray[Any]], name: str) -> NDArray[np.float32]:
+def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], name: str) -> NDArray[np.float32]:
     array = _array(path, arrays, name)
     if array.dtype.kind not in "fiu":
         raise NpzError(f"{path}: {name}: expected numbers, got {array.dtype}")
@@ -222,14 +236,14 @@ def _numbers(path: Path, arrays: dict[str, NDArray[Any]], name: str) -> NDArray[
         return array.astype(np.float32)
 
 
-def _text(path: Path, arrays: dict[str, NDArray[Any]], name: str) -> str:
+def _text(path: Path, arrays: Mapping[str, NDArray[Any]], name: str) -> str:
     array = _array(path, arrays, name)
     if array.dtype.kind != "U" or array.size != 1:
         raise NpzError(f"{path}: {name}: expected one text, got {array.dtype} of shape {array.shape}")
     return str(array.item())
 
 
-def _stamps(path: Path, arrays: dict[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:
+def _stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:
     if "stamp_ns" in arrays:
         stamps = arrays["stamp_ns"]
         fit = stamps.dtype.kind in "iu" and stamps.shape == (frames,)

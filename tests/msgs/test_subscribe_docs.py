@@ -1,5 +1,6 @@
 """The programs of docs/subscribe.md run as they are printed."""
 
+import os
 import re
 import select
 import subprocess
@@ -14,7 +15,7 @@ from tests.helpers.msg_strategies import raw, world
 
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
-from steadypose.msgs.transport import Publisher, Subscriber
+from steadypose.msgs.transport import Publisher, Subscriber, local_address, local_directory
 
 PAGE = Path(__file__).parents[2] / "docs" / "subscribe.md"
 SUBSCRIBER, PUBLISHER, READER = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
@@ -22,10 +23,12 @@ SOON_S = 30.0
 
 
 @contextmanager
-def running(code: str, argument: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+def running(code: str, tmp_path: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     program = tmp_path / "program.py"
     program.write_text(code)
-    with subprocess.Popen([sys.executable, program, argument], stdout=subprocess.PIPE, text=True) as process:
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
+    command = [sys.executable, program, *arguments]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process
         finally:
@@ -37,9 +40,10 @@ def test_they_are_short(code: str):
     assert len([line for line in code.splitlines() if line.strip()]) <= 12
 
 
-def test_the_subscriber_prints_a_wrist(tmp_path: Path):
-    address = f"ipc://{tmp_path}/trajectory"
-    with Publisher(address) as publisher, running(SUBSCRIBER, address, tmp_path) as process:
+def test_the_subscriber_prints_a_wrist(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    local_directory().mkdir()
+    with Publisher(local_address("trajectory")) as publisher, running(SUBSCRIBER, tmp_path) as process:
         assert process.stdout
         deadline = time.monotonic() + SOON_S
         while not select.select([process.stdout], [], [], 0.01)[0]:
@@ -48,9 +52,10 @@ def test_the_subscriber_prints_a_wrist(tmp_path: Path):
         assert process.stdout.readline() == "7 [63. 64. 65.] IMPUTED\n"
 
 
-def test_the_publishers_frames_arrive(tmp_path: Path):
-    address = f"ipc://{tmp_path}/pose_input"
-    with Subscriber(address, POSE_RAW) as subscriber, running(PUBLISHER, address, tmp_path):
+def test_the_publishers_frames_arrive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    local_directory().mkdir()
+    with Subscriber(local_address("pose_input"), POSE_RAW) as subscriber, running(PUBLISHER, tmp_path):
         received = subscriber.receive(SOON_S)
         assert received
         topic, message = received
@@ -63,7 +68,7 @@ def test_the_reader_reads(tmp_path: Path):
         for second in range(3):
             writer.write(POSE_WORLD, world(second * 10**9), second * 10**9)
             writer.write(POSE_RAW, raw(second * 10**9), second * 10**9)
-    with running(READER, str(tmp_path / "recording"), tmp_path) as process:
+    with running(READER, tmp_path, str(tmp_path / "recording")) as process:
         printed, _ = process.communicate(timeout=SOON_S)
     assert printed.splitlines() == [
         "2.0 s of pose/raw pose/world",

@@ -98,3 +98,22 @@ def test_keys_are_made_once(capsys, tmp_path: Path) -> None:
     assert secret.stat().st_mode & 0o077 == 0
     assert main(["keys", str(tmp_path / "keys")]) == USAGE_ERROR
     assert "exists already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("missing", "extra", "arguments"),
+    [
+        ("torch", "train", ["train", "hmvae"]),
+        ("matplotlib", "view", ["plot", "x"]),
+        ("cv2", "oak", ["calibrate", "board", "b.pdf"]),
+        ("depthai", "oak", ["run", "oak"]),
+    ],
+)
+def test_what_an_extra_brings_is_named(missing: str, extra: str, arguments: list[str]) -> None:
+    block = f"import sys; sys.modules[{missing!r}] = None"
+    code = f"{block}; from steadypose.nodes.cli import main; sys.exit(main({arguments}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == USAGE_ERROR
+    assert f"needs {missing}" in done.stderr
+    assert f"pip install 'steadypose[{extra}]'" in done.stderr
+    assert "Traceback" not in done.stderr

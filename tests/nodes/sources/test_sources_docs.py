@@ -40,12 +40,15 @@ def test_the_publisher_publishes(tmp_path: Path) -> None:
     np.savez(tmp_path / "scene.npz", pixels=pixels, depth=scene.depth, intrinsics=CAMERA.intrinsics)
     (tmp_path / "camera.py").write_text(DETECTOR)
     (tmp_path / "publisher.py").write_text(BLOCKS["python"])
-    address = f"ipc://{tmp_path}/pose_input"
+    (tmp_path / "steadypose").mkdir()
+    address = f"ipc://{tmp_path}/steadypose/pose_input"
     root = str(DOCS.parent / "src")
     with (
         Subscriber(address, POSE_RAW) as subscriber,
         subprocess.Popen(
-            [sys.executable, "publisher.py", address], cwd=tmp_path, env=os.environ | {"PYTHONPATH": root}
+            [sys.executable, "publisher.py"],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": root, "XDG_RUNTIME_DIR": str(tmp_path)},
         ) as process,
     ):
         received = subscriber.receive(SOON_S)
