@@ -12,6 +12,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
+import sys
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -19,13 +20,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomllib
 
 from steadypose import PACKAGE
 from steadypose.msgs.keys import Keys, load_keys
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
 from steadypose.msgs.types import Pose
 from steadypose.prior.settings import build_settings
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 #: The graph: each node, and for every node it listens to the topics it takes from there.
 LISTENS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
