@@ -15,10 +15,11 @@ from steadypose.prior.clean.correct import CorrectSettings
 from steadypose.prior.clean.denoise import DenoiseSettings
 from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.impute import ImputeSettings
-from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
-from steadypose.prior.clean.reconstruct import EncodeSettings
+from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.reconstruct import ReconstructSettings
 from steadypose.prior.clean.refine import RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.models.weights_io import WEIGHTS
 
 Floats = NDArray[np.float64]
@@ -40,7 +41,7 @@ OURS: Mapping[str, PriorSettings] = {
     "steadypose, bias_sigma = 0.002": PriorSettings(bias_sigma=0.002),
     **{
         f"steadypose, {weights} weights": PriorSettings(
-            refine=RefineSettings(weights=weights), encode=EncodeSettings(weights=weights)
+            refine=RefineSettings(weights=weights), encode=ReconstructSettings(weights=weights)
         )
         for weights in weight_sets("hmvae")
         if weights != RefineSettings().weights

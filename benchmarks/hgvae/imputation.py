@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from steadypose.benchmarks.corruption import LIMBS
-from steadypose.prior.clean.impute import Climb, ImputeSettings, completed_tracks
-from steadypose.prior.clean.reconstruct import Encoded
+from steadypose.prior.clean.frame import BodyWindows
+from steadypose.prior.clean.impute import ImputeSettings, LatentAscent, completed_tracks
 from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.features import Tracks, from_tracks, in_frame_of, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
@@ -102,10 +102,10 @@ def impute_all(
         tracks = t._replace(x=x, observed=seen)
         look = live.look(x[None], seen[None])
         batch = Tracks(*(np.asarray(part)[None] for part in tracks))
-        encoded = Encoded(np.zeros(1, dtype=np.intp), batch, seen[None], np.array([size]), look, live)
+        windows = BodyWindows(np.zeros(1, dtype=np.intp), batch, seen[None], np.array([size]), look, live)
         passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(tracks, look.mean[0]))
         for count in steps:
-            climbed = Climb(live.latents, ImputeSettings()).complete(encoded, 0, count)
+            climbed = LatentAscent(live.latents, ImputeSettings()).complete(windows, 0, count)
             passes.setdefault(f"HG-VAE, {count} steps", []).append(completed_tracks(tracks, climbed.mean))
     found |= {name: np.stack(windows) for name, windows in passes.items()}
     for count in steps:

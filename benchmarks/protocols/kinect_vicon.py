@@ -41,7 +41,7 @@ from steadypose.benchmarks.tuning import Tuned, loss, search
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, J
-from steadypose.prior.clean.pipeline import PriorSettings
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
 from steadypose.prior.timing.rate import FPS
 

@@ -34,7 +34,8 @@ from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, PoseRaw, RawBody
 from steadypose.nodes.graph.runtime import FRAME_NS, Timeline
 from steadypose.nodes.graph.threads import one_thread
-from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 CROWDS = (1, 4, 8)

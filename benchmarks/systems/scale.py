@@ -30,7 +30,7 @@ from steadypose.nodes.commands.cleaning import clean_recording
 from steadypose.nodes.graph.runtime import FRAME_NS
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.clean.batch import StreamBatch
-from steadypose.prior.clean.pipeline import PriorSettings
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 KIOSKS = (1, 4, 8, 16)

@@ -32,7 +32,8 @@ from steadypose.nodes.sources.pose_input import RecordingSource
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import PARENTS, J
-from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
 from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 

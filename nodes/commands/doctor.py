@@ -297,7 +297,8 @@ def _self_test() -> Finding:
     import numpy as np
 
     from steadypose.nodes.graph.threads import one_thread
-    from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+    from steadypose.prior.clean.pipeline import PriorPipeline
+    from steadypose.prior.clean.settings import PriorSettings
 
     one_thread()
     pipeline = PriorPipeline(PriorSettings())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from steadypose.msgs.topics import POSE_CLEAN
@@ -11,21 +12,33 @@ from steadypose.nodes.graph.launch import Launch, LaunchError
 from steadypose.nodes.graph.runtime import FRAME_NS, Clock, Node
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.clean.batch import StreamBatch
-from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings, load_loops
+from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
+from steadypose.prior.clean.settings import PriorSettings
 
 GATED = ("joints_refused", "limbs_exchanged", "joints_stuck")
 """counts of what the gate found in the sensor's joints: its daily work, and no fault of a message"""
 
 
-def make_prior(settings: Mapping[str, Any], kiosks: int = 0) -> PriorPipeline:
-    """The prior as ``[prior]`` of a launch file wants it: of one stream, or of several kiosks.
+def make_prior(settings: Mapping[str, Any]) -> PriorPipeline:
+    """The prior of one stream, as ``[prior]`` of a launch file wants it.
 
     Raises:
         LaunchError: an unknown setting, a value that cannot be, or weights that are not there.
     """
+    with _launch_errors():
+        return PriorPipeline(PriorSettings.from_dict(settings))
+
+
+def make_batch(settings: Mapping[str, Any], kiosks: int) -> StreamBatch:
+    """The prior of several kiosks; raises as `make_prior`."""
+    with _launch_errors():
+        return StreamBatch(PriorSettings.from_dict(settings), kiosks)
+
+
+@contextmanager
+def _launch_errors() -> Iterator[None]:
     try:
-        wanted = PriorSettings.from_dict(settings)
-        return StreamBatch(wanted, kiosks) if kiosks else PriorPipeline(wanted)
+        yield
     except (ValueError, FileNotFoundError) as error:
         raise LaunchError(str(error)) from error
 
@@ -38,7 +51,8 @@ class PriorNode(Node):
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
         one_thread()
-        self._pipeline = make_prior(launch.prior, len(launch.server.kiosks))
+        kiosks = len(launch.server.kiosks)
+        self._pipeline = make_batch(launch.prior, kiosks) if kiosks else make_prior(launch.prior)
         load_loops()
         self._bodies = 0
         self._anomalies = 0

@@ -12,16 +12,29 @@ that it follows clocks that drift.
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass, field
+from collections import Counter
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from steadypose.msgs.types import CleanBody, Pose, PoseClean, PoseRaw
+from steadypose.msgs.types import PoseClean, PoseRaw
+from steadypose.prior.body.layouts import Skeleton
+from steadypose.prior.clean.adapt import (
+    SensorFrame,
+    Sighting,
+    clean_bodies,
+    clean_message,
+    end_of_stream,
+    layout_of,
+    sightings,
+    stacked,
+)
+from steadypose.prior.clean.core import CleanCore
+from steadypose.prior.clean.frame import Bools, CleanFrame, Observation
 from steadypose.prior.clean.identify import Identify
-from steadypose.prior.clean.pipeline import BACKWARDS_NS, PriorPipeline, PriorSettings
+from steadypose.prior.clean.pipeline import BACKWARDS_NS
+from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.slots import Slots
 from steadypose.prior.timing.resample import PERIOD_NS, Resampler
 
 PATIENCE_NS = 2 * PERIOD_NS
@@ -31,9 +44,6 @@ DRIFT = 200e-6
 """By how much two clocks may run apart: twice what two bad quartzes do."""
 LATE_IN_A_ROW = 15
 """Frames of a stream, half a second; then its clock was set or its way has become longer, and it starts anew."""
-
-Joints = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""(S, 22, 3) metres and the confidence (S, 22)"""
 
 
 @dataclass
@@ -49,7 +59,6 @@ class _Stream:
         heard_ns: when it came.
         first_ns, newest_ns: the first and the newest grid time that it has given joints for; none yet if negative.
         late: how many of its frames in a row came too late.
-        ids: from its bodies' ids to the batch's.
     """
 
     resampler: Resampler
@@ -61,24 +70,31 @@ class _Stream:
     first_ns: int = -1
     newest_ns: int = -1
     late: int = 0
-    ids: dict[int, int] = field(default_factory=dict)
 
 
-class StreamBatch(PriorPipeline):
+class StreamBatch:
     """The prior for many streams, told apart by ``source``.
 
     Args:
         settings: of the prior; ``max_bodies`` is of all streams together.
-        streams: at most so many; further ones are refused.
+        max_streams: further ones are refused.
+
+    Attributes:
+        counters: what was refused or dropped so far, by cause.
+        delay_frames: frames at 30 Hz between a frame and its answer.
     """
 
-    def __init__(self, settings: PriorSettings, streams: int) -> None:
-        super().__init__(settings)
-        self._most = streams
+    def __init__(self, settings: PriorSettings, max_streams: int) -> None:
+        self.counters: Counter[str] = Counter()
+        self.delay_frames = settings.delay
+        self._settings, self._max_streams = settings, max_streams
+        self._timeout_ns = round(settings.timeout * 1e9)
+        self._core = CleanCore(settings, self.counters)
+        self._slots: Slots[tuple[str, int]] = Slots(settings.max_bodies, settings.timeout, self.counters)
         self._streams: dict[str, _Stream] = {}
-        self._waiting: dict[int, list[Joints]] = {}
+        self._waiting: dict[int, list[Sighting]] = {}
+        self._origin_ns = 0
         self._done_ns: int | None = None
-        self._next_id = 0
 
     @property
     def streams(self) -> int:
@@ -93,46 +109,42 @@ class StreamBatch(PriorPipeline):
             now_ns: when it came, on the server's clock.
             hurry: as of `PriorPipeline.process`.
         """
-        if self._impute:
-            self._impute.hurry = hurry
-        silence_ns = round(self.settings.timeout * 1e9)
         cleaned: list[PoseClean] = []
-        if self._done_ns is not None and now_ns - self._done_ns > silence_ns + 2 * PATIENCE_NS:
+        if self._done_ns is not None and now_ns - self._done_ns > self._timeout_ns + 2 * PATIENCE_NS:
             cleaned += self.flush()  # all were silent, and start anew
         for name, stream in list(self._streams.items()):
-            if now_ns - stream.heard_ns > silence_ns and name != raw.source:
+            if now_ns - stream.heard_ns > self._timeout_ns and name != raw.source:
                 self.counters["stream_silent"] += 1
                 self._forget(name)
         stream = self._streams.get(raw.source)
         if raw.end_of_stream:
             if stream:
                 stream.last, stream.heard_ns = raw, now_ns
-        elif self._skeleton(raw) is not None:
-            self._take(raw, now_ns)
-        cleaned += self._advance(now_ns)
+        else:
+            layout = layout_of(raw, self.counters)
+            if layout is not None:
+                self._take(raw, layout, now_ns)
+        cleaned += self._advance(now_ns, hurry)
         if self._streams and all(stream.last.end_of_stream for stream in self._streams.values()):
             cleaned += self.flush()  # nobody is left for whose sake there will be another frame
         return cleaned
 
     def flush(self) -> list[PoseClean]:
         """Give the frames that the delay still holds, and forget all streams."""
-        ids = {name: stream.ids for name, stream in self._streams.items()}
-        held = super().flush()
-        for name, stream in self._streams.items():
-            stream.ids = ids[name]  # bodies are gone, and still in what was held
-        cleaned = [part for joint in held for part in self._split(joint)]
+        cleaned = [part for frame in self._core.flush() for part in self._split(frame)]
         for name, stream in list(self._streams.items()):
             if stream.last.end_of_stream:
-                cleaned.append(self._end(stream))
+                cleaned.append(end_of_stream(stream.last, self.delay_frames))
             self._forget(name)
+        self._drop(np.ones_like(self._slots.present))
         self._waiting.clear()
         self._done_ns = None
         return cleaned
 
-    def _take(self, raw: PoseRaw, now_ns: int) -> None:
+    def _take(self, raw: PoseRaw, layout: Skeleton, now_ns: int) -> None:
         """Put a stream's message on the grid."""
         stream = self._streams.get(raw.source)
-        if stream and not -BACKWARDS_NS < raw.stamp_ns - stream.last.stamp_ns <= self.settings.timeout * 1e9:
+        if stream and not -BACKWARDS_NS < raw.stamp_ns - stream.last.stamp_ns <= self._timeout_ns:
             self.counters["stream_gap" if raw.stamp_ns > stream.last.stamp_ns else "stamp_jumped_back"] += 1
             self._forget(raw.source)
             stream = None
@@ -141,10 +153,10 @@ class StreamBatch(PriorPipeline):
             self._forget(raw.source)
             stream = None
         if stream is None:
-            if len(self._streams) >= self._most:
+            if len(self._streams) >= self._max_streams:
                 self.counters["too_many_streams"] += 1
                 return
-            slots, identify = self.settings.max_bodies, self.settings.identify
+            slots, identify = self._settings.max_bodies, self._settings.identify
             stream = self._streams[raw.source] = _Stream(
                 resampler=Resampler(slots, aligned=True),
                 identify=Identify(identify, 2 * slots, self.counters) if identify.enabled else None,
@@ -161,13 +173,7 @@ class StreamBatch(PriorPipeline):
             stream.late += 1
             return
         stream.last, stream.time_ns = raw, time_ns
-        self._current, self._identify = stream, stream.identify
-        # levelled, but seen from where the sensor stands: the streams have no world in common
-        levelled = Pose(np.zeros(3), raw.sensor_pose.orientation)
-        skeleton = self._skeleton(raw)
-        assert skeleton is not None, "checked before"
-        joints = self._adapt(dataclasses.replace(raw, sensor_pose=levelled), skeleton)
-        for tick_ns, *ready in stream.resampler.update(time_ns, *joints):
+        for tick_ns, *ready in stream.resampler.update(time_ns, *self._arranged(raw, layout, stream)):
             if self._done_ns is not None and tick_ns <= self._done_ns:
                 # the first frames of a stream, which nobody expected yet, are not late
                 self.counters["late_for_batch"] += stream.first_ns >= 0
@@ -176,9 +182,20 @@ class StreamBatch(PriorPipeline):
             stream.late = 0
             stream.first_ns = tick_ns if stream.first_ns < 0 else stream.first_ns
             stream.newest_ns = tick_ns
-            self._waiting.setdefault(tick_ns, []).append((ready[0], ready[1]))
+            self._waiting.setdefault(tick_ns, []).append(Sighting(*ready))
 
-    def _advance(self, now_ns: int) -> list[PoseClean]:
+    def _arranged(self, raw: PoseRaw, layout: Skeleton, stream: _Stream) -> Sighting:
+        """A message's bodies, by slot.
+
+        Levelled, but seen from where the sensor stands: the streams have no world in common.
+        """
+        sensor = SensorFrame.of(raw.sensor_pose).levelled()
+        found = sightings(raw, layout, sensor, self.counters, numbered=stream.identify is not None)
+        own = stream.identify.update(raw.stamp_ns, *stacked(found.values())) if stream.identify else found
+        keys = [None if key is None else (raw.source, key) for key in own]
+        return self._slots.arrange(zip(keys, found.values(), strict=True))
+
+    def _advance(self, now_ns: int, hurry: bool) -> list[PoseClean]:
         """Work on the grid times for which nobody is waited for any more."""
         cleaned: list[PoseClean] = []
         while self._waiting:
@@ -189,77 +206,55 @@ class StreamBatch(PriorPipeline):
             if self._done_ns is None:
                 self._origin_ns = tick_ns
             self._done_ns = tick_ns
-            self._last = PoseRaw(tick_ns, "", "", "smpl22", Pose.identity(), False, [])
-            positions, confidence = self._merge(self._waiting.pop(tick_ns, []))
-            for joint in self._step(tick_ns, positions, confidence, self._last):
-                cleaned += self._split(joint)
+            seen = self._merged(self._waiting.pop(tick_ns, []))
+            gone = self._slots.advance(tick_ns, seen.positions)
+            if gone.any():
+                self._drop(gone)
+            observation = Observation(
+                stamp_s=(tick_ns - self._origin_ns) * 1e-9,
+                positions=seen.positions,
+                confidence=seen.confidence,
+                present=self._slots.present,
+                sensor_position=np.zeros(3),
+            )
+            frame = self._core.step(observation, hurry=hurry)
+            if frame is not None:
+                cleaned += self._split(frame)
         return cleaned
 
-    def _merge(self, parts: list[Joints]) -> Joints:
-        slots = self.settings.max_bodies
-        positions, confidence = np.full((slots, 22, 3), np.nan), np.zeros((slots, 22))
-        for seen, trust in parts:
-            there = np.isfinite(seen[..., 0])
-            positions[there], confidence[there] = seen[there], trust[there]
-        return positions, confidence
+    def _merged(self, parts: list[Sighting]) -> Sighting:
+        slots = self._settings.max_bodies
+        merged = Sighting(np.full((slots, 22, 3), np.nan), np.zeros((slots, 22)))
+        for part in parts:
+            there = np.isfinite(part.positions[..., 0])
+            merged.positions[there], merged.confidence[there] = part.positions[there], part.confidence[there]
+        return merged
 
-    def _split(self, joint: PoseClean) -> list[PoseClean]:
+    def _split(self, frame: CleanFrame) -> list[PoseClean]:
         """The answer for all streams, as one message for each stream that was there."""
-        bodies = {body.id: body for body in joint.bodies}
+        stamp_ns = self._origin_ns + round(frame.estimate.stamp_s * 1e9)
         cleaned = []
         for name, stream in list(self._streams.items()):
             # stamps were seconds on the way, and may be a nanosecond off the grid
-            if not 0 <= stream.first_ns <= joint.stamp_ns + 1000:
+            if not 0 <= stream.first_ns <= stamp_ns + 1000:
                 continue
-            ended = stream.last.end_of_stream and stream.newest_ns < joint.stamp_ns - 1000
-            if ended:
-                cleaned.append(self._end(stream))
+            if stream.last.end_of_stream and stream.newest_ns < stamp_ns - 1000:
+                cleaned.append(end_of_stream(stream.last, self.delay_frames))
                 self._forget(name)
                 continue
-            turn = Rotation.from_quat(stream.last.sensor_pose.orientation)
-            parts = [_in_sensor(bodies[g], own, turn) for own, g in stream.ids.items() if g in bodies]
-            cleaned.append(self._answer(stream, max(joint.stamp_ns - round(stream.offset_ns), 0), parts))
+            ids = {slot: key[1] for slot, key in enumerate(self._slots.keys) if key is not None and key[0] == name}
+            bodies = clean_bodies(frame, SensorFrame.of(stream.last.sensor_pose).levelled(), ids)
+            own_ns = max(stamp_ns - round(stream.offset_ns), 0)
+            cleaned.append(clean_message(stream.last, own_ns, self.delay_frames, bodies))
         return cleaned
 
-    def _end(self, stream: _Stream) -> PoseClean:
-        ended = self._answer(stream, stream.last.stamp_ns, [])
-        ended.end_of_stream = True
-        return ended
-
-    def _answer(self, stream: _Stream, stamp_ns: int, bodies: list[CleanBody]) -> PoseClean:
-        return self._clean(stamp_ns, stream.last, bodies)
-
-    def _slot(self, body_id: int, seen: int) -> int | None:
-        ids = self._current.ids
-        known = ids.get(body_id, self._next_id)
-        slot = super()._slot(known, seen)
-        if slot is not None and known == self._next_id:
-            ids[body_id] = known
-            self._next_id += 1
-        return slot
-
-    def _drop(self, slot: NDArray[np.bool_]) -> None:
-        gone = {self._ids[k] for k in np.flatnonzero(slot)}
-        super()._drop(slot)
-        for stream in self._streams.values():
-            stream.resampler.clear(slot)
-            stream.ids = {own: shared for own, shared in stream.ids.items() if shared not in gone}
-
     def _forget(self, name: str) -> None:
-        mine = set(self._streams[name].ids.values())
-        self._drop(np.array([shared in mine for shared in self._ids]))
+        """Forget a stream."""
+        self._drop(np.array([key is not None and key[0] == name for key in self._slots.keys]))
         del self._streams[name]
 
-
-def _in_sensor(body: CleanBody, own_id: int, turn: Rotation) -> CleanBody:
-    """A body of the batch, levelled, in the frame of its own sensor, which is turned so, and with its own id."""
-    to_world = turn.as_matrix()
-    rotations = body.rotations.copy()
-    rotations[0] = (turn.inv() * Rotation.from_quat(rotations[0])).as_quat()
-    return dataclasses.replace(
-        body,
-        id=own_id,
-        positions=body.positions @ to_world,
-        rotations=rotations,
-        raw_positions=body.raw_positions @ to_world,
-    )
+    def _drop(self, slot: Bools) -> None:
+        self._core.forget(slot)
+        self._slots.free(slot)
+        for stream in self._streams.values():
+            stream.resampler.clear(slot)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.clean.frame import Window
+from steadypose.prior.clean.frame import Bools, Gated
 from steadypose.prior.models.sensor_bias.features import HISTORY, SMOOTHER_DENSITY, features, recall, trunk_frame
 from steadypose.prior.models.sensor_bias.inference import LiveCorrection
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
@@ -33,36 +32,32 @@ class CorrectSettings:
 class Correct:
     """Adds to each joint seen what `CorrectionNet` says is missing; it adds no delay."""
 
-    delay_frames = 0
-
     def __init__(self, settings: CorrectSettings, slots: int) -> None:
         self._net = LiveCorrection.load(settings.sensor, slots)
         self._smoother = FixedLagRTS(0, SMOOTHER_DENSITY)
         self._history = Ring(HISTORY[-1] + 1, (slots, 22, 3))
         self._correction = np.zeros((slots, 22, 3))
 
-    def reset(self, slot: NDArray[np.bool_]) -> None:
-        """Forget the bodies in these slots."""
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
         if slot.all():
             self._smoother.reset()  # a new stream: its stamps may be earlier
         self._smoother.forget(np.repeat(slot[:, None], 22, axis=1))
         self._history.clear(slot)
         self._correction[slot] = 0.0
 
-    def update(self, window: Window) -> Window:
-        """Correct the newest frame's positions, in place."""
-        newest = window.positions.newest
-        smoothed = self._smoother.update(newest, float(window.stamp_s.newest))
+    def update(self, gated: Gated) -> Gated:
+        """The newest frame, corrected."""
+        newest, observation = gated.positions, gated.observation
+        smoothed = self._smoother.update(newest, observation.stamp_s)
         assert smoothed is not None  # a lag of 0 answers at once
         self._history.push(np.where(finite_joints(newest)[..., None], smoothed.positions, np.nan))
-        slots = np.flatnonzero(window.present)
+        slots = np.flatnonzero(observation.present)
         history = recall(self._history.all[:, slots])
         frames = trunk_frame(history[0])
         known = np.isfinite(frames).all(axis=(1, 2))
         self._correction[slots[~known]] *= FADE
         if known.any():
-            x = features(history[:, known], window.sensor_position)
+            x = features(history[:, known], observation.sensor_position)
             self._correction[slots[known]] = self._net(x) @ frames[known].swapaxes(-1, -2)
-        newest += self._correction
-        window.positions.replace(newest)
-        return window
+        return replace(gated, positions=newest + self._correction)

@@ -12,14 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import HIPS, J
-from steadypose.prior.clean.frame import Window
+from steadypose.prior.clean.frame import BodyWindows, Bools, Floats
+from steadypose.prior.clean.history import History
 from steadypose.prior.models.hgvae.features import from_tracks
 from steadypose.prior.timing.fixed_lag import Smoothed
-
-Floats = NDArray[np.float64]
 
 MODEL_SIGMA = 0.005
 """Metres along an axis: what HG-VAE is off by apart from noise, for the least error in noise of 1 and 4 cm."""
@@ -45,55 +43,62 @@ class DenoiseSettings:
 
 
 class Denoise:
-    """Moves ``window.smoothed`` towards what HG-VAE makes of the joints seen."""
+    """Moves the smoother's estimate of the joints seen towards what HG-VAE makes of them.
 
-    def __init__(self, measurement_sigma: float, delay_frames: int, slots: int) -> None:
-        self._measurement_sigma = measurement_sigma
-        self.delay_frames = delay_frames
+    Args:
+        jitter_sigma: metres, which the smoother assumes.
+        delay_frames: between the newest frame and the one that is answered.
+        slots: bodies at most.
+    """
+
+    def __init__(self, jitter_sigma: float, delay_frames: int, slots: int) -> None:
+        self._jitter_sigma = jitter_sigma
         self._found = np.full((delay_frames + 1, slots, 22, 3), np.nan)
 
-    def reset(self, slot: NDArray[np.bool_]) -> None:
-        """Forget the bodies in these slots."""
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
         self._found[:, slot] = np.nan
 
-    def update(self, window: Window) -> Window:
-        """Take in what HG-VAE makes of the newest windows, and denoise the frame that is to be answered."""
+    def update(self, windows: BodyWindows | None, history: History) -> None:
+        """Take in what HG-VAE makes of the newest windows."""
         self._found[:-1], self._found[-1] = self._found[1:], np.nan
-        if window.encoded is not None:
-            slots, tracks, _, size, look, _ = window.encoded
-            latest = from_tracks(look.mean[..., -self.delay_frames - 1 :], tracks, size)
-            _place_pelvis(latest, window.positions.all[:, slots].swapaxes(0, 1))
-            latest = latest.swapaxes(0, 1)
-            before = self._found[:, slots]
-            # a window that ends in the dark tells less of what went before than the last one that did not
-            seen = np.asarray(np.isfinite(window.positions.newest[slots, :, 0]).any(axis=1))
-            renewed = np.where(seen[:, None, None], before + RENEWAL * (latest - before), before)
-            self._found[:, slots] = np.where(np.isnan(before), latest, renewed)
-        if window.smoothed is not None:
-            window.smoothed = self.denoised(window, window.smoothed, self.delay_frames)
-        return window
+        if windows is None:
+            return
+        slots, tracks = windows.slots, windows.tracks
+        latest = from_tracks(windows.reconstruction.mean[..., -len(self._found) :], tracks, windows.size)
+        _place_pelvis(latest, history.positions[:, slots].swapaxes(0, 1))
+        latest = latest.swapaxes(0, 1)
+        before = self._found[:, slots]
+        # a window that ends in the dark tells less of what went before than the last one that did not
+        seen = np.asarray(np.isfinite(history.positions[-1, slots, :, 0]).any(axis=1))
+        renewed = np.where(seen[:, None, None], before + RENEWAL * (latest - before), before)
+        self._found[:, slots] = np.where(np.isnan(before), latest, renewed)
 
-    def denoised(self, window: Window, smoothed: Smoothed, back: int) -> Smoothed:
-        """The smoother's estimate of the frame ``back`` before the newest, denoised.
-
-        The weights are those of least variance for two estimates of which the second holds the share `NOISE_LEFT` of
-        the first one's noise and an error of its own, `MODEL_SIGMA`.
-        """
+    def denoised(self, smoothed: Smoothed, history: History, jitter: Floats, back: int) -> Smoothed:
+        """The smoother's estimate of the frame ``back`` before the newest, denoised; ``jitter`` (S,) as of now."""
         found = self._found[-1 - back]
-        seen = np.isfinite(window.positions.all[-1 - back][..., 0])
+        seen = np.isfinite(history.positions[-1 - back][..., 0])
         # in a frame that was lost whole, the answer must not jump to the smoother's
         seen |= ~seen.any(axis=1, keepdims=True)
         known = seen & np.isfinite(found[..., 0] + smoothed.sigma)
         # `smoothed.sigma` takes noise to be what the smoother assumes, or more if more was found
-        relative = window.noise / self._measurement_sigma
-        noise = np.where(known, smoothed.sigma, 0.0) * (relative / np.maximum(relative, 1.0))[:, None]
-        gained = (1.0 - NOISE_LEFT) * noise**2
-        share = np.where(known, gained / (gained + MODEL_SIGMA**2), 0.0)
+        relative = jitter / self._jitter_sigma
+        share = _share(np.where(known, smoothed.sigma, 0.0) * (relative / np.maximum(relative, 1.0))[:, None])
         moved = np.where(known[..., None], found - smoothed.positions, 0.0)
         return smoothed._replace(
             positions=smoothed.positions + share[..., None] * moved,
             sigma=smoothed.sigma * np.sqrt(1.0 - share * (1.0 - NOISE_LEFT)),
         )
+
+
+def _share(sigma: Floats) -> Floats:
+    """How far to go to HG-VAE's place (S, 22), of joints that the smoother knows to ``sigma`` (S, 22) metres; 0 at 0.
+
+    The weights are those of least variance for two estimates of which the second holds the share `NOISE_LEFT` of
+    the first one's noise and an error of its own, `MODEL_SIGMA`.
+    """
+    gained = (1.0 - NOISE_LEFT) * sigma**2
+    return gained / (gained + MODEL_SIGMA**2)
 
 
 @njit(cache=True)

@@ -1,24 +1,154 @@
-"""What the stages of the prior hand to each other: the last frames of every body, in preallocated rings."""
+"""The values that the steps of the pipeline hand to each other: frozen, made once, and read by whoever comes later.
+
+S bodies stand in as many slots, in world-aligned coordinates (z up), metres and seconds.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.timing.fixed_lag import Smoothed
-from steadypose.prior.timing.ring import Ring
+from steadypose.prior.models.hgvae.features import Tracks
+from steadypose.prior.models.hgvae.inference import LiveHGVAE, Reconstruction
 
-if TYPE_CHECKING:
-    from steadypose.prior.clean.reconstruct import Encoded
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """What a sensor's joints are off by, standard deviations along an axis.
+
+    Attributes:
+        jitter_sigma: metres, from frame to frame, of a joint seen with full confidence.
+        bias_sigma: metres, slowly: what no filter averages out.
+    """
+
+    jitter_sigma: float
+    bias_sigma: float
+
+    @property
+    def total_sigma(self) -> float:
+        """Metres, of both."""
+        return float(np.hypot(self.bias_sigma, self.jitter_sigma))
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What came of one moment of the grid.
+
+    Attributes:
+        stamp_s: the moment, seconds since the stream began.
+        positions: (S, 22, 3) canonical joints; NaN where unobserved.
+        confidence: (S, 22) in 0..1.
+        present: (S,) which slots hold a body, seen in this frame or a while ago.
+        sensor_position: (3,) where the sensor stands.
+    """
+
+    stamp_s: float
+    positions: Floats
+    confidence: Floats
+    present: Bools
+    sensor_position: Floats
+
+
+@dataclass(frozen=True)
+class Gated:
+    """An observation without what cannot be.
+
+    Attributes:
+        observation: of which this is left.
+        positions: (S, 22, 3) metres; NaN where unobserved or refused.
+        jitter: (S,) metres along an axis, how much each body's joints are found to jump about from frame to frame.
+        frozen: (S, 22) joints of which the sensor repeats its last answer.
+    """
+
+    observation: Observation
+    positions: Floats
+    jitter: Floats
+    frozen: Bools
+
+
+@dataclass(frozen=True)
+class BodyWindows:
+    """The windows of the bodies present, seen and as HG-VAE would have them.
+
+    Attributes:
+        slots: (B,) whose windows these are.
+        tracks: what was seen, each in its body's frame.
+        confidence: (B, 66, T) of each entry; 0 where it was not seen.
+        size: (B,) of the bodies, as `body_size` gives it.
+        reconstruction: (B, 66, T) mean and standard deviation, what the model makes of them.
+        model: which still stands at these windows.
+    """
+
+    slots: NDArray[np.intp]
+    tracks: Tracks
+    confidence: Floats
+    size: Floats
+    reconstruction: Reconstruction
+    model: LiveHGVAE
+
+
+@dataclass(frozen=True)
+class Person:
+    """Every body's bones.
+
+    Attributes:
+        offsets: (S, 22, 3) metres, each joint in its parent's frame.
+        length_variance: (S, 22) metres^2, of each bone, still to be learned away; 0 of a generic adult's.
+        measured: (S,) whether these are the person's own, not yet those of a generic adult.
+    """
+
+    offsets: Floats
+    length_variance: Floats
+    measured: Bools
+
+    @classmethod
+    def generic(cls, slots: int) -> Person:
+        """A generic adult's."""
+        return cls(np.tile(REST_OFFSETS, (slots, 1, 1)), np.zeros((slots, 22)), np.zeros(slots, dtype=bool))
+
+
+@dataclass(frozen=True)
+class Score:
+    """Whether what was seen can be trusted.
+
+    Attributes:
+        anomaly: (S,) how unlike human motion the last half second is (`prior.clean.score`); NaN if not scored.
+        flag: (S,) whether it is too much so.
+        joint_anomaly: (S, 22) the same joint by joint; NaN where not seen.
+    """
+
+    anomaly: Floats
+    flag: Bools
+    joint_anomaly: Floats
+
+    @classmethod
+    def unscored(cls, slots: int) -> Score:
+        """Of those of whom nothing is known."""
+        return cls(np.full(slots, np.nan), np.zeros(slots, dtype=bool), np.full((slots, 22), np.nan))
+
+
+class Imputed(NamedTuple):
+    """The last frames of every body as HG-VAE completes them, the newest last.
+
+    Attributes:
+        positions: (K, S, 22, 3) metres; NaN for a body of which nothing is hidden.
+        sigma: (K, S, 22) metres, standard deviation along an axis.
+    """
+
+    positions: Floats
+    sigma: Floats
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The prior's answer for one moment and every slot, in world-aligned coordinates.
+    """The prior's answer for one moment and every slot.
 
     Attributes:
         stamp_s: the moment, seconds.
@@ -30,98 +160,25 @@ class Estimate:
     """
 
     stamp_s: float
-    positions: NDArray[np.float64]
-    rotations: NDArray[np.float64]
-    offsets: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    positions: Floats
+    rotations: Floats
+    offsets: Floats
+    sigma: Floats
     state: NDArray[np.uint8]
 
 
-class Imputed(NamedTuple):
-    """The last frames of every body as HG-VAE completes them, the newest last.
+@dataclass(frozen=True)
+class CleanFrame:
+    """All that is said of one moment.
 
     Attributes:
-        positions: (K, S, 22, 3) metres; NaN for a body of which nothing is hidden.
-        sigma: (K, S, 22) metres, standard deviation along an axis.
+        estimate: where the joints are.
+        score: as of the newest frame.
+        observed: (S, 22, 3) metres, the joints that came in of that moment; NaN where unobserved.
+        confidence: (S, 22) of those.
     """
 
-    positions: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-
-
-class Window:
-    """The last T frames of S bodies in world-aligned coordinates (z up); the newest is the last.
-
-    Attributes:
-        stamp_s: ring of capture times, seconds.
-        raw: ring of (S, 22, 3) metres, the canonical joints that came in; NaN where unobserved.
-        confidence: ring of (S, 22) in 0..1.
-        positions: ring of (S, 22, 3) metres after gate and correction; NaN where unobserved or refused.
-        sensor_position: (3,) metres, where the sensor stands.
-        noise: (S,) metres along an axis, how much each body's joints jump about from frame to frame.
-        stuck: (S, 22) joints of which the sensor repeats its last answer.
-        smoothed: the fixed-lag smoother's estimate of the frame ``delay`` before the newest, or None while there is
-            none.
-        rotations: ring of (S, 22, 3, 3) local, solved from the positions.
-        encoded: what HG-VAE makes of the windows of the bodies present; None if there is no body or no such stage.
-        anomaly: (S,) how unlike human motion the last half second is (`prior.clean.score`); NaN if not scored.
-        anomaly_flag: (S,) whether it is too much so.
-        joint_anomaly: (S, 22) the same joint by joint; NaN where not seen.
-        imputed: the last frames as HG-VAE completes them, or None while there is no such stage.
-        present: (S,) which slots hold a body.
-        offsets: (S, 22, 3) metres, each person's bones.
-        length_variance: (S, 22) metres^2, of each bone, still to be learned away; 0 of a generic adult's.
-        measured: (S,) whether these are the person's own, not yet those of a generic adult.
-        decoded: (D, S, 22, 3, 3) local rotations of the last frames, from the refinement model.
-        out: the estimate of the frame ``delay`` before the newest, or None while there is none.
-    """
-
-    def __init__(self, frames: int, slots: int, decoded_frames: int | None = None) -> None:
-        self.slots = slots
-        self.stamp_s = Ring(frames, ())
-        self.raw = Ring(frames, (slots, 22, 3))
-        self.confidence = Ring(frames, (slots, 22), fill=0.0)
-        self.positions = Ring(frames, (slots, 22, 3))
-        self.rotations = Ring(frames, (slots, 22, 3, 3))
-        self.sensor_position = np.zeros(3)
-        self.noise = np.zeros(slots)
-        self.stuck = np.zeros((slots, 22), dtype=bool)
-        self.smoothed: Smoothed | None = None
-        self.encoded: Encoded | None = None
-        self.anomaly = np.full(slots, np.nan)
-        self.anomaly_flag = np.zeros(slots, dtype=bool)
-        self.joint_anomaly = np.full((slots, 22), np.nan)
-        self.imputed: Imputed | None = None
-        self.present = np.zeros(slots, dtype=bool)
-        self.offsets = np.tile(REST_OFFSETS, (slots, 1, 1))
-        self.length_variance = np.zeros((slots, 22))
-        self.measured = np.zeros(slots, dtype=bool)
-        self.decoded = np.broadcast_to(np.eye(3), (decoded_frames or frames, slots, 22, 3, 3)).copy()
-        self.out: Estimate | None = None
-
-    def clear(self, slot: NDArray[np.bool_]) -> None:
-        """Forget what these slots (S,) held."""
-        for ring in (self.raw, self.confidence, self.positions, self.rotations):
-            ring.clear(slot)
-        self.present &= ~slot
-        self.measured &= ~slot
-        self.anomaly_flag &= ~slot
-        self.noise[slot] = 0.0
-        self.offsets[slot] = REST_OFFSETS
-        self.length_variance[slot] = 0.0
-        self.decoded[:, slot] = np.eye(3)
-
-
-class Stage(Protocol):
-    """One step of the prior. A stage keeps its state by slot, and reads and writes the window."""
-
-    delay_frames: int
-    """How many later frames it needs."""
-
-    def update(self, window: Window) -> Window:
-        """Work on the newest frame; return the window."""
-        ...
-
-    def reset(self, slot: NDArray[np.bool_]) -> None:
-        """Forget the bodies in these slots (S,)."""
-        ...
+    estimate: Estimate
+    score: Score
+    observed: Floats
+    confidence: Floats

@@ -12,13 +12,9 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import JointState
 from steadypose.prior.body.inverse_kinematics import fit_pose, place_joints, solve_pose
-from steadypose.prior.body.skeleton import JOINTS, PARENT, PARENTS
-from steadypose.prior.clean.frame import Estimate, Window
+from steadypose.prior.body.skeleton import PARENT, PARENTS
+from steadypose.prior.clean.frame import Bools, Estimate, Floats, Imputed, Person
 from steadypose.prior.timing.fixed_lag import Smoothed
-from steadypose.prior.timing.rate import FPS
-from steadypose.prior.timing.ring import Ring
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -86,51 +82,55 @@ class Fuse:
     to that mean is the answer: lengths are constant, and positions and rotations agree.
     """
 
-    def __init__(self, settings: FuseSettings, bias_sigma: float, delay_frames: int, slots: int) -> None:
+    def __init__(self, settings: FuseSettings, bias_sigma: float) -> None:
         self._settings, self._bias_sigma = settings, bias_sigma
-        self.delay_frames = delay_frames
-        self._unseen_s = Ring(delay_frames + 1, (slots, len(JOINTS)), fill=np.inf)
 
-    def reset(self, slot: NDArray[np.bool_]) -> None:
-        """Forget the bodies in these slots."""
-        self._unseen_s.clear(slot)
+    def fuse(
+        self,
+        smoothed: Smoothed,
+        person: Person,
+        rotations: Floats,
+        imputed: Imputed | None,
+        unseen_s: Floats,
+        present: Bools,
+    ) -> Estimate:
+        """The estimate of one frame.
 
-    def update(self, window: Window) -> Window:
-        """Write the estimate of the frame ``delay_frames`` before the newest, once there is one."""
-        positions = window.positions.newest
-        self._unseen_s.push(np.where(np.isfinite(positions[..., 0]), 0.0, self._unseen_s.newest + 1 / FPS))
-        window.out = None if window.smoothed is None else self.estimate(window, window.smoothed, self.delay_frames)
-        return window
-
-    def estimate(self, window: Window, smoothed: Smoothed, back: int) -> Estimate:
-        """The estimate of the frame ``back`` before the newest, from what the smoother made of it."""
+        Args:
+            smoothed: what smoother and denoising make of the joints seen.
+            person: on whose bones.
+            rotations: (S, 22, 3, 3) local, of the body as far as it is not seen.
+            imputed: (S, 22, 3) and (S, 22), that frame as HG-VAE completes it; None without it.
+            unseen_s: (S, 22) seconds for which each joint had not been seen by then.
+            present: (S,) who is there.
+        """
         s = self._settings
-        slots = np.flatnonzero(window.present)
-        offsets, decoded = window.offsets[slots], window.decoded[-1 - back][slots]
+        slots, count = np.flatnonzero(present), len(present)
+        offsets, decoded = person.offsets[slots], rotations[slots]
         seen, deviation = smoothed.positions[slots], smoothed.sigma[slots]
-        unseen_s = self._unseen_s.all[-1 - back][slots]
-        held_s = _least_below(unseen_s)
+        unseen = unseen_s[slots]
+        held_s = _least_below(unseen)
         precision = Precision(*_weigh(deviation, held_s, self._bias_sigma, s.prior_sigma, s.prior_drift, s.fade))
-        body, rotations = place_joints(decoded, offsets), decoded
+        body, fitted = place_joints(decoded, offsets), decoded
         well = _lay_over(body, seen, precision)
         if s.enabled:
             # What is not seen hangs from what is, in the prior's rotations.
             hung = solve_pose(well, offsets, decoded)[1]
             body = np.where(np.isfinite(well[:, :1, :1]), hung, body)
-            if window.imputed is not None:
-                completed, sigma = (part[-1 - back][slots] for part in window.imputed)
-                _complete(body, completed, sigma, seen, deviation, unseen_s, self._bias_sigma, precision)
+            if imputed is not None:
+                completed, sigma = imputed.positions[slots], imputed.sigma[slots]
+                _complete(body, completed, sigma, seen, deviation, unseen, self._bias_sigma, precision)
             mobility = _join(body, seen, precision)
-            rotations, body, offsets = fit_pose(body, offsets, mobility, decoded, window.length_variance[slots])
+            fitted, body, offsets = fit_pose(body, offsets, mobility, decoded, person.length_variance[slots])
         placed = np.isfinite(deviation).any(axis=1)
-        state, sigma = _states(unseen_s, held_s, s.fade), _stated(unseen_s, precision)
+        state, sigma = _states(unseen, held_s, s.fade), _stated(unseen, precision)
         return Estimate(
             stamp_s=smoothed.stamp_s,
-            positions=_scatter(window.slots, slots[placed], body[placed], np.nan),
-            rotations=_scatter(window.slots, slots[placed], rotations[placed], np.nan),
-            offsets=_scatter(window.slots, slots[placed], offsets[placed], np.nan),
-            sigma=_scatter(window.slots, slots[placed], sigma[placed], np.inf),
-            state=_scatter(window.slots, slots[placed], state[placed], JointState.UNKNOWN).astype(np.uint8),
+            positions=_scatter(count, slots[placed], body[placed], np.nan),
+            rotations=_scatter(count, slots[placed], fitted[placed], np.nan),
+            offsets=_scatter(count, slots[placed], offsets[placed], np.nan),
+            sigma=_scatter(count, slots[placed], sigma[placed], np.inf),
+            state=_scatter(count, slots[placed], state[placed], JointState.UNKNOWN).astype(np.uint8),
         )
 
 

@@ -1,4 +1,4 @@
-"""The gate: jumps, impossible bone lengths, exchanged limbs and stuck joints, before they reach a network."""
+"""The gate: jumps, impossible bone lengths, exchanged limbs and frozen joints, before they reach a network."""
 
 from __future__ import annotations
 
@@ -8,24 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import CHILDREN, MIRROR, PARENT, limbs
-from steadypose.prior.clean.frame import Window
+from steadypose.prior.clean.frame import Bools, Floats, Gated, Observation, Person
 from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
+from steadypose.prior.timing.frozen_joints import RECENT, frozen_joints
 from steadypose.prior.timing.rate import FPS
-
-RECENT = 15
-"""Frames in which a joint that repeats itself must do so mostly."""
-
-SAME = 1e-6
-"""Metres: a joint that has moved less from one frame to the next repeats itself."""
-
-LEAST_NOISE = 0.001
-"""Metres along an axis, from frame to frame: of a sensor with less, a joint that repeats itself may be at rest."""
-
-_LEAST_NEW = 5
-"""frames that were no repetition of the whole body"""
+from steadypose.prior.timing.ring import Ring
 
 
 @dataclass(frozen=True)
@@ -36,7 +25,7 @@ class GateSettings:
         enabled: whether to refuse anything; off, all that is seen passes.
         jump: metres a joint may be from where it was expected, beyond three standard deviations of that.
         bone: fraction by which a bone may differ from this person's.
-        patience: seconds after which a joint refused (or limbs exchanged) throughout is believed after all.
+        patience: seconds after which a joint refused (or limbs exchanged) throughout is accepted after all.
         min_confidence: joints below are unobserved.
     """
 
@@ -65,54 +54,49 @@ class Gate:
     than ``patience``: then the sensor is right and the expectation wrong.
     """
 
-    delay_frames = 0
-
     def __init__(self, settings: GateSettings, slots: int, counters: Counter[str]) -> None:
         self._settings = settings
         self._counters = counters
         self._filter = FixedLagRTS(0, acceleration_density=8.0, measurement_sigma=0.015)
+        self._observed = Ring(RECENT + 1, (slots, 22, 3))
+        self._jitter = np.zeros(slots)
+        self._frames = np.zeros(slots, dtype=np.int64)
         self._refused = np.zeros((slots, 22))
         self._swapped = np.zeros((slots, len(_EXCHANGED)))
-        self._frames = np.zeros(slots, dtype=np.int64)
 
-    def reset(self, slot: NDArray[np.bool_]) -> None:
-        """Forget the bodies in these slots."""
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
         if slot.all():
             self._filter.reset()  # a new stream: its stamps may be earlier
         self._filter.forget(np.repeat(slot[:, None], 22, axis=1))
+        self._observed.clear(slot)
+        self._jitter[slot] = 0.0
+        self._frames[slot] = 0
         self._refused[slot] = 0
         self._swapped[slot] = 0
-        self._frames[slot] = 0
 
-    def update(self, window: Window) -> Window:
-        """Write the newest frame's positions from its raw ones, NaN where refused."""
+    def update(self, observation: Observation, person: Person) -> Gated:
+        """What can be of the newest frame, by the bones that these people were found to have before it."""
         s = self._settings
-        stamp = float(window.stamp_s.newest)
-        positions = window.raw.newest.copy()
-        positions[window.confidence.newest < s.min_confidence] = np.nan
-        slots = np.flatnonzero(window.present)
-        window.stuck[:] = False
-        window.stuck[slots] = stuck(window.raw.all[-RECENT - 1 :, slots].swapaxes(0, 1))
-        if s.enabled and window.stuck.any():
-            self._counters["joints_stuck"] += int(window.stuck.sum())
-            positions[window.stuck] = np.nan
-        expected = self._filter.predict(stamp)
+        self._observed.push(observation.positions)
+        positions = observation.positions.copy()
+        positions[observation.confidence < s.min_confidence] = np.nan
+        slots = np.flatnonzero(observation.present)
+        frozen = np.zeros(positions.shape[:2], dtype=bool)
+        frozen[slots] = frozen_joints(self._observed.all[:, slots].swapaxes(0, 1))
+        if s.enabled and frozen.any():
+            self._counters["joints_stuck"] += int(frozen.sum())
+            positions[frozen] = np.nan
+        expected = self._filter.predict(observation.stamp_s)
         if expected is not None:
             distance = _apart(positions, expected.positions)
-            self._measure_noise(window, distance)
+            self._measure_jitter(distance)
             if s.enabled:
-                self._judge(window, positions, expected, distance)
-        self._filter.update(positions, stamp)
-        window.positions.push(positions)
-        return window
+                self._judge(positions, person, expected, distance)
+        self._filter.update(positions, observation.stamp_s)
+        return Gated(observation, positions, self._jitter.copy(), frozen)
 
-    def _judge(
-        self,
-        window: Window,
-        positions: NDArray[np.float64],
-        expected: Smoothed,
-        distance: NDArray[np.float64],
-    ) -> None:
+    def _judge(self, positions: Floats, person: Person, expected: Smoothed, distance: Floats) -> None:
         """Put exchanged limbs back, and make NaN what is refused, in place."""
         s = self._settings
         known = np.isfinite(expected.positions[..., 0])
@@ -120,39 +104,37 @@ class Gate:
             self._exchange(positions, expected.positions, known)
             distance = _apart(positions, expected.positions)
         seen = np.isfinite(positions[..., 0])
-        least = np.maximum(s.jump, _JUMP_NOISES * window.noise)[:, None]
+        least = np.maximum(s.jump, _JUMP_NOISES * self._jitter)[:, None]
         jumped = seen & known & (distance > least + 3 * expected.sigma)
         everywhere = jumped.sum(axis=1) > _BODY_JUMP * np.maximum((seen & known).sum(axis=1), 1)
-        self._believe(everywhere[:, None] & jumped)
+        self._expect_anew(everywhere[:, None] & jumped)
         jumped &= ~everywhere[:, None]
-        refused = jumped | (self._bad_bones(window, positions) & ~everywhere[:, None])
+        refused = jumped | (self._bad_bones(positions, person) & ~everywhere[:, None])
         self._refused = np.where(refused, self._refused + 1, 0)
         overruled = self._refused > s.patience * FPS
-        self._believe(overruled)
+        self._expect_anew(overruled)
         refused &= ~overruled
         self._refused[overruled] = 0
         if refused.any():
             self._counters["joints_refused"] += int(refused.sum())
             positions[refused] = np.nan
 
-    def _measure_noise(self, window: Window, distance: NDArray[np.float64]) -> None:
-        """Keep ``window.noise``, from how far (S, 22) the middle one of a body's joints comes from where expected.
+    def _measure_jitter(self, distance: Floats) -> None:
+        """Go on measuring the jitter, from how far (S, 22) the middle one of a body's joints comes from where expected.
 
         The middle one, so that a limb thrown about, or a joint that jumps, says nothing about the sensor. Noise that
         lasts over frames is not seen here; it belongs to the sensor's bias.
         """
-        noise = _middle(distance) / _DISTANCE_OF_NOISE
-        for slot in np.flatnonzero(np.isfinite(noise)):
+        jitter = _middle(distance) / _DISTANCE_OF_NOISE
+        for slot in np.flatnonzero(np.isfinite(jitter)):
             self._frames[slot] += 1
-            window.noise[slot] += (noise[slot] - window.noise[slot]) / min(self._frames[slot], _NOISE_MEMORY)
+            self._jitter[slot] += (jitter[slot] - self._jitter[slot]) / min(self._frames[slot], _NOISE_MEMORY)
 
-    def _believe(self, joints: NDArray[np.bool_]) -> None:
+    def _expect_anew(self, joints: Bools) -> None:
         if joints.any():
             self._filter.forget(joints)
 
-    def _exchange(
-        self, positions: NDArray[np.float64], expected: NDArray[np.float64], known: NDArray[np.bool_]
-    ) -> None:
+    def _exchange(self, positions: Floats, expected: Floats, known: Bools) -> None:
         """Put exchanged limbs back: both sides are nearer to where the other was expected."""
         for k, pair in enumerate(_EXCHANGED):
             keep = _apart(positions[:, pair], expected[:, pair]).mean(axis=1)
@@ -166,55 +148,17 @@ class Gate:
                 self._swapped[overruled, k] = 0
                 forget = np.zeros(known.shape, dtype=bool)
                 forget[np.ix_(overruled, pair)] = True
-                self._believe(forget)
+                self._expect_anew(forget)
                 expected[forget] = np.nan
             if exchanged.any():
                 self._counters["limbs_exchanged"] += int(exchanged.sum())
                 rows = np.flatnonzero(exchanged)[:, None]
                 positions[rows, pair] = positions[rows, MIRROR[pair]]
 
-    def _bad_bones(self, window: Window, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def _bad_bones(self, positions: Floats, person: Person) -> Bools:
         """(S, 22) joints at the end of a bone of impossible length."""
-        least = _LEAST_BONE + _BONE_NOISES * window.noise
-        return _of_impossible_length(positions, window.offsets, self._settings.bone, least) & window.measured[:, None]
-
-
-@njit(cache=True)
-def stuck(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(B, 22) joints that a tracker has lost and of which it repeats the last answer.
-
-    They do so in most of the frames in which the body is not repeated whole, and other joints shake.
-
-    Args:
-        positions: (B, T, 22, 3) metres as the sensor gave them, NaN where it did not; the last frames count.
-    """
-    count, frames, joints, _ = positions.shape
-    found = np.zeros((count, joints), dtype=np.bool_)
-    for b in range(count):
-        recent = positions[b, max(frames - RECENT - 1, 0) :]
-        new, repeated, noise = 0, np.zeros(joints), np.zeros(joints)
-        for t in range(1, len(recent)):
-            same = np.ones(joints)
-            for joint in range(joints):
-                for axis in range(3):
-                    if not abs(recent[t, joint, axis] - recent[t - 1, joint, axis]) < SAME:
-                        same[joint] = 0.0
-            if same.mean() <= 0.5:
-                new += 1
-                repeated += same
-        if not (repeated > 0.5 * max(new, _LEAST_NEW)).any():
-            continue
-        for joint in range(joints):
-            square, seen = 0.0, 0
-            for t in range(2, len(recent)):
-                shaken = recent[t, joint] - 2 * recent[t - 1, joint] + recent[t - 2, joint]
-                if np.isfinite(shaken).all():
-                    square += (shaken**2).sum()
-                    seen += 3
-            noise[joint] = math.sqrt(square / 6 / max(seen, 1))
-        if np.median(noise) > LEAST_NOISE:
-            found[b] = repeated > 0.5 * max(new, _LEAST_NEW)
-    return found
+        least = _LEAST_BONE + _BONE_NOISES * self._jitter
+        return _of_impossible_length(positions, person.offsets, self._settings.bone, least) & person.measured[:, None]
 
 
 _LEAF = np.array([not children for children in CHILDREN])

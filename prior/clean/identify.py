@@ -62,7 +62,7 @@ LENGTH_SPREAD = 0.1
 """Of a bone's length, its standard deviation between people."""
 LENGTH_DOUBT = 3.0
 """The most that one bone says against a person: that it was seen wrong is never less likely than that."""
-SURE = 3.0
+CERTAIN_SCORE = 3.0
 """A score this much above all others (20 to 1) needs no more frames."""
 APART = 0.25
 """Metres: two bodies nearer than this to each other are one, seen twice."""
@@ -208,7 +208,7 @@ class Identify:
         waiting = ~old_enough
         for k, person in _best(score):
             others = np.r_[0.0, np.delete(score[k], person), np.delete(score[:, person], k)]
-            if old_enough[k] or score[k, person] - others.max() > SURE:
+            if old_enough[k] or score[k, person] - others.max() > CERTAIN_SCORE:
                 self._become(int(row_of[nameless[k]]), int(away[person]))
             waiting[k] = True
         for k in np.flatnonzero(~waiting):

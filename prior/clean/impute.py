@@ -19,14 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from steadypose.prior.clean.frame import Imputed, Window
-from steadypose.prior.clean.reconstruct import Encoded
+from steadypose.prior.clean.frame import BodyWindows, Bools, Floats, Imputed
 from steadypose.prior.models.hgvae.features import Tracks, from_tracks
 from steadypose.prior.models.hgvae.inference import Reconstruction
-
-Floats = NDArray[np.float64]
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.99
 """of Adam's moments"""
@@ -64,7 +60,7 @@ class ImputeSettings:
     rate: float = 0.05
 
 
-class Climb:
+class LatentAscent:
     """Gradient ascent (Adam) of the latents of one body's window, as it slides."""
 
     def __init__(self, latents: int, settings: ImputeSettings) -> None:
@@ -75,14 +71,13 @@ class Climb:
         self._second = np.zeros_like(self._moved)
         self._count = 0
 
-    def complete(self, encoded: Encoded, row: int, steps: int) -> Reconstruction:
-        """What the model makes of the window in this row of ``encoded``: of the points visited, the one of highest
-        score.
+    def complete(self, windows: BodyWindows, row: int, steps: int) -> Reconstruction:
+        """What the model makes of the window in this row: of the points visited, the one of highest score.
 
         Each of ``steps`` looks at a point and takes a step from it; where the last one leads is seen in the next frame.
-        Without a step, what the climb had gained when it was last looked at is added to the new start.
+        Without a step, what the ascent had gained when it was last looked at is added to the new start.
         """
-        model, start = encoded.model, Reconstruction(*(part[row] for part in encoded.look))
+        model, start = windows.model, Reconstruction(*(part[row] for part in windows.reconstruction))
         best, best_at = start, np.zeros_like(self._moved)
         if not steps:
             return best._replace(mean=best.mean + self._gained)
@@ -94,13 +89,13 @@ class Climb:
                 look, score = model.decode(row, self._moved), model.score(at)
                 if score > best_score:
                     best, best_at, best_score = look, self._moved, score
-                elif step == 0:  # where the climb had come to is worth less than a new start
+                elif step == 0:  # where the ascent had come to is worth less than a new start
                     self._moved, at = best_at, row
-            self._climb(model.gradient(at))
+            self._step(model.gradient(at))
         self._gained = best.mean - start.mean
         return best
 
-    def _climb(self, uphill: Floats) -> None:
+    def _step(self, uphill: Floats) -> None:
         self._count += 1
         self._first += (1 - FIRST_DECAY) * (uphill - self._first)
         self._second += (1 - SECOND_DECAY) * (uphill**2 - self._second)
@@ -110,62 +105,67 @@ class Climb:
 
 
 class Impute:
-    """Gives ``window.imputed``: every body's joints of the last frames, as the model completes its window."""
+    """Every body's joints of the last frames, as the model completes its window."""
 
     def __init__(self, settings: ImputeSettings, delay_frames: int, slots: int, counters: Counter[str]) -> None:
         if settings.steps < 0 or settings.rate <= 0:
             raise ValueError(f"impute: expected steps >= 0 and rate > 0, got {settings.steps} and {settings.rate:g}")
         self._settings, self._counters = settings, counters
-        self.delay_frames = delay_frames
-        self._climbs: list[Climb | None] = [None] * slots
-        self._frame = 0
-        self.hurry = False
-        """Whether this frame is to do without the climb: a live node that falls behind says so."""
+        self._frames = delay_frames + 1
+        self._ascents: list[LatentAscent | None] = [None] * slots
+        self._updates = 0
 
-    def reset(self, slot: NDArray[np.bool_]) -> None:
-        """Forget the bodies in these slots."""
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
         for k in np.flatnonzero(slot):
-            self._climbs[k] = None
+            self._ascents[k] = None
 
     def _turn(self, slot: int) -> bool:
         """Whether it is this body's turn to climb: of many, so many in each frame."""
-        climbing = [k for k, climb in enumerate(self._climbs) if climb or k == slot]
-        turns = -(-len(climbing) // max(1, len(self._climbs) // CLIMBING))
-        return (climbing.index(slot) + self._frame) % turns == 0
+        climbing = [k for k, ascent in enumerate(self._ascents) if ascent or k == slot]
+        turns = -(-len(climbing) // max(1, len(self._ascents) // CLIMBING))
+        return (climbing.index(slot) + self._updates) % turns == 0
 
-    def update(self, window: Window) -> Window:
-        """Complete the windows of those of whom something is hidden in the frames that are still to be answered."""
-        self._frame += 1
-        window.imputed = None
-        encoded, frames = window.encoded, self.delay_frames + 1
-        if encoded is None:
-            self._climbs = [None] * window.slots
-            return window
-        seen = np.asarray(encoded.tracks.observed[..., -frames:].all(axis=-1))
+    def update(self, windows: BodyWindows | None, jitter: Floats, *, hurry: bool) -> Imputed | None:
+        """Complete the windows of those of whom something is hidden in the frames that are still to be answered.
+
+        Args:
+            windows: the newest; nobody is there if None.
+            jitter: (S,) metres, of each body's joints.
+            hurry: whether to do without the ascent: a live node that falls behind says so.
+        """
+        self._updates += 1
+        frames, slots = self._frames, len(self._ascents)
+        if windows is None:
+            self._ascents = [None] * slots
+            return None
+        tracks, found = windows.tracks, windows.reconstruction
+        seen = np.asarray(tracks.observed[..., -frames:].all(axis=-1))
         # A joint never seen in the window is one that the sensor does not have: that takes no climb.
-        lost = np.asarray((encoded.tracks.observed.any(axis=-1) & ~seen).any(axis=-1))
-        mean = encoded.look.mean.copy()
-        for row, slot in enumerate(encoded.slots):
+        lost = np.asarray((tracks.observed.any(axis=-1) & ~seen).any(axis=-1))
+        mean = found.mean.copy()
+        for row, slot in enumerate(windows.slots):
             if seen[row].all():
-                self._climbs[slot] = None
+                self._ascents[slot] = None
                 continue
             steps = self._settings.steps if lost[row] and self._turn(slot) else 0
-            if self.hurry and steps:
+            if hurry and steps:
                 self._counters["imputation_skipped"] += 1
                 steps = 0
-            climb = self._climbs[slot] = self._climbs[slot] or Climb(encoded.model.latents, self._settings)
-            mean[row] = climb.complete(encoded, row, steps).mean
+            ascent = self._ascents[slot] or LatentAscent(windows.model.latents, self._settings)
+            self._ascents[slot] = ascent
+            mean[row] = ascent.complete(windows, row, steps).mean
         hidden = np.flatnonzero(~seen.all(axis=-1))
-        slots, tracks = encoded.slots[hidden], Tracks(*(part[hidden] for part in encoded.tracks))
-        completed = completed_tracks(tracks, mean[hidden], window.noise[slots])[..., -frames:]
-        imputed = Imputed(np.full((frames, window.slots, 22, 3), np.nan), np.full((frames, window.slots, 22), np.inf))
-        imputed.positions[:, slots] = from_tracks(completed, tracks, encoded.size[hidden]).swapaxes(0, 1)
-        # at the start: where the climb ends, the model is surer than it is right
-        variance = (encoded.look.sigma[hidden, :, -frames:] ** 2).reshape(-1, 22, 3, frames).mean(axis=2)
-        sigma = SIGMA_FOUND * encoded.size[hidden, None, None] * np.sqrt(variance)
-        imputed.sigma[:, slots] = sigma.transpose(2, 0, 1)
-        window.imputed = imputed
-        return window
+        of, size = windows.slots[hidden], windows.size[hidden]
+        tracks = Tracks(*(part[hidden] for part in tracks))
+        completed = completed_tracks(tracks, mean[hidden], jitter[of])[..., -frames:]
+        imputed = Imputed(np.full((frames, slots, 22, 3), np.nan), np.full((frames, slots, 22), np.inf))
+        imputed.positions[:, of] = from_tracks(completed, tracks, size).swapaxes(0, 1)
+        # at the start: where the ascent ends, the model is surer than it is right
+        variance = (found.sigma[hidden, :, -frames:] ** 2).reshape(-1, 22, 3, frames).mean(axis=2)
+        sigma = SIGMA_FOUND * size[:, None, None] * np.sqrt(variance)
+        imputed.sigma[:, of] = sigma.transpose(2, 0, 1)
+        return imputed
 
 
 def completed_tracks(tracks: Tracks, mean: Floats, noise: Floats | float = 0.0) -> Floats:

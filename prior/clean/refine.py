@@ -9,9 +9,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import heading, yaw_matrix
-from steadypose.prior.clean.frame import Window
+from steadypose.prior.clean.frame import Bools, Floats, Gated, Person
 from steadypose.prior.models.hmvae.inference import LiveHMVAE
+from steadypose.prior.timing.ring import Ring
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class RefineSettings:
 
 
 class Refine:
-    """Centre-frame refinement by HM-VAE, with a delay of one's choice.
+    """Local rotations of the last frames: solved from the joints seen and, if enabled, refined by HM-VAE.
 
     A window N_1 … N_T goes through the posterior's mean and the decoder, and its frame ``T - 1 - delay`` (counted
     from 0) is kept by the fusion that follows. With the default delay T / 2 that is index T / 2 - 1, the paper's
@@ -37,34 +39,47 @@ class Refine:
     are filled up with the first frame.
     """
 
-    def __init__(self, settings: RefineSettings, delay_frames: int) -> None:
+    def __init__(self, settings: RefineSettings, delay_frames: int, slots: int) -> None:
         self._enabled = settings.enabled
         self._reconstruct = LiveHMVAE.load(settings.weights)
-        self.window = self._reconstruct.window
-        if not 0 <= delay_frames <= 2 * self.window:
+        self._window = self._reconstruct.window
+        if not 0 <= delay_frames <= 2 * self._window:
             raise ValueError(
-                f"delay: expected 0 to {2 * self.window} frames (twice the model's window), got {delay_frames}"
+                f"delay: expected 0 to {2 * self._window} frames (twice the model's window), got {delay_frames}"
             )
-        self.delay_frames = delay_frames
+        self._solved = Ring(self._window, (slots, 22, 3, 3))
+        shape = (max(self._window, delay_frames + 1), slots, 22, 3, 3)
+        self._decoded = np.broadcast_to(np.eye(3), shape).copy()
 
-    def reset(self, slot: NDArray[np.bool_]) -> None:
-        """Nothing is kept here."""
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
+        self._solved.clear(slot)
+        self._decoded[:, slot] = np.eye(3)
 
-    def update(self, window: Window) -> Window:
-        """Write ``window.decoded`` for every body present, all of them in one batch."""
-        slots = np.flatnonzero(window.present)
-        kept = self.window // 2 + 1  # from the centre on; before it, a frame stays as it was decoded
-        window.decoded[:-1] = window.decoded[1:]
-        frames = window.rotations.all[-self.window :, slots]
+    def update(self, gated: Gated, person: Person) -> Floats:
+        """(K, S, 22, 3, 3) local rotations of the last frames on these bones; what is not seen keeps what it had."""
+        slots = np.flatnonzero(gated.observation.present)
+        self._solve(gated.positions, person.offsets, slots)
+        kept = self._window // 2 + 1  # from the centre on; before it, a frame stays as it was decoded
+        self._decoded[:-1] = self._decoded[1:]
+        frames = self._solved.all[:, slots]
         _repeat_first(frames)
         if self._enabled and len(slots):
             # The body faces +x in the centre frame, as in training; only the root's rotation knows.
-            back = yaw_matrix(heading(frames[self.window // 2 - 1, :, 0]))
-            x = np.empty((len(slots), self.window, 22, 6), dtype=np.float32)
+            back = yaw_matrix(heading(frames[self._window // 2 - 1, :, 0]))
+            x = np.empty((len(slots), self._window, 22, 6), dtype=np.float32)
             _facing_forward(frames, back, x)
             frames = rotations_of(self._reconstruct(x)[:, -kept:], back)
-        window.decoded[-kept:, slots] = frames[-kept:]
-        return window
+        self._decoded[-kept:, slots] = frames[-kept:]
+        return self._decoded
+
+    def _solve(self, positions: Floats, offsets: Floats, slots: NDArray[np.intp]) -> None:
+        """Solve the newest frame's rotations."""
+        before = self._solved.newest[slots]
+        fallback = np.where(np.isnan(before), np.eye(3), before)
+        rotations = np.full_like(self._solved.newest, np.nan)
+        rotations[slots] = solve_rotations(positions[slots], offsets[slots], fallback)
+        self._solved.push(rotations)
 
 
 @njit(cache=True)

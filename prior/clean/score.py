@@ -12,15 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from steadypose.prior.clean.frame import Window
-from steadypose.prior.clean.reconstruct import Encoded
-from steadypose.prior.models.hgvae.anomaly import Calibration, decimals, judged
+from steadypose.prior.clean.frame import BodyWindows, Bools, Floats, Score, SensorNoise
+from steadypose.prior.models.hgvae.anomaly import Calibration, decimals, joint_odds
 from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -38,41 +34,41 @@ class ScoreSettings:
     hold: float = 0.3
 
 
-class Score:
-    """Writes ``window.anomaly``, ``window.joint_anomaly`` and, with hysteresis, ``window.anomaly_flag``."""
+class Scorer:
+    """Scores the newest window of each body, and raises the flag with hysteresis."""
 
-    delay_frames = 0
-
-    def __init__(self, settings: ScoreSettings, weights: str, sensor_sigma: float, slots: int) -> None:
+    def __init__(self, settings: ScoreSettings, weights: str, noise: SensorNoise, slots: int) -> None:
         if not 0 < settings.false_alarms < 1:
             raise ValueError(f"score.false_alarms: expected a share between 0 and 1, got {settings.false_alarms:g}")
         self._height = -np.log10(settings.false_alarms)
         self._hold = settings.hold
-        self._network = LiveFaultNet.load(weights, sensor_sigma, slots)
-        self._calibration = Calibration.load(weights).at(sensor_sigma)
+        self._network = LiveFaultNet.load(weights, noise.total_sigma, slots)
+        self._calibration = Calibration.load(weights).at(noise.total_sigma)
         self._quiet_s = np.full(slots, np.inf)
+        self._flag = np.zeros(slots, dtype=bool)
 
-    def reset(self, slot: NDArray[np.bool_]) -> None:
-        """Forget the bodies in these slots."""
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
         self._quiet_s[slot] = np.inf
+        self._flag = self._flag & ~slot
 
-    def update(self, window: Window) -> Window:
-        """Score the newest window of each body."""
-        window.anomaly[:], window.joint_anomaly[:] = np.nan, np.nan
-        if window.encoded:
-            slots = window.encoded.slots
-            window.anomaly[slots], window.joint_anomaly[slots] = self._score(window.encoded, window.stuck[slots])
+    def update(self, windows: BodyWindows | None, frozen: Bools) -> Score:
+        """The score of the newest frame, in which the joints ``frozen`` (S, 22) repeat themselves."""
+        anomaly, joint_anomaly = np.full(len(frozen), np.nan), np.full(frozen.shape, np.nan)
+        if windows is not None:
+            slots = windows.slots
+            anomaly[slots], joint_anomaly[slots] = self._score(windows, frozen[slots])
         with np.errstate(invalid="ignore"):
-            self._quiet_s = np.where(window.anomaly > self._height / 2, 0.0, self._quiet_s + 1 / FPS)
-            raised = window.anomaly > self._height
-        window.anomaly_flag = raised | window.anomaly_flag & (self._quiet_s < self._hold)
-        return window
+            self._quiet_s = np.where(anomaly > self._height / 2, 0.0, self._quiet_s + 1 / FPS)
+            raised = anomaly > self._height
+        self._flag = raised | self._flag & (self._quiet_s < self._hold)
+        return Score(anomaly, self._flag, joint_anomaly)
 
-    def _score(self, encoded: Encoded, stuck: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-        """The anomaly of each window (B,) and, on the same scale, of its joints (B, 22); some are known to be stuck."""
-        tracks, look = encoded.tracks, encoded.look
-        odds = self._network(tracks.x, look.mean, look.sigma, tracks.observed)
-        odds = judged(odds, tracks.observed, stuck)
+    def _score(self, windows: BodyWindows, frozen: Bools) -> tuple[Floats, Floats]:
+        """The anomaly of each window (B,) and, on the same scale, of its joints (B, 22)."""
+        tracks, found = windows.tracks, windows.reconstruction
+        odds = self._network(tracks.x, found.mean, found.sigma, tracks.observed)
+        odds = joint_odds(odds, tracks.observed, frozen)
         unseen = np.isinf(odds)
         told = decimals(odds, self._calibration, unseen.sum(axis=-1))
         return told.max(axis=-1), np.where(unseen, np.nan, told)

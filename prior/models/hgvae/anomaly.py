@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 MISSING = (0, 4, 8, 14)
 """Joints missing at which the scale was measured; between them it is interpolated."""
 
-STUCK_ODDS = 12.0
+FROZEN_ODDS = 12.0
 """of a joint of which the last answer is repeated while the others shake, logarithm"""
 
 SENSOR_SIGMAS = (0.003, 0.01, 0.02, 0.04)
@@ -67,16 +67,16 @@ class Calibration:
         return Calibration((1 - share) * self.quantiles[:, low] + share * self.quantiles[:, low + 1])
 
 
-def judged(odds: Floats, observed: Floats, stuck: NDArray[np.bool_]) -> Floats:
+def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Floats:
     """(B, 22) what a fault network says, -inf of joints not seen in the frames that are scored.
 
     Args:
         odds: (B, 22) of `FaultNet`.
         observed: (B, 66, T) more than 0 where seen.
-        stuck: (B, 22) joints of which the sensor repeats its last answer.
+        frozen: (B, 22) joints of which the sensor repeats its last answer.
     """
     seen = (observed[:, ::3, -RECENT:] > 0).any(axis=-1)
-    return np.where(seen, np.where(stuck, np.maximum(odds, STUCK_ODDS), odds), -np.inf)
+    return np.where(seen, np.where(frozen, np.maximum(odds, FROZEN_ODDS), odds), -np.inf)
 
 
 def decimals(score: Floats, calibration: Calibration, missing: NDArray[np.integer]) -> Floats:

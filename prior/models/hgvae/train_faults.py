@@ -15,9 +15,8 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
-from steadypose.prior.clean.gate import LEAST_NOISE, stuck
 from steadypose.prior.models.distributed import share
-from steadypose.prior.models.hgvae.anomaly import MISSING, RATES, SENSOR_SIGMAS, Calibration, judged
+from steadypose.prior.models.hgvae.anomaly import MISSING, RATES, SENSOR_SIGMAS, Calibration, joint_odds
 from steadypose.prior.models.hgvae.config import SCALE, FaultNetConfig, HGVAEConfig
 from steadypose.prior.models.hgvae.fault_features import RECENT, fault_features
 from steadypose.prior.models.hgvae.faults import FaultNet
@@ -45,6 +44,7 @@ from steadypose.prior.motion.corruption import (
     stands_still,
 )
 from steadypose.prior.motion.dataset import MotionSet
+from steadypose.prior.timing.frozen_joints import LEAST_NOISE, frozen_joints
 
 Floats = NDArray[np.float64]
 
@@ -171,13 +171,13 @@ def _reconstruct(
 
 @torch.inference_mode()
 def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Floats:
-    """(B, 22) odds, `judged`, of windows (B, T, 22, 3) of bodies of sizes (B,)."""
+    """(B, 22) odds, `joint_odds`, of windows (B, T, 22, 3) of bodies of sizes (B,)."""
     bias_sigma, mean, parts = sensor_sigma * np.sqrt(1.0 - FAST), network.mean.numpy(), []
     for start in range(0, len(seen), 256):
         some = slice(start, start + 256)
         reconstructed = _reconstruct(model, seen[some], sizes[some], bias_sigma)
         odds = network(torch.from_numpy(fault_features(*reconstructed, sensor_sigma, mean)))
-        parts.append(judged(odds.double().numpy(), reconstructed[-1], stuck(seen[some])))
+        parts.append(joint_odds(odds.double().numpy(), reconstructed[-1], frozen_joints(seen[some])))
     return np.concatenate(parts)
 
 

@@ -1,4 +1,5 @@
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -6,17 +7,18 @@ import torch
 from tests.helpers.bodies import stream, waving
 
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
-from steadypose.prior.clean.frame import Window
-from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
-from steadypose.prior.clean.score import Score, ScoreSettings
+from steadypose.prior.clean.frame import SensorNoise
+from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.score import Scorer, ScoreSettings
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.models.hgvae.anomaly import (
+    FROZEN_ODDS,
     MISSING,
     RATES,
     SENSOR_SIGMAS,
-    STUCK_ODDS,
     Calibration,
     decimals,
-    judged,
+    joint_odds,
 )
 from steadypose.prior.models.hgvae.config import FaultNetConfig
 from steadypose.prior.models.hgvae.fault_features import OFF_SCALE, RECENT, ROUGH_SCALE, fault_features
@@ -75,14 +77,14 @@ def test_the_fault_network_is_told_of_what_was_seen_alone() -> None:
     np.testing.assert_allclose(told[..., 81], np.tile(np.log([[1.0], [2.0]]), 66), atol=1e-6)
 
 
-def test_a_joint_not_seen_of_late_has_no_odds_and_a_stuck_one_high_ones() -> None:
+def test_a_joint_not_seen_of_late_has_no_odds_and_a_frozen_one_high_ones() -> None:
     observed = np.ones((2, 66, 20))
     observed[0, 3 * J["neck"] : 3 * J["neck"] + 3, -RECENT:] = 0
-    stuck = np.zeros((2, 22), dtype=bool)
-    stuck[:, J["neck"]] = True
-    odds = judged(np.zeros((2, 22)), observed, stuck)
+    frozen = np.zeros((2, 22), dtype=bool)
+    frozen[:, J["neck"]] = True
+    odds = joint_odds(np.zeros((2, 22)), observed, frozen)
     assert odds[0, J["neck"]] == -np.inf
-    assert odds[1, J["neck"]] == STUCK_ODDS
+    assert odds[1, J["neck"]] == FROZEN_ODDS
     assert (np.delete(odds, J["neck"], axis=1) == 0).all()
 
 
@@ -137,12 +139,12 @@ def test_exchanged_arms_raise_the_flag_which_goes_down_after_they_are_over() -> 
 
 
 def test_a_flag_is_held_until_it_has_been_quiet_for_a_while() -> None:
-    stage = Score(ScoreSettings(false_alarms=0.01, hold=0.1), "default", 0.02, 1)
-    window = Window(4, 1)
+    stage = Scorer(ScoreSettings(false_alarms=0.01, hold=0.1), "default", SensorNoise(0.02, 0.0), 1)
     told = iter([0.0, 2.5, 1.5, 0.9, 0.9, 0.9, 0.9, 2.5])
-    window.encoded = SimpleNamespace(slots=np.array([0]))  # type: ignore[assignment]
+    windows: Any = SimpleNamespace(slots=np.array([0]))
+    frozen = np.zeros((1, 22), dtype=bool)
     stage._score = lambda *_: (np.array([next(told)]), np.zeros((1, 22)))  # type: ignore[method-assign]
-    flags = [bool(stage.update(window).anomaly_flag[0]) for _ in range(8)]
+    flags = [bool(stage.update(windows, frozen).flag[0]) for _ in range(8)]
     assert flags == [False, True, True, True, True, False, False, True]
 
 

@@ -1,11 +1,13 @@
 import numpy as np
 import pytest
 from tests.helpers.bodies import stream, waving
+from tests.helpers.values import gated
 
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.denoise import MODEL_SIGMA, NOISE_LEFT, Denoise, _place_pelvis
-from steadypose.prior.clean.frame import Window
-from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+from steadypose.prior.clean.history import History
+from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.fixed_lag import Smoothed
 
 
@@ -60,30 +62,26 @@ def test_lost_frames_do_not_make_the_answer_flicker() -> None:
 
 def test_the_weight_is_that_of_least_variance() -> None:
     """Of estimates with noise n and own + sqrt(NOISE_LEFT) n', correlated as the better of the two demands."""
-    stage = Denoise(measurement_sigma=0.02, delay_frames=0, slots=1)
-    window = Window(4, 1)
-    window.noise[:] = 0.04
-    window.positions.push(np.zeros((1, 22, 3)))
+    stage, history, jitter = Denoise(jitter_sigma=0.02, delay_frames=0, slots=1), History(4, 1), np.array([0.04])
+    history.append(gated(np.zeros((1, 22, 3))))
     stage._found[:] = 1.0
     smoothed = Smoothed(0.0, np.zeros((1, 22, 3)), np.full((1, 22), 0.012))
-    share = stage.denoised(window, smoothed, 0).positions[0, 0, 0]
+    share = stage.denoised(smoothed, history, jitter, 0).positions[0, 0, 0]
     first, second, both = 0.012**2, NOISE_LEFT * 0.012**2 + MODEL_SIGMA**2, NOISE_LEFT * 0.012**2
     variance = [(1 - w) ** 2 * first + w**2 * second + 2 * w * (1 - w) * both for w in np.linspace(0, 1, 10_001)]
     assert share == pytest.approx(np.argmin(variance) / 10_000, abs=2e-4)
-    assert stage.denoised(window, smoothed, 0).sigma[0, 0] == pytest.approx(np.sqrt(min(variance)), rel=1e-3)
+    assert stage.denoised(smoothed, history, jitter, 0).sigma[0, 0] == pytest.approx(np.sqrt(min(variance)), rel=1e-3)
 
 
 def test_hidden_joints_and_bodies_that_left_are_not_touched() -> None:
-    stage = Denoise(measurement_sigma=0.02, delay_frames=0, slots=2)
-    window = Window(4, 2)
-    window.noise[:] = 0.04
+    stage, history, jitter = Denoise(jitter_sigma=0.02, delay_frames=0, slots=2), History(4, 2), np.full(2, 0.04)
     seen = np.zeros((2, 22, 3))
     seen[0, J["left_wrist"]] = np.nan
-    window.positions.push(seen)
+    history.append(gated(seen))
     stage._found[:] = 1.0
-    stage.reset(np.array([False, True]))
+    stage.forget(np.array([False, True]))
     smoothed = Smoothed(0.0, np.zeros((2, 22, 3)), np.full((2, 22), 0.012))
-    moved = stage.denoised(window, smoothed, 0).positions[..., 0]
+    moved = stage.denoised(smoothed, history, jitter, 0).positions[..., 0]
     assert moved[0, J["left_wrist"]] == 0
     assert (moved[0, : J["left_wrist"]] > 0).all()
     assert (moved[1] == 0).all()

@@ -7,7 +7,8 @@ from tests.helpers.bodies import PERIOD_NS, raw, waving
 
 from steadypose.benchmarks.systems.identity import MANIFEST, all_hidden, identified, nearest, score, source, watch
 from steadypose.prior.clean.identify import Identify, IdentifySettings
-from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.sim.streams import read_manifest
 
 START_NS = 1_700_000_000_000_000_000

@@ -12,7 +12,8 @@ from steadypose.msgs.types import JointState, Pose, PoseClean, PoseRaw
 from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
-from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings, load_loops
+from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
+from steadypose.prior.clean.settings import PriorSettings
 
 
 def clean(messages: list[PoseRaw], **settings) -> tuple[list[PoseClean], PriorPipeline]:

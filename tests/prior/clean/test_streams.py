@@ -13,7 +13,8 @@ from tests.helpers.bodies import raw, waving
 from steadypose.msgs.types import Pose, PoseClean, PoseRaw
 from steadypose.prior.clean.batch import PATIENCE_NS, StreamBatch
 from steadypose.prior.clean.impute import ImputeSettings
-from steadypose.prior.clean.pipeline import PriorPipeline, PriorSettings
+from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.resample import PERIOD_NS, Resampler
 
 NOW_NS = 100_000 * PERIOD_NS
@@ -57,7 +58,7 @@ def end(arrivals: list[Arrival]) -> Arrival:
 
 def serve(*kiosks: list[Arrival], **settings) -> tuple[dict[str, list[PoseClean]], StreamBatch]:
     """The answers to each kiosk."""
-    batch = StreamBatch(PriorSettings.from_dict({"max_bodies": 16} | settings), streams=4)
+    batch = StreamBatch(PriorSettings.from_dict({"max_bodies": 16} | settings), max_streams=4)
     answers: dict[str, list[PoseClean]] = {}
     for now_ns, message in heapq.merge(*kiosks, key=lambda arrival: arrival[0]):
         for clean in batch.process_at(message, now_ns):
@@ -122,7 +123,7 @@ def test_who_is_late_holds_up_nobody() -> None:
     prompt = kiosk("prompt", 60)
     slow = kiosk("slower", 60)
     stuck = [(slow[26][0] if 20 <= k < 26 else now, m) for k, (now, m) in enumerate(slow)]
-    batch = StreamBatch(PriorSettings(), streams=2)
+    batch = StreamBatch(PriorSettings(), max_streams=2)
     waited = []
     for now_ns, message in heapq.merge(prompt, stuck, key=lambda a: a[0]):
         for clean in batch.process_at(message, now_ns):
@@ -201,7 +202,7 @@ def test_nonsense_from_one_is_counted_and_the_others_go_on() -> None:
 
 
 def test_a_server_that_falls_behind_imputes_without_the_climb() -> None:
-    batch = StreamBatch(PriorSettings(impute=ImputeSettings(steps=1)), streams=2)
+    batch = StreamBatch(PriorSettings(impute=ImputeSettings(steps=1)), max_streams=2)
     for k, (now_ns, message) in enumerate(kiosk("hidden", 20)):
         if k > 8:
             message.bodies[0].positions[[18, 20]] = np.nan

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import torch
 from tests.helpers.bodies import waving
+from tests.helpers.values import gated
 
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import MIRROR, J
 from steadypose.prior.clean.correct import Correct, CorrectSettings
-from steadypose.prior.clean.frame import Window
 from steadypose.prior.models.sensor_bias.features import (
     FEATURES,
     HISTORY,
@@ -69,13 +69,10 @@ def test_a_young_body_is_remembered_as_it_was_first_seen() -> None:
 
 
 def correct(positions: np.ndarray) -> np.ndarray:
-    stage, window = Correct(CorrectSettings("kinect_v2"), 1), Window(8, 1)
-    window.present[:] = True
+    stage = Correct(CorrectSettings("kinect_v2"), 1)
     out = []
     for k, frame in enumerate(positions):
-        window.stamp_s.push(k / 30)
-        window.positions.push(frame[None])
-        out.append(stage.update(window).positions.newest[0].copy())
+        out.append(stage.update(gated(frame[None], k / 30)).positions[0])
     return np.array(out)
 
 

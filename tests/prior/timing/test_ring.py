@@ -2,8 +2,6 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.clean.frame import Window
 from steadypose.prior.timing.ring import Ring
 
 
@@ -34,15 +32,3 @@ def test_a_frame_amended_stays_so_as_the_ring_turns() -> None:
     assert ring.all[:, :, 0].tolist() == [[2.0, 2.0], [9.0, 3.0], [4.0, 4.0]]
     ring.push(np.full((2, 1), 5.0))
     assert ring.all[:, :, 0].tolist() == [[9.0, 3.0], [4.0, 4.0], [5.0, 5.0]]
-
-
-def test_clearing_a_slot_leaves_the_others() -> None:
-    window = Window(4, 3)
-    window.positions.push(np.ones((3, 22, 3)))
-    window.offsets[:] = 1.0
-    window.present[:] = True
-    window.clear(np.array([False, True, False]))
-    assert np.isnan(window.positions.newest[1]).all()
-    assert (window.positions.newest[[0, 2]] == 1).all()
-    assert window.present.tolist() == [True, False, True]
-    assert np.array_equal(window.offsets[1], REST_OFFSETS)

@@ -1,0 +1,174 @@
+"""Messages to canonical joints and back: layouts, the sensor's frame, and what no message may bring in."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from steadypose.msgs.types import CleanBody, Pose, PoseClean, PoseRaw, RawBody
+from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
+from steadypose.prior.body.skeleton import finite_joints
+from steadypose.prior.clean.frame import CleanFrame, Floats
+
+MAX_DISTANCE = 30.0
+"""Metres from the sensor beyond which a joint is no sighting."""
+UNIT_TOLERANCE = 0.01
+"""How far from 1 the norm of a sensor pose's quaternion may be."""
+
+
+class Sighting(NamedTuple):
+    """Joints of a body, or of S bodies by slot.
+
+    Attributes:
+        positions: (22, 3) or (S, 22, 3) metres, z up; NaN where unobserved.
+        confidence: (22,) or (S, 22) in 0..1.
+    """
+
+    positions: Floats
+    confidence: Floats
+
+
+def stacked(found: Collection[Sighting]) -> Sighting:
+    """N bodies as one: (N, 22, 3) and (N, 22)."""
+    return Sighting(
+        np.array([seen.positions for seen in found]).reshape(-1, 22, 3),
+        np.array([seen.confidence for seen in found]).reshape(-1, 22),
+    )
+
+
+class SensorFrame(NamedTuple):
+    """Where a sensor stands in the world.
+
+    Attributes:
+        rotation: (3, 3) from its frame to the world's.
+        origin: (3,) metres.
+    """
+
+    rotation: Floats
+    origin: Floats
+
+    @classmethod
+    def of(cls, pose: Pose) -> SensorFrame:
+        """From a message's pose."""
+        return cls(_rotation(pose.orientation.tobytes()), pose.position)
+
+    def levelled(self) -> SensorFrame:
+        """Its own frame, z up."""
+        return SensorFrame(self.rotation, np.zeros(3))
+
+    def to_world(self, positions: Floats) -> Floats:
+        """Of (..., 3) metres in the sensor's frame."""
+        return positions @ self.rotation.T + self.origin
+
+    def from_world(self, positions: Floats) -> Floats:
+        """Of (..., 3) metres in the world."""
+        return (positions - self.origin) @ self.rotation
+
+
+@lru_cache(maxsize=8)
+def _rotation(quaternion: bytes) -> Floats:
+    return Rotation.from_quat(np.frombuffer(quaternion)).as_matrix()
+
+
+def layout_of(raw: PoseRaw, counters: Counter[str]) -> Skeleton | None:
+    """The layout of a message's joints, or None, counted, if the message cannot be used."""
+    layout = SKELETONS.get(raw.skeleton)
+    if layout is None:
+        counters["unknown_skeleton"] += 1
+        return None
+    pose = raw.sensor_pose
+    if not (np.isfinite(pose.position).all() and abs(np.linalg.norm(pose.orientation) - 1) < UNIT_TOLERANCE):
+        counters["sensor_pose_invalid"] += 1
+        return None
+    return layout
+
+
+def sightings(
+    raw: PoseRaw, layout: Skeleton, sensor: SensorFrame, counters: Counter[str], *, numbered: bool
+) -> dict[int, Sighting]:
+    """A message's bodies as canonical joints in the world.
+
+    Args:
+        raw: the message.
+        layout: of its joints.
+        sensor: where the sensor stands.
+        counters: what was refused, by cause.
+        numbered: whether bodies are called by their place in the message, for a source that does not know whose body
+            is whose, or by their id.
+    """
+    found: dict[int, Sighting] = {}
+    for index, body in enumerate(raw.bodies):
+        if len(body.positions) != len(layout.joints):
+            counters["wrong_joint_count"] += 1
+            continue
+        key = index if numbered else body.id
+        if key in found:
+            counters["body_id_repeated"] += 1
+            continue
+        positions, confidence = _sighting(body, layout, counters)
+        found[key] = Sighting(sensor.to_world(positions), confidence)
+    return found
+
+
+def _sighting(body: RawBody, layout: Skeleton, counters: Counter[str]) -> tuple[Floats, Floats]:
+    """A body's canonical joints in the sensor's frame; what is not finite or too far away is missing."""
+    joints = body.positions.astype(np.float64)
+    finite = finite_joints(joints)
+    far = finite & (np.abs(np.where(finite[:, None], joints, 0.0)).max(axis=1) > MAX_DISTANCE)
+    if far.any():
+        counters["joints_too_far"] += int(far.sum())
+        joints[far] = np.nan
+    confidence = np.nan_to_num(body.confidence.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
+    return to_canonical(layout, joints, np.clip(confidence, 0.0, 1.0))
+
+
+def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int]) -> list[CleanBody]:
+    """The bodies of a moment, as that sensor sees them; ``ids`` from slots to what they are called."""
+    estimate, score = frame.estimate, frame.score
+    bodies = []
+    for slot, body_id in ids.items():
+        if not np.isfinite(estimate.positions[slot, 0, 0]):
+            continue
+        rotations = estimate.rotations[slot].copy()
+        rotations[0] = sensor.rotation.T @ rotations[0]
+        bodies.append(
+            CleanBody(
+                id=body_id,
+                positions=sensor.from_world(estimate.positions[slot]),
+                rotations=Rotation.from_matrix(rotations, assume_valid=True).as_quat(),
+                state=estimate.state[slot],
+                sigma=estimate.sigma[slot],
+                anomaly=float(score.anomaly[slot]),
+                anomaly_flag=bool(score.flag[slot]),
+                joint_anomaly=score.joint_anomaly[slot],
+                bone_lengths=np.sqrt((estimate.offsets[slot] ** 2).sum(axis=-1)),
+                raw_positions=sensor.from_world(frame.observed[slot]),
+                raw_confidence=frame.confidence[slot],
+            )
+        )
+    return bodies
+
+
+def clean_message(raw: PoseRaw, stamp_ns: int, delay_frames: int, bodies: list[CleanBody]) -> PoseClean:
+    """The answer to a source of which ``raw`` came last; ``stamp_ns`` is the moment answered, on the source's clock."""
+    return PoseClean(
+        stamp_ns=stamp_ns,
+        frame_id=raw.frame_id,
+        source=raw.source,
+        sensor_pose=raw.sensor_pose,
+        calibrated=raw.calibrated,
+        delay_frames=delay_frames,
+        bodies=bodies,
+    )
+
+
+def end_of_stream(raw: PoseRaw, delay_frames: int) -> PoseClean:
+    """The last answer to a source that has ended with ``raw``."""
+    ended = clean_message(raw, raw.stamp_ns, delay_frames, [])
+    ended.end_of_stream = True
+    return ended

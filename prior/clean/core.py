@@ -1,0 +1,133 @@
+"""The steps from what was seen of a moment to what is said of it, for all bodies together, one slot a body."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from dataclasses import dataclass
+
+from steadypose.prior.clean.correct import Correct
+from steadypose.prior.clean.denoise import Denoise
+from steadypose.prior.clean.frame import Bools, CleanFrame, Floats, Gated, Imputed, Observation, Person, Score
+from steadypose.prior.clean.fuse import Fuse
+from steadypose.prior.clean.gate import Gate
+from steadypose.prior.clean.history import History
+from steadypose.prior.clean.impute import Impute
+from steadypose.prior.clean.person import PersonEstimator
+from steadypose.prior.clean.reconstruct import Reconstruct
+from steadypose.prior.clean.refine import Refine
+from steadypose.prior.clean.score import Scorer
+from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.smooth import Smooth
+from steadypose.prior.timing.fixed_lag import Smoothed
+
+
+@dataclass(frozen=True)
+class _Newest:
+    """What the newest frame has brought, for it and for those that are still to be answered.
+
+    Attributes:
+        gated: the frame.
+        present: (S,) who is there.
+        person: their bones.
+        rotations: (K, S, 22, 3, 3) local, of the last frames.
+        score: as of now.
+        imputed: the last frames, completed; None without that step.
+    """
+
+    gated: Gated
+    present: Bools
+    person: Person
+    rotations: Floats
+    score: Score
+    imputed: Imputed | None
+
+
+class CleanCore:
+    """Observations in, clean frames out, ``settings.delay`` later. Each step keeps its own state, by slot.
+
+    Nothing here reads a clock or draws a random number: the same input gives the same output, bit for bit.
+
+    Args:
+        settings: of the prior.
+        counters: gets what was refused or skipped, by cause.
+    """
+
+    def __init__(self, settings: PriorSettings, counters: Counter[str]) -> None:
+        slots, delay, noise = settings.max_bodies, settings.delay, settings.noise
+        denoise, score, impute = settings.denoise.enabled, settings.score.enabled, settings.impute.enabled
+        self._slots, self._delay = slots, delay
+        self._refine = Refine(settings.refine, delay, slots)
+        self._gate = Gate(settings.gate, slots, counters)
+        self._correct = Correct(settings.correct, slots) if settings.correct.sensor else None
+        self._smooth = Smooth(settings.smooth, delay, slots)
+        self._reconstruct = Reconstruct(settings.encode, noise, slots) if denoise or score or impute else None
+        self._denoise = Denoise(noise.jitter_sigma, delay, slots) if denoise else None
+        self._person = PersonEstimator(settings.bones, noise.bias_sigma, slots)
+        self._score = Scorer(settings.score, settings.encode.weights, noise, slots) if score else None
+        self._impute = Impute(settings.impute, delay, slots, counters) if impute else None
+        self._fuse = Fuse(settings.fuse, noise.bias_sigma)
+        self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
+        self._newest: _Newest | None = None
+
+    def step(self, observation: Observation, *, hurry: bool = False) -> CleanFrame | None:
+        """Take in a frame of the grid, and give what is said of the one ``delay`` before, once there is one.
+
+        In a hurry, hidden joints are imputed without gradient ascent: for a live node that falls behind.
+        """
+        person, present = self._person.current, observation.present  # of the frame before: the one feedback
+        gated = self._gate.update(observation, person)
+        if self._correct:
+            gated = self._correct.update(gated)
+        self._history.append(gated)
+        smoothed = self._smooth.update(gated)
+        windows = self._reconstruct.update(self._history, present, person) if self._reconstruct else None
+        if self._denoise:
+            self._denoise.update(windows, self._history)
+        denoised = None if smoothed is None else self._denoised(smoothed, gated, self._delay)
+        person = self._person.update(denoised, present)
+        score = self._score.update(windows, gated.frozen) if self._score else Score.unscored(self._slots)
+        imputed = self._impute.update(windows, gated.jitter, hurry=hurry) if self._impute else None
+        rotations = self._refine.update(gated, person)
+        self._newest = newest = _Newest(gated, present, person, rotations, score, imputed)
+        return None if denoised is None else self._answer(denoised, newest, self._delay)
+
+    def flush(self) -> list[CleanFrame]:
+        """What is said of the frames that the delay still holds, oldest first."""
+        newest, self._newest = self._newest, None
+        if newest is None:
+            return []
+        held = self._smooth.flush(newest.gated.jitter)
+        return [
+            self._answer(self._denoised(smoothed, newest.gated, back), newest, back)
+            for back, smoothed in zip(reversed(range(len(held))), held, strict=True)
+        ]
+
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
+        steps = (
+            self._gate, self._correct, self._history, self._smooth, self._denoise, self._person, self._score,
+            self._impute, self._refine,
+        )  # fmt: skip
+        for step in steps:
+            if step is not None:
+                step.forget(slot)
+        if self._newest is not None:
+            self._newest = dataclasses.replace(self._newest, present=self._newest.present & ~slot)
+
+    def _denoised(self, smoothed: Smoothed, gated: Gated, back: int) -> Smoothed:
+        """The smoother's estimate of the frame ``back`` before the newest, denoised, if that is wanted."""
+        return self._denoise.denoised(smoothed, self._history, gated.jitter, back) if self._denoise else smoothed
+
+    def _answer(self, denoised: Smoothed, newest: _Newest, back: int) -> CleanFrame:
+        """What is said of the frame ``back`` before the newest."""
+        at, imputed = -1 - back, newest.imputed
+        estimate = self._fuse.fuse(
+            denoised,
+            newest.person,
+            newest.rotations[at],
+            imputed and Imputed(imputed.positions[at], imputed.sigma[at]),
+            self._history.unseen_s[at],
+            newest.present,
+        )
+        return CleanFrame(estimate, newest.score, self._history.observed[at], self._history.confidence[at])

@@ -1,0 +1,72 @@
+"""The last frames of every body: what the windows of the models and the frames still to be answered are taken from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from steadypose.prior.clean.frame import Bools, Floats, Gated
+from steadypose.prior.timing.rate import FPS
+from steadypose.prior.timing.ring import Ring
+
+BRIDGED = 3
+"""Frames: when so many at most were lost whole, joints went in a straight line. The models know limbs that are hidden,
+not bodies that flicker, and would pass the flicker on."""
+
+
+class History:
+    """The last frames of S bodies, the newest last. The pipeline appends; everybody else reads.
+
+    A body that is seen again after a frame or three without any of its joints went in a straight line meanwhile: its
+    `positions` of those frames are filled in, once, when it comes back. `unseen_s` still says that they were not seen.
+    """
+
+    def __init__(self, frames: int, slots: int) -> None:
+        self._observed = Ring(frames, (slots, 22, 3))
+        self._confidence = Ring(frames, (slots, 22), fill=0.0)
+        self._positions = Ring(frames, (slots, 22, 3))
+        self._unseen_s = Ring(frames, (slots, 22), fill=np.inf)
+        self._lost = np.zeros(slots, dtype=np.int64)
+
+    @property
+    def observed(self) -> Floats:
+        """(T, S, 22, 3) metres, the joints that came in; NaN where unobserved."""
+        return self._observed.all
+
+    @property
+    def confidence(self) -> Floats:
+        """(T, S, 22) in 0..1."""
+        return self._confidence.all
+
+    @property
+    def positions(self) -> Floats:
+        """(T, S, 22, 3) metres after gate and correction; NaN where unobserved or refused."""
+        return self._positions.all
+
+    @property
+    def unseen_s(self) -> Floats:
+        """(T, S, 22) seconds for which a joint had not been seen by then; 0 where it was, inf where it never was."""
+        return self._unseen_s.all
+
+    def append(self, gated: Gated) -> None:
+        """Take in the newest frame."""
+        self._observed.push(gated.observation.positions)
+        self._confidence.push(gated.observation.confidence)
+        self._positions.push(gated.positions)
+        seen = np.isfinite(gated.positions[..., 0])
+        self._unseen_s.push(np.where(seen, 0.0, self._unseen_s.newest + 1 / FPS))
+        self._bridge(seen.any(axis=1))
+
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
+        for ring in (self._observed, self._confidence, self._positions, self._unseen_s):
+            ring.clear(slot)
+        self._lost[slot] = 0
+
+    def _bridge(self, seen: Bools) -> None:
+        """Fill in the frames in which nothing was seen of the bodies that are ``seen`` (S,) again."""
+        for slot in np.flatnonzero(seen & (self._lost > 0) & (self._lost <= BRIDGED)).tolist():
+            lost = int(self._lost[slot])
+            before, now = self.positions[-2 - lost][slot], self._positions.newest[slot]
+            for back in range(1, lost + 1):
+                self._positions.amend(back, slot, now + back / (lost + 1) * (before - now))
+        self._lost = np.where(seen, 0, self._lost + 1)

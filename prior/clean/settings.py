@@ -1,0 +1,69 @@
+"""Settings of the prior, stage by stage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from steadypose.prior.clean.correct import CorrectSettings
+from steadypose.prior.clean.denoise import DenoiseSettings
+from steadypose.prior.clean.frame import SensorNoise
+from steadypose.prior.clean.fuse import FuseSettings
+from steadypose.prior.clean.gate import GateSettings
+from steadypose.prior.clean.identify import IdentifySettings
+from steadypose.prior.clean.impute import ImputeSettings
+from steadypose.prior.clean.person import PersonSettings
+from steadypose.prior.clean.reconstruct import ReconstructSettings
+from steadypose.prior.clean.refine import RefineSettings
+from steadypose.prior.clean.score import ScoreSettings
+from steadypose.prior.clean.smooth import SmoothSettings
+from steadypose.prior.settings import build_settings
+
+
+@dataclass(frozen=True)
+class PriorSettings:
+    """Settings of the prior: ``[prior]`` of a launch file.
+
+    Attributes:
+        delay: frames at 30 Hz to wait for before answering, 0 to twice the model's window (4, the default, half of
+            it, is the paper's centre-frame refinement).
+        max_bodies: bodies followed at once.
+        timeout: seconds without a sighting after which a body is dropped, and without a frame after which the
+            stream starts anew.
+        bias_sigma: metres along an axis, the sensor's slow error, which no filter averages out: the less of it, the
+            more bones are measured rather than taken from human proportions, and the surer joints are said to be.
+            Depth cameras have 2 cm or more, marker-based motion capture next to none.
+        identify: who tells bodies apart: the source (the default), or the prior.
+        gate, correct, smooth, encode, denoise, bones, score, impute, refine, fuse: settings of the stages.
+    """
+
+    delay: int = 4
+    max_bodies: int = 8
+    timeout: float = 0.5
+    bias_sigma: float = 0.02
+    identify: IdentifySettings = field(default_factory=IdentifySettings)
+    gate: GateSettings = field(default_factory=GateSettings)
+    correct: CorrectSettings = field(default_factory=CorrectSettings)
+    smooth: SmoothSettings = field(default_factory=SmoothSettings)
+    encode: ReconstructSettings = field(default_factory=ReconstructSettings)
+    denoise: DenoiseSettings = field(default_factory=DenoiseSettings)
+    bones: PersonSettings = field(default_factory=PersonSettings)
+    score: ScoreSettings = field(default_factory=ScoreSettings)
+    impute: ImputeSettings = field(default_factory=ImputeSettings)
+    refine: RefineSettings = field(default_factory=RefineSettings)
+    fuse: FuseSettings = field(default_factory=FuseSettings)
+
+    @property
+    def noise(self) -> SensorNoise:
+        """What the sensor is off by."""
+        return SensorNoise(self.smooth.measurement_sigma, self.bias_sigma)
+
+    @classmethod
+    def from_dict(cls, settings: Mapping[str, Any]) -> PriorSettings:
+        """From the section of a launch file.
+
+        Raises:
+            ValueError: a key that does not exist (the message names the nearest that does) or a wrong type.
+        """
+        return build_settings(cls, settings, "prior")
