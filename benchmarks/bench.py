@@ -20,7 +20,7 @@ from steadypose.benchmarks.peers import smoothnet, window_vaes
 from steadypose.benchmarks.peers.filters import PEERS, Peer
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.tuning import Tuned, search
-from steadypose.prior.clean.pipeline import PriorSettings
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.models.hmvae.network import MotionVAE
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from steadypose.benchmarks.machine import uncommitted
-from steadypose.prior.clean.pipeline import PriorSettings
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.models.weights_io import WEIGHTS
 from steadypose.prior.world.pipeline import TrajectorySettings
 
