@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 
 from steadypose.prior.models.distributed import join, neighbours, writes
+from steadypose.prior.models.torch_weights import install as install_weights
 
 
 def train(
@@ -20,6 +21,7 @@ def train(
     start: str | None = None,
     seed: int = 0,
     threads: int = 2,
+    install: bool = False,
 ) -> None:
     """Train a model of the prior on prepared motion.
 
@@ -27,8 +29,8 @@ def train(
     `torchrun --nproc-per-node 2 -m steadypose.nodes.cli train hmvae`.
 
     Takes about an hour on two cores, shows its progress, draws its curves as it goes, and resumes where it was if
-    it is killed and started again. The weights, with a card that says how they were made, replace those in
-    prior/weights.
+    it is killed and started again. The weights, with a card that says how they were made, lie in the run's folder,
+    runs/MODEL-SET; a launch file takes their path. Those that ship are replaced only when asked to, and kept.
 
     Args:
         model: hmvae (refinement), hgvae (anomaly score and imputation), hgvae-wide (the same in the paper's size, for
@@ -42,6 +44,7 @@ def train(
             iterations, say. Not for a correction.
         seed: for weights and sampling.
         threads: CPU threads; under torchrun, of all processes of a machine together.
+        install: put the weights where nodes find them by the set's name; what they replace goes to 'previous' there.
     """
     join()
     torch.set_num_threads(max(threads // neighbours(), 1))
@@ -64,4 +67,4 @@ def train(
         train_model = partial(train_model, start=start)
     path = train_model(data, runs, weights=name, seed=seed)
     if writes():
-        print(f"weights: {path}")
+        print(f"weights: {install_weights(path) if install else path}")

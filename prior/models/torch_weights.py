@@ -14,8 +14,9 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from steadypose.prior.models import weights_io
 from steadypose.prior.models.distributed import writes
-from steadypose.prior.models.weights_io import WEIGHTS, Arrays, load_weights
+from steadypose.prior.models.weights_io import Arrays, load_weights
 
 Config = TypeVar("Config")
 N = TypeVar("N", bound=nn.Module)
@@ -45,6 +46,31 @@ def load_tensors(name: str, model: str) -> tuple[dict[str, Tensor], dict[str, An
     """As `weights_io.load_weights`: the state dict and the configuration of ``model``."""
     weights, config = load_weights(name, model)
     return {key: torch.from_numpy(array) for key, array in weights.items()}, config
+
+
+def install(path: Path) -> Path:
+    """Put weights where nodes look for them by their set's name, with all that lies beside them under their name.
+
+    What they replace moves to the folder ``previous`` there.
+
+    Args:
+        path: ``MODEL-SET.safetensors`` in the folder of a training run.
+
+    Returns:
+        Their new path.
+    """
+    folder = weights_io.WEIGHTS
+    (folder / "previous").mkdir(parents=True, exist_ok=True)
+    for old in _belonging(folder / path.name):
+        os.replace(old, folder / "previous" / old.name)
+    for new in _belonging(path):
+        _write_whole(folder / new.name, new.read_bytes())
+    return folder / path.name
+
+
+def _belonging(path: Path) -> list[Path]:
+    """The files of these weights: themselves, card, curves, and what else goes by their name."""
+    return [file for file in path.parent.glob(f"{path.stem}.*") if file.is_file()]
 
 
 def arrays_of(network: nn.Module) -> Arrays:
@@ -97,7 +123,11 @@ def _write_whole(path: Path, content: bytes) -> None:
 def _commit() -> str:
     try:
         found = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], cwd=WEIGHTS.parent, capture_output=True, text=True, check=True
+            ["git", "describe", "--always", "--dirty"],
+            cwd=weights_io.WEIGHTS.parent,
+            capture_output=True,
+            text=True,
+            check=True,
         )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"

@@ -14,7 +14,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import nn
 from torch.optim import Optimizer
 
-from steadypose.prior.models import weights_io
 from steadypose.prior.models.distributed import average_gradients, from_first, processes, rank, writes
 from steadypose.prior.models.torch_weights import save_weights
 
@@ -76,22 +75,25 @@ class TrainingRun:
                         self._save()
                 progress.update(task, completed=self.step, result=self._latest())
 
-    def ship(self, name: str, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, str]) -> Path:
-        """Write what came of the training among the weights that ship: the model, its card, its curves.
+    def save(self, path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, str]) -> Path:
+        """Write what came of the training: the model, its card, its curves.
 
         Args:
-            name: ``MODEL-SET``.
+            path: ``MODEL-SET.safetensors``; where nodes read weights it comes by `torch_weights.install`.
             model: trained.
             config: what rebuilds it.
             card: heading to content: what it is, its data, licence and training; how well it did is added here.
 
         Returns:
-            The path of the weights.
+            ``path``.
         """
-        path = weights_io.WEIGHTS / f"{name}.safetensors"
-        told = {"Validation": ", ".join(f"{k} {v:.4g}" for k, v in self.curves[-1].items()), "Curves": f"`{name}.png`"}
+        curves = path.with_suffix(".png")
+        told = {
+            "Validation": ", ".join(f"{k} {v:.4g}" for k, v in self.curves[-1].items()),
+            "Curves": f"`{curves.name}`",
+        }
         save_weights(path, model, config, {**card, **told})
-        draw_curves(self.curves, path.with_suffix(".png"))
+        draw_curves(self.curves, curves)
         return path
 
     def _latest(self) -> str:

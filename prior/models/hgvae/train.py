@@ -93,7 +93,7 @@ def train_hgvae(
     rate = learning_rate if start is None else learning_rate / 2
     train_completion(network, train, val, runs / f"{name}-completion", iterations, seed)
     run = fit(network, train, val, runs / name, iterations, batch, rate, seed)
-    path = run.ship(name, network, asdict(network.config), {
+    path = run.save(runs / name / f"{name}.safetensors", network, asdict(network.config), {
         "Model": f"HG-VAE, '{model}' of prior/models/hgvae/train.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject",
         "Licence": LICENCES[weights],

@@ -90,7 +90,7 @@ def train_anomaly(
     network.mean.copy_(model.mean)
     origin = started(network, "hgvae", start)
     run = fit(network, model, train, val, runs / f"{path.stem}-faults", iterations, seed)
-    run.ship(f"{path.stem}.faults", network, asdict(network.config), {
+    run.save(path.with_suffix(".faults.safetensors"), network, asdict(network.config), {
         "Model": f"fault network beside {path.name}, prior/models/hgvae/faults.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, spoilt as in train_faults.py",
         "Licence": LICENCES[weights],

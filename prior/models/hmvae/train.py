@@ -73,8 +73,9 @@ def train_hmvae(
     config = HMVAEConfig()
     model = HMVAE(config)
     origin = started(model, "hmvae", start)
-    run = fit(model, train, val, runs / f"hmvae-{weights}", iterations, batch, learning_rate, STRIDES, seed)
-    return run.ship(f"hmvae-{weights}", model, asdict(config), {
+    name = f"hmvae-{weights}"
+    run = fit(model, train, val, runs / name, iterations, batch, learning_rate, STRIDES, seed)
+    return run.save(runs / name / f"{name}.safetensors", model, asdict(config), {
         "Model": "HM-VAE, window 8, 22 joints (prior/models/hmvae/network.py)",
         "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],

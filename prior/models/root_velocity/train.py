@@ -106,7 +106,8 @@ def train_trajectory(
     optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=learning_rate / 100)
     state = {"model": model, "optimiser": optimiser, "schedule": schedule}
-    run = TrainingRun(runs / f"trajectory-{weights}", state, iterations, every=max(iterations // 50, 1))
+    name = f"trajectory-{weights}"
+    run = TrainingRun(runs / name, state, iterations, every=max(iterations // 50, 1))
     losses: dict[str, float] = {}
 
     def evaluate() -> dict[str, float]:
@@ -122,7 +123,7 @@ def train_trajectory(
         optimiser.step()
         schedule.step()
     config = calibrate(model, val)
-    return run.ship(f"trajectory-{weights}", model, asdict(config), {
+    return run.save(runs / name / f"{name}.safetensors", model, asdict(config), {
         "Model": f"root velocity and contacts, {config.context} frames of context, 22 joints",
         "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],

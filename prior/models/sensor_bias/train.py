@@ -60,8 +60,9 @@ def train_correction(
     net.scale.copy_((x - net.mean).square().nanmean(dim=0).sqrt().nan_to_num().clamp(min=1e-2))
     optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=iterations)
+    name = f"correction-{weights}"
     run = TrainingRun(
-        runs / f"correction-{weights}",
+        runs / name,
         {"net": net, "optimiser": optimiser, "schedule": schedule},
         iterations,
         every=max(iterations // 40, 1),
@@ -81,7 +82,7 @@ def train_correction(
         optimiser.step()
         schedule.step()
         losses.append(1000 * loss.item())
-    return run.ship(f"correction-{weights}", net, asdict(config), {
+    return run.save(runs / name / f"{name}.safetensors", net, asdict(config), {
         "Model": "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses",
         "Data": f"UI-PRMD, Kinect beside Vicon: {', '.join(TRAIN_SUBJECTS)}",
         "Licence": "Apache-2.0; the data is in the public domain (PDDL 1.0)",

@@ -111,8 +111,8 @@ def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, 
     monkeypatch.setattr("steadypose.prior.models.weights_io.WEIGHTS", tmp_path / "weights")
     state, config = load_tensors(str(training.train_trajectory(prepared, tmp_path / "a", iterations=4, batch=4)), "")
     TrajectoryNet(TrajectoryConfig.from_dict(config)).load_state_dict(state)
-    assert (tmp_path / "weights/trajectory-default.md").read_text().startswith("# trajectory-default")
-    assert (tmp_path / "weights/trajectory-default.png").stat().st_size > 0
+    assert (tmp_path / "a/trajectory-default/trajectory-default.md").read_text().startswith("# trajectory-default")
+    assert (tmp_path / "a/trajectory-default/trajectory-default.png").stat().st_size > 0
 
     calls, loss = iter(range(10)), training._loss
 
