@@ -126,6 +126,7 @@ def prepared(path: Path, clips: int = 4) -> Path:
         split=np.array(["train"] * (clips - 1) + ["val"]),
         set=np.array(["default"] * clips),
         subject=np.array([f"person {k}" for k in range(clips)]),
+        source=np.array(["synthetic"] * clips),
         action=np.array(["waving"] * clips),
     )
     return path

@@ -54,6 +54,7 @@ def prepared(tmp_path: Path) -> Path:
         set=np.array(["default"] * 6),
         flat=np.array([True, True, True, False, True, True]),
         subject=np.array(["somebody"] * 6),
+        source=np.array(["synthetic"] * 6),
         action=np.array(["walking"] * 6),
     )
     return path
