@@ -100,10 +100,10 @@ def impute_all(
     passes: dict[str, list[Floats]] = {}
     for t, x, seen, size in zip(clean, guess, observed.astype(float), sizes, strict=True):
         tracks = t._replace(x=x, observed=seen)
-        look = live.look(x[None], seen[None])
+        reconstruction = live.reconstruct(x[None], seen[None])
         batch = Tracks(*(np.asarray(part)[None] for part in tracks))
-        windows = BodyWindows(np.zeros(1, dtype=np.intp), batch, seen[None], np.array([size]), look, live)
-        passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(tracks, look.mean[0]))
+        windows = BodyWindows(np.zeros(1, dtype=np.intp), batch, seen[None], np.array([size]), reconstruction, live)
+        passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(tracks, reconstruction.mean[0]))
         for count in steps:
             climbed = LatentAscent(live.latents, ImputeSettings()).complete(windows, 0, count)
             passes.setdefault(f"HG-VAE, {count} steps", []).append(completed_tracks(tracks, climbed.mean))

@@ -54,7 +54,7 @@ class History:
         self._positions.push(gated.positions)
         seen = np.isfinite(gated.positions[..., 0])
         self._unseen_s.push(np.where(seen, 0.0, self._unseen_s.newest + 1 / FPS))
-        self._bridge(seen.any(axis=1))
+        self._bridge(np.asarray(seen.any(axis=1)))
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""

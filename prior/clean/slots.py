@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.clean.adapt import Sighting
 from steadypose.prior.clean.frame import Bools, Floats
 
@@ -51,7 +52,7 @@ class Slots(Generic[Key]):
     def advance(self, stamp_ns: int, positions: Floats) -> Bools:
         """Go on to this time of the grid, with these joints (S, 22, 3); give the slots whose bodies have timed out."""
         taken = np.array([key is not None for key in self.keys])
-        seen = np.isfinite(positions).all(axis=-1).any(axis=1)
+        seen = np.asarray(finite_joints(positions).any(axis=1))
         self.present = self.present & taken | seen
         new = self._last_seen_ns == 0
         self._last_seen_ns = np.where(seen | new, stamp_ns, self._last_seen_ns)
