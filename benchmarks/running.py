@@ -13,9 +13,10 @@ from rich.console import Console
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_WORLD
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Message
-from steadypose.nodes.graph.launch import POSE_NODES, Launch
-from steadypose.nodes.graph.runtime import SystemClock
+from steadypose.nodes.graph.clock import SystemClock
+from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.supervisor import Supervisor
+from steadypose.nodes.graph.topology import POSE_NODES
 
 START_S = 60.0
 """what the nodes get to come up"""

@@ -26,9 +26,9 @@ class Keys:
     public: bytes
     secret: bytes = field(repr=False)
     server: bytes
-    """whom a subscriber takes for its publisher"""
+    """public key that a subscriber expects of its publishers"""
     clients: frozenset[bytes]
-    """whom a publisher serves; always with `public`, so that one machine's nodes hear each other"""
+    """public keys that a publisher serves; always with `public`, for the subscribers of the same machine"""
 
 
 def create_keys(directory: str | Path) -> Keys:

@@ -45,8 +45,8 @@ LINGER_MS = 1000
 """how long `Publisher.close` waits for what is on its way"""
 
 _PREFIX = struct.Struct("<BII")
-# A subscriber tells its name as a subscription to what nobody publishes: no topic begins with this byte. It is also
-# the last in order, and ZeroMQ subscribes in that order: who has told its name gets its topics.
+# A subscriber sends its name as a subscription to what nobody publishes: no topic begins with this byte. It is also
+# the last in order, and ZeroMQ subscribes in that order: whose name has arrived gets its topics.
 _NAME = b"\xff"
 _PUBLISHERS = 256
 _FAILED_HANDSHAKES = (
@@ -62,7 +62,7 @@ class Publisher:
     """Publishes messages at an address. A context manager.
 
     `publish` never waits: a subscriber that does not read loses what exceeds `SEND_HIGH_WATER`, and sees so from
-    the sequence numbers. With `lossless` it waits instead, for as long as it is told to, until the slowest
+    the sequence numbers. With `lossless` it waits instead, for as long as `publish` says, until the slowest
     subscriber has room.
     """
 
@@ -80,12 +80,12 @@ class Publisher:
             )
         typestore()
         self._sequence: Counter[str] = Counter()
-        self._listeners: set[str] = set()
+        self._subscribers: set[str] = set()
         self._id = int.from_bytes(os.urandom(4), "little")
         self._lossless = lossless
         self._context = zmq.Context()
         self._authenticator = _authenticate(self._context, keys) if keys else None
-        # XPUB, not PUB, because it tells who has subscribed
+        # XPUB, not PUB, because it receives the subscriptions
         self._socket = self._context.socket(zmq.XPUB)
         self._socket.setsockopt(zmq.XPUB_NODROP, lossless)
         self._socket.setsockopt(zmq.SNDHWM, SEND_HIGH_WATER)
@@ -98,7 +98,7 @@ class Publisher:
             self._socket.curve_publickey = keys.public
         try:
             if transport == "ipc":
-                _refuse_taken(endpoint)
+                _refuse_used(endpoint)
             self._socket.bind(endpoint)
         except zmq.ZMQError as error:
             self.close()
@@ -136,16 +136,16 @@ class Publisher:
         return True
 
     @property
-    def listeners(self) -> frozenset[str]:
+    def subscribers(self) -> frozenset[str]:
         """The names of the subscribers that are connected and get what is published from now on."""
         self._note_subscriptions()
-        return frozenset(self._listeners)
+        return frozenset(self._subscribers)
 
-    def wait_for_listeners(self, names: Iterable[str], *, timeout_s: float) -> bool:
+    def wait_for_subscribers(self, names: Iterable[str], *, timeout_s: float) -> bool:
         """Wait until the subscribers of these names are there; False if `timeout_s` passed before."""
         wanted = frozenset(names)
         deadline = time.monotonic() + timeout_s
-        while not wanted <= self.listeners:
+        while not wanted <= self.subscribers:
             left = deadline - time.monotonic()
             if left <= 0:
                 return False
@@ -162,9 +162,9 @@ class Publisher:
             if prefix.startswith(_NAME):
                 name = prefix.removeprefix(_NAME).decode(errors="replace")
                 if change == b"\1":
-                    self._listeners.add(name)
+                    self._subscribers.add(name)
                 elif change == b"\0":
-                    self._listeners.discard(name)
+                    self._subscribers.discard(name)
 
     def close(self) -> None:
         """Stop, once what was published is on its way, or after `LINGER_MS`."""
@@ -205,7 +205,7 @@ class Subscriber:
                 and one subscription to it; open a subscriber for each topic.
             high_water: messages held unread, beyond which the newest are lost; 0 holds all there is memory for.
             keys: for publishers that have them.
-            name: what `Publisher.listeners` calls this subscriber; without one it is not among them.
+            name: what `Publisher.subscribers` calls this subscriber; without one it is not among them.
 
         Raises:
             TransportError: if an address is malformed.
@@ -348,7 +348,7 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def _refuse_taken(endpoint: str) -> None:
+def _refuse_used(endpoint: str) -> None:
     # ZeroMQ would take the path from a publisher that is still there, and neither would notice
     with posix.socket(posix.AF_UNIX) as probe:
         try:

@@ -12,15 +12,18 @@ import os
 import sys
 from importlib.metadata import version
 
+from steadypose.nodes.commands.user_errors import is_for_user
+from steadypose.nodes.graph.extras import extra_of, how_to_install
+
 #: name: (where, what it does)
 COMMANDS = {
     "run": ("steadypose.nodes.commands.run:run", "start the nodes of a launch file, watch them, show how they do"),
     "node": ("steadypose.nodes.commands.node:node", "one node, for another machine or a supervisor such as systemd"),
     "clean": ("steadypose.nodes.commands.clean:clean", "clean a recording or .npz offline, with the nodes' own code"),
-    "echo": ("steadypose.nodes.commands.inspect:echo", "print the messages of a topic or recording"),
-    "hz": ("steadypose.nodes.commands.inspect:hz", "measure the rate of a topic or recording"),
-    "info": ("steadypose.nodes.commands.inspect:info", "what is in a recording, or on a topic"),
-    "plot": ("steadypose.nodes.commands.plot:plot", "what happened in a recording, as pictures"),
+    "echo": ("steadypose.nodes.commands.inspect.echo:echo", "print the messages of a topic or recording"),
+    "hz": ("steadypose.nodes.commands.inspect.hz:hz", "measure the rate of a topic or recording"),
+    "info": ("steadypose.nodes.commands.inspect.info:info", "what is in a recording, or on a topic"),
+    "plot": ("steadypose.nodes.commands.plot.command:plot", "what happened in a recording, as pictures"),
     "prepare": ("steadypose.nodes.commands.prepare:prepare", "motion capture into training data"),
     "train": ("steadypose.prior.models.registry:train", "train a model of the prior"),
     "evaluate": (
@@ -32,27 +35,12 @@ COMMANDS = {
         "make streams as a depth camera would see them, with their truth",
     ),
     "calibrate": (
-        "steadypose.nodes.commands.calibrate:calibrate",
+        "steadypose.nodes.commands.calibrate.command:calibrate",
         "a camera's lens and place in the world, into its launch file",
     ),
     "doctor": ("steadypose.nodes.commands.doctor:doctor", "what is missing on this machine, and how to get it"),
     "keys": ("steadypose.nodes.commands.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),
 }
-
-EXTRA_OF = {
-    "cv2": "oak",
-    "cyclonedds": "ros2",
-    "depthai": "oak",
-    "matplotlib": "view",
-    "mediapipe": "webcam",
-    "ray": "ray",
-    "rclpy": "ros2",
-    "rerun": "view",
-    "roma": "train",
-    "sklearn": "train",
-    "torch": "train",
-}
-"""which extra brings a module that not every command needs"""
 
 USAGE_ERROR = 2
 """exit status: what was asked for cannot be done, and will not be the next time either"""
@@ -98,15 +86,9 @@ def _main(arguments: list[str]) -> int:
         return INTERRUPTED
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
-        if missing not in EXTRA_OF:
+        if (extra := extra_of(missing)) is None:
             raise
-        extra = EXTRA_OF[missing]
-        print(
-            f"steadypose {name}: needs {missing}, which comes with the extra {extra!r} and is not installed: "
-            f"`pip install 'steadypose[{extra}]'`, or in the checkout "
-            f"`.uv/bin/uv sync --frozen --inexact --extra {extra}`",
-            file=sys.stderr,
-        )
+        print(f"steadypose {name}: {how_to_install([missing], extra)}", file=sys.stderr)
         return USAGE_ERROR
     except Exception as error:
         if isinstance(error, BrokenPipeError) or not is_for_user(error):
@@ -128,11 +110,6 @@ def usage() -> str:
             "\n`steadypose COMMAND --help` says more; `steadypose run` plays a bundled stream.",
         )
     )
-
-
-def is_for_user(error: Exception) -> bool:
-    """Errors of this project's own, and of files, say what to do; any other is a bug and keeps its traceback."""
-    return isinstance(error, OSError) or type(error).__module__.startswith("steadypose.")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from steadypose.nodes.commands.cleaning import stream
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.trajectory_node import make_trajectory
-from steadypose.nodes.sources.npz import ArraySource, NpzCollector
+from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sources.npz import ArraySource
 
 
 def clean(

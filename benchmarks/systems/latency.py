@@ -32,7 +32,7 @@ from steadypose.benchmarks.running import START_S, running
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, PoseRaw, RawBody
-from steadypose.nodes.graph.runtime import FRAME_NS, Timeline
+from steadypose.nodes.graph.clock import FRAME_NS, Timeline
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings

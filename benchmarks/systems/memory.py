@@ -16,7 +16,7 @@ from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.benchmarks.running import running
 from steadypose.msgs.types import Diagnostics
-from steadypose.nodes.graph.launch import POSE_NODES
+from steadypose.nodes.graph.topology import POSE_NODES
 
 
 @dataclass(frozen=True)

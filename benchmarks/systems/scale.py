@@ -27,7 +27,7 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.commands.cleaning import clean_recording
-from steadypose.nodes.graph.runtime import FRAME_NS
+from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.settings import PriorSettings

@@ -27,8 +27,8 @@ from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.msgs.types import CONTACTS, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.commands.cleaning import stream
 from steadypose.nodes.graph.threads import one_thread
-from steadypose.nodes.sources.npz import NpzCollector
-from steadypose.nodes.sources.pose_input import RecordingSource
+from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sources.recording import RecordingSource
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import PARENTS, J

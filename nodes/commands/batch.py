@@ -8,7 +8,6 @@ on where it was, and one with new recordings does these.
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
 import multiprocessing
 import os
@@ -26,9 +25,10 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from steadypose.nodes.cli import is_for_user
 from steadypose.nodes.commands.cleaning import clean_recording
-from steadypose.nodes.graph.launch import LaunchError
+from steadypose.nodes.commands.user_errors import is_for_user
+from steadypose.nodes.graph.extras import require_extra
+from steadypose.nodes.graph.settings import LaunchError
 
 MANIFEST = "manifest.jsonl"
 FILES = (".npz", ".csv")
@@ -128,8 +128,8 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
             progress.advance(bar)
             if result["state"] == "failed":
                 failed += 1
-                said = str(result["error"]).removeprefix(f"{job.source}: ")
-                console.print(f"{job.source}: {said}", style="red", markup=False, highlight=False, soft_wrap=True)
+                cause = str(result["error"]).removeprefix(f"{job.source}: ")
+                console.print(f"{job.source}: {cause}", style="red", markup=False, highlight=False, soft_wrap=True)
             elif not result["poses"]:
                 console.print(f"{job.source}: no body was recognised", markup=False, highlight=False)
     console.print(f"{out}: {len(found) - failed} of {len(found)} recordings are clean", highlight=False)
@@ -193,7 +193,7 @@ class Manifest:
 
 
 def _models() -> str:
-    """What tells the weights that ship from those of another release."""
+    """A digest of the weights that ship, which differs from that of another release."""
     from steadypose.prior.models import weights_io as checkpoint  # brings torch
 
     files = sorted(file for file in checkpoint.WEIGHTS.iterdir() if file.suffix in (".safetensors", ".json"))
@@ -225,11 +225,11 @@ def on_cores(jobs: Iterable[Job], settings: Settings, cores: int) -> Iterator[tu
         while waiting or busy:
             while waiting and len(busy) < cores:
                 worker = idle.pop() if idle else _Worker(context, settings)
-                worker.give(waiting.popleft())
+                worker.send(waiting.popleft())
                 busy[worker.connection] = worker
             for connection in wait(list(busy)):
                 worker = busy.pop(connection)  # type: ignore[index]  (all that is waited for are connections)
-                result = worker.take()
+                result = worker.receive()
                 if worker.process.is_alive():
                     idle.append(worker)
                 yield worker.job, result
@@ -249,12 +249,12 @@ class _Worker:
         self.process.start()
         theirs.close()  # so that its end closes with the process
 
-    def give(self, job: Job) -> None:
+    def send(self, job: Job) -> None:
         self.job = job
-        with suppress(OSError):  # if the process has died since its last job, `take` tells
+        with suppress(OSError):  # if the process has died since its last job, `receive` says so
             self.connection.send(job)
 
-    def take(self) -> dict[str, Any]:
+    def receive(self) -> dict[str, Any]:
         try:
             return self.connection.recv()
         except (EOFError, OSError):
@@ -282,11 +282,7 @@ def on_ray(jobs: Iterable[Job], settings: Settings) -> Iterator[tuple[Job, dict[
     Raises:
         LaunchError: Ray is not installed.
     """
-    if importlib.util.find_spec("ray") is None:
-        raise LaunchError(
-            "--ray needs ray, which is not installed: run `uv sync --inexact --extra ray` in the checkout, "
-            "or `pip install 'steadypose[ray]'`; without --ray, all cores of this machine are used"
-        )
+    require_extra("ray")
     import ray  # pyright: ignore[reportMissingImports]
 
     ray.init(ignore_reinit_error=True, log_to_driver=False)

@@ -11,7 +11,8 @@ from rich.progress import Progress
 
 from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
 from steadypose.nodes.commands.cleaning import clean_recording
-from steadypose.nodes.graph.launch import LaunchError, apply_override
+from steadypose.nodes.graph.launch import apply_override
+from steadypose.nodes.graph.settings import LaunchError
 
 
 def clean(

@@ -15,10 +15,10 @@ import numpy as np
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.graph.launch import LaunchError
-from steadypose.nodes.sinks.recorder import Filing
-from steadypose.nodes.sources.npz import NpzCollector
-from steadypose.nodes.sources.pose_input import open_source, with_end
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sinks.recorder import LogTimes
+from steadypose.nodes.sources.recording import open_recording, with_end
 
 
 class Cleaner(Protocol):
@@ -93,7 +93,7 @@ def clean_recording(
     to_npz = out.suffix == ".npz"
     if out.exists() and not (replace or to_npz):
         raise LaunchError(f"{out} exists: expected a new directory to write the recording to")
-    frames = open_source(source)
+    frames = open_recording(source)
     # these bring torch, which takes seconds: not before it is known that there is something to do
     from steadypose.nodes.graph.prior_node import make_prior
     from steadypose.nodes.graph.threads import one_thread
@@ -105,13 +105,13 @@ def clean_recording(
     collector = NpzCollector()
     stamps_ns: list[int] = []
     poses = 0
-    filing = Filing()
+    log_times = LogTimes()
     started = time.perf_counter()
     with _unfinished(out) as part:
         with nullcontext() if to_npz else RecordingWriter(part) as writer:
             for topic, message in stream(frames, prior, trajectory):
                 if writer:
-                    writer.write(topic, message, filing.stamp(topic, message.stamp_ns))
+                    writer.write(topic, message, log_times.next(topic, message.stamp_ns))
                 else:
                     collector.add(message)
                 if isinstance(message, PoseRaw) and not message.end_of_stream:

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from steadypose import PACKAGE
+from steadypose.nodes.graph.extras import EXTRAS
 
 # what is looked for is imported where it is looked for: a doctor who needs it all could not say what is missing
 if TYPE_CHECKING:
@@ -38,17 +39,7 @@ INSTALL_EXTRA = (
     if PROJECT.exists()
     else "pip install 'steadypose[{}]'"
 )
-EXTRAS = {
-    "dev": "the tests",
-    "oak": "an OAK camera as the source, and calibrating any camera",
-    "ray": "steadypose clean --ray, on a cluster",
-    "ros2": "the ROS 2 bridge, and skeletons from ROS 2 topics",
-    "train": "steadypose train and evaluate",
-    "view": "the picture in the browser, and steadypose plot",
-    "webcam": "a webcam as the source",
-}
-"""what is optional, by the extra that it takes"""
-TOLD = ("numpy", "numba", "rosbags", "pyzmq")
+KEY_PACKAGES = ("numpy", "numba", "rosbags", "pyzmq")
 """packages whose versions matter when something is wrong"""
 MODELS = ("hmvae", "hgvae", "trajectory")
 FRAMES = 100
@@ -146,10 +137,10 @@ def check_packages() -> Iterator[Finding]:
     if missing := _missing(needed):
         yield Finding("packages", Verdict.BAD, "; ".join(missing), INSTALL)
     else:
-        yield Finding("packages", Verdict.GOOD, ", ".join(f"{name} {version(name)}" for name in TOLD))
+        yield Finding("packages", Verdict.GOOD, ", ".join(f"{name} {version(name)}" for name in KEY_PACKAGES))
     for extra, wanted in sorted(extras.items()):
         if missing := _missing(wanted):
-            found = f"{EXTRAS[extra]}: {'; '.join(missing)}"
+            found = f"{EXTRAS[extra].purpose}: {'; '.join(missing)}"
             yield Finding(f"optional: {extra}", Verdict.NOTE, found, INSTALL_EXTRA.format(extra))
 
 
@@ -233,7 +224,7 @@ def check_clock() -> Iterator[Finding]:
 
 def check_messages() -> Iterator[Finding]:
     """The directory of the ipc sockets, and a message there and back."""
-    from steadypose.nodes.graph.launch import TransportSettings
+    from steadypose.nodes.graph.access import TransportSettings
 
     directory = TransportSettings().ipc_directory
     longest = len(os.fsencode(directory / "trajectory"))
@@ -259,7 +250,7 @@ def _round_trip(endpoint: str) -> float:
 
     name = "doctor"
     with Publisher(endpoint) as publisher, Subscriber(endpoint, POSE_RAW, name=name) as subscriber:
-        if not publisher.wait_for_listeners({name}, timeout_s=5.0):
+        if not publisher.wait_for_subscribers({name}, timeout_s=5.0):
             raise TimeoutError(f"no connection over {endpoint} within 5 s")
         started = time.perf_counter()
         publisher.publish(POSE_RAW, _standing(0))
@@ -342,12 +333,13 @@ def check_streams() -> Iterator[Finding]:
     """What the default launch file plays."""
     from steadypose.msgs.recording import RecordingReader
     from steadypose.nodes.graph.launch import Launch, bundled
-    from steadypose.nodes.sources.pose_input import open_source
+    from steadypose.nodes.sources.recording import open_recording
+    from steadypose.nodes.sources.registry import InputSettings
 
     fix = f"{_restored('sim_data launch')}, or play your own: steadypose run --input RECORDING"
-    recording = Path(Launch.read("replay").input.recording).resolve()
+    recording = Path(Launch.read("replay").settings(InputSettings).recording).resolve()
     try:
-        open_source(recording)
+        open_recording(recording)
     except (OSError, ValueError) as error:
         yield Finding("bundled streams", Verdict.BAD, str(error), fix)
         return

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from steadypose.msgs.keys import create_keys
-from steadypose.nodes.graph.launch import LaunchError
+from steadypose.nodes.graph.settings import LaunchError
 
 
 def keys(directory: Path) -> None:

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 import signal
 from typing import Annotated
 
 import tyro
 
-from steadypose.nodes.graph.launch import LISTENS, Launch, LaunchError, nearest
-
-#: name: the class that is the node
-CLASSES = {
-    "pose_input": "steadypose.nodes.sources.pose_input:PoseInputNode",
-    "prior": "steadypose.nodes.graph.prior_node:PriorNode",
-    "trajectory": "steadypose.nodes.graph.trajectory_node:TrajectoryNode",
-    "ros2_bridge": "steadypose.nodes.sinks.ros2.bridge:Ros2BridgeNode",
-    "recorder": "steadypose.nodes.sinks.recorder:RecorderNode",
-    "viewer": "steadypose.nodes.sinks.viewer:ViewerNode",
-}
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError, nearest
+from steadypose.nodes.graph.topology import NODES, load
 
 
 def node(
@@ -34,11 +25,10 @@ def node(
         launch: a launch file, or the name of one of the project's own.
         settings: any setting of the launch file, over what it says. May be given again.
     """
-    if name not in CLASSES:
-        raise LaunchError(f"no node {name!r}{nearest(name, LISTENS)}; there are {', '.join(CLASSES)}")
+    if name not in NODES:
+        raise LaunchError(f"no node {name!r}{nearest(name, NODES)}; there are {', '.join(NODES)}")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    module, kind = CLASSES[name].split(":")
-    process = getattr(importlib.import_module(module), kind)(Launch.read(launch, settings))
+    process = load(NODES[name].node)(Launch.read(launch, settings))
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: process.stop())
     process.run()

@@ -15,21 +15,19 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Level
-from steadypose.nodes.graph.launch import LISTENS, Launch, LaunchError
-from steadypose.nodes.graph.runtime import Clock, SystemClock
+from steadypose.nodes.graph.clock import FRAME_NS, POLL_S, Clock, SystemClock
+from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.supervisor import Supervisor
-from steadypose.nodes.sources.pose_input import open_input
+from steadypose.nodes.graph.topology import NODES, Delivery, load
+from steadypose.nodes.sinks.recorder import RecorderSettings
 
 LINE_NS = 5_000_000_000
 """between lines where there is no terminal for a table"""
-STUCK_NS = 15_000_000_000
-"""the source has ended and nothing more arrives for so long: something was lost on the way"""
-TURN_S = 0.1
-FRAME_MS = 1000 / 30
-STREAM_TOPICS = {"pose_input": POSE_RAW, "prior": POSE_CLEAN, "trajectory": POSE_WORLD}
+STALL_NS = 15_000_000_000
+"""without progress after the source has ended, until the run is given up: a message was lost on the way"""
 
 
 def run(
@@ -80,35 +78,26 @@ def run(
 
 def _check(launch: Launch) -> None:
     """Find here, before any process starts, what every one of them would stumble over."""
-    if "pose_input" in launch.nodes:
-        open_input(launch.input, SystemClock())
-    if "recorder" in launch.nodes and Path(launch.recorder.directory).exists():
-        raise LaunchError(f"{launch.recorder.directory} exists: expected a new directory to record to")
-    if "viewer" in launch.nodes:
-        from steadypose.nodes.sinks.viewer import require_rerun
-
-        require_rerun()
-    if "ros2_bridge" in launch.nodes:
-        from steadypose.nodes.sinks.ros2.bridge import require_ros2
-
-        require_ros2()
+    for name in launch.nodes:
+        if preflight := NODES[name].preflight:
+            load(preflight)(launch)
 
 
 class _Run:
-    """One run: the processes, their news, and when it is over."""
+    """One run: the processes, their diagnostics, and when it is over."""
 
     def __init__(self, launch: Launch, arguments: list[str], console: Console, clock: Clock) -> None:
         self._launch = launch
         self._arguments = arguments
         self._console = console
         self._clock = clock
-        self._news: dict[str, Diagnostics] = {}
+        self._diagnostics: dict[str, Diagnostics] = {}
         self._over = False
-        self._moved_ns = clock.now_ns()
-        self._lines_ns = clock.now_ns()
+        self._progress_ns = clock.now_ns()
+        self._printed_ns = clock.now_ns()
 
     def watch(self) -> int:
-        """Start the nodes and show their news until the stream has ended or Ctrl-C; returns the exit status."""
+        """Start the nodes and show their diagnostics until the stream has ended or Ctrl-C; returns the exit status."""
         transport = self._launch.transport
         transport.ipc_directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         keys = transport.curve_keys()
@@ -117,81 +106,85 @@ class _Run:
         with (
             Subscriber(endpoints, DIAGNOSTICS, keys=keys) as subscriber,
             Live(console=self._console, auto_refresh=False, transient=True) if terminal else nullcontext() as live,
-            Supervisor(self._launch.nodes, self._arguments, self._clock, self._say) as supervisor,
+            Supervisor(self._launch.nodes, self._arguments, self._clock, self._print) as supervisor,
         ):
             status = None
             try:
                 while status is None:
-                    self._take(subscriber.receive(TURN_S))
+                    self._receive(subscriber.receive(POLL_S))
                     supervisor.poll()
                     self._show(supervisor, live)
-                    status = self._verdict(supervisor)
+                    status = self._exit_status(supervisor)
             except KeyboardInterrupt:
                 status = 0
             supervisor.stop()
             while received := subscriber.receive(0):
-                self._take(received)
-        self._console.print(table(self._launch.nodes, self._news, supervisor, summary=True))
+                self._receive(received)
+        self._console.print(table(self._launch.nodes, self._diagnostics, supervisor, summary=True))
         return status
 
-    def _say(self, line: str) -> None:
+    def _print(self, line: str) -> None:
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    def _take(self, received: tuple[str, object] | None) -> None:
-        if received is None or not isinstance(news := received[1], Diagnostics):
+    def _receive(self, received: tuple[str, object] | None) -> None:
+        if received is None or not isinstance(diagnostics := received[1], Diagnostics):
             return
-        last = self._news.get(news.node)
-        if last is None or _counts(last) != _counts(news):
-            self._moved_ns = self._clock.now_ns()
-        self._news[news.node] = news
+        last = self._diagnostics.get(diagnostics.node)
+        if last is None or _counts(last) != _counts(diagnostics):
+            self._progress_ns = self._clock.now_ns()
+        self._diagnostics[diagnostics.node] = diagnostics
 
     def _show(self, supervisor: Supervisor, live: Live | None) -> None:
         if live:
-            live.update(table(self._launch.nodes, self._news, supervisor), refresh=True)
-        elif self._clock.now_ns() - self._lines_ns >= LINE_NS:
-            self._lines_ns = self._clock.now_ns()
-            self._say(line(self._launch.nodes, self._news, supervisor))
+            live.update(table(self._launch.nodes, self._diagnostics, supervisor), refresh=True)
+        elif self._clock.now_ns() - self._printed_ns >= LINE_NS:
+            self._printed_ns = self._clock.now_ns()
+            self._print(line(self._launch.nodes, self._diagnostics, supervisor))
 
-    def _verdict(self, supervisor: Supervisor) -> int | None:
+    def _exit_status(self, supervisor: Supervisor) -> int | None:
         """The exit status, or None while there is something to wait for."""
         if supervisor.failed:
-            self._say(f"{', '.join(supervisor.failed)} cannot run; stopping")
+            self._print(f"{', '.join(supervisor.failed)} cannot run; stopping")
             return 1
         source = supervisor.children.get("pose_input")
         if source is None or source.state != "ended":
-            self._moved_ns = self._moved_ns if source else self._clock.now_ns()
+            self._progress_ns = self._progress_ns if source else self._clock.now_ns()
             return None
         if self._drained():
             if "viewer" not in self._launch.nodes or not self._console.is_terminal:
                 return 0
             if not self._over:
                 self._over = True
-                self._say("the stream has ended; the picture stays until Ctrl-C")
+                self._print("the stream has ended; the picture stays until Ctrl-C")
             return None
-        if self._clock.now_ns() - self._moved_ns > STUCK_NS:
-            self._say("the stream ended, but its end did not come through all nodes; see dropped and restarts")
+        if self._clock.now_ns() - self._progress_ns > STALL_NS:
+            self._print("the stream ended, but its end did not come through all nodes; see dropped and restarts")
             return 1
         return None
 
     def _drained(self) -> bool:
         """Whether the end of the stream has come through every node."""
-        topics = {topic for name, topic in STREAM_TOPICS.items() if name in self._launch.nodes}
+        streams = {NODES[name].stream for name in self._launch.nodes}
+        recorded = set(self._launch.settings(RecorderSettings).topics)
         for name in self._launch.nodes:
-            if name == "viewer":
+            declared = NODES[name]
+            if declared.delivery is Delivery.BEST_EFFORT:
                 continue
-            heard = {topic for listened in LISTENS[name].values() for topic in listened} | {STREAM_TOPICS.get(name)}
-            wanted = topics & (heard if name != "recorder" else heard & set(self._launch.recorder.topics))
-            news = self._news.get(name)
-            if news is None or not wanted <= set(news.values.get("ended", "").split()):
+            seen = {*declared.topics, declared.stream}
+            wanted = streams & (seen if name != "recorder" else seen & recorded) - {None}
+            diagnostics = self._diagnostics.get(name)
+            if diagnostics is None or not wanted <= set(diagnostics.values.get("ended", "").split()):
                 return False
         return True
 
 
-def _counts(news: Diagnostics) -> list[str]:
-    return [value for key, value in news.values.items() if key.startswith("count.") or key == "ended"]
+def _counts(diagnostics: Diagnostics) -> list[str]:
+    return [value for key, value in diagnostics.values.items() if key.startswith("count.") or key == "ended"]
 
 
-def table(nodes: list[str], news: dict[str, Diagnostics], supervisor: Supervisor, *, summary: bool = False) -> Group:
+def table(
+    nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supervisor, *, summary: bool = False
+) -> Group:
     """A row for each node: how fast, how late, what went wrong, what it weighs.
 
     A column in which there is nothing to say is left out. The rates of a ``summary`` are over all the run.
@@ -199,9 +192,9 @@ def table(nodes: list[str], news: dict[str, Diagnostics], supervisor: Supervisor
     rows, notes = [], []
     for name in nodes:
         child = supervisor.children[name]
-        latest = news.get(name)
+        latest = diagnostics.get(name)
         values = latest.values if latest else {}
-        topic = STREAM_TOPICS.get(name, "")
+        topic = NODES[name].stream
         state = _state(child.state, values)
         delay = values.get("delay_frames")
         rows.append(
@@ -212,7 +205,7 @@ def table(nodes: list[str], news: dict[str, Diagnostics], supervisor: Supervisor
                 "Hz": _short(values.get(f"mean_rate.{topic}" if summary else f"rate.{topic}"), 1),
                 "latency ms\np50/p99": _pair(values, "latency_ms"),
                 "compute ms\np50/p99": _pair(values, "compute_ms"),
-                "delay\nms": f"{int(delay) * FRAME_MS:.0f}" if delay else "",
+                "delay\nms": f"{int(delay) * FRAME_NS / 1e6:.0f}" if delay else "",
                 "bodies": values.get("bodies", ""),
                 "joints\ngated": values.get("gate.joints_refused", "0"),
                 "flagged": values.get("anomalies", "0"),
@@ -237,12 +230,12 @@ def table(nodes: list[str], news: dict[str, Diagnostics], supervisor: Supervisor
     return Group(grid, *notes)
 
 
-def line(nodes: list[str], news: dict[str, Diagnostics], supervisor: Supervisor) -> str:
+def line(nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supervisor) -> str:
     """The gist of `table` in one line."""
     parts = []
     for name in nodes:
-        values = news[name].values if name in news else {}
-        topic = STREAM_TOPICS.get(name)
+        values = diagnostics[name].values if name in diagnostics else {}
+        topic = NODES[name].stream
         if topic is None or f"rate.{topic}" not in values:
             parts.append(f"{name} {_state(supervisor.children[name].state, values)}")
             continue

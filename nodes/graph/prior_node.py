@@ -8,8 +8,10 @@ from typing import Any
 
 from steadypose.msgs.topics import POSE_CLEAN
 from steadypose.msgs.types import Message, PoseRaw
-from steadypose.nodes.graph.launch import Launch, LaunchError
-from steadypose.nodes.graph.runtime import FRAME_NS, Clock, Node
+from steadypose.nodes.graph.clock import FRAME_NS, Clock
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.node import Node
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
@@ -52,7 +54,7 @@ class PriorNode(Node):
         super().__init__(launch, clock)
         one_thread()
         kiosks = len(launch.server.kiosks)
-        self._pipeline = make_batch(launch.prior, kiosks) if kiosks else make_prior(launch.prior)
+        self._pipeline = make_batch(launch.table("prior"), kiosks) if kiosks else make_prior(launch.table("prior"))
         load_loops()
         self._bodies = 0
         self._anomalies = 0

@@ -9,18 +9,20 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 
-from steadypose.nodes.graph.runtime import SUPERVISOR, Clock
+from steadypose.nodes.graph.clock import Clock
+from steadypose.nodes.graph.node import SUPERVISOR
+from steadypose.nodes.graph.topology import NODES
 
 BACKOFF_S = (0.5, 1.0, 2.0, 4.0, 8.0)
-"""before each start after a crash in a row; one crash more, and the node has failed"""
+"""before each restart in a row; a node that crashes once more has failed"""
 STEADY_S = 30.0
-"""a node that ran for so long starts the row anew"""
+"""a node that ran for so long begins with the first pause again"""
 STOP_S = 5.0
-"""what a node gets to end by itself"""
+"""between SIGTERM and SIGKILL"""
 USAGE_ERROR = 2
 """exit status of a node that cannot do what its launch file says: it will not the next time either"""
-ORDER = ("pose_input", "prior", "trajectory", "ros2_bridge", "viewer", "recorder")
-"""of stopping: with the stream, so that what is on its way arrives, and the recorder has it"""
+ORDER = tuple(NODES)
+"""of stopping"""
 
 
 class Child:
@@ -31,13 +33,13 @@ class Child:
         restarts: how often it was started again.
     """
 
-    def __init__(self, name: str, command: Sequence[str], clock: Clock, say: Callable[[str], None]) -> None:
+    def __init__(self, name: str, command: Sequence[str], clock: Clock, log: Callable[[str], None]) -> None:
         self.name = name
         self.state = "ended"
         self.restarts = 0
         self._command = command
         self._clock = clock
-        self._say = say
+        self._log = log
         self._crashes = 0
         self._start()
 
@@ -61,16 +63,16 @@ class Child:
             pause_s = BACKOFF_S[self._crashes - 1]
             self._due_ns = self._clock.now_ns() + round(pause_s * 1e9)
             cause = signal.Signals(-status).name if status < 0 else f"status {status}"
-            self._say(f"{self.name}: ended with {cause}; starting it again in {pause_s:g} s")
+            self._log(f"{self.name}: ended with {cause}; starting it again in {pause_s:g} s")
 
     def stop(self) -> None:
-        """End the process, kindly first; returns when it is gone."""
+        """End the process, with SIGTERM first; returns when it is gone."""
         if self.state == "running":
             self._process.terminate()
             try:
                 self._process.wait(STOP_S)
             except subprocess.TimeoutExpired:
-                self._say(f"{self.name}: did not stop within {STOP_S:g} s; killed")
+                self._log(f"{self.name}: did not stop within {STOP_S:g} s; killed")
                 self._process.kill()
                 self._process.wait()
         if self.state != "failed":
@@ -98,25 +100,25 @@ class Child:
         assert process.stdout is not None
         with process.stdout:
             for line in process.stdout:
-                self._say(line.rstrip())
+                self._log(line.rstrip())
 
 
 class Supervisor:
     """The nodes of a launch, each in a process. A context manager; leaving it stops them all."""
 
     def __init__(
-        self, nodes: Sequence[str], arguments: Sequence[str], clock: Clock, say: Callable[[str], None]
+        self, nodes: Sequence[str], arguments: Sequence[str], clock: Clock, log: Callable[[str], None]
     ) -> None:
         """Start the nodes.
 
         Args:
             nodes: their names.
             arguments: of ``steadypose node NAME``, the same for all.
-            say: where a line from a node, or about it, goes; called from several threads.
+            log: where a line from a node, or about it, goes; called from several threads.
         """
         command = [sys.executable, "-m", "steadypose.nodes.cli", "node"]
         self.children = {
-            name: Child(name, [*command, name, *arguments], clock, say)
+            name: Child(name, [*command, name, *arguments], clock, log)
             for name in sorted(nodes, key=ORDER.index, reverse=True)
         }
 

@@ -7,8 +7,10 @@ from typing import Any
 
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import Message, PoseClean
-from steadypose.nodes.graph.launch import Launch, LaunchError
-from steadypose.nodes.graph.runtime import FRAME_NS, Clock, Node
+from steadypose.nodes.graph.clock import FRAME_NS, Clock
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.node import Node
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
@@ -33,7 +35,7 @@ class TrajectoryNode(Node):
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
         one_thread()
-        self._pipeline = make_trajectory(launch.trajectory)
+        self._pipeline = make_trajectory(launch.table("trajectory"))
         self._of_kiosks: dict[str, TrajectoryPipeline] = {}
         self._delay_frames = 0
         self._bodies = 0
@@ -51,7 +53,7 @@ class TrajectoryNode(Node):
         kiosks = len(self.launch.server.kiosks)
         if not kiosks:
             return self._pipeline
-        pipeline = self._of_kiosks.pop(source, None) or make_trajectory(self.launch.trajectory)
+        pipeline = self._of_kiosks.pop(source, None) or make_trajectory(self.launch.table("trajectory"))
         self._of_kiosks[source] = pipeline
         if len(self._of_kiosks) > kiosks:  # one came back under another name
             del self._of_kiosks[next(iter(self._of_kiosks))]

@@ -23,8 +23,8 @@ ZED_BODY_38 = 2
 """``body_format`` of ZED's ROS message for the skeleton of 38 key points"""
 AZURE_IDS = 100
 """the driver's marker id is body · 100 + joint"""
-LEAST_POINTS = 6
-"""key points of an image by which a body can be placed"""
+MIN_POINTS = 6
+"""key points of an image, at least, that determine where a body is"""
 
 
 def from_mediapipe(
@@ -44,7 +44,7 @@ def from_mediapipe(
 
     Returns:
         bodies in the camera's optical frame (x right, y down, z forward), of a camera taken for level. One of which too
-        few landmarks are seen to tell where it is, is left out.
+        few landmarks are seen to determine where it is, is left out.
     """
     bodies = []
     for number, (world, image) in enumerate(zip(result.pose_world_landmarks, result.pose_landmarks, strict=True)):
@@ -165,10 +165,10 @@ def pinhole(image_size: tuple[int, int], field_of_view: float) -> Floats:
 def _placed(joints: Floats, pixels: Floats, confidence: Floats, intrinsics: Floats) -> Floats | None:
     """(3,) where joints (J, 3) have to be moved to so that they fall on pixels (J, 2): linear least squares.
 
-    A joint at p + t is seen at (u, v, 1) · depth: x + tx = u (z + tz), y + ty = v (z + tz). None if it cannot be told.
+    A joint at p + t is seen at (u, v, 1) · depth: x + tx = u (z + tz), y + ty = v (z + tz). None if undetermined.
     """
     seen = (confidence > 0.5) & finite_joints(joints) & finite_joints(pixels)
-    if seen.sum() < LEAST_POINTS:
+    if seen.sum() < MIN_POINTS:
         return None
     rays = np.concatenate([pixels[seen], np.ones((int(seen.sum()), 1))], axis=1) @ np.linalg.inv(intrinsics).T
     x, y, z = joints[seen].T

@@ -1,21 +1,22 @@
-"""Cameras as sources: frames when they come, and what to do when the camera goes away."""
+"""Cameras as sources, opened again when they are unplugged."""
 
 from __future__ import annotations
 
 import logging
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager
 from typing import Protocol
 
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.graph.runtime import TURN_S, Clock
+from steadypose.nodes.graph.clock import POLL_S
+from steadypose.nodes.sources.source import LiveSource, SourceContext
 
 logger = logging.getLogger(__name__)
 
 PAUSES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
-"""before each try in a row to find the camera again; the last goes on"""
+"""before each attempt in a row to open the camera again; the last one repeats"""
 
 STREAMING = "streaming"
 
@@ -51,28 +52,12 @@ def count_failure(counts: Counter[str], camera: str, error: Exception) -> None:
     counts[cause] += 1
 
 
-class LiveSource(ABC):
-    """Skeletons that come when they come, stamped with the wall time of their capture."""
-
-    def __init__(self) -> None:
-        self.refused: Counter[str] = Counter()
-        """what went wrong, by cause"""
-
-    @abstractmethod
-    def frames(self) -> Generator[PoseRaw | None, None, None]:
-        """Skeletons without end; None where a moment passed without one, so that the caller can look up."""
-
-    @abstractmethod
-    def status(self) -> dict[str, str]:
-        """What `diagnostics` should say of it."""
-
-
 class CameraSource(LiveSource):
     """The skeletons of a camera. When it is gone, or not there yet, it is looked for at growing intervals, for ever."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, context: SourceContext) -> None:
         super().__init__()
-        self._clock = clock
+        self._clock = context.clock
         self._state = "looking for a camera"
         self._connection: Connection | None = None
         self._connections = 0
@@ -110,7 +95,7 @@ class CameraSource(LiveSource):
             again_ns = self._clock.now_ns() + round(pause_s * 1e9)
             while self._clock.now_ns() < again_ns:
                 yield None
-                self._clock.sleep(round(TURN_S * 1e9))
+                self._clock.sleep(round(POLL_S * 1e9))
 
     def status(self) -> dict[str, str]:
         values = {"camera": self._state, "camera.connections": str(self._connections)}

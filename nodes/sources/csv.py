@@ -54,16 +54,16 @@ class CsvSource:
         except (OSError, UnicodeDecodeError) as error:
             raise CsvError(f"{path}: cannot be read as text: {error}") from error
         notes = [line[1:].partition(":") for line in lines if line.startswith("#")]
-        said = {key.strip(): value.strip() for key, _, value in notes}
+        header = {key.strip(): value.strip() for key, _, value in notes}
         rows = csv.reader(line for line in lines if line.strip() and not line.startswith("#"))
         try:
             columns = [name.strip() for name in next(rows, [])]
             cells = list(rows)
         except csv.Error as error:
             raise CsvError(f"{path}: cannot be read as CSV: {error}") from error
-        self._skeleton = _skeleton(path, columns, said.get("skeleton"))
+        self._skeleton = _skeleton(path, columns, header.get("skeleton"))
         try:
-            self._sensor_pose = Pose.from_up(said.get("up", "z"))
+            self._sensor_pose = Pose.from_up(header.get("up", "z"))
         except ValueError as error:
             raise CsvError(f"{path}: {error}") from error
         self._frames = self._read(cells, columns)
@@ -101,10 +101,10 @@ class CsvSource:
                 if not id.is_integer():
                     self.refused["rows of which the body is no whole number"] += 1
                     continue
-                joints, sure = numbers[positions], numbers[confidence][:, 0]
-                sure = np.where(np.isnan(sure), np.isfinite(joints).all(axis=-1), sure)
+                joints, confidences = numbers[positions], numbers[confidence][:, 0]
+                confidences = np.where(np.isnan(confidences), np.isfinite(joints).all(axis=-1), confidences)
                 with np.errstate(over="ignore"):
-                    read.append((round(seconds * 1e9), RawBody(int(id), joints, sure)))
+                    read.append((round(seconds * 1e9), RawBody(int(id), joints, confidences)))
             except ValueError:
                 self.refused["rows with something else than numbers"] += 1
         return [(stamp_ns, [one for _, one in group]) for stamp_ns, group in groupby(read, key=lambda pair: pair[0])]

@@ -4,15 +4,25 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Generator
+from dataclasses import dataclass, field
 
-from steadypose.msgs.keys import Keys
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.graph.launch import LaunchError, MergeSettings
-from steadypose.nodes.graph.runtime import TURN_S
-from steadypose.nodes.sources.camera import LiveSource
-from steadypose.prior.camera.multi_view import Merge
+from steadypose.nodes.graph.clock import POLL_S
+from steadypose.nodes.graph.settings import LaunchError, check_addresses
+from steadypose.nodes.sources.source import LiveSource, SourceContext
+
+
+@dataclass(frozen=True)
+class MergeSettings:
+    """``[input.merge]``: several calibrated cameras in place of one."""
+
+    cameras: list[str] = field(default_factory=list)
+    """addresses of their input nodes (``tcp://192.168.1.21:7111``)"""
+
+    def __post_init__(self) -> None:
+        check_addresses("[input.merge] cameras", self.cameras)
 
 
 class MergeSource(LiveSource):
@@ -22,31 +32,33 @@ class MergeSource(LiveSource):
         LaunchError: fewer than two cameras are named, or one twice.
     """
 
-    def __init__(self, settings: MergeSettings, keys: Keys | None) -> None:
+    def __init__(self, settings: MergeSettings, context: SourceContext) -> None:
         super().__init__()
         if len(set(settings.cameras)) < 2 or len(set(settings.cameras)) != len(settings.cameras):
             raise LaunchError(
                 "[input.merge] cameras: expected the addresses of two input nodes or more, each once, such as "
                 f"tcp://192.168.1.21:7111; got {settings.cameras}"
             )
-        self._addresses, self._keys = settings.cameras, keys
+        from steadypose.prior.camera.multi_view import Merge  # brings scipy: not for reading a launch file
+
+        self._addresses, self._keys = settings.cameras, context.keys
         self._merge = Merge()
-        self._heard: Counter[str] = Counter()
+        self._received: Counter[str] = Counter()
         self._lost: Counter[str] = Counter()
 
     def frames(self) -> Generator[PoseRaw | None, None, None]:
         with Subscriber(self._addresses, POSE_RAW, keys=self._keys, name="merge") as subscriber:
             self._lost = subscriber.dropped
             while True:
-                received = subscriber.receive(TURN_S)
+                received = subscriber.receive(POLL_S)
                 if received is None or not isinstance(received[1], PoseRaw):
                     yield None
                     continue
-                self._heard[received[1].source] += 1
+                self._received[received[1].source] += 1
                 yield from self._merge.update(received[1]) or [None]
                 self.refused = self._merge.counters + subscriber.refused
 
     def status(self) -> dict[str, str]:
-        heard = {f"camera.{name}": f"{count} messages" for name, count in sorted(self._heard.items())}
+        cameras = {f"camera.{name}": f"{count} messages" for name, count in sorted(self._received.items())}
         lost = {f"dropped.lost {topic}": str(count) for topic, count in self._lost.items()}
-        return {"camera": f"{len(heard)} of {len(self._addresses)} cameras heard"} | heard | lost
+        return {"camera": f"{len(cameras)} of {len(self._addresses)} cameras heard"} | cameras | lost

@@ -1,275 +1,37 @@
-"""OAK cameras (depthai 3): persons found on the camera, lifted to 3D on this machine.
+"""OAK cameras as the source; what runs with depthai is in `nodes.sources.oak_device`."""
 
-On the camera run colour, a pose network, stereo depth aligned to colour, and the IMU. What it sends is one object for
-the rest of the program (`Host`), made of nodes that run on this machine; tests feed the same nodes from a pipeline that
-has no camera.
-"""
+from __future__ import annotations
 
-# without `from __future__ import annotations`: depthai reads those of `process` to know what an input takes
 import math
-import queue
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from datetime import timedelta
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 
-import depthai as dai
-import numpy as np
-from numpy.typing import NDArray
-
-from steadypose.msgs.types import PoseRaw, RawBody
-from steadypose.nodes.graph.launch import LaunchError, OakSettings
-from steadypose.nodes.graph.runtime import TURN_S, Clock
-from steadypose.nodes.sources.camera import CameraError, CameraSource, count_failure
-from steadypose.prior.body.layouts import COCO17
-from steadypose.prior.camera.depth_lifting import lift
-from steadypose.prior.camera.gravity import Level
-
-Floats = NDArray[np.float64]
-
-FRAME_ID = "oak_rgb_camera_optical_frame"
-MODELS = {
-    "RVC2": ("luxonis/yolov8-nano-pose-estimation:coco-512x288", 12.0),
-    "RVC4": ("luxonis/yolov8-large-pose-estimation:coco-640x352", 30.0),
-}
-"""by platform: the pose network of Luxonis' model zoo that it runs, and the frames a second it does"""
-DEPTH_SIZE = (640, 400)
-DEPTH_FPS = 30.0
-APART = timedelta(seconds=0.5 / DEPTH_FPS)
-"""between colour and depth of the same moment, at most: their sensors run at their own pace"""
-IMU_HZ = 100
-MOST_BODIES = 8
-QUEUE = 4
-"""frames kept for the program when it is late; then the oldest goes"""
-SILENT_S = 5.0
-"""without a frame, after which a camera that claims to run is given up"""
-STARTUP_S = 30.0
-"""the same before its first frame"""
+from steadypose.nodes.graph.clock import Clock
+from steadypose.nodes.graph.settings import LaunchError, path_setting
+from steadypose.nodes.sources.camera import CameraSource, Connection
+from steadypose.nodes.sources.source import SourceContext
 
 
-def _nanoseconds(time: timedelta) -> int:
-    return time // timedelta(microseconds=1) * 1000
+@dataclass(frozen=True)
+class OakSettings:
+    """``[input.oak]``: an OAK camera."""
+
+    device: str = ""
+    """its id or, of one on the network, its address; empty: the first that is found"""
+    model: str = ""
+    """pose network of Luxonis' model zoo, COCO-17 key points; empty: the YOLO pose that suits the camera"""
+    archive: str = path_setting()
+    """a pose network in a file (NN archive, .tar.xz) instead of the zoo's; a relative path starts at the launch file"""
+    fps: float = 0.0
+    """frames a second; 0: what the camera's own network does"""
+    confidence: float = 0.5
+    """of a person, below which it is none"""
 
 
-class Skeletons(dai.node.HostNode):
-    """Detections with key points and the depth image of the same moment, in pairs, to skeletons.
-
-    Attributes:
-        found: skeletons not yet taken.
-        counts: frames that were dropped or refused, by cause.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: queue.Queue[PoseRaw] = queue.Queue()
-        self.counts: Counter[str] = Counter()
-        self._level = Level()
-        self._source = ""
-        self._epoch_ns = 0
-
-    def build(self, pairs: dai.Node.Output, level: Level, source: str, epoch_ns: int) -> "Skeletons":
-        """Link the node.
-
-        Args:
-            pairs: of ``detections`` (``ImgDetections`` with key points) and ``depth`` (``ImgFrame``, millimetres,
-                aligned to the image of the detections).
-            level: the camera's, which says its pose.
-            source: the camera's name, for the messages.
-            epoch_ns: wall time, nanoseconds since 1970, of zero on depthai's clock.
-        """
-        self.link_args(pairs)
-        self._level, self._source, self._epoch_ns = level, source, epoch_ns
-        return self
-
-    def process(self, pair: dai.MessageGroup) -> None:
-        """Work on what was captured at one moment; what it cannot use it counts."""
-        try:
-            detections, depth = pair["detections"], pair["depth"]
-            assert isinstance(detections, dai.ImgDetections)
-            assert isinstance(depth, dai.ImgFrame)
-            frame = self._lifted(detections, depth)
-        except Exception as error:  # whatever the camera sends, the next frame may be good
-            count_failure(self.counts, self._source, error)
-            return
-        while self.found.qsize() >= QUEUE:
-            self.found.get_nowait()
-            self.counts["late"] += 1
-        self.found.put(frame)
-
-    def _lifted(self, detections: dai.ImgDetections, depth: dai.ImgFrame) -> PoseRaw:
-        view = depth.getTransformation()
-        image = depth.getFrame()
-        height, width = image.shape
-        found = detections.transformTo(view).detections if detections.getTransformation() else detections.detections
-        found = sorted(found, key=lambda detection: -detection.confidence)
-        people = [p for p in (detection.getKeypoints() for detection in found) if len(p) == len(COCO17.joints)]
-        if strangers := len(found) - len(people):  # another network than one of poses, or of other poses
-            self.counts["person without the 17 key points of COCO"] += strangers
-        people = people[:MOST_BODIES]
-        points = np.array([[(k.imageCoordinates.x, k.imageCoordinates.y, k.confidence) for k in p] for p in people])
-        points = points.reshape(len(people), len(COCO17.joints), 3)
-        positions, confidence = lift(
-            points[..., :2] * (width, height), points[..., 2], image, np.array(view.getIntrinsicMatrix())
-        )
-        return PoseRaw(
-            stamp_ns=self._epoch_ns + _nanoseconds(detections.getTimestamp()),
-            frame_id=FRAME_ID,
-            source=self._source,
-            skeleton=COCO17.name,
-            sensor_pose=self._level.pose,
-            calibrated=False,
-            bodies=[RawBody(id, *body) for id, body in enumerate(zip(positions, confidence, strict=True))],
-        )
-
-
-class Gravity(dai.node.HostNode):
-    """Readings of the IMU, in the camera's frame, to its level."""
-
-    def build(self, readings: dai.Node.Output, level: Level, imu_to_camera: Floats) -> "Gravity":
-        """Link the node; ``imu_to_camera`` (3, 3) turns from the IMU's frame to the camera's optical one."""
-        self.link_args(readings)
-        self._level, self._turn = level, imu_to_camera
-        return self
-
-    def process(self, readings: dai.IMUData) -> None:
-        for packet in readings.packets:
-            felt = packet.acceleroMeter
-            stamp_ns = _nanoseconds(felt.getTimestamp())
-            self._level.update(self._turn @ np.array([felt.x, felt.y, felt.z]), stamp_ns)
-
-
-class Host:
-    """What runs on this machine for one camera: takes the outputs of its nodes and gives skeletons.
-
-    Args:
-        pipeline: that of the outputs, not yet started.
-        detections, depth: what `Skeletons.build` takes pairs of.
-        readings: of the IMU and the rotation (3, 3) from its frame to the camera's; None without one.
-        source: the camera's name.
-        clock: what stamps are told in.
-    """
-
-    def __init__(
-        self,
-        pipeline: dai.Pipeline,
-        detections: dai.Node.Output,
-        depth: dai.Node.Output,
-        readings: tuple[dai.Node.Output, Floats] | None,
-        source: str,
-        clock: Clock,
-    ) -> None:
-        self.name = source
-        self.level = Level()
-        self._pipeline = pipeline
-        self._clock = clock
-        epoch_ns = clock.now_ns() - _nanoseconds(dai.Clock.now())  # pyright: ignore[reportCallIssue] (static)
-        # a host node's own pairing wants both within 10 ms, and would wait for ever
-        sync = pipeline.create(dai.node.Sync)
-        sync.setRunOnHost(True)
-        sync.setSyncThreshold(APART)
-        detections.link(sync.inputs["detections"])
-        depth.link(sync.inputs["depth"])
-        self._skeletons = pipeline.create(Skeletons).build(sync.out, self.level, source, epoch_ns)
-        if readings:
-            pipeline.create(Gravity).build(readings[0], self.level, readings[1])
-
-    def status(self) -> dict[str, str]:
-        return {"camera.level": "measured" if self.level.measured else "taken for level"}
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Frames dropped or refused, by cause: a copy, because the pipeline's thread goes on counting."""
-        return self._skeletons.counts.copy()
-
-    def frames(self) -> Iterator[PoseRaw | None]:
-        """Skeletons as they come, None where none came for a while; ends when the camera does."""
-        heard_ns, patience_s = self._clock.now_ns(), STARTUP_S
-        while self._pipeline.isRunning():
-            try:
-                yield self._skeletons.found.get(timeout=TURN_S)
-                heard_ns, patience_s = self._clock.now_ns(), SILENT_S
-            except queue.Empty:
-                if self._clock.now_ns() - heard_ns > patience_s * 1e9:
-                    return
-                yield None
-
-
-Connect = Callable[[OakSettings, Clock], AbstractContextManager[Host]]
-
-
-def open_device(settings: OakSettings) -> dai.Device:
-    """The camera that the settings name.
-
-    Raises:
-        RuntimeError: there is no such camera, or it cannot be opened.
-    """
-    if not settings.device and not dai.Device.getAllAvailableDevices():
-        raise CameraError("no camera found; `steadypose doctor` says whether one is plugged in")
-    return dai.Device(dai.DeviceInfo(settings.device)) if settings.device else dai.Device()
-
-
-@contextmanager
-def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
-    """Open the camera and run the whole pipeline on it.
-
-    Raises:
-        RuntimeError: there is no such camera, it cannot be opened, or the model cannot be had; depthai says which.
-    """
-    device = open_device(settings)
-    with device:
-        device.setMaxReconnectionAttempts(0)  # this program does that, and says so
-        platform = device.getPlatformAsString()
-        zoo, usual_fps = MODELS.get(platform, MODELS["RVC2"])
-        fps = settings.fps or usual_fps
-        with dai.Pipeline(device) as pipeline:
-            colour = pipeline.create(dai.node.Camera).build(dai.CameraBoardSocket.CAM_A, sensorFps=fps)
-            model = (
-                dai.NNArchive(Path(settings.archive))
-                if settings.archive
-                else dai.NNModelDescription(settings.model or zoo)
-            )
-            network = pipeline.create(dai.node.DetectionNetwork).build(colour, model, fps)
-            network.setConfidenceThreshold(settings.confidence)
-            _, depth = aligned_depth(pipeline, colour, platform)
-            imu = accelerometer(pipeline, device)
-            host = Host(pipeline, network.out, depth, imu, f"oak-{device.getDeviceId()}", clock)
-            pipeline.start()
-            yield host
-
-
-def aligned_depth(
-    pipeline: dai.Pipeline, colour: dai.node.Camera, platform: str
-) -> tuple[dai.Node.Output, dai.Node.Output]:
-    """Pictures of the colour camera, without distortion, and stereo depth in the same view."""
-    stereo = pipeline.create(dai.node.StereoDepth).build(
-        autoCreateCameras=True, presetMode=dai.node.StereoDepth.PresetMode.DEFAULT, size=DEPTH_SIZE, fps=DEPTH_FPS
-    )
-    stereo.setLeftRightCheck(True)
-    stereo.setSubpixel(True)
-    view = colour.requestOutput(DEPTH_SIZE, enableUndistortion=True)
-    if platform == "RVC4":  # has no alignment in its stereo block
-        align = pipeline.create(dai.node.ImageAlign)
-        stereo.depth.link(align.input)
-        view.link(align.inputAlignTo)
-        return view, align.outputAligned
-    view.link(stereo.inputAlignTo)
-    return view, stereo.depth
-
-
-def accelerometer(pipeline: dai.Pipeline, device: dai.Device) -> tuple[dai.Node.Output, Floats] | None:
-    """The accelerometer's readings and how it is mounted; None for a camera that lacks it, or was not calibrated."""
-    if device.getConnectedIMU() in ("", "NONE"):
-        return None
-    try:
-        turn = np.array(device.readCalibration().getImuToCameraExtrinsics(dai.CameraBoardSocket.CAM_A))[:3, :3]
-    except RuntimeError:
-        return None
-    imu = pipeline.create(dai.node.IMU)
-    imu.enableIMUSensor(dai.IMUSensor.ACCELEROMETER_RAW, IMU_HZ)
-    imu.setBatchReportThreshold(1)
-    imu.setMaxBatchReports(10)
-    return imu.out, turn
+Connect = Callable[[OakSettings, Clock], AbstractContextManager[Connection]]
+"""opens the camera; raises RuntimeError if it cannot be opened now"""
 
 
 class OakSource(CameraSource):
@@ -279,8 +41,8 @@ class OakSource(CameraSource):
         LaunchError: a setting cannot be used.
     """
 
-    def __init__(self, settings: OakSettings, clock: Clock, opener: Connect = connect) -> None:
-        super().__init__(clock)
+    def __init__(self, settings: OakSettings, context: SourceContext, connect: Connect | None = None) -> None:
+        super().__init__(context)
         if settings.archive and not (settings.archive.endswith(".tar.xz") and Path(settings.archive).is_file()):
             raise LaunchError(
                 f"[input.oak] archive: expected a file that is an NN archive (.tar.xz), got {settings.archive}; "
@@ -291,7 +53,11 @@ class OakSource(CameraSource):
                 "[input.oak] expected fps of 0 (as the camera can) or more and confidence between 0 and 1, got "
                 f"{settings.fps:g} and {settings.confidence:g}"
             )
-        self._settings, self._open = settings, opener
+        self._settings, self._connect = settings, connect
 
-    def connect(self) -> AbstractContextManager[Host]:
-        return self._open(self._settings, self._clock)
+    def connect(self) -> AbstractContextManager[Connection]:
+        if self._connect is None:
+            from steadypose.nodes.sources.oak_device import connect  # brings depthai
+
+            self._connect = connect
+        return self._connect(self._settings, self._clock)

@@ -9,14 +9,21 @@ import depthai as dai
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.nodes.graph.launch import OakSettings
 from steadypose.nodes.sources.camera import CameraError
-from steadypose.nodes.sources.oak import APART, DEPTH_FPS, Gravity, accelerometer, aligned_depth, open_device
-from steadypose.prior.camera.gravity import Level
+from steadypose.nodes.sources.oak import OakSettings
+from steadypose.nodes.sources.oak_device import (
+    DEPTH_FPS,
+    SYNC_THRESHOLD,
+    ImuReader,
+    accelerometer,
+    aligned_depth,
+    open_device,
+)
+from steadypose.prior.camera.gravity import GravityEstimator
 
-SETTLE = 30
-"""pairs let pass, while exposure and level settle"""
-PATIENCE_S = 20.0
+SETTLE_PAIRS = 30
+"""pairs skipped while exposure and the direction of gravity settle"""
+PAIR_TIMEOUT_S = 20.0
 """for each pair"""
 
 
@@ -42,7 +49,7 @@ class Pairs(dai.node.HostNode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.taken: queue.Queue[tuple[Any, Any]] = queue.Queue(maxsize=2)
+        self.pairs: queue.Queue[tuple[Any, Any]] = queue.Queue(maxsize=2)
 
     def build(self, pairs: dai.Node.Output) -> "Pairs":
         """Link the node."""
@@ -50,43 +57,43 @@ class Pairs(dai.node.HostNode):
         return self
 
     def process(self, pair: dai.MessageGroup) -> None:
-        if not self.taken.full():
-            self.taken.put((pair["colour"], pair["depth"]))
+        if not self.pairs.full():
+            self.pairs.put((pair["colour"], pair["depth"]))
 
 
-def take(
+def capture(
     pipeline: dai.Pipeline,
     colour: dai.Node.Output,
     depth: dai.Node.Output,
     readings: tuple[dai.Node.Output, NDArray[np.float64]] | None,
-    settle: int = SETTLE,
+    settle: int = SETTLE_PAIRS,
 ) -> Still:
-    """Start a pipeline that has these outputs, and take the picture that comes after ``settle`` others.
+    """Start a pipeline that has these outputs, and capture the picture that comes after ``settle`` others.
 
     Raises:
         CameraError: none comes.
     """
     sync = pipeline.create(dai.node.Sync)
     sync.setRunOnHost(True)
-    sync.setSyncThreshold(APART)
+    sync.setSyncThreshold(SYNC_THRESHOLD)
     colour.link(sync.inputs["colour"])
     depth.link(sync.inputs["depth"])
     pairs = pipeline.create(Pairs).build(sync.out)
-    level = Level()
+    level = GravityEstimator()
     if readings:
-        pipeline.create(Gravity).build(readings[0], level, readings[1])
+        pipeline.create(ImuReader).build(readings[0], level, readings[1])
     pipeline.start()
     try:
         for _ in range(settle):
-            pairs.taken.get(timeout=PATIENCE_S)
-        picture, distances = pairs.taken.get(timeout=PATIENCE_S)
+            pairs.pairs.get(timeout=PAIR_TIMEOUT_S)
+        picture, distances = pairs.pairs.get(timeout=PAIR_TIMEOUT_S)
     except queue.Empty:
-        raise CameraError(f"the camera gave no picture with depth within {PATIENCE_S:g} s") from None
+        raise CameraError(f"the camera gave no picture with depth within {PAIR_TIMEOUT_S:g} s") from None
     intrinsics = np.array(distances.getTransformation().getIntrinsicMatrix())
     return Still(picture.getCvFrame(), distances.getFrame().copy(), intrinsics, level.up if level.measured else None)
 
 
-def take_with_camera(settings: OakSettings) -> Still:
+def capture_with_camera(settings: OakSettings) -> Still:
     """A picture of the camera that the settings name.
 
     Raises:
@@ -96,4 +103,4 @@ def take_with_camera(settings: OakSettings) -> Still:
     with device, dai.Pipeline(device) as pipeline:
         sensor = pipeline.create(dai.node.Camera).build(dai.CameraBoardSocket.CAM_A, sensorFps=DEPTH_FPS)
         colour, depth = aligned_depth(pipeline, sensor, device.getPlatformAsString())
-        return take(pipeline, colour, depth, accelerometer(pipeline, device))
+        return capture(pipeline, colour, depth, accelerometer(pipeline, device))

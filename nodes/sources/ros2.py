@@ -4,35 +4,53 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Generator
+from dataclasses import dataclass
 from typing import Any
 
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.graph.launch import LaunchError, Ros2Settings, nearest
-from steadypose.nodes.graph.runtime import TURN_S
-from steadypose.nodes.sinks.ros2.bridge import require_ros2
+from steadypose.nodes.graph.clock import POLL_S
+from steadypose.nodes.graph.settings import LaunchError, nearest
 from steadypose.nodes.sources.adapters import from_azure_kinect, from_pose_array
-from steadypose.nodes.sources.camera import LiveSource
+from steadypose.nodes.sources.source import LiveSource, SourceContext
 from steadypose.prior.body.layouts import SKELETONS
+
+
+@dataclass(frozen=True)
+class Ros2Settings:
+    """``[input.ros2]``: a ROS 2 topic with skeletons."""
+
+    topic: str = "/body_tracking_data"
+    type: str = "MarkerArray"
+    """MarkerArray, as the driver of the Azure Kinect has it; or PoseArray, the joints of one body after the other"""
+    skeleton: str = "smpl22"
+    """of a PoseArray: the joints and their order"""
+    up: str = "z"
+    """of a PoseArray: the axis of its frame that points up: z, y or -y"""
+
+    def __post_init__(self) -> None:
+        if self.type not in ("MarkerArray", "PoseArray"):
+            raise LaunchError(f"[input.ros2] type: expected MarkerArray or PoseArray, got {self.type!r}")
+        if self.up not in ("z", "y", "-y"):
+            raise LaunchError(f"[input.ros2] up: expected z, y or -y, got {self.up!r}")
 
 
 class Ros2Source(LiveSource):
     """A subscription to ``MarkerArray`` or ``PoseArray``.
 
     Raises:
-        LaunchError: ROS 2 is not installed, or there is no such skeleton.
+        LaunchError: there is no such skeleton.
     """
 
-    def __init__(self, settings: Ros2Settings) -> None:
+    def __init__(self, settings: Ros2Settings, context: SourceContext) -> None:
         super().__init__()
-        require_ros2()
         if settings.skeleton not in SKELETONS:
             raise LaunchError(
                 f"[input.ros2] skeleton: expected one of {', '.join(SKELETONS)}, got {settings.skeleton!r}"
                 f"{nearest(settings.skeleton, SKELETONS)}"
             )
         self._settings = settings
-        self._found: deque[PoseRaw] = deque()
-        self._heard = 0
+        self._queue: deque[PoseRaw] = deque()
+        self._received = 0
 
     def frames(self) -> Generator[PoseRaw | None, None, None]:
         import rclpy  # pyright: ignore[reportMissingImports]
@@ -49,17 +67,17 @@ class Ros2Source(LiveSource):
             node: Any = rclpy.create_node("steadypose_input", context=context, enable_rosout=False)
             kind = {"MarkerArray": MarkerArray, "PoseArray": PoseArray}[self._settings.type]
             # best effort, which hears reliable publishers too
-            node.create_subscription(kind, self._settings.topic, self._hear, qos_profile_sensor_data)
+            node.create_subscription(kind, self._settings.topic, self._on_message, qos_profile_sensor_data)
             executor = SingleThreadedExecutor(context=context)
             executor.add_node(node)
             while True:
-                executor.spin_once(timeout_sec=TURN_S)
-                yield self._found.popleft() if self._found else None
+                executor.spin_once(timeout_sec=POLL_S)
+                yield self._queue.popleft() if self._queue else None
         finally:
             context.shutdown()
 
-    def _hear(self, message: Any) -> None:
-        self._heard += 1
+    def _on_message(self, message: Any) -> None:
+        self._received += 1
         try:
             if self._settings.type == "MarkerArray":
                 raw = from_azure_kinect(message, source=self._settings.topic)
@@ -70,7 +88,7 @@ class Ros2Source(LiveSource):
             self.refused[f"not a {self._settings.type} of skeletons"] += 1
             return
         if raw:
-            self._found.append(raw)
+            self._queue.append(raw)
 
     def status(self) -> dict[str, str]:
-        return {"camera": f"{self._settings.topic}, {self._heard} messages"}
+        return {"camera": f"{self._settings.topic}, {self._received} messages"}

@@ -26,26 +26,26 @@ from steadypose.prior.camera.gravity import level_pose
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-LEAST_CORNERS = 6
+MIN_CORNERS = 6
 """of the board that must be seen for a picture to be used"""
-LEAST_VIEWS = 8
-"""pictures of the board, at least, that tell a lens"""
-LEAST_TILT = np.radians(20.0)
-"""between the planes of the board in two of the pictures, at least: of parallel ones a lens cannot be told"""
-SURE_FOCAL = 0.01
+MIN_VIEWS = 8
+"""pictures of the board that a calibration takes, at least"""
+MIN_TILT = np.radians(20.0)
+"""between the planes of the board in two of the pictures, at least: parallel ones do not determine the focal length"""
+MAX_FOCAL_SIGMA = 0.01
 """of a focal length, the standard deviation up to which it is accepted"""
-WORST_VIEW = 3.0
+OUTLIER_RATIO = 3.0
 """times the median error of all pictures: one that is worse is left out (the board was bent, or moved)"""
 CORNER_SIGMA_PX = 0.05
 """of a corner well seen, standard deviation"""
 CORNER_SCALE_PX = 0.3
 """from where a corner should be, beyond which it is soon taken to be found wrong"""
-MOST_CORNERS = 0.8
-"""share of the corners by whose error a pose is judged"""
-MOST_ERROR_PX = 2.0
+CORNER_QUANTILE = 0.8
+"""of the corners' reprojection errors: the one by which a pose is accepted or refused"""
+MAX_RMS_PX = 2.0
 """root mean square of where corners are seen, from where they should be, beyond which a result is refused"""
 FLOOR_SLACK, FLOOR_SHARE = 0.02, 0.1
-"""metres from the floor within which a point is on it, and the least share of all points that must be"""
+"""metres from the floor within which a point is an inlier, and the fraction of all points that must be"""
 FLOOR_TILT = np.radians(10.0)
 """by which the floor's normal may differ from where up is taken to be"""
 
@@ -83,7 +83,7 @@ class Board:
 
     @cached_property
     def pattern(self) -> cv2.aruco.CharucoBoard:
-        """The board as OpenCV has it; 4x4 markers, the largest that are told apart from afar."""
+        """The board as OpenCV has it; 4x4 markers, the largest that are recognised from afar."""
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker * self.square, dictionary)
 
@@ -149,7 +149,7 @@ def find_corners(picture: Image, board: Board) -> Corners | None:
             image = (np.asarray(on_image, np.float64).reshape(-1, 2) + 0.5) / finer - 0.5
         if len(points) == (board.columns - 1) * (board.rows - 1):
             break
-    if len(points) < LEAST_CORNERS:
+    if len(points) < MIN_CORNERS:
         return None
     if len(np.unique(points[:, 0])) < 2 or len(np.unique(points[:, 1])) < 2:
         return None  # on one line: they say nothing of the board's plane
@@ -168,11 +168,11 @@ def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsic
     Raises:
         CalibrationError: too few pictures, they do not agree, or they are too much alike.
     """
-    kept = [view for view in views if len(view.image) >= LEAST_CORNERS]
+    kept = [view for view in views if len(view.image) >= MIN_CORNERS]
     while True:
-        if len(kept) < LEAST_VIEWS:
+        if len(kept) < MIN_VIEWS:
             raise CalibrationError(
-                f"expected {LEAST_VIEWS} pictures or more that show the board well, got {len(kept)}: take 15 to 25, "
+                f"expected {MIN_VIEWS} pictures or more that show the board well, got {len(kept)}: take 15 to 25, "
                 "the board near and far, tilted to all sides, in the middle and in every corner of the picture"
             )
         error, matrix, distortion, turns, _, sigma, _, errors = cv2.calibrateCameraExtended(
@@ -183,23 +183,23 @@ def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsic
             np.zeros(5),
         )
         errors = np.ravel(errors)
-        bad = errors > max(WORST_VIEW * float(np.median(errors)), 0.5)
+        bad = errors > max(OUTLIER_RATIO * float(np.median(errors)), 0.5)
         if not bad.any():
             break
         kept = [view for view, out in zip(kept, bad, strict=True) if not out]
-    if not error < MOST_ERROR_PX:
+    if not error < MAX_RMS_PX:
         raise CalibrationError(
-            f"expected corners within {MOST_ERROR_PX:g} pixels of where the lens puts them, got {error:.1f}: is the "
+            f"expected corners within {MAX_RMS_PX:g} pixels of where the lens puts them, got {error:.1f}: is the "
             "board flat, the number of squares as printed, and every picture from the same camera and resolution?"
         )
     focal = matrix[[0, 1], [0, 1]]
     unsure = float((np.ravel(sigma)[:2] / focal).max())
     normals = Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()[:, :, 2]
     tilt = float(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0).min()))
-    if tilt < LEAST_TILT or not unsure < SURE_FOCAL:
+    if tilt < MIN_TILT or not unsure < MAX_FOCAL_SIGMA:
         raise CalibrationError(
-            f"expected pictures that tell the focal length to {SURE_FOCAL:.0%}, with the board tilted by "
-            f"{np.degrees(LEAST_TILT):.0f} degrees or more from one to another, got {unsure:.1%} and "
+            f"expected pictures that determine the focal length to {MAX_FOCAL_SIGMA:.0%}, with the board tilted by "
+            f"{np.degrees(MIN_TILT):.0f} degrees or more from one to another, got {unsure:.1%} and "
             f"{np.degrees(tilt):.0f} degrees: they are too much alike; tilt the board to all sides, near and far"
         )
     return Intrinsics(
@@ -247,9 +247,9 @@ def camera_pose(views: Sequence[Corners], lens: Intrinsics) -> Placement:
             "the board is seen from below: lay it face up, and leave it as it is printed (no mirror image)"
         )
     best = min(above, key=lambda placement: placement.error_px)
-    if not best.error_px < MOST_ERROR_PX:
+    if not best.error_px < MAX_RMS_PX:
         raise CalibrationError(
-            f"expected the corners within {MOST_ERROR_PX:g} pixels of one place of the board, got {best.error_px:.1f}: "
+            f"expected the corners within {MAX_RMS_PX:g} pixels of one place of the board, got {best.error_px:.1f}: "
             "camera and board must not move between the pictures, and the lens must be of this camera and resolution"
         )
     return best
@@ -267,7 +267,7 @@ def _refined(points: Floats, image: Floats, lens: Intrinsics, start: Floats) -> 
 
     fit = least_squares(away, start, loss="cauchy", f_scale=CORNER_SCALE_PX, x_scale="jac")
     turn, move = fit.x[:3], fit.x[3:]
-    error = float(np.quantile(np.linalg.norm(away(fit.x).reshape(-1, 2), axis=1), MOST_CORNERS))
+    error = float(np.quantile(np.linalg.norm(away(fit.x).reshape(-1, 2), axis=1), CORNER_QUANTILE))
     to_world = Rotation.from_rotvec(turn).inv()
     # By the Gauss-Markov theorem; the camera's place is -R^T t, so both errors move it.
     covariance = max(error, CORNER_SIGMA_PX) ** 2 * np.linalg.inv(fit.jac.T @ fit.jac)

@@ -32,7 +32,7 @@ from steadypose.prior.body.layouts import COCO17
 
 Floats = NDArray[np.float64]
 
-LEAST_CONFIDENCE = 0.3
+MIN_CONFIDENCE = 0.3
 """of a key point; below it a detector guesses"""
 
 _K = {name: index for index, name in enumerate(COCO17.joints)}
@@ -53,7 +53,7 @@ _HALF_DEPTH, _HALF_BREADTH = 0.12, 0.18
 # the trunk's usual length in metres and those that are believed.
 _HIP_WIDTH, _SHOULDER_WIDTH = 0.35, 0.70
 _TRUNK_LENGTH, _TRUNK_LENGTHS = 0.51, (0.42, 0.60)
-_TURNED = np.cos(np.radians(50))
+_MAX_TURN_COSINE = np.cos(np.radians(50))
 """beyond 50 degrees the far hip is hidden, and its depth cannot be read"""
 _HIP_SLACK = 0.03
 """metres by which a hip's depth may be at odds with the width of the hips"""
@@ -61,12 +61,12 @@ _SEEN_WIDTH = 0.65
 """of the shoulders' width: nearer to each other, one of them is hidden"""
 _TURN_EVIDENCE = 0.10
 """metres by which one side's arm and leg are nearer, when there is no doubt which side that is"""
-_SURE = 0.5
+_FAR_SIDE_THRESHOLD = 0.5
 """of 1, from when on the far side is taken for known"""
 _FAR_LIMBS = np.array([0.05, 0.05, -0.03, -0.03])
 """metres behind the middle of the hips where the far arm (elbow, wrist) and leg (knee, ankle) are, at least"""
 _CONFIDENCE_EVIDENCE = 0.05
-"""by which a detector is less sure of the far side's arm and leg"""
+"""by which a detector's confidence in the far side's arm and leg is less"""
 
 _TRUNK_REACH, _HEAD_REACH = 0.40, 0.50
 """metres: from the trunk's depth to a shoulder or a hip; from the middle of the shoulders to the face"""
@@ -78,19 +78,19 @@ _LIMBS = [
     for joints, lengths in ((("shoulder", "elbow", "wrist"), _ARM), (("hip", "knee", "ankle"), _LEG))
 ]
 _LIMB_ENDS = [[_K[f"{side}_{joint}"] for joint in ("elbow", "wrist", "knee", "ankle")] for side in ("left", "right")]
-_APART = {"ear": 0.08, "elbow": 0.06, "wrist": 0.06, "knee": 0.06, "ankle": 0.05}
+_MIN_SEPARATION = {"ear": 0.08, "elbow": 0.06, "wrist": 0.06, "knee": 0.06, "ankle": 0.05}
 """metres: a left and a right joint nearer to each other are one that was seen twice"""
 
 # The neighbourhood of a key point: a disc of this radius in metres at the body, and how it is sampled.
 _RADIUS = 0.03
-_LEAST_PIXELS, _MOST_PIXELS = 2.0, 16.0
+_MIN_PIXELS, _MAX_PIXELS = 2.0, 16.0
 _GRID = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), axis=-1).reshape(-1, 2)
 _DISC = _GRID[np.hypot(*_GRID.T) <= 1.0]
-_ALONG = np.linspace(0.1, 0.9, 9)
+_LINE_SAMPLES = np.linspace(0.1, 0.9, 9)
 """where lines between joints are sampled"""
 # What counts as one surface: depths that differ by this much; the noise of stereo grows with the distance's square.
 _BAND, _BAND_GROWTH = 0.04, 0.005
-_SHARE = 0.25
+_MIN_FILL = 0.25
 """of its neighbourhood that a surface must fill"""
 _HIP_SAMPLES, _HIP_SIDE_SAMPLES = 2.7, 2.2
 """times that radius: the neighbourhoods of the middle of the hips, and of each of them"""
@@ -134,7 +134,7 @@ def lift(
     with np.errstate(invalid="ignore"):
         x, y = keypoints[..., 0], keypoints[..., 1]
         inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-        known = inside & (confidence >= LEAST_CONFIDENCE)
+        known = inside & (confidence >= MIN_CONFIDENCE)
     positions = np.full((*confidence.shape, 3), np.nan)
     for body in range(len(keypoints)):
         positions[body] = _lift_body(np.where(known[body, :, None], keypoints[body], np.nan), confidence[body], view)
@@ -176,7 +176,7 @@ def _lift_body(pixels: Floats, confidence: Floats, view: _View) -> Floats:
     if not np.isfinite(trunk):
         return positions
     rays = view.rays(pixels)
-    radius = np.clip(_RADIUS * view.intrinsics[0, 0] / trunk, _LEAST_PIXELS, _MOST_PIXELS)
+    radius = np.clip(_RADIUS * view.intrinsics[0, 0] / trunk, _MIN_PIXELS, _MAX_PIXELS)
     samples = view.sample(pixels[:, None] + radius * _DISC)
 
     for joint in _TRUNK:
@@ -208,7 +208,7 @@ def _lift_body(pixels: Floats, confidence: Floats, view: _View) -> Floats:
     turn = _turn(positions, confidence)
     if hips:
         positions[list(_HIPS)] = hips.places(turn)
-        if hips.turned and abs(turn) > _SURE:
+        if hips.turned and abs(turn) > _FAR_SIDE_THRESHOLD:
             # what is not behind the middle of the trunk is the trunk, or the other limb, that hides this one
             far = _LIMB_ENDS[0 if turn > 0 else 1]
             hidden = positions[far, 2] < hips.middle[2] + _FAR_LIMBS
@@ -261,7 +261,7 @@ class _Hips:
     @property
     def turned(self) -> bool:
         """Whether the trunk is seen from its side."""
-        return self.beside < _TURNED * _HIP_WIDTH * self.trunk
+        return self.beside < _MAX_TURN_COSINE * _HIP_WIDTH * self.trunk
 
     def places(self, turn: float) -> Floats:
         """(2, 3) metres: both hips, on their rays. ``turn`` as from `_turn`."""
@@ -283,7 +283,7 @@ def _trunk_depth(pixels: Floats, view: _View) -> float:
     known = [joint for joint in _TRUNK if np.isfinite(pixels[joint]).all()]
     ends = list(combinations(known, 2)) or [(joint, joint) for joint in range(_JOINTS)]
     first, second = pixels[[a for a, _ in ends]], pixels[[b for _, b in ends]]
-    samples = view.sample(first[:, None] + _ALONG[:, None] * (second - first)[:, None])
+    samples = view.sample(first[:, None] + _LINE_SAMPLES[:, None] * (second - first)[:, None])
     samples = np.sort(samples[np.isfinite(samples)])
     if not len(samples):
         return np.nan
@@ -292,7 +292,7 @@ def _trunk_depth(pixels: Floats, view: _View) -> float:
     return float(samples[(start + last[start]) // 2])
 
 
-def _surface(samples: Floats, low: float, high: float, share: float = _SHARE) -> float:
+def _surface(samples: Floats, low: float, high: float, share: float = _MIN_FILL) -> float:
     """Depth of the nearest surface from ``low`` to ``high`` that fills a share of samples (S,), or NaN."""
     return _nearest_surface(samples.ravel(), low, high, max(share * samples.size, 3.0))
 
@@ -336,10 +336,10 @@ def _behind(ray: Floats, skin: float, to_centre: float) -> Floats:
 def _turn(positions: Floats, confidence: Floats) -> float:
     """Which side of a body seen from the side is farther: 1 the left, -1 the right, 0 unknown, between if unsure.
 
-    By the depth of its arms and legs; where these hide each other, by the detector, which is surer of what it sees.
+    By the depth of its arms and legs; where these hide each other, by the confidence of the detector.
     """
     left, right = positions[_LIMB_ENDS[0]], positions[_LIMB_ENDS[1]]
-    distinct = np.linalg.norm(left - right, axis=-1) > max(_APART.values())
+    distinct = np.linalg.norm(left - right, axis=-1) > max(_MIN_SEPARATION.values())
     if distinct.any():
         evidence = float((left - right)[distinct, 2].mean())
         if abs(evidence) > _TURN_EVIDENCE / 3:
@@ -350,11 +350,11 @@ def _turn(positions: Floats, confidence: Floats) -> float:
 
 def _drop_doubles(positions: Floats, confidence: Floats, turn: float, shoulder_width: float) -> None:
     """Of a left and a right joint at one place, the hidden one goes: that of the far side, or the less sure one."""
-    apart = _APART | {"shoulder": _SEEN_WIDTH * shoulder_width}
+    apart = _MIN_SEPARATION | {"shoulder": _SEEN_WIDTH * shoulder_width}
     for name, least in apart.items():
         left, right = _K[f"left_{name}"], _K[f"right_{name}"]
         if np.linalg.norm(positions[left] - positions[right]) < least:
-            left_goes = turn > 0 if abs(turn) > _SURE else confidence[left] < confidence[right]
+            left_goes = turn > 0 if abs(turn) > _FAR_SIDE_THRESHOLD else confidence[left] < confidence[right]
             positions[left if left_goes else right] = np.nan
 
 

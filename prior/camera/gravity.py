@@ -1,6 +1,6 @@
-"""Which way is up: the pose of a camera's frame from what its accelerometer feels.
+"""The pose of a camera's frame from its accelerometer: which way is up.
 
-Gravity gives two of the three angles. The third, where north is, nobody knows: a levelled camera looks along the
+Gravity gives two of the three angles. The third, the heading, is not observable: a levelled camera looks along the
 world's +y, as `msgs.types.Pose.from_up` has it.
 """
 
@@ -16,12 +16,12 @@ Floats = NDArray[np.float64]
 
 GRAVITY = 9.81
 """m/s²"""
-STILL = 0.7
+MAX_DEVIATION = 0.7
 """m/s²: a reading further from gravity is of a camera that is being moved"""
 MEMORY_S = 1.0
-"""over which readings are averaged"""
-TURNED = np.radians(1.0)
-"""the level is told anew when it has changed by so much: a world that shakes with the accelerometer is of no use"""
+"""time constant of the exponential average of readings"""
+UPDATE_ANGLE = np.radians(1.0)
+"""the pose is updated when the direction has changed by so much, so that the world does not shake with the noise"""
 
 
 def level_pose(up: Floats) -> Pose:
@@ -42,8 +42,8 @@ def level_pose(up: Floats) -> Pose:
     return Pose(np.zeros(3), Rotation.from_matrix(np.stack([np.cross(forward, up), forward, up])).as_quat())
 
 
-class Level:
-    """Which way is up, from an accelerometer's readings; a level camera until there are any.
+class GravityEstimator:
+    """The direction of gravity from an accelerometer's readings; that of a level camera until there are any.
 
     Attributes:
         pose: of the camera's frame in the world.
@@ -54,18 +54,18 @@ class Level:
     def __init__(self) -> None:
         self.pose = Pose.from_up("-y")
         self.measured = False
-        self._felt = self.up = np.array([0.0, -1.0, 0.0])
+        self._average = self.up = np.array([0.0, -1.0, 0.0])
         self._last_ns = 0
 
     def update(self, acceleration: Floats, stamp_ns: int) -> None:
         """Take a reading: acceleration (3,) m/s² in the camera's frame, gravity included (9.81 up at rest)."""
         strength = np.linalg.norm(acceleration)
-        if not abs(strength - GRAVITY) < STILL:
+        if not abs(strength - GRAVITY) < MAX_DEVIATION:
             return
         up = acceleration / strength
         elapsed_s, self._last_ns = (stamp_ns - self._last_ns) / 1e9, stamp_ns
         share = 1 - np.exp(-np.clip(elapsed_s, 0.0, MEMORY_S) / MEMORY_S) if self.measured else 1.0
-        self._felt = self._felt + share * (up - self._felt)
-        felt = self._felt / np.linalg.norm(self._felt)
-        if not self.measured or felt @ self.up < np.cos(TURNED):
-            self.pose, self.up, self.measured = level_pose(felt), felt, True
+        self._average = self._average + share * (up - self._average)
+        average = self._average / np.linalg.norm(self._average)
+        if not self.measured or average @ self.up < np.cos(UPDATE_ANGLE):
+            self.pose, self.up, self.measured = level_pose(average), average, True

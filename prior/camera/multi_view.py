@@ -24,21 +24,21 @@ Floats = NDArray[np.float64]
 
 PERIOD_NS = round(1e9 / FPS)
 SOURCE, FRAME_ID = "merged", "world"
-SAME_M = 0.4
-"""Two sightings of one body are nearer than this to each other, in the median over their joints."""
-APART_M = 0.25
-"""Two sightings of a joint farther than this from each other are not of the same thing: the surer one is taken."""
-ALONG = 2.0
-"""Times the error across the line of sight is that along it."""
-WAIT_NS = 100_000_000
-"""For a camera that is late, before the others are merged without it."""
-SILENT_NS = 500_000_000
+MATCH_RADIUS_M = 0.4
+"""Metres, the median over the joints: observations of one body by two cameras are nearer than this."""
+CONFLICT_M = 0.25
+"""Metres: observations of a joint farther apart contradict each other, and the one of less variance is taken."""
+DEPTH_ERROR_RATIO = 2.0
+"""The error along the line of sight, over that across it."""
+MAX_WAIT_NS = 100_000_000
+"""How long a camera is waited for before the others are merged without it."""
+CAMERA_TIMEOUT_NS = 500_000_000
 """A camera without a picture for so long is not waited for."""
-LONGEST_STEP_NS = 150_000_000
-"""Between pictures of a camera; over longer ones is not interpolated."""
-LATE_IN_A_ROW = 30
-"""Pictures of all cameras; then the clocks were set, and the merged stream starts anew."""
-MOST_BODIES = 16
+MAX_GAP_NS = 150_000_000
+"""Between pictures of a camera; longer gaps are not interpolated."""
+CLOCK_RESET_FRAMES = 30
+"""Consecutive pictures of all cameras that come too late: the clocks were set, and the merged stream starts anew."""
+MAX_BODIES = 16
 """In a message; a camera sees fewer."""
 
 
@@ -62,8 +62,8 @@ class Sightings:
 class Merge:
     """Merges the ``pose/raw`` of several cameras into one, on a 30 Hz grid of capture times.
 
-    A moment is given out when every camera that is there has told of it, or `WAIT_NS` later. Only stamps count, so the
-    cameras' clocks must agree (on several machines by NTP or PTP); what comes too late is counted.
+    A frame is published when every camera that is there has sent its picture, or `MAX_WAIT_NS` later. Only stamps
+    count, so the cameras' clocks must agree (on several machines by NTP or PTP); what comes too late is counted.
 
     Attributes:
         counters: what was refused or came too late, by cause and camera.
@@ -89,11 +89,11 @@ class Merge:
         self._late = self._late + 1 if late else 0
         if late:
             self.counters[f"late or repeated, {raw.source}"] += 1
-            if self._late >= LATE_IN_A_ROW:
+            if self._late >= CLOCK_RESET_FRAMES:
                 self._reset()
             return []
         self._last[raw.source] = seen
-        if before and seen.stamp_ns - before.stamp_ns > LONGEST_STEP_NS:
+        if before and seen.stamp_ns - before.stamp_ns > MAX_GAP_NS:
             before = None  # too long ago to say where bodies were in between
         for tick in _ticks(before.stamp_ns if before else seen.stamp_ns - PERIOD_NS, seen.stamp_ns):
             if tick > self._given_ns:
@@ -111,8 +111,8 @@ class Merge:
         elif not raw.calibrated or not np.isfinite(place.position).all() or not unit:
             self.counters[f"not calibrated, {raw.source}"] += 1
         else:
-            bodies = [body for body in raw.bodies if len(body.positions) == len(skeleton.joints)][:MOST_BODIES]
-            self.counters[f"wrong joint count, {raw.source}"] += len(raw.bodies[:MOST_BODIES]) - len(bodies)
+            bodies = [body for body in raw.bodies if len(body.positions) == len(skeleton.joints)][:MAX_BODIES]
+            self.counters[f"wrong joint count, {raw.source}"] += len(raw.bodies[:MAX_BODIES]) - len(bodies)
             joints = np.array([body.positions for body in bodies], np.float64).reshape(-1, len(skeleton.joints), 3)
             trust = np.array([body.confidence for body in bodies], np.float64).reshape(joints.shape[:2])
             joints, trust = to_canonical(skeleton, joints, np.clip(np.nan_to_num(trust), 0.0, 1.0))
@@ -124,8 +124,8 @@ class Merge:
         newest_ns = max(seen.stamp_ns for seen in self._last.values())
         merged = []
         for tick in sorted(self._waiting):
-            expected = [seen for seen in self._last.values() if abs(newest_ns - seen.stamp_ns) <= SILENT_NS]
-            if any(seen.stamp_ns < tick for seen in expected) and newest_ns < tick + WAIT_NS:
+            expected = [seen for seen in self._last.values() if abs(newest_ns - seen.stamp_ns) <= CAMERA_TIMEOUT_NS]
+            if any(seen.stamp_ns < tick for seen in expected) and newest_ns < tick + MAX_WAIT_NS:
                 break
             merged.append(self._message(tick, self._waiting.pop(tick)))
             self._given_ns = tick
@@ -173,8 +173,8 @@ def match_bodies(some: Floats, others: Floats) -> list[tuple[int, int]]:
     both = np.isfinite(away).any(axis=-1)
     distance = np.full(away.shape[:2], np.inf)
     distance[both] = np.nanmedian(away[both], axis=-1)
-    near = distance < SAME_M
-    rows, columns = linear_sum_assignment(np.where(near, distance - SAME_M, 0.0))
+    near = distance < MATCH_RADIUS_M
+    rows, columns = linear_sum_assignment(np.where(near, distance - MATCH_RADIUS_M, 0.0))
     return [(int(r), int(c)) for r, c in zip(rows, columns, strict=True) if near[r, c]]
 
 
@@ -191,10 +191,12 @@ def merge_joints(sightings: list[Sighting]) -> tuple[Floats, Floats]:
     seen = finite_joints(joints) & (confidence > 0)
     weight = np.where(seen, (confidence / np.where(seen, reach, 1.0)) ** 2, 0.0)
     surest = np.take_along_axis(joints, weight.argmax(axis=0)[None, :, None], axis=0)
-    weight[~(np.linalg.norm(joints - surest, axis=-1) < APART_M)] = 0.0
+    weight[~(np.linalg.norm(joints - surest, axis=-1) < CONFLICT_M)] = 0.0
     used = weight > 0
     ray = np.where(used[..., None], ray / reach[..., None], 0.0)
-    precision = weight[..., None, None] * (np.eye(3) + (ALONG**-2 - 1.0) * ray[..., :, None] * ray[..., None, :])
+    precision = weight[..., None, None] * (
+        np.eye(3) + (DEPTH_ERROR_RATIO**-2 - 1.0) * ray[..., :, None] * ray[..., None, :]
+    )
     pulled = (precision @ np.where(used[..., None], joints, 0.0)[..., None]).sum(axis=0)
     any_used = np.asarray(used.any(axis=0))
     total = np.where(any_used[:, None, None], precision.sum(axis=0), np.eye(3))

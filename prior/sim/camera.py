@@ -81,7 +81,7 @@ class Camera:
         c, s = np.cos(self.roll), np.sin(self.roll)
         return np.stack([c * right + s * down, c * down - s * right, forward], axis=-1)
 
-    def told_pose(self) -> Pose:
+    def estimated_pose(self) -> Pose:
         """The pose that goes into its messages: the true one, or, uncalibrated, only which way is up."""
         if self.calibrated:
             return Pose(np.array(self.position), Rotation.from_matrix(self.orientation).as_quat())
@@ -183,7 +183,7 @@ _BLEED_DURATION = 0.08  # seconds, mean
 _GUESS_STD = 0.07  # metres: what a tracker makes of a joint it cannot see
 _GUESS_MEMORY = 0.6  # seconds over which such a guess wanders
 _LOST_SHARE = 0.45  # of hidden joints, those the tracker gives up
-_LEAST_JOINTS = 0.4  # of a body's joints that must be seen for it to be reported
+_MIN_JOINTS = 0.4  # of a body's joints that must be seen for it to be reported
 _FIND_AFTER = 0.3  # seconds in view before a lost body is found again
 _FORGET_AFTER = 0.8  # seconds out of view after which it comes back under a new id
 
@@ -216,7 +216,9 @@ def film(
             if track.reported[f]
         ]
         stamp = start_ns + round(time * 1e9)
-        frames.append(PoseRaw(stamp, FRAME_ID, source, camera.skeleton, camera.told_pose(), camera.calibrated, bodies))
+        frames.append(
+            PoseRaw(stamp, FRAME_ID, source, camera.skeleton, camera.estimated_pose(), camera.calibrated, bodies)
+        )
     return frames
 
 
@@ -271,7 +273,7 @@ def _track(
     lost = given_up | outside | (optical[..., 2] < camera.near)
     positions = np.where(lost[..., None], np.nan, optical)
     confidence = np.where(lost, 0.0, confidence_of(scale, rng))
-    reported = _found((~outside & (hidden < 0.5)).mean(axis=1) >= _LEAST_JOINTS, times)
+    reported = _found((~outside & (hidden < 0.5)).mean(axis=1) >= _MIN_JOINTS, times)
     return _Track(positions, confidence, reported)
 
 

@@ -72,7 +72,7 @@ class NoiseModel:
         fast_spread_memory: seconds, correlation time of that size.
         shared: share of the variance of bias and fast noise that all joints have in common.
         jump_rate: (22,) jumps a second.
-        jump_least: metres, length of the shortest jumps.
+        jump_minimum: metres, length of the shortest jumps.
         jump_tail: exponent of the Pareto law of their lengths.
         jump_short: seconds, mean duration of a short jump.
         jump_long: seconds, mean duration of a long one.
@@ -93,7 +93,7 @@ class NoiseModel:
     fast_spread_memory: float
     shared: float
     jump_rate: Floats
-    jump_least: float
+    jump_minimum: float
     jump_tail: float
     jump_short: float
     jump_long: float
@@ -227,7 +227,7 @@ def _jumps(shape: tuple[int, ...], dt: Floats, rate: Floats, rng: np.random.Gene
         if new:
             direction = rng.standard_normal((new, 3))
             direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-            length = np.minimum(model.jump_least * (1 - rng.random((new, 1))) ** (-1 / model.jump_tail), LONGEST_JUMP)
+            length = np.minimum(model.jump_minimum * (1 - rng.random((new, 1))) ** (-1 / model.jump_tail), LONGEST_JUMP)
             displaced[begin] = direction * length
             mean = np.where(rng.random(new) < short, model.jump_short, model.jump_long)
             stay[begin] = np.exp(-1.0 / mean)

@@ -17,9 +17,9 @@ os.environ.setdefault("DEPTHAI_LEVEL", "error")
 
 import depthai as dai
 
-from steadypose.nodes.graph.launch import OakSettings
-from steadypose.nodes.graph.runtime import Clock
-from steadypose.nodes.sources.oak import Host
+from steadypose.nodes.graph.clock import Clock
+from steadypose.nodes.sources.oak import OakSettings
+from steadypose.nodes.sources.oak_device import Host
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.sim.depth import Stereo, render, room
@@ -181,7 +181,7 @@ def plugged(
 
 
 def opener(make: Callable[[Clock], list[tuple[str, dai.Buffer]]]):
-    """A stand-in for `nodes.sources.oak.connect`."""
+    """A stand-in for `nodes.sources.oak_device.connect`."""
 
     @contextmanager
     def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:

@@ -73,7 +73,7 @@ def stamps_until(subscriber: Subscriber, last: int) -> list[int]:
 
 def test_every_message_arrives_as_it_was(endpoint: str):
     with Publisher(endpoint) as publisher, Subscriber(publisher.endpoint, EXAMPLES, name="test") as subscriber:
-        assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+        assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
         for topic, message in EXAMPLES.items():
             assert publisher.publish(topic, message)
         for topic, message in EXAMPLES.items():
@@ -85,7 +85,7 @@ def test_every_message_arrives_as_it_was(endpoint: str):
 
 def test_only_the_topics_subscribed_to_arrive(endpoint: str):
     with Publisher(endpoint) as publisher, Subscriber(publisher.endpoint, POSE_WORLD, name="test") as subscriber:
-        assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+        assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
         for topic in (POSE_RAW, POSE_CLEAN, POSE_WORLD):
             publisher.publish(topic, EXAMPLES[topic])
         assert subscriber.receive(SOON_S) == (POSE_WORLD, EXAMPLES[POSE_WORLD])
@@ -95,7 +95,7 @@ def test_only_the_topics_subscribed_to_arrive(endpoint: str):
 def test_the_last_message_arrives_though_the_publisher_is_gone(endpoint: str):
     with Publisher(endpoint) as publisher:
         subscriber = Subscriber(publisher.endpoint, POSE_RAW, name="test")
-        assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+        assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
         publisher.publish(POSE_RAW, raw())
     with subscriber:
         assert subscriber.receive(SOON_S) == (POSE_RAW, raw())
@@ -107,7 +107,7 @@ def test_a_subscriber_may_be_first_and_outlive_its_publisher(tmp_path: Path):
         for start in (0, 10):
             with Publisher(path) as publisher:
                 # ZeroMQ subscribes again when the subscriber next looks for messages
-                wait_until(lambda publisher=publisher: subscriber.receive(0) or publisher.listeners)
+                wait_until(lambda publisher=publisher: subscriber.receive(0) or publisher.subscribers)
                 for stamp in range(start, start + 3):
                     publisher.publish(POSE_RAW, raw(stamp))
                     assert subscriber.receive(SOON_S) == (POSE_RAW, raw(stamp))
@@ -122,7 +122,7 @@ def test_publishers_of_one_topic_are_counted_apart(tmp_path: Path):
         Subscriber(paths, [DIAGNOSTICS, POSE_RAW], name="test") as subscriber,
     ):
         for publisher in (first, second):
-            assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+            assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
         for publisher in (first, first, second, first, second):
             publisher.publish(DIAGNOSTICS, diagnostics())
             publisher.publish(POSE_RAW, raw())
@@ -135,11 +135,11 @@ def test_publishers_of_one_topic_are_counted_apart(tmp_path: Path):
 def test_listeners_come_and_go(endpoint: str):
     with Publisher(endpoint) as publisher, Subscriber(publisher.endpoint, POSE_RAW):
         with Subscriber(publisher.endpoint, POSE_RAW, name="a"), Subscriber(publisher.endpoint, POSE_RAW, name="ab"):
-            assert publisher.wait_for_listeners(["a", "ab"], timeout_s=SOON_S)
-            assert publisher.listeners == {"a", "ab"}
-            assert not publisher.wait_for_listeners(["a", "c"], timeout_s=NEVER_S)
-        wait_until(lambda: not publisher.listeners)
-        assert publisher.wait_for_listeners([], timeout_s=0)
+            assert publisher.wait_for_subscribers(["a", "ab"], timeout_s=SOON_S)
+            assert publisher.subscribers == {"a", "ab"}
+            assert not publisher.wait_for_subscribers(["a", "c"], timeout_s=NEVER_S)
+        wait_until(lambda: not publisher.subscribers)
+        assert publisher.wait_for_subscribers([], timeout_s=0)
 
 
 def test_conflate_gives_the_newest_and_counts_the_others(endpoint: str):
@@ -171,7 +171,7 @@ def test_what_does_not_fit_is_lost_and_counted(endpoint: str):
         Publisher(endpoint) as publisher,
         Subscriber(publisher.endpoint, POSE_RAW, high_water=5, name="test") as subscriber,
     ):
-        assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+        assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
         for stamp in range(300):
             publisher.publish(POSE_RAW, dataclasses.replace(BIG, stamp_ns=stamp))
         later = itertools.count(300)
@@ -194,7 +194,7 @@ def test_a_subscriber_that_never_reads_neither_blocks_nor_fills_its_publisher(en
         Publisher(endpoint) as publisher,
         Subscriber(publisher.endpoint, POSE_RAW, high_water=5, name="test") as subscriber,
     ):
-        assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+        assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
 
         def publish() -> None:
             for stamp in range(1000):
@@ -217,7 +217,7 @@ def test_lossless_waits_for_the_slowest(endpoint: str):
         Publisher(endpoint, lossless=True) as publisher,
         Subscriber(publisher.endpoint, POSE_RAW, high_water=5, name="slow") as slow,
     ):
-        assert publisher.wait_for_listeners(["slow"], timeout_s=SOON_S)
+        assert publisher.wait_for_subscribers(["slow"], timeout_s=SOON_S)
         received, waits = [], 0
         for stamp in range(200):
             message = dataclasses.replace(BIG, stamp_ns=stamp)
@@ -349,7 +349,7 @@ def test_a_publisher_survives_strangers(tmp_path: Path):
             for upstream in (b"", b"\1\xff\xfe\xfd", b"\0\xffnobody", b"\2garbage", b"hello"):
                 talker.send(upstream)
             with Subscriber(publisher.endpoint, POSE_RAW, name="test") as subscriber:
-                assert publisher.wait_for_listeners(["test"], timeout_s=SOON_S)
+                assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
                 publisher.publish(POSE_RAW, raw())
                 assert subscriber.receive(SOON_S) == (POSE_RAW, raw())
 
@@ -378,7 +378,7 @@ def test_with_keys_only_the_listed_listen(at: str, key_directories: tuple[Path, 
             Subscriber(reach, POSE_RAW, keys=stranger, name="stranger") as unlisted,
             Subscriber(reach, POSE_RAW, name="keyless") as keyless,
         ):
-            assert publisher.wait_for_listeners(["own", "guest"], timeout_s=SOON_S)
+            assert publisher.wait_for_subscribers(["own", "guest"], timeout_s=SOON_S)
             for refused in (unlisted, keyless):
                 wait_until(lambda refused=refused: refused.receive(0) or refused.refused["handshake"])
             publisher.publish(POSE_RAW, raw())
@@ -386,7 +386,7 @@ def test_with_keys_only_the_listed_listen(at: str, key_directories: tuple[Path, 
             assert listed.receive(SOON_S) == (POSE_RAW, raw())
             assert unlisted.receive(NEVER_S) is None
             assert keyless.receive(NEVER_S) is None
-            assert publisher.listeners == {"own", "guest"}
+            assert publisher.subscribers == {"own", "guest"}
 
 
 def test_a_subscriber_with_keys_does_not_trust_an_impostor(key_directories: tuple[Path, Path, Path]):
@@ -396,7 +396,7 @@ def test_a_subscriber_with_keys_does_not_trust_an_impostor(key_directories: tupl
         Publisher("tcp://127.0.0.1:*", keys=impostor) as publisher,
         Subscriber(publisher.endpoint, POSE_RAW, keys=guest, name="guest"),
     ):
-        assert not publisher.wait_for_listeners(["guest"], timeout_s=NEVER_S)
+        assert not publisher.wait_for_subscribers(["guest"], timeout_s=NEVER_S)
 
 
 def test_the_secret_key_is_for_its_owner_alone(tmp_path: Path):

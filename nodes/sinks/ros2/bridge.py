@@ -1,26 +1,19 @@
-"""The ROS 2 bridge: ``pose/world`` and ``diagnostics`` out to ROS 2. What comes out is told in docs/ros2.md."""
+"""The ROS 2 bridge: ``pose/world`` and ``diagnostics`` out to ROS 2. docs/ros2.md lists the topics."""
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 from steadypose.msgs.types import Diagnostics, Message, PoseWorld
-from steadypose.nodes.graph.launch import Launch, LaunchError
-from steadypose.nodes.graph.runtime import Clock, Node
+from steadypose.nodes.graph.clock import Clock
+from steadypose.nodes.graph.extras import require_extra
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.node import Node
 
-PACKAGES = ("rclpy", "rmw_fastrtps_cpp", "visualization_msgs", "diagnostic_msgs", "sensor_msgs", "cyclonedds")
 
-
-def require_ros2() -> None:
+def check_ros2(launch: Launch) -> None:
     """Raises:
     LaunchError: something of ROS 2 is not installed.
     """
-    missing = [name for name in PACKAGES if find_spec(name) is None]
-    if missing:
-        raise LaunchError(
-            f"the ROS 2 bridge needs {', '.join(missing)}, not installed: run `uv sync --inexact --extra ros2` in the "
-            "checkout, or `pip install 'steadypose[ros2]'`; everything but ROS 2 works without"
-        )
+    require_extra("ros2")
 
 
 class Ros2BridgeNode(Node):
@@ -30,7 +23,7 @@ class Ros2BridgeNode(Node):
 
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
-        require_ros2()
+        require_extra("ros2")
         self._bodies = 0
 
     def work(self) -> None:
@@ -45,7 +38,7 @@ class Ros2BridgeNode(Node):
         elif isinstance(message, PoseWorld):
             self._bodies = len(message.bodies)
             if refused := self._ros.publish_bodies(message):
-                self.counts["refused.body not finite"] += refused
+                self.health.counts["refused.body not finite"] += refused
 
     def status(self) -> dict[str, str]:
         return {"bodies": str(self._bodies)}

@@ -34,7 +34,7 @@ LOCALHOST = """<CycloneDDS><Domain>
 <AllowMulticast>false</AllowMulticast></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers></Discovery>
 </Domain></CycloneDDS>"""
-"""Cyclone's configuration where ROS is told to stay on this machine"""
+"""Cyclone's configuration where ROS's discovery is limited to this machine"""
 
 
 @dataclass

@@ -111,15 +111,15 @@ class RosOutput:
         names = [f"{joint}_{name}" for joint in angles]
         topics.angles.publish(JointAngles(header=header, name=names, position=list(angles.values())))
 
-    def publish_diagnostics(self, news: Diagnostics) -> None:
+    def publish_diagnostics(self, diagnostics: Diagnostics) -> None:
         status = DiagnosticStatus(
-            level=bytes([news.level]),
-            name=f"steadypose: {news.node}",
-            message=news.message,
-            hardware_id=news.node,
-            values=[KeyValue(key=key, value=value) for key, value in news.values.items()],
+            level=bytes([diagnostics.level]),
+            name=f"steadypose: {diagnostics.node}",
+            message=diagnostics.message,
+            hardware_id=diagnostics.node,
+            values=[KeyValue(key=key, value=value) for key, value in diagnostics.values.items()],
         )
-        header = Header(stamp=Time(nanoseconds=news.stamp_ns).to_msg())
+        header = Header(stamp=Time(nanoseconds=diagnostics.stamp_ns).to_msg())
         self._diagnostics.publish(DiagnosticArray(header=header, status=[status]))
 
     def close(self) -> None:

@@ -20,7 +20,7 @@ from steadypose.nodes.commands import batch
 from steadypose.nodes.commands.batch import Job, _Worker, find_recordings, is_folder_of_recordings, on_cores, plan, work
 from steadypose.nodes.commands.clean import clean
 from steadypose.nodes.commands.cleaning import clean_recording
-from steadypose.nodes.graph.launch import LaunchError
+from steadypose.nodes.graph.settings import LaunchError
 
 FRAMES = 15
 
@@ -147,8 +147,8 @@ def test_a_process_that_died_between_two_recordings_takes_one_with_it(tmp_path: 
     worker.connection, theirs = multiprocessing.Pipe()
     worker.process = Mock(exitcode=-9)
     theirs.close()
-    worker.give(Job(tmp_path / "a.npz", tmp_path / "b.npz"))
-    assert worker.take() == {"state": "failed", "error": "the process that cleaned it ended with status -9"}
+    worker.send(Job(tmp_path / "a.npz", tmp_path / "b.npz"))
+    assert worker.receive() == {"state": "failed", "error": "the process that cleaned it ended with status -9"}
 
 
 def test_an_output_is_whole_or_not_there(tmp_path: Path, settings, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,9 +13,12 @@ from conftest import VirtualClock, raw, walking
 from steadypose.benchmarks.systems.calibration import BOARD, depth_points, error, held_poses, look_at, picture, rays
 from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.cli import main
-from steadypose.nodes.commands.calibrate import draw_floor
-from steadypose.nodes.graph.launch import Launch, LaunchError, bundled
-from steadypose.nodes.sources.pose_input import PoseInputNode, RecordingSource
+from steadypose.nodes.commands.calibrate.pictures import draw_floor
+from steadypose.nodes.graph.launch import Launch, bundled
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sources.pose_input import PoseInputNode
+from steadypose.nodes.sources.recording import RecordingSource
+from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.camera.calibration import Intrinsics, find_corners
 
 LENS = Intrinsics((640, 360), (520.0, 518.0), (322.0, 177.0), (0.03, -0.05, 0.0, 0.0, 0.0))
@@ -44,7 +47,7 @@ def test_board_lens_and_pose_end_in_the_launch_file(
     assert "first run steadypose calibrate lens" in capsys.readouterr().err
     assert main(["calibrate", "lens", str(launch), str(pictures / "held"), "--square", square]) == 0
     assert main(["calibrate", "pose", str(launch), str(pictures / "floor"), "--square", square]) == 0
-    told = Launch.read(launch).input.calibration
+    told = Launch.read(launch).settings(InputSettings).calibration
     assert told.focal == pytest.approx(LENS.focal, rel=0.01)
     assert told.pose is not None
     millimetres, degrees = error(told.pose, EYE)
@@ -53,7 +56,7 @@ def test_board_lens_and_pose_end_in_the_launch_file(
     text = launch.read_text()
     assert "# our kitchen" in text
     assert '"oak" # by the window' in text
-    assert Launch.read(launch).prior == {"delay": 2}
+    assert Launch.read(launch).table("prior") == {"delay": 2}
     drawn = cv2.imread(str(tmp_path / "kitchen.floor.png"))
     assert drawn is not None
     assert drawn.shape == (360, 640, 3)
@@ -78,7 +81,7 @@ def test_the_floor_seen_in_depth_tells_height_and_tilt(tmp_path: Path) -> None:
     launch.write_text(LENS_TOLD)
     cv2.imwrite(str(tmp_path / "depth.png"), floor_depth())
     assert main(["calibrate", "floor", str(launch), str(tmp_path / "depth.png"), *UP]) == 0
-    pose = Launch.read(launch).input.calibration.pose
+    pose = Launch.read(launch).settings(InputSettings).calibration.pose
     assert pose is not None
     assert pose.position == pytest.approx([0.0, 0.0, EYE.position[2]], abs=0.01)
 
@@ -123,7 +126,7 @@ def _pixel(point: np.ndarray) -> np.ndarray:
         (["lens", "nowhere.toml", "x"], "no launch file at nowhere.toml"),
         (["lens", "{launch}", "{folder}/nothing"], "expected a picture, a folder of pictures, or a video"),
         (["lens", "{launch}", "{launch}"], "expected a picture that OpenCV reads"),
-        (["floor", "{launch}", "{folder}/no.png"], "tells no lens"),
+        (["floor", "{launch}", "{folder}/no.png"], "has no lens"),
         (["floor", "{lens}", "{folder}/no.npy"], "does not exist"),
         (["floor", "{lens}", "{folder}/bad.npy"], "cannot be read as .npy"),
         (["floor", "{lens}", "{folder}/several.npy"], "got nothing that can be read"),
@@ -165,7 +168,7 @@ def test_a_launch_file_is_whole_whatever_happens(tmp_path: Path, monkeypatch: py
         assert main(arguments) == 2
     assert launch.read_text() == LENS_TOLD
     assert main(arguments) == 0
-    assert Launch.read(launch).input.calibration.pose is not None
+    assert Launch.read(launch).settings(InputSettings).calibration.pose is not None
     assert link.is_symlink()
     assert launch.stat().st_mode & 0o777 == 0o640
     assert {file.name for file in tmp_path.iterdir()} == {"kitchen.toml", "link.toml", "floor.npy", "link.floor.png"}
@@ -179,12 +182,12 @@ def test_a_calibrated_camera_sends_its_place(make_launch: Callable[..., Launch],
     node = PoseInputNode(launch, clock, RecordingSource(bundled("sim_data", "idle")))
     message = raw(0, walking(0))
     message.calibrated = False
-    placed = node._placed(message)
+    placed = node._with_pose(message)
     assert isinstance(placed, PoseRaw)
     assert placed.calibrated
     assert placed.sensor_pose == Pose(np.array([1.0, 2.0, 1.5]), np.array([-half, 0.0, 0.0, half]))
     message.calibrated = True
-    assert node._placed(message) == message, "a source that knows its place keeps it"
+    assert node._with_pose(message) == message, "a source that knows its place keeps it"
 
 
 @pytest.mark.parametrize(

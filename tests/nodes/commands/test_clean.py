@@ -15,8 +15,10 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean, PoseWorld, Tracking, WorldBody
 from steadypose.nodes.commands.clean import clean
-from steadypose.nodes.graph.launch import LaunchError
-from steadypose.nodes.sources.npz import PERIOD_NS, NpzCollector, NpzError
+from steadypose.nodes.graph.clock import FRAME_NS
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sources.npz import NpzError
 
 FRAMES = 40
 
@@ -156,7 +158,7 @@ def collect(*stamped: tuple[PoseClean, PoseWorld]) -> NpzCollector:
 @given(share=st.floats(0.0, 1.0), seed=st.integers(0, 1000))
 def test_between_two_grid_times_it_interpolates(share: float, seed: int) -> None:
     turns = Rotation.random(2, rng=np.random.default_rng(seed))
-    period = round(PERIOD_NS)
+    period = round(FRAME_NS)
     collector = collect(answers(START_NS, 0.0, turns[0]), answers(START_NS + period, 1.0, turns[1]))
     stamp = START_NS + round(share * period)
     out = collector.arrays(np.array([stamp]))

@@ -181,12 +181,12 @@ def test_the_prior_is_timed_on_a_body_that_stands(monkeypatch: pytest.MonkeyPatc
 
 
 def test_missing_streams_say_what_to_play_instead(monkeypatch: pytest.MonkeyPatch) -> None:
-    from steadypose.nodes.sources import pose_input
+    from steadypose.nodes.sources import recording
 
     def gone(path: Path) -> None:
-        raise pose_input.LaunchError(f"{path} does not exist")
+        raise recording.LaunchError(f"{path} does not exist")
 
-    monkeypatch.setattr(pose_input, "open_source", gone)
+    monkeypatch.setattr(recording, "open_recording", gone)
     finding = only(module.check_streams)
     assert finding.verdict is Verdict.BAD
     assert "--input" in finding.fix

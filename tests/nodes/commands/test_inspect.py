@@ -16,8 +16,11 @@ from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import CleanBody, Diagnostics, Level, PoseClean, PoseRaw
-from steadypose.nodes.commands import inspect
-from steadypose.nodes.commands.inspect import InspectError, Rate, echo, hz, info, measure
+from steadypose.nodes.commands.inspect import info as info_module
+from steadypose.nodes.commands.inspect.echo import echo
+from steadypose.nodes.commands.inspect.hz import Rate, hz, measure
+from steadypose.nodes.commands.inspect.info import info
+from steadypose.nodes.commands.inspect.topic import InspectError
 
 DEADLINE_S = 20.0
 
@@ -142,7 +145,7 @@ def test_info_of_a_recording_cut_short_says_so(recording: Path, capsys: pytest.C
 
 
 def test_info_of_a_topic(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inspect, "INFO_S", 0.5)
+    monkeypatch.setattr(info_module, "INFO_S", 0.5)
     endpoint = f"ipc://{tmp_path}/input"
     silent = f"ipc://{tmp_path}/nobody"
     assert published(endpoint, lambda: info(POSE_RAW, endpoints=(endpoint, silent))) == 0
@@ -155,7 +158,7 @@ def test_info_of_a_topic(tmp_path: Path, capsys: pytest.CaptureFixture[str], mon
 def test_info_of_a_topic_that_nobody_publishes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(inspect, "INFO_S", 0.1)
+    monkeypatch.setattr(info_module, "INFO_S", 0.1)
     assert info(POSE_RAW, endpoints=(f"ipc://{tmp_path}/nobody",)) == 1
     assert "is `steadypose run` running?" in capsys.readouterr().out
 

@@ -13,8 +13,10 @@ from tests.helpers.synthetic_poses import messages
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw
-from steadypose.nodes.commands import plot as module
-from steadypose.nodes.commands.plot import PlotError, plot
+from steadypose.nodes.commands.plot.command import PlotError, plot
+from steadypose.nodes.commands.plot.errors import errors_of
+from steadypose.nodes.commands.plot.history import read_history
+from steadypose.nodes.commands.plot.panels import busiest_joints
 from steadypose.prior.body.skeleton import J
 
 PICTURE = b"\x89PNG"
@@ -72,11 +74,11 @@ def test_reads_bodies_errors_and_troubles(tmp_path: Path) -> None:
             writer.write(topic, message, message.stamp_ns)
         values = {"dropped.late": "3", "queue": "1", "refused.undecodable": "2"}
         writer.write(DIAGNOSTICS, Diagnostics(3 * 10**9, "prior", Level.WARN, "", values), 3 * 10**9)
-    story = module._read(tmp_path / "bag")
-    assert story.troubles == {"prior dropped.late": 3, "prior refused.undecodable": 2}
-    assert set(story.tracks[POSE_CLEAN]) == {0, 1}
+    history = read_history(tmp_path / "bag")
+    assert history.dropped_or_refused == {"prior dropped.late": 3, "prior refused.undecodable": 2}
+    assert set(history.tracks[POSE_CLEAN]) == {0, 1}
     for body in (0, 1):
-        errors = module._errors(story, body)
+        errors = errors_of(history, body)
         assert errors[POSE_RAW].mean.mean() == pytest.approx(0.032, abs=0.004), "2 cm of noise along each axis"
         assert errors[POSE_CLEAN].mean.mean() == pytest.approx(0.0048, abs=0.0006)
         assert errors[POSE_WORLD].mean.mean() == pytest.approx(0.0048, abs=0.0006)
@@ -90,8 +92,8 @@ def test_a_body_is_compared_with_the_person_who_stands_there(tmp_path: Path) -> 
                 for body in message.bodies:
                     body.id = 7 - body.id
             writer.write(topic, message, message.stamp_ns)
-    story = module._read(tmp_path / "bag")
-    assert module._errors(story, 7)[POSE_RAW].mean.max() < 0.1
+    history = read_history(tmp_path / "bag")
+    assert errors_of(history, 7)[POSE_RAW].mean.max() < 0.1
 
 
 def test_a_camera_whose_place_is_unknown_is_put_where_it_fits(tmp_path: Path) -> None:
@@ -104,7 +106,7 @@ def test_a_camera_whose_place_is_unknown_is_put_where_it_fits(tmp_path: Path) ->
                 )
                 message.sensor_pose = Pose(np.array([5.0, 6.0, 7.0]), turned.as_quat())
             writer.write(topic, message, message.stamp_ns)
-    errors = module._errors(module._read(tmp_path / "bag"), 0)
+    errors = errors_of(read_history(tmp_path / "bag"), 0)
     assert errors[POSE_RAW].mean.mean() == pytest.approx(0.032, abs=0.004)
 
 
@@ -113,16 +115,16 @@ def test_no_error_where_the_truth_is_silent(tmp_path: Path) -> None:
         for topic, message in messages(3.0):
             if topic != POSE_TRUTH or not 2e9 < message.stamp_ns < 3e9:
                 writer.write(topic, message, message.stamp_ns)
-    story = module._read(tmp_path / "bag")
-    times = module._errors(story, 0)[POSE_RAW].time
+    history = read_history(tmp_path / "bag")
+    times = errors_of(history, 0)[POSE_RAW].time
     assert not ((times > 1.1) & (times < 1.9)).any()
 
 
 def test_shows_the_joints_that_were_most_often_missing(tmp_path: Path) -> None:
-    story = module._read(record(tmp_path / "bag", {POSE_CLEAN}, 4.0))
-    track = story.track(POSE_CLEAN, 0)
+    history = read_history(record(tmp_path / "bag", {POSE_CLEAN}, 4.0))
+    track = history.track(POSE_CLEAN, 0)
     assert track is not None
-    assert module._busiest(track)[0] == J["left_wrist"]
+    assert busiest_joints(track)[0] == J["left_wrist"]
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def replay(launch: Launch) -> None:
     source, recorder = PoseInputNode(launch), RecorderNode(launch)
     # started with the stream's end first, stopped with its start first
     with running(source, PriorNode(launch), TrajectoryNode(launch), recorder) as threads:
-        until(lambda: {POSE_RAW, POSE_CLEAN, POSE_WORLD} <= recorder._ended, timeout_s=120)
+        until(lambda: {POSE_RAW, POSE_CLEAN, POSE_WORLD} <= recorder.health.ended, timeout_s=120)
         threads[0].join(10)
         assert not threads[0].is_alive(), "the input node ends with its source"
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, Level, PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.commands.run import STUCK_NS, _Run, line, table
+from steadypose.nodes.commands.run import STALL_NS, _Run, line, table
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.supervisor import BACKOFF_S, STEADY_S, Child, Supervisor
 
@@ -142,32 +142,32 @@ def watched(clock: VirtualClock, make_launch: Callable[..., Launch]) -> tuple[_R
 
 def test_a_run_is_over_when_the_end_has_come_everywhere(watched: tuple[_Run, Supervisor]) -> None:
     run, processes = watched
-    assert run._verdict(processes) is None
+    assert run._exit_status(processes) is None
     processes.children["pose_input"].state = "ended"
-    run._take(news("pose_input", POSE_RAW))
-    run._take(news("prior", f"{POSE_CLEAN} {POSE_RAW}"))
-    run._take(news("trajectory", f"{POSE_CLEAN} {POSE_WORLD}"))
-    assert run._verdict(processes) is None, "the recorder has not heard it yet"
-    run._take(news("recorder", f"{POSE_CLEAN} {POSE_RAW} {POSE_WORLD}"))
-    assert run._verdict(processes) == 0
+    run._receive(news("pose_input", POSE_RAW))
+    run._receive(news("prior", f"{POSE_CLEAN} {POSE_RAW}"))
+    run._receive(news("trajectory", f"{POSE_CLEAN} {POSE_WORLD}"))
+    assert run._exit_status(processes) is None, "the recorder has not heard it yet"
+    run._receive(news("recorder", f"{POSE_CLEAN} {POSE_RAW} {POSE_WORLD}"))
+    assert run._exit_status(processes) == 0
 
 
 def test_a_run_whose_end_got_lost_does_not_wait_forever(watched: tuple[_Run, Supervisor], clock: VirtualClock) -> None:
     run, processes = watched
     processes.children["pose_input"].state = "ended"
     for _ in range(3):
-        clock.time_ns += STUCK_NS
-        run._take(news("prior", count__pose=str(clock.time_ns)))
-        assert run._verdict(processes) is None, "it is still at work"
-    clock.time_ns += STUCK_NS + 1
-    run._take(news("prior", count__pose=run._news["prior"].values["count.pose"]))
-    assert run._verdict(processes) == 1
+        clock.time_ns += STALL_NS
+        run._receive(news("prior", count__pose=str(clock.time_ns)))
+        assert run._exit_status(processes) is None, "it is still at work"
+    clock.time_ns += STALL_NS + 1
+    run._receive(news("prior", count__pose=run._diagnostics["prior"].values["count.pose"]))
+    assert run._exit_status(processes) == 1
 
 
 def test_a_run_ends_when_a_node_cannot_run(watched: tuple[_Run, Supervisor]) -> None:
     run, processes = watched
     processes.failed.append("prior")
-    assert run._verdict(processes) == 1
+    assert run._exit_status(processes) == 1
 
 
 def test_the_table_and_the_line_show_what_there_is_to_see() -> None:

@@ -154,7 +154,7 @@ def test_no_node_goes_down(weights: dict[str, str], make_launch: Callable[..., L
         Subscriber(launch.transport.endpoint("trajectory"), [POSE_WORLD, DIAGNOSTICS], name="test") as listener,
         running(prior, trajectory) as threads,
     ):
-        assert source.wait_for_listeners({"prior"}, timeout_s=30)
+        assert source.wait_for_subscribers({"prior"}, timeout_s=30)
         ends = 0
         for frames in EVIL.values():
             for frame in frames:
@@ -180,7 +180,9 @@ def test_no_node_goes_down(weights: dict[str, str], make_launch: Callable[..., L
         assert seen["world"] > len(EVIL) * AFTER / 2
     refused = {key: n for key, n in prior.diagnostics().values.items() if key.startswith("refused.")}
     assert {f"refused.{cause}" for cause in ("malformed", "version", "undecodable", "unknown_skeleton")} <= set(refused)
-    assert not [cause for cause in (prior.counts | trajectory.counts) if cause.endswith("Error")], "no surprises"
+    assert not [cause for cause in (prior.health.counts | trajectory.health.counts) if cause.endswith("Error")], (
+        "no surprises"
+    )
 
 
 def test_bytes_that_are_not_even_zeromq(make_launch: Callable[..., Launch]) -> None:
@@ -194,7 +196,7 @@ def test_bytes_that_are_not_even_zeromq(make_launch: Callable[..., Launch]) -> N
         identity, _ = stranger.recv_multipart()
         stranger.send_multipart([identity, b"GET / HTTP/1.1\r\n\r\n" * 100])
         with Subscriber(source.endpoint, [POSE_RAW], name="friend") as friend:
-            assert source.wait_for_listeners({"friend"}, timeout_s=10)
+            assert source.wait_for_subscribers({"friend"}, timeout_s=10)
             source.publish(POSE_RAW, raw(0, walking(0)))
             assert friend.receive(10) == (POSE_RAW, raw(0, walking(0)))
         stranger.close()

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from steadypose.nodes.graph.launch import Launch, LaunchError, bundled, find
+from steadypose.nodes.graph.launch import Launch, bundled, find
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.recorder import RecorderSettings
+from steadypose.nodes.sources.registry import InputSettings
 
 
 @pytest.fixture
@@ -22,14 +25,14 @@ def write(tmp_path: Path):
 def test_an_empty_file_is_a_launch(write) -> None:
     launch = Launch.read(write(""))
     assert launch.nodes == ["pose_input", "prior", "trajectory"]
-    assert launch.input.rate == 1.0
+    assert launch.settings(InputSettings).rate == 1.0
     assert launch.transport.endpoint("prior").startswith("ipc://")
 
 
 @pytest.mark.parametrize("name", ["replay", "kiosk"])
 def test_the_projects_own_files_are_found_by_name(name: str) -> None:
     launch = Launch.read(name)
-    assert Path(launch.input.recording).parent.resolve() == bundled("sim_data").resolve()
+    assert Path(launch.settings(InputSettings).recording).parent.resolve() == bundled("sim_data").resolve()
 
 
 @pytest.mark.parametrize(
@@ -68,10 +71,10 @@ def test_a_missing_file_names_those_there_are() -> None:
 def test_paths_start_at_the_file_and_overrides_win(write, tmp_path: Path) -> None:
     path = write("[input]\nrecording = 'walk'\nrate = 2")
     launch = Launch.read(path, ["input.rate=0", "prior.refine.enabled=false", "recorder.directory=/somewhere/out"])
-    assert launch.input.recording == str(tmp_path / "walk")
-    assert launch.input.rate == 0.0
-    assert launch.prior == {"refine": {"enabled": False}}
-    assert launch.recorder.directory == "/somewhere/out"
+    assert launch.settings(InputSettings).recording == str(tmp_path / "walk")
+    assert launch.settings(InputSettings).rate == 0.0
+    assert launch.table("prior") == {"refine": {"enabled": False}}
+    assert launch.settings(RecorderSettings).directory == "/somewhere/out"
 
 
 @pytest.mark.parametrize("override", ["input.rate", "=3", "input.rate.x=3"])
@@ -82,9 +85,9 @@ def test_an_override_that_sets_nothing_is_refused(write, override: str) -> None:
 
 def test_who_must_hear_whom(write) -> None:
     launch = Launch.read(write("nodes = ['pose_input', 'prior', 'trajectory', 'recorder', 'viewer']"))
-    assert launch.listeners("pose_input") == {"prior", "recorder"}
-    assert launch.listeners("prior") == {"trajectory", "recorder"}
-    assert launch.listeners("trajectory") == {"recorder"}
-    assert launch.listeners("recorder") == frozenset()
+    assert launch.reliable_subscribers("pose_input") == {"prior", "recorder"}
+    assert launch.reliable_subscribers("prior") == {"trajectory", "recorder"}
+    assert launch.reliable_subscribers("trajectory") == {"recorder"}
+    assert launch.reliable_subscribers("recorder") == frozenset()
     live = Launch.read(write("[transport]\nlossless = false"))
-    assert live.listeners("pose_input") == frozenset(), "a camera waits for nobody"
+    assert live.reliable_subscribers("pose_input") == frozenset(), "a camera waits for nobody"

@@ -1,4 +1,4 @@
-"""What every node does: take, give, wait for its listeners, count what went wrong, and say so."""
+"""What every node does: take, give, wait for its subscribers, count what went wrong, and say so."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from conftest import START_NS, VirtualClock, raw, running, until, walking
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW
 from steadypose.msgs.transport import SEND_HIGH_WATER, Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Level, Message, PoseClean, PoseRaw
+from steadypose.nodes.graph.clock import Timeline
+from steadypose.nodes.graph.inbox import READ_AHEAD, Inbox
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.runtime import READ_AHEAD, Inbox, Node, Timeline
+from steadypose.nodes.graph.node import Node
 
 MakeLaunch = Callable[..., Launch]
 
@@ -115,9 +117,9 @@ def test_every_frame_arrives_though_the_listener_comes_last(make_launch: MakeLau
     with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
         news = Listener(launch, "prior", [DIAGNOSTICS])
         news.take_until(lambda: news.got[-1].values["state"] == "waiting for trajectory")  # type: ignore[union-attr]
-        assert "prior" not in source.listeners, "it must not listen before it is heard"
+        assert "prior" not in source.subscribers, "it must not listen before it is heard"
         trajectory = Listener(launch, "prior", [POSE_CLEAN], name="trajectory")
-        assert source.wait_for_listeners({"prior"}, timeout_s=10)
+        assert source.wait_for_subscribers({"prior"}, timeout_s=10)
         for i in range(50):
             source.publish(POSE_RAW, raw(i))
         trajectory.take_until(lambda: len(trajectory.got) == 50)
@@ -131,11 +133,11 @@ def test_the_stream_halts_while_a_listener_is_away(make_launch: MakeLaunch) -> N
     node = Echo(launch)
     with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
         first = Listener(launch, "prior", [POSE_CLEAN], name="trajectory")
-        assert source.wait_for_listeners({"prior"}, timeout_s=10)
+        assert source.wait_for_subscribers({"prior"}, timeout_s=10)
         source.publish(POSE_RAW, raw(0))
         first.take_until(lambda: len(first.got) == 1)
         first.close()
-        until(lambda: "trajectory" not in node._publisher.listeners)
+        until(lambda: "trajectory" not in node._publisher.subscribers)
         for i in range(1, 10):
             source.publish(POSE_RAW, raw(i))
         again = Listener(launch, "prior", [POSE_CLEAN], name="trajectory")
@@ -149,13 +151,13 @@ def test_a_message_that_fails_is_counted_and_the_next_one_is_served(make_launch:
     node = Echo(launch)
     with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
         listener = Listener(launch, "prior", [POSE_CLEAN], name="test")
-        assert source.wait_for_listeners({"prior"}, timeout_s=10)
-        until(lambda: "test" in node._publisher.listeners)
+        assert source.wait_for_subscribers({"prior"}, timeout_s=10)
+        until(lambda: "test" in node._publisher.subscribers)
         for i in range(6):
             source.publish(POSE_RAW, raw(i, skeleton="bad" if i % 2 else "smpl22"))
         listener.take_until(lambda: len(listener.got) == 3)
         listener.close()
-    assert node.counts["refused.ArithmeticError"] == 3
+    assert node.health.counts["refused.ArithmeticError"] == 3
     assert sum("stumbled" in (record.exc_text or "") for record in caplog.records) == 1, "logged once"
     report = node.diagnostics()
     assert report.values["refused.ArithmeticError"] == "3"
@@ -165,7 +167,6 @@ def test_latency_is_counted_from_capture_and_less_the_delay(make_launch: MakeLau
     node = Echo(make_launch(nodes='["prior"]'), clock)
     node.timeline = Timeline(START_NS, clock.time_ns, rate=2.0)
     with Publisher(node.launch.transport.endpoint("prior")) as node._publisher:
-        node._inbox = None
         clock.time_ns += 1_000_000_000
         for late_ms in range(1, 101):
             # two seconds of capture are one second of a replay at twice the rate
@@ -180,7 +181,6 @@ def test_latency_is_counted_from_capture_and_less_the_delay(make_launch: MakeLau
 def test_rates_are_of_the_last_second(make_launch: MakeLaunch, clock: VirtualClock) -> None:
     node = Echo(make_launch(nodes='["prior"]'), clock)
     with Publisher(node.launch.transport.endpoint("prior")) as node._publisher:
-        node._inbox = None
         for _ in range(30):
             node.publish(POSE_CLEAN, clean(raw(0)))
         clock.time_ns += 1_000_000_000
@@ -201,7 +201,7 @@ def test_a_timeline_goes_through_diagnostics_and_back() -> None:
 def test_a_node_stops_though_it_waits_for_a_listener_who_never_comes(make_launch: MakeLaunch) -> None:
     node = Echo(make_launch(nodes='["prior", "trajectory"]'))
     with running(node) as threads:
-        until(lambda: node._state.startswith("waiting"))
+        until(lambda: node.health.state.startswith("waiting"))
         node.stop()
         threads[0].join(10)
         assert not threads[0].is_alive()
@@ -211,13 +211,15 @@ def test_a_node_stops_though_its_listener_does_not_read(make_launch: MakeLaunch)
     launch = make_launch(nodes='["prior"]')
     node = Echo(launch)
     with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
-        assert source.wait_for_listeners({"prior"}, timeout_s=10)
+        assert source.wait_for_subscribers({"prior"}, timeout_s=10)
         deaf = Subscriber(launch.transport.endpoint("prior"), [POSE_CLEAN], high_water=1, name="deaf")
-        until(lambda: "deaf" in node._publisher.listeners)
+        until(lambda: "deaf" in node._publisher.subscribers)
         message = raw(0, walking(0))
-        while source.publish(POSE_RAW, message, timeout_s=0.3) or node._published[POSE_CLEAN] < SEND_HIGH_WATER:
-            assert node._published[POSE_CLEAN] < 10 * SEND_HIGH_WATER, "nothing holds the node up"
+        before = -1
+        while source.publish(POSE_RAW, message, timeout_s=1.0) or node.health.published[POSE_CLEAN] > before:
+            before = node.health.published[POSE_CLEAN]
+            assert before < 10 * SEND_HIGH_WATER, "nothing holds the node up"
         node.stop()
-        until(lambda: node._state == "stopped")
+        until(lambda: node.health.state == "stopped")
         deaf.close()
-    assert node.counts[f"dropped.stopped {POSE_CLEAN}"] == 1
+    assert node.health.counts[f"dropped.stopped {POSE_CLEAN}"] == 1

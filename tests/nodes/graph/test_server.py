@@ -15,8 +15,9 @@ from steadypose.msgs.keys import create_keys
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import PoseRaw, PoseWorld
-from steadypose.nodes.graph.launch import Launch, LaunchError
+from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
 
 FRAMES = 25
@@ -50,14 +51,14 @@ def test_two_kiosks_and_a_server(
         heard = Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD, keys=keys, name="test")
         subscriber = stack.enter_context(heard)
         for publisher in (door, desk):
-            assert publisher.wait_for_listeners({"prior"}, timeout_s=20)
-        until(lambda: {"trajectory"} <= prior._publisher.listeners)
-        until(lambda: {"test"} <= trajectory._publisher.listeners)
+            assert publisher.wait_for_subscribers({"prior"}, timeout_s=20)
+        until(lambda: {"trajectory"} <= prior._publisher.subscribers)
+        until(lambda: {"test"} <= trajectory._publisher.subscribers)
         for k in range(FRAMES):
             clock.time_ns += 33_333_333
             for publisher, name in ((door, "door"), (desk, "desk")):
                 publisher.publish(POSE_RAW, streams[name][k])
-            until(lambda k=k: len(prior._compute_ns) == 2 * (k + 1))
+            until(lambda k=k: len(prior.health._compute_ns) == 2 * (k + 1))
 
         def answered() -> bool:
             while received := subscriber.receive(0):

@@ -17,8 +17,9 @@ from tests.helpers.synthetic_poses import messages
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Diagnostics, Level, PoseWorld, Tracking
-from steadypose.nodes.graph.launch import Launch, LaunchError
-from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, require_ros2
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, check_ros2
 from steadypose.nodes.sinks.ros2.rep155 import JOINTS, LINKS, frames
 
 LISTENER = """
@@ -93,7 +94,7 @@ def test_a_ros_node_hears_bodies(make_launch: Callable[..., Launch], tmp_path: P
         Publisher(launch.transport.endpoint("trajectory"), lossless=True) as publisher,
         running(bridge),
     ):
-        assert publisher.wait_for_listeners({"ros2_bridge"}, timeout_s=20)
+        assert publisher.wait_for_subscribers({"ros2_bridge"}, timeout_s=20)
 
         def told() -> bool:
             publisher.publish(POSE_WORLD, next(stream))
@@ -103,7 +104,7 @@ def test_a_ros_node_hears_bodies(make_launch: Callable[..., Launch], tmp_path: P
         until(told, timeout_s=60)
         assert listener.stdout
         heard = json.loads(listener.stdout.read())
-    assert not bridge.counts
+    assert not bridge.health.counts
 
     by_stamp = {message.stamp_ns: message for message in worlds}
     said = by_stamp[heard["poses"]["stamp"]]
@@ -167,6 +168,6 @@ def test_bodies_that_cannot_be_shown_are_left_out(worlds: list[PoseWorld]) -> No
 
 
 def test_without_ros_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("steadypose.nodes.sinks.ros2.bridge.find_spec", lambda name: None)
+    monkeypatch.setattr("steadypose.nodes.graph.extras.find_spec", lambda name: None)
     with pytest.raises(LaunchError, match=r"steadypose\[ros2\]"):
-        require_ros2()
+        check_ros2(Launch())

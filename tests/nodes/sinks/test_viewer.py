@@ -22,10 +22,15 @@ from tests.helpers.synthetic_poses import CAMERA, messages, walker
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Diagnostics, JointState, Level, Pose, PoseClean, PoseRaw, RawBody, Tracking
-from steadypose.nodes.graph.launch import Launch, TransportSettings
-from steadypose.nodes.sinks import viewer
+from steadypose.nodes.graph import extras
+from steadypose.nodes.graph.access import TransportSettings
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.drawing import STATE_COLOURS
-from steadypose.nodes.sinks.viewer import PoseView, ViewerError, ViewerNode, ViewerServer
+from steadypose.nodes.sinks.viewer import node as viewer_node
+from steadypose.nodes.sinks.viewer.node import ViewerNode
+from steadypose.nodes.sinks.viewer.scene import PATH_SECONDS, PoseView
+from steadypose.nodes.sinks.viewer.server import HOST, ViewerError, ViewerServer
 
 rr = pytest.importorskip("rerun", reason="the optional extra `view` is not installed")
 
@@ -129,7 +134,7 @@ def test_tracking_and_path_are_told_in_the_world(view: PoseView, log: Log) -> No
         view.log(topic, message)
     assert log.last("world/made-up/0/label").labels.as_arrow_array().to_pylist() == ["0 · coasting"]
     way = log.last("world/made-up/0/path").strips.as_arrow_array().to_pylist()[0]
-    assert len(way) == pytest.approx(viewer.PATH_SECONDS * 30, abs=2)
+    assert len(way) == pytest.approx(PATH_SECONDS * 30, abs=2)
 
 
 def test_truth_is_drawn_thin_and_draws_no_rate(view: PoseView, log: Log) -> None:
@@ -215,10 +220,10 @@ def free_ports() -> int:
     """A port that is free together with the next."""
     while True:
         with socket.socket() as first, socket.socket() as second:
-            first.bind((viewer.HOST, 0))
+            first.bind((HOST, 0))
             port = first.getsockname()[1]
             try:
-                second.bind((viewer.HOST, port + 1))
+                second.bind((HOST, port + 1))
             except OSError:
                 continue
             return port
@@ -241,7 +246,7 @@ def test_the_server_shows_a_page_on_this_machine_alone() -> None:
 def test_the_server_goes_with_a_node_that_is_killed() -> None:
     port = free_ports()
     code = (
-        "from steadypose.nodes.sinks.viewer import ViewerServer; "
+        "from steadypose.nodes.sinks.viewer.server import ViewerServer; "
         f"s = ViewerServer({port}); print(s._process.pid, flush=True); input()"
     )
     node = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -274,8 +279,8 @@ class Server:
 def test_the_node_draws_what_is_published_and_ends_with_its_server(
     tmp_path: Path, log: Log, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(viewer, "ViewerServer", Server)
-    monkeypatch.setattr(viewer, "connect", lambda server: log)
+    monkeypatch.setattr(viewer_node, "ViewerServer", Server)
+    monkeypatch.setattr(viewer_node, "connect", lambda server: log)
     launch = Launch(transport=TransportSettings(directory=str(tmp_path)))
     node = ViewerNode(launch)
     raised: list[RuntimeError] = []
@@ -303,6 +308,6 @@ def test_the_node_draws_what_is_published_and_ends_with_its_server(
 
 def test_without_rerun_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
-    monkeypatch.setattr(viewer, "find_spec", lambda name: None if name == "rerun" else found(name))
-    with pytest.raises(ViewerError, match="--extra view"):
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "rerun" else found(name))
+    with pytest.raises(LaunchError, match="--extra view"):
         ViewerServer(free_ports())

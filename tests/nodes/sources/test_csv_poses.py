@@ -10,7 +10,7 @@ from conftest import walk
 
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.sources.csv import CsvError, CsvSource
-from steadypose.nodes.sources.pose_input import open_source
+from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.skeleton import JOINTS
 
 HEADER = "stamp," + ",".join(f"{joint}_{axis}" for joint in JOINTS for axis in "xyz")
@@ -124,7 +124,7 @@ def test_a_csv_that_is_not_poses_says_what_was_expected(tmp_path: Path, lines: l
 def test_bytes_that_are_no_text_say_so(tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_bytes(b"\xff\xfe\x00stamp")
     with pytest.raises(CsvError, match="cannot be read as text"):
-        open_source(tmp_path / "x.csv")
+        open_recording(tmp_path / "x.csv")
 
 
 def test_a_csv_is_played_as_an_npz_of_the_same_poses(tmp_path: Path) -> None:
@@ -133,6 +133,6 @@ def test_a_csv_is_played_as_an_npz_of_the_same_poses(tmp_path: Path) -> None:
     stamps = np.array([frame.stamp_ns for frame in stream]) - stream[0].stamp_ns
     write(tmp_path / "x.csv", HEADER, *(row(f"{ns / 1e9:.9f}", p) for ns, p in zip(stamps, positions, strict=True)))
     np.savez(tmp_path / "x.npz", positions=positions, stamp_ns=stamps, skeleton="smpl22")
-    played = open_source(tmp_path / "x.csv")
+    played = open_recording(tmp_path / "x.csv")
     assert len(played) == len(stream)
-    assert list(played) == list(open_source(tmp_path / "x.npz"))
+    assert list(played) == list(open_recording(tmp_path / "x.npz"))

@@ -9,7 +9,9 @@ from contextlib import contextmanager
 from conftest import VirtualClock, raw, walking
 
 from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import CameraSource
+from steadypose.nodes.sources.source import SourceContext
 
 
 class Flickering:
@@ -36,7 +38,7 @@ class Source(CameraSource):
 
 
 def test_what_was_dropped_is_counted_over_all_connections(clock: VirtualClock) -> None:
-    source, dropped = Source(clock), []
+    source, dropped = Source(SourceContext(clock, CalibrationSettings())), []
     for frame in source.frames():
         if frame:
             dropped.append(source.status().get("dropped.camera late"))

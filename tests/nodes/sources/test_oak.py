@@ -20,16 +20,22 @@ from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import JOINTS, Diagnostics, PoseRaw, PoseWorld
 from steadypose.nodes.commands.run import _check
-from steadypose.nodes.graph.launch import Launch, LaunchError, OakSettings
+from steadypose.nodes.graph.clock import Clock, SystemClock
+from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
-from steadypose.nodes.graph.runtime import Clock, SystemClock
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
-from steadypose.nodes.sources import oak
+from steadypose.nodes.sources import oak_device
+from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import PAUSES_S
-from steadypose.nodes.sources.oak import FRAME_ID, QUEUE, SILENT_S, Host, OakSource
-from steadypose.nodes.sources.pose_input import PoseInputNode, open_input
+from steadypose.nodes.sources.oak import OakSettings, OakSource
+from steadypose.nodes.sources.oak_device import FRAME_ID, QUEUE, TIMEOUT_S, Host
+from steadypose.nodes.sources.pose_input import PoseInputNode
+from steadypose.nodes.sources.registry import InputSettings, open_input
+from steadypose.nodes.sources.source import SourceContext
 from steadypose.prior.body.layouts import COCO17
 
+CONTEXT = SourceContext(SystemClock(), CalibrationSettings())
 MakeLaunch = Callable[..., Launch]
 BODY = [i for i, name in enumerate(COCO17.joints) if name.split("_")[-1] not in ("nose", "eye", "ear")]
 
@@ -91,7 +97,7 @@ def test_the_imu_levels_the_camera(walk: list[Moment]) -> None:
 
 
 def test_without_an_imu_the_camera_is_taken_for_level(walk: list[Moment]) -> None:
-    source = OakSource(OakSettings(), SystemClock(), opener(lambda _: script(walk)))
+    source = OakSource(OakSettings(), CONTEXT, opener(lambda _: script(walk)))
     frames = source.frames()
     frame = next(frame for frame in frames if frame)
     assert source.status()["camera.level"] == "taken for level"
@@ -104,7 +110,7 @@ def test_without_an_imu_the_camera_is_taken_for_level(walk: list[Moment]) -> Non
 def test_frames_reach_subscribers_and_diagnostics_tell(make_launch: MakeLaunch, walk: list[Moment]) -> None:
     # in the place of the prior, which a lossless node waits for
     launch = make_launch(nodes='["pose_input", "prior"]', input__source="oak")
-    source = OakSource(launch.input.oak, SystemClock(), opener(lambda _: script(walk)))
+    source = OakSource(launch.settings(InputSettings).oak, CONTEXT, opener(lambda _: script(walk)))
     node = PoseInputNode(launch, SystemClock(), source)
     launch.transport.ipc_directory.mkdir(exist_ok=True)
     got: list[PoseRaw] = []
@@ -126,10 +132,10 @@ def test_frames_reach_subscribers_and_diagnostics_tell(make_launch: MakeLaunch, 
 
 
 def test_from_the_camera_to_the_world(make_launch: MakeLaunch, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(oak, "QUEUE", 1000)  # these frames come faster than any camera's
+    monkeypatch.setattr(oak_device, "QUEUE", 1000)  # these frames come faster than any camera's
     scene = [moment(frame) for frame in range(24)]
     launch = make_launch(input__source="oak")
-    source = OakSource(launch.input.oak, SystemClock(), opener(lambda _: script(scene)))
+    source = OakSource(launch.settings(InputSettings).oak, CONTEXT, opener(lambda _: script(scene)))
     nodes = [PoseInputNode(launch, SystemClock(), source), PriorNode(launch), TrajectoryNode(launch)]
     worlds: list[PoseWorld] = []
     with Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD) as subscriber, running(*nodes):
@@ -163,7 +169,7 @@ def test_it_goes_on_when_the_camera_is_plugged_in_again(clock: VirtualClock, wal
         with plugged(script(walk[:2]), clock, unplug=pull) as host:
             yield host
 
-    source = OakSource(OakSettings(), clock, connect)
+    source = OakSource(OakSettings(), SourceContext(clock, CalibrationSettings()), connect)
     frames, states = [], []
     for frame in source.frames():
         states.append(source.status()["camera"])
@@ -191,7 +197,7 @@ def test_it_looks_for_a_camera_at_growing_intervals(clock: VirtualClock) -> None
         raise RuntimeError("no camera found")
         yield
 
-    source = OakSource(OakSettings(), clock, connect)
+    source = OakSource(OakSettings(), SourceContext(clock, CalibrationSettings()), connect)
     frames = source.frames()
     while len(tries) < len(PAUSES_S) + 2:
         assert next(frames) is None
@@ -205,7 +211,7 @@ def test_a_camera_that_falls_silent_is_given_up(clock: VirtualClock, walk: list[
         frames = host.frames()
         assert next(frame for frame in frames if frame)
         assert next(frames) is None
-        clock.time_ns += round((SILENT_S + 0.1) * 1e9)
+        clock.time_ns += round((TIMEOUT_S + 0.1) * 1e9)
         assert list(frames) == []
 
 
@@ -256,11 +262,11 @@ def test_what_is_no_skeleton_is_counted_and_the_next_frame_comes(walk: list[Mome
 
 def test_settings_that_cannot_be_used_say_so(make_launch: MakeLaunch, tmp_path) -> None:
     with pytest.raises(LaunchError, match=r"archive: expected a file that is an NN archive"):
-        OakSource(OakSettings(archive=str(tmp_path / "none.tar.xz")), SystemClock())
+        OakSource(OakSettings(archive=str(tmp_path / "none.tar.xz")), CONTEXT)
     with pytest.raises(LaunchError, match="confidence between 0 and 1"):
-        OakSource(OakSettings(confidence=50.0), SystemClock())
+        OakSource(OakSettings(confidence=50.0), CONTEXT)
     with pytest.raises(LaunchError, match=r"fps of 0 .* or more"):
-        OakSource(OakSettings(fps=float("nan")), SystemClock())
+        OakSource(OakSettings(fps=float("nan")), CONTEXT)
     with pytest.raises(LaunchError, match=r"source: expected .*oak.*, got 'oka', did you mean 'oak'"):
         make_launch(input__source="oka")
 
@@ -268,11 +274,11 @@ def test_settings_that_cannot_be_used_say_so(make_launch: MakeLaunch, tmp_path) 
 def test_the_launch_file_can_be_run_without_a_camera_being_there() -> None:
     launch = Launch.read("oak")
     assert not launch.transport.lossless
-    assert isinstance(open_input(launch.input, SystemClock()), OakSource)
+    assert isinstance(open_input(launch.settings(InputSettings), SystemClock()), OakSource)
     _check(launch)
 
 
 def test_without_a_camera_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(oak.dai.Device, "getAllAvailableDevices", staticmethod(list))
-    with pytest.raises(RuntimeError, match="no camera found"), oak.connect(OakSettings(), SystemClock()):
+    monkeypatch.setattr(oak_device.dai.Device, "getAllAvailableDevices", staticmethod(list))
+    with pytest.raises(RuntimeError, match="no camera found"), oak_device.connect(OakSettings(), SystemClock()):
         pass

@@ -15,9 +15,12 @@ from conftest import START_NS, VirtualClock, raw, record, walk, walking
 from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Message, PoseRaw, PoseWorld
-from steadypose.nodes.graph.launch import Launch, LaunchError
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.npz import NpzError, NpzSource
-from steadypose.nodes.sources.pose_input import LEAP_NS, PoseInputNode, RecordingSource, open_source
+from steadypose.nodes.sources.pose_input import LEAP_NS, PoseInputNode
+from steadypose.nodes.sources.recording import RecordingSource, open_recording
+from steadypose.nodes.sources.registry import InputSettings
 
 MakeLaunch = Callable[..., Launch]
 SECOND_NS = 1_000_000_000
@@ -30,6 +33,9 @@ class Frames:
         self.refused: Counter[str] = Counter()
         self._stamps_ns = stamps_ns
 
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
     def __iter__(self) -> Iterator[tuple[str, Message]]:
         return iter((POSE_RAW, raw(0, walking(0), stamp_ns=stamp)) for stamp in self._stamps_ns)
 
@@ -37,7 +43,7 @@ class Frames:
 class Sent:
     """In a publisher's place: notes what is sent, when."""
 
-    listeners: frozenset[str] = frozenset()
+    subscribers: frozenset[str] = frozenset()
 
     def __init__(self, clock: VirtualClock) -> None:
         self._clock = clock
@@ -77,18 +83,22 @@ def launch(make_launch: MakeLaunch) -> Launch:
     return make_launch(nodes='["pose_input"]')
 
 
+def with_input(launch: Launch, **settings: object) -> Launch:
+    return replace(launch, sections={"input": InputSettings(**settings)})  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("rate", [1.0, 2.0, 0.5])
 def test_frames_come_at_the_rate_asked_for(launch: Launch, clock: VirtualClock, rate: float) -> None:
     steps = np.random.default_rng(0).integers(20, 60, 50) * 1_000_000
     stamps = [int(s) for s in START_NS + np.cumsum(steps)]
-    launch = replace(launch, input=replace(launch.input, rate=rate))
+    launch = with_input(launch, rate=rate)
     sent = play(launch, clock, Frames(stamps))
     assert [m.stamp_ns for _, m in sent] == [*stamps, stamps[-1]], "stamps are as captured"
     np.testing.assert_allclose(waits(sent[:-1]), np.diff(stamps) / 1e9 / rate, atol=1e-6)
 
 
 def test_rate_zero_waits_for_nothing(launch: Launch, clock: VirtualClock) -> None:
-    launch = replace(launch, input=replace(launch.input, rate=0.0))
+    launch = with_input(launch, rate=0.0)
     play(launch, clock, Frames([START_NS + i * SECOND_NS for i in range(10)]))
     assert not clock.slept_ns
 
@@ -118,7 +128,7 @@ def test_stamps_that_repeat_or_step_back_come_at_once(launch: Launch, clock: Vir
 
 
 def test_a_loop_goes_on_with_rising_stamps(launch: Launch, clock: VirtualClock) -> None:
-    launch = replace(launch, input=replace(launch.input, loop=True))
+    launch = with_input(launch, loop=True)
     sent = play(launch, clock, Frames([START_NS, START_NS + SECOND_NS]), frames=7)
     seconds = [(m.stamp_ns - START_NS) / 1e9 for _, m in sent]
     assert seconds == [0, 1, 2, 3, 4, 5, 6]
@@ -150,7 +160,7 @@ def test_a_truncated_recording_is_played_as_far_as_it_goes(tmp_path: Path) -> No
     path = record(tmp_path / "r", walk(300))
     file = next(path.glob("*.mcap"))
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    source = open_source(path)
+    source = open_recording(path)
     played = list(source)
     assert 100 < len(played) < 200
     assert played == [(POSE_RAW, frame) for frame in walk(300)[: len(played)]]
@@ -159,23 +169,23 @@ def test_a_truncated_recording_is_played_as_far_as_it_goes(tmp_path: Path) -> No
 
 def test_recordings_that_cannot_be_played_say_why(tmp_path: Path, make_launch: MakeLaunch) -> None:
     with pytest.raises(LaunchError, match="does not exist"):
-        open_source(tmp_path / "nowhere")
+        open_recording(tmp_path / "nowhere")
     with pytest.raises(LaunchError, match="give --input"):
-        open_source("")
+        open_recording("")
     (tmp_path / "empty").mkdir()
     with pytest.raises(RecordingError, match="found none"):
-        open_source(tmp_path / "empty")
+        open_recording(tmp_path / "empty")
     with RecordingWriter(tmp_path / "nothing"):
         pass
     with pytest.raises(RecordingError, match="holds no message"):
-        open_source(tmp_path / "nothing")
+        open_recording(tmp_path / "nothing")
     with RecordingWriter(tmp_path / "others") as writer:
         writer.write(POSE_TRUTH, PoseWorld(START_NS, "world", "t", np.zeros(4), []), START_NS)
     with pytest.raises(RecordingError, match=r"expected messages on pose/raw, got pose/truth"):
-        open_source(tmp_path / "others")
+        open_recording(tmp_path / "others")
     (tmp_path / "x.npz").write_bytes(b"PK\3\4 no zip")
     with pytest.raises(NpzError, match="cannot be read"):
-        open_source(tmp_path / "x.npz")
+        open_recording(tmp_path / "x.npz")
     with pytest.raises(LaunchError, match="rate: expected 0"):
         PoseInputNode(make_launch(input__rate=-1), None, Frames([]))
 
@@ -198,7 +208,7 @@ GOOD = {"positions": np.zeros((5, 22, 3)), "skeleton": np.array("smpl22"), "fps"
         ({"fps": None}, "expected stamp_ns"),
         ({"fps": np.array(0)}, "fps: expected one number above 0"),
         ({"fps": np.array([30, 30])}, "fps: expected one number"),
-        ({"fps": np.array(1e-9)}, "5 frames at 1e-09 a second last longer than stamps can tell"),
+        ({"fps": np.array(1e-9)}, "5 frames at 1e-09 a second last longer than stamps can hold"),
         ({"stamp_ns": np.arange(4)}, "stamp_ns: expected 5 integers"),
         ({"stamp_ns": np.arange(5.0)}, "stamp_ns: expected 5 integers"),
         ({"stamp_ns": np.arange(5) - 1}, "-1 to 3"),
@@ -255,6 +265,6 @@ def test_a_damaged_frame_of_a_recording_is_counted(tmp_path: Path) -> None:
     # a skeleton's name of a billion letters
     at = data.index(b"smpl22") - 4
     file.write_bytes(data[:at] + b"\xff\xff\xff\x3f" + data[at + 4 :])
-    source = open_source(path)
+    source = open_recording(path)
     assert len(list(source)) < 3
     assert source.refused.total() > 0

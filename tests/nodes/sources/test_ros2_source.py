@@ -15,10 +15,11 @@ from tests.helpers.synthetic_poses import walker
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.graph.launch import Launch, LaunchError
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_pose_array
-from steadypose.nodes.sources.camera import LiveSource
 from steadypose.nodes.sources.pose_input import PoseInputNode
+from steadypose.nodes.sources.source import LiveSource
 from steadypose.prior.body.layouts import CANONICAL, COCO17, SKELETONS
 
 PUBLISHER = """
@@ -113,8 +114,8 @@ def test_more_bodies_than_a_message_holds_are_refused_and_the_next_frame_comes(
     frames = Topic(raw(1, walking(1)), crowd, raw(2, walking(2)))
     source = PoseInputNode(make_launch(transport__lossless="false"), clock, frames)
     with running(source):
-        until(lambda: source._published[POSE_RAW] == 2)
-    assert source.counts["refused.ValueError"] == 1
+        until(lambda: source.health.published[POSE_RAW] == 2)
+    assert source.health.counts["refused.ValueError"] == 1
     assert source.timeline
     assert source.timeline.wall(raw(1).stamp_ns) == clock.now_ns(), "captured at another time: it counts from now"
 

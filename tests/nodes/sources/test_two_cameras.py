@@ -14,11 +14,15 @@ from scipy.spatial.transform import Rotation
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Pose, PoseRaw, PoseWorld, RawBody
-from steadypose.nodes.graph.launch import Launch, LaunchError, MergeSettings
+from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
-from steadypose.nodes.sources.merge import MergeSource
+from steadypose.nodes.sources.calibration import CalibrationSettings
+from steadypose.nodes.sources.merge import MergeSettings, MergeSource
 from steadypose.nodes.sources.pose_input import PoseInputNode
+from steadypose.nodes.sources.registry import InputSettings
+from steadypose.nodes.sources.source import SourceContext
 
 FRAMES = 30
 PLACES = {
@@ -70,15 +74,15 @@ def test_two_cameras_become_one_world(
         ) as subscriber,
     ):
         for publisher in (left, right):
-            assert publisher.wait_for_listeners({"merge"}, timeout_s=20)
-        until(lambda: {"prior", "test"} <= nodes[0]._publisher.listeners)
-        until(lambda: {"trajectory"} <= nodes[1]._publisher.listeners)
-        until(lambda: {"test"} <= nodes[2]._publisher.listeners)
+            assert publisher.wait_for_subscribers({"merge"}, timeout_s=20)
+        until(lambda: {"prior", "test"} <= nodes[0]._publisher.subscribers)
+        until(lambda: {"trajectory"} <= nodes[1]._publisher.subscribers)
+        until(lambda: {"test"} <= nodes[2]._publisher.subscribers)
         for k in range(FRAMES):
             clock.time_ns += 33_333_333
             left.publish(POSE_RAW, views["left"][k])
             right.publish(POSE_RAW, views["right"][k])
-            until(lambda k=k: nodes[0]._source._heard.total() == 2 * (k + 1))  # type: ignore[union-attr]
+            until(lambda k=k: nodes[0]._source._received.total() == 2 * (k + 1))  # type: ignore[union-attr]
 
         def answered() -> bool:
             while received := subscriber.receive(0):
@@ -102,15 +106,15 @@ def test_two_cameras_become_one_world(
 
 def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path) -> None:
     addresses = [f"ipc://{folder}/{name}" for name in PLACES]
-    source = MergeSource(MergeSettings(addresses), None)
+    source = MergeSource(MergeSettings(addresses), SourceContext(VirtualClock(), CalibrationSettings()))
     frames, (first, *_, last) = source.frames(), filmed("left", range(0))
     with Publisher(addresses[0]) as camera:
         assert next(frames) is None
-        assert camera.wait_for_listeners({"merge"}, timeout_s=20)
+        assert camera.wait_for_subscribers({"merge"}, timeout_s=20)
         camera.publish(POSE_RAW, first)
         camera._sequence[POSE_RAW] += 3  # which nobody heard
         camera.publish(POSE_RAW, last)
-        until(lambda: (next(frames), source._heard.total())[1] == 2)
+        until(lambda: (next(frames), source._received.total())[1] == 2)
     assert source.status()["dropped.lost pose/raw"] == "3"
     frames.close()
 
@@ -124,6 +128,6 @@ def test_fewer_than_two_cameras_are_refused(make_launch: Callable[..., Launch], 
 
 def test_the_launch_file_that_ships_reads() -> None:
     launch = Launch.read("two_cameras")
-    assert len(launch.input.merge.cameras) == 2
+    assert len(launch.settings(InputSettings).merge.cameras) == 2
     assert not launch.transport.lossless
-    assert launch.prior == {"identify": {"enabled": True}}
+    assert launch.table("prior") == {"identify": {"enabled": True}}

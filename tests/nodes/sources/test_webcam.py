@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace as Made
 
@@ -13,11 +14,17 @@ import pytest
 from conftest import VirtualClock
 
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.graph.launch import CalibrationSettings, Launch, LaunchError, WebcamSettings
-from steadypose.nodes.graph.runtime import SystemClock
-from steadypose.nodes.sources import webcam
+from steadypose.nodes.graph import extras
+from steadypose.nodes.graph.clock import Clock, SystemClock
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sources import webcam_device
+from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import PAUSES_S
-from steadypose.nodes.sources.webcam import Lens, WebcamSource, require_mediapipe
+from steadypose.nodes.sources.registry import InputSettings, open_input
+from steadypose.nodes.sources.source import SourceContext
+from steadypose.nodes.sources.webcam import WebcamSettings, WebcamSource
+from steadypose.nodes.sources.webcam_device import Lens
 
 SIZE = (320, 240)
 NOT_CALIBRATED = CalibrationSettings()
@@ -32,8 +39,8 @@ def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for index in range(FRAMES):
         writer.write(np.full((SIZE[1], SIZE[0], 3), (40 * index, 0, 0), np.uint8))
     writer.release()
-    opened = cv2.VideoCapture
-    monkeypatch.setattr(webcam.cv2, "VideoCapture", lambda number: opened(str(path)) if number == 3 else opened())
+    opened, film = cv2.VideoCapture, str(path)
+    monkeypatch.setattr(webcam_device.cv2, "VideoCapture", lambda number: opened(film) if number == 3 else opened())
     return path
 
 
@@ -51,7 +58,7 @@ class Seen:
         self.pictures: list[tuple[np.ndarray, int]] = []
 
     @contextmanager
-    def landmarker(self, settings: WebcamSettings) -> Iterator[webcam.Landmarker]:
+    def landmarker(self, settings: WebcamSettings) -> Iterator[webcam_device.Landmarker]:
         yield self.look
 
     def look(self, image: np.ndarray, milliseconds: int) -> Made:
@@ -65,9 +72,14 @@ class Seen:
         return Made(pose_world_landmarks=[world], pose_landmarks=[[Made(x=u, y=v) for u, v in places]])
 
 
+def open_webcam(settings: WebcamSettings, clock: Clock, seen: Seen) -> WebcamSource:
+    connect = partial(webcam_device.connect, make_landmarker=seen.landmarker)
+    return WebcamSource(settings, SourceContext(clock, NOT_CALIBRATED), connect)
+
+
 def test_each_picture_gives_the_bodies_in_it(video: Path, model: str) -> None:
     seen = Seen()
-    source = WebcamSource(WebcamSettings(camera=3, model=model), NOT_CALIBRATED, SystemClock(), seen.landmarker)
+    source = open_webcam(WebcamSettings(camera=3, model=model), SystemClock(), seen)
     frames: list[PoseRaw] = []
     for frame in source.frames():
         if frame is None:
@@ -96,7 +108,7 @@ def test_a_picture_that_fails_is_counted_and_the_next_one_comes(video: Path, mod
                 cv2.cvtColor(image[:0], cv2.COLOR_BGR2RGB)  # nothing, where a picture is expected
             return found
 
-    source = WebcamSource(WebcamSettings(camera=3, model=model), NOT_CALIBRATED, SystemClock(), Stumbles().landmarker)
+    source = open_webcam(WebcamSettings(camera=3, model=model), SystemClock(), Stumbles())
     frames = source.frames()
     assert [next(frames) is not None for _ in range(FRAMES)] == [True, False, True, False, True]
     status = source.status()
@@ -121,16 +133,16 @@ def test_a_lens_that_is_calibrated_is_used_for_pictures_of_any_size() -> None:
         for (x, y), expected in zip((bent + 0.5) * scale - 0.5, straight, strict=True):
             picture = np.zeros((size[1], size[0], 3), np.float32)
             cv2.circle(picture, (round(x), round(y)), 3, (1.0, 1.0, 1.0), -1)
-            shown = np.argwhere(one.straightened(picture)[..., 0] > 0.5)[:, ::-1].mean(axis=0)
+            shown = np.argwhere(one.undistort(picture)[..., 0] > 0.5)[:, ::-1].mean(axis=0)
             np.testing.assert_allclose(shown, expected, atol=1.0)
     image = np.zeros((480, 640, 3), np.uint8)
-    assert guessed.straightened(image) is image
+    assert guessed.undistort(image) is image
     with pytest.raises(LaunchError, match="for pictures of 640 x 480, the camera gives 1280 x 720; calibrate it"):
         Lens((1280, 720), 1.05, told)
 
 
 def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str, clock: VirtualClock) -> None:
-    source = WebcamSource(WebcamSettings(camera=4, model=model), NOT_CALIBRATED, clock, Seen().landmarker)
+    source = open_webcam(WebcamSettings(camera=4, model=model), clock, Seen())
     frames = source.frames()
     for _ in range(30):
         assert next(frames) is None
@@ -150,27 +162,26 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
 )
 def test_settings_that_cannot_be_used_say_so(settings: WebcamSettings, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
-        WebcamSource(settings, NOT_CALIBRATED, SystemClock(), Seen().landmarker)
+        open_webcam(settings, SystemClock(), Seen())
 
 
 def test_without_mediapipe_it_says_what_to_install(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(webcam, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
     with pytest.raises(LaunchError, match="--extra webcam"):
-        WebcamSource(WebcamSettings(model=model), NOT_CALIBRATED, SystemClock())
+        open_input(InputSettings(source="webcam", webcam=WebcamSettings(model=model)), SystemClock())
 
 
 def test_the_launch_file_names_what_to_download() -> None:
     launch = Launch.read("webcam")
-    assert launch.input.source == "webcam"
+    assert launch.settings(InputSettings).source == "webcam"
     assert not launch.transport.lossless
-    assert launch.input.webcam.model.endswith("launch/pose_landmarker_full.task")
+    assert launch.settings(InputSettings).webcam.model.endswith("launch/pose_landmarker_full.task")
 
 
 def test_mediapipe_itself_refuses_a_file_that_is_no_model(model: str) -> None:
     pytest.importorskip("mediapipe")
-    require_mediapipe()
     with (
         pytest.raises(LaunchError, match=r"MediaPipe cannot use .* as a pose landmarker"),
-        webcam.landmarker(WebcamSettings(model=model)),
+        webcam_device.mediapipe_landmarker(WebcamSettings(model=model)),
     ):
         pass

@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
-from steadypose.prior.camera.gravity import GRAVITY, Level, level_pose
+from steadypose.prior.camera.gravity import GRAVITY, GravityEstimator, level_pose
 
 SECOND_NS = 1_000_000_000
 
 
-def turned(level: Level, vector: np.ndarray) -> np.ndarray:
+def turned(level: GravityEstimator, vector: np.ndarray) -> np.ndarray:
     return Rotation.from_quat(level.pose.orientation).apply(vector)
 
 
@@ -44,7 +44,7 @@ def test_what_is_no_direction_is_refused(up: np.ndarray) -> None:
 
 
 def test_noise_does_not_shake_the_world_and_turning_the_camera_turns_it() -> None:
-    level, rng = Level(), np.random.default_rng(0)
+    level, rng = GravityEstimator(), np.random.default_rng(0)
     assert not level.measured
     told = set()
     for n in range(500):
@@ -60,7 +60,7 @@ def test_noise_does_not_shake_the_world_and_turning_the_camera_turns_it() -> Non
 
 
 def test_a_camera_that_is_shaken_keeps_its_level() -> None:
-    level = Level()
+    level = GravityEstimator()
     level.update(np.array([0.0, -GRAVITY, 0.0]), 0)
     before = level.pose
     for n in range(1, 100):

@@ -10,7 +10,7 @@ import pytest
 
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
-from steadypose.prior.camera.depth_lifting import LEAST_CONFIDENCE, lift
+from steadypose.prior.camera.depth_lifting import MIN_CONFIDENCE, lift
 from steadypose.prior.sim.depth import Stereo, render, room, spoil
 
 CAMERA = Stereo()
@@ -126,7 +126,7 @@ def test_what_the_detector_doubts_or_places_outside_is_unobserved() -> None:
     pixels = keypoints()
     depth = flat_person(pixels)
     confidence = np.full(17, 0.9)
-    confidence[K["left_knee"]] = LEAST_CONFIDENCE - 0.01
+    confidence[K["left_knee"]] = MIN_CONFIDENCE - 0.01
     confidence[K["right_knee"]] = np.nan
     pixels[K["left_ankle"]] = np.nan
     pixels[K["right_ankle"]] = 1e9, -1e9

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import waving
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
-from steadypose.prior.camera.multi_view import ALONG, PERIOD_NS, SOURCE, Merge, Sighting, merge_joints
+from steadypose.prior.camera.multi_view import DEPTH_ERROR_RATIO, PERIOD_NS, SOURCE, Merge, Sighting, merge_joints
 from steadypose.prior.sim.camera import Camera, film
 from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.scripts import SCRIPTS
@@ -107,7 +107,7 @@ def test_a_camera_errs_along_its_line_of_sight() -> None:
     along_x = Sighting(truth + [0.1, 0.0, 0.0], np.ones(22), np.array([0.0, 2.0, 1.0]))
     along_y = Sighting(truth + [0.0, 0.1, 0.0], np.ones(22), np.array([2.0, 0.0, 1.0]))
     joints, confidence = merge_joints([along_x, along_y])
-    share = ALONG**-2 / (1 + ALONG**-2)
+    share = DEPTH_ERROR_RATIO**-2 / (1 + DEPTH_ERROR_RATIO**-2)
     assert joints - truth == pytest.approx(np.tile([0.1 * share, 0.1 * share, 0.0], (22, 1)), abs=1e-3)
     assert (confidence == 1.0).all()
 

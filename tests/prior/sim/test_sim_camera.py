@@ -107,7 +107,7 @@ def test_joints_are_in_the_optical_frame_of_the_pose_that_is_told() -> None:
 
 def test_an_uncalibrated_camera_tells_only_which_way_is_up() -> None:
     camera = replace(LEVEL, position=(1.0, 2.0, 1.5), look_at=(2.0, 4.0, 1.0), roll=0.2, calibrated=False)
-    pose = camera.told_pose()
+    pose = camera.estimated_pose()
     np.testing.assert_array_equal(pose.position, np.zeros(3))
     told = Rotation.from_quat(pose.orientation).as_matrix()
     np.testing.assert_allclose(told[2], camera.orientation[2], atol=1e-12)

@@ -11,8 +11,9 @@ import pytest
 from scipy.stats import spearmanr
 
 from steadypose.prior.body.skeleton import MIRROR, J
-from steadypose.prior.sim.fit import Clip, align, errors, statistics
-from steadypose.prior.sim.fit import simulate as simulate_clips
+from steadypose.prior.sim.error_statistics import statistics
+from steadypose.prior.sim.kinect_errors import Clip, align, errors
+from steadypose.prior.sim.kinect_errors import simulate as simulate_clips
 from steadypose.prior.sim.noise import (
     KINECT_NOISE,
     SWAP_GROUPS,
@@ -81,7 +82,7 @@ def test_jumps_come_as_often_as_said_and_end() -> None:
     displaced = np.linalg.norm(drawn, axis=-1)
     begins = ((displaced[:, 1:] > 0) & (displaced[:, :-1] != displaced[:, 1:])).sum() / (4 * 22 * 60.0)
     assert begins == pytest.approx(0.2, rel=0.1)
-    assert displaced[displaced > 0].min() >= quiet.jump_least * (1 - 1e-9)
+    assert displaced[displaced > 0].min() >= quiet.jump_minimum * (1 - 1e-9)
     mean = quiet.jump_short_share * quiet.jump_short + (1 - quiet.jump_short_share) * quiet.jump_long
     assert (displaced > 0).mean() == pytest.approx(0.2 * mean, rel=0.25)
 

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import cv2
 import matplotlib
 import numpy as np
-import tomlkit
 import tyro
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
-from steadypose.nodes.graph.launch import Launch, LaunchError
+from steadypose.nodes.commands.calibrate.launch_file import lens_of, read_launch, save_calibration
+from steadypose.nodes.commands.calibrate.pictures import (
+    depth_picture,
+    read_depth,
+    read_pictures,
+    write_floor_grid,
+    write_picture,
+)
+from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.camera.calibration import (
-    LEAST_CORNERS,
+    MIN_CORNERS,
     Board,
     CalibrationError,
     Intrinsics,
@@ -35,19 +37,10 @@ from steadypose.prior.camera.calibration import (
 if TYPE_CHECKING:
     from steadypose.nodes.sources.oak_still import Still
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
-
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
-VIDEO_STEP_S = 0.5
-"""between the pictures taken from a video: nearer ones show the same again"""
-MOST_PICTURES = 60
 PAPERS_MM = {"a4": (297.0, 210.0), "a3": (420.0, 297.0), "letter": (279.4, 215.9)}
-SURE_M = 0.005
+GOOD_SIGMA_M = 0.005
 """a place less sure than this is worth another try"""
 DPI = 300
-AXIS_PX = 4
 _MARGIN_MM = 8.0
 _INCH_MM = 25.4
 
@@ -136,7 +129,7 @@ class CalibratePose:
 class CalibrateFloor:
     """Where the camera stands above the floor, from a depth image and from where up is; without a board.
 
-    This tells height and tilt. It cannot tell where on the floor the camera stands or which way it looks: the world
+    This gives height and tilt. It cannot give where on the floor the camera stands or which way it looks: the world
     begins under the camera, and the camera looks along +y. Several cameras need the board.
 
     Try:
@@ -228,11 +221,11 @@ def _print_board(step: PrintBoard) -> None:
 
 
 def _calibrate_lens(step: CalibrateLens) -> None:
-    _check_launch(step.launch)
+    read_launch(step.launch)
     board = Board(step.columns, step.rows, step.square)
-    views, sizes, looked_at = [], set(), 0
-    for name, picture in _pictures(step.pictures):
-        looked_at += 1
+    views, sizes, pictures = [], set(), 0
+    for name, picture in read_pictures(step.pictures):
+        pictures += 1
         view = find_corners(picture, board)
         print(f"{name}: {f'{len(view.image)} corners' if view else 'no board'}")
         sizes.add(picture.shape[1::-1])
@@ -242,59 +235,59 @@ def _calibrate_lens(step: CalibrateLens) -> None:
             f"expected pictures of one size, got {', '.join(f'{w} x {h}' for w, h in sorted(sizes))}"
         )
     lens = calibrate_lens(views, sizes.pop())
-    _save(step.launch, lens=lens)
+    save_calibration(step.launch, lens=lens)
     angle = 2 * np.degrees(np.arctan(0.5 * lens.size[0] / lens.focal[0]))
     print(
-        f"\nlens from {len(views)} of {looked_at} pictures, {lens.error_px:.2f} pixels off on average (0.5 is good); "
+        f"\nlens from {len(views)} of {pictures} pictures, {lens.error_px:.2f} pixels off on average (0.5 is good); "
         f"{lens.size[0]} x {lens.size[1]}, focal length {lens.focal[0]:.1f} pixels, {angle:.0f} degrees wide"
     )
     print(f"{step.launch}: [input.calibration] written. Next: steadypose calibrate pose")
 
 
 def _calibrate_pose(step: CalibratePose) -> None:
-    lens = _lens(step.launch)
+    lens = lens_of(step.launch)
     board = Board(step.columns, step.rows, step.square)
     views, last = [], None
-    for name, picture in _pictures(step.pictures):
+    for name, picture in read_pictures(step.pictures):
         if picture.shape[1::-1] != lens.size:
             raise CalibrationError(
                 f"{name}: expected {lens.size[0]} x {lens.size[1]} pixels, as the lens was calibrated for, got "
                 f"{picture.shape[1]} x {picture.shape[0]}"
             )
         view, last = find_corners(picture, board), picture
-        print(f"{name}: {f'{len(view.image)} corners' if view else f'fewer than {LEAST_CORNERS} corners'}")
+        print(f"{name}: {f'{len(view.image)} corners' if view else f'fewer than {MIN_CORNERS} corners'}")
         views += [view] if view else []
     found = camera_pose(views, lens)
     assert last is not None, "without a picture there is no pose"
-    _write_grid(step.picture or step.launch.with_suffix(".floor.png"), last, lens, found.pose)
-    _save(step.launch, pose=found.pose)
+    write_floor_grid(step.picture or step.launch.with_suffix(".floor.png"), last, lens, found.pose)
+    save_calibration(step.launch, pose=found.pose)
     print(
         f"\n{_described(found.pose)}; most corners within {found.error_px:.2f} pixels; "
         f"sure to {1e3 * found.sigma_m:.1f} mm and {np.degrees(found.sigma_rad):.2f} degrees"
     )
-    if found.sigma_m > SURE_M:
-        print("More pictures, a larger board, or the board nearer to the camera would make it surer.")
+    if found.sigma_m > GOOD_SIGMA_M:
+        print("More pictures, a larger board, or the board nearer to the camera would make it more certain.")
     print(f"{step.launch}: [input.calibration] written; poses of this camera are calibrated now")
 
 
 def _calibrate_floor(step: CalibrateFloor) -> None:
-    lens = _lens(step.launch)
-    depth = _depth(step.depth)
+    lens = lens_of(step.launch)
+    depth = read_depth(step.depth)
     if not np.isfinite(step.up).all() or not np.linalg.norm(step.up) > 0:
         raise CalibrationError(f"--up: expected a direction, got {step.up}")
     pose, share = floor_pose(points_of_depth(depth, lens), np.array(step.up))
-    _write_grid(step.picture or step.launch.with_suffix(".floor.png"), depth_picture(depth), lens, pose)
-    _save(step.launch, pose=pose)
+    write_floor_grid(step.picture or step.launch.with_suffix(".floor.png"), depth_picture(depth), lens, pose)
+    save_calibration(step.launch, pose=pose)
     print(f"{_described(pose)}; {share:.0%} of what it sees is floor")
     print(f"{step.launch}: [input.calibration] written; poses of this camera are calibrated now")
 
 
 def _calibrate_oak(step: CalibrateOak) -> None:
-    launch = _check_launch(step.launch)
-    from steadypose.nodes.sources.oak_still import take_with_camera  # brings depthai
+    launch = read_launch(step.launch)
+    from steadypose.nodes.sources.oak_still import capture_with_camera  # brings depthai
 
     try:
-        still = take_with_camera(launch.input.oak)
+        still = capture_with_camera(launch.settings(InputSettings).oak)
     except RuntimeError as error:
         raise CalibrationError(str(error)) from error
     _write_still(step, still)
@@ -302,12 +295,12 @@ def _calibrate_oak(step: CalibrateOak) -> None:
 
 def _write_still(step: CalibrateOak, still: Still) -> None:
     picture, depth = step.out.with_name(f"{step.out.name}.png"), step.out.with_name(f"{step.out.name}.depth.png")
-    _write_picture(picture, still.colour)
-    _write_picture(depth, still.depth)
+    write_picture(picture, still.colour)
+    write_picture(depth, still.depth)
     height, width = still.depth.shape
     focal, centre = still.intrinsics[[0, 1], [0, 1]], still.intrinsics[:2, 2]
     lens = Intrinsics((width, height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
-    _save(step.launch, lens=lens)
+    save_calibration(step.launch, lens=lens)
     up = "" if still.up is None else " --up " + " ".join(f"{value:.3f}" for value in still.up)
     print(f"{step.launch}: [input.calibration] has the camera's lens now. With the board on the floor:")
     print(f"  steadypose calibrate pose {step.launch} {picture} --square METRES")
@@ -321,183 +314,3 @@ def _described(pose: Pose) -> str:
         f"camera at x {x:.3f}, y {y:.3f} m, {z:.3f} m above the floor, "
         f"looking {np.degrees(np.arcsin(-forward[2])):.1f} degrees down"
     )
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# Pictures
-
-
-def _pictures(paths: Sequence[Path]) -> Iterator[tuple[str, Image]]:
-    """Pictures by name, from files, folders and videos.
-
-    Raises:
-        CalibrationError: there are none, or one cannot be read.
-    """
-    files: list[Path] = []
-    for path in paths:
-        if path.is_dir():
-            files += sorted(file for file in path.iterdir() if file.suffix.lower() in PICTURES)
-        elif path.is_file():
-            files.append(path)
-        else:
-            raise CalibrationError(f"{path} does not exist: expected a picture, a folder of pictures, or a video")
-    if not files:
-        where = f" in {', '.join(map(str, paths))}" if paths else ""
-        raise CalibrationError(
-            f"expected pictures ({', '.join(PICTURES)}), folders of them, or videos; got none{where}"
-        )
-    if len(files) > MOST_PICTURES:
-        print(f"of {len(files)} pictures the first {MOST_PICTURES} are taken")
-    for file in track(files[:MOST_PICTURES], "reading", disable=len(files) < 2):
-        if file.suffix.lower() in VIDEOS:
-            yield from _frames(file)
-            continue
-        picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        if picture is None:
-            raise CalibrationError(f"{file}: expected a picture that OpenCV reads, such as .png or .jpg")
-        yield file.name, np.asarray(picture, np.uint8)
-
-
-def _frames(file: Path) -> Iterator[tuple[str, Image]]:
-    video = cv2.VideoCapture(str(file))
-    fps = video.get(cv2.CAP_PROP_FPS)
-    fps = fps if 1.0 <= fps <= 1000.0 else 30.0  # some files do not tell, or tell their time base
-    step, taken, index = max(round(VIDEO_STEP_S * fps), 1), 0, 0
-    while taken < MOST_PICTURES and video.grab():
-        if index % step == 0:
-            good, frame = video.retrieve()
-            if good:
-                taken += 1
-                yield (
-                    f"{file.name} at {index / fps:.1f} s",
-                    np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8),
-                )
-        index += 1
-    video.release()
-    if not taken:
-        raise CalibrationError(f"{file}: expected a video that OpenCV reads, got no frame of it")
-
-
-def _depth(file: Path) -> NDArray[np.integer]:
-    if not file.is_file():
-        raise CalibrationError(f"{file} does not exist: expected a depth image, .png of 16 bits or .npy")
-    try:
-        depth = np.load(file) if file.suffix == ".npy" else cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    except Exception as error:  # of damaged bytes numpy's parser raises several kinds
-        raise CalibrationError(f"{file}: cannot be read as .npy: {error}") from error
-    if not isinstance(depth, np.ndarray) or depth.ndim != 2 or depth.dtype.kind not in "iu" or depth.dtype.itemsize < 2:
-        shape = f"{depth.dtype} of shape {depth.shape}" if isinstance(depth, np.ndarray) else "nothing that can be read"
-        raise CalibrationError(f"{file}: expected (H, W) integers of 16 bits, millimetres of depth, got {shape}")
-    return np.asarray(depth, np.int64)
-
-
-def draw_floor(picture: Image, lens: Intrinsics, pose: Pose, reach: float = 6.0, step: float = 0.5) -> Image:
-    """A picture (H, W) as colours (H, W, 3), BGR, with the floor's grid, every metre bolder, and the world's axes.
-
-    Args:
-        picture: grey.
-        lens: of the camera.
-        pose: of the camera in the world.
-        reach: metres of grid around the point that the camera looks at, or stands above.
-        step: metres between lines.
-    """
-    drawn = np.ascontiguousarray(np.repeat(picture[:, :, None], 3, axis=2))
-    turn = Rotation.from_quat(pose.orientation)
-    forward = turn.apply([0.0, 0.0, 1.0])
-    away = min(pose.position[2] / -forward[2], reach) if forward[2] < 0 else reach
-    middle = np.round((pose.position + away * forward)[:2])
-    ticks = np.arange(-reach, reach + step / 2, step)
-    along = np.linspace(-reach, reach, 400)
-    lines: list[tuple[Floats, tuple[int, int, int], int]] = []
-    for tick in ticks:
-        for axis in (0, 1):
-            line = np.zeros((len(along), 3))
-            line[:, axis], line[:, 1 - axis] = middle[axis] + along, middle[1 - axis] + tick
-            bold = abs(line[0, 1 - axis] % 1.0) < 1e-9
-            lines.append((line, (200, 255, 120) if bold else (140, 180, 90), 2 if bold else 1))
-    for axis, colour in enumerate(((60, 60, 255), (60, 220, 60), (255, 120, 60))):
-        lines.append((np.linspace(0.0, 0.5, 50)[:, None] * np.eye(3)[axis], colour, AXIS_PX))
-    back = turn.inv()
-    half = 0.75 * np.array(lens.size) / lens.focal  # beyond, the distortion's polynomial means nothing
-    for line, colour, thickness in lines:
-        seen = back.apply(line - pose.position)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inside = (seen[:, 2] > 0.1) & (np.abs(seen[:, :2] / seen[:, 2:]) < half).all(axis=1)
-        pixels = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), lens.matrix, lens.coefficients)[0].reshape(-1, 2)
-        for run in np.split(np.arange(len(line)), np.flatnonzero(~inside)):
-            run = run[inside[run]]
-            if len(run) > 1:
-                points = np.round(pixels[run] * 16).astype(np.int32)[:, None]
-                cv2.polylines(drawn, [points], False, colour, thickness, cv2.LINE_AA, shift=4)
-        if thickness == AXIS_PX and inside[-1]:
-            x, y = np.round(pixels[-1]).astype(int).tolist()
-            name = "xyz"[int(np.argmax(line[-1]))]
-            cv2.putText(drawn, name, (x + 6, y - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
-    return drawn
-
-
-def depth_picture(depth: NDArray[np.integer]) -> Image:
-    """Depth (H, W) in millimetres as grey, near light and far dark, as inverse depth is seen; black in holes."""
-    near = np.percentile(depth[depth > 0], 1) if depth.any() else 1.0
-    return (255 * np.clip(near / np.where(depth > 0, depth, np.inf), 0.0, 1.0)).astype(np.uint8)
-
-
-def _write_picture(out: Path, picture: NDArray[Any]) -> None:
-    try:
-        written = cv2.imwrite(str(out), picture)
-    except cv2.error:  # an ending it does not know
-        written = False
-    if not written:
-        raise CalibrationError(
-            f"{out} cannot be written: expected a picture such as .png or .jpg in a folder that exists"
-        )
-
-
-def _write_grid(out: Path, picture: Image, lens: Intrinsics, pose: Pose) -> None:
-    _write_picture(out, draw_floor(picture, lens, pose))
-    print(f"{out}: the floor's grid, half a metre a square; it must lie on the floor, its axes where the world begins")
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# The launch file
-
-
-def _check_launch(path: Path) -> Launch:
-    if not path.is_file():
-        raise LaunchError(
-            f"no launch file at {path}: expected the camera's own; start from a copy of one in launch/ such as oak.toml"
-        )
-    return Launch.read(path)
-
-
-def _lens(path: Path) -> Intrinsics:
-    """The lens that a launch file tells."""
-    told = _check_launch(path).input.calibration
-    if not told.size:
-        raise CalibrationError(f"{path} tells no lens in [input.calibration]: first run steadypose calibrate lens")
-    width, height = told.size
-    fx, fy = told.focal
-    cx, cy = told.centre
-    return Intrinsics((width, height), (fx, fy), (cx, cy), tuple(told.distortion))
-
-
-def _save(path: Path, *, lens: Intrinsics | None = None, pose: Pose | None = None) -> None:
-    """Write what was found to ``[input.calibration]`` of a launch file, which is left as it is otherwise."""
-    document = tomlkit.parse(path.read_text(encoding="utf-8"))
-    section = document.setdefault("input", tomlkit.table()).setdefault("calibration", tomlkit.table())
-    if lens:
-        section["size"] = list(lens.size)
-        for name in ("focal", "centre", "distortion"):
-            section[name] = [round(value, 6) for value in getattr(lens, name)]
-    if pose:
-        section["position"] = [round(float(value), 5) for value in pose.position]
-        section["orientation"] = [round(float(value), 7) for value in pose.orientation]
-    # the user's own file: whole, as it was or as it becomes, whatever happens in between
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(tomlkit.dumps(document), encoding="utf-8")
-        shutil.copymode(path, part)
-        Launch.read(part)
-        part.replace(path.resolve())
-    finally:
-        part.unlink(missing_ok=True)

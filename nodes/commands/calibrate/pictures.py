@@ -1,0 +1,159 @@
+"""Pictures for `calibrate`: read from files, folders and videos, and drawn with the floor that was found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+from scipy.spatial.transform import Rotation
+
+from steadypose.msgs.types import Pose
+from steadypose.prior.camera.calibration import (
+    CalibrationError,
+    Intrinsics,
+)
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
+VIDEO_STEP_S = 0.5
+"""between the pictures taken from a video: nearer ones show the same again"""
+MAX_PICTURES = 60
+AXIS_PX = 4
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+
+def read_pictures(paths: Sequence[Path]) -> Iterator[tuple[str, Image]]:
+    """Pictures by name, from files, folders and videos.
+
+    Raises:
+        CalibrationError: there are none, or one cannot be read.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            files += sorted(file for file in path.iterdir() if file.suffix.lower() in PICTURES)
+        elif path.is_file():
+            files.append(path)
+        else:
+            raise CalibrationError(f"{path} does not exist: expected a picture, a folder of pictures, or a video")
+    if not files:
+        where = f" in {', '.join(map(str, paths))}" if paths else ""
+        raise CalibrationError(
+            f"expected pictures ({', '.join(PICTURES)}), folders of them, or videos; got none{where}"
+        )
+    if len(files) > MAX_PICTURES:
+        print(f"of {len(files)} pictures the first {MAX_PICTURES} are taken")
+    for file in track(files[:MAX_PICTURES], "reading", disable=len(files) < 2):
+        if file.suffix.lower() in VIDEOS:
+            yield from _frames(file)
+            continue
+        picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        if picture is None:
+            raise CalibrationError(f"{file}: expected a picture that OpenCV reads, such as .png or .jpg")
+        yield file.name, np.asarray(picture, np.uint8)
+
+
+def _frames(file: Path) -> Iterator[tuple[str, Image]]:
+    video = cv2.VideoCapture(str(file))
+    fps = video.get(cv2.CAP_PROP_FPS)
+    fps = fps if 1.0 <= fps <= 1000.0 else 30.0  # some files lack it, or have their time base there
+    step, taken, index = max(round(VIDEO_STEP_S * fps), 1), 0, 0
+    while taken < MAX_PICTURES and video.grab():
+        if index % step == 0:
+            good, frame = video.retrieve()
+            if good:
+                taken += 1
+                yield (
+                    f"{file.name} at {index / fps:.1f} s",
+                    np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8),
+                )
+        index += 1
+    video.release()
+    if not taken:
+        raise CalibrationError(f"{file}: expected a video that OpenCV reads, got no frame of it")
+
+
+def read_depth(file: Path) -> NDArray[np.integer]:
+    if not file.is_file():
+        raise CalibrationError(f"{file} does not exist: expected a depth image, .png of 16 bits or .npy")
+    try:
+        depth = np.load(file) if file.suffix == ".npy" else cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    except Exception as error:  # of damaged bytes numpy's parser raises several kinds
+        raise CalibrationError(f"{file}: cannot be read as .npy: {error}") from error
+    if not isinstance(depth, np.ndarray) or depth.ndim != 2 or depth.dtype.kind not in "iu" or depth.dtype.itemsize < 2:
+        shape = f"{depth.dtype} of shape {depth.shape}" if isinstance(depth, np.ndarray) else "nothing that can be read"
+        raise CalibrationError(f"{file}: expected (H, W) integers of 16 bits, millimetres of depth, got {shape}")
+    return np.asarray(depth, np.int64)
+
+
+def draw_floor(picture: Image, lens: Intrinsics, pose: Pose, reach: float = 6.0, step: float = 0.5) -> Image:
+    """A picture (H, W) as colours (H, W, 3), BGR, with the floor's grid, every metre bolder, and the world's axes.
+
+    Args:
+        picture: grey.
+        lens: of the camera.
+        pose: of the camera in the world.
+        reach: metres of grid around the point that the camera looks at, or stands above.
+        step: metres between lines.
+    """
+    drawn = np.ascontiguousarray(np.repeat(picture[:, :, None], 3, axis=2))
+    turn = Rotation.from_quat(pose.orientation)
+    forward = turn.apply([0.0, 0.0, 1.0])
+    away = min(pose.position[2] / -forward[2], reach) if forward[2] < 0 else reach
+    middle = np.round((pose.position + away * forward)[:2])
+    ticks = np.arange(-reach, reach + step / 2, step)
+    along = np.linspace(-reach, reach, 400)
+    lines: list[tuple[Floats, tuple[int, int, int], int]] = []
+    for tick in ticks:
+        for axis in (0, 1):
+            line = np.zeros((len(along), 3))
+            line[:, axis], line[:, 1 - axis] = middle[axis] + along, middle[1 - axis] + tick
+            bold = abs(line[0, 1 - axis] % 1.0) < 1e-9
+            lines.append((line, (200, 255, 120) if bold else (140, 180, 90), 2 if bold else 1))
+    for axis, colour in enumerate(((60, 60, 255), (60, 220, 60), (255, 120, 60))):
+        lines.append((np.linspace(0.0, 0.5, 50)[:, None] * np.eye(3)[axis], colour, AXIS_PX))
+    back = turn.inv()
+    half = 0.75 * np.array(lens.size) / lens.focal  # beyond, the distortion's polynomial means nothing
+    for line, colour, thickness in lines:
+        seen = back.apply(line - pose.position)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inside = (seen[:, 2] > 0.1) & (np.abs(seen[:, :2] / seen[:, 2:]) < half).all(axis=1)
+        pixels = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), lens.matrix, lens.coefficients)[0].reshape(-1, 2)
+        for run in np.split(np.arange(len(line)), np.flatnonzero(~inside)):
+            run = run[inside[run]]
+            if len(run) > 1:
+                points = np.round(pixels[run] * 16).astype(np.int32)[:, None]
+                cv2.polylines(drawn, [points], False, colour, thickness, cv2.LINE_AA, shift=4)
+        if thickness == AXIS_PX and inside[-1]:
+            x, y = np.round(pixels[-1]).astype(int).tolist()
+            name = "xyz"[int(np.argmax(line[-1]))]
+            cv2.putText(drawn, name, (x + 6, y - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
+    return drawn
+
+
+def depth_picture(depth: NDArray[np.integer]) -> Image:
+    """Depth (H, W) in millimetres as grey, near light and far dark, as inverse depth is seen; black in holes."""
+    near = np.percentile(depth[depth > 0], 1) if depth.any() else 1.0
+    return (255 * np.clip(near / np.where(depth > 0, depth, np.inf), 0.0, 1.0)).astype(np.uint8)
+
+
+def write_picture(out: Path, picture: NDArray[Any]) -> None:
+    try:
+        written = cv2.imwrite(str(out), picture)
+    except cv2.error:  # an ending it does not know
+        written = False
+    if not written:
+        raise CalibrationError(
+            f"{out} cannot be written: expected a picture such as .png or .jpg in a folder that exists"
+        )
+
+
+def write_floor_grid(out: Path, picture: Image, lens: Intrinsics, pose: Pose) -> None:
+    write_picture(out, draw_floor(picture, lens, pose))
+    print(f"{out}: the floor's grid, half a metre a square; it must lie on the floor, its axes where the world begins")

@@ -1,0 +1,138 @@
+"""``steadypose info``: what is in a recording, or who publishes a topic."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from steadypose.msgs.codec import wire_type
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import TOPICS
+from steadypose.msgs.transport import Subscriber
+from steadypose.msgs.types import Diagnostics, Message, PoseClean, PoseRaw
+from steadypose.nodes.commands.inspect.hz import Rate
+from steadypose.nodes.commands.inspect.topic import (
+    Address,
+    LaunchFile,
+    endpoints_of,
+    plural,
+    recording_at,
+    subscribe,
+)
+from steadypose.nodes.graph.clock import POLL_S
+
+INFO_S = 2.0
+"""for which `info` listens to a topic that is published"""
+
+
+def info(
+    target: Annotated[str, tyro.conf.arg(metavar="TOPIC|RECORDING")],
+    launch: LaunchFile = None,
+    endpoints: Address = (),
+) -> int:
+    """Tell what is in a recording, or who publishes a topic.
+
+    Try:
+      steadypose info RECORDING
+      steadypose info pose/world
+
+    Args:
+        target: a topic, such as pose/clean, or a recording.
+        launch: the launch file, or the name of one of the project's own, whose addresses to look at.
+        endpoints: the address to look at. May be given again.
+
+    Returns:
+        0, or 1 if nobody publishes the topic.
+    """
+    if target not in TOPICS:
+        for line in _describe_recording(recording_at(target)):
+            print(line)
+        return 0
+    print(f"{target}: {wire_type(TOPICS[target])}")
+    published = False
+    for endpoint in endpoints_of(target, launch, endpoints):
+        with subscribe(target, launch, (endpoint,)) as subscriber:
+            arrivals, contents = _listen(subscriber)
+        published |= bool(arrivals)
+        print(f"  {endpoint}: {plural(len(arrivals), 'message', 'messages')} in {INFO_S:g} s{Rate.of(arrivals).brief}")
+        if arrivals:
+            print(f"    {contents}")
+    if not published:
+        print("nobody publishes it there: is `steadypose run` running?")
+    return 0 if published else 1
+
+
+class _Contents:
+    """What messages speak of, gathered."""
+
+    def __init__(self) -> None:
+        self._names: dict[str, Counter[str]] = {}
+        self._bodies: set[int] = set()
+
+    def add(self, message: Message) -> None:
+        if isinstance(message, Diagnostics):
+            self._note("nodes", message.node)
+            return
+        self._note("source", message.source)
+        self._note("frame", message.frame_id)
+        if isinstance(message, PoseRaw):
+            self._note("skeleton", message.skeleton)
+        if isinstance(message, PoseClean):
+            self._note("delay", f"{message.delay_frames} frames")
+        self._bodies.update(body.id for body in message.bodies)
+
+    def _note(self, what: str, name: str) -> None:
+        self._names.setdefault(what, Counter())[name] += 1
+
+    def __str__(self) -> str:
+        parts = [f"{what} {', '.join(names)}" for what, names in self._names.items()]
+        return "; ".join([*parts, f"bodies {_enumerate(sorted(self._bodies))}"] if self._bodies else parts)
+
+
+def _enumerate(ids: list[int], limit: int = 8) -> str:
+    return ", ".join(map(str, ids[:limit])) + (f" and {len(ids) - limit} more" if len(ids) > limit else "")
+
+
+def _describe_recording(path: Path) -> Iterator[str]:
+    with RecordingReader(path) as recording:
+        contents = {topic: _Contents() for topic in recording.topics}
+        stamps: dict[str, list[float]] = {topic: [] for topic in recording.topics}
+        for topic, stamp_ns, message in recording:
+            contents[topic].add(message)
+            stamps[topic].append(stamp_ns / 1e9)
+        files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+        start = datetime.fromtimestamp(recording.start_ns / 1e9, timezone.utc)
+        size = sum(file.stat().st_size for file in files) / 1e6
+        yield f"{path}: {recording.duration_s:.2f} s, {size:.2f} MB"
+        yield f"from {start:%Y-%m-%d %H:%M:%S.%f} UTC, stamp {recording.start_ns}"
+        if not recording.complete:
+            yield (
+                f"cut short: the writer was killed or the file truncated, {recording.lost_bytes} bytes at its end "
+                "cannot be read; what follows can"
+            )
+        for topic in recording.topics:
+            rate = Rate.of(stamps[topic])
+            yield f"{topic}: {wire_type(TOPICS[topic])}"
+            yield f"    {plural(rate.count, 'message', 'messages')}{rate.brief}"
+            yield f"    {contents[topic]}"
+        for topic, count in recording.refused.items():
+            yield f"{topic}: {plural(count, 'message', 'messages')} that cannot be decoded"
+
+
+def _listen(subscriber: Subscriber) -> tuple[list[float], _Contents]:
+    """Times of arrival and contents of what comes in a short while."""
+    arrivals: list[float] = []
+    contents = _Contents()
+    until = time.monotonic() + INFO_S
+    while (left := until - time.monotonic()) > 0:
+        received = subscriber.receive(min(left, POLL_S))
+        if received is not None:
+            arrivals.append(time.monotonic())
+            contents.add(received[1])
+    return arrivals, contents

@@ -1,0 +1,154 @@
+"""A recording as arrays: each body on each topic, a row a message."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from steadypose.msgs.types import JOINTS, Diagnostics, PoseClean, PoseRaw, PoseWorld, Tracking
+from steadypose.nodes.sinks.drawing import to_world
+from steadypose.prior.body.layouts import SKELETONS, to_canonical
+
+
+class Track(NamedTuple):
+    """One body on one topic, a row a message. Positions are in the world."""
+
+    time: NDArray[np.float64]
+    """(T,) seconds since the recording's first stamp"""
+    positions: NDArray[np.float64]
+    """(T, 22, 3) metres; NaN where unobserved"""
+    raw: NDArray[np.float64]
+    """(T, 22, 3) what went in; empty but on `pose/clean`"""
+    state: NDArray[np.uint8]
+    """(T, 22) `JointState`"""
+    sigma: NDArray[np.float64]
+    """(T, 22) metres"""
+    anomaly: NDArray[np.float64]
+    """(T,)"""
+    flag: NDArray[np.bool_]
+    """(T,)"""
+    contacts: NDArray[np.float64]
+    """(T, 8)"""
+    tracking: NDArray[np.uint8]
+    """(T,) `Tracking`"""
+
+
+class Row(NamedTuple):
+    """A body in a message, as it is gathered; the fields of `Track`."""
+
+    time: float
+    positions: NDArray[np.floating]
+    raw: NDArray[np.floating] = np.zeros(0)
+    state: NDArray[np.uint8] = np.zeros(0, np.uint8)
+    sigma: NDArray[np.floating] = np.zeros(0)
+    anomaly: float = np.nan
+    flag: bool = False
+    contacts: NDArray[np.floating] = np.zeros(0)
+    tracking: int = Tracking.OK
+
+
+@dataclass
+class History:
+    """A recording as arrays."""
+
+    name: str
+    stamps: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    """topic to (T,) seconds"""
+    tracks: dict[str, dict[int, Track]] = field(default_factory=dict)
+    """topic and body to its track"""
+    calibrated: bool = True
+    """whether the camera's place in the world is known"""
+    reported: bool = False
+    """whether diagnostics were recorded"""
+    observable: NDArray[np.bool_] = field(default_factory=lambda: np.ones(len(JOINTS), bool))
+    """(22,) the joints that the sensor has at all"""
+    origin: str = ""
+    dropped_or_refused: Counter[str] = field(default_factory=Counter)
+    """dropped and refused messages by node and cause, as the nodes counted them; and what could not be read"""
+
+    def track(self, topic: str, body: int) -> Track | None:
+        return self.tracks.get(topic, {}).get(body)
+
+    def longest(self) -> int | None:
+        """The body with the most messages on the furthest topic that has any."""
+        for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH):
+            if bodies := self.tracks.get(topic):
+                return max(bodies, key=lambda body: len(bodies[body].time))
+        return None
+
+
+def read_history(recording: Path) -> History:
+    rows: dict[tuple[str, int], list[Row]] = {}
+    stamps: dict[str, list[float]] = {}
+    dropped_or_refused: dict[str, Mapping[str, str]] = {}
+    sources, skeletons = Counter[str](), Counter[str]()
+    observable = np.zeros(len(JOINTS), bool)
+    with RecordingReader(recording) as reader:
+        history = History(reader.path.name)
+        for topic, stamp_ns, message in reader:
+            if isinstance(message, Diagnostics):
+                dropped_or_refused[message.node] = message.values
+                continue
+            if message.end_of_stream:
+                continue
+            time = (stamp_ns - reader.start_ns) / 1e9
+            stamps.setdefault(topic, []).append(time)
+            sources[message.source] += 1
+            history.calibrated &= getattr(message, "calibrated", True)
+            if isinstance(message, PoseRaw) and message.skeleton in SKELETONS:
+                skeletons[message.skeleton] += 1
+                observable |= SKELETONS[message.skeleton].observable
+            for body, row in _rows(message, time):
+                rows.setdefault((topic, body), []).append(row)
+        history.dropped_or_refused.update({f"unreadable {topic}": count for topic, count in reader.refused.items()})
+        if not reader.complete:
+            history.dropped_or_refused["bytes cut off"] = reader.lost_bytes
+    history.stamps = {topic: np.array(times) for topic, times in stamps.items()}
+    for (topic, body), found in rows.items():
+        track = Track(*(np.array(column) for column in zip(*found, strict=True)))
+        history.tracks.setdefault(topic, {})[body] = track
+    if observable.any():
+        history.observable = observable
+    history.reported = bool(dropped_or_refused)
+    history.origin = " · ".join([", ".join(sources), *skeletons])
+    for node, values in dropped_or_refused.items():
+        counts = {key: value for key, value in values.items() if key.startswith(("dropped.", "refused."))}
+        history.dropped_or_refused.update(
+            {f"{node} {key}": int(value) for key, value in counts.items() if value.isdecimal()}
+        )
+    return history
+
+
+def _rows(message: PoseRaw | PoseClean | PoseWorld, time: float) -> Iterable[tuple[int, Row]]:
+    if isinstance(message, PoseRaw):
+        skeleton = SKELETONS.get(message.skeleton)
+        for body in message.bodies if skeleton else ():
+            if skeleton and len(body.positions) == len(skeleton.joints):
+                positions, _ = to_canonical(skeleton, to_world(body.positions, message.sensor_pose), body.confidence)
+                yield body.id, Row(time, positions)
+    elif isinstance(message, PoseClean):
+        for body in message.bodies:
+            positions = to_world(body.positions, message.sensor_pose)
+            raw = to_world(body.raw_positions, message.sensor_pose)
+            yield body.id, Row(time, positions, raw, body.state, body.sigma, body.anomaly, body.anomaly_flag)
+    else:
+        for body in message.bodies:
+            yield (
+                body.id,
+                Row(
+                    time,
+                    body.positions,
+                    state=body.state,
+                    sigma=body.sigma,
+                    contacts=body.contacts,
+                    tracking=body.tracking,
+                ),
+            )

@@ -1,0 +1,136 @@
+"""What a node measures of itself, and says in `diagnostics`: rates, latency, queue, what was dropped or refused."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from collections import Counter, deque
+from collections.abc import Mapping
+
+import numpy as np
+
+from steadypose.msgs.types import Diagnostics, Level
+from steadypose.nodes.graph.clock import Clock
+
+REPORT_NS = 1_000_000_000
+"""between two reports"""
+SAMPLES = 1000
+"""latencies and compute times kept for the percentiles: half a minute at 30 Hz"""
+
+
+class Health:
+    """The measurements of one node.
+
+    Args:
+        clock: of the node.
+
+    Attributes:
+        state: in a word or two: ``starting``, ``running``, ``waiting for prior``, ``stopped``.
+        counts: messages refused and dropped by the node itself, by cause.
+        published: messages published, by topic.
+        ended: topics of which the end of the stream was seen.
+        stamp_ns: capture of the newest frame, nanoseconds.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self.state = "starting"
+        self.counts: Counter[str] = Counter()
+        self.published: Counter[str] = Counter()
+        self.ended: set[str] = set()
+        self.stamp_ns = 0
+        self._clock = clock
+        self._queue = 0
+        self._latency_ns: deque[int] = deque(maxlen=SAMPLES)
+        self._compute_ns: deque[int] = deque(maxlen=SAMPLES)
+        self._first_and_last_ns: dict[str, tuple[int, int]] = {}
+        self._published_before: Counter[str] = Counter()
+        self._rates: dict[str, float] = {}
+        self._problems_before = 0
+        self._reported_at = self._rated_at = clock.now_ns()
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time for the next report."""
+        return self._clock.now_ns() - self._reported_at >= REPORT_NS
+
+    def note_published(self, topic: str, at_ns: int, latency_ns: int | None) -> None:
+        """A message was published.
+
+        Args:
+            topic: its topic.
+            at_ns: wall time.
+            latency_ns: from capture, less the delay that is meant; None where it is not known.
+        """
+        self.published[topic] += 1
+        self._first_and_last_ns[topic] = self._first_and_last_ns.get(topic, (at_ns, at_ns))[0], at_ns
+        if latency_ns is not None:
+            self._latency_ns.append(latency_ns)
+
+    def note_computed(self, spent_ns: int) -> None:
+        """A frame took so long, without the time its publication waited for subscribers."""
+        self._compute_ns.append(spent_ns)
+
+    def note_queue(self, length: int) -> None:
+        """So many messages wait."""
+        self._queue = max(self._queue, length)
+
+    def report(self, node: str, received: Counter[str], status: Mapping[str, str]) -> Diagnostics:
+        """The `diagnostics` of now.
+
+        Args:
+            node: its name.
+            received: what was dropped and refused on the way to the node, by cause.
+            status: what the node itself has to say.
+        """
+        self._reported_at = self._clock.now_ns()
+        self._measure_rates()
+        counts = self.counts + received
+        refused_by_node = sum(int(n) for key, n in status.items() if key.startswith(("refused.", "dropped.")))
+        problems = counts.total() + refused_by_node
+        new_problems, self._problems_before = problems - self._problems_before, problems
+        values = {"state": self.state, "ended": " ".join(sorted(self.ended)), "queue": str(self._queue)}
+        self._queue = 0
+        values |= {f"count.{topic}": str(n) for topic, n in self.published.items()}
+        values |= {f"rate.{topic}": f"{rate:.2f}" for topic, rate in self._rates.items()}
+        values |= {
+            f"mean_rate.{topic}": f"{(self.published[topic] - 1) * 1e9 / max(last - first, 1):.2f}"
+            for topic, (first, last) in self._first_and_last_ns.items()
+        }
+        values |= _percentiles("latency_ms", self._latency_ns) | _percentiles("compute_ms", self._compute_ns)
+        values |= {key: str(n) for key, n in sorted(counts.items())}
+        values |= {"memory_mb": f"{resident_bytes() / 1e6:.1f}"} | dict(status)
+        rates = ", ".join(f"{topic} {rate:.1f} Hz" for topic, rate in self._rates.items())
+        return Diagnostics(
+            stamp_ns=self.stamp_ns,
+            node=node,
+            level=Level.WARN if new_problems else Level.OK,
+            message=f"{new_problems} dropped or refused" if new_problems else rates or self.state,
+            values=values,
+        )
+
+    def _measure_rates(self) -> None:
+        now = self._clock.now_ns()
+        elapsed = now - self._rated_at
+        # a report out of turn, as at the end of a stream, sees too little time for a rate
+        if elapsed < REPORT_NS // 2 and self._rates:
+            return
+        new = self.published - self._published_before
+        self._rates = {topic: new[topic] * 1e9 / max(elapsed, 1) for topic in self.published}
+        self._published_before, self._rated_at = self.published.copy(), now
+
+
+def _percentiles(name: str, samples: deque[int]) -> dict[str, str]:
+    if not samples:
+        return {}
+    values = np.percentile(np.array(samples) / 1e6, (50, 95, 99))
+    return {f"{name}.p{p}": f"{value:.3f}" for p, value in zip((50, 95, 99), values, strict=True)}
+
+
+def resident_bytes() -> int:
+    """Memory this process holds now; where the system does not say, the most it ever held."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * resource.getpagesize()
+    except OSError:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else peak * 1024

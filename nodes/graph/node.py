@@ -1,0 +1,225 @@
+"""What every node is: a process that takes messages, publishes messages, and reports once a second how it is doing.
+
+**When a node falls behind.** A recording can wait: with ``lossless`` a full node holds up the one before it, back to
+the source, so that every frame arrives and a replay repeats. A camera cannot: otherwise a node keeps the newest
+frames, drops the oldest and counts them. What a node's `Delivery` says comes before either.
+
+**Order of start.** With ``lossless``, a node opens its publisher, waits until its reliable subscribers are there, and
+only then subscribes itself. So a stream starts when the whole way to its end is open, whatever the order in which the
+processes came up, and its first frame is not lost; and it halts while a node on the way is started again.
+
+**Latency.** Stamps are of capture, and in a replay long past. The input node says in its diagnostics which stamp
+it plays at which time (`Timeline`); with that, every node knows how late it is. Stamps are never touched.
+
+**Bad input.** What cannot be used is counted by its cause and reported; it stops nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from abc import ABC, abstractmethod
+from collections import Counter
+from contextlib import ExitStack
+from typing import ClassVar
+
+from steadypose.msgs.topics import DIAGNOSTICS
+from steadypose.msgs.transport import Publisher, Subscriber
+from steadypose.msgs.types import Diagnostics, Message
+from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock, Timeline
+from steadypose.nodes.graph.health import Health
+from steadypose.nodes.graph.inbox import Inbox
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.topology import NODES, Delivery
+
+logger = logging.getLogger(__name__)
+
+SUPERVISOR = "STEADYPOSE_SUPERVISOR"
+"""environment: the process that started this node; without it, the node stops"""
+
+
+class Node(ABC):
+    """A node of the graph. A subclass says what it does with a message; all else is here.
+
+    Made in one thread, it may run in another; `stop` may be called from anywhere.
+    """
+
+    name: ClassVar[str]
+    """by which `topology.NODES` declares it"""
+
+    def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
+        self.launch = launch
+        self.clock: Clock = clock or SystemClock()
+        self.timeline: Timeline | None = None
+        self.health = Health(self.clock)
+        self._stopping = False
+        self._required = launch.reliable_subscribers(self.name)
+        self._blocked_ns = 0
+        self._inbox: Inbox | None = None
+        self._supervisor = int(os.environ.get(SUPERVISOR, 0))
+
+    @abstractmethod
+    def handle(self, topic: str, message: Message) -> None:
+        """Work on one message. What it raises is counted and logged, and the next message comes."""
+
+    def status(self) -> dict[str, str]:
+        """What this node has to say in `diagnostics` beyond what every node says."""
+        return {}
+
+    @property
+    def queue_limit(self) -> int | None:
+        """Frames kept when this node falls behind; None: it loses nothing."""
+        transport = self.launch.transport
+        delivery = NODES[self.name].delivery
+        reliable = transport.lossless if delivery is Delivery.AS_LAUNCHED else delivery is Delivery.RELIABLE
+        return None if reliable else transport.queue
+
+    @property
+    def behind(self) -> bool:
+        """Whether frames wait that will be dropped if this node does not catch up."""
+        return self.queue_limit is not None and self._inbox is not None and len(self._inbox) > 0
+
+    def stop(self) -> None:
+        """Ask the node to end; `run` returns within `POLL_S` and what the message at hand takes."""
+        self._stopping = True
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the node was requested_at to end."""
+        return self._stopping
+
+    def run(self) -> None:
+        """Work until stopped.
+
+        Raises:
+            TransportError: an address cannot be bound.
+            LaunchError: keys are requested_at for and cannot be used.
+        """
+        transport = self.launch.transport
+        keys = transport.curve_keys()
+        transport.ipc_directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            self._publisher = stack.enter_context(
+                Publisher(transport.endpoint(self.name), keys=keys, lossless=transport.lossless)
+            )
+            self._await_subscribers()
+            declared = NODES[self.name]
+            if declared.subscribes:
+                self._subscriber = stack.enter_context(
+                    Subscriber(
+                        [address for node in declared.subscribes for address in self.launch.addresses(node)],
+                        sorted(declared.topics),
+                        keys=keys,
+                        name=self.name,
+                    )
+                )
+                self._inbox = Inbox(self._subscriber, self.queue_limit)
+            self.health.state = "running"
+            self.report()
+            self.work()
+            self.health.state = "stopped"
+            self.report()
+
+    def work(self) -> None:
+        """Take messages until stopped."""
+        while not self._stopping:
+            self.take_next(POLL_S)
+            self.report_if_due()
+
+    def take_next(self, timeout_s: float) -> bool:
+        """Work on the next message; False if none came in ``timeout_s``."""
+        assert self._inbox is not None, "a node that subscribes to none has no messages to take"
+        received = self._inbox.next(timeout_s)
+        if received is None:
+            return False
+        self.health.note_queue(len(self._inbox))
+        topic, message = received
+        if isinstance(message, Diagnostics):
+            # of several kiosks each has its own
+            if message.node == "pose_input" and not self.launch.server.kiosks:
+                self.timeline = Timeline.from_values(message.values)
+        else:
+            self.health.stamp_ns = message.stamp_ns
+        started, self._blocked_ns = self.clock.now_ns(), 0
+        try:
+            self.handle(topic, message)
+        except Exception as error:
+            self.refuse(topic, error)
+        if not isinstance(message, Diagnostics):
+            self.health.note_computed(self.clock.now_ns() - started - self._blocked_ns)
+            if message.end_of_stream:
+                self.note_end(topic)
+        return True
+
+    def refuse(self, topic: str, error: Exception) -> None:
+        """Count a message that could not be worked on, and log the first of its kind."""
+        cause = f"refused.{type(error).__name__}"
+        if cause not in self.health.counts:
+            logger.error("%s: a message of %s failed; more are only counted", self.name, topic, exc_info=error)
+        self.health.counts[cause] += 1
+
+    def publish(self, topic: str, message: Message, *, delay_ns: int = 0) -> bool:
+        """Publish a message; if the launch is lossless, as soon as all reliable subscribers have room.
+
+        Args:
+            delay_ns: how much of its age is meant; latency is what goes beyond.
+
+        Returns:
+            False if the node was stopped while it waited.
+        """
+        requested_at = self.clock.now_ns()
+        self._await_subscribers()
+        while not self._publisher.publish(topic, message, timeout_s=POLL_S):
+            if self._stopping:
+                self.health.counts[f"dropped.stopped {topic}"] += 1
+                return False
+            self.report_if_due()
+        now = self.clock.now_ns()
+        self._blocked_ns += now - requested_at
+        of_frame = not isinstance(message, Diagnostics) and not message.end_of_stream
+        latency_ns = now - self.timeline.wall(message.stamp_ns) - delay_ns if of_frame and self.timeline else None
+        self.health.note_published(topic, now, latency_ns)
+        if not isinstance(message, Diagnostics):
+            self.health.stamp_ns = message.stamp_ns
+            if message.end_of_stream:
+                self.note_end(topic)
+        return True
+
+    def note_end(self, topic: str) -> None:
+        """A stream has ended; whoever waits for that should not have to wait a second."""
+        self.health.ended.add(topic)
+        self.report()
+
+    def report_if_due(self) -> None:
+        """Publish `diagnostics` if the last were a second ago."""
+        if self.health.due:
+            self.report()
+
+    def report(self) -> None:
+        """Publish `diagnostics` now."""
+        if self._supervisor and os.getppid() != self._supervisor:
+            logger.error("%s: the process that started this node is gone; stopping", self.name)
+            self._stopping = True
+        # a subscriber without room for this second's diagnostics can have those of the next
+        self._publisher.publish(DIAGNOSTICS, self.diagnostics(), timeout_s=0)
+
+    def diagnostics(self) -> Diagnostics:
+        """How this node is doing."""
+        received: Counter[str] = Counter()
+        if self._inbox is not None:
+            received["dropped.late"] = self._inbox.overrun
+            received.update({f"dropped.lost {topic}": n for topic, n in self._subscriber.dropped.items()})
+            received.update({f"refused.{cause}": n for cause, n in self._subscriber.refused.items()})
+        return self.health.report(self.name, received, self.status())
+
+    def _await_subscribers(self) -> None:
+        """Wait until all reliable subscribers are there, or the node is stopped."""
+        if self._required <= self._publisher.subscribers:
+            return
+        missing = ", ".join(sorted(self._required - self._publisher.subscribers))
+        logger.info("%s: waiting for %s", self.name, missing)
+        state, self.health.state = self.health.state, f"waiting for {missing}"
+        self.report()
+        while not self._stopping and not self._publisher.wait_for_subscribers(self._required, timeout_s=POLL_S):
+            self.report_if_due()
+        self.health.state = state

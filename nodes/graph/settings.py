@@ -1,0 +1,52 @@
+"""What every settings dataclass of a launch file shares: its error, paths, addresses, and the nearest known name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from dataclasses import field, fields, is_dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+_PATH = "path"
+
+
+class LaunchError(ValueError):
+    """A launch file, or a setting given on the command line, cannot be used. The text says what to do."""
+
+
+def path_setting(metadata: Mapping[str, Any] = MappingProxyType({})) -> Any:
+    """A field of a settings dataclass that is a path: a relative one in a launch file starts at that file."""
+    return field(default="", metadata={_PATH: True, **metadata})
+
+
+def resolve_paths(settings: type, table: dict[str, Any], folder: Path) -> None:
+    """Make the paths in a launch file's table absolute, in place.
+
+    Args:
+        settings: the dataclass of the table; nested ones are those of its sections.
+        table: as TOML gives it.
+        folder: where relative paths start.
+    """
+    for setting in fields(settings):
+        value = table.get(setting.name)
+        if setting.metadata.get(_PATH) and isinstance(value, str) and value:
+            table[setting.name] = str(folder / Path(value).expanduser())
+        elif isinstance(section := setting.default_factory, type) and is_dataclass(section) and isinstance(value, dict):
+            resolve_paths(section, value, folder)
+
+
+def check_addresses(setting: str, addresses: list[str]) -> None:
+    """Raises:
+    LaunchError: one of ``addresses`` is no text; the setting is named in it.
+    """
+    for address in addresses:
+        if not isinstance(address, str):
+            raise LaunchError(f"{setting}: expected addresses such as tcp://192.168.1.21:7111, got {address!r}")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The end of an error's sentence: the known name that was probably meant, if there is one."""
+    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
+    return f", did you mean {close[0]!r}?" if close else ""

@@ -1,0 +1,120 @@
+"""The viewer's window: scenes, plots, their colours, and where the scenes are looked at from."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.types import JointState
+from steadypose.nodes.sinks.drawing import ALARM_COLOUR, CONTACT_COLOUR, RAW_COLOUR, STATE_COLOURS, TRUTH_COLOUR
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+TIMELINE = "elapsed"
+
+
+def _rgb(colour: str) -> list[int]:
+    return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+
+
+STATE_RGB = np.array([_rgb(STATE_COLOURS[state]) for state in JointState], np.uint8)
+RAW_RGB, TRUTH_RGB, CONTACT_RGB, ALARM_RGB = map(_rgb, (RAW_COLOUR, TRUTH_COLOUR, CONTACT_COLOUR, ALARM_COLOUR))
+PATH_RGB = [235, 235, 235]
+RATE_RGB = {POSE_RAW: RAW_RGB, POSE_CLEAN: _rgb(STATE_COLOURS[JointState.REFINED]), POSE_WORLD: CONTACT_RGB}
+
+
+class Eye(NamedTuple):
+    """Where a scene is looked at from, at first."""
+
+    target: NDArray[np.float64]
+    """(3,) metres, world: the middle of those seen"""
+    front: NDArray[np.float64]
+    """(3,) unit vector, world: where one of them faces"""
+
+
+def name_series(recording: rr.RecordingStream) -> None:
+    """Give the plots' lines their names and colours once, for good."""
+    import rerun as rr
+
+    recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    states = rr.SeriesLines(
+        names=[state.name.lower() for state in JointState], colors=STATE_RGB, widths=[2.0] * len(JointState)
+    )
+    recording.log("plots/joints", states, static=True)
+    for topic, colour in RATE_RGB.items():
+        recording.log(f"plots/rates/{topic}", rr.SeriesLines(names=topic, colors=colour, widths=2), static=True)
+    flagged = rr.SeriesPoints(names="flagged", colors=ALARM_RGB, markers="circle", marker_sizes=3)
+    recording.log("plots/anomaly/flagged", flagged, static=True)
+
+
+def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool) -> rrb.Blueprint:
+    """How scenes and plots lie in the window.
+
+    Args:
+        eye: where the scenes are looked at from; None until somebody was seen.
+        calibrated: whether the floor's place is known, and drawn under raw and clean.
+        scored: whether the prior scores its windows, and there is an anomaly to plot.
+    """
+    import rerun.blueprint as rrb
+
+    last_half_minute = rrb.VisibleTimeRange(
+        TIMELINE,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-30.0),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+
+    def scene(origin: str, name: str, *, distance: float, height: float, floor: bool) -> rrb.Spatial3DView:
+        return rrb.Spatial3DView(
+            origin="/",
+            contents=f"/{origin}/**",
+            name=name,
+            background=[18, 20, 26],
+            line_grid=rrb.LineGrid3D(visible=floor, spacing=0.5, color=[120, 130, 150, 90]),
+            eye_controls=_eye_controls(eye, origin, distance, height),
+        )
+
+    def plot(origin: str, name: str, span: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(
+            origin=f"/plots/{origin}",
+            name=name,
+            axis_y=None if span is None else rrb.ScalarAxis(range=span),
+            plot_legend=rrb.Corner2D.LeftTop,
+            time_ranges=last_half_minute,
+        )
+
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(
+                scene("raw", "raw: what the sensor says", distance=2.5, height=0.5, floor=calibrated),
+                scene("clean", "clean: seen, refined, imputed", distance=2.5, height=0.5, floor=calibrated),
+                scene("world", "world: path and contacts", distance=3.2, height=1.3, floor=True),
+            ),
+            rrb.Horizontal(
+                *([plot("anomaly", "anomaly score")] if scored else []),
+                plot("correction", "mean correction of a joint, cm"),
+                plot("joints", "joints by state"),
+                plot("rates", "messages a second", (0.0, 40.0)),
+            ),
+            row_shares=[5, 2],
+        ),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+    )
+
+
+def _eye_controls(eye: Eye | None, origin: str, distance: float, height: float) -> rrb.EyeControls3D | None:
+    import rerun.blueprint as rrb
+
+    if eye is None:
+        return None
+    aside = np.array([-eye.front[1], eye.front[0], 0.0])
+    position = eye.target + distance * (0.94 * eye.front + 0.34 * aside) + [0, 0, height]
+    return rrb.EyeControls3D(
+        kind="orbital", position=position, look_target=eye.target, eye_up=[0, 0, 1], tracking_entity=f"/{origin}/focus"
+    )

@@ -1,0 +1,60 @@
+"""The viewer: raw and clean poses side by side in a browser, through Rerun.
+
+It only subscribes, so the pipeline does not know of it: start it, stop it, look or do not look, the poses are the
+same. `PoseView` turns messages into drawings and knows neither sockets nor nodes; `ViewerServer` is the process that
+keeps the last minutes of drawings and serves them with the page. Both need the optional extra ``view``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from steadypose.msgs.types import Message
+from steadypose.nodes.graph.clock import POLL_S
+from steadypose.nodes.graph.node import Node
+from steadypose.nodes.sinks.viewer.scene import PoseView
+from steadypose.nodes.sinks.viewer.server import ViewerServer
+from steadypose.nodes.sinks.viewer.settings import ViewerSettings
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+FLUSH_S = 0.05
+"""between batches of drawings: longer looks jerky, shorter costs more in wrapping than in drawings"""
+
+
+class ViewerNode(Node):
+    """Draws what the other nodes publish, newest first when it falls behind; the pipeline never waits for it."""
+
+    name = "viewer"
+
+    def run(self) -> None:
+        with ViewerServer(self.launch.settings(ViewerSettings).port) as self._server:
+            recording = connect(self._server)
+            self._view = PoseView(recording)
+            print(f"viewer: {self._server.url}", flush=True)
+            try:
+                super().run()
+            finally:
+                recording.disconnect()
+
+    def work(self) -> None:
+        while not self.stopping:
+            self.take_next(POLL_S)
+            self.report_if_due()
+            self._server.check()
+
+    def handle(self, topic: str, message: Message) -> None:
+        self._view.log(topic, message)
+
+    def status(self) -> dict[str, str]:
+        return {"address": self._server.url}
+
+
+def connect(server: ViewerServer) -> rr.RecordingStream:
+    """A stream of drawings to the server."""
+    import rerun as rr
+
+    recording = rr.RecordingStream("steadypose", batcher_config=rr.ChunkBatcherConfig(flush_tick=FLUSH_S))
+    recording.connect_grpc(server.data_url)
+    return recording

@@ -1,0 +1,268 @@
+"""What the viewer draws of each message: bodies in three scenes, and the lines of its plots."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.topics import POSE_TRUTH
+from steadypose.msgs.types import (
+    CleanBody,
+    Diagnostics,
+    JointState,
+    Message,
+    PoseClean,
+    PoseRaw,
+    PoseWorld,
+    RawBody,
+    Tracking,
+    WorldBody,
+)
+from steadypose.nodes.sinks.drawing import ALL_BONES, CONTACT_INDICES, bone_states, bones, facing, to_world
+from steadypose.nodes.sinks.viewer.layout import (
+    CONTACT_RGB,
+    PATH_RGB,
+    RATE_RGB,
+    RAW_RGB,
+    STATE_RGB,
+    TIMELINE,
+    TRUTH_RGB,
+    Eye,
+    blueprint,
+    name_series,
+)
+from steadypose.prior.body.layouts import SKELETONS, to_canonical
+from steadypose.prior.body.skeleton import J
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+PATH_SECONDS = 10.0
+"""of a body's path over the floor that are drawn"""
+CONTACT_PROBABILITY = 0.5
+FOLLOW_SHARE = 0.1
+"""gain by which the eye follows the bodies with each message: low enough not to shake with a raw pose"""
+FOLLOW_STEP = 0.1
+"""metres a message that the eye moves at most, whatever a joint does"""
+BELOW_TRUNK = 0.25
+"""metres from the middle of the trunk down to the middle of somebody who stands"""
+BACK_JUMP_NS = 1_000_000_000
+"""a stamp so far behind the last one is a stream that starts again"""
+
+_TRUNK = [J[name] for name in ("pelvis", "left_hip", "right_hip", "left_shoulder", "right_shoulder")]
+
+
+class PoseView:
+    """Draws messages: three scenes (raw, clean, world), and as plots corrections, joint states, rates and, where the
+    prior scores its windows, anomaly.
+
+    Everything is drawn in the z-up world, raw and clean by way of the message's sensor pose, at the time of capture
+    counted from the first message.
+    """
+
+    def __init__(self, recording: rr.RecordingStream) -> None:
+        self._recording = recording
+        self._origin_ns: int | None = None
+        self._last: dict[str, tuple[int, int]] = {}
+        self._eye: Eye | None = None
+        self._calibrated = True
+        self._scored = False
+        self._focus: dict[str, NDArray[np.float64]] = {}
+        self._drawn: dict[str, set[str]] = {}
+        self._paths: dict[str, deque[tuple[int, NDArray[np.float64]]]] = {}
+        name_series(recording)
+        self._send_layout()
+
+    def log(self, topic: str, message: Message) -> None:
+        """Draw one message.
+
+        Raises:
+            ValueError: the message cannot be drawn: an unknown skeleton, a wrong number of joints, a sensor pose
+                that is no rotation.
+        """
+        if isinstance(message, Diagnostics):
+            self._draw_rates(message)
+            return
+        if message.end_of_stream:
+            return
+        self._set_time(topic, message.stamp_ns)
+        if isinstance(message, PoseRaw):
+            drawn = dict(self._draw_raw(message))
+        elif isinstance(message, PoseClean):
+            drawn = dict(self._draw_clean(message))
+        else:
+            drawn = dict(self._draw_world(message, truth=topic == POSE_TRUTH))
+        self._clear_absent(f"{topic}/{message.source}", set(drawn))
+        if topic != POSE_TRUTH:
+            self._follow(topic, list(drawn.values()), calibrated=getattr(message, "calibrated", True))
+
+    def _draw_rates(self, message: Diagnostics) -> None:
+        """The nodes' own counts, drawn at the time of the newest pose: the viewer may skip frames, they do not."""
+        for topic in RATE_RGB:
+            if (rate := message.values.get(f"rate.{topic}")) is not None and self._origin_ns is not None:
+                self._scalar(f"plots/rates/{topic}", float(rate))
+
+    def _draw_raw(self, message: PoseRaw) -> Iterator[tuple[str, NDArray[np.float64]]]:
+        import rerun as rr
+
+        skeleton = SKELETONS.get(message.skeleton)
+        if skeleton is None:
+            raise ValueError(f"unknown skeleton {message.skeleton!r}: expected one of {', '.join(SKELETONS)}")
+        pairs = bones(skeleton.observable)
+        for body in message.bodies:
+            if len(body.positions) != len(skeleton.joints):
+                raise ValueError(f"{skeleton.name} has {len(skeleton.joints)} joints, got {len(body.positions)}")
+            path = _entity("raw", message.source, body)
+            positions = to_world(body.positions, message.sensor_pose)
+            canonical, _ = to_canonical(skeleton, positions, body.confidence)
+            seen = np.isfinite(positions).all(axis=1)
+            self._log(f"{path}/joints", rr.Points3D(positions[seen], radii=0.016, colors=_grey(body.confidence[seen])))
+            self._bones(f"{path}/bones", canonical, pairs, RAW_RGB)
+            yield path, canonical
+
+    def _draw_clean(self, message: PoseClean) -> Iterator[tuple[str, NDArray[np.float64]]]:
+        for body in message.bodies:
+            path = _entity("clean", message.source, body)
+            positions = to_world(body.positions, message.sensor_pose)
+            self._body(path, positions, body.state, body.sigma)
+            correction = np.linalg.norm(body.positions - body.raw_positions, axis=1)
+            if np.isfinite(correction).any():
+                self._scalar(_entity("plots/correction", message.source, body), 100 * float(np.nanmean(correction)))
+            if np.isfinite(body.anomaly):
+                self._draw_anomaly(_entity("plots/anomaly", message.source, body), body)
+            yield path, positions
+        if message.bodies:
+            states = np.concatenate([body.state for body in message.bodies])
+            self._scalar("plots/joints", np.bincount(states, minlength=len(JointState)))
+
+    def _draw_anomaly(self, path: str, body: CleanBody) -> None:
+        if not self._scored:
+            self._scored = True
+            self._send_layout()
+        self._scalar(path, body.anomaly)
+        if body.anomaly_flag:
+            self._scalar("plots/anomaly/flagged", body.anomaly)
+
+    def _draw_world(self, message: PoseWorld, *, truth: bool) -> Iterator[tuple[str, NDArray[np.float64]]]:
+        import rerun as rr
+
+        if truth and not self._calibrated:
+            return  # the poses have a world of their own, and where that lies in the true one is not known
+        for body in message.bodies:
+            positions = body.positions.astype(np.float64)
+            if truth:
+                path = _entity("world/truth", message.source, body)
+                self._bones(f"{path}/bones", positions, ALL_BONES, TRUTH_RGB, radius=0.006)
+                yield path, positions
+                continue
+            path = _entity("world", message.source, body)
+            self._body(path, positions, body.state, body.sigma)
+            self._log(f"{path}/path", rr.LineStrips3D([self._way(path, message, body)], colors=PATH_RGB, radii=0.01))
+            touching = body.contacts > CONTACT_PROBABILITY
+            self._log(
+                f"{path}/contacts",
+                rr.Points3D(positions[CONTACT_INDICES[touching]], colors=CONTACT_RGB, radii=0.035),
+            )
+            standing = "" if body.tracking == Tracking.OK else f" · {body.tracking.name.lower()}"
+            above = positions[[J["head"]]] + [0, 0, 0.28]
+            label = rr.Points3D(above, labels=f"{body.id}{standing}", colors=PATH_RGB, radii=0.0)
+            self._log(f"{path}/label", label)
+            yield path, positions
+
+    def _body(self, path: str, positions: NDArray, state: NDArray[np.uint8], sigma: NDArray[np.floating]) -> None:
+        """A body in the colours of its joints' states; around each imputed joint a sphere of one sigma."""
+        import rerun as rr
+
+        self._bones(f"{path}/bones", positions, ALL_BONES, STATE_RGB[bone_states(state)])
+        shown = (state != JointState.UNKNOWN) & np.isfinite(positions).all(axis=1)
+        self._log(f"{path}/joints", rr.Points3D(positions[shown], radii=0.018, colors=STATE_RGB[state[shown]]))
+        guessed = shown & (state == JointState.IMPUTED)
+        spheres = rr.Ellipsoids3D(
+            centers=positions[guessed],
+            radii=sigma[guessed],
+            colors=STATE_RGB[state[guessed]],
+            line_radii=0.0008,
+            fill_mode="majorwireframe",
+        )
+        self._log(f"{path}/sigma", spheres)
+
+    def _bones(
+        self, path: str, positions: NDArray, pairs: NDArray[np.intp], colours: Any, radius: float = 0.011
+    ) -> None:
+        import rerun as rr
+
+        ends = positions[pairs]
+        drawable = np.isfinite(ends).all(axis=(1, 2))
+        colours = colours[drawable] if isinstance(colours, np.ndarray) else colours
+        self._log(path, rr.LineStrips3D(ends[drawable], colors=colours, radii=radius))
+
+    def _way(self, path: str, message: PoseWorld, body: WorldBody) -> NDArray[np.float64]:
+        """(N, 3) the body's way over the floor in the last seconds."""
+        way = self._paths.setdefault(path, deque())
+        way.append((message.stamp_ns, np.array([*body.root_position[:2], 0.005])))
+        while message.stamp_ns - way[0][0] > PATH_SECONDS * 1e9 or way[0][0] > message.stamp_ns:
+            way.popleft()
+        return np.stack([point for _, point in way])
+
+    def _clear_absent(self, key: str, drawn: set[str]) -> None:
+        import rerun as rr
+
+        for path in self._drawn.get(key, set()) - drawn:
+            self._log(path, rr.Clear(recursive=True))
+            self._paths.pop(path, None)
+        self._drawn[key] = drawn
+
+    def _send_layout(self) -> None:
+        self._recording.send_blueprint(blueprint(self._eye, calibrated=self._calibrated, scored=self._scored))
+
+    def _set_time(self, topic: str, stamp_ns: int) -> None:
+        """Draw from now on at that moment; where a topic's stamps jump back, its time goes on from where it was."""
+        if self._origin_ns is None:
+            self._origin_ns = stamp_ns
+        last_ns, origin_ns = self._last.get(topic, (stamp_ns, self._origin_ns))
+        if stamp_ns < last_ns - BACK_JUMP_NS:
+            origin_ns -= last_ns - stamp_ns
+        self._last[topic] = stamp_ns, origin_ns
+        self._recording.set_time(TIMELINE, duration=np.timedelta64(stamp_ns - origin_ns, "ns"))
+
+    def _log(self, path: str, what: Any) -> None:
+        self._recording.log(path, what)
+
+    def _scalar(self, path: str, value: float | NDArray[np.integer]) -> None:
+        import rerun as rr
+
+        self._recording.log(path, rr.Scalars(value))
+
+    def _follow(self, topic: str, bodies: list[NDArray[np.float64]], *, calibrated: bool) -> None:
+        """Keep the eye on the bodies: first from the front of one of them, later from where the user turns it."""
+        import rerun as rr
+
+        trunks = np.array([body[_TRUNK] for body in bodies]).reshape(-1, 3)
+        trunks = trunks[np.isfinite(trunks).all(axis=1)]
+        if not len(trunks):
+            return
+        target = trunks.mean(axis=0) - [0.0, 0.0, BELOW_TRUNK]
+        focus = self._focus.get(topic, target)
+        self._focus[topic] = focus + np.clip(FOLLOW_SHARE * (target - focus), -FOLLOW_STEP, FOLLOW_STEP)
+        self._log(f"{topic.removeprefix('pose/')}/focus", rr.Points3D([self._focus[topic]], radii=0.0))
+        if self._eye is None:
+            front = facing(bodies[0])
+            self._eye = Eye(target, np.array([1.0, 0.0, 0.0]) if front is None else front)
+            self._calibrated = calibrated
+            self._send_layout()
+
+
+def _entity(root: str, source: str, body: RawBody | CleanBody | WorldBody) -> str:
+    import rerun as rr
+
+    return f"{root}/{rr.escape_entity_path_part(source or 'source')}/{body.id}"
+
+
+def _grey(confidence: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """(J, 3) RGB: the higher the confidence, the whiter."""
+    shade = 70 + 185 * np.clip(np.nan_to_num(confidence), 0, 1)
+    return np.repeat(shade.astype(np.uint8)[:, None], 3, axis=1)

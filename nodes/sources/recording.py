@@ -1,0 +1,74 @@
+"""Recorded skeletons: a rosbag2 directory, an ``.mcap``, an ``.npz`` or a ``.csv``."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+
+from steadypose.msgs.recording import RecordingError, RecordingReader
+from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
+from steadypose.msgs.types import Diagnostics, Message, PoseRaw
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sources.csv import CsvSource
+from steadypose.nodes.sources.npz import NpzSource
+from steadypose.nodes.sources.source import RecordedSource
+
+
+class RecordingSource:
+    """The skeletons of a recording, without the mark of its end.
+
+    Raises:
+        RecordingError: there is no recording, or no ``pose/raw`` in it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with RecordingReader(path) as recording:
+            if not recording.count(POSE_RAW):
+                raise RecordingError(
+                    f"{path}: expected messages on {POSE_RAW}, got {', '.join(recording.topics)}; record that topic too"
+                )
+            self.refused: Counter[str] = Counter({"bytes of a truncated recording": recording.lost_bytes})
+            self._frames = recording.count(POSE_RAW)
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def __iter__(self) -> Iterator[tuple[str, Message]]:
+        with RecordingReader(self.path) as recording:
+            try:
+                for topic, _, message in recording.messages([POSE_RAW, POSE_TRUTH]):
+                    if not isinstance(message, Diagnostics) and not message.end_of_stream:
+                        yield topic, message
+            except RecordingError:
+                self.refused["damaged recording"] += 1
+            self.refused.update({f"undecodable {topic}": n for topic, n in recording.refused.items()})
+
+
+def open_recording(path: str | Path) -> RecordedSource:
+    """The recording at ``path``: a rosbag2 directory, an ``.mcap``, an ``.npz`` or a ``.csv``.
+
+    Raises:
+        LaunchError: there is nothing at the path.
+        RecordingError, NpzError, CsvError: what is there holds no skeletons. All are ValueErrors that say what to do.
+    """
+    if not str(path):
+        raise LaunchError("[input] recording: expected a recording, .npz or .csv to play, got none; give --input")
+    path = Path(path)
+    if not path.exists():
+        raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, an .npz or a .csv")
+    formats: Mapping[str, Callable[[Path], RecordedSource]] = {".npz": NpzSource, ".csv": CsvSource}
+    return formats.get(path.suffix, RecordingSource)(path)
+
+
+def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:
+    """The messages, and after the last the mark that the stream ends there."""
+    last: PoseRaw | None = None
+    for topic, message in messages:
+        yield topic, message
+        if isinstance(message, PoseRaw):
+            last = message
+    if last:
+        yield POSE_RAW, dataclasses.replace(last, bodies=[], end_of_stream=True)

@@ -1,0 +1,100 @@
+"""Every source, declared once: a new source is a module with its settings and its class, and one field here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from steadypose.msgs.keys import Keys
+from steadypose.nodes.graph.clock import Clock, SystemClock
+from steadypose.nodes.graph.extras import require_extra
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError, nearest, path_setting
+from steadypose.nodes.sources.calibration import CalibrationSettings
+from steadypose.nodes.sources.merge import MergeSettings, MergeSource
+from steadypose.nodes.sources.oak import OakSettings, OakSource
+from steadypose.nodes.sources.recording import open_recording
+from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source
+from steadypose.nodes.sources.source import LiveSource, RecordedSource, SourceContext
+from steadypose.nodes.sources.webcam import WebcamSettings, WebcamSource
+
+_SOURCE = "source"
+
+
+@dataclass(frozen=True)
+class SourceDeclaration:
+    """One source of skeletons."""
+
+    opens: Callable[[Any, SourceContext], RecordedSource | LiveSource]
+    """with its settings; a camera is looked for when its frames are asked for"""
+    extra: str
+    """of `graph.extras.EXTRAS`, that it needs; empty: none"""
+
+
+def _declare(
+    opens: Callable[[Any, SourceContext], RecordedSource | LiveSource], extra: str = ""
+) -> dict[str, SourceDeclaration]:
+    """What makes a field of `InputSettings` a source of the field's name, whose settings are the field's."""
+    return {_SOURCE: SourceDeclaration(opens, extra)}
+
+
+@dataclass(frozen=True)
+class InputSettings:
+    """``[input]``: where skeletons come from."""
+
+    source: str = "recording"
+    """name of a source: one of the fields declared below"""
+    rate: float = 1.0
+    """times real time; 0 is as fast as the subscribers take it"""
+    loop: bool = False
+    """start again at the end, with stamps that go on rising"""
+    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
+
+    recording: str = path_setting(_declare(lambda path, _: open_recording(path)))
+    """rosbag2 directory, .mcap, .npz or .csv to play; a relative path starts at the launch file"""
+    oak: OakSettings = field(default_factory=OakSettings, metadata=_declare(OakSource, extra="oak"))
+    webcam: WebcamSettings = field(default_factory=WebcamSettings, metadata=_declare(WebcamSource, extra="webcam"))
+    ros2: Ros2Settings = field(default_factory=Ros2Settings, metadata=_declare(Ros2Source, extra="ros2"))
+    merge: MergeSettings = field(default_factory=MergeSettings, metadata=_declare(MergeSource))
+
+    def __post_init__(self) -> None:
+        if self.source not in SOURCES:
+            *others, last = SOURCES
+            raise LaunchError(
+                f"[input] source: expected {', '.join(others)} or {last}, got {self.source!r}"
+                f"{nearest(self.source, SOURCES)}"
+            )
+        if not 0 <= self.rate < math.inf:
+            raise LaunchError(f"[input] rate: expected 0 (as fast as possible) or more, got {self.rate:g}")
+
+
+SOURCES: Mapping[str, SourceDeclaration] = {
+    setting.name: setting.metadata[_SOURCE] for setting in fields(InputSettings) if _SOURCE in setting.metadata
+}
+"""by name"""
+
+
+def open_input(settings: InputSettings, clock: Clock, keys: Keys | None = None) -> RecordedSource | LiveSource:
+    """The source that ``[input]`` names.
+
+    Args:
+        settings: of the launch.
+        clock: of the node.
+        keys: for cameras on other machines.
+
+    Raises:
+        LaunchError, RecordingError, NpzError, CsvError: a setting, or the recording, cannot be used.
+    """
+    declared = SOURCES[settings.source]
+    if declared.extra:
+        require_extra(declared.extra)
+    return declared.opens(getattr(settings, settings.source), SourceContext(clock, settings.calibration, keys))
+
+
+def check_input(launch: Launch) -> None:
+    """Raises:
+    LaunchError, RecordingError, NpzError, CsvError: the input node could not open its source.
+    """
+    open_input(launch.settings(InputSettings), SystemClock())

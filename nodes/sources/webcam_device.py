@@ -1,0 +1,155 @@
+"""A webcam that is open: its pictures through OpenCV, undistorted, and the skeletons that MediaPipe finds in them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.graph.clock import Clock
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sources.adapters import from_mediapipe, pinhole
+from steadypose.nodes.sources.calibration import CalibrationSettings
+from steadypose.nodes.sources.camera import CameraError, count_failure
+from steadypose.nodes.sources.webcam import WebcamSettings
+
+Landmarker = Callable[[NDArray[Any], int], Any]
+"""an RGB image (H, W, 3) and its milliseconds, which rise, to a ``PoseLandmarkerResult``"""
+
+
+class Lens:
+    """Undistorts a webcam's pictures, and says their intrinsics then: as calibrated, or a guess.
+
+    Args:
+        size: width and height of the pictures.
+        field_of_view: radians; what is guessed from where nothing is calibrated.
+        calibration: as it was made; for pictures of another size it is scaled.
+
+    Raises:
+        LaunchError: it is of pictures of another shape.
+    """
+
+    def __init__(self, size: tuple[int, int], field_of_view: float, calibration: CalibrationSettings) -> None:
+        self.size = size
+        self.intrinsics = pinhole(size, field_of_view)
+        self._maps = None
+        if calibration.size:
+            scale = np.array(size) / calibration.size
+            if abs(scale[0] / scale[1] - 1.0) > 0.01:  # another part of the lens's view, and nobody says which
+                width, height = calibration.size
+                raise LaunchError(
+                    f"[input.calibration] size: the lens was calibrated for pictures of {width} x {height}, the camera "
+                    f"gives {size[0]} x {size[1]}; calibrate it with pictures of that size"
+                )
+            self.intrinsics[[0, 1], [0, 1]] = calibration.focal * scale
+            self.intrinsics[:2, 2] = (np.array(calibration.centre) + 0.5) * scale - 0.5
+            distortion = np.array(calibration.distortion)
+            if distortion.any():
+                self._maps = cv2.initUndistortRectifyMap(
+                    self.intrinsics, distortion, np.eye(3), self.intrinsics, size, cv2.CV_16SC2
+                )
+
+    def undistort(self, image: NDArray[Any]) -> NDArray[Any]:
+        """A picture (H, W, 3) without distortion."""
+        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR) if self._maps else image
+
+
+class Webcam:
+    """A webcam that is open, and the landmarker that looks at its pictures."""
+
+    def __init__(
+        self,
+        capture: cv2.VideoCapture,
+        landmarker: Landmarker,
+        settings: WebcamSettings,
+        calibration: CalibrationSettings,
+        clock: Clock,
+    ) -> None:
+        self.name = f"webcam-{settings.camera}"
+        self.counts: Counter[str] = Counter()
+        self._capture, self._landmarker, self._clock = capture, landmarker, clock
+        self._settings, self._calibration = settings, calibration
+
+    def frames(self) -> Iterator[PoseRaw | None]:
+        started_ns = last_ms = lens = None
+        while self._capture.grab():
+            stamp_ns = self._clock.now_ns()  # of arrival: the system has no stamp of capture
+            started_ns = stamp_ns if started_ns is None else started_ns
+            good, image = self._capture.retrieve()
+            if not good:
+                self.counts["picture that cannot be decoded"] += 1
+                yield None
+                continue
+            now_ms = (stamp_ns - started_ns) // 1_000_000
+            last_ms = now_ms if last_ms is None else max(now_ms, last_ms + 1)  # the landmarker wants them to rise
+            size = (image.shape[1], image.shape[0])
+            if lens is None or lens.size != size:
+                lens = Lens(size, self._settings.field_of_view, self._calibration)
+            frame = None
+            try:
+                result = self._landmarker(cv2.cvtColor(lens.undistort(image), cv2.COLOR_BGR2RGB), last_ms)
+                frame = from_mediapipe(result, stamp_ns, size, lens.intrinsics, self.name)
+            except (cv2.error, ValueError) as error:  # a picture of another kind, a result that is none
+                count_failure(self.counts, self.name, error)
+            yield frame
+
+    def status(self) -> dict[str, str]:
+        return {}
+
+
+@contextmanager
+def mediapipe_landmarker(settings: WebcamSettings) -> Iterator[Landmarker]:
+    """MediaPipe's pose landmarker, in its mode for video.
+
+    Raises:
+        LaunchError: the model is none.
+    """
+    # an extra, of which nobody need have the types
+    import mediapipe  # pyright: ignore[reportMissingImports]
+    from mediapipe.tasks.python import BaseOptions, vision  # pyright: ignore[reportMissingImports]
+
+    options = vision.PoseLandmarkerOptions(
+        base_options=BaseOptions(model_asset_path=settings.model),
+        running_mode=vision.RunningMode.VIDEO,
+        num_poses=settings.bodies,
+    )
+    try:
+        found = vision.PoseLandmarker.create_from_options(options)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise LaunchError(
+            f"[input.webcam] model: MediaPipe cannot use {settings.model} as a pose landmarker: {error}"
+        ) from error
+    with found:
+        yield lambda image, milliseconds: found.detect_for_video(
+            mediapipe.Image(image_format=mediapipe.ImageFormat.SRGB, data=image), milliseconds
+        )
+
+
+@contextmanager
+def connect(
+    settings: WebcamSettings,
+    calibration: CalibrationSettings,
+    clock: Clock,
+    make_landmarker: Callable[[WebcamSettings], AbstractContextManager[Landmarker]] = mediapipe_landmarker,
+) -> Iterator[Webcam]:
+    """Open the camera and the landmarker.
+
+    Raises:
+        CameraError: the camera cannot be opened now.
+        LaunchError: the landmarker's model is none.
+    """
+    capture = cv2.VideoCapture(settings.camera)
+    try:
+        if not capture.isOpened():
+            raise CameraError(f"camera {settings.camera} cannot be opened; `ls /dev/video*` lists them")
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest picture, not the oldest that waits
+        with make_landmarker(settings) as landmarker:
+            yield Webcam(capture, landmarker, settings, calibration, clock)
+    finally:
+        capture.release()
