@@ -25,7 +25,7 @@ COLOURS = {
     "steadypose": "#e45756",
     "steadypose, bias_sigma = 0.002": "#7a1423",
     "steadypose, research weights": "#d6179b",
-    "steadypose, sensor = kinect_v2": "#5b2a86",
+    "steadypose, sensor known": "#5b2a86",
 }
 """One colour a method in every picture; one not named here takes matplotlib's next."""
 

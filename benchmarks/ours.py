@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from steadypose.benchmarks.peers.filters import missing
 from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
-from steadypose.prior.clean.correct import CorrectSettings
 from steadypose.prior.clean.denoise import DenoiseSettings
 from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.impute import ImputeSettings
@@ -50,11 +49,6 @@ OURS: Mapping[str, PriorSettings] = {
 """Every variant that each protocol runs; one line adds one. HM-VAE is the paper's refinement alone, unfused. The third
 is told what holds for motion capture and for independent noise, not for cameras: that the sensor has no slow error."""
 
-OURS_KINECT: Mapping[str, PriorSettings] = {
-    "steadypose, sensor = kinect_v2": PriorSettings(correct=CorrectSettings(sensor="kinect_v2")),
-}
-"""Those that know the sensor, for the protocol with that sensor."""
-
 SIDE_BY_SIDE = 64
 """Clips in one stream: bodies do not touch each other, and many together take a fraction of the time."""
 
@@ -70,11 +64,15 @@ class Cleaned:
         stamps_s: (T',) seconds, of the prior's own 30 Hz grid.
         positions: (T', C, 22, 3) metres; NaN where there was no answer.
         sigma: (T', C, 22) metres, the standard deviation stated, along an axis.
+        anomaly: (T', C) score, NaN where there was no answer.
+        flagged: (T', C) whether it was called an anomaly.
     """
 
     stamps_s: Floats
     positions: Floats
     sigma: Floats
+    anomaly: Floats
+    flagged: NDArray[np.bool_]
 
 
 @lru_cache(maxsize=64)
@@ -107,13 +105,16 @@ def run(settings: PriorSettings, seen: Floats, stamps_s: Floats, delay: int, ske
     grid = np.unique([message.stamp_ns for messages in parts for message in messages])
     positions = np.full((len(grid), seen.shape[1], 22, 3), np.nan)
     sigma = np.full(positions.shape[:-1], np.inf)
+    anomaly = np.full(sigma.shape[:-1], np.nan)
+    flagged = np.zeros(anomaly.shape, dtype=bool)
     for number, messages in enumerate(parts):
         for message in messages:
             row = np.searchsorted(grid, message.stamp_ns)
             for body in message.bodies:
-                positions[row, number * SIDE_BY_SIDE + body.id] = body.positions
-                sigma[row, number * SIDE_BY_SIDE + body.id] = body.sigma
-    return Cleaned(grid * 1e-9, positions, sigma)
+                clip = number * SIDE_BY_SIDE + body.id
+                positions[row, clip], sigma[row, clip] = body.positions, body.sigma
+                anomaly[row, clip], flagged[row, clip] = body.anomaly, body.anomaly_flag
+    return Cleaned(grid * 1e-9, positions, sigma, anomaly, flagged)
 
 
 def stream(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 PROTOCOLS: dict[str, str] = {
     "fidelity": "error by speed of the joint, noise and delay; what is left of a swing",
-    "kinect_vicon": "real Kinect against Vicon, by subject",
+    "kinect_vicon": "real Kinect against Vicon, each of eight people left out",
+    "mediapipe": "real MediaPipe beside four cameras",
     "noisy_joints": "independent and correlated noise, spikes, exchanged limbs",
     "hidden_joints": "joints below 0.9 m, an arm behind the body, limbs away for 0.2 to 2 s",
     "reconstruction": "windows through the refinement model (HM-VAE, table 3)",
@@ -14,5 +15,5 @@ PROTOCOLS: dict[str, str] = {
 }
 """Module in this package: what it measures."""
 
-SENSORS = {"kinect_vicon": "ui_prmd.npz"}
+SENSORS = {"kinect_vicon": "ui_prmd.npz", "mediapipe": "mediapipe_pose.npz"}
 """Protocols with a sensor's own recordings, and the file of them."""

@@ -13,6 +13,7 @@ def evaluate(
         "all",
         "fidelity",
         "kinect_vicon",
+        "mediapipe",
         "noisy_joints",
         "hidden_joints",
         "reconstruction",

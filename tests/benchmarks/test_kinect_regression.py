@@ -1,9 +1,9 @@
 import numpy as np
 import torch
 
+from steadypose.benchmarks.kinect.clips import OTHER_SIDE, SCORED
 from steadypose.benchmarks.metrics import position_error
 from steadypose.benchmarks.peers.kinect_regression import _OTHER_SIDE, Smoothed, _mirrored, ridge, temporal_convolution
-from steadypose.benchmarks.protocols.kinect_vicon import OTHER_SIDE, SCORED
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22
 

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from steadypose.benchmarks.kinect.clips import SCORED, Clip
+from steadypose.benchmarks.kinect.methods import run_filter
+from steadypose.benchmarks.kinect.scoring import align, learn_offset, score
 from steadypose.benchmarks.peers.filters import constant_velocity, gaussian_hampel, one_euro
-from steadypose.benchmarks.protocols.kinect_vicon import SCORED, Clip, align, learn_offset, run_filter, score
 
 REST = np.array(
     [[0.0, 0.0, 1.6]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,13 @@ INPUT_NOISE = 0.03
 
 
 def train_correction(
-    data: Path, runs: Path, weights: str = "kinect_v2", iterations: int = 4000, batch: int = 256, seed: int = 0
+    data: Path,
+    runs: Path,
+    weights: str = "kinect_v2",
+    iterations: int = 4000,
+    batch: int = 256,
+    seed: int = 0,
+    subjects: Collection[str] = TRAIN_SUBJECTS,
 ) -> Path:
     """Train the Kinect's correction and write weights, card and curves.
 
@@ -46,6 +53,7 @@ def train_correction(
         iterations: optimiser steps.
         batch: frames a step.
         seed: of weights and sampling.
+        subjects: whom to learn from.
 
     Returns:
         The path of the weights.
@@ -53,7 +61,7 @@ def train_correction(
     torch.manual_seed(seed)
     # All six people: with one held back to watch, the other five teach measurably less (docs/experiments.md). The
     # length of the training was chosen that way once; `steadypose evaluate kinect_vicon` has people never seen.
-    x, y = _examples(data, TRAIN_SUBJECTS)
+    x, y = _examples(data, subjects)
     config = CorrectionConfig(sensor=weights)
     net = CorrectionNet(config)
     net.mean.copy_(x.nanmean(dim=0).nan_to_num())
@@ -84,7 +92,7 @@ def train_correction(
         losses.append(1000 * loss.item())
     return run.save(runs / name / f"{name}.safetensors", net, asdict(config), {
         "Model": "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses",
-        "Data": f"UI-PRMD, Kinect beside Vicon: {', '.join(TRAIN_SUBJECTS)}",
+        "Data": f"UI-PRMD, Kinect beside Vicon: {', '.join(subjects)}",
         "Licence": "Apache-2.0; the data is in the public domain (PDDL 1.0)",
         "Training": f"`steadypose train correction --data ui_prmd.npz`: {iterations} steps of {batch}, seed {seed}",
     })  # fmt: skip
@@ -92,10 +100,17 @@ def train_correction(
 
 def _examples(data: Path, subjects: Collection[str]) -> tuple[Tensor, Tensor]:
     """Features (N, FEATURES) and the missing part (N, 22, 3) of every frame, metres in the trunk's frame."""
-    found = [_clip(pair) for pair in load_pairs(data, subjects)]
-    x, y = (np.concatenate(part) for part in zip(*found, strict=True))
+    x, y = (np.concatenate(part) for part in zip(*(_examples_of(data, s) for s in subjects), strict=True))
     usable = np.isfinite(x[:, 0])
     return torch.from_numpy(x[usable]).float(), torch.from_numpy(y[usable]).float()
+
+
+@lru_cache(maxsize=8)
+def _examples_of(data: Path, subject: str) -> tuple[np.ndarray, np.ndarray]:
+    """Those of one person; kept, since people are left out one at a time to measure."""
+    found = [_clip(pair) for pair in load_pairs(data, (subject,))]
+    x, y = (np.concatenate(part) for part in zip(*found, strict=True))
+    return x, y
 
 
 def _clip(pair: KinectPair) -> tuple[np.ndarray, np.ndarray]:

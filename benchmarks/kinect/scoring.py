@@ -1,0 +1,142 @@
+"""Scores against Vicon: one rotation and translation a clip, then a constant offset a joint in the trunk's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import spearmanr
+from sklearn.metrics import roc_auc_score
+
+from steadypose.benchmarks.kinect.clips import BONES, SCORED, Clip, Floats
+from steadypose.benchmarks.metrics import (
+    acceleration_error,
+    body_frame,
+    bootstrap,
+    length_variation,
+    position_error,
+    sigma_ratio,
+)
+from steadypose.prior.body.kinematics import rigid_alignment
+
+OFF = 0.10
+"""Metres: a joint that its standard deviation should have told of."""
+WORST = 0.1
+"""Share of the frames that the anomaly should have told of."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What a method gets, one number a clip."""
+
+    position: Floats  # (C,) metres
+    acceleration: Floats  # (C,) metres/frame²
+    variation: Floats  # (C,) of bone lengths, relative
+    joints: Floats  # (13,) metres, mean over the frames of all clips
+
+
+def learn_offset(truths: Sequence[Floats], aligned: Sequence[Floats]) -> Floats:
+    """(13, 3) metres in the trunk's frame: what, added to aligned estimates, brings each joint to the truth."""
+    pairs = zip(truths, aligned, strict=True)
+    return np.nanmean(np.concatenate([np.einsum("tba,tjb->tja", _trunk(a), t - a) for t, a in pairs]), axis=0)
+
+
+def score(truths: Sequence[Floats], aligned: Sequence[Floats], offset: Floats) -> Scores:
+    """Errors of each clip, of aligned estimates moved by the offset."""
+    errors, acceleration, variation = [], [], []
+    for truth, estimate in zip(truths, aligned, strict=True):
+        placed = move(estimate, offset)
+        errors.append(position_error(placed, truth))
+        acceleration.append(np.nanmean(acceleration_error(placed, truth)))
+        variation.append(length_variation(estimate, BONES))
+    return Scores(
+        position=np.array([np.nanmean(error) for error in errors]),
+        acceleration=np.array(acceleration),
+        variation=np.array(variation),
+        joints=np.nanmean(np.concatenate(errors), axis=0),
+    )
+
+
+def align(truths: Sequence[Floats], estimates: Sequence[Floats]) -> list[Floats]:
+    """Each clip's estimate, turned and moved as a whole to lie nearest to the truth."""
+    aligned = []
+    for truth, estimate in zip(truths, estimates, strict=True):
+        rotation, translation = rigid_alignment(estimate, truth)
+        aligned.append(estimate @ rotation.T + translation)
+    return aligned
+
+
+def move(estimate: Floats, offset: Floats) -> Floats:
+    """(T, 13, 3) the estimate with a constant offset (13, 3) in the trunk's frame."""
+    return estimate + np.einsum("tab,jb->tja", _trunk(estimate), offset)
+
+
+def _trunk(positions: Floats) -> Floats:
+    corners = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
+    return body_frame(*(positions[:, SCORED.index(name)] for name in corners))
+
+
+def quick_score(clips: Sequence[Clip], answers: Sequence[Floats]) -> dict[str, float]:
+    """Errors (mm, mm/frame²) with the offset learned on these very clips: for tuning."""
+    truths = [clip.centres for clip in clips]
+    aligned = align(truths, answers)
+    scores = score(truths, aligned, learn_offset(truths, aligned))
+    return {"position_mm": _mm(scores.position), "acceleration_mm": _mm(scores.acceleration)}
+
+
+def _mm(values: Floats) -> float:
+    return round(float(np.mean(values)) * 1000, 3)
+
+
+def summary(clips: Sequence[Clip], scores: Scores) -> dict[str, Any]:
+    """Figures of a method: millimetres, millimetres/frame², per cent; of each subject, and of movements done wrong."""
+    wrong = [clip.name.endswith("_inc") for clip in clips]
+    groups = {
+        subject: [clip.subject == subject for clip in clips] for subject in dict.fromkeys(c.subject for c in clips)
+    }
+    groups |= {"done right": [not w for w in wrong], "done wrong": wrong}
+    return {
+        "position_mm": _mm(scores.position),
+        "position_ci_mm": [round(v * 1000, 3) for v in bootstrap(scores.position)],
+        "acceleration_mm": _mm(scores.acceleration),
+        "acceleration_ci_mm": [round(v * 1000, 3) for v in bootstrap(scores.acceleration)],
+        "bone_variation_percent": round(float(scores.variation.mean()) * 100, 3),
+        "joints_mm": dict(zip(SCORED, np.round(scores.joints * 1000, 2).tolist(), strict=True)),
+        "groups": {
+            name: {"position_mm": _mm(scores.position[mask]), "acceleration_mm": _mm(scores.acceleration[mask])}
+            for name, mask in groups.items()
+            if any(mask)
+        },
+    }
+
+
+def deviation(error: Floats, sigma: Floats, anomaly: Floats, flagged: NDArray[np.bool_]) -> dict[str, float | None]:
+    """Whether what is stated tells of the error.
+
+    Args:
+        error: (N, 13) metres, NaN where Vicon has nothing.
+        sigma: (N, 13) metres, stated.
+        anomaly: (N,) score of each frame.
+        flagged: (N,) whether it is called an anomaly.
+
+    Returns:
+        the rank correlation of sigma with the error; areas under the ROC curve of sigma for joints off by more than
+        10 cm, and of the anomaly for the worst tenth of the frames by mean error (None where there is no such joint);
+        error found by deviation stated; the share flagged.
+    """
+    known = np.isfinite(error) & np.isfinite(sigma)
+    off = error[known] > OFF
+    frames = np.isfinite(anomaly) & np.isfinite(error).any(axis=1)
+    mean = np.nanmean(error[frames], axis=1)
+    worst = mean > np.quantile(mean, 1 - WORST)
+    return {
+        "rank_correlation": round(float(spearmanr(sigma[known], error[known]).statistic), 3),
+        "auroc_off": round(float(roc_auc_score(off, sigma[known])), 3) if 0 < off.sum() < len(off) else None,
+        "off_percent": round(100 * float(off.mean()), 2),
+        "auroc_worst": round(float(roc_auc_score(worst, anomaly[frames])), 3) if 0 < worst.sum() < len(worst) else None,
+        "found_by_stated": round(sigma_ratio(error, sigma), 3),
+        "flagged_percent": round(100 * float(flagged.mean()), 2),
+    }
