@@ -89,8 +89,8 @@ def run(bench: Bench) -> Result:
     ]
     note = (
         f"{len(streams)} streams of {len(streams[0].seen)} frames, one person, relative to the hips' middle, one "
-        f"rotation and a constant offset a joint; in {EXCHANGED} a third of the frames have left and right exchanged. Peers "
-        "are tuned on these very streams. For validation: the reference shares MediaPipe's idea of a joint."
+        f"rotation and a constant offset a joint; in {EXCHANGED} a third of the frames have left and right exchanged. "
+        "Peers are tuned on these very streams. For validation: the reference shares MediaPipe's idea of a joint."
     )
     tables = [
         pivot(records, "camera", "position_mm", "mediapipe", "MediaPipe beside four cameras: position error, mm", note),
