@@ -5,9 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.kinect.clips import SCORED, Clip
-from steadypose.benchmarks.kinect.methods import run_filter
-from steadypose.benchmarks.kinect.scoring import align, learn_offset, score
-from steadypose.benchmarks.peers.filters import constant_velocity, gaussian_hampel, one_euro
+from steadypose.benchmarks.kinect.methods import best_without, run_filter
+from steadypose.benchmarks.kinect.scoring import align, deviation, learn_offset, score
+from steadypose.benchmarks.peers.filters import Peer, constant_velocity, gaussian_hampel, one_euro
+from steadypose.benchmarks.tuning import Tuned
 
 REST = np.array(
     [[0.0, 0.0, 1.6]]
@@ -86,3 +87,31 @@ def test_a_delay_of_zero_knows_nothing_of_later_frames() -> None:
     cut = here._replace(raw=here.raw[:11])
     run = partial(constant_velocity, delay=0, density=1.0)
     np.testing.assert_array_equal(run_filter([here], run)[0][:11], run_filter([cut], run)[0])
+
+
+def test_what_is_stated_is_held_against_the_error() -> None:
+    rng = np.random.default_rng(5)
+    sigma = rng.uniform(0.01, 0.1, (400, len(SCORED)))
+    error = np.abs(rng.normal(0, 1, sigma.shape)) * sigma * np.sqrt(3)
+    error[:5, 0] = np.nan
+    honest = deviation(error, sigma, np.nanmean(error, axis=1), np.arange(400) < 4)
+    assert honest["rank_correlation"] > 0.3
+    assert honest["auroc_off"] > 0.75
+    assert honest["auroc_worst"] == 1.0
+    assert honest["found_by_stated"] == pytest.approx(1.0, rel=0.05)
+    assert honest["flagged_percent"] == 1.0
+    blind = deviation(error, rng.permuted(sigma), rng.normal(size=400), np.zeros(400, dtype=bool))
+    assert abs(blind["rank_correlation"]) < 0.1
+    assert deviation(0.001 * error, sigma, error[:, 1], np.zeros(400, dtype=bool))["auroc_off"] is None
+
+
+def test_a_filter_is_chosen_by_the_others_figures() -> None:
+    peer = Peer("filter", lambda seen, _, delay: seen, None, {"density": (0.1, 10.0)})
+    tried = [
+        {"density": d, **{f"{s} position_mm": p for s, p in zip(("s01", "s02", "s03"), of, strict=True)},
+         **{f"{s} acceleration_mm": 0.0 for s in ("s01", "s02", "s03")}, "position_mm": 0.0, "acceleration_mm": 0.0}
+        for d, of in ((0.5, (1.0, 9.0, 9.0)), (5.0, (9.0, 4.0, 8.0)))
+    ]  # fmt: skip
+    found = Tuned({"density": 0.5}, tried)
+    assert [best_without(s, found, peer)["density"] for s in ("s01", "s02", "s03")] == [5.0, 0.5, 0.5]
+    assert best_without("s01", Tuned({}, []), peer) == {}
