@@ -96,7 +96,7 @@ class Kinect:
     data: Path
     clips: Sequence[Clip]
     taught: Sequence[Clip]
-    _answers: dict[tuple[str, int, str], tuple[Floats, Stated | None]] = field(default_factory=dict)
+    _answers: dict[tuple[str, int, str], tuple[Floats, Stated]] = field(default_factory=dict)
 
     def tuned(self, on: Sequence[Clip]) -> dict[tuple[str, int], Tuned]:
         """One search for each filter and delay on clips of everybody, with the figures of each subject in it."""
@@ -152,10 +152,11 @@ class Kinect:
     ) -> tuple[list[Floats], list[Stated]]:
         """`run_ours` over everybody's clips the first time, remembered after that."""
         if (name, delay, clips[0].name) not in self._answers:
-            for clip, *answer in zip(self.clips, *run_ours(self.clips, settings, delay), strict=True):
-                self._answers[name, delay, clip.name] = (answer[0], answer[1])
+            positions, stated = run_ours(self.clips, settings, delay)
+            for clip, own, told in zip(self.clips, positions, stated, strict=True):
+                self._answers[name, delay, clip.name] = own, told
         found = [self._answers[name, delay, clip.name] for clip in clips]
-        return [positions for positions, _ in found], [stated for _, stated in found if stated is not None]
+        return [own for own, _ in found], [told for _, told in found]
 
 
 def best_without(left_out: str, search: Tuned, peer: Peer) -> dict[str, float]:

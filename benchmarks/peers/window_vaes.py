@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from steadypose.prior.models.hmvae.config import ROTATION_FEATURES, HMVAEConfig
+from steadypose.prior.models.hmvae.config import CHANNELS, ROTATION_FEATURES, HMVAEConfig
 from steadypose.prior.models.hmvae.network import HMVAE, MotionVAE, Posterior
 from steadypose.prior.models.hmvae.train import STRIDES, fit
 from steadypose.prior.models.layers.dense import SLOPE
@@ -40,7 +40,7 @@ class MVAE(HMVAE):
     def __init__(self, config: HMVAEConfig) -> None:
         super().__init__(config)
         _, size = _latents(self)
-        channels, last = self.CHANNELS, self.steps[4]
+        channels, last = CHANNELS, self.steps[4]
         del self.to_local, self.from_local
         self.to_global = EdgeLinear(channels[4], last, 2 * size)
         self.from_global = nn.Linear(size, channels[4] * last)

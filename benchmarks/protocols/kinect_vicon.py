@@ -65,7 +65,8 @@ def run(bench: Bench) -> Result:
     scored = {key: _together([s for s, _ in some]) for key, some in parts.items()}
     records = over_seeds([_record(key, ordered, scored, parts[key], told) for key in scored])
     reliabilities = {
-        name: reliability(*(np.concatenate(part) for part in zip(*some, strict=True))) for name, some in bins.items()
+        name: reliability(np.concatenate([error for error, _ in some]), np.concatenate([sigma for _, sigma in some]))
+        for name, some in bins.items()
     }
     data = {
         "data": {

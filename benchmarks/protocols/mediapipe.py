@@ -59,7 +59,8 @@ def error_of(answer: Floats, stream: Stream) -> dict[str, float]:
 
     Of what lasts all along, the constant offset of each joint, one part is how joints are defined: it is taken out.
     """
-    own, wanted = (x - x[:, HIPS].mean(axis=1, keepdims=True) for x in (answer, stream.truth))
+    both = np.isfinite(answer).all(axis=-1).any(axis=0) & np.isfinite(stream.truth).all(axis=-1).any(axis=0)
+    own, wanted = ((x - x[:, HIPS].mean(axis=1, keepdims=True))[:, both] for x in (answer, stream.truth))
     rotation, _ = rigid_alignment(own, wanted)
     turned = own @ rotation.T
     turned = turned + np.nanmean(wanted - turned, axis=0)

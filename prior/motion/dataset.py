@@ -99,7 +99,8 @@ class MotionSet:
         lengths = np.diff(self.clip_start)[clips]
         return MotionSet(
             self.rotations[frames], self.positions[frames], self.offsets[frames], self.contacts[frames],
-            np.concatenate([[0], np.cumsum(lengths)]), self.subject[clips], self.action[clips], self.source[clips],
+            np.concatenate([[0], np.cumsum(lengths)]),
+            *(told[clips] if len(told) else told for told in (self.subject, self.action, self.source)),
         )  # fmt: skip
 
     def sample(
