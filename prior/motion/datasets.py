@@ -357,6 +357,12 @@ def _held_out(test: bool) -> Split:
     return "val" if test else "train"
 
 
+def _own_split(clip: Clip) -> Split:
+    """By the folders that a recording of the user's own lies in."""
+    folders = PurePosixPath(clip.name).parts
+    return "val" if "val" in folders else "test" if "test" in folders else "train"
+
+
 CMU_VALIDATION = frozenset({"02"})
 """Subjects of the AMC recordings; all ten of subject 02's are among them, so that no other archive has more of them."""
 
@@ -402,7 +408,7 @@ DATA_SETS: tuple[DataSet, ...] = (
     ),
     DataSet(
         "own", r"own\b.*", "default", _read_own,
-        lambda clip: next((split for split in SPLITS[1:] if split in PurePosixPath(clip.name).parts), "train"),
+        _own_split,
     ),
 )  # fmt: skip
 """In the order of preparation. What a user puts into a folder ``own`` is theirs to train on: the default set."""
