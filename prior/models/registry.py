@@ -13,7 +13,7 @@ from steadypose.prior.models.torch_weights import install as install_weights
 
 
 def train(
-    model: Literal["hmvae", "hgvae", "hgvae-wide", "trajectory", "correction"],
+    model: Literal["hmvae", "hgvae", "hgvae-wide", "trajectory", "correction", "mixture"],
     data: Path = Path("data/prepared.npz"),
     weights: Literal["default", "research", "kinect_v2"] | None = None,
     runs: Path = Path("runs"),
@@ -33,9 +33,11 @@ def train(
     runs/MODEL-SET; a launch file takes their path. Those that ship are replaced only when asked to, and kept.
 
     Args:
-        model: hmvae (refinement), hgvae (anomaly score and imputation), hgvae-wide (the same in the paper's size, for
-            recordings), trajectory (root velocity and contacts), or correction (a sensor's own error).
-        data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon.
+        model: mixture (the smoother), hmvae (refinement), hgvae (anomaly score and imputation),
+            hgvae-wide (the same in the paper's size, for recordings), trajectory (root velocity and contacts), or
+            correction (a sensor's own error).
+        data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon; for the
+            mixture, the folder of the recordings, which it takes at several speeds.
         weights: the set to train: 'default' takes only data free for products, 'research' all of it; a correction
             is named after its sensor, kinect_v2.
         runs: where checkpoints and curves go.
@@ -54,6 +56,8 @@ def train(
         from steadypose.prior.models.hgvae.train import train_hgvae as train_model
     elif model == "hgvae-wide":
         from steadypose.prior.models.hgvae.train import train_hgvae_wide as train_model
+    elif model == "mixture":
+        from steadypose.prior.models.mixture.train import train_mixture as train_model
     elif model == "trajectory":
         from steadypose.prior.models.root_velocity.train import train_trajectory as train_model
     else:

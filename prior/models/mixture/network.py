@@ -1,0 +1,158 @@
+"""The network of the mixture: from what a bank of filters says of every joint to the weights it gives them.
+
+Mixture of experts (Jacobs et al. 1991) over linear filters. Each joint's features are read by weights that all joints
+share, the body's are read together, and each joint's answer is written from both. The answer is
+
+    sum of w_m x_m  +  (1 - w_raw) (sum of b_m x_m + scale r),   w >= 0, sum of w = 1, sum of b = 0, b and r bounded
+
+``x`` being the experts' places. The second part lets the mixture reach ahead of filters that lag, and correct a joint
+by what the whole body tells, by an amount that is bounded by the noise found; where a joint is believed as it came, it
+vanishes: a perfect input stays what it is.
+
+What is written for a joint may lean on what was written for it a frame before, by gates that are written with it (as in
+gated recurrent units, Cho et al. 2014): weights that jump about would be noise of their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from steadypose.prior.models.mixture.bank import EXPERTS, FEATURES, RAW
+from steadypose.prior.models.mixture.form import (
+    COASTING,
+    CORRECTION,
+    GATES,
+    LEAST_LOG_SIGMA,
+    MOST_LOG_SIGMA,
+    OUTPUTS,
+    REACH,
+)
+from steadypose.prior.timing.rate import FPS
+
+JOINTS = 22
+
+FIRST_GATE = -4.0
+"""What training begins with: as good as no leaning."""
+
+
+@dataclass(frozen=True)
+class MixtureConfig:
+    """Sizes.
+
+    Attributes:
+        own: features that are read of each joint.
+        body: features of the whole body.
+        told: features of the body that each joint is told.
+        head: features from which a joint's answer is written.
+    """
+
+    own: int = 32
+    body: int = 384
+    told: int = 24
+    head: int = 64
+
+
+class Memory(nn.Module):
+    """Running means of features, each with a memory of its own: a diagonal linear recurrence, which cannot run away.
+
+    From the first frame on they are means: what they start from has no weight.
+    """
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        frames = torch.logspace(0.2, 1.7, features)[torch.randperm(features)]
+        self.decay = nn.Parameter(torch.logit(1.0 - 1.0 / frames))
+
+    def forward(self, values: Tensor, present: Tensor) -> Tensor:
+        """Means (C, T, ..., F) of values up to each frame; frames that are not ``present`` (C, T) do not count."""
+        inner = (1,) * (values.ndim - 3)
+        kept = torch.where(present[..., None], torch.sigmoid(self.decay), 1.0)
+        kept = kept.reshape(*present.shape, *inner, -1)
+        total = _faded(kept, (1.0 - kept) * values)
+        return total / _faded(kept, 1.0 - kept).clamp(min=1e-6)
+
+
+def _faded(kept: Tensor, added: Tensor) -> Tensor:
+    """Sums (C, T, ...) over the frames up to each, of which ``kept`` (C, T, ...) is left from one to the next."""
+    total, out = torch.zeros_like(added[:, 0]), []
+    for keep, new in zip(kept.unbind(1), added.unbind(1), strict=True):
+        total = torch.addcmul(new, keep, total)
+        out.append(total)
+    return torch.stack(out, dim=1)
+
+
+class MixtureNet(nn.Module):
+    """Weights, corrections and deviations of the joints of a body, from their features, frame after frame."""
+
+    def __init__(self, config: MixtureConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.register_buffer("mean", torch.zeros(FEATURES))
+        self.register_buffer("deviation", torch.ones(FEATURES))
+        self.read = nn.Linear(FEATURES, config.own)
+        self.joint = nn.Parameter(torch.zeros(JOINTS, config.own))
+        self.own_memory = Memory(config.own)
+        self.gather = nn.Linear(JOINTS * config.own, config.body)
+        self.body_memory = Memory(config.body)
+        self.remember = nn.Linear(config.body, config.body)
+        self.think = nn.Linear(config.body, config.body)
+        self.tell = nn.Linear(config.body, JOINTS * config.told)
+        self.mix = nn.Linear(FEATURES + config.own + config.told, config.head)
+        self.joint_mix = nn.Parameter(torch.zeros(JOINTS, config.head))
+        self.deepen = nn.Linear(config.head, config.head)
+        self.write = nn.Linear(config.head, OUTPUTS + GATES)
+        with torch.no_grad():
+            self.write.weight.mul_(0.1)
+            self.write.bias[OUTPUTS:] = FIRST_GATE
+
+    mean: Tensor
+    deviation: Tensor
+
+    def forward(self, features: Tensor, present: Tensor) -> Tensor:
+        """(C, T, 22, FEATURES) from a clip's first frame on, and whether there is a body (C, T), to
+        (C, T, 22, OUTPUTS)."""
+        told = (features - self.mean) / self.deviation
+        own = F.relu(self.read(told) + self.joint)
+        before = self.own_memory(own, present)
+        body = F.relu(self.gather(own.flatten(2)))
+        body = body + F.relu(self.remember(self.body_memory(body, present)))
+        body = body + F.relu(self.think(body))
+        context = self.tell(body).unflatten(-1, (JOINTS, self.config.told))
+        mixed = F.relu(self.mix(torch.cat([told, before, context], dim=-1)) + self.joint_mix)
+        written, gates = self.write(mixed + F.relu(self.deepen(mixed))).split([OUTPUTS, GATES], dim=-1)
+        before = F.pad(present[:, :-1], (1, 0))[..., None, None]
+        kept = torch.where(before, torch.sigmoid(gates), 0.0)
+        kept = kept.repeat_interleave(torch.tensor([2 * EXPERTS, 3, 1]), dim=-1)
+        return _faded(kept, (1.0 - kept) * written)
+
+
+def answer(outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, unseen: Tensor) -> tuple[Tensor, Tensor]:
+    """Places (..., 22, 3) metres, and their variances along an axis (..., 22) mm².
+
+    Args:
+        outputs: (..., 22, OUTPUTS) of the network.
+        experts: (..., 22, EXPERTS, 3) metres.
+        heading: (..., 2) cosine and sine of where the body faces.
+        scale: (...) metres, the noise found.
+        unseen: (..., 22) frames since each joint was seen.
+    """
+    logits, reach, correction, log_sigma = outputs.split([EXPERTS, EXPERTS, 3, 1], dim=-1)
+    weights = logits.softmax(dim=-1)
+    free = 1.0 - weights[..., RAW:]
+    reach = REACH * torch.tanh(reach)
+    reach = reach - reach.mean(dim=-1, keepdim=True)
+    weights = weights + free * reach
+    moved = CORRECTION * torch.tanh(correction / CORRECTION) * free * scale[..., None, None]
+    cos, sin = heading[..., None, 0], heading[..., None, 1]
+    moved = torch.stack(
+        [cos * moved[..., 0] - sin * moved[..., 1], sin * moved[..., 0] + cos * moved[..., 1], moved[..., 2]], dim=-1
+    )
+    # from the joint as it came, so that rounding does not move it
+    came = experts[..., RAW, :]
+    places = came + (weights[..., None] * (experts - came[..., None, :])).sum(dim=-2) + moved
+    coasted = 1e3 * COASTING / FPS * unseen
+    return places, (2.0 * log_sigma[..., 0].clamp(LEAST_LOG_SIGMA, MOST_LOG_SIGMA)).exp() + coasted.square()

@@ -1,0 +1,232 @@
+"""Simulated sensors: what cameras make of true joints, from nothing at all to 8 cm, for the training of the mixture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
+from steadypose.prior.models.mixture.motion import Motion, Pairs
+from steadypose.prior.motion.corruption import occlude
+from steadypose.prior.timing.rate import FPS
+
+Floats = NDArray[np.float64]
+Rng = np.random.Generator
+
+GATED = 0.18
+"""Metres: what jumps farther is refused by the gate before the mixture sees it, mostly."""
+
+KINDS = ("perfect", "white", "lasting", "replayed", "mixed", "kinect")
+SHARES = np.array([0.16, 0.30, 0.15, 0.13, 0.12, 0.14])
+"""Sensors and how often they are drawn: none, noise from frame to frame, noise that lasts, a Kinect's errors put on
+other motion, all of these together, and the real Kinect."""
+
+_SWINGS = (
+    ("elbow", ("wrist",)),
+    ("shoulder", ("elbow", "wrist")),
+    ("knee", ("ankle", "foot")),
+    ("hip", ("knee", "ankle", "foot")),
+)
+_ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_collar", "left_foot", "right_foot")]
+"""joints that many sensors do not have"""
+_HIPS = [J["left_hip"], J["right_hip"]]
+_LIMBS = [
+    [J[f"{side}_{n}"] for n in names]
+    for side in ("left", "right")
+    for names in (("elbow", "wrist"), ("knee", "ankle", "foot"))
+]
+
+
+@dataclass(frozen=True)
+class Sensed:
+    """Clips as a sensor sees them.
+
+    Attributes:
+        seen: (C, T, 22, 3) metres, NaN where not seen.
+        truth: (C, T, 22, 3) metres, NaN where not known.
+        confidence: (C, T, 22) 0 to 1, as the sensor states it: with some, what is less sure is noisier.
+        kind: (C,) index into `KINDS`.
+    """
+
+    seen: Floats
+    truth: Floats
+    confidence: Floats
+    kind: NDArray[np.int64]
+
+
+class Sensors:
+    """Draws clips of true motion and of what sensors see of it."""
+
+    def __init__(self, motion: Motion, pairs: Pairs, frames: int) -> None:
+        """``frames`` of each clip; ``pairs`` of the training subjects."""
+        self._motion, self._pairs, self._frames = motion, pairs, frames
+        sources = sorted(set(motion.source))
+        room = np.maximum(np.diff(motion.start) - frames, 0).astype(float)
+        # every source the same, by a softer measure than its length: dance is short and fast
+        weight = np.zeros(len(room))
+        for source in sources:
+            own = motion.source == source
+            if room[own].sum() > 0:
+                weight[own] = room[own] / room[own].sum() ** 0.6
+        self._weight = weight / weight.sum()
+        lengths = np.diff(pairs.start) * sound(pairs)
+        self._pair_weight = np.maximum(lengths - 20, 0) / np.maximum(lengths - 20, 0).sum()
+
+    def draw(self, count: int, rng: Rng) -> Sensed:
+        """``count`` clips."""
+        kind = rng.choice(len(KINDS), count, p=SHARES)
+        truth = self._true(count, rng)
+        seen = truth.copy()
+        confidence = _confidences(count, self._frames, rng)
+        for clip in range(count):
+            if KINDS[kind[clip]] == "kinect":
+                seen[clip], truth[clip] = self._real(rng)
+            else:
+                noise = self._noise(KINDS[kind[clip]], truth[clip], rng)
+                told = rng.random() < 0.7
+                seen[clip] = truth[clip] + (noise * (0.8 / confidence[clip, ..., None]) if told else noise)
+        self._spoil(seen, kind, rng)
+        about = np.flatnonzero(rng.random(count) < 0.08)  # as monocular networks have it: beside the hips
+        for places in (seen, truth):
+            places[about] -= places[about][:, :, _HIPS].mean(axis=2, keepdims=True)
+        return Sensed(seen, truth, confidence, kind)
+
+    def _true(self, count: int, rng: Rng) -> Floats:
+        start = self._motion.start
+        clips = rng.choice(len(self._weight), count, p=self._weight)
+        first = start[clips] + (rng.random(count) * (np.diff(start)[clips] - self._frames)).astype(int)
+        truth = self._motion.positions[first[:, None] + np.arange(self._frames)].astype(np.float64)
+        mirrored = rng.random(count) < 0.5
+        truth[mirrored] = truth[mirrored][:, :, MIRROR] * (1.0, -1.0, 1.0)
+        truth *= np.where(rng.random(count) < 0.4, rng.uniform(0.75, 1.1, count), 1.0)[:, None, None, None]
+        still = rng.random(count) < 0.04
+        truth[still] = truth[still, :1]
+        for clip in np.flatnonzero((rng.random(count) < 0.12) | still):
+            if rng.random() < 0.9:
+                _swing(truth[clip], rng)
+        return truth
+
+    def _residual(self, rng: Rng) -> Floats:
+        """(T, 22, 3) errors of the real Kinect, turned about the vertical; of joints it lacks, those of their parents.
+
+        Clips are shorter than what is asked for: they are played forwards and backwards.
+        """
+        start = self._pairs.start
+        clip = rng.choice(len(self._pair_weight), p=self._pair_weight)
+        rows = slice(start[clip], start[clip + 1])
+        error = np.nan_to_num((self._pairs.seen[rows] - self._pairs.truth[rows]).astype(np.float64))
+        error -= np.median(error, axis=0) * rng.random()
+        for joint in range(1, 22):
+            if not error[:, joint].any():
+                error[:, joint] = error[:, PARENTS[joint]]
+        length = len(error)
+        time = np.arange(self._frames) + rng.integers(0, 2 * length)
+        time = np.abs((time % (2 * length)) - length + 0.5) - 0.5
+        error = error[np.clip(time, 0, length - 1).astype(int)]
+        if rng.random() < 0.5:
+            error = error[:, MIRROR] * (1.0, -1.0, 1.0)
+        return rng.uniform(0.6, 1.4) * error @ Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix().T
+
+    def _noise(self, kind: str, truth: Floats, rng: Rng) -> Floats:
+        """(T, 22, 3) metres."""
+        shape = truth.shape
+        if kind == "perfect":
+            return 10 ** rng.uniform(-4, -3) * rng.standard_normal(shape) if rng.random() < 0.15 else np.zeros(shape)
+        by_joint = np.exp(rng.choice([0.0, 0.5]) * rng.standard_normal((1, 22, 1)))
+        noise = np.zeros(shape)
+        if kind in ("white", "mixed"):
+            most = -1.05 if kind == "white" else -1.5
+            noise += 10 ** rng.uniform(-2.8, most) * by_joint * rng.standard_normal(shape)
+        if kind in ("lasting", "mixed"):
+            noise += 10 ** rng.uniform(-2.4, -1.2) * by_joint * _lasting(shape, rng.uniform(0.5, 0.97), rng)
+        if kind == "replayed" or (kind == "mixed" and rng.random() < 0.3):
+            noise += self._residual(rng)
+        if kind != "replayed" and rng.random() < 0.25:
+            along = rng.standard_normal(3) * (1.0, 1.0, 0.3)
+            along /= np.linalg.norm(along)
+            noise += (rng.choice([2.0, 1.0])) * (noise @ along)[..., None] * along
+        if kind == "mixed":
+            rate = np.gradient(truth, axis=0) * FPS
+            noise += rate * 10 ** rng.uniform(-3.0, -2.0) * rng.standard_normal((shape[0], 1, 1))
+        if kind == "white" and rng.random() < 0.06:  # a camera of 15 frames a second, read at 30
+            noise[1:-1:2] = 0.5 * (noise[:-2:2] + noise[2::2])
+        return noise
+
+    def _real(self, rng: Rng) -> tuple[Floats, Floats]:
+        """A clip of the real Kinect; where it is shorter than what is asked for, nothing is known of the rest."""
+        start = self._pairs.start
+        clip = rng.choice(len(self._pair_weight), p=self._pair_weight)
+        first = start[clip] + int(rng.random() * max(start[clip + 1] - start[clip] - self._frames, 0))
+        rows = slice(first, min(first + self._frames, start[clip + 1]))
+        seen, truth = np.full((2, self._frames, 22, 3), np.nan)
+        seen[: rows.stop - rows.start], truth[: rows.stop - rows.start] = (
+            self._pairs.seen[rows],
+            self._pairs.truth[rows],
+        )
+        if rng.random() < 0.5:
+            seen, truth = (x[:, MIRROR] * (1.0, -1.0, 1.0) for x in (seen, truth))
+        return seen, truth
+
+    def _spoil(self, seen: Floats, kind: NDArray[np.int64], rng: Rng) -> None:
+        """Outliers, exchanged limbs, hidden joints, in place; not of what is perfect, but hidden joints."""
+        count, frames = seen.shape[:2]
+        for clip in range(count):
+            noisy = KINDS[kind[clip]] != "perfect"
+            if noisy and rng.random() < 0.15:
+                hit = rng.random((frames, 22)) < 10 ** rng.uniform(-2.7, -1.5)
+                jump = rng.standard_normal((frames, 22, 3))
+                jump *= (rng.uniform(0.05, 0.4, (frames, 22)) / np.linalg.norm(jump, axis=-1))[..., None]
+                far = (np.linalg.norm(jump, axis=-1) > GATED) & (rng.random((frames, 22)) < 0.9)
+                seen[clip] += np.where(hit[..., None], jump, 0.0)
+                seen[clip][hit & far] = np.nan
+            if noisy and rng.random() < 0.05:
+                first, length = rng.integers(1, frames - 1), rng.geometric(1 / 3)
+                pair = _LIMBS[rng.integers(len(_LIMBS))]
+                rows = slice(first, first + length)
+                if rng.random() < 0.5:
+                    both = [*pair, *MIRROR[pair]]
+                    seen[clip, rows, both] = seen[clip, rows][:, MIRROR[both]].swapaxes(0, 1)
+                else:
+                    seen[clip, rows, pair] = np.nan
+        few = np.flatnonzero(rng.random(count) < 0.15)
+        seen[np.ix_(few, np.arange(frames), np.array(_ABSENT))] = np.nan
+        hidden = np.flatnonzero(rng.random(count) < 0.2)
+        if len(hidden):
+            seen[hidden] = occlude(seen[hidden], rng)
+
+
+def sound(pairs: Pairs, most: float = 0.05) -> NDArray[np.bool_]:
+    """(C,) recordings in which Kinect and Vicon agree to ``most`` metres in the median: elsewhere, either is lost."""
+    error = np.linalg.norm(pairs.seen - pairs.truth, axis=-1)
+    return np.array([np.nanmedian(error[a:b]) < most for a, b in zip(pairs.start, pairs.start[1:], strict=False)])
+
+
+def _confidences(count: int, frames: int, rng: Rng) -> Floats:
+    """(C, T, 22) of sensors of which most are always sure; of others, joints differ and change slowly."""
+    time = 2 * np.pi * rng.uniform(0.0, 0.5, (count, 1, 22)) * np.arange(frames)[:, None] / FPS
+    middle = rng.uniform(0.3, 1.0, (count, 1, 22))
+    unsure = np.clip(middle + 0.2 * np.cos(time + rng.uniform(0, 2 * np.pi, (count, 1, 22))), 0.1, 1.0)
+    return np.where((rng.random(count) < 0.3)[:, None, None], unsure, 1.0)
+
+
+def _lasting(shape: tuple[int, ...], memory: float, rng: Rng) -> Floats:
+    """Stationary AR(1) noise of unit variance, ``memory`` its correlation from a frame to the next."""
+    noise = rng.standard_normal(shape)
+    for t in range(1, len(noise)):
+        noise[t] = memory * noise[t - 1] + np.sqrt(1 - memory**2) * noise[t]
+    return noise
+
+
+def _swing(truth: Floats, rng: Rng) -> None:
+    """A limb that waves, in place: 0.5 to 4.5 Hz, by up to 0.7 rad."""
+    centre, moved = _SWINGS[rng.integers(len(_SWINGS))]
+    side = rng.choice(["left", "right"])
+    pivot, joints = J[f"{side}_{centre}"], [J[f"{side}_{n}"] for n in moved]
+    frequency, phase = rng.uniform(0.5, 4.5), rng.uniform(0, 2 * np.pi)
+    angle = rng.uniform(0.1, 0.7) * np.sin(phase + 2 * np.pi * frequency * np.arange(len(truth)) / FPS)
+    axis = rng.standard_normal(3)
+    turns = Rotation.from_rotvec(angle[:, None] * axis / np.linalg.norm(axis)).as_matrix()
+    truth[:, joints] = truth[:, [pivot]] + np.einsum("tab,tjb->tja", turns, truth[:, joints] - truth[:, [pivot]])

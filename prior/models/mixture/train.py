@@ -1,0 +1,253 @@
+"""Training of the mixture: ``steadypose train mixture --data MOCAP``, resumable.
+
+Clips of true motion go through simulated sensors and the bank that the live node runs; the loss is what the bench
+counts, position error (mm) and acceleration error (mm/frame²), of each clip by that of the expert that is best for that
+very clip: so no kind of sensor or motion is given up for another. The standard deviation is trained by its likelihood.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from steadypose.prior.models.mixture.bank import (
+    DENSITIES,
+    EXPERTS,
+    FEATURES,
+    MEASUREMENT_SIGMA,
+    PARENT,
+    advance,
+    describe,
+    new_bank,
+)
+from steadypose.prior.models.mixture.motion import load_kinect, load_motion, write_arrays
+from steadypose.prior.models.mixture.network import MixtureConfig, MixtureNet, answer
+from steadypose.prior.models.mixture.sensors import Sensed, Sensors
+from steadypose.prior.models.torch_weights import started
+from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.weights_io import LICENCES
+from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS
+from steadypose.prior.timing.rate import FPS
+
+RATE = 2e-3
+"""Of learning, at first."""
+
+FRAMES = 90
+"""of a clip, from its first: the start of a stream is a part of it"""
+
+CLIPS, DELAYS_A_STEP = 16, 2
+"""clips of each delay, and delays, of a step"""
+
+DELAYS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16])
+DELAY_SHARES = np.array([0.22, 0.08, 0.12, 0.05, 0.17, 0.03, 0.04, 0.13, 0.03, 0.03, 0.10])
+
+LEAST_MM = 1.0
+"""Added to what the best expert is off by, before it divides: a perfect input matters, but not beyond all measure."""
+
+SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.25, 0.4, 0.7, 1.5, 2.5)
+"""Weight of the acceleration error by delay in frames: without delay, smoothness is paid for in lag, and later not."""
+
+LEAST_SMOOTH_MM = 0.5
+"""mm/frame², added to the acceleration error of the best expert."""
+
+UNSEEN = 0.15
+"""Weight of the places of joints that are not seen."""
+
+DEVIATION = 0.3
+"""Weight of the likelihood of the errors."""
+
+AVERAGE = 0.999
+"""Memory of the running mean of the weights, which is what ships."""
+
+
+class Batch(NamedTuple):
+    """Described clips, (C, T, ...): what `answer` takes, and the truth."""
+
+    features: Tensor
+    experts: Tensor
+    heading: Tensor
+    scale: Tensor
+    unseen: Tensor
+    truth: Tensor
+
+
+def through_bank(sensed: Sensed, delay: int) -> Batch:
+    """Clips as the live node describes them, one after the other; the frames that ``delay`` leaves."""
+    clips, frames = sensed.seen.shape[:2]
+    kept = frames - delay
+    features = np.empty((kept, clips, 22, FEATURES), dtype=np.float32)
+    experts = np.empty((kept, clips, 22, EXPERTS, 3))
+    heading, scale, unseen = np.empty((kept, clips, 2)), np.empty((kept, clips)), np.empty((kept, clips, 22))
+    bank = new_bank(clips, delay)
+    for t in range(frames):
+        advance(bank, t, 1 / FPS, sensed.seen[:, t], sensed.confidence[:, t], DENSITIES, MEASUREMENT_SIGMA)
+        at = t - delay
+        if at >= 0:
+            describe(bank, t + 1, delay, PARENT, experts[at], features[at], scale[at])
+            heading[at], unseen[at] = bank.heading, bank.unseen[:, :, at % (delay + 1)]
+    middle = sensed.truth[:, :1, :1]
+    middle = np.where(np.isfinite(middle), middle, 0.0)  # so that single precision is enough
+    arrays = (
+        features, experts - middle.swapaxes(0, 1)[:, :, :, None], heading, scale, unseen,
+        (sensed.truth - middle)[:, :kept].swapaxes(0, 1),
+    )  # fmt: skip
+    return Batch(*(torch.from_numpy(a.astype(np.float32)).transpose(0, 1) for a in arrays))
+
+
+class Errors(NamedTuple):
+    """Of each clip, (C,) or (C, experts)."""
+
+    position: Tensor  # mm
+    acceleration: Tensor  # mm/frame²
+
+
+def errors(places: Tensor, truth: Tensor, weight: Tensor) -> Errors:
+    """Of places (C, T, 22, 3), weighed (C, T, 22); what weighs nothing may be NaN."""
+    off = torch.where(weight[..., None] > 0, places - truth, 0.0) * 1e3
+    bent = off[:, 2:] - 2 * off[:, 1:-1] + off[:, :-2]
+    seen = (weight[:, 2:] >= 1) & (weight[:, 1:-1] >= 1) & (weight[:, :-2] >= 1)
+    return Errors(
+        (weight * _length(off)).sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1),
+        (seen * _length(bent)).sum(dim=(1, 2)) / seen.sum(dim=(1, 2)).clamp(min=1),
+    )
+
+
+def _length(vectors: Tensor) -> Tensor:
+    return (vectors.square().sum(dim=-1) + 1e-4).sqrt()
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What a batch costs: to be minimised; and what it is made of, each clip's."""
+
+    total: Tensor
+    relative: Tensor
+    own: Errors
+    likelihood: Tensor
+
+
+def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
+    """Of clips of one delay."""
+    smooth = float(np.interp(delay, SMOOTH_DELAYS, SMOOTH))
+    outputs = network(batch.features, (batch.unseen >= 0).any(dim=-1))
+    known = batch.truth.isfinite().all(dim=-1) & batch.experts.isfinite().all(dim=(-1, -2))
+    experts = torch.where(known[..., None, None], batch.experts, 0.0)
+    places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.unseen)
+    weight = known * torch.where(batch.unseen > 0, UNSEEN, 1.0)
+    own = errors(places, batch.truth, weight)
+    with torch.no_grad():
+        seen = known * (batch.unseen == 0).float()
+        each = [errors(experts[:, :, :, m], batch.truth, seen) for m in range(EXPERTS)]
+        position, acceleration = (torch.stack(values) for values in zip(*each, strict=True))
+        best = (position + acceleration).argmin(dim=0, keepdim=True)
+        position, acceleration = position.gather(0, best)[0], acceleration.gather(0, best)[0]
+    relative = own.position / (position + LEAST_MM) + smooth * own.acceleration / (acceleration + LEAST_SMOOTH_MM)
+    square = torch.where(known[..., None], places - batch.truth, 0.0).square().mean(dim=-1).detach() * 1e6
+    density = 0.5 * (variance.log() + square / variance)
+    likelihood = (density * known).sum(dim=(1, 2)) / known.sum(dim=(1, 2)).clamp(min=1)
+    total = relative.mean() + DEVIATION * likelihood.mean()
+    return Loss(total, relative, own, likelihood)
+
+
+def train(
+    network: MixtureNet,
+    sensors: Sensors,
+    val: Sensors,
+    directory: Path,
+    steps: int,
+    seed: int,
+    rate: float = 2e-3,
+    fresh: bool = True,
+) -> TrainingRun:
+    """Train, and leave the mean of the last weights in ``network``; which, unless ``fresh``, is trained already."""
+    mean = MixtureNet(network.config)
+    if fresh and not (directory / "checkpoint.pt").exists():
+        _measure_features(network, sensors, seed)
+    mean.load_state_dict(network.state_dict())
+    optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimiser,
+        lambda s: min(1.0, (s + 1) / 100) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(s / steps, 1.0)))),
+    )
+    state = {"model": network, "mean": mean, "optimiser": optimiser, "schedule": schedule}
+    run = TrainingRun(directory, state, steps, every=max(steps // 20, 1))
+    watched = [(delay, through_bank(val.draw(40, np.random.default_rng((1, delay))), delay)) for delay in (0, 4)]
+    recent = {"loss": 0.0}
+
+    def evaluate() -> dict[str, float]:
+        with torch.no_grad():
+            found = {
+                f"val, delay {delay}": loss_of(mean, batch, delay).relative.mean().item() for delay, batch in watched
+            }
+        return {**recent, **found}
+
+    for step in run.steps(evaluate):
+        rng = run.random(seed)
+        optimiser.zero_grad()
+        total = 0.0
+        for delay in rng.choice(DELAYS, DELAYS_A_STEP, p=DELAY_SHARES):
+            batch = through_bank(sensors.draw(CLIPS, rng), int(delay))
+            loss = loss_of(network, batch, int(delay)).total / DELAYS_A_STEP
+            loss.backward()
+            total += loss.item()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        keep = min(AVERAGE, (step + 1) / (step + 10))
+        with torch.no_grad():
+            for kept, new in zip(mean.parameters(), network.parameters(), strict=True):
+                kept.lerp_(new, 1 - keep)
+        recent["loss"] += 0.02 * (total - recent["loss"]) if step else total
+    network.load_state_dict(mean.state_dict())
+    return run
+
+
+def _measure_features(network: MixtureNet, sensors: Sensors, seed: int) -> None:
+    """Mean and standard deviation of the features, over training."""
+    rng = np.random.default_rng((seed, 7))
+    rows = torch.cat([through_bank(sensors.draw(32, rng), int(d)).features.reshape(-1, FEATURES) for d in DELAYS])
+    network.mean.copy_(rows.mean(dim=0))
+    network.deviation.copy_(rows.std(dim=0).clamp(min=0.05))
+
+
+def train_mixture(
+    data: Path,
+    runs: Path,
+    *,
+    weights: str = "default",
+    seed: int = 0,
+    iterations: int = 6000,
+    start: str | None = None,
+) -> Path:
+    """Train on the recordings in the folder ``data`` that are free for products; the path of the weights.
+
+    Prepared arrays, at several speeds, lie in the run's folder. From ``start``, the rate of learning is half.
+    """
+    name = f"mixture-{weights}"
+    directory = runs / name
+    arrays = directory / "arrays"
+    if not (arrays / "pairs.npz").is_file():
+        write_arrays(data, arrays)
+    torch.manual_seed(seed)
+    pairs = load_kinect(arrays / "pairs.npz")
+    sensors = Sensors(load_motion(arrays / "motion-train.npz"), pairs.of(TRAIN_SUBJECTS), FRAMES)
+    val = Sensors(load_motion(arrays / "motion-val.npz"), pairs.of(("s07", "s08")), FRAMES)
+    network = MixtureNet(MixtureConfig())
+    began = started(network, "mixture", start)
+    rate = RATE if start is None else RATE / 2
+    run = train(network, sensors, val, directory, iterations, seed, rate, fresh=start is None)
+    card = {
+        "Model": "weights that a network gives to a bank of fixed-lag smoothers, joint by joint",
+        "Data": "CMU (AMC 01; BVH 06, 07; expmap; salsa), ReActIdle, UI-PRMD s01-s06 (Vicon, and Kinect beside it), at "
+        "1 to 2.5 times its speed, through simulated sensors; validated on CMU 02, ReActIdle 013-015, UI-PRMD s07, s08",
+        "Licence": LICENCES["default"],
+        "Seed": str(seed),
+        "Training": f"`steadypose train mixture --iterations {iterations} --seed {seed}`{began}",
+    }
+    return run.save(directory / f"{name}.safetensors", network, asdict(network.config), card)

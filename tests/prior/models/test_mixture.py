@@ -1,0 +1,180 @@
+"""The mixture: the live form against torch, and what must hold of its answers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import save_file
+
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
+from steadypose.prior.models.mixture.bank import (
+    DENSITIES,
+    EXPERTS,
+    FEATURES,
+    MEASUREMENT_SIGMA,
+    PARENT,
+    advance,
+    describe,
+    new_bank,
+)
+from steadypose.prior.models.mixture.inference import MixtureSmoother
+from steadypose.prior.models.mixture.network import MixtureConfig, MixtureNet, answer
+from steadypose.prior.models.mixture.sensors import Sensed
+from steadypose.prior.models.mixture.train import through_bank
+from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
+from steadypose.prior.timing.rate import FPS
+
+Floats = NDArray[np.float64]
+
+DELAYS = (0, 1, 4, 16)
+
+
+def walk(frames: int = 90, clips: int = 1, pace: float = 1.0) -> Floats:
+    """(T, C, 22, 3) metres: a body of which every bone swings, each at its own rate, and which moves on."""
+    time = np.arange(frames)[:, None, None] / FPS
+    rng = np.random.default_rng(3)
+    places = np.zeros((frames, clips, 22, 3))
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        phase, rate = rng.uniform(0, 6, (clips, 3)), rng.uniform(0.3, 1.0, (clips, 3)) * pace
+        bone = REST_OFFSETS[joint] + 0.3 * np.linalg.norm(REST_OFFSETS[joint]) * np.sin(phase + 6.28 * rate * time)
+        bone *= np.linalg.norm(REST_OFFSETS[joint]) / np.linalg.norm(bone, axis=-1, keepdims=True)
+        places[:, :, joint] = places[:, :, parent] + bone
+    return places + np.array([0.8, 0.3, 0.0]) * time[..., None, :] + (1.0, 2.0, 0.9)
+
+
+def smoothed(seen: Floats, delay: int, weights: str = "default") -> list[Smoothed]:
+    """All answers to (T, S, 22, 3)."""
+    smoother = MixtureSmoother(delay, seen.shape[1], weights)
+    found = [smoother.update(frame, t / FPS) for t, frame in enumerate(seen)]
+    return [one for one in found if one is not None] + smoother.flush()
+
+
+def places(found: list[Smoothed]) -> Floats:
+    return np.stack([one.positions for one in found])
+
+
+def noisy(truth: Floats, sigma: float = 0.02) -> Floats:
+    return truth + sigma * np.random.default_rng(5).standard_normal(truth.shape)
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+def test_experts_are_fixed_lag_smoothers(delay: int) -> None:
+    seen = noisy(walk(40))
+    seen[10:20, :, 7] = np.nan
+    bank, confidence = new_bank(1, delay), np.full((1, 22), 0.8)
+    textbook = [FixedLagRTS(delay, density, MEASUREMENT_SIGMA / 0.8) for density in DENSITIES]
+    experts, features, scale = np.empty((1, 22, EXPERTS, 3)), np.empty((1, 22, FEATURES), np.float32), np.empty(1)
+    for t, frame in enumerate(seen):
+        advance(bank, t, 1 / FPS, frame, confidence, DENSITIES, MEASUREMENT_SIGMA)
+        expected = [smoother.update(frame, t / FPS) for smoother in textbook]
+        if t >= delay:
+            describe(bank, t + 1, delay, PARENT, experts, features, scale)
+            for m, one in enumerate(expected):
+                assert one is not None
+                np.testing.assert_allclose(experts[:, :, m], one.positions, atol=1e-9)
+
+
+def test_live_form_gives_what_torch_gives(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    net = MixtureNet(MixtureConfig(own=8, body=24, told=6, head=16))
+    with torch.no_grad():
+        net.write.weight.mul_(10)
+    path = tmp_path / "some.safetensors"
+    save_file({name: value.contiguous() for name, value in net.state_dict().items()}, path, metadata={"config": "{}"})
+    truth = walk(50, 2)
+    seen = noisy(truth)
+    seen[20:30, :, 5] = np.nan
+    clips = seen.swapaxes(0, 1)
+    sensed = Sensed(clips, truth.swapaxes(0, 1), np.ones(clips.shape[:3]), np.zeros(2, dtype=int))
+    for delay in (0, 4):
+        batch = through_bank(sensed, delay)
+        with torch.no_grad():
+            outputs = net(batch.features, torch.ones(batch.features.shape[:2], dtype=torch.bool))
+            expected, variance = answer(outputs, batch.experts, batch.heading, batch.scale, batch.unseen)
+        found = smoothed(seen, delay, str(path))[: 50 - delay]
+        origin = truth[0, :, 0][:, None, None]
+        np.testing.assert_allclose(places(found).swapaxes(0, 1), expected.numpy() + origin, atol=2e-5)
+        sigma = np.stack([one.sigma for one in found], axis=1)
+        np.testing.assert_allclose(sigma, np.sqrt(variance.numpy()) * 1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize("pace", [0.5, 3.0])
+def test_a_perfect_input_stays_what_it_is(delay: int, pace: float) -> None:
+    truth = walk(pace=pace)
+    off = np.linalg.norm(places(smoothed(truth, delay)) - truth, axis=-1)
+    assert off.mean() < 0.002
+    assert np.quantile(off, 0.99) < 0.005
+
+
+@pytest.mark.parametrize("delay", [0, 4])
+def test_place_and_heading_of_the_body_change_nothing(delay: int) -> None:
+    seen = noisy(walk())
+    angle = 1.1
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    moved = seen @ turn.T + (3.0, -2.0, 0.4)
+    there = places(smoothed(seen, delay)) @ turn.T + (3.0, -2.0, 0.4)
+    np.testing.assert_allclose(places(smoothed(moved, delay)), there, atol=2e-4)
+
+
+def test_noise_gets_less_and_more_so_with_more_delay() -> None:
+    truth = walk()
+    seen = noisy(truth, 0.04)
+    raw = np.linalg.norm(seen - truth, axis=-1).mean()
+    errors = [np.linalg.norm(places(smoothed(seen, delay)) - truth, axis=-1).mean() for delay in (0, 4, 16)]
+    assert errors[0] < 0.85 * raw
+    assert errors[1] < 0.8 * errors[0]
+    assert errors[2] < 1.02 * errors[1]
+
+
+@pytest.mark.parametrize("delay", [0, 4])
+def test_an_unseen_joint_coasts_and_says_so(delay: int) -> None:
+    seen = noisy(walk(), 0.005)
+    seen[40:, :, 20] = np.nan
+    found = smoothed(seen, delay)
+    assert np.isfinite(places(found)).all()
+    sigma = np.array([one.sigma[0, 20] for one in found])
+    assert sigma[50] > sigma[30]
+    assert sigma[85] > sigma[50]
+    assert sigma[85] > 0.1
+
+
+def test_a_joint_never_seen_is_not_known() -> None:
+    seen = noisy(walk())
+    seen[:, :, 3] = np.nan
+    found = smoothed(seen, 4)
+    assert np.isnan(places(found)[:, :, 3]).all()
+    assert all(np.isinf(one.sigma[:, 3]).all() for one in found)
+    assert np.isfinite(np.delete(places(found), 3, axis=2)).all()
+
+
+def test_bodies_do_not_touch_each_other_and_the_same_gives_the_same() -> None:
+    seen = noisy(walk(60, 3))
+    together = smoothed(seen, 4)
+    alone = smoothed(seen[:, 1:2], 4)
+    assert (places(together)[:, 1:2] == places(alone)).all()
+    assert all((a.sigma[1] == b.sigma[0]).all() for a, b in zip(together, alone, strict=True))
+    assert (places(smoothed(seen, 4)) == places(together)).all()
+
+
+def test_a_slot_forgotten_starts_afresh() -> None:
+    first, second = noisy(walk(60, 2)), noisy(walk(60, 2) + 1.0)
+    smoother = MixtureSmoother(0, 2)
+    for t, frame in enumerate(first):
+        smoother.update(frame, t / FPS)
+    smoother.forget(np.array([True, False]))
+    found = [smoother.update(frame, (60 + t) / FPS) for t, frame in enumerate(second)]
+    fresh = smoothed(second, 0)
+    for a, b in zip(found, fresh, strict=True):
+        assert a is not None
+        np.testing.assert_allclose(a.positions[0], b.positions[0], atol=1e-12)
+
+
+def test_every_frame_is_answered_once_with_its_stamp() -> None:
+    found = smoothed(walk(20), 4)
+    np.testing.assert_allclose([one.stamp_s for one in found], np.arange(20) / FPS)
+    assert len(smoothed(walk(3), 16)) == 3
