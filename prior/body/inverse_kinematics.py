@@ -24,16 +24,16 @@ _PART_UP = np.array(
         [(J["neck"],) * 2, (J["head"],) * 2, (J["head"],) * 2, (J["head"],) * 2],
     ]
 )
-# What is rigid on constant bones: every bone, and what pelvis and chest carry. The frame of each is in its first three.
+# What is rigid on constant bones: every bone, and what pelvis and chest carry.
 _PELVIS_GROUP = (*HIPS, J["spine1"], J["pelvis"])
 _CHEST_GROUP = (*COLLARS, J["neck"], J["spine3"])
-_RIGID = np.array(
+RIGID = np.array(
     sorted(
         {(joint, parent) for joint, parent in enumerate(PARENTS) if parent >= 0}
         | {(max(a, b), min(a, b)) for group in (_PELVIS_GROUP, _CHEST_GROUP) for a in group for b in group if a != b}
     )
 )
-_RIGID_FRAME = np.array([_PELVIS_GROUP[:3], _CHEST_GROUP[:3]])
+"""(R, 2) the joints at the ends of each."""
 _SWEEPS = 20
 
 # Where the pelvis is upright below, when it is hidden itself: the middle of two joints, best first.
@@ -94,44 +94,38 @@ def solve_pose(
     shape = np.shape(positions)
     p, bones = _frames(positions, shape), _frames(offsets, shape)
     local, placed = _initial(fallback, p), np.empty_like(p)
-    _solve(p, np.asarray(finite_joints(p)), bones, False, local, placed)
+    _solve(p, np.asarray(finite_joints(p)), bones, local, placed)
     return local.reshape(*shape, 3), placed.reshape(shape)
 
 
-def fit_pose(
+def fit_lengths(
     positions: NDArray[np.floating],
     offsets: NDArray[np.floating],
     mobility: NDArray[np.floating],
-    fallback: NDArray[np.floating] | None = None,
     length_variance: NDArray[np.floating] | float = 0.0,
-) -> tuple[Floats, Floats, Floats]:
-    """Rotations and positions of the pose on these bones that is nearest to the positions.
+) -> Floats:
+    """The joints nearest to the positions whose bones are as long as these.
 
     `solve_pose` follows the chain: where a bone seems too long or short, all of that goes to its end, and on to what
     hangs from it. Here every bone and every rigid part of the trunk pulls at both its ends until the lengths are
-    right, by sweeps of Gauss-Newton over the distances (position-based dynamics, Müller et al. 2007); what comes out
-    is solved, which moves it by about a millimetre. Bones of uncertain length give way as their variance says
-    (compliant constraints, XPBD, Macklin et al. 2016).
+    right, by sweeps of Gauss-Newton over the distances (position-based dynamics, Müller et al. 2007). Lengths that
+    are uncertain give way as their variance says (compliant constraints, XPBD, Macklin et al. 2016).
 
     Args:
         positions: (..., 22, 3) metres, all of them finite.
         offsets: (22, 3) or (..., 22, 3) metres, the person's bones.
         mobility: (..., 22) how easily each joint yields: its variance, in any unit.
-        fallback: (..., 22, 3, 3) local rotations of the leaves, which no position shows; identity if left out.
-        length_variance: (..., 22) how easily the bone above each joint yields: of its length, in that unit.
+        length_variance: (..., R) of the length of each of `RIGID`, in that unit.
 
     Returns:
-        local rotations (..., 22, 3, 3), the positions (..., 22, 3) where they put the joints, metres, and the bones
-        (..., 22, 3) on which they do.
+        (..., 22, 3) metres.
     """
     shape = np.shape(positions)
     p, bones = _frames(positions, shape), _frames(offsets, shape)
-    yields, variance = np.empty(shape[:-1]), np.empty(shape[:-1])
+    yields, variance = np.empty(shape[:-1]), np.empty((*shape[:-2], len(RIGID)))
     yields[...], variance[...] = mobility, length_variance
-    _constrain(p, bones, yields.reshape(p.shape[:-1]), variance.reshape(p.shape[:-1]))
-    local, placed = _initial(fallback, p), np.empty_like(p)
-    _solve(p, np.ones(p.shape[:-1], dtype=bool), bones, True, local, placed)
-    return local.reshape(*shape, 3), placed.reshape(shape), bones.reshape(shape)
+    _constrain(p, bones, yields.reshape(p.shape[:-1]), variance.reshape(len(p), len(RIGID)))
+    return p.reshape(shape)
 
 
 def place_joints(rotations: NDArray[np.floating], offsets: NDArray[np.floating]) -> Floats:
@@ -280,35 +274,24 @@ def _trunk(which, p, seen, rest, here):
     return False, np.eye(3)
 
 
-@njit(cache=True)
-def _rigid_trunk(which, p, rest, here):
-    """The rotation of pelvis (0) or chest (1) in the frame of the positions, from the joints it carries."""
-    left, right, up = _RIGID_FRAME[which]
-    at_rest = _frame(rest[left] - rest[right], rest[up] - rest[_RIGID_PARTS[which]])
-    return _product(_frame(p[left] - p[right], p[up] - here), at_rest.T)
-
-
 @njit("(f8[:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,::1])", cache=True)
 def _constrain(positions, offsets, mobility, length_variance):
-    """Of B frames: moves ``positions`` (B, 22, 3) until what is rigid has its lengths; ``offsets`` within theirs."""
+    """Of B frames: moves ``positions`` (B, 22, 3) until what is rigid has its lengths."""
     rest = np.empty((len(PARENT), 3))
-    length = np.empty(len(_RIGID))
-    compliance = np.empty(len(_RIGID))
-    force = np.empty(len(_RIGID))
+    length = np.empty(len(RIGID))
+    force = np.empty(len(RIGID))
     for frame in range(len(positions)):
-        p, yields = positions[frame], mobility[frame]
+        p, yields, compliance = positions[frame], mobility[frame], length_variance[frame]
         rest[0] = 0.0
         for joint in range(1, len(PARENT)):
             rest[joint] = rest[PARENT[joint]] + offsets[frame, joint]
-        for k in range(len(_RIGID)):
-            bone = rest[_RIGID[k, 0]] - rest[_RIGID[k, 1]]
+        for k in range(len(RIGID)):
+            bone = rest[RIGID[k, 0]] - rest[RIGID[k, 1]]
             length[k] = np.sqrt(_dot(bone, bone))
-            a, b = _RIGID[k]
-            compliance[k] = length_variance[frame, a] + (0.0 if b == PARENT[a] else length_variance[frame, b])
             force[k] = 0.0
         for _ in range(_SWEEPS):
-            for k in range(len(_RIGID)):
-                a, b = _RIGID[k]
+            for k in range(len(RIGID)):
+                a, b = RIGID[k]
                 squared = 0.0
                 for i in range(3):  # no vectors here: in the innermost loop, making them would take most of the time
                     squared += (p[a, i] - p[b, i]) ** 2
@@ -319,12 +302,6 @@ def _constrain(positions, offsets, mobility, length_variance):
                     along = pull / now * (p[a, i] - p[b, i])
                     p[a, i] -= yields[a] * along
                     p[b, i] += yields[b] * along
-        for k in range(len(_RIGID)):
-            a, b = _RIGID[k]
-            if b == PARENT[a]:
-                stretch = 1.0 + compliance[k] * force[k] / max(length[k], 1e-9)
-                for i in range(3):
-                    offsets[frame, a, i] *= stretch
 
 
 @njit(cache=True)
@@ -343,13 +320,9 @@ def _twist(joint, p, seen, above, turn, bone):
     return _product(_about(bone, angle * share * share * (3.0 - 2.0 * share)), turn)
 
 
-@njit("(f8[:,:,::1], b1[:,::1], f8[:,:,::1], b1, f8[:,:,:,::1], f8[:,:,::1])", cache=True)
-def _solve(positions, observed, offsets, rigid, local, placed):
-    """Of B frames: writes ``placed`` (B, 22, 3), and into ``local`` (B, 22, 3, 3) what can be solved.
-
-    ``rigid``: the positions lie on these bones, so the joints next to pelvis and chest show their frames. Measured
-    ones do not, and those further apart show them better.
-    """
+@njit("(f8[:,:,::1], b1[:,::1], f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1])", cache=True)
+def _solve(positions, observed, offsets, local, placed):
+    """Of B frames: writes ``placed`` (B, 22, 3), and into ``local`` (B, 22, 3, 3) what can be solved."""
     joints = len(PARENT)
     rest = np.empty((joints, 3))
     world = np.empty((joints, 3, 3))
@@ -367,10 +340,7 @@ def _solve(positions, observed, offsets, rigid, local, placed):
             placed[frame, joint] = here
             for which in range(len(_RIGID_PARTS)):
                 if joint == _RIGID_PARTS[which]:
-                    if rigid:
-                        solved, orientation = True, _rigid_trunk(which, p, rest, here)
-                    else:
-                        solved, orientation = _trunk(which, p, seen, rest, here)
+                    solved, orientation = _trunk(which, p, seen, rest, here)
                     if solved:
                         local[frame, joint] = _product(above.T, orientation)
             for target in _AIM[joint]:

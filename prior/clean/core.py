@@ -18,6 +18,7 @@ from steadypose.prior.clean.reconstruct import Reconstruct
 from steadypose.prior.clean.refine import Refine
 from steadypose.prior.clean.score import Scorer
 from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.slow_error import SlowError, SlowErrorEstimator
 from steadypose.prior.clean.smooth import Smooth
 from steadypose.prior.timing.fixed_lag import Smoothed
 
@@ -30,6 +31,7 @@ class _Newest:
         gated: the frame.
         present: (S,) who is there.
         person: their bones.
+        slow_error: of the sensor, as found by then.
         rotations: (K, S, 22, 3, 3) local, of the last frames.
         score: as of now.
         imputed: the last frames, completed; None without that step.
@@ -38,6 +40,7 @@ class _Newest:
     gated: Gated
     present: Bools
     person: Person
+    slow_error: SlowError
     rotations: Floats
     score: Score
     imputed: Imputed | None
@@ -62,11 +65,12 @@ class CleanCore:
         self._correct = Correct(settings.correct, slots) if settings.correct.sensor else None
         self._smooth = Smooth(settings.smooth, delay, slots)
         self._reconstruct = Reconstruct(settings.encode, noise, slots) if denoise or score or impute else None
-        self._denoise = Denoise(noise.jitter_sigma, delay, slots) if denoise else None
-        self._person = PersonEstimator(settings.bones, noise.bias_sigma, slots)
+        self._denoise = Denoise(delay, slots) if denoise else None
+        self._slow_error = SlowErrorEstimator(noise.bias_sigma, slots)
+        self._person = PersonEstimator(settings.bones, slots)
         self._score = Scorer(settings.score, settings.encode.weights, noise, slots) if score else None
         self._impute = Impute(settings.impute, delay, slots, counters) if impute else None
-        self._fuse = Fuse(settings.fuse, noise.bias_sigma)
+        self._fuse = Fuse(settings.fuse, slots)
         self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
         self._newest: _Newest | None = None
 
@@ -85,11 +89,12 @@ class CleanCore:
         if self._denoise:
             self._denoise.update(windows, self._history)
         denoised = None if smoothed is None else self._denoised(smoothed, gated, self._delay)
-        person = self._person.update(denoised, present)
+        slow_error = self._slow_error.update(denoised, person.offsets, gated.jitter)
+        person = self._person.update(denoised, slow_error.bias_sigma, present)
         score = self._score.update(windows, gated.frozen) if self._score else Score.unscored(self._slots)
         imputed = self._impute.update(windows, gated.jitter, hurry=hurry) if self._impute else None
         rotations = self._refine.update(gated, person)
-        self._newest = newest = _Newest(gated, present, person, rotations, score, imputed)
+        self._newest = newest = _Newest(gated, present, person, slow_error, rotations, score, imputed)
         return None if denoised is None else self._answer(denoised, newest, self._delay)
 
     def flush(self) -> list[CleanFrame]:
@@ -97,7 +102,7 @@ class CleanCore:
         newest, self._newest = self._newest, None
         if newest is None:
             return []
-        held = self._smooth.flush(newest.gated.jitter)
+        held = self._smooth.flush()
         return [
             self._answer(self._denoised(smoothed, newest.gated, back), newest, back)
             for back, smoothed in zip(reversed(range(len(held))), held, strict=True)
@@ -106,8 +111,8 @@ class CleanCore:
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
         steps = (
-            self._gate, self._correct, self._history, self._smooth, self._denoise, self._person, self._score,
-            self._impute, self._refine,
+            self._gate, self._correct, self._history, self._smooth, self._denoise, self._slow_error,
+            self._person, self._score, self._impute, self._refine, self._fuse,
         )  # fmt: skip
         for step in steps:
             if step is not None:
@@ -125,6 +130,7 @@ class CleanCore:
         estimate = self._fuse.fuse(
             denoised,
             newest.person,
+            newest.slow_error,
             newest.rotations[at],
             imputed and Imputed(imputed.positions[at], imputed.sigma[at]),
             self._history.unseen_s[at],

@@ -20,10 +20,16 @@ from steadypose.prior.models.hgvae.features import from_tracks
 from steadypose.prior.timing.fixed_lag import Smoothed
 
 MODEL_SIGMA = 0.005
-"""Metres along an axis: what HG-VAE is off by apart from noise, for the least error in noise of 1 and 4 cm."""
+"""Metres along an axis: what HG-VAE is off by at least, apart from noise."""
 
 NOISE_LEFT = 0.59
 """Of the variance that noise gives to the smoother's answer, what it gives to HG-VAE's."""
+
+MEMORY = 15
+"""Frames over which HG-VAE earns its belief."""
+
+SUDDEN = 3.0
+"""Times the mean of its squared distance to what was smoothed, above which this very frame's counts."""
 
 RENEWAL = 0.5
 """How far a frame's answer goes to that of the next window: windows one frame apart disagree, which would be jitter."""
@@ -46,18 +52,19 @@ class Denoise:
     """Moves the smoother's estimate of the joints seen towards what HG-VAE makes of them.
 
     Args:
-        jitter_sigma: metres, which the smoother assumes.
         delay_frames: between the newest frame and the one that is answered.
         slots: bodies at most.
     """
 
-    def __init__(self, jitter_sigma: float, delay_frames: int, slots: int) -> None:
-        self._jitter_sigma = jitter_sigma
+    def __init__(self, delay_frames: int, slots: int) -> None:
+        self._apart = np.zeros((slots, 22))  # m², mean square of the distance between the two along an axis
+        self._frames = np.zeros((slots, 22))
         self._found = np.full((delay_frames + 1, slots, 22, 3), np.nan)
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
         self._found[:, slot] = np.nan
+        self._apart[slot] = self._frames[slot] = 0.0
 
     def update(self, windows: BodyWindows | None, history: History) -> None:
         """Take in what HG-VAE makes of the newest windows."""
@@ -75,30 +82,30 @@ class Denoise:
         self._found[:, slots] = np.where(np.isnan(before), latest, renewed)
 
     def denoised(self, smoothed: Smoothed, history: History, jitter: Floats, back: int) -> Smoothed:
-        """The smoother's estimate of the frame ``back`` before the newest, denoised; ``jitter`` (S,) as of now."""
+        """The smoother's estimate of the frame ``back`` before the newest, denoised; frames are to be given in order.
+
+        The weights are those of least variance for two estimates of which the second holds the share `NOISE_LEFT` of
+        the first one's noise and an error of its own. That error is what its distance to the first one shows beyond
+        noise, in this joint and of late (innovations, as in adaptive Kalman filters: Mehra 1970): motion that HG-VAE
+        has never seen takes its belief away. Noise is what jumps from frame to frame, ``jitter`` (S,) metres as of
+        now: of an error that lasts, HG-VAE keeps all.
+        """
         found = self._found[-1 - back]
         seen = np.isfinite(history.positions[-1 - back][..., 0])
         # in a frame that was lost whole, the answer must not jump to the smoother's
         seen |= ~seen.any(axis=1, keepdims=True)
         known = seen & np.isfinite(found[..., 0] + smoothed.sigma)
-        # `smoothed.sigma` takes noise to be what the smoother assumes, or more if more was found
-        relative = jitter / self._jitter_sigma
-        share = _share(np.where(known, smoothed.sigma, 0.0) * (relative / np.maximum(relative, 1.0))[:, None])
         moved = np.where(known[..., None], found - smoothed.positions, 0.0)
+        square = np.square(moved).mean(axis=-1)
+        self._frames += known
+        self._apart += known * (square - self._apart) / np.clip(self._frames, 1, MEMORY)
+        gained = (1.0 - NOISE_LEFT) * np.square(np.where(known, np.minimum(smoothed.sigma, jitter[:, None]), 0.0))
+        own = np.maximum(np.maximum(self._apart, square / SUDDEN) - gained, MODEL_SIGMA**2)
+        share = gained / (gained + own)
         return smoothed._replace(
             positions=smoothed.positions + share[..., None] * moved,
             sigma=smoothed.sigma * np.sqrt(1.0 - share * (1.0 - NOISE_LEFT)),
         )
-
-
-def _share(sigma: Floats) -> Floats:
-    """How far to go to HG-VAE's place (S, 22), of joints that the smoother knows to ``sigma`` (S, 22) metres; 0 at 0.
-
-    The weights are those of least variance for two estimates of which the second holds the share `NOISE_LEFT` of
-    the first one's noise and an error of its own, `MODEL_SIGMA`.
-    """
-    gained = (1.0 - NOISE_LEFT) * sigma**2
-    return gained / (gained + MODEL_SIGMA**2)
 
 
 @njit(cache=True)

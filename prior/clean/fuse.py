@@ -11,9 +11,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import JointState
-from steadypose.prior.body.inverse_kinematics import fit_pose, place_joints, solve_pose
+from steadypose.prior.body.inverse_kinematics import RIGID, fit_lengths, place_joints, solve_pose
 from steadypose.prior.body.skeleton import PARENT, PARENTS
 from steadypose.prior.clean.frame import Bools, Estimate, Floats, Imputed, Person
+from steadypose.prior.clean.slow_error import SlowError
 from steadypose.prior.timing.fixed_lag import Smoothed
 
 
@@ -34,9 +35,12 @@ class FuseSettings:
     fade: float = 3.0
 
 
-_MOST_MOBILE = 3.0
+_MOST_MOBILE = 1e4
 """Times the variance of the best-known joint, at most, by which the fit to the bones lets a joint yield: one that
 yields without resistance no longer says where it was, and the fit needs many more sweeps."""
+
+_RENEWAL = 0.03
+"""Of the way to what the newest frame says of it, a frame, that the correction of the slow error goes: it is slow."""
 
 _COASTING = 4.0
 """Times: the standard deviation of a smoother that coasts, beside what is imputed. It holds that a joint goes on as it
@@ -73,32 +77,38 @@ class Precision(NamedTuple):
 
 
 class Fuse:
-    """Joins a fixed-lag smoother of what was seen with the rotations that the prior decoded for the rest.
+    """Joins the joints seen with what the prior says of the hidden ones.
 
-    The prior's body is solved from the joints well seen; others are where HG-VAE completes the body or, without it,
-    hang from those seen in the rotations decoded. Each joint
-    is the mean of smoother and body, weighted by their precisions: one well seen stays near the observation, one
-    hidden follows the prior as the smoother's uncertainty grows. Of the poses on the person's bones, the one nearest
-    to that mean is the answer: lengths are constant, and positions and rotations agree.
+    A joint that is seen stays where smoothing and denoising have it, but for the sensor's slow error, as far as the
+    stream shows that there is one: the pose nearest to what is seen on the person's bones tells of it, and the joint
+    follows slowly. Hidden joints are where HG-VAE completes the body or, without it, hang from those seen in the
+    rotations decoded; smoother and completion are weighed by their precisions, and the person's bones hold.
     """
 
-    def __init__(self, settings: FuseSettings, bias_sigma: float) -> None:
-        self._settings, self._bias_sigma = settings, bias_sigma
+    def __init__(self, settings: FuseSettings, slots: int) -> None:
+        self._settings = settings
+        self._correction = np.zeros((slots, len(PARENTS), 3))
+
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
+        self._correction[slot] = 0.0
 
     def fuse(
         self,
         smoothed: Smoothed,
         person: Person,
+        slow_error: SlowError,
         rotations: Floats,
         imputed: Imputed | None,
         unseen_s: Floats,
         present: Bools,
     ) -> Estimate:
-        """The estimate of one frame.
+        """The estimate of one frame; frames are to be given in order.
 
         Args:
             smoothed: what smoother and denoising make of the joints seen.
             person: on whose bones.
+            slow_error: of the sensor, as found so far.
             rotations: (S, 22, 3, 3) local, of the body as far as it is not seen.
             imputed: (S, 22, 3) and (S, 22), that frame as HG-VAE completes it; None without it.
             unseen_s: (S, 22) seconds for which each joint had not been seen by then.
@@ -106,11 +116,10 @@ class Fuse:
         """
         s = self._settings
         slots, count = np.flatnonzero(present), len(present)
-        offsets, decoded = person.offsets[slots], rotations[slots]
-        seen, deviation = smoothed.positions[slots], smoothed.sigma[slots]
-        unseen = unseen_s[slots]
+        offsets, decoded, bias = person.offsets[slots], rotations[slots], slow_error.bias_sigma[slots]
+        seen, deviation, unseen = smoothed.positions[slots], smoothed.sigma[slots], unseen_s[slots]
         held_s = _least_below(unseen)
-        precision = Precision(*_weigh(deviation, held_s, self._bias_sigma, s.prior_sigma, s.prior_drift, s.fade))
+        precision = Precision(*_weigh(deviation, held_s, bias, s.prior_sigma, s.prior_drift, s.fade))
         body, fitted = place_joints(decoded, offsets), decoded
         well = _lay_over(body, seen, precision)
         if s.enabled:
@@ -119,11 +128,14 @@ class Fuse:
             body = np.where(np.isfinite(well[:, :1, :1]), hung, body)
             if imputed is not None:
                 completed, sigma = imputed.positions[slots], imputed.sigma[slots]
-                _complete(body, completed, sigma, seen, deviation, unseen, self._bias_sigma, precision)
-            mobility = _join(body, seen, precision)
-            fitted, body, offsets = fit_pose(body, offsets, mobility, decoded, person.length_variance[slots])
+                _complete(body, completed, sigma, seen, deviation, unseen, bias, precision)
+            # of a frame that was lost whole, the smoother knows more
+            here = (unseen <= unseen.min(axis=1, keepdims=True)) & np.isfinite(deviation)
+            variance = _join(body, seen, here, precision)
+            body = self._on_bones(slots, body, here, variance, bias, person, slow_error)
+            fitted = solve_pose(body, offsets, decoded)[0]
         placed = np.isfinite(deviation).any(axis=1)
-        state, sigma = _states(unseen, held_s, s.fade), _stated(unseen, precision)
+        state, sigma = _states(unseen, held_s, s.fade), _stated(unseen, deviation, precision)
         return Estimate(
             stamp_s=smoothed.stamp_s,
             positions=_scatter(count, slots[placed], body[placed], np.nan),
@@ -132,6 +144,35 @@ class Fuse:
             sigma=_scatter(count, slots[placed], sigma[placed], np.inf),
             state=_scatter(count, slots[placed], state[placed], JointState.UNKNOWN).astype(np.uint8),
         )
+
+    def _on_bones(
+        self,
+        slots: NDArray[np.intp],
+        body: Floats,
+        here: Bools,
+        variance: Floats,
+        bias: Floats,
+        person: Person,
+        slow_error: SlowError,
+    ) -> Floats:
+        """(B, 22, 3): seen joints (B, 22) ``here`` less the slow error; the others on the bones beside them."""
+        offsets = person.offsets[slots]
+        length_variance = slow_error.length_variance[slots] + _of_rigid(person.length_variance[slots])
+        slow = np.maximum(bias[:, None] ** 2, _LEAST_VARIANCE)
+        mobility = np.where(here, slow, np.clip(variance, slow, _MOST_MOBILE * slow))
+        wanted = fit_lengths(body, offsets, mobility, length_variance) - body
+        correction = self._correction[slots]
+        correction += _RENEWAL * np.where(here[..., None], wanted - correction, 0.0)
+        self._correction[slots] = correction
+        body = body + np.where(here[..., None], correction, wanted)
+        return fit_lengths(body, offsets, np.where(here, _LEAST_VARIANCE, mobility), length_variance)
+
+
+def _of_rigid(length_variance: Floats) -> Floats:
+    """(B, R) of `RIGID`, of what is of bones (B, 22): what is rigid across two bones varies by both."""
+    end, start = RIGID.T
+    across = np.where(PARENT[end] == start, 0.0, length_variance[:, start])
+    return length_variance[:, end] + across
 
 
 def _scatter(slots: int, rows: NDArray[np.intp], values: NDArray[Any], fill: float) -> NDArray[Any]:
@@ -174,7 +215,7 @@ def _weigh(deviation, held_s, bias_sigma, prior_sigma, prior_drift, fade):
     for row in range(len(deviation)):
         for joint in range(deviation.shape[1]):
             drift = prior_drift * min(held_s[row, joint], fade)
-            seen[row, joint] = _inverse(deviation[row, joint] ** 2 + bias_sigma**2)
+            seen[row, joint] = _inverse(deviation[row, joint] ** 2 + bias_sigma[row] ** 2)
             prior[row, joint] = _inverse(prior_sigma**2 + drift**2)
     return seen, prior
 
@@ -228,31 +269,33 @@ def _complete(body, completed, sigma, seen, deviation, unseen_s, bias_sigma, pre
                     off[axis] += weight * (seen[row, other, axis] - completed[row, other, axis])
             for axis in range(3):
                 body[row, joint, axis] = completed[row, joint, axis] + off[axis] / max(total, 1e-12)
-            precision.prior[row, joint] = _inverse(sigma[row, joint] ** 2 + bias_sigma**2)
-            precision.seen[row, joint] = _inverse((_COASTING * deviation[row, joint]) ** 2 + bias_sigma**2)
+            precision.prior[row, joint] = _inverse(sigma[row, joint] ** 2 + bias_sigma[row] ** 2)
+            precision.seen[row, joint] = _inverse((_COASTING * deviation[row, joint]) ** 2 + bias_sigma[row] ** 2)
 
 
 @njit(cache=True)
-def _join(body, seen, precision):
-    """Puts every joint at the mean of smoother and body, and gives its mobility (S, 22) for the fit to the bones."""
+def _join(body, seen, here, precision):
+    """Puts joints ``here`` (S, 22) where they were seen, others at the mean of smoother and body, of which it gives the
+    variance (S, 22)."""
     variance = 1.0 / (precision.seen + precision.prior)
     for row in range(len(body)):
         for joint in range(body.shape[1]):
             if precision.seen[row, joint] > 0.0:
-                share = precision.seen[row, joint] * variance[row, joint]
+                share = 1.0 if here[row, joint] else precision.seen[row, joint] * variance[row, joint]
                 for axis in range(3):
                     body[row, joint, axis] += share * (seen[row, joint, axis] - body[row, joint, axis])
-        variance[row] = np.minimum(variance[row], _MOST_MOBILE * variance[row].min())
     return variance
 
 
 @njit(cache=True)
-def _stated(unseen_s, precision):
+def _stated(unseen_s, deviation, precision):
     """(S, 22) standard deviations. Of a joint not seen, smoother and prior know the same past: what one says does not
     make the other surer."""
     sigma = np.empty_like(unseen_s)
     for row in range(len(sigma)):
         for joint in range(sigma.shape[1]):
-            seen, prior = precision.seen[row, joint], precision.prior[row, joint]
-            sigma[row, joint] = 1.0 / math.sqrt(max(seen, prior) if unseen_s[row, joint] > 0.0 else seen + prior)
+            if unseen_s[row, joint] == 0.0 and np.isfinite(deviation[row, joint]):
+                sigma[row, joint] = deviation[row, joint]
+            else:
+                sigma[row, joint] = 1.0 / math.sqrt(max(precision.seen[row, joint], precision.prior[row, joint]))
     return sigma

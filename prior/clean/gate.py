@@ -44,6 +44,7 @@ _JUMP_NOISES = 7.0  # times the noise: one sighting in a thousand is further fro
 _LEAST_BONE, _BONE_NOISES = 0.1, 4.0  # metres, and times the noise, by which even a short bone may differ
 _NOISE_MEMORY = 15  # frames
 _DISTANCE_OF_NOISE = 2.6  # median distance to the expectation of white noise of 1 along each axis, by this filter
+_OWN_MEMORY, _OWN_TIMES = 9, 3.0  # frames in which a joint shows how far from expected it comes, and times that
 _BODY_JUMP = 0.5  # if more of the joints jump at once, the body did (a new track, a gap), not the joints
 
 
@@ -60,6 +61,7 @@ class Gate:
         self._filter = FixedLagRTS(0, acceleration_density=8.0, measurement_sigma=0.015)
         self._observed = Ring(RECENT + 1, (slots, 22, 3))
         self._jitter = np.zeros(slots)
+        self._own = np.zeros((slots, 22))
         self._frames = np.zeros(slots, dtype=np.int64)
         self._refused = np.zeros((slots, 22))
         self._swapped = np.zeros((slots, len(_EXCHANGED)))
@@ -71,6 +73,7 @@ class Gate:
         self._filter.forget(np.repeat(slot[:, None], 22, axis=1))
         self._observed.clear(slot)
         self._jitter[slot] = 0.0
+        self._own[slot] = 0.0
         self._frames[slot] = 0
         self._refused[slot] = 0
         self._swapped[slot] = 0
@@ -104,7 +107,9 @@ class Gate:
             self._exchange(positions, expected.positions, known)
             distance = _apart(positions, expected.positions)
         seen = np.isfinite(positions[..., 0])
-        least = np.maximum(s.jump, _JUMP_NOISES * self._jitter)[:, None]
+        # a limb thrown about comes far from where it was expected all the time, a joint that jumps once
+        least = np.maximum(np.maximum(s.jump, _JUMP_NOISES * self._jitter)[:, None], _OWN_TIMES * self._own)
+        self._own += np.where(seen & known, distance - self._own, 0.0) / _OWN_MEMORY
         jumped = seen & known & (distance > least + 3 * expected.sigma)
         everywhere = jumped.sum(axis=1) > _BODY_JUMP * np.maximum((seen & known).sum(axis=1), 1)
         self._expect_anew(everywhere[:, None] & jumped)

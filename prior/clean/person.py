@@ -8,7 +8,7 @@ import numpy as np
 
 from steadypose.prior.body.bone_lengths import estimate_bones
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.clean.frame import Bools, Person
+from steadypose.prior.clean.frame import Bools, Floats, Person
 from steadypose.prior.timing.fixed_lag import Smoothed
 
 
@@ -45,8 +45,8 @@ class PersonEstimator:
         current: the bones as of the last frame.
     """
 
-    def __init__(self, settings: PersonSettings, bias_sigma: float, slots: int) -> None:
-        self._settings, self._bias_sigma = settings, bias_sigma
+    def __init__(self, settings: PersonSettings, slots: int) -> None:
+        self._settings = settings
         self._samples = np.full((slots, settings.samples, 22, 3), np.nan)
         self._target = np.zeros((slots, 22, 3))
         self._target_variance = np.zeros((slots, 22))
@@ -67,8 +67,14 @@ class PersonEstimator:
             before.measured & ~slot,
         )
 
-    def update(self, smoothed: Smoothed | None, present: Bools) -> Person:
-        """Sample the newest estimate of the bodies ``present`` (S,), where it is due, and renew the bones."""
+    def update(self, smoothed: Smoothed | None, bias_sigma: Floats, present: Bools) -> Person:
+        """Sample the newest estimate of the bodies ``present`` (S,), where it is due, and renew the bones.
+
+        Args:
+            smoothed: joints and their standard deviations; None while there is none.
+            bias_sigma: (S,) metres along an axis, the sensor's slow error as found so far.
+            present: (S,) who is there.
+        """
         if not self._settings.enabled or smoothed is None:
             return self.current
         # Smoothed, for noise makes bones longer.
@@ -92,7 +98,7 @@ class PersonEstimator:
             count = self._used[slot] = self._count[slot]
             noise = float(np.median(smoothed.sigma[slot, known[slot]]))
             self._target[slot], self._target_variance[slot] = estimate_bones(
-                self._samples[slot, :count], self._bias_sigma, noise, self._settings.samples
+                self._samples[slot, :count], float(bias_sigma[slot]), noise, self._settings.samples
             )
             measured[slot] = count >= _ENOUGH_SAMPLES
             if count == 1:

@@ -20,6 +20,9 @@ from steadypose.prior.clean.score import ScoreSettings
 from steadypose.prior.clean.smooth import SmoothSettings
 from steadypose.prior.settings import build_settings
 
+JITTER_SIGMA = 0.02
+"""Metres along an axis, of a joint seen with full confidence: what networks are told before noise is found."""
+
 
 @dataclass(frozen=True)
 class PriorSettings:
@@ -31,9 +34,8 @@ class PriorSettings:
         max_bodies: bodies followed at once.
         timeout: seconds without a sighting after which a body is dropped, and without a frame after which the
             stream starts anew.
-        bias_sigma: metres along an axis, the sensor's slow error, which no filter averages out: the less of it, the
-            more bones are measured rather than taken from human proportions, and the surer joints are said to be.
-            Depth cameras have 2 cm or more, marker-based motion capture next to none.
+        bias_sigma: metres along an axis, the sensor's slow error, which no filter averages out, as far as it is to be
+            expected before the stream shows what it is. Depth cameras have 2 cm or more.
         identify: who tells bodies apart: the source (the default), or the prior.
         gate, correct, smooth, encode, denoise, bones, score, impute, refine, fuse: settings of the stages.
     """
@@ -57,7 +59,7 @@ class PriorSettings:
     @property
     def noise(self) -> SensorNoise:
         """What the sensor is off by."""
-        return SensorNoise(self.smooth.measurement_sigma, self.bias_sigma)
+        return SensorNoise(JITTER_SIGMA, self.bias_sigma)
 
     @classmethod
     def from_dict(cls, settings: Mapping[str, Any]) -> PriorSettings:

