@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.progress import track
 from scipy.spatial.transform import Rotation
 
+from steadypose.benchmarks.provenance import require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.msgs.types import Pose
 from steadypose.prior.camera.calibration import (
@@ -165,6 +166,7 @@ def depth_points(pose: Pose, rng: np.random.Generator) -> Floats:
 
 def main(args: Args) -> None:
     """Measure, print, write."""
+    require_committed(args.out)
     console, rng = Console(), np.random.default_rng(1)
     looks = rays(LENS, finer=2)
     views = [corners_of(pose, looks, rng) for pose, _ in zip(held_poses(rng), range(args.views), strict=False)]
@@ -193,7 +195,7 @@ def main(args: Args) -> None:
     }
     table = _table(found, lens, missed)
     show(table, console)
-    console.print(f"wrote {save('calibration', sys.argv[1:], [table], data, args.out)}")
+    console.print(f"wrote {save('calibration', sys.argv[1:], [table], data, args.out, measured=())}")
 
 
 def _table(found: dict[str, list[tuple[float, float]]], lens: Intrinsics, missed: int) -> Table:

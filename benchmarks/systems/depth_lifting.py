@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import track
 from scipy.spatial.transform import Rotation
 
+from steadypose.benchmarks.provenance import require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.camera.depth_lifting import lift
@@ -160,6 +161,8 @@ def measure(scenes: list[Picture], lifter: Lifter, noise: float, seed: int = 1) 
 
 def main(args: Args) -> None:
     """Measure, print, write."""
+    if args.out or not args.quick:
+        require_committed(args.out or RESULTS)
     console = Console()
     rows, figures = [], []
     for distance in DISTANCES:
@@ -181,7 +184,7 @@ def main(args: Args) -> None:
     show(table, console)
     if args.out or not args.quick:
         data: dict[str, Any] = {"depth_lifting": figures}
-        console.print(f"wrote {save('depth_lifting', sys.argv[1:], [table], data, args.out or RESULTS)}")
+        console.print(f"wrote {save('depth_lifting', sys.argv[1:], [table], data, args.out or RESULTS, measured=())}")
 
 
 def _row(name: str, distance: float, noise: float, found: dict[str, float]) -> list[str]:

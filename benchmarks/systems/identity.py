@@ -23,6 +23,7 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.provenance import require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.msgs.types import PoseRaw, PoseWorld
 from steadypose.prior.body.layouts import get_skeleton, to_canonical
@@ -206,6 +207,7 @@ def _streams(args: Args) -> Iterator[tuple[str, str, list[Frame]]]:
 
 def main(args: Args) -> None:
     """Measure, print, write."""
+    require_committed(args.out)
     results: list[dict[str, Any]] = []
     for scene, name, frames in track(_streams(args), total=1 + 2 * args.crossings, description="crossings"):
         for method, start in METHODS.items():
@@ -213,7 +215,8 @@ def main(args: Args) -> None:
     console = Console()
     table = _table(results)
     show(table, console)
-    console.print(f"wrote {save('identity', sys.argv[1:], [table], {'streams': results}, args.out)}")
+    path = save("identity", sys.argv[1:], [table], {"streams": results}, args.out, measured=("settings",))
+    console.print(f"wrote {path}")
 
 
 def _table(results: list[dict[str, Any]]) -> Table:

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.interpolate import CubicSpline
 
+from steadypose.benchmarks.provenance import require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import Skeleton, to_canonical
@@ -85,6 +86,7 @@ class Difference(NamedTuple):
 
 def main(args: Args) -> None:
     """Read, compare, print, and write the results."""
+    require_committed(args.results)
     motions, families = read(args.mocap)
     groups: dict[str, list[Difference]] = {}
     for other, kept in REPEATS.items():
@@ -94,7 +96,7 @@ def main(args: Args) -> None:
     console = Console()
     for table in tables:
         show(table, console)
-    console.print(f"wrote {save('importers', sys.argv[1:], tables, {}, args.results)}")
+    console.print(f"wrote {save('importers', sys.argv[1:], tables, {}, args.results, measured=())}")
 
 
 def read(mocap: Path) -> tuple[dict[str, Floats], dict[str, str]]:

@@ -27,6 +27,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.provenance import require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.benchmarks.running import START_S, running
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
@@ -166,6 +167,8 @@ def percentiles(values: ArrayLike) -> dict[str, float]:
 
 def main(args: Args) -> None:
     """Measure, print, write."""
+    if args.out or not args.quick:
+        require_committed(args.out or RESULTS)
     console = Console()
     one_thread()
     seconds = 10.0 if args.quick else args.seconds

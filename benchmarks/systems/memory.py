@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.provenance import require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.benchmarks.running import running
 from steadypose.msgs.types import Diagnostics
@@ -62,6 +63,8 @@ def growth(samples: list[tuple[float, float]], hours: float) -> dict[str, float]
 
 def main(args: Args) -> None:
     """Measure, print, write."""
+    if args.out or not args.quick:
+        require_committed(args.out or RESULTS)
     console = Console()
     with Progress(console=console) as progress:
         result = memory(args.recording, 0.05 if args.quick else args.hours, progress)

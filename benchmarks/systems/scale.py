@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.provenance import require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.benchmarks.systems.latency import WARM_UP, crowd, percentiles
 from steadypose.msgs.recording import RecordingReader
@@ -110,6 +111,8 @@ def clean_rate(recording: Path) -> dict[str, float]:
 
 def main(args: Args) -> None:
     """Measure, print, write."""
+    if args.out or not args.quick:
+        require_committed(args.out or RESULTS)
     console = Console()
     one_thread()
     periods = round((2.0 if args.quick else args.seconds) * 30)

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.metrics import acceleration_error, contact_speed, length_variation, position_error
+from steadypose.benchmarks.provenance import require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.msgs.types import CONTACTS, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.commands.cleaning import stream
@@ -253,6 +254,8 @@ def tune(
 
 def main(args: Args) -> None:
     """Run, measure, print, write."""
+    if args.out or not args.quick:
+        require_committed(args.out or RESULTS)
     console = Console()
     one_thread()
     paths = sorted(path.parent for path in args.streams.glob("*/metadata.yaml"))
