@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import roma
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from steadypose.prior.body.skeleton import MIRROR
-from steadypose.prior.models.weights_io import LICENCES
+from steadypose.prior.motion.datasets import WeightSet
 from steadypose.prior.timing.rate import FPS
 
 
@@ -56,8 +57,8 @@ class MotionSet:
             FileNotFoundError: no such file.
             ValueError: no clip of this split in it, or no such set.
         """
-        if weights not in LICENCES:
-            raise ValueError(f"weights: expected one of {', '.join(LICENCES)}, got {weights!r}")
+        if weights not in get_args(WeightSet):
+            raise ValueError(f"weights: expected one of {', '.join(get_args(WeightSet))}, got {weights!r}")
         if not path.is_file():
             raise FileNotFoundError(f"no prepared motion at {path}: make it with 'steadypose prepare MOCAP --out DIR'")
         data = np.load(path)
