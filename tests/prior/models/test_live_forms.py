@@ -1,0 +1,79 @@
+"""The live forms of the small networks are the trained ones: random weights, random inputs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tests.prior.models.test_hgvae import awake
+
+from steadypose.prior.models.hgvae.completion_inference import LiveCompletion
+from steadypose.prior.models.hgvae.config import FaultNetConfig
+from steadypose.prior.models.hgvae.fault_features import fault_features
+from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
+from steadypose.prior.models.hgvae.faults import FaultNet
+from steadypose.prior.models.sensor_bias.features import FEATURES, CorrectionConfig
+from steadypose.prior.models.sensor_bias.inference import LiveCorrection
+from steadypose.prior.models.sensor_bias.network import CorrectionNet
+from steadypose.prior.models.torch_weights import arrays_of
+
+SEEDS = pytest.mark.parametrize("seed", range(5))
+
+
+def randomised(network: torch.nn.Module, seed: int) -> None:
+    """Every weight counts: as they begin, biases and residual branches are zero."""
+    torch.manual_seed(seed)
+    for name, tensor in network.state_dict().items():
+        torch.nn.init.normal_(tensor, std=0.3)
+        if "adjacency" in name or "weight" in name:
+            tensor /= tensor.shape[-1] ** 0.5
+
+
+@SEEDS
+def test_completion(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model = awake(seed=seed)
+    assert model.completion is not None
+    deviations = rng.normal(scale=0.3, size=(4, 66, 12)).astype(np.float32)
+    observed = (rng.random((4, 66, 12)) < 0.8) * rng.uniform(0.1, 1.0, (4, 66, 12))
+    observed[0] = 1.0  # a whole window, which it leaves alone
+    observed[1, 30:36] = 0.0  # joints never seen
+    observed[2, :, 5:] = 0.0
+    torched = torch.from_numpy(deviations), torch.from_numpy(observed).float()
+    expected, expected_belief = model.completed(*torched, 0.01)
+    completed = deviations.copy()
+    assert model.config.completion is not None
+    live = LiveCompletion(model.config.completion, arrays_of(model.completion), 0.01, max_batch=5)
+    believed = live.complete(completed, observed)
+    np.testing.assert_allclose(completed, expected.numpy(), atol=2e-6)
+    np.testing.assert_allclose(believed, expected_belief.numpy(), atol=2e-6)
+    assert (completed[0] == deviations[0]).all()
+
+
+@SEEDS
+def test_faults(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    config = FaultNetConfig(frames=20, features=8)
+    network = FaultNet(config).eval()
+    randomised(network, seed)
+    x, found = rng.normal(scale=0.3, size=(2, 3, 66, 20))
+    sigma, observed = rng.uniform(0.002, 0.1, (3, 66, 20)), (rng.random((3, 66, 20)) < 0.8).astype(float)
+    features = fault_features(x, found, sigma, observed, 0.02, network.mean.numpy().astype(np.float64))
+    with torch.inference_mode():
+        expected = network(torch.from_numpy(features)).numpy()
+    live = LiveFaultNet(config, arrays_of(network), 0.02, max_batch=4)
+    np.testing.assert_allclose(live(x, found, sigma, observed), expected, atol=1e-5 * np.abs(expected).max())
+
+
+@SEEDS
+def test_sensor_correction(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    network = CorrectionNet(CorrectionConfig(hidden=16)).eval()
+    randomised(network, seed)
+    network.scale.abs_().add_(0.1)
+    features = rng.normal(size=(3, FEATURES))
+    features[rng.random(features.shape) < 0.1] = np.nan  # of missing joints
+    with torch.inference_mode():
+        expected = network(torch.from_numpy(features).float()).numpy()
+    live = LiveCorrection(arrays_of(network), max_batch=4)(features)
+    np.testing.assert_allclose(live, expected, atol=1e-5 * np.abs(expected).max())
