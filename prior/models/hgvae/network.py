@@ -149,15 +149,15 @@ class HGVAE(nn.Module):
         for up, block in zip(self.up, self.encoder, strict=True):
             graph = block(up(graph))
             found.append(graph)
-        stream = self.start[:, None].expand(-1, len(x), -1)
+        stream = self.start[:, None].expand(-1, x.shape[0], -1)
         kl, log_prior, top = [], [], None
         off = len(self.down) - (len(self.down) if self.config.stochastic is None else self.config.stochastic)
         for k, (level, seen) in enumerate(zip(self.decoder_levels, reversed(found), strict=True)):
             prior = level.prior(stream)
             if k < off:
                 stream = level.add(stream, prior.mean, action)
-                kl.append(x.new_zeros(len(x)))
-                log_prior.append(x.new_zeros(len(x)))
+                kl.append(x.new_zeros(x.shape[0]))
+                log_prior.append(x.new_zeros(x.shape[0]))
                 continue
             posterior = level.posterior(stream, seen)
             kl.append(posterior.kl(prior).sum(dim=(0, 2)))
@@ -167,7 +167,7 @@ class HGVAE(nn.Module):
             stream = level.add(stream, posterior.mean if spread is None else posterior.sample(spread), action)
         tracks = self._decode(stream)
         if top is None:
-            top = x.new_zeros(len(x), self.config.levels[0].latent)
+            top = x.new_zeros(x.shape[0], self.config.levels[0].latent)
         return Pass(tracks, torch.stack(kl, dim=1), torch.stack(log_prior, dim=1), top)
 
     def generate(

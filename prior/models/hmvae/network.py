@@ -132,7 +132,7 @@ class HMVAE(MotionVAE):
             features = conv(unpool(features))
             if k > 0:
                 features = F.leaky_relu(features, SLOPE)
-        return features.transpose(1, 2).reshape(len(features), self.config.window, -1, ROTATION_FEATURES)
+        return features.transpose(1, 2).reshape(features.shape[0], self.config.window, -1, ROTATION_FEATURES)
 
 
 def _join_edges(a: Tensor, b: Tensor, channels: int) -> Tensor:

@@ -1,0 +1,88 @@
+"""Each network of the prior as its ONNX file has it: from what a sensor shows to what the live form answers."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from steadypose.prior.models.hgvae.completion import belief
+from steadypose.prior.models.hgvae.config import SCALE
+from steadypose.prior.models.hgvae.faults import FaultNet
+from steadypose.prior.models.hgvae.network import HGVAE
+from steadypose.prior.models.hmvae.network import HMVAE
+from steadypose.prior.models.onnx.torch_features import (
+    completion_features,
+    correction_features,
+    fault_features,
+    hang_unseen,
+    trunk_frame,
+)
+from steadypose.prior.models.root_velocity.network import TrajectoryNet
+from steadypose.prior.models.sensor_bias.network import CorrectionNet
+
+
+class Refinement(nn.Module):
+    """`LiveHMVAE`: windows (B, 8, 22, 6) of local rotations to the same, decoded."""
+
+    def __init__(self, network: HMVAE) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, rotations: Tensor) -> Tensor:
+        return self.network.reconstruct(rotations)
+
+
+class Reconstruction(nn.Module):
+    """`LiveHGVAE.reconstruct`: tracks, confidence (B, 66, T) and bias_sigma (B,) to mean and sigma (B, 66, T)."""
+
+    def __init__(self, network: HGVAE) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, tracks: Tensor, confidence: Tensor, bias_sigma: Tensor) -> tuple[Tensor, Tensor]:
+        origin, completion = self.network.mean[:, None], self.network.completion
+        deviations = hang_unseen((tracks - origin) / SCALE)
+        seen = confidence > 0
+        believed = seen.float()
+        if completion is not None:
+            features = completion_features(deviations, confidence, bias_sigma, completion.config.patch)
+            correction, log_var = completion(*features)
+            deviations = torch.where(seen, deviations, deviations + correction)
+            believed = belief(confidence, log_var)
+        found = self.network(deviations, believed).tracks
+        return found.mean * SCALE + origin, (0.5 * found.log_var).exp() * SCALE
+
+
+class Faults(nn.Module):
+    """`LiveFaultNet`: tracks, those of HG-VAE, and confidence (B, 66, T), sensor_sigma (B,) to odds (B, 22)."""
+
+    def __init__(self, network: FaultNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, tracks: Tensor, mean: Tensor, sigma: Tensor, confidence: Tensor, sensor_sigma: Tensor) -> Tensor:
+        return self.network(fault_features(tracks, mean, sigma, confidence, sensor_sigma, self.network.mean))
+
+
+class RootMotion(nn.Module):
+    """`LiveRootVelocity`: joints (B, context, 22, 3) to the newest frame's velocity, log_sigma, contact_logits."""
+
+    def __init__(self, network: TrajectoryNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        velocity, log_sigma, contact_logits = (part[:, -1] for part in self.network(joints))
+        return velocity, log_sigma, contact_logits
+
+
+class Correction(nn.Module):
+    """`LiveCorrection`, turned into the world: history (B, H, 22, 3), camera (B, 3) to correction (B, 22, 3)."""
+
+    def __init__(self, network: CorrectionNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, history: Tensor, camera: Tensor) -> Tensor:
+        frame = trunk_frame(history[:, 0])
+        return self.network(correction_features(history, camera, frame)) @ frame.transpose(1, 2)
