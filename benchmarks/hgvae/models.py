@@ -106,33 +106,28 @@ def train(
     model.mean.copy_(mean_tracks(windows, config.frames, count=500))
     optimiser = torch.optim.Adam(model.parameters(), lr=rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-    run = TrainingRun(
-        directory, {"model": model, "optimiser": optimiser, "schedule": schedule}, steps, every=max(steps // 8, 1)
-    )
-    losses: dict[str, float] = {}
-    for step in run.steps(lambda: losses):
-        rng = run.random(seed=0)
+    run = TrainingRun(directory, model, schedule, steps, evaluations=8)
+    entries = JOINT_NODES * config.frames
+
+    def loss_of(count: int, done: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
         action = None
         if isinstance(windows, ActionWindows):
-            positions, sizes, actions = windows.draw_actions(batch, config.frames, rng)
+            positions, sizes, actions = windows.draw_actions(count, config.frames, rng)
             action = one_hot(actions, config.actions)
         else:
-            positions, sizes = windows.draw(batch, config.frames, rng)
+            positions, sizes = windows.draw(count, config.frames, rng)
         whole = Batch.of(model, positions, positions, sizes)
-        drawn = model(whole.x, whole.believed, spread=torch.ones(batch, 1), action=action)
+        drawn = model(whole.x, whole.believed, spread=torch.ones(count, 1), action=action)
         if least_sigma:
             log_var = drawn.tracks.log_var.clamp(min=2 * math.log(least_sigma / SCALE))
             drawn = drawn._replace(tracks=drawn.tracks._replace(log_var=log_var))
         likelihood, kl = evidence(drawn, whole.target)
-        beta = min(0.001 + step / (0.2 * steps), 1.0)
-        loss = (beta * kl - likelihood).mean()
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), CLIP_ENTRY * whole.x[0].numel() ** 0.5)
-        optimiser.step()
-        schedule.step()
-        losses.update({"ELBO": (likelihood - kl).mean().item() / whole.x[0].numel(), "KL": kl.mean().item()})
-    return model.eval()
+        beta = min(0.001 + done / 0.2, 1.0)
+        terms = {"ELBO": (likelihood - kl).mean().item() / entries, "KL": kl.mean().item()}
+        return (beta * kl - likelihood).mean(), terms
+
+    run.minimise(loss_of, dict, batch, seed=0, clip=CLIP_ENTRY * entries**0.5)
+    return model
 
 
 def draw_tops(top: NDArray[np.float64], actions: NDArray[np.intp], wanted: NDArray[np.intp], seed: int) -> Tensor:

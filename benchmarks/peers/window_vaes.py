@@ -145,4 +145,4 @@ def trained(name: str, frames: int, train: MotionSet, val: MotionSet, runs: Path
     model = MODELS[name](CONFIGS[frames])
     directory = runs / f"{name.lower()}-{frames}-{steps}"
     fit(model, train, val, directory, steps, FRAMES_A_STEP // frames, _LEARNING_RATE, _STRIDES[frames], seed=0)
-    return model.eval()
+    return model

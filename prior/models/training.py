@@ -1,38 +1,49 @@
-"""What every training shares: resumable checkpoints, a progress bar, and curves drawn as it goes."""
+"""The training loop of every model: it minimises a loss, resumably, with a progress bar and curves drawn as it goes."""
 
 from __future__ import annotations
 
 import json
+import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from torch import nn
-from torch.optim import Optimizer
+from torch import Tensor, nn
+from torch.optim.lr_scheduler import LRScheduler
 
-from steadypose.prior.models.distributed import average_gradients, from_first, processes, rank, writes
+from steadypose.prior.models.distributed import average_gradients, from_first, processes, rank, share, writes
 from steadypose.prior.models.torch_weights import save_weights
+
+Loss = Callable[[int, float, np.random.Generator], tuple[Tensor, dict[str, float]]]
+"""Of a random batch: how many samples to draw, the share of the training that is done, in [0, 1), and random numbers to
+draw them by, which torchrun's processes do not share; to what is to be minimised, and the terms to plot."""
 
 
 class TrainingRun:
     """A training that survives being killed: its state lies in ``directory/checkpoint.pt``.
 
-    Under torchrun, all processes start from the state of the first, which alone writes and evaluates, and the
-    gradients of every optimiser in ``state`` are averaged before it steps.
+    Under torchrun, all processes start from the state of the first, which alone writes and evaluates; each draws its
+    share of a batch, and gradients are averaged before the optimiser steps.
 
     Args:
         directory: where checkpoints, ``curves.json`` and ``curves.png`` go; a checkpoint there is resumed.
-        state: what to save and restore by ``state_dict`` / ``load_state_dict`` (model, optimiser, schedule).
+        model: all that is learned or follows from it: averaged weights, say, that a post-step hook of the optimiser
+            keeps up, in an `nn.ModuleDict` beside the network.
+        schedule: of the learning rate, one step for each of its optimiser's.
         iterations: how many steps the whole training has.
-        every: steps between evaluations and checkpoints.
+        evaluations: how many evaluations and checkpoints.
     """
 
-    def __init__(self, directory: Path, state: Mapping[str, Any], iterations: int, every: int) -> None:
-        self.directory, self.state, self.iterations, self.every = directory, state, iterations, every
+    def __init__(
+        self, directory: Path, model: nn.Module, schedule: LRScheduler, iterations: int, evaluations: int
+    ) -> None:
+        self.directory, self.iterations, self.every = directory, iterations, max(iterations // evaluations, 1)
+        self._model, self._schedule, self._optimiser = model, schedule, schedule.optimizer
+        self._state = {"model": model, "optimiser": self._optimiser, "schedule": schedule}
         self.step = 0
         self.curves: list[dict[str, float]] = []
         self._checkpoint = directory / "checkpoint.pt"
@@ -41,23 +52,28 @@ class TrainingRun:
         if processes() > 1:
             saved = from_first(saved or self._states())
         if saved:
-            for name, part in state.items():
+            for name, part in self._state.items():
                 part.load_state_dict(saved[name])
             self.step, self.curves = saved["step"], saved["curves"]
             torch.set_rng_state(saved["rng"])
         if rank():
             # the same noise on every process would be noise that does not average out
             torch.manual_seed(torch.initial_seed() + rank() + processes() * self.step)
-        for part in state.values():
-            if isinstance(part, Optimizer):
-                average_gradients(part)
+        average_gradients(self._optimiser)
 
-    def random(self, seed: int) -> np.random.Generator:
-        """Random numbers for the step at hand, another stream on each process of torchrun."""
-        return np.random.default_rng((seed, self.step, rank()))
+    def minimise(
+        self, loss: Loss, evaluate: Callable[[], dict[str, float]], batch: int, seed: int, clip: float = math.inf
+    ) -> None:
+        """Do the steps that are left; evaluate, checkpoint and draw every so often and at the end.
 
-    def steps(self, evaluate: Callable[[], dict[str, float]]) -> Iterator[int]:
-        """Yield the number of each step still to do; evaluate, checkpoint and draw every so often and at the end."""
+        Args:
+            loss: called with the model in training mode.
+            evaluate: quantities to plot beside the loss' terms; called in evaluation mode, without gradients.
+            batch: samples a step, of all processes together.
+            seed: of the batches.
+            clip: the most that the gradient's norm may be.
+        """
+        parameters = [parameter for group in self._optimiser.param_groups for parameter in group["params"]]
         columns = (
             TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
             TimeRemainingColumn(), TextColumn("{task.fields[result]}"),
@@ -67,13 +83,19 @@ class TrainingRun:
                 self.directory.name, total=self.iterations, completed=self.step, result=self._latest()
             )
             while self.step < self.iterations:
-                yield self.step
+                self._model.train()
+                rng = np.random.default_rng((seed, self.step, rank()))
+                value, terms = loss(share(batch), self.step / self.iterations, rng)
+                self._optimiser.zero_grad()
+                value.backward()
+                nn.utils.clip_grad_norm_(parameters, clip)
+                self._optimiser.step()
+                self._schedule.step()
                 self.step += 1
                 if self.step % self.every == 0 or self.step == self.iterations:
-                    self.curves.append(from_first({"step": self.step, **(evaluate() if writes() else {})}))
-                    if writes():
-                        self._save()
+                    self._evaluate(terms, evaluate)
                 progress.update(task, completed=self.step, result=self._latest())
+        self._model.eval()
 
     def save(self, path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, str]) -> Path:
         """Write what came of the training: the model, its card, its curves.
@@ -96,6 +118,13 @@ class TrainingRun:
         draw_curves(self.curves, curves)
         return path
 
+    @torch.no_grad()
+    def _evaluate(self, terms: dict[str, float], evaluate: Callable[[], dict[str, float]]) -> None:
+        self._model.eval()
+        self.curves.append(from_first({"step": self.step, **({**terms, **evaluate()} if writes() else {})}))
+        if writes():
+            self._save()
+
     def _latest(self) -> str:
         return "  ".join(f"{k} {v:.4g}" for k, v in (self.curves[-1] if self.curves else {}).items() if k != "step")
 
@@ -107,7 +136,7 @@ class TrainingRun:
         draw_curves(self.curves, self.directory / "curves.png")
 
     def _states(self) -> dict[str, Any]:
-        states = {name: part.state_dict() for name, part in self.state.items()}
+        states = {name: part.state_dict() for name, part in self._state.items()}
         return {**states, "step": self.step, "curves": self.curves, "rng": torch.get_rng_state()}
 
 

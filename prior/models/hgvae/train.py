@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from steadypose.prior.models.distributed import share
 from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, CompletionConfig, HGVAEConfig, Level
 from steadypose.prior.models.hgvae.network import HGVAE, Pass
 from steadypose.prior.models.hgvae.train_completion import BATCH, BONES, SPOILT_BY, TURNED, train_completion
@@ -125,37 +124,31 @@ def fit(
     learned = [p for name, p in model.named_parameters() if not name.startswith("completion.")]
     optimiser = torch.optim.Adam(learned, lr=rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
-    state = {"model": model, "optimiser": optimiser, "schedule": schedule}
-    run = TrainingRun(directory, state, iterations, every=max(iterations // 24, 1))
-    frames, batch = model.config.frames, share(batch)
-    losses: dict[str, float] = {}
-    for step in run.steps(lambda: {**losses, **evaluate_hgvae(model, val)}):
-        model.train()
-        rng = run.random(seed)
-        positions, sizes = train.draw(batch, frames, rng, STRIDES)
-        half = batch // 2
+    run = TrainingRun(directory, model, schedule, iterations, evaluations=24)
+    frames = model.config.frames
+
+    def loss_of(count: int, done: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+        positions, sizes = train.draw(count, frames, rng, STRIDES)
+        half = count // 2
         whole = Batch.of(model, positions[:half], positions[:half], sizes[:half])
-        slow = slow_errors(batch - half, rng)
+        slow = slow_errors(count - half, rng)
         clean = other_builds(positions[half:], BONES, TURNED, rng)
         seen = occlude(spoil(add_noise(clean, rng, slow), SPOILT_BY, 0.5, rng), rng)
         both = whole.beside(Batch.of(model, seen, clean, sizes[half:]).completed(model, slow))
-        drawn = model(both.x, both.believed, spread=(torch.arange(batch) < half).float()[:, None])
+        drawn = model(both.x, both.believed, spread=(torch.arange(count) < half).float()[:, None])
         density = drawn.tracks.log_density(both.target) * both.counts
         stated = (0.5 * drawn.tracks.log_var[half:]).exp().detach()
         density[half:] = density[half:] * (
             stated / stated.mean()
         )  # as in `prior.models.hgvae.train_completion`, and for its reason
         likelihood = density.flatten(1).sum(dim=1)
-        kl = drawn.kl[:half].sum() / batch
-        beta = min(KL_START + (1 - KL_START) * step / (WARM_UP * iterations), 1.0)
+        kl = drawn.kl[:half].sum() / count
+        beta = min(KL_START + (1 - KL_START) * done / WARM_UP, 1.0)
         loss = beta * kl - likelihood.mean()
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(learned, CLIP_ENTRY * math.sqrt(frames * JOINT_NODES))
-        optimiser.step()
-        schedule.step()
-        losses.update({"loss": loss.item(), "KL": 2 * kl.item()})
-    model.eval()
+        return loss, {"loss": loss.item(), "KL": 2 * kl.item()}
+
+    clip = CLIP_ENTRY * math.sqrt(frames * JOINT_NODES)
+    run.minimise(loss_of, lambda: evaluate_hgvae(model, val), batch, seed, clip)
     return run
 
 
@@ -173,7 +166,6 @@ def evaluate_hgvae(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, 
         ``ELBO`` and its ``log p(x|z)``, nats an entry; ``val mm``, the mean joint error of whole windows; ``hidden
         mm``, that of entries hidden as in training, and ``guess mm``, that of the completion it started from.
     """
-    model.eval()
     rng = np.random.default_rng(1)
     positions, sizes = val.draw(windows, model.config.frames, rng)
     whole = Batch.of(model, positions, positions, sizes)

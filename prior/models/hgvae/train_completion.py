@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from steadypose.prior.models.distributed import share
 from steadypose.prior.models.hgvae.completion import CompletionNet
 from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.network import HGVAE
@@ -61,25 +60,19 @@ def train_completion(model: HGVAE, train: Windows, val: Windows, directory: Path
     network = _network(model)
     optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
-    state = {"model": network, "optimiser": optimiser, "schedule": schedule}
-    run = TrainingRun(directory, state, iterations, every=max(iterations // 20, 1))
-    losses: dict[str, float] = {}
-    for _ in run.steps(lambda: {**losses, **evaluate_completion(model, val)}):
-        rng = run.random(seed)
-        clean, sizes = train.draw(share(BATCH), model.config.frames, rng, STRIDES)
+    run = TrainingRun(directory, network, schedule, iterations, evaluations=20)
+
+    def loss_of(count: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+        clean, sizes = train.draw(count, model.config.frames, rng, STRIDES)
         clean = other_builds(clean, BONES, TURNED, rng)
-        slow = slow_errors(len(clean), rng)
+        slow = slow_errors(count, rng)
         seen = occlude(spoil(add_noise(clean, rng, slow), SPOILT_BY, SPOILT, rng), rng)
         off, log_var, hidden = _errors(model, seen, clean, sizes, slow)
         density = 0.5 * (log_var + off.square() * (-log_var).exp())
         loss = (density * (0.5 * log_var.detach()).exp())[hidden].mean()
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        losses["loss"] = loss.item()
-    network.eval()
+        return loss, {"loss": loss.item()}
+
+    run.minimise(loss_of, lambda: evaluate_completion(model, val), BATCH, seed, clip=1.0)
 
 
 def _errors(model: HGVAE, seen: Floats, truth: Floats, sizes: Floats, slow: Floats | float) -> tuple[Tensor, ...]:

@@ -15,7 +15,6 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
-from steadypose.prior.models.distributed import share
 from steadypose.prior.models.hgvae.anomaly import MISSING, RATES, SENSOR_SIGMAS, Calibration, joint_odds
 from steadypose.prior.models.hgvae.config import SCALE, FaultNetConfig, HGVAEConfig
 from steadypose.prior.models.hgvae.fault_features import RECENT, fault_features
@@ -111,22 +110,16 @@ def fit(
     """Train ``network``; see `train_anomaly`."""
     optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
-    state = {"model": network, "optimiser": optimiser, "schedule": schedule}
-    run = TrainingRun(directory, state, iterations, every=max(iterations // 10, 1))
-    losses: dict[str, float] = {}
+    run = TrainingRun(directory, network, schedule, iterations, evaluations=10)
+
+    def loss_of(count: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+        loss = _loss(network, model, train, count, rng)
+        return loss, {"loss": loss.item()}
 
     def evaluate() -> dict[str, float]:
-        with torch.no_grad():
-            return {**losses, "val loss": _loss(network, model, val, 1024, np.random.default_rng(1)).item()}
+        return {"val loss": _loss(network, model, val, 1024, np.random.default_rng(1)).item()}
 
-    for _ in run.steps(evaluate):
-        loss = _loss(network, model, train, share(BATCH), run.random(seed))
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        schedule.step()
-        losses["loss"] = loss.item()
-    network.eval()
+    run.minimise(loss_of, evaluate, BATCH, seed)
     return run
 
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import roma
 import torch
 from torch import Tensor
 
-from steadypose.prior.models.distributed import share
 from steadypose.prior.models.hmvae.config import HMVAEConfig
 from steadypose.prior.models.hmvae.network import HMVAE, MotionVAE, from_6d, to_6d
 from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
@@ -113,25 +113,15 @@ def fit(
     """
     optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.MultiStepLR(optimiser, [int(iterations * f) for f in (0.6, 0.85)], gamma=0.3)
-    state = {"model": model, "optimiser": optimiser, "schedule": schedule}
-    run = TrainingRun(directory, state, iterations, every=max(iterations // 48, 1))
-    losses: dict[str, float] = {}
+    run = TrainingRun(directory, model, schedule, iterations, evaluations=48)
 
-    def evaluate() -> dict[str, float]:
-        return {**losses, **evaluate_hmvae(model, val)}
-
-    for _ in run.steps(evaluate):
-        model.train()
-        rows = train.sample(share(batch), model.window, strides, run.random(seed))
+    def loss_of(count: int, done: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+        rows = train.sample(count, model.window, strides, rng)
         rotations, offsets = _augment(train.rotations[rows], train.offsets[rows[:, 0]])
         rotations, _ = remove_heading(rotations, model.window // 2 - 1)
-        local_weight = (run.step / iterations - GLOBAL_FIRST) / LOCAL_WARM_UP
-        loss, terms = _loss(model, rotations, offsets, local_weight)
-        losses.update(terms)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        schedule.step()
+        return _loss(model, rotations, offsets, local_weight=(done - GLOBAL_FIRST) / LOCAL_WARM_UP)
+
+    run.minimise(loss_of, lambda: evaluate_hmvae(model, val), batch, seed)
     return run
 
 
@@ -177,7 +167,6 @@ def evaluate_hmvae(model: MotionVAE, motion: MotionSet, frames: int = 16_384) ->
     Returns:
         ``val MPJPE mm`` over whole windows, root-centred, and ``val centre mm``, of the frame that refinement keeps.
     """
-    model.eval()
     window = model.window
     rows = motion.all_windows(window, step=1)
     rows = rows[:: max(len(rows) * window // frames, 1)]

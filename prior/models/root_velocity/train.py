@@ -13,7 +13,6 @@ from torch.nn import functional as F
 
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.body.skeleton import MIRROR, limbs
-from steadypose.prior.models.distributed import share
 from steadypose.prior.models.root_velocity.config import FRAME_S, TrajectoryConfig
 from steadypose.prior.models.root_velocity.network import RootMotion, TrajectoryNet
 from steadypose.prior.models.torch_weights import started
@@ -105,23 +104,14 @@ def train_trajectory(
     origin = started(model, "trajectory", start)
     optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=learning_rate / 100)
-    state = {"model": model, "optimiser": optimiser, "schedule": schedule}
     name = f"trajectory-{weights}"
-    run = TrainingRun(runs / name, state, iterations, every=max(iterations // 50, 1))
-    losses: dict[str, float] = {}
+    run = TrainingRun(runs / name, model, schedule, iterations, evaluations=50)
 
-    def evaluate() -> dict[str, float]:
-        return {**losses, **evaluate_trajectory(model, val)}
+    def loss_of(count: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+        windows = _sample(train, starts, chances, count, rng)
+        return _loss(model(windows.joints), windows)
 
-    for _ in run.steps(evaluate):
-        model.train()
-        windows = _sample(train, starts, chances, share(batch), run.random(seed))
-        loss, terms = _loss(model(windows.joints), windows)
-        losses.update(terms)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        schedule.step()
+    run.minimise(loss_of, lambda: evaluate_trajectory(model, val), batch, seed)
     config = calibrate(model, val)
     return run.save(runs / name / f"{name}.safetensors", model, asdict(config), {
         "Model": f"root velocity and contacts, {config.context} frames of context, 22 joints",
@@ -236,7 +226,6 @@ def _loss(said: RootMotion, windows: _Windows) -> tuple[Tensor, dict[str, float]
 @torch.no_grad()
 def _validate(model: TrajectoryNet, motion: MotionSet, length: int, count: int) -> tuple[RootMotion, _Windows]:
     """What the network says of about ``count`` windows of ``length`` frames of unseen people with 1 cm of noise."""
-    model.eval()
     rows = motion.all_windows(length + 2, step=length)
     rows = rows[:: max(len(rows) // count, 1)]
     turn = yaw_rotation(heading(motion.rotations[rows[:, length // 2], 0]))

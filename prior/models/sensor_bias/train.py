@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection
 from dataclasses import asdict
 from functools import lru_cache
@@ -14,7 +15,6 @@ from torch import Tensor, nn
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.models.distributed import share
 from steadypose.prior.models.sensor_bias.features import (
     HISTORY,
     SMOOTHER_DENSITY,
@@ -69,27 +69,20 @@ def train_correction(
     optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=iterations)
     name = f"correction-{weights}"
-    run = TrainingRun(
-        runs / name,
-        {"net": net, "optimiser": optimiser, "schedule": schedule},
-        iterations,
-        every=max(iterations // 40, 1),
-    )
-    losses: list[float] = []
+    run = TrainingRun(runs / name, net, schedule, iterations, evaluations=40)
+    recent = deque[float](maxlen=run.every)
 
-    for _ in run.steps(lambda: {"training mm": float(np.mean(losses[-run.every :]))}):
-        generator = run.random(seed)
-        rows = torch.from_numpy(generator.integers(len(x), size=share(batch)))
-        inputs, targets = _hide(x[rows], generator), y[rows]
-        half = len(rows) // 2
+    def loss_of(count: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+        rows = torch.from_numpy(rng.integers(len(x), size=count))
+        inputs, targets = _hide(x[rows], rng), y[rows]
+        half = count // 2
         inputs = torch.cat([mirror_features(inputs[:half]), inputs[half:]])
         targets = torch.cat([mirror_offsets(targets[:half]), targets[half:]])
         loss = _error(net(inputs + INPUT_NOISE * net.scale * torch.randn_like(inputs)), targets)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        schedule.step()
-        losses.append(1000 * loss.item())
+        recent.append(1000 * loss.item())
+        return loss, {"training mm": float(np.mean(recent))}
+
+    run.minimise(loss_of, dict, batch, seed)
     return run.save(runs / name / f"{name}.safetensors", net, asdict(config), {
         "Model": "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses",
         "Data": f"UI-PRMD, Kinect beside Vicon: {', '.join(subjects)}",
