@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
@@ -167,43 +167,38 @@ def train(
 ) -> TrainingRun:
     """Train, and leave the mean of the last weights in ``network``; which, unless ``fresh``, is trained already."""
     mean = MixtureNet(network.config)
-    if fresh and not (directory / "checkpoint.pt").exists():
-        _measure_features(network, sensors, seed)
-    mean.load_state_dict(network.state_dict())
     optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimiser,
         lambda s: min(1.0, (s + 1) / 100) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(s / steps, 1.0)))),
     )
-    state = {"model": network, "mean": mean, "optimiser": optimiser, "schedule": schedule}
-    run = TrainingRun(directory, state, steps, every=max(steps // 20, 1))
+    both = nn.ModuleDict({"network": network, "mean": mean})
+    run = TrainingRun(directory, both, schedule, steps, evaluations=20)
+    if run.step == 0:
+        if fresh:
+            _measure_features(network, sensors, seed)
+        mean.load_state_dict(network.state_dict())
     watched = [(delay, through_bank(val.draw(40, np.random.default_rng((1, delay))), delay)) for delay in (0, 4)]
     recent = {"loss": 0.0}
 
-    def evaluate() -> dict[str, float]:
-        with torch.no_grad():
-            found = {
-                f"val, delay {delay}": loss_of(mean, batch, delay).relative.mean().item() for delay, batch in watched
-            }
-        return {**recent, **found}
+    @torch.no_grad()
+    def average(*_: object) -> None:
+        keep = min(AVERAGE, (run.step + 1) / (run.step + 10))
+        for kept, new in zip(mean.parameters(), network.parameters(), strict=True):
+            kept.lerp_(new, 1 - keep)
 
-    for step in run.steps(evaluate):
-        rng = run.random(seed)
-        optimiser.zero_grad()
-        total = 0.0
-        for delay in rng.choice(DELAYS, DELAYS_A_STEP, p=DELAY_SHARES):
-            batch = through_bank(sensors.draw(CLIPS, rng), int(delay))
-            loss = loss_of(network, batch, int(delay)).total / DELAYS_A_STEP
-            loss.backward()
-            total += loss.item()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        keep = min(AVERAGE, (step + 1) / (step + 10))
-        with torch.no_grad():
-            for kept, new in zip(mean.parameters(), network.parameters(), strict=True):
-                kept.lerp_(new, 1 - keep)
-        recent["loss"] += 0.02 * (total - recent["loss"]) if step else total
+    def loss_of_step(clips: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+        delays = [int(delay) for delay in rng.choice(DELAYS, DELAYS_A_STEP, p=DELAY_SHARES)]
+        batches = [(through_bank(sensors.draw(clips, rng), delay), delay) for delay in delays]
+        total = torch.stack([loss_of(network, batch, delay).total for batch, delay in batches]).mean()
+        recent["loss"] += 0.02 * (total.item() - recent["loss"]) if run.step else total.item()
+        return total, recent
+
+    def evaluate() -> dict[str, float]:
+        return {f"val, delay {delay}": loss_of(mean, batch, delay).relative.mean().item() for delay, batch in watched}
+
+    optimiser.register_step_post_hook(average)
+    run.minimise(loss_of_step, evaluate, CLIPS, seed, clip=1.0)
     network.load_state_dict(mean.state_dict())
     return run
 
