@@ -62,8 +62,9 @@ class CompletionNet(nn.Module):
         """
         found, log_var = written.split([JOINT_NODES * self.config.patch, JOINTS * self.config.patch], dim=-1)
         log_var = (_by_track(log_var, JOINTS) + FIRST_LOG_VAR).clamp(*LOG_VAR_RANGE)
-        # of a line of infinite variance, 1
-        gain = 1.0 / (1.0 + log_var.exp() / line_variance)
+        # of a line of infinite variance, 1; of one of none, 0, where the quotient's gradient is not a number
+        gain = 1.0 / (1.0 + log_var.exp() / line_variance.clamp(min=1e-12))
+        gain = torch.where(line_variance > 0, gain, 0.0)
         fused = log_var + gain.clamp(min=1e-6).log()
         return _by_track(found, JOINT_NODES) * gain.repeat_interleave(3, dim=1), fused.clamp(*LOG_VAR_RANGE)
 

@@ -216,6 +216,7 @@ def test_training_writes_weights_their_card_and_their_scale(tmp_path: Path, monk
     path = train_hgvae(prepared(tmp_path / "m.npz"), tmp_path / "runs", iterations=2, batch=4)
     state, stored = load_tensors(str(path), "hgvae")
     HGVAE(HGVAEConfig.from_dict(stored)).load_state_dict(state)
+    assert all(torch.isfinite(tensor).all() for tensor in state.values())
     assert HGVAEConfig.from_dict(stored) == config
     assert json.loads(path.with_suffix(".anomaly.json").read_text())["quantiles"]
     assert load_fault_net(str(path)).config.frames == 20
