@@ -2,6 +2,7 @@
 
 # without `from __future__ import annotations`: depthai reads those of `process` to know what an input takes
 import queue
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,8 @@ SETTLE_PAIRS = 30
 """pairs skipped while exposure and the direction of gravity settle"""
 PAIR_TIMEOUT_S = 20.0
 """for each pair"""
+READING_TIMEOUT_S = 1.0
+"""for the accelerometer, which may speak after the picture"""
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,9 @@ def capture(
         picture, distances = pairs.pairs.get(timeout=PAIR_TIMEOUT_S)
     except queue.Empty:
         raise CameraError(f"the camera gave no picture with depth within {PAIR_TIMEOUT_S:g} s") from None
+    late = time.monotonic() + READING_TIMEOUT_S
+    while readings and not level.measured and time.monotonic() < late:
+        time.sleep(0.01)
     intrinsics = np.array(distances.getTransformation().getIntrinsicMatrix())
     return Still(picture.getCvFrame(), distances.getFrame().copy(), intrinsics, level.up if level.measured else None)
 
