@@ -70,7 +70,7 @@ class CleanCore:
         self._person = PersonEstimator(settings.bones, slots)
         self._score = Scorer(settings.score, settings.encode.weights, noise, slots) if score else None
         self._impute = Impute(settings.impute, delay, slots, counters) if impute else None
-        self._fuse = Fuse(settings.fuse, slots)
+        self._fuse = Fuse(settings.fuse)
         self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
         self._newest: _Newest | None = None
 
@@ -112,7 +112,7 @@ class CleanCore:
         """Forget the bodies in these slots (S,)."""
         steps = (
             self._gate, self._correct, self._history, self._smooth, self._denoise, self._slow_error,
-            self._person, self._score, self._impute, self._refine, self._fuse,
+            self._person, self._score, self._impute, self._refine,
         )  # fmt: skip
         for step in steps:
             if step is not None:

@@ -35,13 +35,6 @@ class FuseSettings:
     fade: float = 3.0
 
 
-_MOST_MOBILE = 1e4
-"""Times the variance of the best-known joint, at most, by which the fit to the bones lets a joint yield: one that
-yields without resistance no longer says where it was, and the fit needs many more sweeps."""
-
-_RENEWAL = 0.03
-"""Of the way to what the newest frame says of it, a frame, that the correction of the slow error goes: it is slow."""
-
 _COASTING = 4.0
 """Times: the standard deviation of a smoother that coasts, beside what is imputed. It holds that a joint goes on as it
 went, which people need not: limbs hidden for half a second are 4 % nearer to the truth so than if it is believed, and
@@ -79,19 +72,13 @@ class Precision(NamedTuple):
 class Fuse:
     """Joins the joints seen with what the prior says of the hidden ones.
 
-    A joint that is seen stays where smoothing and denoising have it, but for the sensor's slow error, as far as the
-    stream shows that there is one: the pose nearest to what is seen on the person's bones tells of it, and the joint
-    follows slowly. Hidden joints are where HG-VAE completes the body or, without it, hang from those seen in the
-    rotations decoded; smoother and completion are weighed by their precisions, and the person's bones hold.
+    A joint that is seen stays where smoothing and denoising have it. Hidden joints are where HG-VAE completes the body
+    or, without it, hang from those seen in the rotations decoded; smoother and completion are weighed by their
+    precisions, and the person's bones hold, as far as their lengths are known.
     """
 
-    def __init__(self, settings: FuseSettings, slots: int) -> None:
+    def __init__(self, settings: FuseSettings) -> None:
         self._settings = settings
-        self._correction = np.zeros((slots, len(PARENTS), 3))
-
-    def forget(self, slot: Bools) -> None:
-        """Forget the bodies in these slots (S,)."""
-        self._correction[slot] = 0.0
 
     def fuse(
         self,
@@ -103,7 +90,7 @@ class Fuse:
         unseen_s: Floats,
         present: Bools,
     ) -> Estimate:
-        """The estimate of one frame; frames are to be given in order.
+        """The estimate of one frame.
 
         Args:
             smoothed: what smoother and denoising make of the joints seen.
@@ -132,7 +119,8 @@ class Fuse:
             # of a frame that was lost whole, the smoother knows more
             here = (unseen <= unseen.min(axis=1, keepdims=True)) & np.isfinite(deviation)
             variance = _join(body, seen, here, precision)
-            body = self._on_bones(slots, body, here, variance, bias, person, slow_error)
+            length_variance = slow_error.length_variance[slots] + _of_rigid(person.length_variance[slots])
+            body = fit_lengths(body, offsets, np.where(here, _LEAST_VARIANCE, variance), length_variance)
             fitted = solve_pose(body, offsets, decoded)[0]
         placed = np.isfinite(deviation).any(axis=1)
         state, sigma = _states(unseen, held_s, s.fade), _stated(unseen, deviation, precision)
@@ -144,28 +132,6 @@ class Fuse:
             sigma=_scatter(count, slots[placed], sigma[placed], np.inf),
             state=_scatter(count, slots[placed], state[placed], JointState.UNKNOWN).astype(np.uint8),
         )
-
-    def _on_bones(
-        self,
-        slots: NDArray[np.intp],
-        body: Floats,
-        here: Bools,
-        variance: Floats,
-        bias: Floats,
-        person: Person,
-        slow_error: SlowError,
-    ) -> Floats:
-        """(B, 22, 3): seen joints (B, 22) ``here`` less the slow error; the others on the bones beside them."""
-        offsets = person.offsets[slots]
-        length_variance = slow_error.length_variance[slots] + _of_rigid(person.length_variance[slots])
-        slow = np.maximum(bias[:, None] ** 2, _LEAST_VARIANCE)
-        mobility = np.where(here, slow, np.clip(variance, slow, _MOST_MOBILE * slow))
-        wanted = fit_lengths(body, offsets, mobility, length_variance) - body
-        correction = self._correction[slots]
-        correction += _RENEWAL * np.where(here[..., None], wanted - correction, 0.0)
-        self._correction[slots] = correction
-        body = body + np.where(here[..., None], correction, wanted)
-        return fit_lengths(body, offsets, np.where(here, _LEAST_VARIANCE, mobility), length_variance)
 
 
 def _of_rigid(length_variance: Floats) -> Floats:

@@ -3,7 +3,9 @@
 The length of a rigid part of the body varies by the noise that the smoother leaves, which it states, and by the
 sensor's slow error: what is left of the variance, halved since a bone has two ends, is that error's variance. Where the
 mean length differs from the person's bone, or one part varies by more than the others do, the sensor's idea of a joint
-differs from the skeleton's: that part's length is uncertain, and nothing seen is to be moved for it.
+differs from the skeleton's: that part's length is uncertain. It says how far this person's bones are to be measured
+rather than taken from human proportions, and how firmly they hold hidden joints. Moving seen joints onto the bones by
+it was tried: 0.2 % of a Kinect's error, for 0.6 mm of a perfect input's.
 """
 
 from __future__ import annotations
