@@ -1,6 +1,6 @@
 """Do the importers agree? The same CMU recordings, read from AMC, from exponential maps and from BVH.
 
-Two archives hold twenty recordings twice (`prior.motion.datasets.REPEATS`). AMC and exponential maps should be the
+Two archives hold twenty recordings twice (`prior.motion.cmu.REPEATS`). AMC and exponential maps should be the
 same motion of nearly the same body: a fault in either reader, or in the bones that the latter's converter has lost,
 shows in full. The BVH is a hobbyist's retarget onto another character, with legs 15 % longer and other shoulders, so
 that positions cannot agree; what a retarget should keep is compared too: the directions of bones, the bends of
@@ -41,7 +41,8 @@ from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import Skeleton, to_canonical
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J
 from steadypose.prior.motion.clip import Y_UP_TO_Z_UP, MotionError
-from steadypose.prior.motion.datasets import CMU_FPS, REPEATS, amc_motions, bvh_motion, members
+from steadypose.prior.motion.cmu import REPEATS
+from steadypose.prior.motion.datasets import CMU_FPS, amc_motions, bvh_motion, members
 from steadypose.prior.motion.npz import read_expmap
 from steadypose.prior.motion.prepare import FPS, resample
 from steadypose.prior.motion.tables import CMU_AMC, CMU_BVH, ICLONE

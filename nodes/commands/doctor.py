@@ -381,10 +381,7 @@ def check_webcam() -> Iterator[Finding]:
 
 
 def _reads(file: Path, text: str) -> bool:
-    try:
-        return file.read_text().strip() == text
-    except OSError:
-        return False
+    return os.access(file, os.R_OK) and file.read_text().strip() == text
 
 
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (

@@ -23,6 +23,7 @@ from steadypose.prior.body.layouts import CANONICAL, Skeleton
 from steadypose.prior.motion.amc import Asf, read_amc, read_asf
 from steadypose.prior.motion.bvh import Bvh, read_bvh
 from steadypose.prior.motion.clip import Y_UP_TO_Z_UP, Clip, MotionError
+from steadypose.prior.motion.cmu import CMU_ACTIONS, REPEATS
 from steadypose.prior.motion.npz import read_amass, read_expmap
 from steadypose.prior.motion.tables import BANDAI, BVH_RIGS, CMU_AMC, CMU_BVH, CMU_DAZ, ICLONE, REACTIDLE, Rig
 from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
@@ -201,54 +202,8 @@ def _read_cmu_amc(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
             yield Dropped(stem, "CMU (AMC)", UNREADABLE, str(motion))
             continue
         subject = stem.split("_")[0]
-        action = _CMU_ACTIONS.get(stem, _CMU_ACTIONS.get(subject, ""))
+        action = CMU_ACTIONS.get(stem, CMU_ACTIONS.get(subject, ""))
         yield Clip(stem, "CMU (AMC)", CMU_LICENCE, subject, action, CMU_FPS, CMU_AMC.skeleton, motion)
-
-
-_CMU_ACTIONS = {
-    "01": "playground",
-    "02_01": "walk",
-    "02_02": "walk",
-    "02_03": "run",
-    "02_04": "jump, balance",
-    "02_05": "punch",
-    "02_06": "bend, lift",
-    "02_07": "swordplay",
-    "02_08": "swordplay",
-    "02_09": "swordplay",
-    "02_10": "wash",
-    "06": "basketball",
-    "07": "walk",
-}
-
-
-REPEATS = {
-    "002_01": "02_01",
-    "002_02": "02_02",
-    "002_03": "02_03",
-    "002_04": "02_04",
-    "002_05": "02_05",
-    "002_06": "02_06",
-    "002_07": "02_07",
-    "002_08": "02_08",
-    "002_09": "02_09",
-    "002_10": "02_10",
-    "006_01": "train_walking_3",
-    "006_02": "train_basketball_1",
-    "006_03": "train_basketball_2",
-    "006_04": "train_basketball_3",
-    "006_05": "train_basketball_4",
-    "006_06": "train_basketball_5",
-    "006_07": "test_basketball_1",
-    "007_01": "train_walking_4",
-    "007_02": "train_walking_5",
-    "train_walking_1": "02_01",
-}
-"""Recordings that two CMU archives hold: the one left out, and the one kept (nearer to the source, or validating).
-
-Found by the bends of elbows and knees, frame by frame: 0.1 degrees apart for AMC and exponential maps, below 1.7 for
-the hobbyist's BVH, against more than 5 between any two other recordings at the same lag.
-"""
 
 
 def _repeat(name: str, source: str) -> Dropped:
@@ -267,7 +222,7 @@ def _read_cmu_bvh(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
         except MotionError as error:
             yield Dropped(stem, source, UNREADABLE, str(error))
             continue
-        yield Clip(stem, source, CMU_LICENCE, subject, _CMU_ACTIONS.get(subject, ""), bvh.fps, skeleton, positions)
+        yield Clip(stem, source, CMU_LICENCE, subject, CMU_ACTIONS.get(subject, ""), bvh.fps, skeleton, positions)
 
 
 def _read_cmu_expmap(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:

@@ -13,7 +13,8 @@ from tests.prior.motion.test_motion_amc import AMC, ASF
 
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.motion.clip import Clip, MotionError
-from steadypose.prior.motion.datasets import DATA_SETS, REPEATS, Dropped, amc_motions, bvh_motion, members
+from steadypose.prior.motion.cmu import REPEATS
+from steadypose.prior.motion.datasets import DATA_SETS, Dropped, amc_motions, bvh_motion, members
 from steadypose.prior.motion.tables import BVH_RIGS, CMU_AMC, REACTIDLE
 
 # A body of ReActIdle's family, y up, facing +z, left +x: name, depth, offset, end site.
