@@ -217,7 +217,7 @@ def _tables(records: list[dict[str, Any]], swings: list[dict[str, Any]], bench: 
         "each noise and delay on every third of these clips with other noise; the bank has no setting. Best filter: "
         "the tuned one of the least error in that very cell, of at most that delay."
     )
-    tables = [_speed_table(records, delay, note) for delay in (4, 0)]
+    tables = [_summary_table(records, note), *(_speed_table(records, delay, note) for delay in (4, 0))]
     sums = ("fidelity", "Fidelity: MPJPE by noise, mm", "position_mm", 1), (
         "fidelity-acceleration", "Fidelity: acceleration error by noise, mm/frame²", "acceleration_mm", 2
     )  # fmt: skip
@@ -237,15 +237,38 @@ def _slug(noise: str) -> str:
     return noise.replace(" ", "")
 
 
+UNTUNED = ("raw", "bank of smoothers", "steadypose")
+
+
+def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
+    """The best tuned filter, the bank and ours, by noise and delay: position / acceleration."""
+    noises = [name for name in dict.fromkeys(r["condition"] for r in records) if "depth" not in name]
+    rows: list[list[str]] = []
+    for delay in sorted({r["delay"] for r in records if r["method"] == "steadypose"}):
+        for name in ("best filter", *UNTUNED[1:]):
+            cells = []
+            for noise in noises:
+                mine = [r for r in records if r["condition"] == noise and 0 <= r["delay"] <= delay]
+                if name in UNTUNED:
+                    mine = [r for r in mine if r["method"] == name and r["delay"] == delay]
+                else:
+                    mine = [r for r in mine if r["method"] not in UNTUNED]
+                cells.append(
+                    " / ".join(f"{min(r[key] for r in mine):.1f}" for key in ("position_mm", "acceleration_mm"))
+                )
+            rows.append([f"delay {delay}: {name}", *cells])
+    title = "Fidelity: MPJPE, mm / acceleration error, mm/frame², by independent noise along each axis"
+    return Table("fidelity-summary", title, ["method", *noises], rows, note)
+
+
 def _speed_table(records: Sequence[Mapping[str, Any]], delay: int, note: str) -> Table:
     """Raw, the best tuned filter, the bank and ours, by noise and speed."""
     bins = list(dict.fromkeys(name for record in records for name in record["by_speed"]))
-    untuned = ("raw", "bank of smoothers", "steadypose")
     rows: list[list[str]] = []
     for condition in dict.fromkeys(record["condition"] for record in records):
         mine = [r for r in records if r["condition"] == condition and 0 <= r["delay"] <= delay]
-        rivals = [r for r in mine if r["method"] not in untuned]
-        fixed = {r["method"]: r for r in mine if r["method"] in untuned and r["delay"] in (delay, 0)}
+        rivals = [r for r in mine if r["method"] not in UNTUNED]
+        fixed = {r["method"]: r for r in mine if r["method"] in UNTUNED and r["delay"] in (delay, 0)}
         cells = {name: [r["by_speed"][b]["position_mm"] for b in bins] for name, r in fixed.items()}
         cells["best filter"] = [min(r["by_speed"][b]["position_mm"] for r in rivals) for b in bins]
         for name in ("raw", "best filter", "bank of smoothers", "steadypose"):
