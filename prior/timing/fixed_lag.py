@@ -253,39 +253,6 @@ def _correct(
         velocity_variance[joint] -= gain * covariance
 
 
-class Follower:
-    """Moves after an estimate as a body would, steered by accelerations (a critically damped alpha-beta tracker).
-
-    A filter that answers at once hands every new measurement's noise on as a jump. What follows it closes the gap to
-    it in place and velocity gently, and falls behind only where it accelerates.
-    """
-
-    def __init__(self, memory: float) -> None:
-        """`memory`: share of a gap that is left after a frame, 0 to 1."""
-        if not 0 <= memory < 1:
-            raise ValueError(f"follower: expected a memory of 0 to 1, got {memory}")
-        # Both eigenvalues of the gap's dynamics are `memory`.
-        self._place_gain = (1 - memory) ** 2
-        self._velocity_gain = 1 - memory**2 - self._place_gain / 2
-        self._place = self._velocity = np.empty(0)
-
-    def update(self, place: Array, velocity: Array, steered: NDArray[np.bool_]) -> Array:
-        """Take an estimate and give what follows it, (..., 3).
-
-        place: metres, NaN where there is none. velocity: metres a frame. steered: (...) which joints to steer; the
-        others are put on the estimate.
-        """
-        if self._place.shape != place.shape:
-            self._place, self._velocity = place.copy(), velocity.copy()
-            return place
-        ahead = self._place + self._velocity
-        push = self._place_gain * (place - ahead) + self._velocity_gain * (velocity - self._velocity)
-        smooth = (steered & _seen(ahead))[..., None]
-        self._place = np.where(smooth, ahead + push / 2, place)
-        self._velocity = np.where(smooth, self._velocity + push, velocity)
-        return self._place.copy()
-
-
 def _seen(measured: Array) -> NDArray[np.bool_]:
     return np.all(np.isfinite(measured), axis=-1)
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from steadypose.prior.timing.fixed_lag import FixedLagRTS, Follower, OneEuroFilter
+from steadypose.prior.timing.fixed_lag import FixedLagRTS, OneEuroFilter
 
 DENSITY, INITIAL_SPEED = 3.0, 0.7
 
@@ -228,38 +228,3 @@ def test_refuses_settings_without_meaning() -> None:
         FixedLagRTS(0, 0.0)
     with pytest.raises(ValueError, match="cut-offs"):
         OneEuroFilter(0.0, 1.0)
-
-
-def test_a_follower_keeps_up_with_steady_motion_and_closes_a_gap_by_its_memory() -> None:
-    follower, steered = Follower(memory=0.5), np.ones(2, dtype=bool)
-    speed = np.array([[0.01, 0.0, 0.0], [0.0, -0.02, 0.01]])
-    for t in range(10):
-        np.testing.assert_allclose(follower.update(t * speed, speed, steered), t * speed, atol=1e-12)
-    gaps = [follower.update(t * speed + 0.1, speed, steered) - t * speed - 0.1 for t in range(10, 40)]
-    assert np.abs(gaps[0]).max() > 0.05
-    # twice the eigenvalue 0.5: of a gap, (t + c) 0.5^t is left
-    np.testing.assert_allclose(gaps[-1] / gaps[-2], 0.5, rtol=0.05)
-
-
-def test_a_follower_of_noise_jitters_less_and_lets_go_of_what_is_not_steered() -> None:
-    rng = np.random.default_rng(0)
-    follower, smoother = Follower(memory=0.25), FixedLagRTS(0, 0.5)
-    told, followed = [], []
-    for t in range(200):
-        answer = smoother.update(rng.normal(0, 0.02, (5, 3)), t / 30)
-        assert answer is not None
-        told.append(answer.positions)
-        followed.append(follower.update(answer.positions, smoother.velocity / 30, np.arange(5) < 4))
-    jitter = [np.linalg.norm(np.diff(x, n=2, axis=0), axis=-1).mean(axis=0) for x in (told, followed)]
-    assert (jitter[1][:4] < 0.55 * jitter[0][:4]).all()
-    np.testing.assert_array_equal(np.array(followed)[:, 4], np.array(told)[:, 4])
-
-
-def test_a_follower_starts_a_joint_where_it_is_first_seen() -> None:
-    follower = Follower(memory=0.5)
-    nowhere, still = np.full((1, 3), np.nan), np.zeros((1, 3))
-    steered = np.ones(1, dtype=bool)
-    assert np.isnan(follower.update(nowhere, still, steered)).all()
-    np.testing.assert_array_equal(follower.update(still + 2.0, still, steered), still + 2.0)
-    with pytest.raises(ValueError, match="memory"):
-        Follower(1.0)
