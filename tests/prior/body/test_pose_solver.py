@@ -152,7 +152,7 @@ def test_a_bone_of_uncertain_length_gives_way_by_its_share_of_the_variance() -> 
     off[:, wrist] += 0.1 * (truth[:, wrist] - truth[:, elbow])
     mobility = np.where(np.isin(np.arange(22), [elbow, wrist]), 1.0, 1e-6)
     mobility[elbow] = 1e-6
-    variance = np.where(((wrist, elbow) == RIGID).all(axis=1), 1.0, 0.0)
+    variance = np.where((RIGID[:, 0] == wrist) & (RIGID[:, 1] == elbow), 1.0, 0.0)
     placed = fit_lengths(off, REST_OFFSETS, mobility, variance)
     length = np.linalg.norm(REST_OFFSETS[wrist])
     np.testing.assert_allclose(np.linalg.norm(placed[:, wrist] - placed[:, elbow], axis=-1), 1.05 * length, rtol=1e-4)
