@@ -6,8 +6,9 @@ never been seen is no question to ask a filter. HuMoR scores 43 points on the bo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,15 @@ from numpy.typing import NDArray
 from steadypose.benchmarks import figures
 from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
+from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import pivot
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
+
+BESIDE = "held beside the body"
 
 NOISE = 0.01
 """Metres."""
@@ -61,7 +65,8 @@ def run(bench: Bench) -> Result:
         f"long. {HOW}"
     )
     groups = (("hidden", "hidden joints"), ("seen", "seen joints"))
-    tables: list[Table] = [
+    tables: list[Table] = [_summary_table(records, note)]
+    tables += [
         pivot(records, "condition", f"{group}_mm", "hidden_joints" if group == "hidden" else "hidden_joints-seen",
               f"Hidden joints: error of {text}, mm", note)
         for group, text in groups
@@ -85,3 +90,22 @@ def run(bench: Bench) -> Result:
     if bins:
         pictures["hidden_reliability"] = figures.reliability(bins, "steadypose, delay 4: hidden joints")
     return Result(tables, {"data": clips.source, **data}, pictures)
+
+
+def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
+    """The peer nearest to the truth that does not know the body, the one that does, and ours: hidden joints, mm."""
+    conditions = list(dict.fromkeys(r["condition"] for r in records))
+    rows: list[list[str]] = []
+    for delay in (0, 4):
+        for name in ("best filter", BESIDE, "steadypose"):
+            cells = []
+            for condition in conditions:
+                mine = [r for r in records if r["condition"] == condition and 0 <= r["delay"] <= delay]
+                if name == "best filter":
+                    mine = [r for r in mine if r["method"] not in OURS and r["method"] != BESIDE]
+                else:
+                    mine = [r for r in mine if r["method"] == name and r["delay"] in (delay, 0)][-1:]
+                found = [r["hidden_mm"] for r in mine if "hidden_mm" in r]  # raw has no answer
+                cells.append(f"{min(found):.0f}")
+            rows.append([f"delay {delay}: {name}", *cells])
+    return Table("hidden_joints-summary", "Hidden joints: their error, mm", ["method", *conditions], rows, note)
