@@ -35,12 +35,6 @@ class FuseSettings:
     fade: float = 3.0
 
 
-_COASTING = 4.0
-"""Times: the standard deviation of a smoother that coasts, beside what is imputed. It holds that a joint goes on as it
-went, which people need not: limbs hidden for half a second are 4 % nearer to the truth so than if it is believed, and
-off by what is said."""
-
-
 def _bones_between() -> NDArray[np.int64]:
     """(22, 22) bones on the way from one joint to another."""
     between = np.full((len(PARENTS), len(PARENTS)), -1)
@@ -236,7 +230,7 @@ def _complete(body, completed, sigma, seen, deviation, unseen_s, bias_sigma, pre
             for axis in range(3):
                 body[row, joint, axis] = completed[row, joint, axis] + off[axis] / max(total, 1e-12)
             precision.prior[row, joint] = _inverse(sigma[row, joint] ** 2 + bias_sigma[row] ** 2)
-            precision.seen[row, joint] = _inverse((_COASTING * deviation[row, joint]) ** 2 + bias_sigma[row] ** 2)
+            precision.seen[row, joint] = _inverse(deviation[row, joint] ** 2 + bias_sigma[row] ** 2)
 
 
 @njit(cache=True)
