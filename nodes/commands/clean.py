@@ -74,6 +74,8 @@ def clean(
     console.print(f"{out}: {done.frames} frames, {spent}", highlight=False)
     for cause, count in done.refused.items():
         console.print(f"  refused or dropped, {cause}: {count}", highlight=False)
+    for problem in done.problems:
+        console.print(f"  {problem}", highlight=False, markup=False, soft_wrap=True, style="yellow")
     if not done.poses:
         console.print(f"  no body was recognised: is the skeleton right, are the units metres? See what {source} holds")
     return 0

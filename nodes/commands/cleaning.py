@@ -15,10 +15,14 @@ import numpy as np
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
+from steadypose.nodes.checks.stream import StreamCheck
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.recording import open_recording, with_end
+
+CHECKED, CHECKED_NS = 45, 1_500_000_000
+"""frames between two looks at whether the input can be right, and the time in which they count as having come"""
 
 
 class Cleaner(Protocol):
@@ -59,6 +63,7 @@ class Cleaned:
         spent_s: what it took.
         poses: of bodies, given in answer; none if no body was recognised.
         refused: what was refused or dropped, by cause.
+        problems: what is wrong with the input, each as it was first found.
     """
 
     frames: int
@@ -66,6 +71,7 @@ class Cleaned:
     spent_s: float
     poses: int
     refused: dict[str, int]
+    problems: list[str]
 
 
 def clean_recording(
@@ -98,6 +104,7 @@ def clean_recording(
     from steadypose.nodes.graph.prior_node import make_prior
     from steadypose.nodes.graph.threads import one_thread
     from steadypose.nodes.graph.trajectory_node import make_trajectory
+    from steadypose.prior.clean.settings import PriorSettings
 
     one_thread()
     prior, trajectory = make_prior(settings["prior"]), make_trajectory(settings["trajectory"])
@@ -105,6 +112,9 @@ def clean_recording(
     collector = NpzCollector()
     stamps_ns: list[int] = []
     poses = 0
+    problems: dict[str, str] = {}
+    prior_settings = PriorSettings.from_dict(settings["prior"])
+    check = StreamCheck(prior_settings.max_bodies, identified=prior_settings.identify.enabled)
     log_times = LogTimes()
     started = time.perf_counter()
     with _unfinished(out) as part:
@@ -115,6 +125,11 @@ def clean_recording(
                 else:
                     collector.add(message)
                 if isinstance(message, PoseRaw) and not message.end_of_stream:
+                    now_ns = len(stamps_ns) * CHECKED_NS // CHECKED
+                    check.see(message, now_ns)
+                    if len(stamps_ns) % CHECKED == CHECKED - 1:
+                        for problem in check.problems(now_ns, live=False):
+                            problems.setdefault(problem.cause, f"{problem.cause}: {problem.text}")
                     stamps_ns.append(message.stamp_ns)
                     advanced()
                 elif isinstance(message, PoseClean):
@@ -133,6 +148,7 @@ def clean_recording(
         spent_s=time.perf_counter() - started,
         poses=poses,
         refused={cause: n for cause, n in (frames.refused + prior.counters + trajectory.counters).items() if n},
+        problems=list(problems.values()),
     )
 
 

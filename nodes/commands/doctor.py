@@ -44,8 +44,7 @@ KEY_PACKAGES = ("numpy", "numba", "rosbags", "pyzmq")
 MODELS = ("hmvae", "hgvae", "trajectory")
 FRAMES, WARM_UP = 100, 20
 FRAME_NS = 1_000_000_000 / 30
-TARGET_MS = 10.0
-BUDGET_MS = 1000 / 30
+TARGET_MS, BUDGET_MS = 10.0, 1000 / 30
 LONGEST_IPC_PATH = 107
 """bytes of a unix socket's path that the system takes"""
 NEEDED_GB = 1.0
@@ -79,19 +78,24 @@ class Finding:
     fix: str = ""
 
 
-def doctor() -> int:
+def doctor(live: bool = False, launch: str = "replay") -> int:
     """Check this machine: what works, what is missing, and what to type about it.
 
+    Args:
+        live: listen for three seconds to a tracker that publishes, and to nodes that run, and say what is wrong there.
+        launch: the launch file whose addresses these are.
+
     Returns:
-        0 if `steadypose run` can work here, otherwise 1.
+        0 if `steadypose run` can work here, otherwise 1; with `live`, 0 if nothing is wrong.
     """
     console = Console(highlight=False)
+    if live:
+        from steadypose.nodes.commands.doctor_live import listen
+
+        return listen(launch, console)
     table = Table("", "what", "found", box=None, pad_edge=False, header_style="bold")
-    with console.status("looking") as status:
-        findings = []
-        for check in CHECKS:
-            status.update(f"looking at {_name(check)}")
-            findings += _examine(check)
+    with console.status("looking"):
+        findings = [finding for check in CHECKS for finding in _examine(check)]
     for finding in findings:
         table.add_row(finding.verdict.value, finding.what, finding.found)
     console.print(table)
@@ -316,14 +320,10 @@ def _standing(frame: int) -> PoseRaw:
 
     from steadypose.msgs.types import Pose, PoseRaw, RawBody
     from steadypose.prior.body.layouts import CANONICAL
-    from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+    from steadypose.prior.body.skeleton import REST_POSITIONS
 
-    positions = np.zeros((len(CANONICAL.joints), 3))
-    positions[J["pelvis"]] = [2.0, 0.02 * np.sin(frame / 10), 0.95]
-    for child, parent in enumerate(PARENTS):
-        if parent >= 0:
-            positions[child] = positions[parent] + REST_OFFSETS[child]
-    body = RawBody(0, positions.astype(np.float32), np.ones(len(positions), np.float32))
+    positions = REST_POSITIONS + [2.0, 0.02 * np.sin(frame / 10), 0.95]
+    body = RawBody(0, positions, np.ones(len(positions)))
     stamp_ns = round(frame * FRAME_NS)
     return PoseRaw(stamp_ns, "world", "doctor", CANONICAL.name, Pose.identity(), True, [body])
 

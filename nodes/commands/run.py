@@ -18,6 +18,7 @@ from rich.text import Text
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Level
+from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.graph.clock import FRAME_NS, POLL_S, Clock, SystemClock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.supervisor import Supervisor
@@ -92,6 +93,7 @@ class _Run:
         self._console = console
         self._clock = clock
         self._diagnostics: dict[str, Diagnostics] = {}
+        self._problems: dict[str, set[str]] = {}
         self._over = False
         self._progress_ns = clock.now_ns()
         self._printed_ns = clock.now_ns()
@@ -133,6 +135,17 @@ class _Run:
         if last is None or _counts(last) != _counts(diagnostics):
             self._progress_ns = self._clock.now_ns()
         self._diagnostics[diagnostics.node] = diagnostics
+        self._tell_problems(diagnostics)
+
+    def _tell_problems(self, diagnostics: Diagnostics) -> None:
+        """Print what is newly wrong, and what no longer is."""
+        problems = from_values(diagnostics.values)
+        told = self._problems.get(diagnostics.node, set())
+        for cause in sorted(problems.keys() - told):
+            self._print(f"{diagnostics.node}: {diagnostics.level.name}: {problems[cause]} [{cause}]")
+        for cause in sorted(told - problems.keys()):
+            self._print(f"{diagnostics.node}: no longer: {cause}")
+        self._problems[diagnostics.node] = set(problems)
 
     def _show(self, supervisor: Supervisor, live: Live | None) -> None:
         if live:
@@ -218,6 +231,9 @@ def table(
         )
         if " " in state:
             notes.append(Text(f"{name}: {state}"))
+        if latest and not summary:
+            style = "bold red" if latest.level == Level.ERROR else "yellow"
+            notes += [Text(f"{name}: {text}", style=style) for text in from_values(values).values()]
         causes = [f"{key} {n}" for key, n in values.items() if key.startswith(("dropped.", "refused."))]
         if latest and causes and (summary or latest.level != Level.OK):
             notes.append(Text(f"{name}: {', '.join(causes)}", style="yellow"))
@@ -236,8 +252,9 @@ def line(nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supe
     for name in nodes:
         values = diagnostics[name].values if name in diagnostics else {}
         topic = NODES[name].stream
+        problems = "".join(f", {cause}" for cause in from_values(values))
         if topic is None or f"rate.{topic}" not in values:
-            parts.append(f"{name} {_state(supervisor.children[name].state, values)}")
+            parts.append(f"{name} {_state(supervisor.children[name].state, values)}{problems}")
             continue
         late = _pair(values, "latency_ms")
         trouble = _sum(values, "dropped."), _sum(values, "refused.")
@@ -245,6 +262,7 @@ def line(nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supe
             f"{topic} {_short(values[f'rate.{topic}'], 1)} Hz"
             + (f", {late} ms" if late else "")
             + (f", {trouble[0]} dropped, {trouble[1]} refused" if any(trouble) else "")
+            + problems
         )
     return " | ".join(parts)
 

@@ -55,6 +55,11 @@ class Timeline:
         """Nanoseconds of wall time at which ``stamp_ns`` is due."""
         return self.wall_ns + round((stamp_ns - self.stamp_ns) / self.rate)
 
+    @property
+    def is_now(self) -> bool:
+        """Whether stamps are of the wall clock: a live source's, not a replay's."""
+        return self.rate == 1.0 and self.stamp_ns == self.wall_ns
+
     def values(self) -> dict[str, str]:
         """As the input node's diagnostics carry it."""
         return {

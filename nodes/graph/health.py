@@ -5,11 +5,12 @@ from __future__ import annotations
 import resource
 import sys
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from steadypose.msgs.types import Diagnostics, Level
+from steadypose.nodes.checks.problem import Problem, as_values
 from steadypose.nodes.graph.clock import Clock
 
 REPORT_NS = 1_000_000_000
@@ -45,7 +46,7 @@ class Health:
         self._first_and_last_ns: dict[str, tuple[int, int]] = {}
         self._published_before: Counter[str] = Counter()
         self._rates: dict[str, float] = {}
-        self._problems_before = 0
+        self._lost_before = 0
         self._reported_at = self._rated_at = clock.now_ns()
 
     @property
@@ -74,20 +75,24 @@ class Health:
         """So many messages wait."""
         self._queue = max(self._queue, length)
 
-    def report(self, node: str, received: Counter[str], status: Mapping[str, str]) -> Diagnostics:
+    def report(
+        self, node: str, received: Counter[str], status: Mapping[str, str], problems: Sequence[Problem] = ()
+    ) -> Diagnostics:
         """The `diagnostics` of now.
 
         Args:
             node: its name.
             received: what was dropped and refused on the way to the node, by cause.
             status: what the node itself has to say.
+            problems: that it found with its stream, the worst of which is the level and the message.
         """
         self._reported_at = self._clock.now_ns()
         self._measure_rates()
         counts = self.counts + received
         refused_by_node = sum(int(n) for key, n in status.items() if key.startswith(("refused.", "dropped.")))
-        problems = counts.total() + refused_by_node
-        new_problems, self._problems_before = problems - self._problems_before, problems
+        lost = counts.total() + refused_by_node
+        newly_lost, self._lost_before = lost - self._lost_before, lost
+        worst = max(problems, key=lambda problem: problem.level, default=None)
         values = {"state": self.state, "ended": " ".join(sorted(self.ended)), "queue": str(self._queue)}
         self._queue = 0
         values |= {f"count.{topic}": str(n) for topic, n in self.published.items()}
@@ -98,13 +103,13 @@ class Health:
         }
         values |= _percentiles("latency_ms", self._latency_ns) | _percentiles("compute_ms", self._compute_ns)
         values |= {key: str(n) for key, n in sorted(counts.items())}
-        values |= {"memory_mb": f"{resident_bytes() / 1e6:.1f}"} | dict(status)
+        values |= {"memory_mb": f"{resident_bytes() / 1e6:.1f}"} | dict(status) | as_values(problems)
         rates = ", ".join(f"{topic} {rate:.1f} Hz" for topic, rate in self._rates.items())
         return Diagnostics(
             stamp_ns=self.stamp_ns,
             node=node,
-            level=Level.WARN if new_problems else Level.OK,
-            message=f"{new_problems} dropped or refused" if new_problems else rates or self.state,
+            level=worst.level if worst else Level.WARN if newly_lost else Level.OK,
+            message=worst.text if worst else f"{newly_lost} dropped or refused" if newly_lost else rates or self.state,
             values=values,
         )
 

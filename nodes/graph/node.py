@@ -20,12 +20,14 @@ import logging
 import os
 from abc import ABC, abstractmethod
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import ClassVar
 
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Message
+from steadypose.nodes.checks.problem import Problem, error
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock, Timeline
 from steadypose.nodes.graph.health import Health
 from steadypose.nodes.graph.inbox import Inbox
@@ -56,6 +58,7 @@ class Node(ABC):
         self._required = launch.reliable_subscribers(self.name)
         self._blocked_ns = 0
         self._inbox: Inbox | None = None
+        self._refused_before: Counter[str] = Counter()
         self._supervisor = int(os.environ.get(SUPERVISOR, 0))
 
     @abstractmethod
@@ -65,6 +68,10 @@ class Node(ABC):
     def status(self) -> dict[str, str]:
         """What this node has to say in `diagnostics` beyond what every node says."""
         return {}
+
+    def problems(self) -> list[Problem]:
+        """What this node found wrong with its stream since it was last asked."""
+        return []
 
     @property
     def queue_limit(self) -> int | None:
@@ -210,7 +217,20 @@ class Node(ABC):
             received["dropped.late"] = self._inbox.overrun
             received.update({f"dropped.lost {topic}": n for topic, n in self._subscriber.dropped.items()})
             received.update({f"refused.{cause}": n for cause, n in self._subscriber.refused.items()})
-        return self.health.report(self.name, received, self.status())
+        return self.health.report(self.name, received, self.status(), [*self._wire_problems(), *self.problems()])
+
+    def _wire_problems(self) -> Iterator[Problem]:
+        """What came and is no message, since this was last asked."""
+        if self._inbox is None:
+            return
+        refused = Counter(self._subscriber.refused)
+        new, self._refused_before = refused - self._refused_before, refused
+        if new:
+            yield error(
+                "not_a_message",
+                f"{new.total()} of what came were no messages ({', '.join(sorted(new))}): expected the topic, a zero "
+                "byte, a header of 9 bytes, and CDR (docs/other_languages.md)",
+            )
 
     def _await_subscribers(self) -> None:
         """Wait until all reliable subscribers are there, or the node is stopped."""

@@ -6,8 +6,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from steadypose.msgs.topics import POSE_CLEAN
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW
 from steadypose.msgs.types import Message, PoseRaw
+from steadypose.nodes.checks.answers import Answers
+from steadypose.nodes.checks.problem import Problem, error
+from steadypose.nodes.checks.stream import StreamChecks
 from steadypose.nodes.graph.clock import FRAME_NS, Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
@@ -19,6 +22,9 @@ from steadypose.prior.clean.settings import PriorSettings
 
 GATED = ("joints_refused", "limbs_exchanged", "joints_stuck")
 """counts of what the gate found in the sensor's joints: its daily work, and no fault of a message"""
+
+OWN_SOURCE_NS, FOREIGN_SOURCE_NS = 10_000_000_000, 2_000_000_000
+"""until the first message of a source that this launch starts itself, and of one that should be there"""
 
 
 def make_prior(settings: Mapping[str, Any]) -> PriorPipeline:
@@ -58,10 +64,16 @@ class PriorNode(Node):
         load_loops()
         self._bodies = 0
         self._anomalies = 0
+        self._answers = Answers(self._pipeline.counters)
+        settings = PriorSettings.from_dict(launch.table("prior"))
+        self._checks = StreamChecks(settings.max_bodies, identified=settings.identify.enabled, streams=kiosks or 1)
+        self._started_ns = self.clock.now_ns()
 
     def handle(self, topic: str, message: Message) -> None:
         if not isinstance(message, PoseRaw):
             return
+        self._checks.see(message, self.clock.now_ns())
+        self._answers.asked(message)
         if isinstance(self._pipeline, StreamBatch):
             cleaned = self._pipeline.process_at(message, self.clock.now_ns(), hurry=self.behind)
         else:
@@ -69,7 +81,29 @@ class PriorNode(Node):
         for clean in cleaned:
             self._bodies = len(clean.bodies)
             self._anomalies += sum(body.anomaly_flag for body in clean.bodies)
+            self._answers.given(clean)
             self.publish(POSE_CLEAN, clean, delay_ns=round(clean.delay_frames * FRAME_NS))
+
+    def problems(self) -> list[Problem]:
+        now_ns = self.clock.now_ns()
+        found = self._checks.problems(now_ns, live=self.timeline is None or self.timeline.is_now)
+        if not self._checks.seen and now_ns - self._started_ns > self._patience_ns:
+            return [self._no_source(now_ns)]
+        in_general = self._answers.problems()
+        return found or in_general
+
+    @property
+    def _patience_ns(self) -> int:
+        """How long a source may take until its first message: one of this launch has to start first."""
+        return OWN_SOURCE_NS if "pose_input" in self.launch.nodes else FOREIGN_SOURCE_NS
+
+    def _no_source(self, now_ns: int) -> Problem:
+        return error(
+            "no_source",
+            f"nothing has come on {POSE_RAW} for {(now_ns - self._started_ns) / 1e9:.0f} s, ever: expected a "
+            f"publisher at {', '.join(self.launch.addresses('pose_input'))}; start the tracker, or have it bind that "
+            "address",
+        )
 
     def status(self) -> dict[str, str]:
         counts = {

@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager
 from typing import Protocol
 
 from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.checks.problem import Problem, warning
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.sources.source import LiveSource, SourceContext
 
@@ -61,6 +62,7 @@ class CameraSource(LiveSource):
         self._state = "looking for a camera"
         self._connection: Connection | None = None
         self._connections = 0
+        self._tried = False
         self._dropped: Counter[str] = Counter()  # by connections that are closed
 
     @abstractmethod
@@ -88,7 +90,7 @@ class CameraSource(LiveSource):
                 trouble = str(error)
             if self._connection:
                 self._dropped.update(self._connection.counts)
-            self._connection = None
+            self._connection, self._tried = None, True
             pause_s = PAUSES_S[min(tries, len(PAUSES_S) - 1)]
             tries += 1
             self._state = f"waiting for a camera: {trouble}; next try in {pause_s:g} s"
@@ -96,6 +98,15 @@ class CameraSource(LiveSource):
             while self._clock.now_ns() < again_ns:
                 yield None
                 self._clock.sleep(round(POLL_S * 1e9))
+
+    def problems(self) -> list[Problem]:
+        if self._state == STREAMING or not self._tried:
+            return []
+        return [
+            warning(
+                "camera", f"{self._state}; expected a camera that gives frames: `steadypose doctor` names those here"
+            )
+        ]
 
     def status(self) -> dict[str, str]:
         values = {"camera": self._state, "camera.connections": str(self._connections)}

@@ -8,6 +8,7 @@ from contextlib import closing
 
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Message, PoseRaw
+from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.graph.clock import POLL_S, Clock, Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
@@ -76,6 +77,9 @@ class PoseInputNode(Node):
             except ValueError as error:  # a message that was recorded, and still cannot be sent
                 self.refuse(topic, error)
             self.report_if_due()
+
+    def problems(self) -> list[Problem]:
+        return self._source.problems() if isinstance(self._source, LiveSource) else []
 
     def status(self) -> dict[str, str]:
         refused = {f"refused.{cause}": str(n) for cause, n in self._source.refused.items() if n}

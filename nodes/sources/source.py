@@ -10,6 +10,7 @@ from typing import Protocol
 
 from steadypose.msgs.keys import Keys
 from steadypose.msgs.types import Message, PoseRaw
+from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.sources.calibration import CalibrationSettings
 
@@ -41,6 +42,10 @@ class LiveSource(ABC):
     @abstractmethod
     def status(self) -> dict[str, str]:
         """What `diagnostics` should say of it."""
+
+    def problems(self) -> list[Problem]:
+        """What is wrong with it now."""
+        return []
 
 
 @dataclass(frozen=True)

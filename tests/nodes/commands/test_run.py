@@ -191,6 +191,19 @@ def test_the_table_and_the_line_show_what_there_is_to_see() -> None:
     assert "pose/clean 30.0 Hz, 3.1/9.9 ms, 0 dropped, 5 refused" in line(NODES, latest, processes)
 
 
+def test_what_goes_wrong_is_printed_when_it_does(make_launch: Callable[..., Launch], clock: VirtualClock) -> None:
+    console = Console(width=140, record=True)
+    run = _Run(make_launch(nodes='["prior"]'), [], console, clock)
+    for _ in range(2):
+        run._receive(news("prior", level=Level.ERROR, problem__stamps_zero="stamp is 0: expected more"))
+    assert "stamps_zero" in line(["prior"], run._diagnostics, Processes("prior"))  # type: ignore[arg-type]
+    run._receive(news("prior"))
+    assert console.export_text().splitlines() == [
+        "prior: ERROR: stamp is 0: expected more [stamps_zero]",
+        "prior: no longer: stamps_zero",
+    ]
+
+
 def steadypose(*arguments: str, folder: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "steadypose.nodes.cli", *arguments],

@@ -1,0 +1,234 @@
+"""Joints: that they make a body, in metres, upright, not mirrored, and that it moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import Pose, PoseRaw
+from steadypose.nodes.checks.problem import Problem, error, warning
+from steadypose.nodes.checks.window import tracks
+from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
+from steadypose.prior.body.likeness import Likeness, Stance, likeness, likenesses, stance
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.adapt import SensorFrame
+
+ENOUGH = 15
+"""messages to judge by"""
+SIZES = (0.5, 1.4)
+"""of bodies, from a child of three to the tallest, times an adult's lengths"""
+UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281, "kilometres": 0.001}
+ADULT_M = 1.72
+UPRIGHT, ALONG = 0.5, 0.85
+"""cosines: with the vertical, of somebody who bends; with an axis, of somebody who stands along it"""
+MIRRORED = -0.2
+"""handedness: trackers of the field stay above 0.2"""
+FASTEST = 8.0
+"""times its height that a body moves in a second: twice a sprinter"""
+AT_ORIGIN_M = 1e-3
+FLOOR_M = (-0.4, 0.7)
+"""height of the lowest joint of a leg: a pit, or a stage, is more"""
+
+Floats = NDArray[np.float64]
+
+
+def check_geometry(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
+    """Problems with where the joints of a window are."""
+    messages = [raw for raw in messages if raw.skeleton == messages[-1].skeleton]
+    if len(messages) < ENOUGH or messages[-1].skeleton not in SKELETONS:
+        return
+    skeleton = SKELETONS[messages[-1].skeleton]
+    joints = tracks(messages, len(skeleton.joints))
+    if len(joints) < ENOUGH:
+        return
+    if not np.isfinite(joints).any():
+        yield error(
+            "all_missing",
+            f"all joints of the last {len(joints)} bodies are NaN: expected metres; where nobody is, send no body",
+        )
+        return
+    if (problem := _degenerate(messages, joints)) is not None:
+        yield problem
+        return
+    like = likeness(skeleton, joints)
+    if like is None:
+        return
+    if not like.is_body:
+        yield _no_body(skeleton, like, joints)
+        return
+    if not SIZES[0] < like.scale < SIZES[1]:
+        yield _unit(like)
+    stand = stance(skeleton, joints)
+    if stand is not None:
+        yield from _frame(messages[-1].sensor_pose, stand)
+        if SIZES[0] < like.scale < SIZES[1]:
+            yield from _place(messages[-1], skeleton, joints)
+
+
+def check_jumps(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
+    """Bodies of which the whole goes from place to place; of stamps that are nanoseconds."""
+    skeleton = SKELETONS.get(messages[-1].skeleton)
+    if skeleton is None:
+        return
+    last: dict[int, tuple[int, Floats]] = {}
+    speeds = []
+    for raw in messages:
+        for body in raw.bodies:
+            if len(body.positions) != len(skeleton.joints):
+                continue
+            middle = np.nanmedian(body.positions, axis=0)
+            if body.id in last and raw.stamp_ns > (stamp_ns := last[body.id][0]):
+                speeds.append(np.linalg.norm(middle - last[body.id][1]) / (raw.stamp_ns - stamp_ns) * 1e9)
+            last[body.id] = raw.stamp_ns, middle
+    if len(speeds) < ENOUGH:
+        return
+    joints = tracks(messages, len(skeleton.joints))
+    height = float(np.nanmax(np.nanmax(joints, axis=1) - np.nanmin(joints, axis=1)))
+    if (fast := float(np.nanmedian(speeds))) > FASTEST * height > 0:
+        yield warning(
+            "jumps",
+            f"a body goes at {fast:.0f} units a second, {fast / height:.0f} times its height: expected less than "
+            f"{FASTEST:.0f}; if an id goes from one person to another, --set prior.identify.enabled=true; if stamps "
+            "are those of arrival, take those of capture",
+        )
+
+
+def _degenerate(messages: Sequence[PoseRaw], joints: Floats) -> Problem | None:
+    flat = np.nanmax(joints, axis=(0, 1)) - np.nanmin(joints, axis=(0, 1))
+    if (flat == 0).all():
+        return error(
+            "one_point",
+            f"all joints are at {joints[0, 0].tolist()}: expected metres, and NaN of a joint that was not seen",
+        )
+    if (flat == 0).any():
+        axis = "xyz"[int(np.argmax(flat == 0))]
+        return error(
+            "flat",
+            f"{axis} is the same of all joints: key points of an image, without depth; expected three coordinates in "
+            "metres: with a depth image, from_coco lifts them (docs/sources.md)",
+        )
+    stamps = {raw.stamp_ns for raw in messages}
+    if len(stamps) >= ENOUGH and len(joints) >= len(messages):
+        same = all(
+            np.array_equal(a.positions, b.positions, equal_nan=True)
+            for raw in messages[1:]
+            for a, b in zip(raw.bodies[:1], messages[0].bodies[:1], strict=False)
+        )
+        if same:
+            return error(
+                "frozen",
+                f"the joints are the same to the last bit in {len(messages)} messages of {len(stamps)} stamps: the "
+                "tracker repeats its last answer; expected new joints with each stamp, or no message",
+            )
+    return None
+
+
+def _no_body(skeleton: Skeleton, like: Likeness, joints: Floats) -> Problem:
+    others = [other for other in likenesses(joints) if other.skeleton != skeleton.name]
+    off = f"{like.worst} is {like.ratio:.1f} times as long as in a body"
+    if others and others[0].is_body:
+        return error(
+            "wrong_order",
+            f"in the order of {skeleton.name} these joints are no body ({off}), in that of {others[0].skeleton} they "
+            f"are: expected skeleton {others[0].skeleton!r}",
+        )
+    tried = ", ".join(other.skeleton for other in others)
+    return error(
+        "wrong_order",
+        f"in the order of {skeleton.name} these joints are no body "
+        f"({off}){f', nor in that of {tried}' if tried else ''}: expected {', '.join(skeleton.joints[:4])}, … as "
+        "prior/body/layouts.py has them; reorder yours, or describe them (docs/sources.md)",
+    )
+
+
+def _unit(like: Likeness) -> Problem:
+    height = like.scale * ADULT_M
+    for unit, factor in UNITS.items():
+        if SIZES[0] < like.scale / factor < SIZES[1]:
+            return error(
+                "unit",
+                f"the body is {height:.3g} m tall: these seem to be {unit}, expected metres; "
+                + (f"divide by {factor:g}" if factor > 1 else f"multiply by {1 / factor:g}"),
+            )
+    return error(
+        "unit",
+        f"the body is {height:.3g} m tall: expected metres; coordinates of an image, normalised or in pixels, are "
+        "none: take the tracker's world coordinates",
+    )
+
+
+def _frame(pose: Pose, stand: Stance) -> Iterator[Problem]:
+    """Which axis points up, and whether one has the wrong sign."""
+    up = SensorFrame.of(pose).rotation @ stand.up
+    mirrored = stand.handed < MIRRORED
+    if up[2] >= UPRIGHT:
+        if mirrored:
+            yield error(
+                "mirrored",
+                "bodies are mirrored: toes, noses and knees point backwards by their left and right; expected a "
+                "right-handed frame and the person's own left: negate x, or undo an exchange of two axes, or of left "
+                "and right (a selfie picture)",
+            )
+        return
+    axis = int(np.argmax(np.abs(stand.up)))
+    if abs(stand.up[axis]) < ALONG:
+        yield warning(
+            "not_upright",
+            f"bodies are {np.degrees(np.arccos(np.clip(up[2], -1, 1))):.0f} degrees from upright, along no axis of "
+            "their frame: expected sensor_pose.orientation to turn their frame to z up; calibrate the sensor, or give "
+            "gravity (docs/calibrate.md)",
+        )
+        return
+    name = ("-" if stand.up[axis] < 0 else "") + "xyz"[axis]
+    x, _, _, w = pose.orientation
+    if abs(abs(x) - 1.0) < 0.01 and abs(w) < 0.01 and name == "z":
+        yield error(
+            "quaternion_order",
+            "sensor_pose.orientation is 1 0 0 0, which turns bodies upside down: read as wxyz it is the identity; "
+            "expected xyzw, 0 0 0 1",
+        )
+    elif mirrored and name in ("y", "-y"):
+        yield error(
+            "axes_exchanged",
+            f"bodies stand along {name} of their frame and are mirrored: y and z are exchanged; expected x, y, z of a "
+            "right-handed frame: exchange them back",
+        )
+    elif mirrored:
+        yield error(
+            "axis_sign",
+            f"bodies stand along {name} of their frame and are mirrored: that axis has the wrong sign, or was "
+            "exchanged with z; expected a right-handed frame with z up",
+        )
+    else:
+        wanted = f"up {name!r}: Pose.from_up({name!r}), or up = {name!r} in the file"
+        yield warning(
+            "up_axis",
+            f"bodies stand along {name} of their frame, which lies flat in the world: unless they lie down, expected "
+            + (wanted if name in ("z", "y", "-y") else "sensor_pose.orientation to turn that axis to the world's z"),
+        )
+
+
+def _place(raw: PoseRaw, skeleton: Skeleton, joints: Floats) -> Iterator[Problem]:
+    """Where bodies are: at the origin, on the floor."""
+    canonical, _ = to_canonical(skeleton, joints)
+    pelvis = canonical[:, J["pelvis"]]
+    if np.isfinite(pelvis).any() and np.nanmax(np.abs(pelvis)) < AT_ORIGIN_M:
+        yield warning(
+            "root_relative",
+            "the pelvis is at the origin in every frame: joints relative to the root, so that nobody moves; expected "
+            "metres from the sensor: add the root's place",
+        )
+    elif raw.calibrated:
+        world = SensorFrame.of(raw.sensor_pose).to_world(canonical)
+        legs = world[:, [J[f"{side}_{joint}"] for side in ("left", "right") for joint in ("ankle", "foot")], 2]
+        if (
+            np.isfinite(legs).any()
+            and not FLOOR_M[0] < (lowest := float(np.nanmedian(np.nanmin(legs, axis=1)))) < FLOOR_M[1]
+        ):
+            yield warning(
+                "floor",
+                f"the sensor is said to be calibrated, but feet are at a height of {lowest:.2f} m: expected the floor "
+                "at 0; calibrate again (docs/calibrate.md), or say calibrated=False",
+            )

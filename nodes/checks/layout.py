@@ -1,0 +1,161 @@
+"""Names, numbers of joints, confidences and ids."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.checks.problem import Problem, error, warning
+from steadypose.nodes.checks.window import bodies
+from steadypose.nodes.graph.settings import nearest
+from steadypose.prior.body.layouts import SKELETONS, Skeleton
+from steadypose.prior.body.likeness import likenesses
+from steadypose.prior.clean.slots import MIN_JOINTS
+
+UNIT_TOLERANCE = 0.01
+ENOUGH = 5
+"""messages to judge by"""
+
+
+def check_layout(messages: Sequence[PoseRaw], max_bodies: int, *, identified: bool) -> Iterator[Problem]:
+    """Problems with what the messages of a window say that they are.
+
+    Args:
+        messages: the window.
+        max_bodies: that the prior follows at once.
+        identified: whether the prior finds ids itself, whatever the source's are.
+    """
+    if len(messages) < ENOUGH:
+        return
+    newest = messages[-1]
+    if newest.skeleton not in SKELETONS:
+        yield _unknown(messages)
+        return
+    yield from _sensor_pose(newest)
+    skeleton = SKELETONS[newest.skeleton]
+    counts = Counter(len(body.positions) for body in bodies(messages))
+    if counts and (common := counts.most_common(1)[0][0]) != len(skeleton.joints):
+        yield _wrong_count(messages, skeleton, common)
+        return
+    yield from _confidence(messages)
+    yield from _seen(messages)
+    yield from _ids(messages, max_bodies, identified)
+
+
+def _unknown(messages: Sequence[PoseRaw]) -> Problem:
+    name = messages[-1].skeleton
+    like = _best(messages)
+    hint = f"; its {like[1]} joints are most like {like[0]!r}" if like else ""
+    close = nearest(name.lower().replace("_", "").replace("-", ""), SKELETONS)
+    return error(
+        "unknown_skeleton",
+        f"skeleton {name!r}: expected one of {', '.join(SKELETONS)}{close}{hint}; of joints of your own, see "
+        "docs/sources.md",
+    )
+
+
+def _wrong_count(messages: Sequence[PoseRaw], skeleton: Skeleton, count: int) -> Problem:
+    same = [s.name for s in SKELETONS.values() if len(s.joints) == count]
+    like = _best(messages)
+    if like:
+        hint = f"; these are most like {like[0]!r}: name that"
+    elif same:
+        hint = f"; {' and '.join(same)} have {count}"
+    else:
+        hint = "; a joint that was not found is NaN, not left out"
+    return error(
+        "wrong_joint_count", f"{skeleton.name}: expected bodies of {len(skeleton.joints)} joints, got {count}{hint}"
+    )
+
+
+def _best(messages: Sequence[PoseRaw]) -> tuple[str, int] | None:
+    """The layout in which what came is a body, and its number of joints."""
+    counts = Counter(len(body.positions) for body in bodies(messages))
+    if not counts:
+        return None
+    count = counts.most_common(1)[0][0]
+    joints = np.array([body.positions for body in bodies(messages) if len(body.positions) == count], np.float64)
+    best = next(iter(likenesses(np.where(np.isfinite(joints), joints, np.nan))), None)
+    return (best.skeleton, count) if best and best.is_body else None
+
+
+def _sensor_pose(raw: PoseRaw) -> Iterator[Problem]:
+    pose = raw.sensor_pose
+    norm = float(np.linalg.norm(pose.orientation))
+    if not np.isfinite(pose.position).all() or not abs(norm - 1.0) < UNIT_TOLERANCE:
+        yield error(
+            "sensor_pose",
+            f"sensor_pose is no pose: position {np.round(pose.position, 3).tolist()}, orientation "
+            f"{np.round(pose.orientation, 3).tolist()} of norm {norm:.3g}; expected finite numbers and a unit "
+            "quaternion xyzw: Pose.from_up('-y') of a level camera, 0 0 0 1 where z is up",
+        )
+
+
+def _confidence(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
+    found = [body.confidence for body in bodies(messages) if len(body.confidence)]
+    if not found:
+        return
+    values = np.concatenate(found)
+    seen = np.concatenate([np.isfinite(body.positions).all(axis=1) for body in bodies(messages)])
+    if not np.isfinite(values).any():
+        yield error(
+            "confidence_nan", "confidence is NaN of every joint: expected 0 to 1; 1 where the source has no confidences"
+        )
+        return
+    most, least = float(np.nanmax(values)), float(np.nanmin(values))
+    if most > 1.0:
+        top = 100 if most <= 100 else 255 if most <= 255 else None
+        yield warning(
+            "confidence_range",
+            f"confidence goes up to {most:g}: expected 0 to 1, all above counts as 1; "
+            + (f"divide by {top}" if top and most > 1.5 else "scale or clip it"),
+        )
+    elif least < 0.0:
+        yield warning("confidence_range", f"confidence goes down to {least:g}: expected 0 to 1; below 0 counts as 0")
+    elif seen.any() and not (np.nan_to_num(values[seen]) > 0).any():
+        yield warning(
+            "confidence_zero",
+            "confidence is 0 of every joint that has a position: expected 0 to 1; give 1 where the source has none, "
+            "and NaN positions where it saw nothing",
+        )
+
+
+def _seen(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
+    seen = [int(np.isfinite(body.positions).all(axis=1).sum()) for body in bodies(messages)]
+    if seen and 0 < (usual := int(np.median(seen))) < MIN_JOINTS:
+        yield warning(
+            "few_joints",
+            f"{usual} joints of a body are seen, the rest is NaN: a body is taken up from {MIN_JOINTS} on; expected "
+            "most of the body in the picture: stand farther away, or lower the tracker's own threshold",
+        )
+
+
+def _ids(messages: Sequence[PoseRaw], max_bodies: int, identified: bool) -> Iterator[Problem]:
+    most = max(len(raw.bodies) for raw in messages)
+    if most > max_bodies:
+        yield warning(
+            "too_many_bodies",
+            f"{most} bodies in a message, the prior follows {max_bodies}: expected [prior] max_bodies of {most} or "
+            f"more; set --set prior.max_bodies={most}, or send those that matter",
+        )
+    twice = sum(len({body.id for body in raw.bodies}) < len(raw.bodies) for raw in messages)
+    if identified:
+        return
+    if twice > len(messages) / 2:
+        yield error(
+            "ids_repeated",
+            f"bodies of one message have the same id in {twice} of {len(messages)} messages: expected an id a person; "
+            "number them, or --set prior.identify.enabled=true",
+        )
+        return
+    appearances = Counter(body.id for body in bodies(messages))
+    inhabited = sum(bool(raw.bodies) for raw in messages)
+    if inhabited >= 2 * ENOUGH and np.median(list(appearances.values())) <= 2 and len(appearances) > 2 * most:
+        yield error(
+            "ids_change",
+            f"{len(appearances)} ids in {inhabited} messages of at most {most} bodies: expected a person to keep the "
+            "id; where the tracker does not, --set prior.identify.enabled=true",
+        )

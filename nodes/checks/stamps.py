@@ -1,0 +1,125 @@
+"""Stamps: that they are nanoseconds of capture, rise, and are of now."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from steadypose.nodes.checks.problem import Problem, error, warning
+from steadypose.nodes.checks.window import Arrival
+
+SECOND_NS = 1_000_000_000
+ENOUGH = 10
+"""messages to judge by"""
+RATES_HZ = (4.0, 300.0)
+"""what trackers give"""
+SLOW_HZ = 9.0
+"""below that, half of what moves is gone between two frames"""
+UNITS = {"seconds": 1e9, "milliseconds": 1e6, "microseconds": 1e3, "ticks of 100 ns": 100.0}
+AHEAD_NS = 300_000_000
+"""that a stamp may be ahead of this machine's clock: two clocks that are set by hand, no more"""
+STEP_NS = 500_000_000
+"""between stamps and clock, from one message to the next, that a source's clock was set"""
+SECONDS_BELOW = 10**11
+"""a stamp that counts seconds since 1970, until the year 5138"""
+SETTLED = 8
+"""messages before and after such a step"""
+
+
+def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem]:
+    """Problems with the stamps of a window.
+
+    Args:
+        arrivals: the window.
+        live: whether stamps should be of now: not those of a replay.
+    """
+    if len(arrivals) < ENOUGH:
+        return
+    stamps = np.array([arrival.raw.stamp_ns for arrival in arrivals])
+    if (problem := _unit(stamps)) is not None:
+        yield problem
+        return
+    steps = np.diff(stamps)
+    if (steps < 0).sum() > max(1, 0.1 * len(steps)):
+        yield warning(
+            "stamps_out_of_order",
+            f"{(steps < 0).sum()} of the last {len(steps)} stamps are older than the one before: expected stamps that "
+            "rise; publish frames in the order of their capture, from one thread",
+        )
+    elif (steps == 0).sum() > 0.3 * len(steps):
+        yield warning(
+            "stamps_repeated",
+            f"{(steps == 0).sum()} of the last {len(steps)} stamps repeat the one before: expected one message a "
+            "frame, with all its bodies; put bodies of one moment into one message",
+        )
+    rate = SECOND_NS / max(float(np.median(steps)), 1.0)
+    if 0 < rate < SLOW_HZ:
+        yield warning(
+            "slow",
+            f"stamps are {1e3 / rate:.0f} ms apart, {rate:.1f} frames a second: expected {SLOW_HZ:.0f} or more, best "
+            "30; what moves is lost in between: a smaller network, or a picture of less size",
+        )
+    if live:
+        yield from _against_clock(arrivals, stamps)
+
+
+def _unit(stamps: np.ndarray) -> Problem | None:
+    """What is said where stamps are not nanoseconds."""
+    newest, rising = int(stamps[-1]), np.diff(stamps)
+    if not stamps.any():
+        return error(
+            "stamps_zero",
+            "stamp is 0 in every message: expected nanoseconds of capture; set stamp_ns, such as time.time_ns() when "
+            "the picture was taken",
+        )
+    step = float(np.median(rising[rising > 0])) if (rising > 0).any() else 0.0
+    if not (stamps % SECOND_NS).any() and (step == 0 or step >= SECOND_NS):
+        return error(
+            "stamps_whole_seconds",
+            f"stamps are whole seconds, the last {newest // SECOND_NS} s: the part below the second is lost; expected "
+            "nanoseconds of capture: in ROS both stamp.sec and stamp.nanosec, else time.time_ns()",
+        )
+    if not step and newest < SECONDS_BELOW:
+        return _of_unit("seconds", f"stamp is {newest} in every message", UNITS["seconds"])
+    if not step:
+        return error(
+            "stamps_constant",
+            f"stamp is {newest} in every message: expected nanoseconds of capture, another for each frame; "
+            "use time.time_ns()",
+        )
+    if SECOND_NS / step > RATES_HZ[1]:
+        for unit, factor in UNITS.items():
+            # whole seconds count up by one now and then; what is finer by every frame
+            if RATES_HZ[0] <= SECOND_NS / (step * factor) <= RATES_HZ[1] or (unit == "seconds" and step <= 1):
+                return _of_unit(unit, f"stamps are {step:g} ns apart, {SECOND_NS / step:.3g} frames a second", factor)
+    return None
+
+
+def _of_unit(unit: str, found: str, factor: float) -> Problem:
+    return error(
+        "stamps_unit",
+        f"{found}: they seem to be {unit}, expected nanoseconds of capture; multiply by {factor:.0f}, or use "
+        "time.time_ns(), when the picture was taken",
+    )
+
+
+def _against_clock(arrivals: Sequence[Arrival], stamps: np.ndarray) -> Iterator[Problem]:
+    """Stamps against this machine's clock."""
+    late = np.array([arrival.at_ns for arrival in arrivals]) - stamps
+    if -late.max() > AHEAD_NS:
+        yield warning(
+            "stamps_ahead",
+            f"stamps are {-late.max() / SECOND_NS:.1f} s ahead of this machine's clock: expected times of capture, "
+            "which are past; synchronise the two clocks (NTP or PTP)",
+        )
+    # what was held up on its way comes late and then catches up; a clock that was set stays where it is
+    step = int(np.argmax(np.abs(np.diff(late)))) + 1
+    before, after = late[:step], late[step:]
+    if min(len(before), len(after)) >= SETTLED and abs(moved := int(after.min() - before.min())) > STEP_NS:
+        yield warning(
+            "clock_jumped",
+            f"the source's clock moved by {abs(moved) / SECOND_NS:.1f} s against this machine's from one message to "
+            "the next: the stream starts anew; expected a clock that runs on: let NTP slew that clock instead of "
+            "setting it",
+        )

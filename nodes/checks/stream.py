@@ -1,0 +1,124 @@
+"""All checks of one stream of ``pose/raw``."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from steadypose.msgs.types import Level, PoseRaw
+from steadypose.nodes.checks.geometry import check_geometry, check_jumps
+from steadypose.nodes.checks.layout import check_layout
+from steadypose.nodes.checks.problem import Problem, error, warning
+from steadypose.nodes.checks.stamps import check_stamps
+from steadypose.nodes.checks.window import Window
+
+SILENT_NS = 2_000_000_000
+"""without a message, after which a stream has stopped"""
+NOBODY = 60
+"""messages without ever a body"""
+
+
+class StreamCheck:
+    """Looks at a stream and says what is wrong with it.
+
+    Args:
+        max_bodies: that the prior follows at once.
+        identified: whether the prior finds ids itself.
+    """
+
+    def __init__(self, max_bodies: int, *, identified: bool = False) -> None:
+        self._max_bodies, self._identified = max_bodies, identified
+        self._window = Window()
+        self._ended = False
+
+    def see(self, raw: PoseRaw, at_ns: int) -> None:
+        """A message came, at this wall time."""
+        self._ended = raw.end_of_stream
+        if not raw.end_of_stream:
+            self._window.add(raw, at_ns)
+
+    def problems(self, now_ns: int, *, live: bool) -> list[Problem]:
+        """What is wrong with the stream now.
+
+        Args:
+            now_ns: wall time.
+            live: whether it should be of now and go on: not a replay.
+        """
+        with warnings.catch_warnings():  # of joints that are NaN throughout numpy warns; they are looked for
+            warnings.simplefilter("ignore", RuntimeWarning)
+            with np.errstate(all="ignore"):
+                return list(self._problems(now_ns, live))
+
+    def _problems(self, now_ns: int, live: bool) -> Iterator[Problem]:
+        last = self._window.last
+        if last is None or self._ended:
+            return
+        if live and (silent_ns := now_ns - last.at_ns) > SILENT_NS:
+            yield error(
+                "stopped",
+                f"no message for {silent_ns / 1e9:.0f} s, after {self._window.received}: the tracker has stopped, "
+                "hangs, or its connection is cut; start it again: this goes on when it does",
+            )
+            return
+        arrivals = self._window.arrivals(now_ns)
+        messages = [arrival.raw for arrival in arrivals]
+        if not messages:
+            return
+        stamps = list(check_stamps(arrivals, live=live))
+        names = list(check_layout(messages, self._max_bodies, identified=self._identified))
+        yield from (*stamps, *names)
+        if not self._window.inhabited and self._window.received >= NOBODY:
+            yield warning(
+                "nobody",
+                f"{self._window.received} messages and nobody in any: expected bodies; if somebody stands there, the "
+                "tracker does not find them, or the publisher leaves `bodies` empty",
+            )
+        if _usable(names):  # else joints are not what they are called
+            yield from check_geometry(messages)
+        if _usable(names) and _usable(stamps):
+            yield from check_jumps(messages)
+
+
+def _usable(problems: list[Problem]) -> bool:
+    return not any(problem.level == Level.ERROR for problem in problems)
+
+
+class StreamChecks:
+    """The checks of all streams that a prior takes: one, or one of each kiosk, by its source.
+
+    Args:
+        max_bodies, identified: as of `StreamCheck`.
+        streams: how many to tell apart.
+    """
+
+    def __init__(self, max_bodies: int, *, identified: bool, streams: int) -> None:
+        self._new = partial(StreamCheck, max_bodies, identified=identified)
+        self._streams = streams
+        self._checks: dict[str, StreamCheck] = {}
+
+    @property
+    def seen(self) -> bool:
+        """Whether any message came, ever."""
+        return bool(self._checks)
+
+    def see(self, raw: PoseRaw, at_ns: int) -> None:
+        """A message came, at this wall time."""
+        source = raw.source if self._streams > 1 else ""
+        check = self._checks.pop(source, None) or self._new()
+        self._checks[source] = check
+        if len(self._checks) > self._streams:
+            del self._checks[next(iter(self._checks))]
+        check.see(raw, at_ns)
+
+    def problems(self, now_ns: int, *, live: bool) -> list[Problem]:
+        """As of `StreamCheck.problems`; of several streams each with its source's name."""
+        found = [
+            replace(problem, cause=f"{source}.{problem.cause}", text=f"{source}: {problem.text}") if source else problem
+            for source, check in self._checks.items()
+            for problem in check.problems(now_ns, live=live)
+        ]
+        return sorted(found, key=lambda problem: -problem.level)

@@ -1,0 +1,62 @@
+"""The last second of a stream, as the checks look at it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import PoseRaw, RawBody
+
+LENGTH_NS = 1_500_000_000
+LONGEST = 90
+"""messages"""
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A message, and when it came."""
+
+    at_ns: int
+    """wall time"""
+    raw: PoseRaw
+
+
+class Window:
+    """The messages of the last moments, by when they came."""
+
+    def __init__(self) -> None:
+        self._arrivals: deque[Arrival] = deque(maxlen=LONGEST)
+        self.received = 0
+        """messages, ever"""
+        self.inhabited = 0
+        """messages with a body in them, ever"""
+
+    def add(self, raw: PoseRaw, at_ns: int) -> None:
+        self.received += 1
+        self.inhabited += bool(raw.bodies)
+        self._arrivals.append(Arrival(at_ns, raw))
+
+    def arrivals(self, now_ns: int) -> list[Arrival]:
+        """Those of the window that ends now, oldest first."""
+        return [arrival for arrival in self._arrivals if now_ns - arrival.at_ns <= LENGTH_NS]
+
+    @property
+    def last(self) -> Arrival | None:
+        return self._arrivals[-1] if self._arrivals else None
+
+
+def bodies(messages: Sequence[PoseRaw]) -> Iterator[RawBody]:
+    """All bodies of all messages."""
+    for raw in messages:
+        yield from raw.bodies
+
+
+def tracks(messages: Sequence[PoseRaw], joints: int) -> NDArray[np.float64]:
+    """(N, J, 3) the joints of all bodies of as many joints as the layout has; what is not finite is NaN."""
+    found = [body.positions for body in bodies(messages) if len(body.positions) == joints]
+    stacked = np.array(found, np.float64).reshape(-1, joints, 3)
+    return np.where(np.isfinite(stacked).all(axis=-1, keepdims=True), stacked, np.nan)

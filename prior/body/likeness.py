@@ -1,0 +1,173 @@
+"""How like a body joints are: whose order, unit, upright axis and handedness would make them one.
+
+For what comes from outside under a name that may be wrong. Nothing here changes a pose; it finds the words for what is
+wrong with one. Lengths are compared as logarithms, so that a unit is a shift of all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
+from steadypose.prior.body.skeleton import REST_POSITIONS, J, finite_joints
+
+Floats = NDArray[np.float64]
+
+_SIDE = ("shoulder-elbow", "elbow-wrist", "hip-knee", "knee-ankle")
+_SPANS = (
+    ("left_hip", "right_hip"),
+    ("left_shoulder", "right_shoulder"),
+    ("pelvis", "neck"),
+    ("neck", "head"),
+    *((f"{side}_{a}", f"{side}_{b}") for side in ("left", "right") for a, b in (s.split("-") for s in _SIDE)),
+)
+SPANS: NDArray[np.intp] = np.array([[J[a], J[b]] for a, b in _SPANS])
+"""(S, 2) canonical joints whose distance hardly depends on the pose"""
+SPAN_NAMES: tuple[str, ...] = tuple(f"{a} to {b}" for a, b in _SPANS)
+MIN_SPANS = 5
+"""of which a body is known by its lengths"""
+BODY_ERROR = 0.5
+"""RMS of the logarithms of lengths against a human's, up to which joints make a body; trackers of the field stay below
+0.35, joints read in the order of another layout are above 0.55"""
+NO_LENGTH = 1e-4
+"""of an adult's: two joints in one place are so far apart, which keeps logarithms finite"""
+
+HUMAN: Floats = np.linalg.norm(REST_POSITIONS[SPANS[:, 0]] - REST_POSITIONS[SPANS[:, 1]], axis=1)
+"""(S,) metres, of an adult"""
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """Joints, read in the order of a layout, against a human body.
+
+    Attributes:
+        skeleton: the layout they were read in.
+        scale: their lengths over an adult's: 1 in metres, 1000 in millimetres.
+        error: RMS over the spans of the logarithm of a length over the human one at that scale, and of its spread
+            over time. 0 is a statue of proportions of the canonical skeleton.
+        worst: the span that is farthest off.
+        ratio: that span's length over the human one at that scale.
+    """
+
+    skeleton: str
+    scale: float
+    error: float
+    worst: str
+    ratio: float
+
+    @property
+    def is_body(self) -> bool:
+        return self.error < BODY_ERROR
+
+
+def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | None:
+    """How like a body joints are in the order of a layout.
+
+    Args:
+        skeleton: the layout, of J joints.
+        positions: (T, J, 3) of one or several bodies, any unit and frame; NaN where missing.
+
+    Returns:
+        None where too few joints were seen to say.
+    """
+    joints, _ = to_canonical(skeleton, positions.astype(np.float64))
+    lengths = np.linalg.norm(joints[:, SPANS[:, 0]] - joints[:, SPANS[:, 1]], axis=-1)
+    seen = np.isfinite(lengths).sum(axis=0) > len(lengths) / 4
+    if seen.sum() < MIN_SPANS:
+        return None
+    logs = np.log(np.maximum(lengths[:, seen] / HUMAN[seen], NO_LENGTH))
+    middle = np.nanmedian(logs, axis=0)
+    scale = float(np.median(middle))
+    spread = np.minimum(np.nanmedian(np.abs(logs - middle), axis=0), 1.0)
+    off = np.clip(middle - scale, -3.0, 3.0)
+    worst = int(np.argmax(np.abs(off)))
+    return Likeness(
+        skeleton.name,
+        float(np.exp(scale)),
+        float(np.sqrt(np.mean(off**2 + spread**2))),
+        SPAN_NAMES[int(np.flatnonzero(seen)[worst])],
+        float(np.exp(off[worst])),
+    )
+
+
+def likenesses(positions: NDArray[np.floating]) -> list[Likeness]:
+    """The layouts of as many joints as came, those in which they are most like a body first."""
+    fitting = [s for s in SKELETONS.values() if len(s.joints) == positions.shape[1]]
+    found = [like for skeleton in fitting if (like := likeness(skeleton, positions))]
+    return sorted(found, key=lambda like: like.error)
+
+
+@dataclass(frozen=True)
+class Stance:
+    """How bodies stand in their frame.
+
+    Attributes:
+        up: (3,) unit vector from their feet to their heads, in the frame of the joints.
+        handed: -1 to 1: whether toes, noses and knees point where left and right say is forward. A mirrored body
+            is near -1; NaN where nothing told.
+    """
+
+    up: Floats
+    handed: float
+
+
+def stance(skeleton: Skeleton, positions: NDArray[np.floating]) -> Stance | None:
+    """How bodies stand.
+
+    Args:
+        skeleton: the layout, of J joints.
+        positions: (T, J, 3) any unit, NaN where missing.
+
+    Returns:
+        None where it cannot be told, or changes.
+    """
+    positions = positions.astype(np.float64)
+    joints, _ = to_canonical(skeleton, positions)
+    low = _mean(joints, "left_ankle", "right_ankle", "left_hip", "right_hip", "left_knee", "right_knee")
+    high = _mean(joints, "left_shoulder", "right_shoulder", "neck", "head")
+    ups = _unit(high - low)
+    ups = ups[np.isfinite(ups[:, 0])]
+    if not len(ups):
+        return None
+    up = ups.mean(axis=0)
+    if np.linalg.norm(up) < 0.9:  # not one direction: somebody falls, or the joints are no body
+        return None
+    return Stance(up / np.linalg.norm(up), _handedness(skeleton, positions, joints))
+
+
+def _handedness(skeleton: Skeleton, positions: Floats, joints: Floats) -> float:
+    """The mean cosine between what points forwards on a body and what its left and right say is forwards."""
+    upwards = _unit(_mean(joints, "left_shoulder", "right_shoulder") - _mean(joints, "left_hip", "right_hip"))
+    leftwards = sum(_unit(joints[:, J[f"left_{j}"]] - joints[:, J[f"right_{j}"]]) for j in ("hip", "shoulder"))
+    forwards = _unit(np.cross(leftwards, upwards))
+    told: list[Floats] = []
+    for side in ("left", "right"):
+        hip, knee, ankle, foot = (joints[:, J[f"{side}_{j}"]] for j in ("hip", "knee", "ankle", "foot"))
+        told.append(_unit(foot - ankle))
+        bent = knee - (hip + ankle) / 2
+        flexed = np.linalg.norm(bent, axis=1) > 0.08 * np.linalg.norm(hip - ankle, axis=1)
+        told.append(np.where(flexed[:, None], _unit(bent), np.nan))
+    names = {name.lower().replace("_", ""): index for index, name in enumerate(skeleton.joints)}
+    ears = [names[name] for name in ("leftear", "rightear", "lear", "rear", "earleft", "earright") if name in names]
+    if "nose" in names and len(ears) == 2:
+        told.append(_unit(positions[:, names["nose"]] - positions[:, ears].mean(axis=1)))
+    cosines = np.concatenate([(forwards * direction).sum(axis=1) for direction in told])
+    cosines = cosines[np.isfinite(cosines)]
+    return float(np.median(cosines)) if len(cosines) else float("nan")
+
+
+def _mean(joints: Floats, *names: str) -> Floats:
+    """(T, 3) the mean of those of the joints that are seen; NaN where none is."""
+    chosen = joints[:, [J[name] for name in names]]
+    seen = finite_joints(chosen)
+    total = np.where(seen[..., None], chosen, 0.0).sum(axis=1)
+    counts = seen.sum(axis=1)[:, None]
+    return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
+
+
+def _unit(vectors: Floats) -> Floats:
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(lengths > 0, vectors / np.where(lengths > 0, lengths, 1.0), np.nan)

@@ -1,0 +1,377 @@
+"""What goes wrong at a user's is named within three seconds, with what to do: the table of docs/troubleshooting.md."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import VirtualClock
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from tests.helpers.msg_strategies import RAW
+from tests.helpers.synthetic_poses import walker
+
+from steadypose import PACKAGE
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.types import CleanBody, Diagnostics, Level, Pose, PoseClean, PoseRaw, RawBody
+from steadypose.nodes.checks.answers import Answers
+from steadypose.nodes.checks.problem import from_values
+from steadypose.nodes.checks.stream import StreamCheck
+from steadypose.nodes.graph.clock import Timeline
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.prior_node import PriorNode
+from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.body.layouts import CANONICAL, COCO17, H36M17, KINECT22, SKELETONS, Skeleton
+
+SECOND_NS = 1_000_000_000
+SOON_S = 3.0
+START_NS = 1_763_000_000 * SECOND_NS
+STREAMS = sorted(path.parent.name for path in (PACKAGE / "sim_data").glob("*/*.mcap"))
+
+Frames = list[PoseRaw]
+Spoil = Callable[[PoseRaw, int], PoseRaw]
+
+
+def walk(seconds: float = SOON_S, skeleton: Skeleton = CANONICAL, *, fps: float = 30.0) -> Frames:
+    """Somebody who walks, as a tracker of that layout with a centimetre of noise gives it, in a world with z up."""
+    lift = np.linalg.pinv(skeleton.to_canonical)
+    frames = []
+    for index in range(round(seconds * fps)):
+        joints, _, _ = walker(index / fps)
+        noise = np.random.default_rng(index).normal(0.0, 0.01, (len(skeleton.joints), 3))
+        body = RawBody(1, lift @ joints + noise, np.full(len(skeleton.joints), 0.9))
+        frames.append(
+            PoseRaw(
+                START_NS + round(index * SECOND_NS / fps),
+                "camera",
+                "mine",
+                skeleton.name,
+                Pose.identity(),
+                False,
+                [body],
+            )
+        )
+    return frames
+
+
+def body(change: Callable[[RawBody, int], RawBody]) -> Spoil:
+    return lambda raw, index: dataclasses.replace(raw, bodies=[change(body, index) for body in raw.bodies])
+
+
+def joints(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+    return body(lambda it, _: RawBody(it.id, change(it.positions.copy()), it.confidence))
+
+
+def confidence(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+    return body(lambda it, _: RawBody(it.id, it.positions, change(it.confidence.copy())))
+
+
+def message(**values: object) -> Spoil:
+    return lambda raw, _: dataclasses.replace(raw, **values)  # type: ignore[arg-type]
+
+
+def stamp(change: Callable[[int, int], int]) -> Spoil:
+    return lambda raw, index: dataclasses.replace(raw, stamp_ns=change(raw.stamp_ns, index))
+
+
+def bodies(change: Callable[[RawBody, int], list[RawBody]]) -> Spoil:
+    return lambda raw, index: dataclasses.replace(raw, bodies=change(raw.bodies[0], index))
+
+
+def mirrored(joints: np.ndarray) -> np.ndarray:
+    return joints * [-1, 1, 1]
+
+
+MISUSES: dict[str, tuple[Spoil, str, str]] = {
+    "a skeleton's name nearly right": (message(skeleton="smpl-22"), "unknown_skeleton", "did you mean 'smpl22'"),
+    "a skeleton nobody knows": (message(skeleton="octopus"), "unknown_skeleton", "most like 'smpl22'"),
+    "a skeleton's name left empty": (message(skeleton=""), "unknown_skeleton", "expected one of smpl22"),
+    "a skeleton of another number of joints": (message(skeleton="coco17"), "wrong_joint_count", "most like 'smpl22'"),
+    "a joint left out": (
+        body(lambda it, _: RawBody(it.id, it.positions[:-1], it.confidence[:-1])),
+        "wrong_joint_count",
+        "NaN, not left out",
+    ),
+    "the skeleton of another tracker": (message(skeleton="kinect22"), "wrong_order", "expected skeleton 'smpl22'"),
+    "joints in an order of one's own": (
+        joints(lambda it: it[np.random.default_rng(5).permutation(22)]),
+        "wrong_order",
+        "reorder yours",
+    ),
+    "stamps of zero": (stamp(lambda _, __: 0), "stamps_zero", "time.time_ns()"),
+    "the same stamp": (stamp(lambda _, __: START_NS + 7), "stamps_constant", "another for each frame"),
+    "stamps in whole seconds": (
+        stamp(lambda ns, _: ns // SECOND_NS * SECOND_NS),
+        "stamps_whole_seconds",
+        "stamp.nanosec",
+    ),
+    "seconds for nanoseconds": (stamp(lambda ns, _: ns // SECOND_NS), "stamps_unit", "multiply by 1000000000"),
+    "milliseconds for nanoseconds": (stamp(lambda ns, _: ns // 10**6), "stamps_unit", "multiply by 1000000"),
+    "microseconds for nanoseconds": (stamp(lambda ns, _: ns // 10**3), "stamps_unit", "multiply by 1000"),
+    "a Kinect's ticks for nanoseconds": (stamp(lambda ns, _: ns // 100), "stamps_unit", "ticks of 100 ns"),
+    "two threads that publish out of order": (
+        stamp(lambda ns, index: ns + (50_000_000 if index % 2 else 0)),
+        "stamps_out_of_order",
+        "order of their capture",
+    ),
+    "a message a body": (stamp(lambda ns, index: ns - index % 2 * 33_333_333), "stamps_repeated", "into one message"),
+    "a clock that is ahead": (stamp(lambda ns, _: ns + 5 * SECOND_NS), "stamps_ahead", "NTP or PTP"),
+    "a clock that is set": (
+        stamp(lambda ns, index: ns - 3600 * SECOND_NS * (index > 60)),
+        "clock_jumped",
+        "slew that clock",
+    ),
+    "a sensor pose of zeros": (
+        message(sensor_pose=Pose(np.zeros(3), np.zeros(4))),
+        "sensor_pose",
+        "unit quaternion xyzw",
+    ),
+    "a quaternion wxyz": (
+        message(sensor_pose=Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))),
+        "quaternion_order",
+        "expected xyzw, 0 0 0 1",
+    ),
+    "y up, and z said": (joints(lambda it: it[:, [1, 2, 0]]), "up_axis", "Pose.from_up('y')"),
+    "an optical frame, and z said": (
+        joints(lambda it: np.stack([-it[:, 1], -it[:, 2], it[:, 0]], axis=1)),
+        "up_axis",
+        "Pose.from_up('-y')",
+    ),
+    "x up": (joints(lambda it: it[:, [2, 0, 1]]), "up_axis", "turn that axis to the world's z"),
+    "y and z exchanged": (joints(lambda it: it[:, [0, 2, 1]]), "axes_exchanged", "exchange them back"),
+    "z of the wrong sign": (joints(lambda it: it * [1, 1, -1]), "axis_sign", "wrong sign"),
+    "x mirrored": (joints(mirrored), "mirrored", "negate x"),
+    "x and y exchanged": (joints(lambda it: it[:, [1, 0, 2]]), "mirrored", "exchange of two axes"),
+    "a selfie picture: left is right": (
+        joints(lambda it: it[[CANONICAL.joints.index(_other(name)) for name in CANONICAL.joints]]),
+        "mirrored",
+        "left and right",
+    ),
+    "a camera that leans": (
+        joints(lambda it: Rotation.from_rotvec([0.8, -0.8, 0]).apply(it)),
+        "not_upright",
+        "docs/calibrate.md",
+    ),
+    "millimetres": (joints(lambda it: it * 1000), "unit", "divide by 1000"),
+    "centimetres": (joints(lambda it: it * 100), "unit", "divide by 100"),
+    "feet": (joints(lambda it: it * 3.281), "unit", "divide by 3.281"),
+    "coordinates of an image from 0 to 1": (joints(lambda it: it * 0.3), "unit", "world coordinates"),
+    "key points of an image, z 0": (joints(lambda it: it * [1, 0, 1]), "flat", "from_coco"),
+    "joints relative to the root": (joints(lambda it: it - it[0]), "root_relative", "add the root's place"),
+    "all joints at the origin": (joints(np.zeros_like), "one_point", "NaN of a joint"),
+    "all joints missing": (joints(lambda it: np.full_like(it, np.nan)), "all_missing", "send no body"),
+    "hardly a joint seen": (
+        joints(lambda it: np.where(np.arange(22)[:, None] < 4, it, np.nan)),
+        "few_joints",
+        "the tracker's own threshold",
+    ),
+    "a tracker that repeats itself": (body(lambda it, _: walk(0.1)[0].bodies[0]), "frozen", "repeats its last answer"),
+    "confidences of zero": (confidence(np.zeros_like), "confidence_zero", "give 1"),
+    "confidences to a hundred": (confidence(lambda it: it * 100), "confidence_range", "divide by 100"),
+    "confidences to 255": (confidence(lambda it: it * 255), "confidence_range", "divide by 255"),
+    "confidences below zero": (confidence(lambda it: it - 2), "confidence_range", "below 0 counts as 0"),
+    "confidences of NaN": (confidence(lambda it: it * np.nan), "confidence_nan", "1 where the source has no"),
+    "an id a frame": (
+        body(lambda it, index: RawBody(index, it.positions, it.confidence)),
+        "ids_change",
+        "prior.identify.enabled=true",
+    ),
+    "all ids the same": (
+        bodies(lambda it, _: [it, RawBody(it.id, it.positions + np.float32(1), it.confidence)]),
+        "ids_repeated",
+        "number them",
+    ),
+    "more bodies than the prior follows": (
+        bodies(lambda it, _: [RawBody(i, it.positions + np.float32(i), it.confidence) for i in range(11)]),
+        "too_many_bodies",
+        "prior.max_bodies=11",
+    ),
+    "two people under one id in turn": (
+        body(lambda it, index: RawBody(it.id, it.positions + np.float32(1.5 * (index % 2)), it.confidence)),
+        "jumps",
+        "prior.identify.enabled=true",
+    ),
+    "messages without bodies": (message(bodies=[]), "nobody", "leaves `bodies` empty"),
+    "a calibration with another floor": (
+        lambda raw, _: dataclasses.replace(
+            raw, sensor_pose=Pose(np.array([0, 0, 1.4]), np.array([0.0, 0, 0, 1])), calibrated=True
+        ),
+        "floor",
+        "calibrate again",
+    ),
+}
+
+
+def _other(name: str) -> str:
+    return {"l": "right", "r": "left"}[name[0]] + name[name.index("_") :] if "_" in name else name
+
+
+def told(frames: Frames, *, max_bodies: int = 8, live: bool = True) -> dict[str, tuple[float, Level, str]]:
+    """What is told of a stream that comes at its own rate: by cause, when first, in seconds from the first message."""
+    check, found, due = StreamCheck(max_bodies), {}, START_NS + SECOND_NS
+    for index, raw in enumerate(frames):
+        at_ns = START_NS + index * SECOND_NS // 30
+        while at_ns >= due:
+            for problem in check.problems(due, live=live):
+                found.setdefault(problem.cause, ((due - START_NS) / SECOND_NS, problem.level, problem.text))
+            due += SECOND_NS
+        check.see(raw, at_ns)
+    for problem in check.problems(due, live=live):
+        found.setdefault(problem.cause, ((due - START_NS) / SECOND_NS, problem.level, problem.text))
+    return found
+
+
+@pytest.mark.parametrize("misuse", MISUSES)
+def test_it_is_named_within_three_seconds(misuse: str) -> None:
+    spoil, cause, words = MISUSES[misuse]
+    found = told([spoil(raw, index) for index, raw in enumerate(walk())])
+    assert cause in found, found
+    after_s, _, text = found[cause]
+    assert after_s <= SOON_S
+    assert words in text
+    assert "expected" in text
+
+
+def test_nothing_else_is_named() -> None:
+    """One thing that is wrong is not told as five."""
+    for misuse, (spoil, cause, _) in MISUSES.items():
+        found = told([spoil(raw, index) for index, raw in enumerate(walk())])
+        assert set(found) <= {cause}, misuse
+
+
+def test_the_table_is_long_enough() -> None:
+    assert len(MISUSES) >= 25
+
+
+@pytest.mark.parametrize("skeleton", SKELETONS)
+def test_a_good_stream_has_no_problem(skeleton: str) -> None:
+    good = walk(skeleton=SKELETONS[skeleton])
+    assert not told(good)
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_recorded_streams_have_no_problem(name: str) -> None:
+    frames = [message for _, message in open_recording(PACKAGE / "sim_data" / name) if isinstance(message, PoseRaw)]
+    assert not told(frames, live=False)
+
+
+@pytest.mark.parametrize(("said", "meant"), [(COCO17, H36M17), (H36M17, COCO17), (KINECT22, CANONICAL)])
+def test_a_layout_for_another_of_as_many_joints(said: Skeleton, meant: Skeleton) -> None:
+    frames = [dataclasses.replace(raw, skeleton=said.name) for raw in walk(skeleton=meant)]
+    assert f"expected skeleton {meant.name!r}" in told(frames)["wrong_order"][2]
+
+
+def test_a_short_hold_up_is_no_clock_that_was_set() -> None:
+    check = StreamCheck(8)
+    for index, raw in enumerate(walk()):
+        due = START_NS + index * SECOND_NS // 30
+        held_until = START_NS + 2 * SECOND_NS
+        check.see(raw, held_until if SECOND_NS < due - START_NS < 2 * SECOND_NS else due)
+    assert not check.problems(START_NS + 3 * SECOND_NS, live=True)
+
+
+class TestNode:
+    """What the prior node makes of it."""
+
+    @pytest.fixture
+    def node(self, make_launch: Callable[..., Launch], clock: VirtualClock) -> PriorNode:
+        clock.time_ns = START_NS
+        return PriorNode(make_launch(nodes='["prior"]'), clock)
+
+    @staticmethod
+    def play(node: PriorNode, clock: VirtualClock, frames: Frames) -> Diagnostics:
+        node.publish = lambda *_, **__: True  # type: ignore[method-assign]
+        for raw in frames:
+            clock.time_ns += SECOND_NS // 30
+            node.handle(POSE_RAW, raw)
+        return node.diagnostics()
+
+    def test_a_good_stream(self, node: PriorNode, clock: VirtualClock) -> None:
+        news = self.play(node, clock, walk())
+        assert news.level == Level.OK
+        assert not from_values(news.values)
+
+    def test_a_problem_is_the_level_and_the_message(self, node: PriorNode, clock: VirtualClock) -> None:
+        news = self.play(node, clock, [dataclasses.replace(raw, skeleton="octopus") for raw in walk()])
+        assert news.level == Level.ERROR
+        assert news.message == news.values["problem.unknown_skeleton"]
+
+    def test_a_tracker_that_stops(self, node: PriorNode, clock: VirtualClock) -> None:
+        self.play(node, clock, walk())
+        clock.time_ns += round(2.5 * SECOND_NS)
+        assert "start it again" in from_values(node.diagnostics().values)["stopped"]
+
+    def test_a_stream_that_ended_has_not_stopped(self, node: PriorNode, clock: VirtualClock) -> None:
+        frames = walk()
+        self.play(node, clock, [*frames, dataclasses.replace(frames[-1], bodies=[], end_of_stream=True)])
+        clock.time_ns += 60 * SECOND_NS
+        assert node.diagnostics().level == Level.OK
+
+    def test_a_tracker_that_never_came(self, node: PriorNode, clock: VirtualClock) -> None:
+        clock.time_ns += round(2.5 * SECOND_NS)
+        assert "pose_input" in from_values(node.diagnostics().values)["no_source"]
+
+    def test_a_replay_is_not_of_now(self, node: PriorNode, clock: VirtualClock) -> None:
+        node.timeline = Timeline(START_NS, START_NS - 10 * SECOND_NS, 2.0)
+        assert self.play(node, clock, walk()).level == Level.OK
+
+
+def test_the_page_has_every_cause() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "troubleshooting.md").read_text()
+    package = Path(__file__).parents[3] / "nodes"
+    code = "".join(
+        file.read_text() for folder in ("checks", "graph", "sources") for file in (package / folder).glob("*.py")
+    )
+    causes = set(re.findall(r'(?:error|warning)\(\s*"(\w+)"', code))
+    assert causes >= {cause for _, cause, _ in MISUSES.values()}
+    assert causes == set(re.findall(r"^\| `(\w+)`", page, re.MULTILINE))
+
+
+def test_answers_that_are_of_no_use() -> None:
+    counters: Counter[str] = Counter()
+    answers = Answers(counters)
+    good = walk(1.0)
+    for raw in good:
+        answers.asked(raw)
+    assert not answers.problems()
+    for raw in good:
+        answers.asked(raw)
+        counters["joints_refused"] += 18
+    assert [problem.cause for problem in answers.problems()] == ["nearly_all_refused"]
+    flagged = CleanBody(
+        1, np.zeros((22, 3)), np.zeros((22, 4)), np.ones(22), np.zeros(22), 5.0, True, np.zeros(22), np.zeros(22),
+        np.zeros((22, 3)), np.ones(22),
+    )  # fmt: skip
+    for raw in good:
+        answers.given(PoseClean(raw.stamp_ns, "camera", "mine", raw.sensor_pose, False, 4, [flagged]))
+    assert [problem.cause for problem in answers.problems()] == ["nearly_all_flagged"]
+    assert not answers.problems()
+
+
+def _named(raw: PoseRaw, skeleton: str) -> PoseRaw:
+    """The message with its joints cut or filled to the layout's number, so that it comes as far as the geometry."""
+    count = len(SKELETONS[skeleton].joints)
+    return dataclasses.replace(
+        raw,
+        skeleton=skeleton,
+        bodies=[
+            RawBody(it.id, np.resize(it.positions, (count, 3)), np.resize(it.confidence, count)) for it in raw.bodies
+        ],
+    )
+
+
+@given(st.lists(RAW, min_size=1, max_size=4), st.sampled_from([*SKELETONS, None]), st.booleans())
+@settings(deadline=None, max_examples=60)
+def test_whatever_comes_is_survived(raws: list[PoseRaw], skeleton: str | None, live: bool) -> None:
+    check = StreamCheck(2)
+    for index in range(30):
+        raw = raws[index % len(raws)]
+        check.see(_named(raw, skeleton) if skeleton else raw, START_NS + index * 33_000_000)
+    for problem in check.problems(START_NS + SECOND_NS, live=live):
+        assert problem.text

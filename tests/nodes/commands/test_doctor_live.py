@@ -1,0 +1,69 @@
+"""The doctor listens to a tracker that publishes, over a real socket."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import running, walk
+from rich.console import Console
+
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.commands import doctor_live
+from steadypose.nodes.graph.clock import SystemClock
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.node import Node
+
+
+class Tracker(Node):
+    """Publishes frames, again and again."""
+
+    name = "pose_input"
+    frames: tuple[PoseRaw, ...] = ()
+
+    def handle(self, topic: str, message: object) -> None:
+        raise AssertionError
+
+    def work(self) -> None:
+        index = 0
+        while not self.stopping:
+            frame = self.frames[index % len(self.frames)]
+            self.publish(POSE_RAW, dataclasses.replace(frame, stamp_ns=self.clock.now_ns()))
+            self.clock.sleep(10_000_000)
+            index += 1
+
+
+@pytest.fixture
+def file(make_launch: Callable[..., Launch], tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    path = tmp_path / "launch.toml"
+    path.write_text(f'[transport]\ndirectory = "{folder}"\nlossless = false\n')
+    monkeypatch.setattr(doctor_live, "LISTEN_NS", 800_000_000)
+    return str(path)
+
+
+def heard(file: str, frames: list[PoseRaw]) -> tuple[int, str]:
+    console = Console(record=True, width=200)
+    node = Tracker(Launch.read(file), SystemClock())
+    node.frames = tuple(frames)
+    with running(node):
+        return doctor_live.listen(file, console), console.export_text()
+
+
+def test_a_good_tracker(file: str) -> None:
+    status, text = heard(file, [dataclasses.replace(raw, calibrated=False) for raw in walk(120)])
+    assert (status, "nothing is wrong with it" in text) == (0, True), text
+
+
+def test_a_bad_tracker(file: str) -> None:
+    status, text = heard(file, [dataclasses.replace(raw, skeleton="smpl") for raw in walk(30)])
+    assert status == 1
+    assert "did you mean 'smpl22'" in text
+
+
+def test_no_tracker(file: str) -> None:
+    console = Console(record=True, width=200)
+    assert doctor_live.listen(file, console) == 1
+    assert "start the tracker" in console.export_text()
