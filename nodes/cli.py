@@ -23,6 +23,7 @@ COMMANDS = {
     "echo": ("steadypose.nodes.commands.inspect.echo:echo", "print the messages of a topic or recording"),
     "hz": ("steadypose.nodes.commands.inspect.hz:hz", "measure the rate of a topic or recording"),
     "info": ("steadypose.nodes.commands.inspect.info:info", "what is in a recording, or on a topic"),
+    "repair": ("steadypose.nodes.commands.repair:repair", "what can be read of a damaged recording, as a whole one"),
     "plot": ("steadypose.nodes.commands.plot.command:plot", "what happened in a recording, as pictures"),
     "prepare": ("steadypose.nodes.commands.prepare:prepare", "motion capture into training data"),
     "train": ("steadypose.prior.models.registry:train", "train a model of the prior"),

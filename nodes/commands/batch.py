@@ -103,7 +103,7 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
         console: for progress and what went wrong.
 
     Returns:
-        the exit status: 1 if one could not be cleaned.
+        the exit status: 1 if one could not be cleaned, or not be read to the end.
 
     Raises:
         LaunchError: nothing can be done at all.
@@ -120,7 +120,7 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
     if known := len(found) - len(waiting):
         console.print(f"{known} of {len(found)} are done already; see {manifest.path}", highlight=False)
     cleaning = on_ray(waiting, settings) if ray else on_cores(waiting, settings, jobs or _cores())
-    failed = 0
+    failed = damaged = 0
     with Progress(console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task(folder.name, total=len(found), completed=known)
         for job, result in cleaning:
@@ -130,10 +130,14 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
                 failed += 1
                 cause = str(result["error"]).removeprefix(f"{job.source}: ")
                 console.print(f"{job.source}: {cause}", style="red", markup=False, highlight=False, soft_wrap=True)
+            elif result["unread"]:
+                damaged += 1
+                causes = ", ".join(f"{cause}: {n}" for cause, n in result["unread"].items())
+                console.print(f"{job.source}: damaged; {causes}", style="red", markup=False, highlight=False)
             elif not result["poses"]:
                 console.print(f"{job.source}: no body was recognised", markup=False, highlight=False)
     console.print(f"{out}: {len(found) - failed} of {len(found)} recordings are clean", highlight=False)
-    return 1 if failed else 0
+    return 1 if failed or damaged else 0
 
 
 class Manifest:

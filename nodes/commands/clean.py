@@ -28,7 +28,8 @@ def clean(
 
     A folder of recordings is cleaned into another, as many at once as there are cores, or on a Ray cluster.
     OUT/manifest.jsonl says what became of each; started again, the command does what is not done yet. A recording
-    that cannot be cleaned does not stop the others: the exit status is then 1.
+    that cannot be cleaned does not stop the others. The exit status is 1 if one could not be cleaned, or is damaged so
+    that a part of it could not be read.
 
     Args:
         source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
@@ -78,4 +79,6 @@ def clean(
         console.print(f"  {problem}", highlight=False, markup=False, soft_wrap=True, style="yellow")
     if not done.poses:
         console.print(f"  no body was recognised: is the skeleton right, are the units metres? See what {source} holds")
-    return 0
+    if done.unread:
+        console.print(f"  {source} is damaged: what could be read of it is clean", style="red", highlight=False)
+    return 1 if done.unread else 0

@@ -64,6 +64,7 @@ class Cleaned:
         poses: of bodies, given in answer; none if no body was recognised.
         refused: what was refused or dropped, by cause.
         problems: what is wrong with the input, each as it was first found.
+        unread: what of it the input holds and could not be read, because it is damaged.
     """
 
     frames: int
@@ -72,6 +73,7 @@ class Cleaned:
     poses: int
     refused: dict[str, int]
     problems: list[str]
+    unread: dict[str, int]
 
 
 def clean_recording(
@@ -149,6 +151,7 @@ def clean_recording(
         poses=poses,
         refused={cause: n for cause, n in (frames.refused + prior.counters + trajectory.counters).items() if n},
         problems=list(problems.values()),
+        unread={cause: n for cause, n in frames.refused.items() if n},
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import signal
 import sys
@@ -20,13 +21,18 @@ from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Level
 from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.graph.clock import FRAME_NS, POLL_S, Clock, SystemClock
+from steadypose.nodes.graph import health_file
+from steadypose.nodes.graph.health_file import write_health
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.supervisor import Supervisor
-from steadypose.nodes.graph.topology import NODES, Delivery, load
+from steadypose.nodes.graph.systemd import ALIVE, READY, STOPPING, notify
+from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, load
 from steadypose.nodes.sinks.recorder import RecorderSettings
 
 LINE_NS = 5_000_000_000
 """between lines where there is no terminal for a table"""
+TELL_NS = 1_000_000_000
+"""between two times the health file is written"""
 STALL_NS = 15_000_000_000
 """without progress after the source has ended, until the run is given up: a message was lost on the way"""
 
@@ -42,7 +48,7 @@ def run(
 ) -> int:
     """Start the nodes of a launch file, watch them and show how they do, until the stream ends or Ctrl-C.
 
-    A node that crashes is started again. With `view` on a terminal, the picture stays when the stream has ended.
+    A node that crashes, or is not heard any more, is started again. With `view` on a terminal, the picture stays when the stream has ended.
 
     Args:
         launch: a launch file, or the name of one of the project's own, such as replay, oak, ros2 or server.
@@ -95,14 +101,21 @@ class _Run:
         self._diagnostics: dict[str, Diagnostics] = {}
         self._problems: dict[str, set[str]] = {}
         self._over = False
+        waited_for = frozenset[str]().union(*map(launch.reliable_subscribers, POSE_NODES))
+        self._required = {name for name in launch.nodes if not NODES[name].optional or name in waited_for}
+        self._without: list[str] = []
         self._progress_ns = clock.now_ns()
         self._printed_ns = clock.now_ns()
+        self._told_ns = 0
+        self._ready = False
 
     def watch(self) -> int:
         """Start the nodes and show their diagnostics until the stream has ended or Ctrl-C; returns the exit status."""
         transport = self._launch.transport
         transport.ipc_directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         keys = transport.curve_keys()
+        if keys:  # the nodes are this machine's own, whoever else is subscribed to
+            keys = dataclasses.replace(keys, server=keys.public)
         endpoints = [transport.endpoint(name) for name in self._launch.nodes]
         terminal = self._console.is_terminal
         with (
@@ -113,24 +126,46 @@ class _Run:
             status = None
             try:
                 while status is None:
-                    self._receive(subscriber.receive(POLL_S))
+                    received = subscriber.receive(POLL_S)
+                    while received:
+                        self._receive(received, supervisor)
+                        received = subscriber.receive(0)
                     supervisor.poll()
                     self._show(supervisor, live)
+                    self._tell(supervisor)
                     status = self._exit_status(supervisor)
             except KeyboardInterrupt:
                 status = 0
+            notify(STOPPING)
             supervisor.stop()
+            (transport.ipc_directory / health_file.NAME).unlink(missing_ok=True)
             while received := subscriber.receive(0):
-                self._receive(received)
+                self._receive(received, supervisor)
         self._console.print(table(self._launch.nodes, self._diagnostics, supervisor, summary=True))
+        if status == 0 and (lost := self._not_recorded(supervisor)):
+            self._print(f"the recording is not complete: {lost}")
+            return 1
         return status
+
+    def _tell(self, supervisor: Supervisor) -> None:
+        """Say how things are to who is no person: once a second, a file and systemd."""
+        if self._clock.now_ns() - self._told_ns < TELL_NS:
+            return
+        self._told_ns = self._clock.now_ns()
+        write_health(self._launch.transport.ipc_directory, sorted(self._required), supervisor, self._diagnostics)
+        if not self._ready and all(name in self._diagnostics for name in self._required):
+            self._ready = True
+            notify(READY)
+        notify(ALIVE)
 
     def _print(self, line: str) -> None:
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    def _receive(self, received: tuple[str, object] | None) -> None:
-        if received is None or not isinstance(diagnostics := received[1], Diagnostics):
+    def _receive(self, received: tuple[str, object], supervisor: Supervisor) -> None:
+        diagnostics = received[1]
+        if not isinstance(diagnostics, Diagnostics) or diagnostics.node not in supervisor.children:
             return
+        supervisor.children[diagnostics.node].heard()
         last = self._diagnostics.get(diagnostics.node)
         if last is None or _counts(last) != _counts(diagnostics):
             self._progress_ns = self._clock.now_ns()
@@ -156,9 +191,12 @@ class _Run:
 
     def _exit_status(self, supervisor: Supervisor) -> int | None:
         """The exit status, or None while there is something to wait for."""
-        if supervisor.failed:
-            self._print(f"{', '.join(supervisor.failed)} cannot run; stopping")
+        if required := [name for name in supervisor.failed if name in self._required]:
+            self._print(f"{', '.join(required)} cannot run; stopping")
             return 1
+        if without := [name for name in supervisor.failed if name not in self._without]:
+            self._without += without
+            self._print(f"{', '.join(without)} cannot run; going on without")
         source = supervisor.children.get("pose_input")
         if source is None or source.state != "ended":
             self._progress_ns = self._progress_ns if source else self._clock.now_ns()
@@ -175,13 +213,23 @@ class _Run:
             return 1
         return None
 
+    def _not_recorded(self, supervisor: Supervisor) -> str:
+        """What the recorder could not write; empty if it wrote all, or there is none."""
+        if "recorder" not in supervisor.children:
+            return ""
+        if "recorder" in supervisor.failed:
+            return "the recorder could not run"
+        values = self._diagnostics["recorder"].values if "recorder" in self._diagnostics else {}
+        causes = [f"{key} {n}" for key, n in values.items() if key.startswith(("dropped.", "refused.")) and n != "0"]
+        return ", ".join(causes)
+
     def _drained(self) -> bool:
         """Whether the end of the stream has come through every node."""
         streams = {NODES[name].stream for name in self._launch.nodes}
         recorded = set(self._launch.settings(RecorderSettings).topics)
         for name in self._launch.nodes:
             declared = NODES[name]
-            if declared.delivery is Delivery.BEST_EFFORT:
+            if declared.delivery is Delivery.BEST_EFFORT or name in self._without:
                 continue
             seen = {*declared.topics, declared.stream}
             wanted = streams & (seen if name != "recorder" else seen & recorded) - {None}
@@ -209,6 +257,8 @@ def table(
         values = latest.values if latest else {}
         topic = NODES[name].stream
         state = _state(child.state, values)
+        if child.state == "stale":  # what it said before does not hold any more
+            values = {}
         delay = values.get("delay_frames")
         rows.append(
             {
@@ -253,8 +303,9 @@ def line(nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supe
         values = diagnostics[name].values if name in diagnostics else {}
         topic = NODES[name].stream
         problems = "".join(f", {cause}" for cause in from_values(values))
-        if topic is None or f"rate.{topic}" not in values:
-            parts.append(f"{name} {_state(supervisor.children[name].state, values)}{problems}")
+        stale = supervisor.children[name].state == "stale"
+        if stale or topic is None or f"rate.{topic}" not in values:
+            parts.append(f"{name} {_state(supervisor.children[name].state, values)}{'' if stale else problems}")
             continue
         late = _pair(values, "latency_ms")
         trouble = _sum(values, "dropped."), _sum(values, "refused.")

@@ -32,12 +32,18 @@ from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock, Timeline
 from steadypose.nodes.graph.health import Health
 from steadypose.nodes.graph.inbox import Inbox
 from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.systemd import ALIVE, READY, notify
 from steadypose.nodes.graph.topology import NODES, Delivery
 
 logger = logging.getLogger(__name__)
 
 SUPERVISOR = "STEADYPOSE_SUPERVISOR"
 """environment: the process that started this node; without it, the node stops"""
+
+
+def supervisor_id() -> int:
+    """The process that started this node, and starts it again; 0 if there is none."""
+    return int(os.environ.get(SUPERVISOR, 0))
 
 
 class Node(ABC):
@@ -59,7 +65,7 @@ class Node(ABC):
         self._blocked_ns = 0
         self._inbox: Inbox | None = None
         self._refused_before: Counter[str] = Counter()
-        self._supervisor = int(os.environ.get(SUPERVISOR, 0))
+        self._supervisor = supervisor_id()
 
     @abstractmethod
     def handle(self, topic: str, message: Message) -> None:
@@ -123,6 +129,7 @@ class Node(ABC):
                 self._inbox = Inbox(self._subscriber, self.queue_limit)
             self.health.state = "running"
             self.report()
+            notify(READY)
             self.work()
             self.health.state = "stopped"
             self.report()
@@ -207,6 +214,7 @@ class Node(ABC):
         if self._supervisor and os.getppid() != self._supervisor:
             logger.error("%s: the process that started this node is gone; stopping", self.name)
             self._stopping = True
+        notify(ALIVE)
         # a subscriber without room for this second's diagnostics can have those of the next
         self._publisher.publish(DIAGNOSTICS, self.diagnostics(), timeout_s=0)
 

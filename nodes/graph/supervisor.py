@@ -1,4 +1,4 @@
-"""Nodes as processes: started, watched, started again when they crash, stopped in order."""
+"""Nodes as processes: started, watched, started again when they crash or fall silent, stopped in order."""
 
 from __future__ import annotations
 
@@ -13,23 +13,39 @@ from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.node import SUPERVISOR
 from steadypose.nodes.graph.topology import NODES
 
-BACKOFF_S = (0.5, 1.0, 2.0, 4.0, 8.0)
-"""before each restart in a row; a node that crashes once more has failed"""
-STEADY_S = 30.0
+BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
+"""before each restart in a row; the last one repeats for as long as it takes"""
+STEADY_S = 10.0
 """a node that ran for so long begins with the first pause again"""
+TRIES = 6
+"""of a node that was not heard once: then it has failed"""
+STARTING_S = 600.0
+"""until a node must be heard; the first start on a small machine compiles for minutes"""
+STALE_S = 3.0
+"""silence of a node, which reports once a second, from which on nothing that it said before holds"""
+HUNG_S = 10.0
+"""silence after which it is killed, and started again"""
 STOP_S = 5.0
 """between SIGTERM and SIGKILL"""
 USAGE_ERROR = 2
-"""exit status of a node that cannot do what its launch file says: it will not the next time either"""
+"""exit status of a node that cannot do what its launch file says: if it never could, it will not the next time either"""
 ORDER = tuple(NODES)
 """of stopping"""
+COMMAND = (
+    sys.executable,
+    "-c",
+    # the working directory is not looked through for modules (python -P, which 3.10 does not have): it may hold others
+    "import sys; sys.path[:] = [p for p in sys.path if p]; from steadypose.nodes.cli import main; sys.exit(main())",
+    "node",
+)
 
 
 class Child:
     """One node's process.
 
     Attributes:
-        state: ``running``, ``crashed`` (and about to start again), ``ended``, or ``failed``.
+        state: ``running``, ``stale`` (it runs, and is not heard), ``crashed`` (and about to start again), ``ended``, or
+            ``failed``.
         restarts: how often it was started again.
     """
 
@@ -41,33 +57,69 @@ class Child:
         self._clock = clock
         self._log = log
         self._crashes = 0
+        self._was_heard = False
         self._start()
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def silent_s(self) -> float:
+        """Since when it was not heard; 0 for one that does not run, or that is only starting."""
+        if self.state not in ("running", "stale") or self._heard_ns is None:
+            return 0.0
+        return (self._clock.now_ns() - self._heard_ns) / 1e9
+
+    def heard(self) -> None:
+        """It said something."""
+        if self.state in ("running", "stale"):
+            self._heard_ns = self._clock.now_ns()
+            self._was_heard = True
+            self.state = "running"
+
+    def excuse(self) -> None:
+        """Who listens was away: silence begins to count from now."""
+        if self._heard_ns is not None:
+            self._heard_ns = self._clock.now_ns()
 
     def poll(self) -> None:
         """See whether the process is still there, and start it again when that is due."""
-        if self.state == "crashed" and self._clock.now_ns() >= self._due_ns:
+        now = self._clock.now_ns()
+        if self.state == "crashed" and now >= self._due_ns:
             self.restarts += 1
             self._start()
             return
-        if self.state != "running" or (status := self._process.poll()) is None:
+        if self.state not in ("running", "stale"):
             return
+        if (status := self._process.poll()) is not None:
+            self._note_exit(status)
+        elif self.silent_s > HUNG_S or (self._heard_ns is None and now - self._started_ns > STARTING_S * 1e9):
+            self._log(f"{self.name}: was not heard for {HUNG_S if self._heard_ns else STARTING_S:g} s; killing it")
+            self._process.kill()
+            self._process.wait()
+            self._note_exit(-signal.SIGKILL)
+        elif self.silent_s > STALE_S:
+            self.state = "stale"
+
+    def _note_exit(self, status: int) -> None:
         if self._clock.now_ns() - self._started_ns > STEADY_S * 1e9:
             self._crashes = 0
         self._crashes += 1
         if status == 0:
             self.state = "ended"
-        elif status == USAGE_ERROR or self._crashes > len(BACKOFF_S):
+        elif not self._was_heard and (status == USAGE_ERROR or self._crashes >= TRIES):
             self.state = "failed"
         else:
             self.state = "crashed"
-            pause_s = BACKOFF_S[self._crashes - 1]
+            pause_s = BACKOFF_S[min(self._crashes, len(BACKOFF_S)) - 1]
             self._due_ns = self._clock.now_ns() + round(pause_s * 1e9)
             cause = signal.Signals(-status).name if status < 0 else f"status {status}"
             self._log(f"{self.name}: ended with {cause}; starting it again in {pause_s:g} s")
 
     def stop(self) -> None:
         """End the process, with SIGTERM first; returns when it is gone."""
-        if self.state == "running":
+        if self.state in ("running", "stale"):
             self._process.terminate()
             try:
                 self._process.wait(STOP_S)
@@ -87,13 +139,14 @@ class Child:
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env=os.environ | {SUPERVISOR: str(os.getpid())},
+            env=_environment(),
             # Ctrl-C is for the supervisor, which stops its nodes in order
             start_new_session=True,
         )
         self._reader = threading.Thread(target=self._read, args=(self._process,), daemon=True)
         self._reader.start()
         self._started_ns = self._clock.now_ns()
+        self._heard_ns: int | None = None
         self.state = "running"
 
     def _read(self, process: subprocess.Popen[str]) -> None:
@@ -101,6 +154,12 @@ class Child:
         with process.stdout:
             for line in process.stdout:
                 self._log(line.rstrip())
+
+
+def _environment() -> dict[str, str]:
+    """Of a node: that of this process, which is its supervisor, less what systemd says to this process alone."""
+    kept = {key: value for key, value in os.environ.items() if key not in ("NOTIFY_SOCKET", "WATCHDOG_USEC")}
+    return kept | {SUPERVISOR: str(os.getpid()), "PYTHONSAFEPATH": "1"}
 
 
 class Supervisor:
@@ -116,14 +175,20 @@ class Supervisor:
             arguments: of ``steadypose node NAME``, the same for all.
             log: where a line from a node, or about it, goes; called from several threads.
         """
-        command = [sys.executable, "-m", "steadypose.nodes.cli", "node"]
+        self._clock = clock
+        self._polled_ns = clock.now_ns()
         self.children = {
-            name: Child(name, [*command, name, *arguments], clock, log)
+            name: Child(name, [*COMMAND, name, *arguments], clock, log)
             for name in sorted(nodes, key=ORDER.index, reverse=True)
         }
 
     def poll(self) -> None:
+        """See after all nodes; to be called several times a second, after what they said was taken."""
+        before, self._polled_ns = self._polled_ns, self._clock.now_ns()
+        away = self._polled_ns - before > STALE_S * 1e9
         for child in self.children.values():
+            if away:  # suspended, or starved: nobody listened
+                child.excuse()
             child.poll()
 
     @property

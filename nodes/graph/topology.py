@@ -42,6 +42,8 @@ class NodeDeclaration:
     """the dataclass of the section, as ``module:name``; empty: a table that the node itself reads, so that reading a
     launch file takes none of its libraries"""
     delivery: Delivery = Delivery.AS_LAUNCHED
+    optional: bool = False
+    """poses go on without it: a run whose optional node cannot run does"""
     preflight: str = ""
     """a function of the `Launch`, as ``module:name``, that raises what would keep the node from starting; or empty"""
 
@@ -97,6 +99,7 @@ NODES: Mapping[str, NodeDeclaration] = {
         section="viewer",
         settings="steadypose.nodes.sinks.viewer.settings:ViewerSettings",
         delivery=Delivery.BEST_EFFORT,
+        optional=True,
         preflight="steadypose.nodes.sinks.viewer.settings:check_viewer",
     ),
     "recorder": NodeDeclaration(
@@ -105,6 +108,7 @@ NODES: Mapping[str, NodeDeclaration] = {
         section="recorder",
         settings="steadypose.nodes.sinks.recorder:RecorderSettings",
         delivery=Delivery.RELIABLE,
+        optional=True,
         preflight="steadypose.nodes.sinks.recorder:check_recorder",
     ),
 }

@@ -1,7 +1,14 @@
-"""The recorder: topics into a rosbag2 directory."""
+"""The recorder: topics into a rosbag2 directory.
+
+It runs for months: parts are split, the oldest removed where there is a limit, and where the disk has no room it drops
+messages and counts them, until there is room again. Started again, it goes on with the next part.
+"""
 
 from __future__ import annotations
 
+import logging
+import math
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +20,10 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.settings import LaunchError, nearest, path_setting
 
+logger = logging.getLogger(__name__)
+
+CHECK_NS = 1_000_000_000
+"""between two looks at how much room the disk has"""
 QUIET_S = 0.3
 """without a message after the stop, until all that was on its way has arrived"""
 
@@ -24,6 +35,16 @@ class RecorderSettings:
     directory: str = path_setting()
     """the rosbag2 directory to make; a relative path starts at the launch file"""
     topics: list[str] = field(default_factory=lambda: list(TOPICS))
+    split_mb: float = 1000.0
+    """begin the next part at this size, MB; 0: never"""
+    split_s: float = 3600.0
+    """begin the next part after so much of the stream, seconds; 0: never"""
+    keep_mb: float = 0.0
+    """remove the oldest parts so that all have no more, MB; 0: keep all"""
+    free_mb: float = 500.0
+    """what is to be left of the disk, MB: with less, messages are dropped and counted"""
+    sync_s: float = 5.0
+    """how much a power failure may cost, seconds; 0: what the operating system has not written yet"""
 
     def __post_init__(self) -> None:
         for topic in self.topics:
@@ -32,6 +53,26 @@ class RecorderSettings:
                     f"[recorder] topics names {topic!r}, which nobody publishes{nearest(topic, TOPICS)}; "
                     f"topics are {', '.join(TOPICS)}"
                 )
+        for name in ("split_mb", "split_s", "keep_mb", "free_mb", "sync_s"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise LaunchError(f"[recorder] {name}: expected 0 or more, got {getattr(self, name)}")
+        if 0 < self.keep_mb < 2 * self.split_mb:
+            raise LaunchError(
+                f"[recorder] keep_mb: expected at least two parts of split_mb, {2 * self.split_mb:g}, got {self.keep_mb:g}"
+            )
+
+    def writer(self) -> RecordingWriter:
+        """Raises:
+        RecordingError: the directory holds something else, or cannot be made.
+        """
+        return RecordingWriter(
+            self.directory,
+            go_on=True,
+            split_bytes=round(self.split_mb * 1e6),
+            split_ns=round(self.split_s * 1e9),
+            keep_bytes=round(self.keep_mb * 1e6),
+        )
+
 
 
 def check_recorder(launch: Launch) -> None:
@@ -58,6 +99,9 @@ class LogTimes:
         return self._highest_ns[topic]
 
 
+NO_ROOM = "dropped.no room on the disk"
+
+
 class RecorderNode(Node):
     """Writes what is published, loses nothing, and completes the recording when it is stopped."""
 
@@ -68,7 +112,9 @@ class RecorderNode(Node):
         settings = launch.settings(RecorderSettings)
         if not settings.directory:
             raise LaunchError("[recorder] directory: expected the recording to make, got none; give --record")
-        self._directory = Path(settings.directory)
+        self._settings = settings
+        self._full = False
+        self._checked_ns = self._synced_ns = 0
         self._topics = frozenset(settings.topics)
         self._log_times = LogTimes()
         self._before_first_pose: list[Diagnostics] = []
@@ -76,10 +122,16 @@ class RecorderNode(Node):
         self._written = 0
 
     def work(self) -> None:
-        with RecordingWriter(self._directory) as self._writer:
+        self._writer = self._settings.writer()
+        try:
             super().work()
             while self.take_next(QUIET_S):
                 pass
+        finally:
+            try:
+                self._writer.close()
+            except OSError as error:
+                self._no_room(error.strerror or str(error))
 
     def handle(self, topic: str, message: Message) -> None:
         if topic not in self._topics:
@@ -97,8 +149,39 @@ class RecorderNode(Node):
         self._write(topic, message, message.stamp_ns or self._pose_ns or 0)
 
     def _write(self, topic: str, message: Message, stamp_ns: int) -> None:
-        self._writer.write(topic, message, self._log_times.next(topic, stamp_ns))
-        self._written += 1
+        self._look_at_disk()
+        if not self._full:
+            try:
+                self._writer.write(topic, message, self._log_times.next(topic, stamp_ns))
+                self._written += 1
+                return
+            except OSError as error:
+                self._no_room(error.strerror or str(error))
+        self.health.counts[NO_ROOM] += 1
+
+    def _look_at_disk(self) -> None:
+        now = self.clock.now_ns()
+        if self._checked_ns and now - self._checked_ns < CHECK_NS:
+            return
+        self._checked_ns = now
+        try:
+            free = shutil.disk_usage(self._writer.directory).free
+            if free < self._settings.free_mb * 1e6:
+                self._no_room(f"{free / 1e6:.0f} MB are free, {self._settings.free_mb:g} are to be left")
+            elif self._full:
+                logger.info("recorder: there is room again; going on in the next part")
+                self._writer.split()
+                self._full = False
+            elif self._settings.sync_s and now - self._synced_ns >= self._settings.sync_s * 1e9:
+                self._synced_ns = now
+                self._writer.sync()
+        except OSError as error:
+            self._no_room(error.strerror or str(error))
+
+    def _no_room(self, cause: str) -> None:
+        if not self._full:
+            logger.error("recorder: %s: messages are dropped until there is room", cause)
+        self._full = True
 
     def status(self) -> dict[str, str]:
-        return {"written": str(self._written), "recording": str(self._directory)}
+        return {"written": str(self._written), "recording": self._settings.directory}

@@ -11,7 +11,8 @@ from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.graph.clock import POLL_S, Clock, Timeline
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.node import Node
+from steadypose.nodes.graph.node import Node, supervisor_id
+from steadypose.nodes.sources.progress import Progress, ProgressFile
 from steadypose.nodes.sources.recording import with_end
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import LiveSource, RecordedSource
@@ -23,7 +24,10 @@ LOOP_PAUSE_NS = 1_000_000_000
 
 
 class PoseInputNode(Node):
-    """Publishes ``pose/raw``, and ``pose/truth`` where the source has it; ends when the source does."""
+    """Publishes ``pose/raw``, and ``pose/truth`` where the source has it; ends when the source does.
+
+    One that plays a recording and was killed goes on where it was, so that stamps never go back.
+    """
 
     name = "pose_input"
 
@@ -37,6 +41,8 @@ class PoseInputNode(Node):
         self._loop = settings.loop
         self._pose = settings.calibration.pose
         self._last_ns: int | None = None
+        self._at = Progress()
+        self._progress = ProgressFile(launch.transport.ipc_directory / "pose_input.progress", supervisor_id())
 
     def handle(self, topic: str, message: Message) -> None:
         raise AssertionError("the input node subscribes to none")
@@ -67,16 +73,21 @@ class PoseInputNode(Node):
                 self.report_if_due()
 
     def _play(self, source: RecordedSource) -> None:
-        for topic, message in with_end(self._messages(source)):
+        began = self._progress.read()
+        for topic, message in with_end(self._messages(source, began.loops_ns)):
+            if self._at <= began and not _is_end(message):
+                continue  # the node that was here before has published it
             if message.stamp_ns != self._last_ns:
                 self._wait_for(message.stamp_ns)
             if self.stopping:
                 return
+            self._progress.write(self._at)
             try:
                 self.publish(topic, self._with_pose(message))
             except ValueError as error:  # a message that was recorded, and still cannot be sent
                 self.refuse(topic, error)
             self.report_if_due()
+        self._progress.close(finished=True)
 
     def problems(self) -> list[Problem]:
         return self._source.problems() if isinstance(self._source, LiveSource) else []
@@ -92,12 +103,12 @@ class PoseInputNode(Node):
             return dataclasses.replace(message, sensor_pose=self._pose, calibrated=True)
         return message
 
-    def _messages(self, source: RecordedSource) -> Iterator[tuple[str, Message]]:
-        shift_ns = 0
+    def _messages(self, source: RecordedSource, shift_ns: int) -> Iterator[tuple[str, Message]]:
         while True:
             newest_ns = 0
             first_ns: int | None = None
-            for topic, message in source:
+            for count, (topic, message) in enumerate(source, start=1):
+                self._at = Progress(shift_ns, count)
                 first_ns = message.stamp_ns if first_ns is None else first_ns
                 newest_ns = max(newest_ns, message.stamp_ns)
                 yield topic, dataclasses.replace(message, stamp_ns=message.stamp_ns + shift_ns) if shift_ns else message
@@ -117,3 +128,7 @@ class PoseInputNode(Node):
         while (left_ns := due_ns - self.clock.now_ns()) > 0 and not self.stopping:
             self.clock.sleep(min(left_ns, round(POLL_S * 1e9)))
             self.report_if_due()
+
+
+def _is_end(message: Message) -> bool:
+    return isinstance(message, PoseRaw) and message.end_of_stream

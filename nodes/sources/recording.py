@@ -15,6 +15,8 @@ from steadypose.nodes.sources.csv import CsvSource
 from steadypose.nodes.sources.npz import NpzSource
 from steadypose.nodes.sources.source import RecordedSource
 
+LOST = "bytes of a damaged recording"
+
 
 class RecordingSource:
     """The skeletons of a recording, without the mark of its end.
@@ -30,7 +32,7 @@ class RecordingSource:
                 raise RecordingError(
                     f"{path}: expected messages on {POSE_RAW}, got {', '.join(recording.topics)}; record that topic too"
                 )
-            self.refused: Counter[str] = Counter({"bytes of a truncated recording": recording.lost_bytes})
+            self.refused: Counter[str] = Counter({LOST: recording.lost_bytes})
             self._frames = recording.count(POSE_RAW)
 
     def __len__(self) -> int:
@@ -44,6 +46,7 @@ class RecordingSource:
                         yield topic, message
             except RecordingError:
                 self.refused["damaged recording"] += 1
+            self.refused[LOST] = recording.lost_bytes
             self.refused.update({f"undecodable {topic}": n for topic, n in recording.refused.items()})
 
 

@@ -4,6 +4,8 @@ import contextlib
 import dataclasses
 import subprocess
 import sys
+import tracemalloc
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cache
 from io import BytesIO
@@ -13,8 +15,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.records import Chunk, McapRecord
-from mcap.stream_reader import StreamReader
+from mcap.records import Chunk, McapRecord, MessageIndex
+from mcap.records import Message as Record
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 from tests.helpers.msg_strategies import ANY, EXAMPLES, raw
@@ -376,3 +379,154 @@ def test_messages_that_cannot_be_decoded_are_counted(tmp_path: Path):
     with RecordingReader(foreign(tmp_path / "bad.mcap", ros_definition(), payload=b"\0\1\0\0bad")) as reader:
         assert list(reader) == []
         assert reader.refused == {POSE_RAW: 2}
+
+
+@given(data=st.data())
+@settings(max_examples=100)
+def test_one_flipped_bit_costs_one_chunk_at_most(
+    data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
+):
+    content = bytearray(mcap_of(whole).read_bytes())
+    finished = data.draw(st.booleans())
+    if not finished:  # as its writer leaves it when it is killed: without index
+        content = content[: max(chunk_ends(bytes(content)))]
+    at = data.draw(st.one_of(st.integers(0, 5000), st.integers(0, len(content) - 1), st.integers(-9000, -1)))
+    content[at] ^= 1 << data.draw(st.integers(0, 7))
+    flipped = tmp_path_factory.mktemp("flipped") / "flipped.mcap"
+    flipped.write_bytes(content)
+    with RecordingReader(flipped) as reader:
+        found = [(recorded.topic, encode(recorded.message)) for recorded in reader]
+        largest = max(len(r.data) for r in records_of(mcap_of(whole).read_bytes()) if isinstance(r, Chunk))
+        assert reader.lost_bytes < largest + 4096
+        assert reader.gaps <= 1
+        assert not reader.refused
+    assert set(found) <= payloads()
+    in_chunks = Counter(
+        sum(isinstance(record, Record) for record in breakup_chunk(chunk))
+        for chunk in records_of(mcap_of(whole).read_bytes())
+        if isinstance(chunk, Chunk)
+    )
+    assert len(found) >= len(stream()) - max(in_chunks)
+    assert len(found) == len(stream()) or reader.gaps
+
+
+def chunk_ends(content: bytes) -> Iterator[int]:
+    """Where each chunk of a file ends, and the indexes of its messages."""
+    file = BytesIO(content)
+    for record in StreamReader(file, emit_chunks=True).records:
+        if isinstance(record, Chunk | MessageIndex):
+            yield file.tell()
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_what_a_chunk_becomes_has_a_limit(compression: CompressionType, tmp_path: Path):
+    bomb = foreign(tmp_path / "bomb.mcap", ros_definition(), payload=bytes(100 * 2**20), compression=compression)
+    assert bomb.stat().st_size < 4 * 2**20
+    tracemalloc.start()
+    try:
+        with RecordingReader(bomb) as reader:
+            assert list(reader) == []
+            assert reader.gaps == 2, "the index speaks of them, and they are not read"
+        assert tracemalloc.get_traced_memory()[1] < 2**24
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_damage_to_compressed_chunks_is_counted(compression: CompressionType, tmp_path: Path):
+    path = foreign(tmp_path / "ros.mcap", ros_definition(), compression=compression)
+    content = bytearray(path.read_bytes())
+    chunk = content.index(b"\x06", 9 + 8 + 12)
+    content[chunk + 120] ^= 0x10
+    path.write_bytes(content)
+    with RecordingReader(path) as reader:
+        assert list(reader) == []
+        assert reader.gaps == 1
+
+
+def test_messages_outside_of_chunks_are_read(tmp_path: Path):
+    writer = Writer(str(tmp_path / "plain.mcap"), use_chunking=False)
+    writer.start("ros2", "somebody")
+    channel = writer.register_channel(
+        "/pose/raw", "cdr", writer.register_schema(wire_type(TOPICS[POSE_RAW]), "ros2msg", ros_definition().encode())
+    )
+    for stamp in (7, 5):
+        writer.add_message(channel, stamp, encode(raw()), stamp)
+    writer.finish()
+    assert [recorded.stamp_ns for recorded in read(tmp_path / "plain.mcap")] == [5, 7]
+
+
+def test_a_recording_goes_on_in_the_next_part(tmp_path: Path):
+    everything = stream()
+    directory = tmp_path / "recording"
+    record(directory, everything[:100])
+    mcap_of(directory).write_bytes(mcap_of(directory).read_bytes()[:-3000])  # killed
+    (directory / "metadata.yaml").unlink()
+    before = read(directory)
+    for part in (everything[100:200], everything[200:]):
+        with RecordingWriter(directory, go_on=True) as writer:
+            for topic, stamp_ns, message in part:
+                writer.write(topic, message, stamp_ns)
+    assert sorted(path.name for path in directory.iterdir()) == [
+        "metadata.yaml", "recording_0.mcap", "recording_1.mcap", "recording_2.mcap",
+    ]  # fmt: skip
+    found = read(directory)
+    assert len(found) == len(before) + len(everything) - 100
+    assert len(before) > 60
+    metadata = (directory / "metadata.yaml").read_text()
+    assert f"message_count: {len(found)}\n" in metadata
+
+
+def test_nothing_is_added_to_what_is_no_recording_of_that_name(tmp_path: Path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(RecordingError, match=r"holds notes.txt: expected a new directory, or a recording"):
+        RecordingWriter(tmp_path, go_on=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("limits", [{"split_bytes": 50_000}, {"split_ns": 10**9}])
+def test_parts_are_split_by_size_and_by_time(limits: dict[str, int], tmp_path: Path):
+    with RecordingWriter(tmp_path / "recording", **limits) as writer:
+        for topic, stamp_ns, message in stream():
+            writer.write(topic, message, stamp_ns)
+    assert len(list((tmp_path / "recording").glob("*.mcap"))) > 2
+    assert read(tmp_path / "recording") == sorted(stream(), key=lambda recorded: recorded.stamp_ns)
+    with AnyReader([tmp_path / "recording"]) as bag:
+        assert bag.message_count == len(stream())
+
+
+def test_the_oldest_parts_go_where_there_is_a_limit(tmp_path: Path):
+    directory = tmp_path / "recording"
+    with RecordingWriter(directory, split_bytes=50_000, keep_bytes=200_000) as writer:
+        for topic, stamp_ns, message in stream():
+            writer.write(topic, message, stamp_ns)
+    assert sum(path.stat().st_size for path in directory.glob("*.mcap")) <= 200_000
+    found = read(directory)
+    assert found[-1].stamp_ns == max(recorded.stamp_ns for recorded in stream())
+    assert 20 < len(found) < len(stream())
+    with AnyReader([directory]) as bag:
+        assert bag.message_count == len(found)
+
+
+def test_a_full_disk_keeps_what_was_written_and_the_next_part_comes_when_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    directory, everything, full = tmp_path / "recording", stream(), []
+    with RecordingWriter(directory) as writer:
+        for index, (topic, stamp_ns, message) in enumerate(everything):
+            if index == 100:
+                flush = writer._part._writer.flush
+                monkeypatch.setattr(writer._part._writer, "flush", lambda: _no_space())
+            try:
+                writer.write(topic, message, stamp_ns)
+            except OSError:
+                full.append(index)
+                monkeypatch.setattr(writer._part._writer, "flush", flush)
+    assert len(full) == 1, "the next part takes what follows"
+    found = read(directory)
+    assert len(found) > len(everything) - 60
+    assert found[-1].stamp_ns == max(recorded.stamp_ns for recorded in everything)
+
+
+def _no_space() -> None:
+    raise OSError(28, "No space left on device")

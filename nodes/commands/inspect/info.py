@@ -112,10 +112,10 @@ def _describe_recording(path: Path) -> Iterator[str]:
         yield f"{path}: {recording.duration_s:.2f} s, {size:.2f} MB"
         yield f"from {start:%Y-%m-%d %H:%M:%S.%f} UTC, stamp {recording.start_ns}"
         if not recording.complete:
-            yield (
-                f"cut short: the writer was killed or the file truncated, {recording.lost_bytes} bytes at its end "
-                "cannot be read; what follows can"
-            )
+            yield "cut short: the writer was killed or the file truncated; what follows could be read"
+        if recording.lost_bytes:
+            where = plural(recording.gaps, "place", "places")
+            yield f"damaged: {recording.lost_bytes} bytes in {where} cannot be read; `steadypose repair` saves the rest"
         for topic in recording.topics:
             rate = Rate.of(stamps[topic])
             yield f"{topic}: {wire_type(TOPICS[topic])}"

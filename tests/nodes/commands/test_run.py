@@ -17,8 +17,9 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, Level, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.commands.run import STALL_NS, _Run, line, table
+from steadypose.nodes.graph import supervisor
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.supervisor import BACKOFF_S, STEADY_S, Child, Supervisor
+from steadypose.nodes.graph.supervisor import BACKOFF_S, HUNG_S, STALE_S, STEADY_S, TRIES, Child, Supervisor
 
 FOREVER = "import signal; signal.pause()"
 Start = Callable[[str], Child]
@@ -59,22 +60,67 @@ def test_a_node_that_crashes_starts_again_a_little_later_each_time(
     start: Start, clock: VirtualClock, said: list[str]
 ) -> None:
     child = start("raise SystemExit(7)")
-    for restarts, pause_s in enumerate(BACKOFF_S):
+    child.heard()
+    for restarts, pause_s in enumerate([*BACKOFF_S, BACKOFF_S[-1], BACKOFF_S[-1]]):
         ended(child)
         assert child.state == "crashed"
-        clock.time_ns += round((pause_s - 0.01) * 1e9)
-        child.poll()
-        assert (child.state, child.restarts) == ("crashed", restarts)
+        clock.time_ns += max(round((pause_s - 0.01) * 1e9), -1)
+        if pause_s:
+            child.poll()
+            assert (child.state, child.restarts) == ("crashed", restarts)
         clock.time_ns += 20_000_000
         child.poll()
         assert (child.state, child.restarts) == ("running", restarts + 1)
     ended(child)
-    assert child.state == "failed", "enough is enough"
-    assert said[0] == "prior: ended with status 7; starting it again in 0.5 s"
+    assert child.state == "crashed", "there is no last time"
+    assert said[:2] == [f"prior: ended with status 7; starting it again in {pause} s" for pause in ("0", "0.5")]
+
+
+def test_a_node_that_was_never_heard_has_failed_at_last(start: Start, clock: VirtualClock) -> None:
+    child = start("raise SystemExit(7)")
+    for _ in range(TRIES - 1):
+        ended(child)
+        assert child.state == "crashed"
+        clock.time_ns += round(BACKOFF_S[-1] * 1e9)
+        child.poll()
+    ended(child)
+    assert child.state == "failed"
+
+
+def test_a_node_that_falls_silent_is_stale_then_killed_and_started_again(
+    start: Start, clock: VirtualClock, said: list[str]
+) -> None:
+    child = start(FOREVER)
+    clock.time_ns += round(HUNG_S * 2e9)
+    child.poll()
+    assert child.state == "running", "the first start may take long"
+    child.heard()
+    clock.time_ns += round((STALE_S + 0.1) * 1e9)
+    child.poll()
+    assert child.state == "stale"
+    child.heard()
+    assert child.state == "running"
+    clock.time_ns += round((HUNG_S + 0.1) * 1e9)
+    child.poll()
+    assert "killing it" in said[0]
+    assert child.state == "crashed"
+    child.poll()
+    assert (child.state, child.restarts, child.silent_s) == ("running", 1, 0.0)
+
+
+def test_a_supervisor_that_was_away_blames_nobody(clock: VirtualClock, said: list[str], monkeypatch) -> None:
+    monkeypatch.setattr(supervisor, "COMMAND", (sys.executable, "-c", FOREVER))
+    with Supervisor(["prior"], [], clock, said.append) as processes:
+        child = processes.children["prior"]
+        child.heard()
+        clock.time_ns += round(HUNG_S * 2e9)
+        processes.poll()
+        assert child.state == "running"
 
 
 def test_a_node_that_ran_for_a_while_gets_new_chances(start: Start, clock: VirtualClock) -> None:
     child = start("raise SystemExit(7)")
+    child.heard()
     for _ in range(2 * len(BACKOFF_S)):
         clock.time_ns += round((STEADY_S + 1) * 1e9)
         ended(child)
@@ -121,6 +167,8 @@ class Processes:
         restarts = 0
         state = "running"
 
+        def heard(self) -> None: ...
+
     def __init__(self, *names: str) -> None:
         self.children = {name: self._Child() for name in names}
         self.failed: list[str] = []
@@ -144,11 +192,11 @@ def test_a_run_is_over_when_the_end_has_come_everywhere(watched: tuple[_Run, Sup
     run, processes = watched
     assert run._exit_status(processes) is None
     processes.children["pose_input"].state = "ended"
-    run._receive(news("pose_input", POSE_RAW))
-    run._receive(news("prior", f"{POSE_CLEAN} {POSE_RAW}"))
-    run._receive(news("trajectory", f"{POSE_CLEAN} {POSE_WORLD}"))
+    run._receive(news("pose_input", POSE_RAW), processes)
+    run._receive(news("prior", f"{POSE_CLEAN} {POSE_RAW}"), processes)
+    run._receive(news("trajectory", f"{POSE_CLEAN} {POSE_WORLD}"), processes)
     assert run._exit_status(processes) is None, "the recorder has not heard it yet"
-    run._receive(news("recorder", f"{POSE_CLEAN} {POSE_RAW} {POSE_WORLD}"))
+    run._receive(news("recorder", f"{POSE_CLEAN} {POSE_RAW} {POSE_WORLD}"), processes)
     assert run._exit_status(processes) == 0
 
 
@@ -157,10 +205,10 @@ def test_a_run_whose_end_got_lost_does_not_wait_forever(watched: tuple[_Run, Sup
     processes.children["pose_input"].state = "ended"
     for _ in range(3):
         clock.time_ns += STALL_NS
-        run._receive(news("prior", count__pose=str(clock.time_ns)))
+        run._receive(news("prior", count__pose=str(clock.time_ns)), processes)
         assert run._exit_status(processes) is None, "it is still at work"
     clock.time_ns += STALL_NS + 1
-    run._receive(news("prior", count__pose=run._diagnostics["prior"].values["count.pose"]))
+    run._receive(news("prior", count__pose=run._diagnostics["prior"].values["count.pose"]), processes)
     assert run._exit_status(processes) == 1
 
 

@@ -1,0 +1,339 @@
+"""One MCAP file, read chunk by chunk, so that what is damaged costs what is damaged and nothing else.
+
+The index at the end of a file is believed if its checksum holds. Otherwise, as after the writer was killed, the file
+is gone through from its beginning; where bytes are no record, the search goes on at the next that look like a chunk. A
+chunk whose checksum does not hold is left out and counted; all others are read. What a chunk may become when it is
+decompressed has a limit, so that a small file cannot fill the memory.
+"""
+
+from __future__ import annotations
+
+import heapq
+import re
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Container, Iterator
+from io import BytesIO
+from typing import IO, NamedTuple, TypeVar
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Header, MessageIndex, Schema
+
+MAX_CHUNK = 2**26
+"""bytes of one chunk, decompressed; a writer closes its chunks at some megabytes"""
+MAX_RATIO = 250
+"""a chunk's size decompressed by its size in the file, above `RATIO_FROM`; skeletons come to a hundred at most"""
+RATIO_FROM = 2**20
+
+BROKEN = (
+    McapError,
+    ValueError,
+    KeyError,
+    EOFError,
+    OSError,
+    RuntimeError,
+    OverflowError,
+    MemoryError,
+    struct.error,
+    zstandard.ZstdError,
+)
+"""what the libraries raise, somewhere, for bytes that are not MCAP"""
+
+_MAGIC = b"\x89MCAP0\r\n"
+_RECORD = struct.Struct("<BQ")
+_CHUNK = struct.Struct("<QQQII")  # start, end, size decompressed, its checksum, length of the compression's name
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_FOOTER = struct.Struct("<BQQQI")
+#: the head of a chunk, whose lengths are under a terabyte and whose compression is known
+_CHUNK_HEAD = re.compile(rb"\x06.{5}\0{3}.{16}.{5}\0{3}.{4}(?:\0{4}|\x04\0{3}zstd|\x03\0{3}lz4).{5}\0{3}", re.DOTALL)
+_CHUNK_HEAD_BYTES = 9 + _CHUNK.size + 4 + 8
+_WINDOW = 2**20
+
+_Record = TypeVar("_Record", Schema, Channel, Header, MessageIndex)
+
+
+class Place(NamedTuple):
+    """Where in a file a chunk, or a message outside of chunks, lies, and the log times of what is in it."""
+
+    opcode: int
+    offset: int
+    length: int
+    start_ns: int
+    end_ns: int
+
+
+class Logged(NamedTuple):
+    """A message, not decoded."""
+
+    log_ns: int
+    channel: Channel
+    data: bytes | memoryview
+
+
+class McapFile:
+    """What is in an MCAP file, whole or damaged.
+
+    Args:
+        file: opened for reading; it stays open.
+        size: of it, bytes.
+
+    Attributes:
+        channels: by id.
+        schemas: by id.
+        counts: of messages, by channel; with an index as it says, so that damaged chunks are among them.
+        places: of chunks.
+        complete: whether the writer came to the end.
+        lost_bytes: that could not be read, as far as is known: all of them once all messages were read.
+        gaps: how many pieces these are.
+
+    Raises:
+        ValueError: nothing in it looks like MCAP.
+    """
+
+    def __init__(self, file: IO[bytes], size: int) -> None:
+        self._file = file
+        self._size = size
+        self.channels: dict[int, Channel] = {}
+        self.schemas: dict[int, Schema] = {}
+        self.counts: Counter[int] = Counter()
+        self.places: list[Place] = []
+        self.complete = True
+        self._lost: dict[int, int] = {}
+        try:
+            indexed = self._read_index()
+        except BROKEN:
+            indexed = False
+        if not indexed:
+            self._scan()
+        file.seek(0)
+        if file.read(len(_MAGIC)) != _MAGIC and not self.places:
+            raise ValueError("it does not begin as MCAP files do, and holds no chunk")
+
+    @property
+    def lost_bytes(self) -> int:
+        return sum(self._lost.values())
+
+    @property
+    def gaps(self) -> int:
+        return len(self._lost)
+
+    @property
+    def start_ns(self) -> int:
+        """The first log time; 0 if there is none."""
+        return min((place.start_ns for place in self.places), default=0)
+
+    @property
+    def end_ns(self) -> int:
+        """The last log time; 0 if there is none."""
+        return max((place.end_ns for place in self.places), default=0)
+
+    def messages(self, topics: Container[str], start_ns: int | None = None) -> Iterator[Logged]:
+        """The messages on ``topics``, as the file calls them, from ``start_ns`` on, by log time, then as written."""
+        wanted = {channel.id for channel in self.channels.values() if channel.topic in topics}
+        waiting: list[tuple[int, int, int, Channel, bytes | memoryview]] = []
+        for place in sorted(self.places, key=lambda place: (place.start_ns, place.offset)):
+            if start_ns is not None and place.end_ns < start_ns:
+                continue
+            while waiting and waiting[0][0] < place.start_ns:
+                log_ns, _, _, channel, data = heapq.heappop(waiting)
+                yield Logged(log_ns, channel, data)
+            try:
+                found = [
+                    (log_ns, place.offset, index, self.channels[channel], data)
+                    for index, (channel, log_ns, data) in enumerate(self._messages_at(place))
+                    if channel in wanted and (start_ns is None or log_ns >= start_ns)
+                ]
+            except BROKEN:
+                self._lose(place.offset, place.length)
+                continue
+            for item in found:
+                heapq.heappush(waiting, item)
+        while waiting:
+            log_ns, _, _, channel, data = heapq.heappop(waiting)
+            yield Logged(log_ns, channel, data)
+
+    def _lose(self, offset: int, length: int) -> None:
+        self._lost[offset] = length
+
+    def _messages_at(self, place: Place) -> Iterator[tuple[int, int, bytes | memoryview]]:
+        """Channel, log time and data of each message in a chunk."""
+        opcode, body = self._record_at(place.offset)
+        if opcode != place.opcode or _RECORD.size + len(body) != place.length:
+            raise ValueError("not the record that the index says")
+        for inner, data in self._inside(opcode, body):
+            if inner == Opcode.MESSAGE:
+                channel, _, log_ns, _ = _MESSAGE.unpack_from(data)
+                yield channel, log_ns, data[_MESSAGE.size :]
+
+    def _record_at(self, offset: int) -> tuple[int, bytes]:
+        """The opcode and the bytes of a record.
+
+        Raises:
+            ValueError: it is longer than the file.
+        """
+        self._file.seek(offset)
+        opcode, length = _RECORD.unpack(self._file.read(_RECORD.size))
+        if offset + _RECORD.size + length > self._size:
+            raise ValueError("a record beyond the end of the file")
+        return opcode, self._file.read(length)
+
+    def _inside(self, opcode: int, body: bytes) -> Iterator[tuple[int, memoryview]]:
+        """The records in a chunk; a record outside of chunks is itself."""
+        if opcode != Opcode.CHUNK:
+            yield opcode, memoryview(body)
+            return
+        data = memoryview(_decompressed(body))
+        at = 0
+        while at < len(data):
+            inner, length = _RECORD.unpack_from(data, at)
+            at += _RECORD.size
+            if at + length > len(data):
+                raise ValueError("a record beyond the end of its chunk")
+            yield inner, data[at : at + length]
+            at += length
+
+    def _read_index(self) -> bool:
+        """Take the places of chunks from the end of the file; False if there is no index, or it does not hold."""
+        tail = _FOOTER.size + len(_MAGIC)
+        self._file.seek(max(self._size - tail, 0))
+        end = self._file.read()
+        if len(end) < tail or end[-len(_MAGIC) :] != _MAGIC:
+            return False
+        opcode, _, start, _, checksum = _FOOTER.unpack_from(end)
+        if opcode != Opcode.FOOTER or not 0 < start <= self._size - tail:
+            return False
+        if checksum:
+            self._file.seek(start)
+            summed = self._file.read(self._size - tail - start) + end[: _FOOTER.size - 4]
+            if zlib.crc32(summed) != checksum:
+                return False
+        self._file.seek(0)
+        if self._file.read(len(_MAGIC)) != _MAGIC:
+            return False
+        self._file.seek(0)
+        summary = SeekingReader(self._file, record_size_limit=self._size).get_summary()
+        if summary is None or summary.statistics is None:
+            return False
+        if summary.statistics.message_count and not summary.chunk_indexes:
+            return False
+        self.channels, self.schemas = summary.channels, summary.schemas
+        self.counts.update({k: n for k, n in summary.statistics.channel_message_counts.items() if n})
+        self.places = [
+            Place(Opcode.CHUNK, c.chunk_start_offset, c.chunk_length, c.message_start_time, c.message_end_time)
+            for c in summary.chunk_indexes
+        ]
+        return True
+
+    def _scan(self) -> None:
+        """Go through the file from its beginning for whatever can be read."""
+        self.complete = False
+        found: list[tuple[Place, Counter[int]]] = []
+        at = len(_MAGIC)
+        while at < self._size and not self.complete:
+            try:
+                at = self._take(at, found)
+            except BROKEN:
+                after = self._next_chunk(at + 1)
+                self._lose(at, after - at)
+                at = after
+        # messages outside of chunks have no checksum: beside chunks, they are damage that looks like one
+        chunked = any(place.opcode == Opcode.CHUNK for place, _ in found)
+        for place, counts in found:
+            if not chunked or place.opcode == Opcode.CHUNK:
+                self.places.append(place)
+                self.counts += counts
+
+    def _take(self, at: int, places: list[tuple[Place, Counter[int]]]) -> int:
+        """Note what is in the record at ``at``; where the next one begins.
+
+        Raises:
+            BROKEN: it is none, or damaged.
+        """
+        opcode, body = self._record_at(at)
+        length = _RECORD.size + len(body)
+        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            self.complete = True
+        elif opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+            stamps, counts = [], Counter[int]()
+            channels, schemas = {}, {}
+            for inner, data in self._inside(opcode, body):
+                if inner == Opcode.MESSAGE:
+                    channel, _, log_ns, _ = _MESSAGE.unpack_from(data)
+                    stamps.append(log_ns)
+                    counts[channel] += 1
+                elif inner == Opcode.CHANNEL:
+                    channels |= {(found := _parse(Channel, data)).id: found}
+                elif inner == Opcode.SCHEMA:
+                    schemas |= {(told := _parse(Schema, data)).id: told}
+            # what a checksum covers goes before what none does
+            self.channels |= channels
+            self.schemas |= schemas
+            if stamps:
+                places.append((Place(opcode, at, length, min(stamps), max(stamps)), counts))
+        elif opcode == Opcode.CHANNEL:
+            self.channels.setdefault((found := _parse(Channel, body)).id, found)
+        elif opcode == Opcode.SCHEMA:
+            self.schemas.setdefault((told := _parse(Schema, body)).id, told)
+        elif opcode == Opcode.HEADER:
+            _parse(Header, body)
+        elif opcode == Opcode.MESSAGE_INDEX:
+            _parse(MessageIndex, body)
+        elif opcode not in (Opcode.ATTACHMENT, Opcode.METADATA):
+            raise ValueError(f"no record of the data section has opcode {opcode}")
+        return at + length
+
+    def _next_chunk(self, at: int) -> int:
+        """Where the next bytes lie that look like a chunk; the end of the file if there are none."""
+        while at < self._size:
+            self._file.seek(at)
+            window = self._file.read(_WINDOW)
+            if found := _CHUNK_HEAD.search(window):
+                return at + found.start()
+            if len(window) < _WINDOW:
+                break
+            at += _WINDOW - _CHUNK_HEAD_BYTES
+        return self._size
+
+
+def _parse(kind: type[_Record], body: bytes | memoryview) -> _Record:
+    """A record, of which no byte is left over: a length that is damaged shows in that."""
+    stream = ReadDataStream(BytesIO(body))
+    record = kind.read(stream)
+    if stream.count != len(body):
+        raise ValueError(f"{kind.__name__}: expected {stream.count} bytes, got {len(body)}")
+    return record
+
+
+def _decompressed(body: bytes) -> bytes | memoryview:
+    """What is in a chunk, if its checksum holds.
+
+    Raises:
+        BROKEN: it does not, or it would be larger than a chunk may be.
+    """
+    _, _, size, checksum, name_length = _CHUNK.unpack_from(body)
+    at = _CHUNK.size + name_length
+    name = body[_CHUNK.size : at].decode()
+    (length,) = struct.unpack_from("<Q", body, at)
+    packed = memoryview(body)[at + 8 :]
+    if length != len(packed):
+        raise ValueError("a chunk of another length than its record")
+    if size > MAX_CHUNK or size > max(RATIO_FROM, MAX_RATIO * len(packed)):
+        raise ValueError(f"a chunk of {len(packed)} bytes that becomes {size}")
+    data: bytes | memoryview = packed
+    if name == "zstd":
+        data = zstandard.ZstdDecompressor().stream_reader(packed).read(size + 1)
+    elif name == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(bytes(packed), max_length=size + 1)
+    elif name:
+        raise ValueError(f"compression {name!r} is not known")
+    if len(data) != size:
+        raise ValueError("a chunk that becomes of another size than it says")
+    if checksum and zlib.crc32(data) != checksum:
+        raise ValueError("a chunk whose checksum does not hold")
+    return data

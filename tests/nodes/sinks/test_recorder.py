@@ -1,0 +1,79 @@
+"""A recorder on a disk that fills: what it drops is counted, and what it wrote is whole."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from conftest import VirtualClock, walk
+
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.recorder import NO_ROOM, RecorderNode
+
+
+@pytest.fixture
+def free(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    usage = SimpleNamespace(free=10**12)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    return usage
+
+
+def test_messages_are_dropped_while_there_is_no_room_and_recorded_again_when_there_is(
+    tmp_path: Path, make_launch: Callable[..., Launch], clock: VirtualClock, free: SimpleNamespace
+) -> None:
+    node = RecorderNode(make_launch(recorder__directory=tmp_path / "out"), clock)
+    node._writer = node._settings.writer()
+    for index, frame in enumerate(walk(90)):
+        free.free = 10**7 if 30 <= index < 60 else 10**12
+        clock.time_ns += 1_100_000_000
+        node.handle(POSE_RAW, frame)
+    node._writer.close()
+    assert node.health.counts[NO_ROOM] == 30
+    with RecordingReader(tmp_path / "out") as reader:
+        assert reader.complete
+        assert [m.stamp_ns for _, _, m in reader] == [f.stamp_ns for f in [*walk(90)[:30], *walk(90)[60:]]]
+
+
+def test_a_disk_that_is_full_before_it_was_noticed(
+    tmp_path: Path,
+    make_launch: Callable[..., Launch],
+    clock: VirtualClock,
+    free: SimpleNamespace,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node = RecorderNode(make_launch(recorder__directory=tmp_path / "out"), clock)
+    node._writer = node._settings.writer()
+    frames = walk(90)
+    for frame in frames[:60]:
+        node.handle(POSE_RAW, frame)
+
+    def fail() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(node._writer._part._writer, "flush", fail)
+    for frame in frames[60:]:
+        node.handle(POSE_RAW, frame)
+    node._writer.close()
+    assert 0 < node.health.counts[NO_ROOM] <= 30
+    with RecordingReader(tmp_path / "out") as reader:
+        assert reader.count(POSE_RAW) > 30, "half a second before it at most is lost"
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"recorder__split_mb": "nan"}, "split_mb: expected 0 or more, got nan"),
+        ({"recorder__keep_mb": "10", "recorder__split_mb": "10"}, "at least two parts"),
+        ({"recorder__sync_s": "-1"}, "sync_s: expected 0 or more"),
+    ],
+)
+def test_limits_that_cannot_be(settings: dict[str, str], said: str, make_launch: Callable[..., Launch]) -> None:
+    with pytest.raises(LaunchError, match=said):
+        make_launch(**settings)
