@@ -1,6 +1,6 @@
 """A folder of recordings, cleaned many at once: on the cores at hand, or on a Ray cluster.
 
-A manifest in the output folder has a line for each recording that was tried, written when it is done. What it says
+A manifest in the output folder has a line for each recording that is to be cleaned, and one when it is. What it says
 is done is not done again, unless the recording, the settings or the models have changed: so a run that was stopped goes
 on where it was, and one with new recordings does these.
 """
@@ -11,12 +11,13 @@ import hashlib
 import json
 import multiprocessing
 import os
+import re
 import signal
 import traceback
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnContext
 from pathlib import Path
@@ -31,6 +32,8 @@ from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
 
 MANIFEST = "manifest.jsonl"
+_LINE = '{"input": '
+"""how each line of it begins"""
 FILES = (".npz", ".csv")
 """endings of files of poses that are cleaned into an .npz each"""
 
@@ -43,6 +46,8 @@ class Job:
 
     source: Path
     out: Path
+    replace: bool = False
+    """whether an earlier call made what is at ``out``"""
 
 
 def is_folder_of_recordings(path: Path) -> bool:
@@ -52,7 +57,9 @@ def is_folder_of_recordings(path: Path) -> bool:
 
 def _is_recording(folder: Path) -> bool:
     # the metadata is missing where the recorder was killed
-    return (folder / "metadata.yaml").exists() or (len(list(folder.glob("*.mcap"))) == 1 and not _files(folder))
+    files = list(folder.glob("*.mcap"))
+    parts = all(re.fullmatch(rf"{re.escape(folder.name)}_\d+", file.stem) for file in files)
+    return (folder / "metadata.yaml").exists() or (bool(files) and (len(files) == 1 or parts) and not _files(folder))
 
 
 def _files(folder: Path) -> list[Path]:
@@ -116,9 +123,12 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
     found = plan(folder, out)
     _check(settings)
     manifest = Manifest(out, folder, settings)
-    waiting = [job for job in found if not manifest.is_done(job)]
+    waiting = [replace(job, replace=manifest.made(job.out)) for job in found if not manifest.is_done(job)]
     if known := len(found) - len(waiting):
         console.print(f"{known} of {len(found)} are done already; see {manifest.path}", highlight=False)
+    for job in waiting:
+        if job.replace or not os.path.lexists(job.out):
+            manifest.add(job, {"state": "started"})
     cleaning = on_ray(waiting, settings) if ray else on_cores(waiting, settings, jobs or _cores())
     failed = damaged = 0
     with Progress(console=console, disable=not console.is_terminal) as progress:
@@ -158,7 +168,9 @@ class Manifest:
         self._known: dict[str, dict[str, Any]] = {}
         if self.path.exists():
             text = self.path.read_text(encoding="utf-8", errors="replace")
-            if not text.endswith("\n"):  # cut short by whatever stopped the run that wrote it
+            if not all(line[: len(_LINE)] == _LINE[: len(line)] for line in text.splitlines()):
+                raise LaunchError(f"{self.path} is not of an earlier call: expected a new folder, or one that this made")
+            if text and not text.endswith("\n"):  # cut short by whatever stopped the run that wrote it
                 with self.path.open("a", encoding="utf-8") as file:
                     file.write("\n")
             for line in text.splitlines():
@@ -170,6 +182,11 @@ class Manifest:
         elif out.exists() and any(out.iterdir()):
             raise LaunchError(f"{out}: expected a new folder, or one with the {MANIFEST} of an earlier call")
         out.mkdir(exist_ok=True)
+
+    def made(self, out: Path) -> bool:
+        """Whether an earlier call made what is at this path, or began to."""
+        output = str(out.relative_to(self._out))
+        return any(entry.get("state") in ("started", "done") and entry.get("output") == output for entry in self._known.values())
 
     def is_done(self, job: Job) -> bool:
         """Whether this recording, as it is now, was cleaned with these settings."""
@@ -207,7 +224,7 @@ def _models() -> str:
 def work(job: Job, settings: Settings) -> dict[str, Any]:
     """Clean one recording; whatever goes wrong is the result."""
     try:
-        return {"state": "done"} | asdict(clean_recording(job.source, job.out, settings, replace=True))
+        return {"state": "done"} | asdict(clean_recording(job.source, job.out, settings, replace=job.replace))
     except Exception as error:  # any file may hold what nobody thought of, and the others wait
         return _failed(str(error) if is_for_user(error) else "".join(traceback.format_exception_only(error)).strip())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -12,7 +13,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.recording import RecordingError, RecordingWriter
+from steadypose.msgs.recording_writer import recorded_parts
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.checks.stream import StreamCheck
@@ -91,7 +93,7 @@ def clean_recording(
         source: a recording or file of poses.
         out: the recording to make, or .npz.
         settings: ``[prior]`` and ``[trajectory]`` of a launch file.
-        replace: whether a recording that is already at ``out`` may be replaced; an .npz is.
+        replace: whether what is at ``out`` may be replaced, if it is a recording or an .npz.
         began: called with the number of frames.
         advanced: called after each.
 
@@ -99,8 +101,10 @@ def clean_recording(
         LaunchError, RecordingError, NpzError: the input cannot be used, or the output not be made.
     """
     to_npz = out.suffix == ".npz"
-    if out.exists() and not (replace or to_npz):
-        raise LaunchError(f"{out} exists: expected a new directory to write the recording to")
+    if os.path.lexists(out):
+        if not replace:
+            raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
+        _check_replaceable(out, to_npz=to_npz)
     frames = open_recording(source)
     # these bring torch, which takes seconds: not before it is known that there is something to do
     from steadypose.nodes.graph.prior_node import make_prior
@@ -155,13 +159,33 @@ def clean_recording(
     )
 
 
+def _check_replaceable(out: Path, *, to_npz: bool) -> None:
+    """Raises:
+    LaunchError: it is nothing that this command makes, so nothing that it removes.
+    """
+    if to_npz:
+        if not out.is_file():
+            raise LaunchError(f"{out} is no file: expected an .npz to replace")
+        return
+    try:
+        recorded_parts(out)
+    except (RecordingError, OSError) as error:
+        raise LaunchError(f"{out} is no recording, and is not replaced: {error}") from error
+
+
 @contextmanager
 def _unfinished(out: Path) -> Iterator[Path]:
     """Where to write what becomes ``out``: beside it, under the same name, because a recording's file has its name."""
     folder = out.with_name(f".{out.name}.part")
-    shutil.rmtree(folder, ignore_errors=True)  # of somebody who was killed
+    mark = folder / ".steadypose"
+    if mark.exists():
+        shutil.rmtree(folder)  # of a call that was killed
     try:
         folder.mkdir(parents=True)
+    except FileExistsError as error:
+        raise LaunchError(f"{folder} is in the way, and was not made here: expected it not to exist") from error
+    try:
+        mark.touch()
         yield folder / out.name
     finally:
         shutil.rmtree(folder, ignore_errors=True)
