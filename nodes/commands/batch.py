@@ -169,7 +169,9 @@ class Manifest:
         if self.path.exists():
             text = self.path.read_text(encoding="utf-8", errors="replace")
             if not all(line[: len(_LINE)] == _LINE[: len(line)] for line in text.splitlines()):
-                raise LaunchError(f"{self.path} is not of an earlier call: expected a new folder, or one that this made")
+                raise LaunchError(
+                    f"{self.path} is not of an earlier call: expected a new folder, or one that this made"
+                )
             if text and not text.endswith("\n"):  # cut short by whatever stopped the run that wrote it
                 with self.path.open("a", encoding="utf-8") as file:
                     file.write("\n")
@@ -186,7 +188,10 @@ class Manifest:
     def made(self, out: Path) -> bool:
         """Whether an earlier call made what is at this path, or began to."""
         output = str(out.relative_to(self._out))
-        return any(entry.get("state") in ("started", "done") and entry.get("output") == output for entry in self._known.values())
+        return any(
+            entry.get("state") in ("started", "done") and entry.get("output") == output
+            for entry in self._known.values()
+        )
 
     def is_done(self, job: Job) -> bool:
         """Whether this recording, as it is now, was cleaned with these settings."""

@@ -45,8 +45,8 @@ def clean(
             memory; as many as there are cores unless given.
         ray: clean a folder on the Ray cluster that this machine belongs to, or that RAY_ADDRESS names, or else on
             one started here; its machines must see IN and OUT under the same paths. Needs the extra 'ray'.
-        force: replace what is at OUT, if it is a recording or an .npz. In a folder, what an earlier call made is replaced
-            without being asked for, and all else is kept in any case.
+        force: replace what is at OUT, if it is a recording or an .npz. In a folder, what an earlier call made is
+            replaced without being asked for, and all else is kept in any case.
     """
     table: dict[str, Any] = {"prior": {}, "trajectory": {}}
     if weights is not None:

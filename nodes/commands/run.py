@@ -20,8 +20,8 @@ from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Level
 from steadypose.nodes.checks.problem import from_values
-from steadypose.nodes.graph.clock import FRAME_NS, POLL_S, Clock, SystemClock
 from steadypose.nodes.graph import health_file
+from steadypose.nodes.graph.clock import FRAME_NS, POLL_S, Clock, SystemClock
 from steadypose.nodes.graph.health_file import write_health
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.supervisor import Supervisor
@@ -48,7 +48,8 @@ def run(
 ) -> int:
     """Start the nodes of a launch file, watch them and show how they do, until the stream ends or Ctrl-C.
 
-    A node that crashes, or is not heard any more, is started again. With `view` on a terminal, the picture stays when the stream has ended.
+    A node that crashes, or is not heard any more, is started again. With `view` on a terminal, the picture stays when
+    the stream has ended.
 
     Args:
         launch: a launch file, or the name of one of the project's own, such as replay, oak, ros2 or server.

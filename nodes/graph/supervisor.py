@@ -28,7 +28,7 @@ HUNG_S = 10.0
 STOP_S = 5.0
 """between SIGTERM and SIGKILL"""
 USAGE_ERROR = 2
-"""exit status of a node that cannot do what its launch file says: if it never could, it will not the next time either"""
+"""exit status of a node that cannot do what its launch file says: if it never could, it never will"""
 ORDER = tuple(NODES)
 """of stopping"""
 COMMAND = (

@@ -1,4 +1,4 @@
-"""What a process tells systemd of itself: that it is ready, and that it is alive. Does nothing where systemd did not ask."""
+"""What a process tells systemd of itself, where systemd asked: that it is ready, and that it is alive."""
 
 from __future__ import annotations
 

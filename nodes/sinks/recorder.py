@@ -58,7 +58,7 @@ class RecorderSettings:
                 raise LaunchError(f"[recorder] {name}: expected 0 or more, got {getattr(self, name)}")
         if 0 < self.keep_mb < 2 * self.split_mb:
             raise LaunchError(
-                f"[recorder] keep_mb: expected at least two parts of split_mb, {2 * self.split_mb:g}, got {self.keep_mb:g}"
+                f"[recorder] keep_mb: expected two parts or more, {2 * self.split_mb:g}, got {self.keep_mb:g}"
             )
 
     def writer(self) -> RecordingWriter:
@@ -72,7 +72,6 @@ class RecorderSettings:
             split_ns=round(self.split_s * 1e9),
             keep_bytes=round(self.keep_mb * 1e6),
         )
-
 
 
 def check_recorder(launch: Launch) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -485,7 +486,7 @@ def test_nothing_is_added_to_what_is_no_recording_of_that_name(tmp_path: Path):
 
 
 @pytest.mark.parametrize("limits", [{"split_bytes": 50_000}, {"split_ns": 10**9}])
-def test_parts_are_split_by_size_and_by_time(limits: dict[str, int], tmp_path: Path):
+def test_parts_are_split_by_size_and_by_time(limits: dict[str, Any], tmp_path: Path):
     with RecordingWriter(tmp_path / "recording", **limits) as writer:
         for topic, stamp_ns, message in stream():
             writer.write(topic, message, stamp_ns)
@@ -513,9 +514,9 @@ def test_a_full_disk_keeps_what_was_written_and_the_next_part_comes_when_there_i
 ):
     directory, everything, full = tmp_path / "recording", stream(), []
     with RecordingWriter(directory) as writer:
+        flush = writer._part._writer.flush
         for index, (topic, stamp_ns, message) in enumerate(everything):
             if index == 100:
-                flush = writer._part._writer.flush
                 monkeypatch.setattr(writer._part._writer, "flush", lambda: _no_space())
             try:
                 writer.write(topic, message, stamp_ns)

@@ -242,10 +242,11 @@ def test_the_table_and_the_line_show_what_there_is_to_see() -> None:
 def test_what_goes_wrong_is_printed_when_it_does(make_launch: Callable[..., Launch], clock: VirtualClock) -> None:
     console = Console(width=140, record=True)
     run = _Run(make_launch(nodes='["prior"]'), [], console, clock)
+    processes: Supervisor = Processes("prior")  # type: ignore[assignment]
     for _ in range(2):
-        run._receive(news("prior", level=Level.ERROR, problem__stamps_zero="stamp is 0: expected more"))
-    assert "stamps_zero" in line(["prior"], run._diagnostics, Processes("prior"))  # type: ignore[arg-type]
-    run._receive(news("prior"))
+        run._receive(news("prior", level=Level.ERROR, problem__stamps_zero="stamp is 0: expected more"), processes)
+    assert "stamps_zero" in line(["prior"], run._diagnostics, processes)
+    run._receive(news("prior"), processes)
     assert console.export_text().splitlines() == [
         "prior: ERROR: stamp is 0: expected more [stamps_zero]",
         "prior: no longer: stamps_zero",

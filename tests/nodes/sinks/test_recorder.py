@@ -70,7 +70,7 @@ def test_a_disk_that_is_full_before_it_was_noticed(
     ("settings", "said"),
     [
         ({"recorder__split_mb": "nan"}, "split_mb: expected 0 or more, got nan"),
-        ({"recorder__keep_mb": "10", "recorder__split_mb": "10"}, "at least two parts"),
+        ({"recorder__keep_mb": "10", "recorder__split_mb": "10"}, "expected two parts or more, 20, got 10"),
         ({"recorder__sync_s": "-1"}, "sync_s: expected 0 or more"),
     ],
 )
