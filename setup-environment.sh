@@ -22,11 +22,18 @@ install() {
     python=$(find_python)
     echo "Installing steadypose[$(echo "$@" | tr ' ' ',')] into $root/.venv, once" >&2
     if [ ! -x "$root/.uv/bin/uv" ]; then
-        "$python" -m venv "$root/.uv" || {
-            echo "Python's venv module is missing. On Debian or Ubuntu: sudo apt install python3-venv" >&2
-            exit 1
-        }
-        "$root/.uv/bin/python" -m pip install --quiet --disable-pip-version-check "uv==$UV_VERSION"
+        # by the Python's own pip where that can: putting another into the new folder takes five seconds
+        if "$python" -m pip --python "$python" --version >/dev/null 2>&1; then
+            "$python" -m venv --without-pip "$root/.uv"
+            "$python" -m pip --python "$root/.uv/bin/python" install \
+                --quiet --disable-pip-version-check "uv==$UV_VERSION"
+        else
+            "$python" -m venv "$root/.uv" || {
+                echo "Python's venv module is missing. On Debian or Ubuntu: sudo apt install python3-venv" >&2
+                exit 1
+            }
+            "$root/.uv/bin/python" -m pip install --quiet --disable-pip-version-check "uv==$UV_VERSION"
+        fi
     fi
     extras=
     for extra in "$@"; do
@@ -36,8 +43,7 @@ install() {
     (unset VIRTUAL_ENV UV_PROJECT_ENVIRONMENT &&
         "$root/.uv/bin/uv" sync --project "$root" --frozen --inexact --python "$python" $extras)
     # loops are compiled once, and bytecode written; else the first stream would wait for both
-    "$root/.venv/bin/python" -c "import steadypose.nodes.commands.run, steadypose.nodes.graph.trajectory_node
-import steadypose.prior.camera.depth_lifting, steadypose.prior.clean.pipeline as prior
-prior.load_loops()"
+    echo "Compiling, once" >&2
+    (unset PYTHONDONTWRITEBYTECODE && "$root/.venv/bin/python" -m steadypose.nodes.graph.loops)
     touch "$stamp"
 }

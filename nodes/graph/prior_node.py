@@ -59,9 +59,10 @@ class PriorNode(Node):
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
         one_thread()
-        kiosks = len(launch.server.kiosks)
-        self._pipeline = make_batch(launch.table("prior"), kiosks) if kiosks else make_prior(launch.table("prior"))
-        load_loops()
+        settings, kiosks = launch.table("prior"), len(launch.server.kiosks)
+        with _launch_errors():
+            load_loops(PriorSettings.from_dict(settings))  # first: what it takes and leaves serves the pipeline
+        self._pipeline = make_batch(settings, kiosks) if kiosks else make_prior(settings)
         self._bodies = 0
         self._anomalies = 0
         self._answers = Answers(self._pipeline.counters)

@@ -7,6 +7,8 @@ arithmetic. Rotations are local (child in parent's frame); the root's is its ori
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -60,6 +62,7 @@ _HINGE = np.zeros((len(PARENTS), 3))
 _HINGE[list(HIPS)] = (0.0, 1.0, 0.0)
 _HINGE[SHOULDERS[0]] = (0.0, 0.0, -1.0)
 _HINGE[SHOULDERS[1]] = (0.0, 0.0, 1.0)
+_HINGED = np.array([hinge.any() for hinge in _HINGE])
 # The sine of the bend below which the plane of a limb says nothing of its twist, and above which it says all.
 _BEND_NONE, _BEND_FULL = 0.1, 0.35
 
@@ -157,7 +160,28 @@ def _frames(values: NDArray[np.floating], shape: tuple[int, ...]) -> Floats:
 
 
 # ---------------------------------------------------------------------------------------------------------------
-# Vectors (3,) and matrices (3, 3)
+# Vectors (x, y, z) and matrices (3, 3). Vectors are tuples: arrays of three would be made and dropped by the hundred,
+# and each assignment of one array to a part of another takes a second more to compile.
+
+
+@njit(cache=True)
+def _at(points, joint):
+    return points[joint, 0], points[joint, 1], points[joint, 2]
+
+
+@njit(cache=True)
+def _less(a, b):
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(cache=True)
+def _middle(points, joints):
+    a, b = joints
+    return (
+        (points[a, 0] + points[b, 0]) / 2.0,
+        (points[a, 1] + points[b, 1]) / 2.0,
+        (points[a, 2] + points[b, 2]) / 2.0,
+    )
 
 
 @njit(cache=True)
@@ -167,82 +191,77 @@ def _dot(a, b):
 
 @njit(cache=True)
 def _cross(a, b):
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _normalised(v):
-    return v / max(np.sqrt(_dot(v, v)), 1e-9)
-
-
-@njit(cache=True)
-def _product(a, b):
-    out = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
-    return out
+    length = max(math.sqrt(_dot(v, v)), 1e-9)
+    return v[0] / length, v[1] / length, v[2] / length
 
 
 @njit(cache=True)
 def _turned(m, v):
-    return np.array([_dot(m[0], v), _dot(m[1], v), _dot(m[2], v)])
+    """``m @ v``"""
+    return (
+        m[0, 0] * v[0] + m[0, 1] * v[1] + m[0, 2] * v[2],
+        m[1, 0] * v[0] + m[1, 1] * v[1] + m[1, 2] * v[2],
+        m[2, 0] * v[0] + m[2, 1] * v[1] + m[2, 2] * v[2],
+    )
 
 
 @njit(cache=True)
 def _turned_back(m, v):
-    return m[0] * v[0] + m[1] * v[1] + m[2] * v[2]
+    """``m.T @ v``"""
+    return (
+        m[0, 0] * v[0] + m[1, 0] * v[1] + m[2, 0] * v[2],
+        m[0, 1] * v[0] + m[1, 1] * v[1] + m[2, 1] * v[2],
+        m[0, 2] * v[0] + m[1, 2] * v[1] + m[2, 2] * v[2],
+    )
 
 
 @njit(cache=True)
-def _frame(left, up):
-    """Right-handed frame, columns forward, left, up: y along ``left``, z in the plane of ``up``."""
-    y = _normalised(left)
-    x = _normalised(_cross(y, up))
-    z = _cross(x, y)
-    out = np.empty((3, 3))
-    out[:, 0], out[:, 1], out[:, 2] = x, y, z
-    return out
-
-
-@njit(cache=True)
-def _about(axis, angle):
-    """The rotation about unit ``axis`` by ``angle`` radians."""
-    s, c = np.sin(angle), np.cos(angle)
-    out = np.empty((3, 3))
+def _write_product(a, b, out):
+    """Write ``a @ b``, both (3, 3)."""
     for i in range(3):
         for j in range(3):
-            out[i, j] = (1.0 - c) * axis[i] * axis[j]
-        out[i, i] += c
-    out[0, 1] -= s * axis[2]
-    out[0, 2] += s * axis[1]
-    out[1, 0] += s * axis[2]
-    out[1, 2] -= s * axis[0]
-    out[2, 0] -= s * axis[1]
-    out[2, 1] += s * axis[0]
-    return out
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
 @njit(cache=True)
-def swing(a, b):
-    """The smallest rotation (3, 3) that turns direction ``a`` (3,) into ``b`` (3,)."""
-    a, b = _normalised(a), _normalised(b)
-    axis, cosine = _cross(a, b), _dot(a, b)
-    if cosine < -1.0 + 1e-8:  # opposite directions have no smallest rotation: any half turn will do
-        other = np.array([1.0, 0.0, 0.0]) if abs(a[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-        return _about(_normalised(_cross(a, other)), np.pi)
-    out = np.empty((3, 3))
-    for i in range(3):  # Rodrigues without the angle
+def _axes(left, up):
+    """Of a right-handed frame, forward, left and up: y along ``left``, z in the plane of ``up``."""
+    y = _normalised(left)
+    x = _normalised(_cross(y, up))
+    return x, y, _cross(x, y)
+
+
+@njit(cache=True)
+def _write_rotation(axis, sine, cosine, rest, out):
+    """Write Rodrigues' rotation: ``sine`` times the cross product with ``axis``, ``cosine`` times the identity, and
+    ``rest`` times the outer product of ``axis`` with itself."""
+    for i in range(3):
         for j in range(3):
-            out[i, j] = axis[i] * axis[j] / (1.0 + cosine)
+            out[i, j] = rest * axis[i] * axis[j]
         out[i, i] += cosine
-    out[0, 1] -= axis[2]
-    out[0, 2] += axis[1]
-    out[1, 0] += axis[2]
-    out[1, 2] -= axis[0]
-    out[2, 0] -= axis[1]
-    out[2, 1] += axis[0]
-    return out
+    out[0, 1] -= sine * axis[2]
+    out[0, 2] += sine * axis[1]
+    out[1, 0] += sine * axis[2]
+    out[1, 2] -= sine * axis[0]
+    out[2, 0] -= sine * axis[1]
+    out[2, 1] += sine * axis[0]
+
+
+@njit(cache=True, error_model="numpy")
+def write_swing(a, b, out):
+    """Write the smallest rotation (3, 3) that turns direction ``a`` into ``b``."""
+    a, b = _normalised(a), _normalised(b)
+    cosine = _dot(a, b)
+    if cosine < -1.0 + 1e-8:  # opposite directions have no smallest rotation: any half turn will do
+        other = (1.0, 0.0, 0.0) if abs(a[0]) < 0.9 else (0.0, 1.0, 0.0)
+        _write_rotation(_normalised(_cross(a, other)), 0.0, -1.0, 2.0, out)
+    else:
+        _write_rotation(_cross(a, b), 1.0, cosine, 1.0 / (1.0 + cosine), out)
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -250,31 +269,47 @@ def swing(a, b):
 
 
 @njit(cache=True)
-def _pelvis(p, seen, rest):
-    """The pelvis: seen, between the hips, or upright below the highest part of the trunk seen."""
-    if not seen[0]:
-        for a, b in _BELOW:
-            if seen[a] and seen[b]:
-                place = (p[a] + p[b]) / 2.0
-                place[2] -= (rest[a, 2] + rest[b, 2]) / 2.0
-                return place
-    return np.where(np.isfinite(p[0]), p[0], 0.0)
+def _write_rest(offsets, rest):
+    """Write where the joints (22, 3) of the rest pose are, on these bones."""
+    for i in range(3):
+        rest[0, i] = 0.0
+        for joint in range(1, len(PARENT)):
+            rest[joint, i] = rest[PARENT[joint], i] + offsets[joint, i]
 
 
 @njit(cache=True)
-def _trunk(which, p, seen, rest, here):
-    """Whether the frame shows pelvis (0) or chest (1), and its rotation in the frame of the positions."""
+def _pelvis(p, seen, rest):
+    """The pelvis: seen, between the hips, or upright below the highest part of the trunk seen."""
+    if seen[0]:
+        return _at(p, 0)
+    for k in range(len(_BELOW)):
+        if seen[_BELOW[k, 0]] and seen[_BELOW[k, 1]]:
+            place = _middle(p, _BELOW[k])
+            return place[0], place[1], place[2] - _middle(rest, _BELOW[k])[2]
+    return 0.0, 0.0, 0.0
+
+
+@njit(cache=True)
+def _write_trunk(which, p, seen, rest, here, above, out):
+    """Write the rotation of pelvis (0) or chest (1), local to its parent's, ``above``, if the frame shows it."""
     joint = _RIGID_PARTS[which]
-    for left, right in _PART_LEFT[which]:
-        for a, b in _PART_UP[which]:
+    for k in range(len(_PART_LEFT[which])):
+        left, right = _PART_LEFT[which, k]
+        for m in range(len(_PART_UP[which])):
+            a, b = _PART_UP[which, m]
             if seen[left] and seen[right] and seen[a] and seen[b]:
-                shown = _frame(p[left] - p[right], (p[a] + p[b]) / 2.0 - here)
-                at_rest = _frame(rest[left] - rest[right], (rest[a] + rest[b]) / 2.0 - rest[joint])
-                return True, _product(shown, at_rest.T)
-    return False, np.eye(3)
+                shown = _axes(_less(_at(p, left), _at(p, right)), _less(_middle(p, (a, b)), here))
+                resting = _axes(
+                    _less(_at(rest, left), _at(rest, right)), _less(_middle(rest, (a, b)), _at(rest, joint))
+                )
+                x, y, z = _turned_back(above, shown[0]), _turned_back(above, shown[1]), _turned_back(above, shown[2])
+                for i in range(3):
+                    for j in range(3):
+                        out[i, j] = x[i] * resting[0][j] + y[i] * resting[1][j] + z[i] * resting[2][j]
+                return
 
 
-@njit("(f8[:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,::1])", cache=True)
+@njit(cache=True)
 def _constrain(positions, offsets, mobility, length_variance):
     """Of B frames: moves ``positions`` (B, 22, 3) until what is rigid has its lengths."""
     rest = np.empty((len(PARENT), 3))
@@ -282,86 +317,88 @@ def _constrain(positions, offsets, mobility, length_variance):
     force = np.empty(len(RIGID))
     for frame in range(len(positions)):
         p, yields, compliance = positions[frame], mobility[frame], length_variance[frame]
-        rest[0] = 0.0
-        for joint in range(1, len(PARENT)):
-            rest[joint] = rest[PARENT[joint]] + offsets[frame, joint]
+        _write_rest(offsets[frame], rest)
         for k in range(len(RIGID)):
-            bone = rest[RIGID[k, 0]] - rest[RIGID[k, 1]]
-            length[k] = np.sqrt(_dot(bone, bone))
+            bone = _less(_at(rest, RIGID[k, 0]), _at(rest, RIGID[k, 1]))
+            length[k] = math.sqrt(_dot(bone, bone))
             force[k] = 0.0
         for _ in range(_SWEEPS):
             for k in range(len(RIGID)):
                 a, b = RIGID[k]
-                squared = 0.0
-                for i in range(3):  # no vectors here: in the innermost loop, making them would take most of the time
-                    squared += (p[a, i] - p[b, i]) ** 2
-                now = max(np.sqrt(squared), 1e-9)
+                apart = _less(_at(p, a), _at(p, b))
+                now = max(math.sqrt(_dot(apart, apart)), 1e-9)
                 pull = (now - length[k] - compliance[k] * force[k]) / (yields[a] + yields[b] + compliance[k])
                 force[k] += pull
                 for i in range(3):
-                    along = pull / now * (p[a, i] - p[b, i])
+                    along = pull / now * apart[i]
                     p[a, i] -= yields[a] * along
                     p[b, i] += yields[b] * along
 
 
 @njit(cache=True)
 def _twist(joint, p, seen, above, turn, bone):
-    """``turn``, twisted about ``bone`` (parent's frame) so that the hinge below lies in the plane of the bent limb."""
-    middle = _AIM[joint, 0]
-    end = _AIM[joint, 1]
+    """The angle about unit ``bone`` (parent's frame) by which ``turn`` is to be twisted so that the hinge below lies in
+    the plane of the bent limb."""
+    middle, end = _AIM[joint, 0], _AIM[joint, 1]
     if not (seen[middle] and seen[end]):
-        return turn
-    bone = _normalised(bone)
-    normal = _cross(bone, _normalised(_turned_back(above, p[end] - p[middle])))
-    share = (np.sqrt(_dot(normal, normal)) - _BEND_NONE) / (_BEND_FULL - _BEND_NONE)
+        return 0.0
+    normal = _cross(bone, _normalised(_turned_back(above, _less(_at(p, end), _at(p, middle)))))
+    share = (math.sqrt(_dot(normal, normal)) - _BEND_NONE) / (_BEND_FULL - _BEND_NONE)
     share = min(max(share, 0.0), 1.0)
-    hinge = _turned(turn, _HINGE[joint])
-    angle = np.arctan2(_dot(_cross(hinge, normal), bone), _dot(hinge, normal))
-    return _product(_about(bone, angle * share * share * (3.0 - 2.0 * share)), turn)
+    hinge = _turned(turn, _at(_HINGE, joint))
+    angle = math.atan2(_dot(_cross(hinge, normal), bone), _dot(hinge, normal))
+    return angle * share * share * (3.0 - 2.0 * share)
 
 
-@njit("(f8[:,:,::1], b1[:,::1], f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1])", cache=True)
+@njit(cache=True)
 def _solve(positions, observed, offsets, local, placed):
     """Of B frames: writes ``placed`` (B, 22, 3), and into ``local`` (B, 22, 3, 3) what can be solved."""
     joints = len(PARENT)
     rest = np.empty((joints, 3))
     world = np.empty((joints, 3, 3))
+    turn, twist = np.empty((3, 3)), np.empty((3, 3))
+    upright = np.eye(3)
     for frame in range(len(positions)):
         p, seen, bones = positions[frame], observed[frame], offsets[frame]
-        rest[0] = 0.0
-        for joint in range(1, joints):
-            rest[joint] = rest[PARENT[joint]] + bones[joint]
+        _write_rest(bones, rest)
         for joint in range(joints):
             if joint == 0:
-                above, here = np.eye(3), _pelvis(p, seen, rest)
+                above, here = upright, _pelvis(p, seen, rest)
             else:
                 above = world[PARENT[joint]]
-                here = placed[frame, PARENT[joint]] + _turned(above, bones[joint])
-            placed[frame, joint] = here
+                bone = _turned(above, _at(bones, joint))
+                start = _at(placed[frame], PARENT[joint])
+                here = (start[0] + bone[0], start[1] + bone[1], start[2] + bone[2])
+            for i in range(3):
+                placed[frame, joint, i] = here[i]
             for which in range(len(_RIGID_PARTS)):
                 if joint == _RIGID_PARTS[which]:
-                    solved, orientation = _trunk(which, p, seen, rest, here)
-                    if solved:
-                        local[frame, joint] = _product(above.T, orientation)
-            for target in _AIM[joint]:
+                    _write_trunk(which, p, seen, rest, here, above, local[frame, joint])
+            for k in range(_AIM.shape[1]):
+                target = _AIM[joint, k]
                 if target >= 0 and seen[target]:
-                    direction = _turned_back(above, p[target] - here)
-                    turn = swing(rest[target] - rest[joint], direction)
-                    if _HINGE[joint].any():
-                        turn = _twist(joint, p, seen, above, turn, direction)
-                    local[frame, joint] = turn
+                    direction = _turned_back(above, _less(_at(p, target), here))
+                    write_swing(_less(_at(rest, target), _at(rest, joint)), direction, turn)
+                    direction = _normalised(direction)
+                    angle = _twist(joint, p, seen, above, turn, direction) if _HINGED[joint] else 0.0
+                    _write_rotation(direction, math.sin(angle), math.cos(angle), 1.0 - math.cos(angle), twist)
+                    _write_product(twist, turn, local[frame, joint])
                     break
-            world[joint] = _product(above, local[frame, joint])
+            _write_product(above, local[frame, joint], world[joint])
 
 
-@njit("(f8[:,:,:,::1], f8[:,:,::1], f8[:,:,::1])", cache=True)
+@njit(cache=True)
 def _place(local, offsets, placed):
     """Of B frames: writes ``placed`` (B, 22, 3)."""
     world = np.empty((len(PARENT), 3, 3))
     for frame in range(len(local)):
-        placed[frame, 0] = 0.0
-        world[0] = local[frame, 0]
+        for i in range(3):
+            placed[frame, 0, i] = 0.0
+            for j in range(3):
+                world[0, i, j] = local[frame, 0, i, j]
         for joint in range(1, len(PARENT)):
             above = world[PARENT[joint]]
-            placed[frame, joint] = placed[frame, PARENT[joint]] + _turned(above, offsets[frame, joint])
-            world[joint] = _product(above, local[frame, joint])
+            bone = _turned(above, _at(offsets[frame], joint))
+            for i in range(3):
+                placed[frame, joint, i] = placed[frame, PARENT[joint], i] + bone[i]
+            _write_product(above, local[frame, joint], world[joint])

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from steadypose.prior.body.skeleton import TRUNK_LANDMARKS, J, finite_joints
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
@@ -296,5 +295,7 @@ def _place_score(away: Floats, sigma: Floats) -> Floats:
 
 def _best(score: Floats) -> list[tuple[int, int]]:
     """Pairs (row, column) of the assignment with the greatest sum of scores (R, C), none below 0."""
+    from scipy.optimize import linear_sum_assignment  # 12 MB, for those alone whose source gives no ids
+
     pairs = zip(*linear_sum_assignment(np.maximum(score, 0.0), maximize=True), strict=True)
     return [(int(r), int(c)) for r, c in pairs if score[r, c] > 0]

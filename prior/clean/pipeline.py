@@ -8,9 +8,8 @@ from functools import cache
 import numpy as np
 
 from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
-from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.layouts import CANONICAL, Skeleton
-from steadypose.prior.body.skeleton import REST_OFFSETS, J
+from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.clean.adapt import (
     SensorFrame,
     Sighting,
@@ -24,7 +23,6 @@ from steadypose.prior.clean.adapt import (
 from steadypose.prior.clean.core import CleanCore
 from steadypose.prior.clean.frame import Bools, CleanFrame, Observation
 from steadypose.prior.clean.identify import Identify
-from steadypose.prior.clean.impute import ImputeSettings
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.clean.slots import Slots
 from steadypose.prior.timing.rate import FPS
@@ -128,13 +126,13 @@ class PriorPipeline:
 
 
 @cache
-def load_loops() -> None:
-    """Have every stage's compiled loops loaded, or compiled: they are at their first call, and no frame should wait."""
-    pipeline = PriorPipeline(PriorSettings(impute=ImputeSettings(steps=1)))
+def load_loops(settings: PriorSettings) -> None:
+    """Have the compiled loops of every stage in use loaded, or compiled: they are at their first call, and no frame
+    should wait."""
+    pipeline = PriorPipeline(settings)
     pose = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
-    standing = place_joints(np.tile(np.eye(3), (22, 1, 1)), REST_OFFSETS).astype(np.float32)
     for frame in range(40):
-        positions = standing + np.float32(0.001 * frame)
+        positions = (REST_POSITIONS + 0.001 * frame).astype(np.float32)
         if frame == 20:
             positions[J["left_wrist"]] += 0.5
         if frame > 30:

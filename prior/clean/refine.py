@@ -90,7 +90,10 @@ def _repeat_first(frames):
         while first < len(frames) - 1 and math.isnan(frames[first, row, 0, 0, 0]):
             first += 1
         for t in range(first):
-            frames[t, row] = frames[first, row]
+            for joint in range(frames.shape[2]):
+                for i in range(3):
+                    for j in range(3):
+                        frames[t, row, joint, i, j] = frames[first, row, joint, i, j]
 
 
 @njit(cache=True)
@@ -120,7 +123,9 @@ def rotations_of(x, back):
         for t in range(x.shape[1]):
             for joint in range(22):
                 _orthonormal(x[row, t, joint], rotations[t, row, joint])
-            root[:] = rotations[t, row, 0]
+            for i in range(3):
+                for j in range(3):
+                    root[i, j] = rotations[t, row, 0, i, j]
             for i in range(3):
                 for j in range(3):
                     rotations[t, row, 0, i, j] = (

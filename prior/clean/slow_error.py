@@ -10,6 +10,7 @@ it was tried: 0.2 % of a Kinect's error, for 0.6 mm of a perfect input's.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from numba import njit
 from steadypose.prior.body.inverse_kinematics import RIGID
 from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.clean.frame import Bools, Floats
+from steadypose.prior.compiled import median
 from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS
 
@@ -96,15 +98,19 @@ def _find(positions, sigma, offsets, expected, moments, bias, length_variance):
     rest, lasting = np.zeros((22, 3)), np.empty(len(_BONE))
     for s in range(len(positions)):
         for joint in range(1, 22):
-            rest[joint] = rest[PARENT[joint]] + offsets[s, joint]
-        frames, mean, variance, noise = moments[:, s]
+            for axis in range(3):
+                rest[joint, axis] = rest[PARENT[joint], axis] + offsets[s, joint, axis]
+        frames, mean, variance, noise = moments[0, s], moments[1, s], moments[2, s], moments[3, s]
+        most = 0.0
         for k in range(len(RIGID)):
             a, b = RIGID[k]
             left = sigma[s, a] ** 2 + sigma[s, b] ** 2
-            length = np.sqrt(((positions[s, a] - positions[s, b]) ** 2).sum())
-            if not (left < 2 * SURE**2 and np.isfinite(length)):
+            length = _apart(positions[s], a, b)
+            most = max(most, frames[k])
+            if not (left < 2 * SURE**2 and math.isfinite(length)):
                 continue
             frames[k] += 1
+            most = max(most, frames[k])
             share = 1.0 / min(frames[k], MEMORY)
             off = length - mean[k]
             mean[k] += share * off
@@ -115,14 +121,22 @@ def _find(positions, sigma, offsets, expected, moments, bias, length_variance):
             if frames[k] > LEAST_FRAMES:
                 lasting[known] = max(variance[k] - noise[k], 0.0)
                 known += 1
-        found = 0.5 * np.median(lasting[:known]) if known else 0.0
-        most = float(min(frames.max(), MEMORY))
+        found = 0.5 * median(lasting[:known]) if known else 0.0
+        most = min(most, MEMORY)
         square = (PRIOR_FRAMES * expected[s] ** 2 + most * found) / (PRIOR_FRAMES + most)
-        bias[s] = np.sqrt(square)
+        bias[s] = math.sqrt(square)
         for k in range(len(RIGID)):
             if frames[k] <= LEAST_FRAMES:
                 length_variance[s, k] = UNKNOWN_VARIANCE
                 continue
-            own = rest[RIGID[k, 0]] - rest[RIGID[k, 1]]
-            apart = (mean[k] - np.sqrt((own * own).sum())) ** 2 - noise[k] / max(frames[k] / INDEPENDENT, 1.0)
+            own = _apart(rest, RIGID[k, 0], RIGID[k, 1])
+            apart = (mean[k] - own) ** 2 - noise[k] / max(frames[k] / INDEPENDENT, 1.0)
             length_variance[s, k] = max(apart, 0.0) + max(variance[k] - noise[k] - 2.0 * square, 0.0)
+
+
+@njit(cache=True)
+def _apart(positions, a, b):
+    square = 0.0
+    for axis in range(3):
+        square += (positions[a, axis] - positions[b, axis]) ** 2
+    return math.sqrt(square)

@@ -229,27 +229,34 @@ def _correct(
 ):  # fmt: skip
     """Take in the measurement (N, 3) of the newest frame, which is in ``slot``."""
     for joint in range(len(measured)):
-        if not (np.isfinite(measured[joint]).all() and np.isfinite(sigma[joint])):
+        x, y, z = measured[joint, 0], measured[joint, 1], measured[joint, 2]
+        if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z) and math.isfinite(sigma[joint])):
             continue
         noise = sigma[joint] ** 2
         if not known[joint]:
             known[joint] = True
-            with_position[:, joint] = with_velocity[:, joint] = 0.0
-            position[slot, joint] = measured[joint]
+            for frame in range(len(position)):
+                with_position[frame, joint] = with_velocity[frame, joint] = 0.0
+            for axis in range(3):
+                position[slot, joint, axis] = measured[joint, axis]
+                velocity[joint, axis] = 0.0
             variance[slot, joint] = with_position[slot, joint] = noise
-            velocity[joint] = 0.0
             velocity_variance[joint] = initial_velocity_variance
             continue
         own, covariance = with_position[slot, joint], with_velocity[slot, joint]
-        innovation = measured[joint] - position[slot, joint]
+        x, y, z = x - position[slot, joint, 0], y - position[slot, joint, 1], z - position[slot, joint, 2]
         for frame in range(len(position)):
             gain = with_position[frame, joint] / (own + noise)
-            position[frame, joint] += gain * innovation
+            position[frame, joint, 0] += gain * x
+            position[frame, joint, 1] += gain * y
+            position[frame, joint, 2] += gain * z
             variance[frame, joint] -= gain * with_position[frame, joint]
             with_position[frame, joint] -= gain * own
             with_velocity[frame, joint] -= gain * covariance
         gain = covariance / (own + noise)
-        velocity[joint] += gain * innovation
+        velocity[joint, 0] += gain * x
+        velocity[joint, 1] += gain * y
+        velocity[joint, 2] += gain * z
         velocity_variance[joint] -= gain * covariance
 
 

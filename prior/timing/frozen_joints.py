@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from steadypose.prior.compiled import median
+
 RECENT = 15
 """Frames in which a joint that repeats itself must do so mostly."""
 
@@ -34,26 +36,40 @@ def frozen_joints(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
     found = np.zeros((count, joints), dtype=np.bool_)
     for b in range(count):
         recent = positions[b, max(frames - RECENT - 1, 0) :]
-        new, repeated, noise = 0, np.zeros(joints), np.zeros(joints)
+        new, repeated, most = 0, np.zeros(joints), 0
         for t in range(1, len(recent)):
-            same = np.ones(joints)
+            same, repeats = np.ones(joints, dtype=np.uint8), 0
             for joint in range(joints):
                 for axis in range(3):
                     if not abs(recent[t, joint, axis] - recent[t - 1, joint, axis]) < SAME:
-                        same[joint] = 0.0
-            if same.mean() <= 0.5:
+                        same[joint] = 0
+                repeats += same[joint]
+            if 2 * repeats <= joints:
                 new += 1
-                repeated += same
-        if not (repeated > 0.5 * max(new, _LEAST_NEW)).any():
-            continue
-        for joint in range(joints):
-            square, seen = 0.0, 0
-            for t in range(2, len(recent)):
-                shaken = recent[t, joint] - 2 * recent[t - 1, joint] + recent[t - 2, joint]
-                if np.isfinite(shaken).all():
-                    square += (shaken**2).sum()
-                    seen += 3
-            noise[joint] = math.sqrt(square / 6 / max(seen, 1))
-        if np.median(noise) > LEAST_NOISE:
-            found[b] = repeated > 0.5 * max(new, _LEAST_NEW)
+                for joint in range(joints):
+                    repeated[joint] += same[joint]
+                    most = max(most, repeated[joint])
+        limit = 0.5 * max(new, _LEAST_NEW)
+        if most > limit and median(_noise(recent)) > LEAST_NOISE:
+            for joint in range(joints):
+                found[b, joint] = repeated[joint] > limit
     return found
+
+
+@njit(cache=True)
+def _noise(positions):
+    """(22,) metres along an axis, from frame to frame, of positions (T, 22, 3): from their second differences."""
+    frames, joints, _ = positions.shape
+    noise = np.empty(joints)
+    for joint in range(joints):
+        squares, seen = 0.0, 0
+        for t in range(2, frames):
+            square = 0.0
+            for axis in range(3):
+                shaken = positions[t, joint, axis] - 2 * positions[t - 1, joint, axis] + positions[t - 2, joint, axis]
+                square += shaken * shaken
+            if math.isfinite(square):
+                squares += square
+                seen += 3
+        noise[joint] = math.sqrt(squares / 6 / max(seen, 1))
+    return noise

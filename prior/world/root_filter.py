@@ -184,17 +184,22 @@ def _predict(x, p, dt, density, kept, slip):
     """Move state (size, 3) and covariances (3, size, size) on in place; ``kept`` (2, 3) is left of the slow errors."""
     for a in range(3):
         x[_POSITION, a] += dt * x[_VELOCITY, a]
-        p[a, _POSITION] += dt * p[a, _VELOCITY]
-        p[a, :, _POSITION] += dt * p[a, :, _VELOCITY]
+        for k in range(len(x)):
+            p[a, _POSITION, k] += dt * p[a, _VELOCITY, k]
+        for k in range(len(x)):
+            p[a, k, _POSITION] += dt * p[a, k, _VELOCITY]
         p[a, _POSITION, _POSITION] += density * dt**3 / 3
         p[a, _POSITION, _VELOCITY] += density * dt**2 / 2
         p[a, _VELOCITY, _POSITION] += density * dt**2 / 2
         p[a, _VELOCITY, _VELOCITY] += density * dt
-        for k, error in enumerate((_SENSOR, _NETWORK)):
-            x[error, a] *= kept[k, a]
-            p[a, error] *= kept[k, a]
-            p[a, :, error] *= kept[k, a]
-            p[a, error, error] += 1.0 - kept[k, a] ** 2
+        for which, error in enumerate((_SENSOR, _NETWORK)):
+            left = kept[which, a]
+            x[error, a] *= left
+            for k in range(len(x)):
+                p[a, error, k] *= left
+            for k in range(len(x)):
+                p[a, k, error] *= left
+            p[a, error, error] += 1.0 - left**2
         for k in range(len(slip)):
             p[a, _FEET + k, _FEET + k] += slip[k]
 

@@ -103,7 +103,10 @@ def _decimals(score, quantiles, heights, told):
     for row in range(len(score)):
         limits = quantiles[row]
         for k in range(score.shape[1]):
-            low = min(max((score[row, k] > limits).sum() - 1, 0), len(limits) - 2)
+            below = 0
+            for limit in range(len(limits)):
+                below += score[row, k] > limits[limit]
+            low = min(max(below - 1, 0), len(limits) - 2)
             # beyond the rarest rate measured, the tail goes on as it went between the last two
             rising = (heights[low + 1] - heights[low]) / max(limits[low + 1] - limits[low], 1e-6)
             told[row, k] = max(heights[low] + rising * (score[row, k] - limits[low]), 0.0)

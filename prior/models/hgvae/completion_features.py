@@ -160,8 +160,18 @@ def _write_nodes(deviations, observed, patch, nodes, moved, noise, apart):
         _measure_noise(deviations[b], seen, nodes[b, :, patch * frame :], noise[b])
         _measure_moved(deviations[b], seen, moved[b])
         for joint in range(joints):
-            nodes[b, :, patch * frame + joints + 1 + joint] = 0.5 * math.log(moved[b, joint] / CENTIMETRE**2 + 1e-3)
+            liveliness = 0.5 * math.log(moved[b, joint] / CENTIMETRE**2 + 1e-3)
+            for node in range(nodes.shape[1]):
+                nodes[b, node, patch * frame + joints + 1 + joint] = liveliness
             moved[b, joint] = max(moved[b, joint] - 2 * noise[b, joint], 0.0)
+
+
+@njit(cache=True)
+def _total(values):
+    total = values[0]
+    for k in range(1, len(values)):
+        total += values[k]
+    return total
 
 
 @njit(cache=True)
@@ -170,9 +180,9 @@ def _measure_moved(deviations, seen, moved):
     tracks, frames = deviations.shape
     joints = tracks // 3
     counts = np.zeros(joints)
-    moved[:] = 0.0
     for joint in range(joints):
         above = PARENT[joint]
+        moved[joint] = 0.0
         for t in range(LAG, frames):
             if seen[joint, t] > 0 and seen[joint, t - LAG] > 0:
                 counts[joint] += 1
@@ -181,7 +191,7 @@ def _measure_moved(deviations, seen, moved):
                     if above > 0:
                         way -= deviations[3 * above + axis, t] - deviations[3 * above + axis, t - LAG]
                     moved[joint] += way * way / 3
-    together = moved.sum() / max(counts.sum(), 1.0)
+    together = _total(moved) / max(_total(counts), 1.0)
     for joint in range(joints):
         moved[joint] = moved[joint] / counts[joint] if counts[joint] > 0 else together
 
@@ -199,10 +209,12 @@ def _measure_noise(deviations, seen, nodes, noise):
                 for axis in range(3):
                     track = deviations[3 * joint + axis]
                     squares[joint] += (track[t - 1] - 2 * track[t] + track[t + 1]) ** 2
-    together = squares.sum() / max(counts.sum(), 1.0)
+    together = _total(squares) / max(_total(counts), 1.0)
     for joint in range(joints + 1):
         alone = joint < joints and counts[joint] > 3
         square = squares[joint] / counts[joint] if alone else together
-        nodes[:, joint] = 0.25 * math.log(square / CENTIMETRE**2 + 1e-3)
+        level = 0.25 * math.log(square / CENTIMETRE**2 + 1e-3)
+        for node in range(len(nodes)):
+            nodes[node, joint] = level
         if joint < joints:
             noise[joint] = square / 18  # a second difference has six times the variance, and this is of three axes

@@ -58,7 +58,8 @@ def _fuse(written, line_variance, places, observed, deviations, believed):
     joints, frames = line_variance.shape[1:]
     patch = written.shape[2] // (4 * joints)
     half = np.float32(2 * math.log(HALF_BELIEVED / SCALE))
-    for row, place in enumerate(places):
+    for row in range(len(places)):
+        place = places[row]
         for joint in range(joints):
             for t in range(frames):
                 held = line_variance[row, joint, t]

@@ -120,7 +120,9 @@ def _to_tracks(windows, sizes, low_pass, all_x, all_observed, all_path, yaws):
         yaw = yaws[window] = _heading(positions)
         path = np.dot(low_pass, _centre(positions, yaw, sizes[window]), all_path[window])
         for axis in range(3):
-            middle[:, axis] = path[:, axis].mean()
+            mean = _mean(path, axis)
+            for t in range(frames):
+                middle[t, axis] = mean
         c, s = math.cos(yaw) / sizes[window], math.sin(yaw) / sizes[window]
         for j in range(joints):
             origin = middle if j == 0 else path
@@ -152,7 +154,7 @@ def _from_tracks(x, path, yaws, sizes, world):
     for window in range(len(x)):
         c, s = math.cos(yaws[window]), math.sin(yaws[window])
         for axis in range(3):
-            middle[axis] = path[window, :, axis].mean()
+            middle[axis] = _mean(path[window], axis)
         for t in range(frames):
             along = path[window, path.shape[1] - frames + t]
             for joint in range(22):
@@ -164,9 +166,18 @@ def _from_tracks(x, path, yaws, sizes, world):
 
 
 @njit(cache=True)
+def _mean(path, axis):
+    total = 0.0
+    for t in range(len(path)):
+        total += path[t, axis]
+    return total / len(path)
+
+
+@njit(cache=True)
 def _hang_unseen(deviations):
     """As `hang_unseen`, of (N, 22, 3, T)."""
-    for window in deviations:
+    for row in range(len(deviations)):
+        window = deviations[row]
         for joint in range(len(PARENT)):
             parent = PARENT[joint]
             if math.isnan(window[joint, 0, 0]):
@@ -202,7 +213,8 @@ def _heading(positions):
     """Of the mean of all vectors from right to left, over hips and shoulders."""
     a = b = 0.0
     for t in range(len(positions)):
-        for left, right in _SIDES:
+        for k in range(len(_SIDES)):
+            left, right = _SIDES[k]
             dx = positions[t, left, 0] - positions[t, right, 0]
             dy = positions[t, left, 1] - positions[t, right, 1]
             if not math.isnan(dx):
@@ -219,9 +231,10 @@ def _centre(positions, yaw, size):
     centre = np.zeros((frames, 3))
     weight = np.zeros(frames)
     lies, seen = np.zeros(3), np.zeros(3)
-    for j in TRUNK:
-        seen[:] = 0.0
-        count = 0
+    for k in range(len(TRUNK)):
+        j, count = TRUNK[k], 0
+        for axis in range(3):
+            seen[axis] = 0.0
         for t in range(frames):
             if not math.isnan(positions[t, j, 0]) and not math.isnan(positions[t, 0, 0]):
                 for axis in range(3):

@@ -53,11 +53,17 @@ PACE = 2.0
 _LAGS = ((1, 1), (2, 1), (3, 1), (2, 3))
 """Order and spacing in frames of the differences of what came, whose sizes tell noise from motion."""
 _HISTORY = 7
+_CENTIMETRES = float(np.log(100.0))
 
 _DELAYS = (0, 1, 2, 4, 8)
 FEATURES = 3 * RAW + len(_LAGS) + 6 + 6 + 3 * RAW + 5 + len(_DELAYS) + 1
 """Of each joint: three logarithms of the distance between neighbouring experts, sizes of differences, bone, pose,
 the vectors between neighbouring experts, sighting, delay."""
+_SIZES = 6 * RAW
+_BONE = _SIZES + len(_LAGS)
+_POSE = _BONE + 6
+_SIGHTING = _POSE + 6
+"""where these begin"""
 
 
 class Bank(NamedTuple):
@@ -150,24 +156,16 @@ def advance(bank, count, step, positions, confidence, densities, sigma):
     slot, last = count % frames, (count - 1) % frames
     for s in range(bodies):
         for j in range(joints):
-            seen = (
-                np.isfinite(positions[s, j, 0]) and np.isfinite(positions[s, j, 1]) and np.isfinite(positions[s, j, 2])
-            )
+            seen = np.isfinite(positions[s, j, 0] + positions[s, j, 1] + positions[s, j, 2])
             known = bank.unseen[s, j, last] >= 0
-            for k in range(_HISTORY - 1):
-                for axis in range(3):
-                    bank.recent[s, j, k, axis] = bank.recent[s, j, k + 1, axis]
-            bank.recent[s, j, _HISTORY - 1] = np.nan
             bank.confidence[s, j, slot] = confidence[s, j] if seen else 0.0
-            if seen:
-                bank.raw[s, j, slot] = bank.recent[s, j, _HISTORY - 1] = positions[s, j]
-                bank.unseen[s, j, slot] = 0.0
-            elif known:
-                bank.raw[s, j, slot] = bank.raw[s, j, last]
-                bank.unseen[s, j, slot] = bank.unseen[s, j, last] + 1.0
-            else:
-                bank.raw[s, j, slot] = np.nan
-                bank.unseen[s, j, slot] = -1.0
+            bank.unseen[s, j, slot] = 0.0 if seen else bank.unseen[s, j, last] + 1.0 if known else -1.0
+            for axis in range(3):
+                for k in range(_HISTORY - 1):
+                    bank.recent[s, j, k, axis] = bank.recent[s, j, k + 1, axis]
+                came = positions[s, j, axis] if seen else np.nan
+                bank.recent[s, j, _HISTORY - 1, axis] = came
+                bank.raw[s, j, slot, axis] = bank.raw[s, j, last, axis] if known and not seen else came
             if seen:
                 _measure_differences(bank.recent[s, j], bank.sizes[s, j], bank.age[s, j])
             variance = (sigma / min(max(confidence[s, j], 0.1), 1.0)) ** 2
@@ -176,11 +174,12 @@ def advance(bank, count, step, positions, confidence, densities, sigma):
                 with_velocity, velocity = bank.with_velocity[s, j, m], bank.velocity[s, j, m]
                 if not known:
                     if seen:
-                        with_position[:] = 0.0
-                        with_velocity[:] = 0.0
-                        position[slot] = positions[s, j]
+                        for k in range(frames):
+                            with_position[k] = with_velocity[k] = 0.0
+                        for axis in range(3):
+                            position[slot, axis] = positions[s, j, axis]
+                            velocity[axis] = 0.0
                         with_position[slot] = variance
-                        velocity[:] = 0.0
                         bank.velocity_variance[s, j, m] = INITIAL_SPEED**2
                     continue
                 own = bank.velocity_variance[s, j, m]
@@ -217,20 +216,13 @@ def advance(bank, count, step, positions, confidence, densities, sigma):
 def _measure_differences(recent, sizes, age):
     """Running means of the logarithms of the sizes of `_LAGS`' differences of what came (7, 3)."""
     n = _HISTORY - 1
-    found = np.empty(4)
+    found = np.zeros(4)
     for axis in range(3):
         a, b, c, d = recent[n, axis], recent[n - 1, axis], recent[n - 2, axis], recent[n - 3, axis]
-        first = (a - b) ** 2
-        second = (a - 2 * b + c) ** 2
-        third = (a - 3 * b + 3 * c - d) ** 2
-        wide = (a - 2 * d + recent[n - 6, axis]) ** 2
-        if axis == 0:
-            found[0], found[1], found[2], found[3] = first, second, third, wide
-        else:
-            found[0] += first
-            found[1] += second
-            found[2] += third
-            found[3] += wide
+        found[0] += (a - b) ** 2
+        found[1] += (a - 2 * b + c) ** 2
+        found[2] += (a - 3 * b + 3 * c - d) ** 2
+        found[3] += (a - 2 * d + recent[n - 6, axis]) ** 2
     if np.isfinite(found[2]):
         age[1] += 1.0
         for k in range(4):
@@ -244,7 +236,7 @@ def _measure_differences(recent, sizes, age):
 @njit(cache=True, error_model="numpy")
 def _log(square):
     """How large a square of metres is, in powers of e of a centimetre, its root."""
-    return 0.5 * np.log(square + LEAST**2) + 4.605170185988091
+    return 0.5 * np.log(square + LEAST**2) + _CENTIMETRES
 
 
 @njit(cache=True, error_model="numpy")
@@ -262,8 +254,7 @@ def describe(bank, count, back, parents, experts, features, scale):
         features: (S, J, FEATURES) float32, written.
         scale: (S,) metres along an axis, the noise found; written.
     """
-    bodies, joints = bank.position.shape[:2]
-    frames = bank.position.shape[3]
+    bodies, joints, _, frames, _ = bank.position.shape
     slot = (count - 1 - back) % frames
     for s in range(bodies):
         total, seen_joints = 0.0, 0.0
@@ -290,10 +281,22 @@ def describe(bank, count, back, parents, experts, features, scale):
                 seen_joints += 1.0
         scale[s] = np.sqrt(total / max(seen_joints, 1.0) / 3.0) + LEAST
         _face(experts[s], bank.heading[s])
+        unseen = bank.unseen[s, :, slot]
         for j in range(joints):
-            _describe_joint(bank, s, j, parents[j], slot, back, experts[s], scale[s], features[s, j])
+            _describe_sighting(
+                unseen[j], bank.confidence[s, j, slot], bank.age[s, j, 0], back, scale[s], features[s, j]
+            )
+            if unseen[j] >= 0.0:
+                _describe_experts(experts[s, j], bank.apart[s, j], bank.heading[s], scale[s], features[s, j])
+                if bank.age[s, j, 1] > 0.0:
+                    for k in range(len(_LAGS)):
+                        features[s, j, _SIZES + k] = bank.sizes[s, j, k] + _CENTIMETRES
+                length, age, heading = bank.length[s, j], bank.age[s, j], bank.heading[s]
+                _describe_bone(j, parents[j], unseen, length, age, experts[s], heading, scale[s], features[s, j])
+                _describe_pose(j, unseen[0], experts[s], bank.place[s, j], heading, features[s, j])
         for j in range(joints):
-            bank.place[s, j] = experts[s, j, MIDDLE]
+            for axis in range(3):
+                bank.place[s, j, axis] = experts[s, j, MIDDLE, axis]
 
 
 @njit(cache=True, error_model="numpy")
@@ -319,71 +322,72 @@ def _turned(heading, x, y, z, unit, features, at):
     features[at + 2] = np.arcsinh(z / unit)
 
 
+# Each writes its part of a joint's features. None is handed the bank: its 16 arrays take a second more to compile.
+
+
 @njit(cache=True, error_model="numpy")
-def _describe_joint(bank, s, j, parent, slot, back, experts, scale, features):
-    features[:] = 0.0
+def _describe_sighting(unseen, confidence, age, back, scale, features):
+    """How the joint was seen, and the delay; the rest is 0 for a joint never seen."""
+    for k in range(FEATURES):
+        features[k] = 0.0
     at = FEATURES - len(_DELAYS) - 1
     for k, delay in enumerate(_DELAYS):
         features[at + k] = 1.0 / (1.0 + (back - delay) ** 2)
     features[at + len(_DELAYS)] = back / 16.0
-    unseen = bank.unseen[s, j, slot]
     if unseen < 0.0:
         return
-    heading, own, at = bank.heading[s], experts[j], 0
-    for m in range(RAW):
-        x, y, z = own[m, 0] - own[m + 1, 0], own[m, 1] - own[m + 1, 1], own[m, 2] - own[m + 1, 2]
-        features[at] = _log(x * x + y * y + z * z)
-        features[at + 1], features[at + 2] = _log(bank.apart[s, j, m, 0]), _log(bank.apart[s, j, m, 1])
-        _turned(heading, x, y, z, scale, features, 3 * RAW + 3 * m)
-        at += 3
-    at = 6 * RAW
-    if bank.age[s, j, 1] > 0.0:
-        for k in range(4):
-            features[at + k] = bank.sizes[s, j, k] + 4.605170185988091
-    at += 4
-    if parent != j and bank.unseen[s, parent, slot] >= 0.0:
-        _describe_bone(bank, s, j, parent, slot, experts, scale, features, at)
-    at += 6
-    x, y, z = own[MIDDLE, 0], own[MIDDLE, 1], own[MIDDLE, 2]
-    if bank.unseen[s, 0, slot] >= 0.0:
-        root = experts[0, MIDDLE]
-        _turned(heading, x - root[0], y - root[1], z - root[2], 0.5, features, at)
-    if np.isfinite(bank.place[s, j, 0]):
-        place, unit = bank.place[s, j], PACE / FPS
-        _turned(heading, x - place[0], y - place[1], z - place[2], unit, features, at + 3)
-    at += 6
-    features[at] = 1.0 if unseen == 0.0 else 0.0
-    features[at + 1] = np.log(1.0 + unseen)
-    features[at + 2] = bank.confidence[s, j, slot]
-    features[at + 3] = 1.0 / (1.0 + bank.age[s, j, 0] / 10.0)
-    features[at + 4] = np.log(scale / 0.01)
+    features[_SIGHTING] = 1.0 if unseen == 0.0 else 0.0
+    features[_SIGHTING + 1] = np.log(1.0 + unseen)
+    features[_SIGHTING + 2] = confidence
+    features[_SIGHTING + 3] = 1.0 / (1.0 + age / 10.0)
+    features[_SIGHTING + 4] = np.log(scale / 0.01)
 
 
 @njit(cache=True, error_model="numpy")
-def _describe_bone(bank, s, j, parent, slot, experts, scale, features, at):
+def _describe_experts(own, apart, heading, scale, features):
+    """How far neighbouring experts (M + 1, 3) are from each other, now and of late, and which way."""
+    for m in range(RAW):
+        x, y, z = own[m, 0] - own[m + 1, 0], own[m, 1] - own[m + 1, 1], own[m, 2] - own[m + 1, 2]
+        features[3 * m] = _log(x * x + y * y + z * z)
+        features[3 * m + 1], features[3 * m + 2] = _log(apart[m, 0]), _log(apart[m, 1])
+        _turned(heading, x, y, z, scale, features, 3 * RAW + 3 * m)
+
+
+@njit(cache=True, error_model="numpy")
+def _describe_pose(j, unseen_root, experts, place, heading, features):
+    """Where the joint is beside the root, and how it has moved since the last frame."""
+    x, y, z = experts[j, MIDDLE, 0], experts[j, MIDDLE, 1], experts[j, MIDDLE, 2]
+    if unseen_root >= 0.0:
+        a, b, c = experts[0, MIDDLE, 0], experts[0, MIDDLE, 1], experts[0, MIDDLE, 2]
+        _turned(heading, x - a, y - b, z - c, 0.5, features, _POSE)
+    if np.isfinite(place[0]):
+        _turned(heading, x - place[0], y - place[1], z - place[2], PACE / FPS, features, _POSE + 3)
+
+
+@njit(cache=True, error_model="numpy")
+def _describe_bone(j, parent, unseen, length, age, experts, heading, scale, features):
     """The bone to a joint: how its length varies, and by how much, and where to, it is too long now."""
+    if parent == j or unseen[parent] < 0.0:
+        return
     came, middle = 0.0, 0.0
     for axis in range(3):
         came += (experts[j, RAW, axis] - experts[parent, RAW, axis]) ** 2
         middle += (experts[j, MIDDLE, axis] - experts[parent, MIDDLE, axis]) ** 2
     came, middle = np.sqrt(came), np.sqrt(middle)
-    length = bank.length[s, j]
-    if bank.unseen[s, j, slot] == 0.0 and bank.unseen[s, parent, slot] == 0.0:
-        bank.age[s, j, 2] += 1.0
-        length[0] += (came - length[0]) / min(bank.age[s, j, 2], LONG)
-        length[1] += ((came - length[0]) ** 2 - length[1]) / min(bank.age[s, j, 2], LONG)
-    if bank.age[s, j, 2] == 0.0:
+    if unseen[j] == 0.0 and unseen[parent] == 0.0:
+        age[2] += 1.0
+        length[0] += (came - length[0]) / min(age[2], LONG)
+        length[1] += ((came - length[0]) ** 2 - length[1]) / min(age[2], LONG)
+    if age[2] == 0.0:
         return
-    features[at] = _log(length[1])
-    features[at + 1] = np.arcsinh((came - length[0]) / scale)
-    features[at + 2] = np.arcsinh((middle - length[0]) / scale)
+    features[_BONE] = _log(length[1])
+    features[_BONE + 1] = np.arcsinh((came - length[0]) / scale)
+    features[_BONE + 2] = np.arcsinh((middle - length[0]) / scale)
     long = (middle - length[0]) / max(middle, 1e-3)
-    x, y, z = (
-        experts[j, MIDDLE, 0] - experts[parent, MIDDLE, 0],
-        experts[j, MIDDLE, 1] - experts[parent, MIDDLE, 1],
-        experts[j, MIDDLE, 2] - experts[parent, MIDDLE, 2],
-    )
-    _turned(bank.heading[s], long * x, long * y, long * z, scale, features, at + 3)
+    x = experts[j, MIDDLE, 0] - experts[parent, MIDDLE, 0]
+    y = experts[j, MIDDLE, 1] - experts[parent, MIDDLE, 1]
+    z = experts[j, MIDDLE, 2] - experts[parent, MIDDLE, 2]
+    _turned(heading, long * x, long * y, long * z, scale, features, _BONE + 3)
 
 
 PARENT = np.maximum(np.array(PARENTS), 0)

@@ -102,8 +102,8 @@ class MixtureSmoother:
 
 
 class _Network(NamedTuple):
-    """A trained `MixtureNet`: weights (in, out) and biases, float32; those that are added to the
-    same are added up."""
+    """A trained `MixtureNet`: weights (in, out) and biases (rows, out), float32; those that are added to the same are
+    added up."""
 
     mean: Floats
     per_deviation: Floats
@@ -145,8 +145,8 @@ def _network(name: str) -> _Network:
     def weight(layer: str) -> Floats:
         return np.ascontiguousarray(arrays[f"{layer}.weight"].T)
 
-    def bias(layer: str) -> Floats:
-        return arrays[f"{layer}.bias"]
+    def bias(layer: str, rows: int = 1) -> Floats:
+        return np.tile(arrays[f"{layer}.bias"], (rows, 1))
 
     def decay(layer: str) -> Floats:
         return (1.0 / (1.0 + np.exp(-arrays[f"{layer}.decay"]))).astype(np.float32)
@@ -155,39 +155,94 @@ def _network(name: str) -> _Network:
         arrays["mean"], (1.0 / arrays["deviation"]).astype(np.float32),
         weight("read"), bias("read") + arrays["joint"], decay("own_memory"),
         weight("gather"), bias("gather"), decay("body_memory"),
-        weight("remember"), bias("remember"), weight("think"), bias("think"), weight("tell"), bias("tell"),
-        weight("mix"), bias("mix") + arrays["joint_mix"], weight("deepen"), bias("deepen"),
-        weight("write"), bias("write"),
+        weight("remember"), bias("remember"), weight("think"), bias("think"),
+        weight("tell"), bias("tell").reshape(22, -1),
+        weight("mix"), bias("mix") + arrays["joint_mix"], weight("deepen"), bias("deepen", 22),
+        weight("write"), bias("write", 22),
     )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
 def _outputs(features, net, memory, slot):
     """(22, OUTPUTS) of one body's features (22, FEATURES), as `prior.models.mixture.network.MixtureNet` has them."""
-    zero, one = np.float32(0), np.float32(1)
-    told = (features - net.mean) * net.per_deviation
-    own = np.maximum(np.dot(told, net.read) + net.joint, zero)
+    joints, zero, one = len(features), np.float32(0), np.float32(1)
     started = memory.body_weight[slot, 0] > zero
-    kept, weight = memory.own[slot], memory.own_weight[slot]
-    kept[:] = net.own_decay * kept + (one - net.own_decay) * own
-    weight[:] = net.own_decay * weight + (one - net.own_decay)
-    before = kept / weight
-    body = np.maximum(np.dot(own.ravel(), net.gather) + net.gather_bias, zero)
-    lasting, weighed = memory.body[slot], memory.body_weight[slot]
-    lasting[:] = net.body_decay * lasting + (one - net.body_decay) * body
-    weighed[:] = net.body_decay * weighed + (one - net.body_decay)
-    body = body + np.maximum(np.dot(lasting / weighed, net.remember) + net.remember_bias, zero)
-    body = body + np.maximum(np.dot(body, net.think) + net.think_bias, zero)
-    context = (np.dot(body, net.tell) + net.tell_bias).reshape(len(own), -1)
-    mixed = np.maximum(np.dot(np.concatenate((told, before, context), axis=1), net.mix) + net.joint_mix, zero)
-    mixed = mixed + np.maximum(np.dot(mixed, net.deepen) + net.deepen_bias, zero)
-    new, written = np.dot(mixed, net.write) + net.write_bias, memory.written[slot]
-    for j in range(len(written)):
+    told = np.empty_like(features)
+    for j in range(joints):
+        for k in range(FEATURES):
+            told[j, k] = (features[j, k] - net.mean[k]) * net.per_deviation[k]
+    own = np.dot(told, net.read)
+    _rectify(own, net.joint, own)
+    own_before = np.empty_like(own)
+    _remember(own, net.own_decay, memory.own[slot], memory.own_weight[slot], own_before)
+    body, summand = np.dot(own.reshape(1, -1), net.gather), np.empty_like(net.gather_bias)
+    _rectify(body, net.gather_bias, body)
+    lasting = np.empty_like(body)
+    _remember(body, net.body_decay, memory.body[slot : slot + 1], memory.body_weight[slot : slot + 1], lasting)
+    np.dot(lasting, net.remember, summand)
+    _rectify(summand, net.remember_bias, summand)
+    _add(summand, body)
+    np.dot(body, net.think, summand)
+    _rectify(summand, net.think_bias, summand)
+    _add(summand, body)
+    context = np.dot(body, net.tell).reshape(joints, -1)
+    _add(net.tell_bias, context)
+    mixed = np.dot(_beside(told, own_before, context), net.mix)
+    _rectify(mixed, net.joint_mix, mixed)
+    deeper = np.dot(mixed, net.deepen)
+    _rectify(deeper, net.deepen_bias, deeper)
+    _add(deeper, mixed)
+    new, written = np.dot(mixed, net.write), memory.written[slot]
+    _add(net.write_bias, new)
+    for j in range(joints):
         for k in range(OUTPUTS):
             gate = OUTPUTS if k < 2 * EXPERTS else OUTPUTS + 1 if k < OUTPUTS - 1 else OUTPUTS + 2
             leaning = one / (one + np.exp(-new[j, gate])) if started else zero
             written[j, k] = leaning * written[j, k] + (one - leaning) * new[j, k]
     return written
+
+
+# Loops in place of array expressions: numba compiles each of those, broadcasting and all, for a second or two.
+
+
+@njit(cache=True)
+def _rectify(values, bias, out):
+    """Write ``max(values + bias, 0)``, all (N, F)."""
+    for i in range(len(values)):
+        for k in range(values.shape[1]):
+            out[i, k] = max(values[i, k] + bias[i, k], np.float32(0))
+
+
+@njit(cache=True)
+def _add(values, out):
+    for i in range(len(out)):
+        for k in range(out.shape[1]):
+            out[i, k] += values[i, k]
+
+
+@njit(cache=True, error_model="numpy")
+def _remember(values, decay, total, weight, mean):
+    """Fade the sums (N, F) of values and of their weights, take ``values`` in, and write the mean."""
+    one = np.float32(1)
+    for i in range(len(values)):
+        for k in range(values.shape[1]):
+            total[i, k] = decay[k] * total[i, k] + (one - decay[k]) * values[i, k]
+            weight[i, k] = decay[k] * weight[i, k] + (one - decay[k])
+            mean[i, k] = total[i, k] / weight[i, k]
+
+
+@njit(cache=True)
+def _beside(a, b, c):
+    """(N, A + B + C) of (N, A), (N, B) and (N, C)."""
+    out = np.empty((len(a), a.shape[1] + b.shape[1] + c.shape[1]), dtype=np.float32)
+    for i in range(len(a)):
+        for k in range(a.shape[1]):
+            out[i, k] = a[i, k]
+        for k in range(b.shape[1]):
+            out[i, a.shape[1] + k] = b[i, k]
+        for k in range(c.shape[1]):
+            out[i, a.shape[1] + b.shape[1] + k] = c[i, k]
+    return out
 
 
 @njit(cache=True, error_model="numpy")
@@ -198,21 +253,33 @@ def _mixed(outputs, experts, heading, scale, unseen, places, sigma):
     for j in range(len(outputs)):
         if unseen[j] < 0:
             continue
-        out = outputs[j].astype(np.float64)
-        weights[:] = np.exp(out[:EXPERTS] - out[:EXPERTS].max())
-        weights /= weights.sum()
-        free = 1.0 - weights[RAW]
-        reach[:] = REACH * np.tanh(out[EXPERTS : 2 * EXPERTS])
-        weights += free * (reach - reach.mean())
-        moved = CORRECTION * np.tanh(out[2 * EXPERTS : 2 * EXPERTS + 3] / CORRECTION) * free * scale
-        places[j, 0] = cos * moved[0] - sin * moved[1]
-        places[j, 1] = sin * moved[0] + cos * moved[1]
-        places[j, 2] = moved[2]
+        out = outputs[j]
+        most = out[0]
+        for m in range(1, EXPERTS):
+            most = max(most, out[m])
+        total = mean = 0.0
+        for m in range(EXPERTS):
+            weights[m] = np.exp(np.float64(out[m]) - np.float64(most))
+            total += weights[m]
+            reach[m] = REACH * np.tanh(np.float64(out[EXPERTS + m]))
+            mean += reach[m]
+        free = 1.0 - weights[RAW] / total
+        for m in range(EXPERTS):
+            weights[m] = weights[m] / total + free * (reach[m] - mean / EXPERTS)
+        moved = free * scale
+        x, y, z = (
+            CORRECTION * np.tanh(np.float64(out[2 * EXPERTS]) / CORRECTION) * moved,
+            CORRECTION * np.tanh(np.float64(out[2 * EXPERTS + 1]) / CORRECTION) * moved,
+            CORRECTION * np.tanh(np.float64(out[2 * EXPERTS + 2]) / CORRECTION) * moved,
+        )
+        places[j, 0] = cos * x - sin * y
+        places[j, 1] = sin * x + cos * y
+        places[j, 2] = z
         for axis in range(3):
             came = experts[j, RAW, axis]
             for m in range(RAW):
                 places[j, axis] += weights[m] * (experts[j, m, axis] - came)
             places[j, axis] += came
-        log_sigma = min(max(out[2 * EXPERTS + 3], LEAST_LOG_SIGMA), MOST_LOG_SIGMA)
+        log_sigma = min(max(np.float64(out[2 * EXPERTS + 3]), LEAST_LOG_SIGMA), MOST_LOG_SIGMA)
         coasted = COASTING / FPS * unseen[j]
         sigma[j] = np.sqrt((1e-3 * np.exp(log_sigma)) ** 2 + coasted**2)

@@ -69,7 +69,7 @@ def test_the_same_stream_gives_the_same_bytes() -> None:
 
 
 def test_no_frame_waits_for_a_loop_to_be_compiled_or_loaded() -> None:
-    load_loops()
+    load_loops(PriorSettings())
     seen = noisy(70)
     seen[30:45, J["left_wrist"]] = np.nan
     seen[50] = np.nan
@@ -82,7 +82,7 @@ def test_no_frame_waits_for_a_loop_to_be_compiled_or_loaded() -> None:
 
 def loops() -> dict[str, int]:
     """Of every compiled function of the prior, for how many kinds of arguments it is loaded."""
-    found = [value for name, module in list(sys.modules.items()) if name.startswith("prior.")
+    found = [value for name, module in list(sys.modules.items()) if name.startswith("steadypose.prior.")
              for value in vars(module).values() if isinstance(value, Dispatcher)]  # fmt: skip
     return {f"{f.py_func.__module__}.{f.py_func.__qualname__}": len(f.signatures) for f in found}
 
