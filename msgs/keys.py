@@ -3,18 +3,25 @@
 A directory of keys holds
 
 - `own.key_secret`, readable by its owner alone, and `own.key`, the public half to hand out;
-- `clients/*.key`: public keys of those who may subscribe here;
-- `server.key`: public key of the publishers to subscribe to; without it they are this machine's own.
+- `clients/*.key`: public keys of those who may subscribe here. Who is taken off the list is not let in any more, and is
+  disconnected within a second or two, without a restart;
+- `server.key`: public key of the publishers to subscribe to; without it they are this machine's own;
+- `servers/HOST.key`: public keys of publishers that each have their own, by host as in their addresses; then those on
+  other hosts are not subscribed to.
 """
 
 from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from zmq.auth import create_certificates, load_certificate, load_certificates
+from zmq.auth import create_certificates, load_certificate
+
+from steadypose.msgs.addresses import is_local, parse
 
 _OWN = "own"
 
@@ -29,6 +36,65 @@ class Keys:
     """public key that a subscriber expects of its publishers"""
     clients: frozenset[bytes]
     """public keys that a publisher serves; always with `public`, for the subscribers of the same machine"""
+    servers: Mapping[str, bytes] = field(default_factory=dict)
+    """public keys of publishers that have their own, by host"""
+    directory: Path | None = None
+    """where they were read from"""
+
+    def server_at(self, endpoint: str) -> bytes:
+        """The public key of the publisher at an address.
+
+        Raises:
+            ValueError: there is none for it.
+        """
+        _, host = parse(endpoint)
+        if host in self.servers:
+            return self.servers[host]
+        if self.servers and not is_local(endpoint):
+            raise ValueError(f"{endpoint}: expected its public key in {self.directory}/servers/{host}.key, found none")
+        return self.server
+
+
+class ClientList:
+    """Who may subscribe, as the directory of keys says now."""
+
+    def __init__(self, keys: Keys) -> None:
+        self._keys = keys
+        self._served = self._read()
+
+    def allows(self, key: bytes) -> bool:
+        """Whether the holder of this public key is let in."""
+        return key in self._read()
+
+    def revoked(self) -> bool:
+        """Whether keys were taken off the list since the last call."""
+        before, self._served = self._served, self._read()
+        return not before <= self._served
+
+    def _read(self) -> frozenset[bytes]:
+        if self._keys.directory is None:
+            return self._keys.clients
+        listed = {self._keys.public}
+        for file in (self._keys.directory / "clients").glob("*.key"):
+            with suppress(ValueError, OSError):  # one that is not yet whole is none
+                listed.add(_public(file))
+        return frozenset(listed)
+
+
+def _listed(directory: Path) -> dict[str, bytes]:
+    """Public keys in a folder, by the names of their files.
+
+    Raises:
+        ValueError: one is no key.
+    """
+    return {file.stem: _public(file) for file in sorted(directory.glob("*.key"))}
+
+
+def _public(file: Path) -> bytes:
+    public, _ = load_certificate(file)
+    if len(public) != 40:
+        raise ValueError(f"{file}: expected keys of 40 characters, got one of {len(public)}")
+    return public
 
 
 def create_keys(directory: str | Path) -> Keys:
@@ -66,8 +132,8 @@ def load_keys(directory: str | Path) -> Keys:
         raise ValueError(f"{secret_file}: expected a secret key, found none; make new keys")
     server_file = directory / "server.key"
     server = load_certificate(server_file)[0] if server_file.is_file() else public
-    clients = load_certificates(directory / "clients") if (directory / "clients").is_dir() else {}
-    for key in (public, secret, server, *clients):
+    for key in (public, secret, server):
         if len(key) != 40:
             raise ValueError(f"{directory}: expected keys of 40 characters, got one of {len(key)}")
-    return Keys(public, secret, server, frozenset({public, *clients}))
+    clients = _listed(directory / "clients").values()
+    return Keys(public, secret, server, frozenset({public, *clients}), _listed(directory / "servers"), directory)

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from steadypose import PACKAGE
+from steadypose.msgs.addresses import TransportError, make_private
 from steadypose.nodes.graph.extras import EXTRAS
 
 # what is looked for is imported where it is looked for: a doctor who needs it all could not say what is missing
@@ -236,9 +237,12 @@ def check_messages() -> Iterator[Finding]:
         yield Finding("messages", Verdict.BAD, f"{directory} is too long a path for sockets", fix)
         return
     try:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        make_private(directory)
         with tempfile.TemporaryDirectory(dir=directory, prefix="") as folder:
             took_ms = _round_trip(f"ipc://{folder}/s") * 1e3
+    except TransportError as error:
+        yield Finding("messages", Verdict.BAD, str(error))
+        return
     except OSError as error:
         fix = f"sudo chown {os.getuid()} {directory}; or set [transport] directory in the launch file"
         yield Finding("messages", Verdict.BAD, f"cannot write to {directory}: {error.strerror}", fix)

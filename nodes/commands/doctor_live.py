@@ -40,8 +40,13 @@ def listen(launch_file: str, console: Console, clock: Clock | None = None) -> in
     told: dict[str, str] = {}
     frames: list[PoseRaw] = []
     with (
-        Subscriber(addresses, POSE_RAW, keys=keys) as tracker,
-        Subscriber([transport.endpoint(name) for name in POSE_NODES], DIAGNOSTICS, keys=keys) as nodes,
+        Subscriber(addresses, POSE_RAW, keys=keys, clear_text=transport.clear_text) as tracker,
+        Subscriber(
+            [transport.endpoint(name) for name in POSE_NODES],
+            DIAGNOSTICS,
+            keys=keys,
+            clear_text=transport.clear_text,
+        ) as nodes,
         console.status(f"listening at {', '.join(addresses)}"),
     ):
         end_ns = clock.now_ns() + LISTEN_NS

@@ -113,14 +113,14 @@ class _Run:
     def watch(self) -> int:
         """Start the nodes and show their diagnostics until the stream has ended or Ctrl-C; returns the exit status."""
         transport = self._launch.transport
-        transport.ipc_directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        transport.make_ipc_directory()
         keys = transport.curve_keys()
         if keys:  # the nodes are this machine's own, whoever else is subscribed to
             keys = dataclasses.replace(keys, server=keys.public)
         endpoints = [transport.endpoint(name) for name in self._launch.nodes]
         terminal = self._console.is_terminal
         with (
-            Subscriber(endpoints, DIAGNOSTICS, keys=keys) as subscriber,
+            Subscriber(endpoints, DIAGNOSTICS, keys=keys, clear_text=transport.clear_text) as subscriber,
             Live(console=self._console, auto_refresh=False, transient=True) if terminal else nullcontext() as live,
             Supervisor(self._launch.nodes, self._arguments, self._clock, self._print) as supervisor,
         ):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from steadypose.msgs.addresses import local_directory, make_private
 from steadypose.msgs.keys import Keys, load_keys
-from steadypose.msgs.transport import local_directory
 from steadypose.nodes.graph.settings import LaunchError, check_addresses, nearest, path_setting
 from steadypose.nodes.graph.topology import NODES
 
@@ -26,6 +26,10 @@ class TransportSettings:
     false drops its oldest frames"""
     queue: int = 8
     """not lossless: frames a node keeps when it falls behind"""
+    lifespan_s: float = 1.0
+    """not lossless: age of a message, from its sending on, from which a node drops it instead of taking it for new"""
+    clear_text: bool = False
+    """whether to publish to, and listen to, other machines without keys: everybody on the way can see and make poses"""
 
     def __post_init__(self) -> None:
         for node, address in self.endpoints.items():
@@ -36,6 +40,8 @@ class TransportSettings:
                     f"[transport.endpoints] names {node!r}, which is no node{nearest(node, NODES)}; "
                     f"nodes are {', '.join(NODES)}"
                 )
+        if not self.lifespan_s > 0:
+            raise LaunchError(f"[transport] lifespan_s: expected more than 0, got {self.lifespan_s}")
         if self.queue < 1:
             raise LaunchError(f"[transport] queue: expected 1 frame or more, got {self.queue}")
 
@@ -60,6 +66,15 @@ class TransportSettings:
     def ipc_directory(self) -> Path:
         """Where the ipc sockets are."""
         return Path(self.directory) if self.directory else local_directory()
+
+    def make_ipc_directory(self) -> Path:
+        """Make it, for nobody but this user.
+
+        Raises:
+            TransportError: it is there, and others may write to it.
+        """
+        make_private(self.ipc_directory)
+        return self.ipc_directory
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ it plays at which time (`Timeline`); with that, every node knows how late it is.
 from __future__ import annotations
 
 import logging
+import math
 import os
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -110,10 +111,15 @@ class Node(ABC):
         """
         transport = self.launch.transport
         keys = transport.curve_keys()
-        transport.ipc_directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        transport.make_ipc_directory()
         with ExitStack() as stack:
             self._publisher = stack.enter_context(
-                Publisher(transport.endpoint(self.name), keys=keys, lossless=transport.lossless)
+                Publisher(
+                    transport.endpoint(self.name),
+                    keys=keys,
+                    reliable=self._required,
+                    clear_text=transport.clear_text,
+                )
             )
             self._await_subscribers()
             declared = NODES[self.name]
@@ -122,7 +128,10 @@ class Node(ABC):
                     Subscriber(
                         [address for node in declared.subscribes for address in self.launch.addresses(node)],
                         sorted(declared.topics),
+                        reliable=transport.lossless and self.queue_limit is None,
+                        lifespan_s=math.inf if self.queue_limit is None else transport.lifespan_s,
                         keys=keys,
+                        clear_text=transport.clear_text,
                         name=self.name,
                     )
                 )
@@ -215,15 +224,17 @@ class Node(ABC):
             logger.error("%s: the process that started this node is gone; stopping", self.name)
             self._stopping = True
         notify(ALIVE)
+        self._publisher.check()
         # a subscriber without room for this second's diagnostics can have those of the next
         self._publisher.publish(DIAGNOSTICS, self.diagnostics(), timeout_s=0)
 
     def diagnostics(self) -> Diagnostics:
         """How this node is doing."""
-        received: Counter[str] = Counter()
+        received = Counter({f"refused.{cause}": n for cause, n in self._publisher.refused.items()})
         if self._inbox is not None:
             received["dropped.late"] = self._inbox.overrun
             received.update({f"dropped.lost {topic}": n for topic, n in self._subscriber.dropped.items()})
+            received.update({f"dropped.expired {topic}": n for topic, n in self._subscriber.late.items()})
             received.update({f"refused.{cause}": n for cause, n in self._subscriber.refused.items()})
         return self.health.report(self.name, received, self.status(), [*self._wire_problems(), *self.problems()])
 

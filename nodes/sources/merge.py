@@ -13,6 +13,9 @@ from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.settings import LaunchError, check_addresses
 from steadypose.nodes.sources.source import LiveSource, SourceContext
 
+LATE_S = 1.0
+"""age from which a camera's skeletons are not merged any more"""
+
 
 @dataclass(frozen=True)
 class MergeSettings:
@@ -41,13 +44,13 @@ class MergeSource(LiveSource):
             )
         from steadypose.prior.camera.multi_view import Merge  # brings scipy: not for reading a launch file
 
-        self._addresses, self._keys = settings.cameras, context.keys
+        self._addresses, self._context = settings.cameras, context
         self._merge = Merge()
         self._received: Counter[str] = Counter()
         self._lost: Counter[str] = Counter()
 
     def frames(self) -> Generator[PoseRaw | None, None, None]:
-        with Subscriber(self._addresses, POSE_RAW, keys=self._keys, name="merge") as subscriber:
+        with self._subscriber() as subscriber:
             self._lost = subscriber.dropped
             while True:
                 received = subscriber.receive(POLL_S)
@@ -57,6 +60,12 @@ class MergeSource(LiveSource):
                 self._received[received[1].source] += 1
                 yield from self._merge.update(received[1]) or [None]
                 self.refused = self._merge.counters + subscriber.refused
+
+    def _subscriber(self) -> Subscriber:
+        context = self._context
+        return Subscriber(
+            self._addresses, POSE_RAW, keys=context.keys, clear_text=context.clear_text, lifespan_s=LATE_S, name="merge"
+        )
 
     def status(self) -> dict[str, str]:
         cameras = {f"camera.{name}": f"{count} messages" for name, count in sorted(self._received.items())}

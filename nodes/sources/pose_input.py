@@ -36,7 +36,10 @@ class PoseInputNode(Node):
     ) -> None:
         super().__init__(launch, clock)
         settings = launch.settings(InputSettings)
-        self._source = source or open_input(settings, self.clock, launch.transport.curve_keys())
+        transport = launch.transport
+        self._source = source or open_input(
+            settings, self.clock, transport.curve_keys(), clear_text=transport.clear_text
+        )
         self._rate = settings.rate
         self._loop = settings.loop
         self._pose = settings.calibration.pose

@@ -76,13 +76,16 @@ SOURCES: Mapping[str, SourceDeclaration] = {
 """by name"""
 
 
-def open_input(settings: InputSettings, clock: Clock, keys: Keys | None = None) -> RecordedSource | LiveSource:
+def open_input(
+    settings: InputSettings, clock: Clock, keys: Keys | None = None, *, clear_text: bool = False
+) -> RecordedSource | LiveSource:
     """The source that ``[input]`` names.
 
     Args:
         settings: of the launch.
         clock: of the node.
         keys: for cameras on other machines.
+        clear_text: whether to listen to these without keys.
 
     Raises:
         LaunchError, RecordingError, NpzError, CsvError: a setting, or the recording, cannot be used.
@@ -90,7 +93,9 @@ def open_input(settings: InputSettings, clock: Clock, keys: Keys | None = None) 
     declared = SOURCES[settings.source]
     if declared.extra:
         require_extra(declared.extra)
-    return declared.opens(getattr(settings, settings.source), SourceContext(clock, settings.calibration, keys))
+    return declared.opens(
+        getattr(settings, settings.source), SourceContext(clock, settings.calibration, keys, clear_text)
+    )
 
 
 def check_input(launch: Launch) -> None:

@@ -58,3 +58,5 @@ class SourceContext:
     """of the camera"""
     keys: Keys | None = None
     """for publishers on other machines"""
+    clear_text: bool = False
+    """whether to listen to other machines without keys"""

@@ -2,8 +2,9 @@
 
 import dataclasses
 import itertools
+import os
 import socket
-import struct
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,11 +15,14 @@ import pytest
 import zmq
 from tests.helpers.msg_strategies import EXAMPLES, diagnostics, raw
 
-from steadypose.msgs import transport
+from steadypose.msgs import publisher as publishing
+from steadypose.msgs.addresses import local_address, local_directory, make_private
 from steadypose.msgs.codec import encode
 from steadypose.msgs.keys import Keys, create_keys, load_keys
+from steadypose.msgs.subscriber import MAX_RECEIVED
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.transport import MAX_FRAME, Publisher, Subscriber, TransportError
+from steadypose.msgs.transport import MAX_FRAME, VERSION, Publisher, Subscriber, TransportError
+from steadypose.msgs.wire import PREFIX
 
 SOON_S = 20.0
 """for what must happen; the machine may be busy"""
@@ -35,7 +39,7 @@ def endpoint(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 @pytest.fixture
 def small_buffers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transport, "SEND_HIGH_WATER", 5)
+    monkeypatch.setattr(publishing, "SEND_HIGH_WATER", 5)
 
 
 @pytest.fixture
@@ -46,8 +50,13 @@ def rogue() -> Iterator[zmq.Socket[bytes]]:
         yield publisher
 
 
-def frame(sequence: int, payload: bytes | None = None, *, topic: bytes = b"pose/raw", version: int = 1) -> bytes:
-    return topic + b"\0" + struct.pack("<BII", version, 42, sequence) + (encode(raw()) if payload is None else payload)
+def frame(sequence: int, payload: bytes | None = None, *, topic: bytes = b"pose/raw", version: int = VERSION) -> bytes:
+    return (
+        topic
+        + b"\0"
+        + PREFIX.pack(version, 42, sequence, time.monotonic_ns())
+        + (encode(raw()) if payload is None else payload)
+    )
 
 
 def address(publisher: zmq.Socket[bytes]) -> str:
@@ -157,11 +166,11 @@ def test_conflate_gives_the_newest_and_counts_the_others(endpoint: str):
 
 def test_a_conflating_subscriber_that_never_reads_holds_up_no_lossless_publisher(endpoint: str):
     with (
-        Publisher(endpoint, lossless=True) as publisher,
+        Publisher(endpoint, reliable={"test"}) as publisher,
         Subscriber(publisher.endpoint, POSE_RAW, conflate=True) as subscriber,
     ):
         wait_until(lambda: publisher.publish(POSE_RAW, BIG) and subscriber.receive(0.01))
-        for stamp in range(transport.SEND_HIGH_WATER + 500):
+        for stamp in range(publishing.SEND_HIGH_WATER + 500):
             assert publisher.publish(POSE_RAW, raw(stamp), timeout_s=SOON_S)
 
 
@@ -211,24 +220,26 @@ def test_a_subscriber_that_never_reads_neither_blocks_nor_fills_its_publisher(en
         assert held < 200
 
 
-@pytest.mark.usefixtures("small_buffers")
-def test_lossless_waits_for_the_slowest(endpoint: str):
+def test_who_is_reliable_is_waited_for_and_nobody_else(endpoint: str):
     with (
-        Publisher(endpoint, lossless=True) as publisher,
-        Subscriber(publisher.endpoint, POSE_RAW, high_water=5, name="slow") as slow,
+        Publisher(endpoint, reliable={"slow"}) as publisher,
+        Subscriber(publisher.endpoint, POSE_RAW, reliable=True, name="slow") as slow,
+        Subscriber(publisher.endpoint, POSE_RAW, reliable=True, name="self-appointed"),
+        Subscriber(publisher.endpoint, POSE_RAW, high_water=5, name="deaf"),
     ):
+        assert publisher.wait_for_subscribers(["self-appointed", "deaf"], timeout_s=SOON_S)
         assert publisher.wait_for_subscribers(["slow"], timeout_s=SOON_S)
         received, waits = [], 0
-        for stamp in range(200):
+        for stamp in range(500):
             message = dataclasses.replace(BIG, stamp_ns=stamp)
             while not publisher.publish(POSE_RAW, message, timeout_s=0):
                 waits += 1
                 got = slow.receive(SOON_S)
                 assert got
                 received.append(got[1].stamp_ns)
-        received += stamps_until(slow, 199)
+        received += stamps_until(slow, 499)
         assert waits > 0
-        assert received == list(range(200))
+        assert received == list(range(500))
         assert not slow.dropped
 
 
@@ -238,6 +249,51 @@ def test_lossless_waits_for_the_slowest(endpoint: str):
 def test_an_address_others_can_reach_needs_keys(host: str):
     with pytest.raises(TransportError, match="can be reached from other machines: expected keys, got none"):
         Publisher(f"tcp://{host}:7101")
+
+
+def test_clear_text_from_another_machine_is_refused_unless_named():
+    with pytest.raises(TransportError, match="is another machine: expected keys, got none"):
+        Subscriber("tcp://192.0.2.1:7101", POSE_RAW)
+    Subscriber("tcp://192.0.2.1:7101", POSE_RAW, clear_text=True).close()
+    Publisher("tcp://0.0.0.0:*", clear_text=True).close()
+
+
+def test_a_directory_that_others_may_write_to_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
+    directory = local_directory()
+    assert directory == tmp_path / f"steadypose-{os.getuid()}"
+    make_private(directory)
+    assert directory.stat().st_mode & 0o777 == 0o700
+    local_address("prior")
+    directory.chmod(0o777)
+    for use in (
+        lambda: local_address("prior"),
+        lambda: make_private(directory),
+        lambda: Subscriber(f"ipc://{directory}/prior", POSE_RAW),
+    ):
+        with pytest.raises(TransportError, match="can be written to by others"):
+            use()
+    directory.rmdir()
+    directory.write_text("")
+    with pytest.raises(TransportError, match="expected a directory for sockets"):
+        local_address("prior")
+
+
+def test_a_directory_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    mine = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: mine + 1)
+    if mine == 0:
+        pytest.skip("what is root's is trusted")
+    with pytest.raises(TransportError, match="expected a directory of one's own"):
+        make_private(tmp_path)
+
+
+def test_a_file_at_an_address_is_not_deleted(tmp_path: Path):
+    (tmp_path / "thesis").write_text("years of work")
+    with pytest.raises(TransportError, match="expected no file there"):
+        Publisher(f"ipc://{tmp_path}/thesis")
+    assert (tmp_path / "thesis").read_text() == "years of work"
 
 
 @pytest.mark.parametrize(
@@ -288,10 +344,10 @@ def test_garbage_is_counted_by_cause(rogue: zmq.Socket[bytes]):
             b"",
             b"pose/raw",
             b"pose/raw\0",
-            b"pose/raw\0\1\0\0",
+            b"pose/raw\0\2\0\0",
             b"\xff\xfe\0" + bytes(20),
             frame(0, topic=b"pose/row"),
-            frame(0, version=2),
+            frame(0, version=VERSION + 1),
             frame(0, b"\0\1\0\0garbage"),
             frame(1, b""),
         ]:
@@ -332,11 +388,86 @@ def test_a_flood_of_garbage_does_not_outlast_the_timeout(rogue: zmq.Socket[bytes
         assert subscriber.refused["malformed"] < 10
 
 
-def test_a_frame_too_big_is_not_even_received(rogue: zmq.Socket[bytes]):
+@pytest.mark.parametrize("size", [MAX_FRAME, MAX_RECEIVED])
+def test_a_frame_too_large_is_counted_and_the_next_is_heard(size: int, rogue: zmq.Socket[bytes]):
     with Subscriber(address(rogue), POSE_RAW) as subscriber:
         assert rogue.poll(round(SOON_S * 1000))
-        rogue.send(frame(0, bytes(MAX_FRAME)))
-        assert subscriber.receive(NEVER_S) is None
+        rogue.send(frame(0, bytes(size)))
+        sequence = itertools.count(1)
+        wait_until(lambda: rogue.send(frame(next(sequence))) or subscriber.receive(0.01))
+        assert subscriber.refused == {"too large": 1}
+
+
+def test_messages_that_are_old_are_dropped_and_counted_but_not_the_end(rogue: zmq.Socket[bytes]):
+    def sent(seconds_ago: float, sequence: int, message: Any, topic: bytes = b"pose/raw") -> bytes:
+        prefix = PREFIX.pack(VERSION, 42, sequence, time.monotonic_ns() - round(seconds_ago * 1e9))
+        return topic + b"\0" + prefix + encode(message)
+
+    end = dataclasses.replace(raw(5), bodies=[], end_of_stream=True)
+    with Subscriber(address(rogue), [POSE_RAW, DIAGNOSTICS], lifespan_s=1.0) as subscriber:
+        for _ in range(2):
+            assert rogue.poll(round(SOON_S * 1000))
+            rogue.recv()
+        for sequence, (age, message) in enumerate([(60.0, raw(1)), (1.5, raw(2)), (0.0, raw(3)), (60.0, end)]):
+            rogue.send(sent(age, sequence, message))
+        rogue.send(sent(60.0, 0, diagnostics(), b"diagnostics"))
+        got = [subscriber.receive(SOON_S) for _ in range(3)]
+        assert got == [(POSE_RAW, raw(3)), (POSE_RAW, end), (DIAGNOSTICS, diagnostics())]
+        assert subscriber.late == {POSE_RAW: 2}
+        assert not subscriber.dropped
+
+
+def test_another_machines_clock_is_found_from_its_fastest_message():
+    with Subscriber("tcp://192.0.2.1:7101", POSE_RAW, clear_text=True, lifespan_s=1.0) as subscriber:
+        for apart_s in (-7e5, 7e5):
+            start_ns = time.monotonic_ns() + round(apart_s * 1e9)
+            publisher = round(abs(apart_s) + apart_s)
+            assert subscriber._age_ns(publisher, start_ns) == 0
+            assert abs(subscriber._age_ns(publisher, start_ns - 2 * 10**9) - 2e9) < 1e8
+            assert subscriber._age_ns(publisher, start_ns + 10**9) == 0
+
+
+@pytest.mark.parametrize("endpoint", ["ipc"], indirect=True)
+def test_a_flood_of_subscriptions_is_cut_off_and_forgotten(endpoint: str):
+    with (
+        Publisher(endpoint) as publisher,
+        Subscriber(publisher.endpoint, POSE_RAW, name="friend") as friend,
+        zmq.Context() as context,
+        context.socket(zmq.XSUB) as hostile,
+    ):
+        assert publisher.wait_for_subscribers(["friend"], timeout_s=SOON_S)
+        hostile.setsockopt(zmq.LINGER, 0)
+        hostile.setsockopt(zmq.RECONNECT_IVL, 100_000)
+        hostile.connect(publisher.endpoint)
+        heard = 0
+        for number in range(50_000):
+            hostile.send(b"\1" + b"%0900d" % number, zmq.NOBLOCK)
+            if number % 500 == 0:
+                publisher.publish(POSE_RAW, raw(number))
+                heard += friend.receive(SOON_S) == (POSE_RAW, raw(number))
+        assert heard == 100, "nobody else notices"
+        wait_until(lambda: publisher.subscribers and publisher.refused["subscriptions"])
+        wait_until(lambda: publisher.subscribers and len(publisher._subscriptions) == 2)
+
+
+def test_what_a_subscriber_says_of_itself_is_not_believed_blindly(endpoint: str):
+    with (
+        Publisher(endpoint, reliable={"x"}) as publisher,
+        Subscriber(publisher.endpoint, POSE_RAW, name="friend") as friend,
+        zmq.Context() as context,
+        context.socket(zmq.XSUB) as hostile,
+    ):
+        assert publisher.wait_for_subscribers(["friend"], timeout_s=SOON_S)
+        hostile.setsockopt(zmq.LINGER, 0)
+        hostile.connect(publisher.endpoint)
+        for junk in (b"\xff", b"\xffx\0\0", b"\xffx\0zz\0pose/raw", b"\xff\xfe\0" + b"0" * 8 + b"\0", b"\xff" * 900):
+            hostile.send(b"\1" + junk)
+        for junk in (b"", b"\2", b"\2" + bytes(12), b"\2" + b"\xff" * 20, b"hello"):
+            hostile.send(junk)
+        for stamp in range(50):
+            publisher.publish(POSE_RAW, raw(stamp), timeout_s=0)
+            assert friend.receive(SOON_S) == (POSE_RAW, raw(stamp))
+        assert publisher.subscribers == {"friend"}
 
 
 def test_a_publisher_survives_strangers(tmp_path: Path):
@@ -354,7 +485,7 @@ def test_a_publisher_survives_strangers(tmp_path: Path):
                 assert subscriber.receive(SOON_S) == (POSE_RAW, raw())
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def key_directories(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
     """Of a robot, of a guest on its list, and of one who is not."""
     directories = [tmp_path_factory.mktemp("keys") / name for name in ("robot", "guest", "stranger")]
@@ -389,9 +520,63 @@ def test_with_keys_only_the_listed_listen(at: str, key_directories: tuple[Path, 
             assert publisher.subscribers == {"own", "guest"}
 
 
+def test_nobody_is_let_in_when_keys_are_not_checked_any_more(key_directories: tuple[Path, Path, Path]):
+    robot, guest, stranger = (load_keys(directory) for directory in key_directories)
+    with Publisher("tcp://127.0.0.1:*", keys=robot) as publisher:
+        assert publisher._authenticator
+        publisher.check()
+        publisher._authenticator.stop()
+        with (
+            Subscriber(publisher.endpoint, POSE_RAW, keys=stranger, name="stranger") as unlisted,
+            Subscriber(publisher.endpoint, POSE_RAW, keys=guest, name="guest"),
+        ):
+            assert not publisher.wait_for_subscribers(["stranger"], timeout_s=NEVER_S)
+            publisher.publish(POSE_RAW, raw())
+            assert unlisted.receive(NEVER_S) is None
+            assert not publisher.subscribers
+        with pytest.raises(RuntimeError, match="nobody is let in any more"):
+            publisher.check()
+
+
+def test_who_is_taken_off_the_list_is_put_out_and_who_is_added_let_in(key_directories: tuple[Path, Path, Path]):
+    directory = key_directories[0]
+    robot, guest, late = (load_keys(directory) for directory in key_directories)
+    with (
+        Publisher("tcp://127.0.0.1:*", keys=robot) as publisher,
+        Subscriber(publisher.endpoint, POSE_RAW, keys=robot, name="own") as own,
+        Subscriber(publisher.endpoint, POSE_RAW, keys=guest, name="guest") as put_out,
+    ):
+        assert publisher.wait_for_subscribers(["own", "guest"], timeout_s=SOON_S)
+        (directory / "clients" / "late.key").write_text((key_directories[2] / "own.key").read_text())
+        with Subscriber(publisher.endpoint, POSE_RAW, keys=late, name="late") as added:
+            assert publisher.wait_for_subscribers(["late"], timeout_s=SOON_S)
+            publisher.check()
+            assert publisher.subscribers == {"own", "guest", "late"}
+            (directory / "clients" / "guest.key").unlink()
+            publisher.check()
+            for subscriber in (own, added, put_out):
+                assert subscriber.receive(NEVER_S) is None  # ZeroMQ subscribes again when it looks for messages
+            wait_until(lambda: publisher.subscribers == {"own", "late"})
+            publisher.publish(POSE_RAW, raw(7))
+            assert own.receive(SOON_S) == (POSE_RAW, raw(7))
+            assert put_out.receive(NEVER_S) is None
+
+
+def test_each_publisher_may_have_a_key_of_its_own(key_directories: tuple[Path, Path, Path]):
+    robot, guest, _ = key_directories
+    (guest / "server.key").unlink()
+    (guest / "servers").mkdir()
+    (guest / "servers" / "127.0.0.1.key").write_text((robot / "own.key").read_text())
+    with Publisher("tcp://127.0.0.1:*", keys=load_keys(robot)) as publisher:
+        with Subscriber(publisher.endpoint, POSE_RAW, keys=load_keys(guest), name="guest"):
+            assert publisher.wait_for_subscribers(["guest"], timeout_s=SOON_S)
+        with pytest.raises(ValueError, match=r"servers/192\.0\.2\.7\.key, found none"):
+            Subscriber("tcp://192.0.2.7:1", POSE_RAW, keys=load_keys(guest))
+
+
 def test_a_subscriber_with_keys_does_not_trust_an_impostor(key_directories: tuple[Path, Path, Path]):
     _, guest, stranger = (load_keys(directory) for directory in key_directories)
-    impostor = dataclasses.replace(stranger, clients=frozenset({guest.public}))
+    impostor = dataclasses.replace(stranger, clients=frozenset({guest.public}), directory=None)
     with (
         Publisher("tcp://127.0.0.1:*", keys=impostor) as publisher,
         Subscriber(publisher.endpoint, POSE_RAW, keys=guest, name="guest"),
@@ -406,7 +591,9 @@ def test_the_secret_key_is_for_its_owner_alone(tmp_path: Path):
     assert keys.secret.decode() in secret_file.read_text()
     assert keys.secret.decode() not in repr(keys)
     assert load_keys(tmp_path / "keys") == keys
-    assert keys == Keys(keys.public, keys.secret, server=keys.public, clients=frozenset({keys.public}))
+    assert keys == Keys(
+        keys.public, keys.secret, server=keys.public, clients=frozenset({keys.public}), directory=tmp_path / "keys"
+    )
     with pytest.raises(ValueError, match="exists already"):
         create_keys(tmp_path / "keys")
     secret_file.chmod(0o640)

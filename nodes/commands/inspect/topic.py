@@ -76,9 +76,10 @@ def endpoints_of(topic: str, launch: str | None, endpoints: tuple[str, ...]) -> 
 
 
 def subscribe(topic: str, launch: str | None, endpoints: tuple[str, ...], *, conflate: bool = False) -> Subscriber:
-    directory = _transport(launch).keys
-    keys = load_keys(directory) if directory else None
-    return Subscriber(endpoints_of(topic, launch, endpoints), topic, keys=keys, conflate=conflate)
+    transport = _transport(launch)
+    keys = load_keys(transport.keys) if transport.keys else None
+    addresses = endpoints_of(topic, launch, endpoints)
+    return Subscriber(addresses, topic, keys=keys, clear_text=transport.clear_text, conflate=conflate)
 
 
 def receive(subscriber: Subscriber, topic: str) -> Iterator[tuple[str, Message]]:

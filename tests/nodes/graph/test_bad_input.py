@@ -117,7 +117,7 @@ COUNTED = {
 
 
 #: no header; a header cut short; of another version; of this version, with no message behind it, or with nonsense
-GARBAGE = (b"", b"\1\2\3", b"?" * 999, b"\1" + bytes(8), b"\1" + bytes(4) + b"\1" + bytes(3) + b"\xff" * 40)
+GARBAGE = (b"", b"\2\2\3", b"?" * 999, b"\2" + bytes(16), b"\2" + bytes(4) + b"\1" + bytes(11) + b"\xff" * 40)
 
 
 def settings(weights: dict[str, str]) -> tuple[dict, dict]:
@@ -150,7 +150,7 @@ def test_no_node_goes_down(weights: dict[str, str], make_launch: Callable[..., L
     prior, trajectory = PriorNode(launch), TrajectoryNode(launch)
     address = launch.transport.endpoint("pose_input")
     with (
-        Publisher(address, lossless=True) as source,
+        Publisher(address, reliable={"prior"}) as source,
         Subscriber(launch.transport.endpoint("trajectory"), [POSE_WORLD, DIAGNOSTICS], name="test") as listener,
         running(prior, trajectory) as threads,
     ):

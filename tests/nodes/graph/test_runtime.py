@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from conftest import START_NS, VirtualClock, raw, running, until, walking
 
+from steadypose.msgs.publisher import SEND_HIGH_WATER
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW
-from steadypose.msgs.transport import SEND_HIGH_WATER, Publisher, Subscriber
+from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Level, Message, PoseClean, PoseRaw
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.inbox import READ_AHEAD, Inbox
@@ -114,7 +115,7 @@ def test_a_lossless_node_leaves_the_rest_to_the_sender() -> None:
 def test_every_frame_arrives_though_the_listener_comes_last(make_launch: MakeLaunch) -> None:
     launch = make_launch(nodes='["prior", "trajectory"]')
     node = Echo(launch)
-    with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
+    with Publisher(launch.transport.endpoint("pose_input"), reliable={"prior"}) as source, running(node):
         news = Listener(launch, "prior", [DIAGNOSTICS])
         news.take_until(lambda: news.got[-1].values["state"] == "waiting for trajectory")  # type: ignore[union-attr]
         assert "prior" not in source.subscribers, "it must not listen before it is heard"
@@ -131,7 +132,7 @@ def test_every_frame_arrives_though_the_listener_comes_last(make_launch: MakeLau
 def test_the_stream_halts_while_a_listener_is_away(make_launch: MakeLaunch) -> None:
     launch = make_launch(nodes='["prior", "trajectory"]')
     node = Echo(launch)
-    with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
+    with Publisher(launch.transport.endpoint("pose_input"), reliable={"prior"}) as source, running(node):
         first = Listener(launch, "prior", [POSE_CLEAN], name="trajectory")
         assert source.wait_for_subscribers({"prior"}, timeout_s=10)
         source.publish(POSE_RAW, raw(0))
@@ -149,7 +150,7 @@ def test_the_stream_halts_while_a_listener_is_away(make_launch: MakeLaunch) -> N
 def test_a_message_that_fails_is_counted_and_the_next_one_is_served(make_launch: MakeLaunch, caplog) -> None:
     launch = make_launch(nodes='["prior"]')
     node = Echo(launch)
-    with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
+    with Publisher(launch.transport.endpoint("pose_input"), reliable={"prior"}) as source, running(node):
         listener = Listener(launch, "prior", [POSE_CLEAN], name="test")
         assert source.wait_for_subscribers({"prior"}, timeout_s=10)
         until(lambda: "test" in node._publisher.subscribers)
@@ -208,12 +209,11 @@ def test_a_node_stops_though_it_waits_for_a_listener_who_never_comes(make_launch
 
 
 def test_a_node_stops_though_its_listener_does_not_read(make_launch: MakeLaunch) -> None:
-    launch = make_launch(nodes='["prior"]')
+    launch = make_launch(nodes='["prior", "trajectory"]')
     node = Echo(launch)
-    with Publisher(launch.transport.endpoint("pose_input"), lossless=True) as source, running(node):
+    with Publisher(launch.transport.endpoint("pose_input"), reliable={"prior"}) as source, running(node):
+        deaf = Subscriber(launch.transport.endpoint("prior"), [POSE_CLEAN], reliable=True, name="trajectory")
         assert source.wait_for_subscribers({"prior"}, timeout_s=10)
-        deaf = Subscriber(launch.transport.endpoint("prior"), [POSE_CLEAN], high_water=1, name="deaf")
-        until(lambda: "deaf" in node._publisher.subscribers)
         message = raw(0, walking(0))
         before = -1
         while source.publish(POSE_RAW, message, timeout_s=1.0) or node.health.published[POSE_CLEAN] > before:

@@ -91,7 +91,7 @@ def test_a_ros_node_hears_bodies(make_launch: Callable[..., Launch], tmp_path: P
     stream = cycle(worlds)
     with (
         another_python(LISTENER, tmp_path) as listener,
-        Publisher(launch.transport.endpoint("trajectory"), lossless=True) as publisher,
+        Publisher(launch.transport.endpoint("trajectory"), reliable={"ros2_bridge"}) as publisher,
         running(bridge),
     ):
         assert publisher.wait_for_subscribers({"ros2_bridge"}, timeout_s=20)

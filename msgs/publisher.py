@@ -1,0 +1,298 @@
+"""Publishing messages at an address."""
+
+from __future__ import annotations
+
+import math
+import os
+import socket as posix
+import time
+from collections import Counter
+from collections.abc import Collection, Iterable
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import zmq
+
+from steadypose.msgs.addresses import TransportError, is_local, parse, refuse_used
+from steadypose.msgs.codec import encode, typestore
+from steadypose.msgs.keys import ClientList, Keys
+from steadypose.msgs.topics import TOPICS, check_topic
+from steadypose.msgs.types import Message
+from steadypose.msgs.wire import MAX_FRAME, PREFIX, VERSION, Listener, read_subscription, read_taken
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+    from zmq.auth.thread import ThreadAuthenticator
+
+SEND_HIGH_WATER = 1000
+"""messages held for each subscriber that does not keep up"""
+WINDOW = 256
+"""messages of a topic that a reliable subscriber may be behind before it is waited for; with what is sent beside them,
+below half of `SEND_HIGH_WATER`, so that ZeroMQ never drops one"""
+LINGER_MS = 1000
+"""how long `Publisher.close` waits for what is on its way"""
+MAX_SUBSCRIPTIONS = 4096
+"""different ones, of all subscribers together; who goes beyond is disconnected"""
+MAX_NEW_SUBSCRIPTIONS = 256
+"""of one connection in a second"""
+
+_CUT = "subscriptions"
+_DOMAIN = "steadypose"
+
+
+class Publisher:
+    """Publishes messages at an address. A context manager.
+
+    `publish` waits for nobody but the subscribers that were named `reliable` when the publisher was made and that ask
+    for it: any other that does not read loses what exceeds `SEND_HIGH_WATER`, and sees so from the sequence numbers.
+
+    Attributes:
+        endpoint: as bound: a port given as `*` is a number here.
+        refused: connections that were closed, by cause.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        keys: Keys | None = None,
+        reliable: Collection[str] = (),
+        clear_text: bool = False,
+    ) -> None:
+        """Bind `endpoint`: `ipc://` and a path, or `tcp://` and an address of this machine and a port.
+
+        Args:
+            keys: whose holders may subscribe; the list is looked at again while this runs.
+            reliable: names of the subscribers to wait for.
+            clear_text: whether an address that others can reach may do without keys.
+
+        Raises:
+            TransportError: if the address is malformed, in use, or reachable from outside and `keys` is None.
+        """
+        transport, host = parse(endpoint)
+        if keys is None and not clear_text and not is_local(endpoint):
+            raise TransportError(
+                f"{endpoint} can be reached from other machines: expected keys, got none; "
+                "make them with `steadypose keys`, or bind tcp://127.0.0.1"
+            )
+        typestore()
+        self.refused: Counter[str] = Counter()
+        self._keys, self._reliable = keys, frozenset(reliable)
+        self._clients = ClientList(keys) if keys else None
+        self._sequence: Counter[str] = Counter()
+        self._listeners: dict[Listener, dict[str, int]] = {}  # and of each reliable topic, what it expects next
+        self._subscriptions: set[bytes] = set()
+        self._new_subscriptions: Counter[int] = Counter()
+        self._new_since = time.monotonic()
+        self._id = int.from_bytes(os.urandom(4), "little")
+        self._context = zmq.Context()
+        self._authenticator = _authenticate(self._context, self._clients) if self._clients else None
+        try:
+            if transport == "ipc":
+                refuse_used(Path(host))
+            self._socket = self._bind(endpoint)
+        except zmq.ZMQError as error:
+            self._end()
+            raise TransportError(f"cannot publish at {endpoint}: {error.strerror}") from error
+        except TransportError:
+            self._end()
+            raise
+        self.endpoint: str = self._socket.get_string(zmq.LAST_ENDPOINT)
+
+    def _bind(self, endpoint: str) -> zmq.Socket[bytes]:
+        # XPUB, not PUB, because it receives the subscriptions
+        socket = self._context.socket(zmq.XPUB)
+        try:
+            socket.setsockopt(zmq.SNDHWM, SEND_HIGH_WATER)
+            socket.setsockopt(zmq.LINGER, LINGER_MS)
+            socket.setsockopt(zmq.MAXMSGSIZE, 1024)
+            socket.setsockopt(zmq.IPV6, "[" in endpoint)
+            # a subscriber whose machine vanished is noticed in 15 s
+            for option, value in KEEPALIVE.items():
+                socket.setsockopt(option, value)
+            if self._keys:
+                socket.curve_server = True
+                socket.curve_secretkey = self._keys.secret
+                socket.curve_publickey = self._keys.public
+                # without this, whoever comes while nobody checks keys is let in
+                socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN.encode())
+                socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+            socket.bind(endpoint)
+        except zmq.ZMQError:
+            socket.close(0)
+            raise
+        return socket
+
+    def publish(self, topic: str, message: Message, timeout_s: float = math.inf) -> bool:
+        """Send a message to all who subscribe to its topic.
+
+        Args:
+            timeout_s: how long to wait for a reliable subscriber that is behind.
+
+        Returns:
+            whether it was sent; False only if it was waited for in vain, and then nobody got it.
+
+        Raises:
+            ValueError: if the message is not of the topic's type, or encodes to more than `MAX_FRAME` bytes.
+        """
+        check_topic(topic, message)
+        payload = encode(message)
+        size = len(topic) + 1 + PREFIX.size + len(payload)
+        if size > MAX_FRAME:
+            raise ValueError(f"{topic}: expected a message of at most {MAX_FRAME} bytes, got {size}")
+        self._note_subscribers()
+        deadline = time.monotonic() + timeout_s
+        while self._is_behind(topic):
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return False
+            self._socket.poll(milliseconds(left))
+            self._note_subscribers()
+        prefix = PREFIX.pack(VERSION, self._id, self._sequence[topic], time.monotonic_ns())
+        self._socket.send(topic.encode() + b"\0" + prefix + payload)
+        self._sequence[topic] = (self._sequence[topic] + 1) % 2**32
+        return True
+
+    @property
+    def subscribers(self) -> frozenset[str]:
+        """The names of the subscribers that are connected and get what is published from now on."""
+        self._note_subscribers()
+        return frozenset(listener.name for listener in self._listeners)
+
+    def wait_for_subscribers(self, names: Iterable[str], *, timeout_s: float) -> bool:
+        """Wait until the subscribers of these names are there; False if `timeout_s` passed before."""
+        wanted = frozenset(names)
+        deadline = time.monotonic() + timeout_s
+        while not wanted <= self.subscribers:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return False
+            self._socket.poll(milliseconds(left))
+        return True
+
+    def check(self) -> None:
+        """See that nobody listens who may not; to be called about once a second.
+
+        A key that was taken off the list since the last call ends every connection, and so do more subscriptions than
+        `_note_new` could keep out; who may comes back.
+
+        Raises:
+            RuntimeError: keys are not checked any more, so that nobody new is let in: make another publisher.
+        """
+        if self._authenticator and not self._authenticator.is_alive():
+            raise RuntimeError("the thread that checks keys has ended; nobody is let in any more")
+        if self._clients and self._clients.revoked():
+            self._begin_anew("revoked keys")
+        if len(self._subscriptions) > 2 * MAX_SUBSCRIPTIONS:
+            self._begin_anew(_CUT)
+
+    def _begin_anew(self, cause: str) -> None:
+        """Disconnect everybody; who may comes back."""
+        self.refused[cause] += 1
+        self._socket.close(0)
+        self._listeners.clear()
+        self._subscriptions.clear()
+        self._socket = self._bind(self.endpoint)
+
+    def _is_behind(self, topic: str) -> bool:
+        following = self._sequence[topic]
+        return any(
+            topic in expected and (following - expected[topic]) % 2**32 >= WINDOW
+            for listener, expected in self._listeners.items()
+            if listener.name in self._reliable
+        )
+
+    def _note_subscribers(self) -> None:
+        for _ in range(SEND_HIGH_WATER):  # whoever floods this is not to keep it from publishing
+            try:
+                received = self._socket.recv(zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                return
+            frame = received.bytes
+            if frame[:1] == b"\1":
+                self._note_subscription(frame[1:], received)
+            elif frame[:1] == b"\0":
+                self._subscriptions.discard(frame[1:])
+                if listener := read_subscription(frame[1:]):
+                    self._listeners.pop(listener, None)
+            elif taken := read_taken(frame, TOPICS):
+                if taken.publisher == self._id:
+                    self._note_taken(taken.instance, taken.topic, taken.following)
+            else:
+                self._note_new(received)
+
+    def _note_subscription(self, prefix: bytes, received: zmq.Frame) -> None:
+        self._subscriptions.add(prefix)
+        self._note_new(received)
+        if listener := read_subscription(prefix):
+            self._listeners[listener] = {topic: self._sequence[topic] for topic in listener.reliable}
+
+    def _note_taken(self, instance: int, topic: str, following: int) -> None:
+        for listener, expected in self._listeners.items():
+            if listener.instance == instance and topic in expected:
+                further = (following - expected[topic]) % 2**32
+                if further <= (self._sequence[topic] - expected[topic]) % 2**32:
+                    expected[topic] = following
+
+    def _note_new(self, received: zmq.Frame) -> None:
+        """Count what a connection asks for, and close one that asks for too much."""
+        now = time.monotonic()
+        if now - self._new_since > 1.0:
+            self._new_subscriptions.clear()
+            self._new_since = now
+        try:
+            connection = int(received.get(zmq.SRCFD))  # type: ignore[arg-type]
+        except zmq.ZMQError:  # who speaks the first version of the protocol cannot be told from others; see `check`
+            return
+        self._new_subscriptions[connection] += 1
+        too_many = len(self._subscriptions) > MAX_SUBSCRIPTIONS
+        if too_many or self._new_subscriptions[connection] == MAX_NEW_SUBSCRIPTIONS:
+            self.refused[_CUT] += 1
+            with suppress(OSError), posix.socket(fileno=os.dup(connection)) as end:
+                end.shutdown(posix.SHUT_RDWR)  # ZeroMQ sees it leave, and forgets what it asked for
+
+    def close(self) -> None:
+        """Stop, once what was published is on its way, or after `LINGER_MS`."""
+        self._socket.close()
+        self._end()
+
+    def _end(self) -> None:
+        if self._authenticator:
+            self._authenticator.stop()
+        self._context.term()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+KEEPALIVE = {
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 5,
+    zmq.TCP_KEEPALIVE_INTVL: 5,
+    zmq.TCP_KEEPALIVE_CNT: 2,
+}
+"""so that whose machine vanished is noticed in 15 s. Not by ZeroMQ's heartbeats: they abort the process of a subscriber
+that is behind (libzmq issue 3937)."""
+
+
+def milliseconds(seconds: float) -> int:
+    """For ZeroMQ; -1 is for ever."""
+    return -1 if math.isinf(seconds) else math.ceil(seconds * 1000)
+
+
+def _authenticate(context: zmq.Context[zmq.Socket[bytes]], clients: ClientList) -> ThreadAuthenticator:
+    from zmq.auth.thread import ThreadAuthenticator  # brings asyncio, which nobody else here needs
+
+    class KeyList:
+        def callback(self, domain: str, key: bytes) -> bool:
+            return clients.allows(key)
+
+    authenticator = ThreadAuthenticator(context)
+    authenticator.start()
+    authenticator.configure_curve_callback(_DOMAIN, KeyList())
+    return authenticator

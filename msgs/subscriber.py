@@ -1,0 +1,270 @@
+"""Receiving messages from publishers."""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import zmq
+
+from steadypose.msgs.addresses import TransportError, check_private, is_local, parse
+from steadypose.msgs.codec import DecodeError, decode, typestore
+from steadypose.msgs.keys import Keys
+from steadypose.msgs.publisher import KEEPALIVE, milliseconds
+from steadypose.msgs.topics import TOPICS
+from steadypose.msgs.types import Diagnostics, Message
+from steadypose.msgs.wire import MAX_FRAME, PREFIX, VERSION, Listener, Taken
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+HIGH_WATER = 1000
+"""messages a subscriber holds unread, unless it says otherwise"""
+MAX_RECEIVED = 2**26
+"""bytes of a frame that is received at all; with one beyond, ZeroMQ ends the connection"""
+ACKNOWLEDGE = 16
+"""messages of a topic between two times that a reliable subscriber says how far it is"""
+DRIFT = 1e-4
+"""of two machines' clocks against each other: more than any crystal has"""
+REVIVE_S = 0.5
+"""without another attempt, a connection that was lost is given up by ZeroMQ, and made anew here"""
+
+_PUBLISHERS = 256
+_EVENT = struct.Struct("=HI")  # of ZeroMQ's monitor; zmq.utils.monitor, which reads it too, brings asyncio
+_HANDSHAKES = (
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
+_RETRIES = zmq.EVENT_CONNECT_DELAYED | zmq.EVENT_CONNECT_RETRIED | zmq.EVENT_CONNECTED
+
+
+class Subscriber:
+    """Receives messages from publishers. A context manager.
+
+    What cannot be used is counted, never raised: `dropped` counts by topic the messages that were published and
+    did not arrive (or, with `conflate`, were overtaken), `late` those that came after their lifespan, `refused` by
+    cause the frames that were not messages.
+    """
+
+    def __init__(
+        self,
+        endpoints: str | Iterable[str],
+        topics: str | Iterable[str],
+        *,
+        conflate: bool = False,
+        reliable: bool = False,
+        lifespan_s: float = math.inf,
+        high_water: int = HIGH_WATER,
+        keys: Keys | None = None,
+        clear_text: bool = False,
+        name: str = "",
+    ) -> None:
+        """Connect to `endpoints`, now or as soon as a publisher is there, and subscribe to `topics`.
+
+        Args:
+            conflate: keep the newest message alone: for a picture or a control loop that wants the state, not the
+                history. For one topic and without a name, because ZeroMQ then keeps one message of each publisher,
+                and one subscription to it; open a subscriber for each topic.
+            reliable: miss no pose of a publisher that names this subscriber: it waits, as long as this one is behind.
+            lifespan_s: what was sent longer ago is dropped, but for news of nodes and the end of a stream: a program
+                that was stopped for a minute is not to take that minute's poses for new ones.
+            high_water: messages held unread, beyond which the newest are lost; 0 holds all there is memory for.
+            keys: for publishers that have them.
+            clear_text: whether to listen to another machine without keys.
+            name: what `Publisher.subscribers` calls this subscriber; without one it is not among them.
+
+        Raises:
+            TransportError: if an address is malformed, or another machine's and `keys` is None, or if others could
+                publish there.
+            ValueError: if a topic does not exist, for `conflate` with several topics or a name, for `reliable`
+                without one.
+        """
+        self._endpoints = [endpoints] if isinstance(endpoints, str) else list(endpoints)
+        topics = [topics] if isinstance(topics, str) else list(topics)
+        for topic in topics:
+            if topic not in TOPICS:
+                raise ValueError(f"topic: expected one of {', '.join(TOPICS)}, got {topic!r}")
+        if conflate and (len(topics) != 1 or name):
+            raise ValueError(f"conflate: expected one topic and no name, got {topics} and {name!r}")
+        if reliable and not name:
+            raise ValueError("reliable: expected a name, by which publishers know whom to wait for; got none")
+        if not lifespan_s > 0:
+            raise ValueError(f"lifespan_s: expected more than 0, got {lifespan_s}")
+        for endpoint in self._endpoints:
+            _check(endpoint, keys, clear_text)
+        typestore()
+        self.dropped: Counter[str] = Counter()
+        self.late: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+        self._lifespan_ns = lifespan_s * 1e9
+        self._local = all(map(is_local, self._endpoints))
+        self._expected: OrderedDict[tuple[int, str], int] = OrderedDict()
+        self._offsets: OrderedDict[int, tuple[int, int]] = OrderedDict()  # of each publisher's clock, and when found
+        news = [topic for topic in topics if TOPICS[topic] is Diagnostics]
+        waited_for = tuple(topic for topic in topics if topic not in news) if reliable else ()
+        self._listener = Listener(name, int.from_bytes(os.urandom(4), "little"), waited_for)
+        self._lost: dict[str, float] = {}
+        self._looked = 0.0
+        self._context = zmq.Context()
+        # XSUB, unlike SUB, can say how far it is
+        self.socket = self._context.socket(zmq.XSUB if reliable else zmq.SUB)
+        """for a `zmq.Poller`; read it with `receive` alone"""
+        self.socket.setsockopt(zmq.CONFLATE, conflate)
+        self.socket.setsockopt(zmq.RCVHWM, high_water)
+        self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_RECEIVED)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        for option, value in KEEPALIVE.items():
+            self.socket.setsockopt(option, value)
+        self._keys = keys
+        self._monitor = self.socket.get_monitor_socket(_HANDSHAKES | zmq.EVENT_DISCONNECTED | _RETRIES)
+        try:
+            prefixes = [topic.encode() + b"\0" for topic in topics] + ([self._listener.subscription()] if name else [])
+            for prefix in prefixes:
+                if reliable:
+                    self.socket.send(b"\1" + prefix)
+                else:
+                    self.socket.setsockopt(zmq.SUBSCRIBE, prefix)
+            for endpoint in self._endpoints:
+                self._connect(endpoint)
+        except zmq.ZMQError as error:
+            self.close()
+            raise TransportError(f"cannot subscribe at {', '.join(self._endpoints)}: {error.strerror}") from error
+        except ValueError:
+            self.close()
+            raise
+
+    def _connect(self, endpoint: str) -> None:
+        self.socket.setsockopt(zmq.IPV6, "[" in endpoint)
+        if self._keys:
+            self.socket.curve_publickey = self._keys.public
+            self.socket.curve_secretkey = self._keys.secret
+            self.socket.curve_serverkey = self._keys.server_at(endpoint)
+        self.socket.connect(endpoint)
+
+    def receive(self, timeout_s: float) -> tuple[str, Message] | None:
+        """The next message and its topic, or None if none came in `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            now = time.monotonic()
+            left = max(0.0, deadline - now)
+            if now - self._looked > REVIVE_S:
+                self._note_connections(now)
+            if not self.socket.poll(milliseconds(min(left, REVIVE_S))):
+                if time.monotonic() >= deadline:
+                    self._note_connections(time.monotonic())
+                    return None
+                continue
+            parts = self.socket.recv_multipart()
+            received = self._read(parts[0]) if len(parts) == 1 else self._refuse("multipart")
+            if received or left == 0:
+                return received
+
+    def _read(self, frame: bytes) -> tuple[str, Message] | None:
+        if len(frame) > MAX_FRAME:
+            return self._refuse("too large")
+        end = frame.find(b"\0")
+        if end < 0 or len(frame) < end + 1 + PREFIX.size:
+            return self._refuse("malformed")
+        topic = frame[:end].decode(errors="replace")
+        version, publisher, sequence, sent_ns = PREFIX.unpack_from(frame, end + 1)
+        if topic not in TOPICS:
+            return self._refuse("unknown topic")
+        if version != VERSION:
+            return self._refuse("version")
+        if not self._count(publisher, topic, sequence):
+            return self._refuse("repeated")
+        late = self._age_ns(publisher, sent_ns) > self._lifespan_ns
+        try:
+            message = decode(topic, memoryview(frame)[end + 1 + PREFIX.size :])
+        except DecodeError:
+            return self._refuse("undecodable")
+        if late and not isinstance(message, Diagnostics) and not message.end_of_stream:
+            self.late[topic] += 1
+            return None
+        return topic, message
+
+    def _count(self, publisher: int, topic: str, sequence: int) -> bool:
+        """Count what is missing before `sequence`; False if it is no later than what came before."""
+        missed = (sequence - self._expected.get((publisher, topic), sequence)) % 2**32
+        if missed >= 2**31:
+            return False
+        if missed:
+            self.dropped[topic] += missed
+        following = (sequence + 1) % 2**32
+        self._expected[publisher, topic] = following
+        self._expected.move_to_end((publisher, topic))
+        if len(self._expected) > _PUBLISHERS:
+            self._expected.popitem(last=False)
+        if topic in self._listener.reliable and following % ACKNOWLEDGE == 0:
+            self.socket.send(Taken(self._listener.instance, publisher, following, topic).frame())
+        return True
+
+    def _age_ns(self, publisher: int, sent_ns: int) -> int:
+        """How long ago a message was sent, nanoseconds.
+
+        The clocks of one machine's processes are one. Another machine's stands to it by what the fastest message
+        showed, which took next to no time.
+        """
+        now = time.monotonic_ns()
+        apart = now - sent_ns
+        if self._local:
+            return apart
+        fastest, found_ns = self._offsets.get(publisher, (apart, now))
+        fastest = min(apart, fastest + round((now - found_ns) * DRIFT))
+        self._offsets[publisher] = fastest, now
+        self._offsets.move_to_end(publisher)
+        if len(self._offsets) > _PUBLISHERS:
+            self._offsets.popitem(last=False)
+        return apart - fastest
+
+    def _refuse(self, cause: str) -> None:
+        self.refused[cause] += 1
+
+    def _note_connections(self, now: float) -> None:
+        """Count who was not let in, and connect again where ZeroMQ has given up, as it does after too large a frame."""
+        self._looked = now
+        while self._monitor.poll(0):
+            told, at = self._monitor.recv_multipart()
+            event, _ = _EVENT.unpack(told)
+            endpoint = at.decode(errors="replace")
+            if event & _HANDSHAKES:
+                self._refuse("handshake")
+            elif event & _RETRIES:
+                self._lost.pop(endpoint, None)
+            else:
+                self._lost[endpoint] = now
+        for endpoint in [endpoint for endpoint, at in self._lost.items() if now - at > REVIVE_S]:
+            del self._lost[endpoint]
+            self._refuse("too large")
+            for given in [given for given in self._endpoints if given == endpoint] or self._endpoints:
+                self.socket.disconnect(given)
+                self._connect(given)
+
+    def close(self) -> None:
+        self.socket.disable_monitor()
+        self._monitor.close(0)
+        self.socket.close()
+        self._context.term()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+def _check(endpoint: str, keys: Keys | None, clear_text: bool) -> None:
+    transport, path = parse(endpoint)
+    if keys is None and not clear_text and not is_local(endpoint):
+        raise TransportError(
+            f"{endpoint} is another machine: expected keys, got none; make them with `steadypose keys`, "
+            "or ask for clear text by name"
+        )
+    if transport == "ipc" and not path.startswith("@"):
+        check_private(Path(path).absolute().parent)
