@@ -64,6 +64,7 @@ class Node(ABC):
         self._stopping = False
         self._required = launch.reliable_subscribers(self.name)
         self._blocked_ns = 0
+        self._disconnected: Counter[str] = Counter()
         self._inbox: Inbox | None = None
         self._refused_before: Counter[str] = Counter()
         self._supervisor = supervisor_id()
@@ -225,12 +226,13 @@ class Node(ABC):
             self._stopping = True
         notify(ALIVE)
         self._publisher.check()
+        self._disconnected = self._publisher.refused
         # a subscriber without room for this second's diagnostics can have those of the next
         self._publisher.publish(DIAGNOSTICS, self.diagnostics(), timeout_s=0)
 
     def diagnostics(self) -> Diagnostics:
         """How this node is doing."""
-        received = Counter({f"refused.{cause}": n for cause, n in self._publisher.refused.items()})
+        received = Counter({f"refused.{cause}": n for cause, n in self._disconnected.items()})
         if self._inbox is not None:
             received["dropped.late"] = self._inbox.overrun
             received.update({f"dropped.lost {topic}": n for topic, n in self._subscriber.dropped.items()})

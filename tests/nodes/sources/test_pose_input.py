@@ -46,6 +46,7 @@ class Sent:
     subscribers: frozenset[str] = frozenset()
 
     def __init__(self, clock: VirtualClock) -> None:
+        self.refused: Counter[str] = Counter()
         self._clock = clock
         self.at: list[tuple[int, Message]] = []
 
@@ -53,6 +54,8 @@ class Sent:
         if topic != DIAGNOSTICS:
             self.at.append((self._clock.time_ns, message))
         return True
+
+    def check(self) -> None: ...
 
 
 def play(launch: Launch, clock: VirtualClock, source: Frames, frames: int | None = None) -> list[tuple[int, PoseRaw]]:
