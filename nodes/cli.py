@@ -73,6 +73,8 @@ def _main(arguments: list[str]) -> int:
         hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(COMMANDS)}"
         print(f"steadypose: no command {name!r}: {hint}", file=sys.stderr)
         return USAGE_ERROR
+    if name == "node":  # OpenBLAS makes threads, with 9 MB, as it is loaded; `one_thread` comes too late for that
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import tyro
 
     module, function = COMMANDS[name][0].split(":")

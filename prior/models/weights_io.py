@@ -50,7 +50,8 @@ def load_weights(name: str, model: str) -> tuple[Arrays, dict[str, Any]]:
         )
     with safe_open(path, framework="numpy") as file:
         config = json.loads(file.metadata()["config"])
-        return {key: file.get_tensor(key).astype(np.float32) for key in file.keys()}, config  # noqa: SIM118 (no mapping)
+        names = file.keys()
+        return {name: file.get_tensor(name).astype(np.float32, copy=False) for name in names}, config
 
 
 def part(weights: Arrays, name: str) -> Arrays:

@@ -1,7 +1,8 @@
-"""The Python programs of docs/other_languages.md run as they are printed, without anything of steadypose."""
+"""The programs of docs/other_languages.md run as they are printed, without anything of steadypose."""
 
 import re
 import select
+import shutil
 import subprocess
 import sys
 import time
@@ -9,14 +10,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from tests.helpers.msg_strategies import world
 
+from steadypose.msgs.codec import encode
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import PoseRaw
+from steadypose.msgs.wire import PREFIX, VERSION
 
 PAGE = Path(__file__).parents[2] / "docs" / "other_languages.md"
 SUBSCRIBER, PUBLISHER = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+CPP = re.search(r"^```cpp\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
 SOON_S = 30.0
 
 
@@ -56,3 +61,14 @@ def test_the_publishers_frames_arrive(tmp_path: Path) -> None:
     assert (body.id, body.positions.shape, body.confidence.sum()) == (7, (22, 3), 22)
     assert not subscriber.refused
     assert not subscriber.dropped
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
+def test_the_cpp_program_reads_what_the_python_program_does(tmp_path: Path) -> None:
+    assert CPP
+    (tmp_path / "program.cpp").write_text(CPP[1])
+    strict = ("-std=c++17", "-Wall", "-Werror", "-Wno-unused-variable", "-Wno-unused-but-set-variable")
+    subprocess.run(["g++", *strict, "program.cpp"], cwd=tmp_path, check=True)
+    frame = b"pose/world\0" + PREFIX.pack(VERSION, 5, 12, 0) + encode(world())
+    printed = subprocess.run(["./a.out"], cwd=tmp_path, input=frame, capture_output=True, check=True)
+    assert printed.stdout == b"12 7 (63, 64, 65) 3\n"

@@ -15,6 +15,7 @@ gated recurrent units, Cho et al. 2014): weights that jump about would be noise 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -115,19 +116,38 @@ class MixtureNet(nn.Module):
     def forward(self, features: Tensor, present: Tensor) -> Tensor:
         """(C, T, 22, FEATURES) from a clip's first frame on, and whether there is a body (C, T), to
         (C, T, 22, OUTPUTS)."""
+        written, gates = self.layers(
+            features, lambda own: self.own_memory(own, present), lambda body: self.body_memory(body, present)
+        )
+        kept = kept_of(gates, F.pad(present[:, :-1], (1, 0))[..., None, None])
+        return _faded(kept, (1.0 - kept) * written)
+
+    def layers(
+        self, features: Tensor, own_memory: Callable[[Tensor], Tensor], body_memory: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """What is newly written (..., 22, OUTPUTS), and its gates (..., 22, GATES).
+
+        Args:
+            features: (..., 22, FEATURES).
+            own_memory: from joints' features (..., 22, own) to their means so far.
+            body_memory: from bodies' features (..., body) to theirs.
+        """
         told = (features - self.mean) / self.deviation
         own = F.relu(self.read(told) + self.joint)
-        before = self.own_memory(own, present)
-        body = F.relu(self.gather(own.flatten(2)))
-        body = body + F.relu(self.remember(self.body_memory(body, present)))
+        before = own_memory(own)
+        body = F.relu(self.gather(own.flatten(-2)))
+        body = body + F.relu(self.remember(body_memory(body)))
         body = body + F.relu(self.think(body))
         context = self.tell(body).unflatten(-1, (JOINTS, self.config.told))
         mixed = F.relu(self.mix(torch.cat([told, before, context], dim=-1)) + self.joint_mix)
         written, gates = self.write(mixed + F.relu(self.deepen(mixed))).split([OUTPUTS, GATES], dim=-1)
-        before = F.pad(present[:, :-1], (1, 0))[..., None, None]
-        kept = torch.where(before, torch.sigmoid(gates), 0.0)
-        kept = kept.repeat_interleave(torch.tensor([2 * EXPERTS, 3, 1]), dim=-1)
-        return _faded(kept, (1.0 - kept) * written)
+        return written, gates
+
+
+def kept_of(gates: Tensor, before: Tensor) -> Tensor:
+    """How much of each output (..., 22, OUTPUTS) stays as it was a frame before; 0 where there was none ``before``."""
+    kept = torch.where(before, torch.sigmoid(gates), 0.0)
+    return kept.repeat_interleave(torch.tensor([2 * EXPERTS, 3, 1]), dim=-1)
 
 
 def answer(outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, unseen: Tensor) -> tuple[Tensor, Tensor]:

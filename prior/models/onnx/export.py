@@ -19,7 +19,10 @@ from steadypose.prior.models.hgvae.faults import load_fault_net
 from steadypose.prior.models.hgvae.network import HGVAE
 from steadypose.prior.models.hmvae.config import HMVAEConfig
 from steadypose.prior.models.hmvae.network import HMVAE
-from steadypose.prior.models.onnx.modules import Correction, Faults, Reconstruction, Refinement, RootMotion
+from steadypose.prior.models.mixture.bank import EXPERTS, FEATURES
+from steadypose.prior.models.mixture.form import OUTPUTS
+from steadypose.prior.models.mixture.network import MixtureConfig, MixtureNet
+from steadypose.prior.models.onnx.modules import Correction, Faults, Mixture, Reconstruction, Refinement, RootMotion
 from steadypose.prior.models.root_velocity.config import TrajectoryConfig
 from steadypose.prior.models.root_velocity.network import TrajectoryNet
 from steadypose.prior.models.sensor_bias.features import HISTORY, CorrectionConfig
@@ -43,6 +46,15 @@ class Form:
     module: nn.Module
     inputs: dict[str, tuple[int, ...]]
     outputs: tuple[str, ...]
+
+
+def _mixture() -> Form:
+    network = load_network(MixtureNet, lambda config: MixtureConfig(**config), "default", "mixture")
+    sizes = network.config
+    bank = {"features": (22, FEATURES), "experts": (22, EXPERTS, 3), "heading": (2,), "scale": (), "unseen": (22,)}
+    own, body = (22, sizes.own), (sizes.body,)
+    memory = {"own": own, "own_weight": own, "body": body, "body_weight": body, "written": (22, OUTPUTS)}
+    return Form(Mixture(network), {**bank, **memory}, ("positions", "sigma", *(f"{name}_next" for name in memory)))
 
 
 def _refinement() -> Form:
@@ -76,6 +88,7 @@ def _correction() -> Form:
 
 
 FORMS: dict[str, Callable[[], Form]] = {
+    "mixture-default": _mixture,
     "hmvae-default": _refinement,
     "hgvae-default": _reconstruction,
     "hgvae-default.faults": _faults,

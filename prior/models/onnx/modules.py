@@ -10,6 +10,7 @@ from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.faults import FaultNet
 from steadypose.prior.models.hgvae.network import HGVAE
 from steadypose.prior.models.hmvae.network import HMVAE
+from steadypose.prior.models.mixture.network import MixtureNet, answer, kept_of
 from steadypose.prior.models.onnx.torch_features import (
     completion_features,
     correction_features,
@@ -19,6 +20,41 @@ from steadypose.prior.models.onnx.torch_features import (
 )
 from steadypose.prior.models.root_velocity.network import TrajectoryNet
 from steadypose.prior.models.sensor_bias.network import CorrectionNet
+
+
+class Mixture(nn.Module):
+    """A frame of `MixtureSmoother`: what its bank says of it, and the memory so far, to joints, deviations and memory.
+
+    Bank: features (B, 22, FEATURES), experts (B, 22, EXPERTS, 3), heading (B, 2), scale (B,) and unseen (B, 22).
+    Memory: own, own_weight (B, 22, own), body, body_weight (B, body), written (B, 22, OUTPUTS); zeros at first.
+    """
+
+    def __init__(self, network: MixtureNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(
+        self, features: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, unseen: Tensor,
+        own: Tensor, own_weight: Tensor, body: Tensor, body_weight: Tensor, written: Tensor,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        own_keep, body_keep = self.network.own_memory.decay.sigmoid(), self.network.body_memory.decay.sigmoid()
+        own_weight, before = own_keep * own_weight + (1.0 - own_keep), body_weight[:, :1, None] > 0
+        body_weight = body_keep * body_weight + (1.0 - body_keep)
+        memory = [own, body]
+
+        def remember(which: int, keep: Tensor, new: Tensor) -> Tensor:
+            memory[which] = keep * memory[which] + (1.0 - keep) * new
+            return memory[which]
+
+        new, gates = self.network.layers(
+            features,
+            lambda values: remember(0, own_keep, values) / own_weight,
+            lambda values: remember(1, body_keep, values) / body_weight,
+        )
+        kept = kept_of(gates, before)
+        written = kept * written + (1.0 - kept) * new
+        positions, variance = answer(written, experts, heading, scale, unseen)
+        return positions, 1e-3 * variance.sqrt(), memory[0], own_weight, memory[1], body_weight, written
 
 
 class Refinement(nn.Module):

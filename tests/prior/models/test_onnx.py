@@ -17,6 +17,17 @@ from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
 from steadypose.prior.models.hgvae.features import to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
 from steadypose.prior.models.hmvae.inference import LiveHMVAE
+from steadypose.prior.models.mixture.bank import (
+    DENSITIES,
+    EXPERTS,
+    FEATURES,
+    MEASUREMENT_SIGMA,
+    PARENT,
+    advance,
+    describe,
+    new_bank,
+)
+from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.models.onnx.export import FORMS, export
 from steadypose.prior.models.root_velocity.inference import LiveRootVelocity
 from steadypose.prior.models.sensor_bias.features import HISTORY, features, trunk_frame
@@ -50,6 +61,32 @@ def windows(bodies: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         body[:, rng.choice(np.arange(3, 22), 2, replace=False)] = np.nan
     tracks = to_tracks(positions, np.full(bodies, 1.05))
     return tracks.x, tracks.observed * rng.uniform(0.1, 1.0, tracks.observed.shape)
+
+
+def test_mixture_frame_by_frame() -> None:
+    bodies, delay, rng = 2, 2, np.random.default_rng(0)
+    motion = np.stack([waving(30), waving(30) + 1.0], axis=1) + rng.normal(scale=0.01, size=(30, bodies, 22, 3))
+    motion[5:15, 0, 20] = motion[20:, 1, 7] = np.nan
+    live, bank, confidence = MixtureSmoother(delay, bodies), new_bank(bodies, delay), np.ones((bodies, 22))
+    features = np.empty((bodies, 22, FEATURES), dtype=np.float32)
+    experts, scale = np.empty((bodies, 22, EXPERTS, 3)), np.empty(bodies)
+    sizes = {value.name: value.shape[1:] for value in session("mixture-default").get_inputs()}
+    parts = ("own", "own_weight", "body", "body_weight", "written")
+    memory = {name: np.zeros((bodies, *sizes[name])) for name in parts}
+    for frame, positions in enumerate(motion):
+        expected = live.update(positions, frame / 30)
+        advance(bank, frame, 1 / 30, positions, confidence, DENSITIES, MEASUREMENT_SIGMA)
+        if expected is None:
+            continue
+        describe(bank, frame + 1, delay, PARENT, experts, features, scale)
+        unseen = bank.unseen[:, :, (frame - delay) % (delay + 1)]
+        found, sigma, *kept = answers(
+            "mixture-default",
+            features=features, experts=experts, heading=bank.heading, scale=scale, unseen=unseen, **memory,
+        )  # fmt: skip
+        memory = dict(zip(memory, kept, strict=True))
+        np.testing.assert_allclose(found, expected.positions, atol=5e-6)  # metres
+        np.testing.assert_allclose(sigma, expected.sigma, rtol=1e-4)
 
 
 def test_refinement() -> None:
