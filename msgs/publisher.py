@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import zmq
 
-from steadypose.msgs.addresses import TransportError, is_local, parse, refuse_used
+from steadypose.msgs.addresses import TransportError, is_local, make_private, parse, refuse_used
 from steadypose.msgs.codec import encode, typestore
 from steadypose.msgs.keys import ClientList, Keys
 from steadypose.msgs.topics import TOPICS, check_topic
@@ -91,6 +91,7 @@ class Publisher:
         self._authenticator = _authenticate(self._context, self._clients) if self._clients else None
         try:
             if transport == "ipc":
+                make_private(Path(host).parent)
                 refuse_used(Path(host))
             self._socket = self._bind(endpoint)
         except zmq.ZMQError as error:

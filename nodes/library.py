@@ -25,14 +25,14 @@ def clean(
     up: str = "z",
     delay: int = 4,
 ) -> dict[str, NDArray[Any]]:
-    """Clean the joints of one body, offline: `steadypose clean` on arrays.
+    """Clean joints, offline: `steadypose clean` on arrays.
 
     Args:
-        positions: (T, J, 3) metres; NaN where a joint is missing.
+        positions: (T, J, 3) metres, or (T, B, J, 3) of several bodies; NaN where a joint, or a body, is missing.
         fps: frames a second, of a stream that is regular; else ``stamp_ns``.
         stamp_ns: (T,) whole nanoseconds of capture.
         skeleton: the joints' names and order, such as ``coco17`` (`steadypose.prior.body.layouts`).
-        confidence: (T, J) 0 to 1, where the source tells it.
+        confidence: (T, J) or (T, B, J) 0 to 1, where the source tells it.
         up: the axis of the positions that points up: ``z``, ``y`` or ``-y``.
         delay: frames at 30 Hz that an answer may wait for, 0 to 16; more is smoother.
 
@@ -40,8 +40,9 @@ def clean(
         The arrays of ``steadypose clean``'s ``.npz``, a row for each of ``positions``: ``positions`` (T, 22, 3)
         metres in the input's frame, ``rotations`` (T, 22, 4) local, xyzw, ``state`` (T, 22)
         `steadypose.msgs.types.JointState`, ``sigma`` (T, 22) metres, ``anomaly`` and ``anomaly_flag`` (T,),
-        ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s, ``world_positions`` (T, 22, 3) metres, z up, and
-        ``joint_names`` (22,), among them.
+        ``joint_anomaly`` (T, 22), ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s, ``world_positions`` (T, 22, 3)
+        metres, z up, and ``joint_names`` (22,), among them. Of several bodies, an axis B after time, and ``body_id``
+        (B,) with as many as were recognised.
 
     Raises:
         ValueError: an array has the wrong form, or neither fps nor stamp_ns is given; says what was expected.

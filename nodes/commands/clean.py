@@ -11,8 +11,9 @@ from rich.progress import Progress
 
 from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
 from steadypose.nodes.commands.cleaning import clean_recording
-from steadypose.nodes.graph.launch import apply_override
+from steadypose.nodes.graph.launch import apply_override, read_toml
 from steadypose.nodes.graph.settings import LaunchError
+from steadypose.prior.body.own_layouts import add_layouts
 
 
 def clean(
@@ -21,6 +22,7 @@ def clean(
     weights: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
     delay: Annotated[int | None, tyro.conf.arg(metavar="K")] = None,
     settings: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="STAGE.OPTION=VALUE")] = (),
+    skeletons: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     jobs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     ray: bool = False,
     force: bool = False,
@@ -41,6 +43,7 @@ def clean(
         delay: frames at 30 Hz to wait for, 0 to 16; more is smoother. 4 unless given.
         settings: any setting of [prior], such as gate.enabled=false, or of [trajectory], such as
             trajectory.contacts=false. May be given again.
+        skeletons: TOML with [skeletons.NAME] of joint layouts of your own; a launch file with them will do.
         jobs: of a folder, how many recordings at once, each in a process of its own that takes about 1 GB of
             memory; as many as there are cores unless given.
         ray: clean a folder on the Ray cluster that this machine belongs to, or that RAY_ADDRESS names, or else on
@@ -56,6 +59,9 @@ def clean(
         table["prior"]["delay"] = delay
     for override in settings:
         apply_override(table, override if override.startswith("trajectory.") else f"prior.{override}")
+    if skeletons is not None:
+        table["skeletons"] = read_toml(skeletons).get("skeletons", {})
+        add_layouts(table["skeletons"])
     if source.resolve() == out.resolve():
         raise LaunchError(f"{out}: expected another path than the input's; nothing is cleaned in place")
     if not out.resolve().parent.is_dir():

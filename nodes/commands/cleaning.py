@@ -22,6 +22,7 @@ from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.recording import open_recording, with_end
+from steadypose.prior.body.own_layouts import add_layouts
 
 CHECKED, CHECKED_NS = 45, 1_500_000_000
 """frames between two looks at whether the input can be right, and the time in which they count as having come"""
@@ -92,7 +93,7 @@ def clean_recording(
     Args:
         source: a recording or file of poses.
         out: the recording to make, or .npz.
-        settings: ``[prior]`` and ``[trajectory]`` of a launch file.
+        settings: ``[prior]``, ``[trajectory]`` and, if it has them, ``[skeletons]`` of a launch file.
         replace: whether what is at ``out`` may be replaced, if it is a recording or an .npz.
         began: called with the number of frames.
         advanced: called after each.
@@ -105,6 +106,7 @@ def clean_recording(
         if not replace:
             raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
         _check_replaceable(out, to_npz=to_npz)
+    add_layouts(settings.get("skeletons", {}))
     frames = open_recording(source)
     # these bring torch, which takes seconds: not before it is known that there is something to do
     from steadypose.nodes.graph.prior_node import make_prior

@@ -33,12 +33,14 @@ LINE_NS = 5_000_000_000
 """between lines where there is no terminal for a table"""
 TELL_NS = 1_000_000_000
 """between two times the health file is written"""
+REPLAY = "replay"
+VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
 STALL_NS = 15_000_000_000
 """without progress after the source has ended, until the run is given up: a message was lost on the way"""
 
 
 def run(
-    launch: Annotated[str, tyro.conf.Positional] = "replay",
+    launch: Annotated[str, tyro.conf.Positional] = REPLAY,
     input: Path | None = None,
     rate: Annotated[float | None, tyro.conf.arg(metavar="X")] = None,
     loop: bool = False,
@@ -53,7 +55,7 @@ def run(
 
     Args:
         launch: a launch file, or the name of one of the project's own, such as replay, oak, ros2 or server.
-        input: the recording, .npz or .csv to play in place of the launch file's.
+        input: the recording, .npz or .csv to play in place of the launch file's; or a film, for the webcam's eyes.
         rate: times real time; 0 is as fast as it goes.
         loop: play it again and again.
         record: a recording to make of all topics.
@@ -61,7 +63,11 @@ def run(
         settings: any setting of the launch file, over what it says. May be given again.
     """
     overrides = list(settings)
-    if input is not None:
+    if input is not None and input.suffix.lower() in VIDEOS:
+        launch = "webcam" if launch == REPLAY else launch
+        overrides += ['input.source="webcam"', f"input.webcam.video={json.dumps(str(input.resolve()))}"]
+        overrides.append("transport.lossless=true")  # a film can wait
+    elif input is not None:
         overrides += ['input.source="recording"', f"input.recording={json.dumps(str(input.resolve()))}"]
     if rate is not None:
         overrides.append(f"input.rate={rate}")

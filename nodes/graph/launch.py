@@ -20,6 +20,7 @@ from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.nodes.graph.access import ServerSettings, TransportSettings
 from steadypose.nodes.graph.settings import LaunchError, nearest, resolve_paths
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, load
+from steadypose.prior.body.own_layouts import add_layouts
 from steadypose.prior.settings import build_settings
 
 if sys.version_info >= (3, 11):
@@ -37,6 +38,8 @@ class _EveryLaunch:
     nodes: list[str] = field(default_factory=lambda: list(POSE_NODES))
     transport: TransportSettings = field(default_factory=TransportSettings)
     server: ServerSettings = field(default_factory=ServerSettings)
+    skeletons: dict[str, Any] = field(default_factory=dict)
+    """joint layouts of the user's own (`prior.body.own_layouts`)"""
 
 
 @dataclass(frozen=True)
@@ -69,17 +72,15 @@ class Launch(_EveryLaunch):
             LaunchError: no such file, not TOML, an unknown key, or a value of the wrong type.
         """
         file = find(path)
-        try:
-            table = tomllib.loads(file.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise LaunchError(f"{file} is not TOML: {error}") from error
+        table = read_toml(file)
         resolve_paths(_layout(table), table, file.parent)
         for override in overrides:
             apply_override(table, override)
         try:
             whole = build_settings(_layout(table), table, file.name)
             sections = {name: getattr(whole, name) for name in table.keys() & _sections().keys()}
-            return cls(whole.nodes, whole.transport, whole.server, sections)
+            add_layouts(whole.skeletons)
+            return cls(whole.nodes, whole.transport, whole.server, whole.skeletons, sections)
         except LaunchError:
             raise
         except ValueError as error:
@@ -124,6 +125,18 @@ def _layout(table: Mapping[str, Any]) -> type:
     kinds = {name: load(kind) if kind and name in table else dict for name, kind in _sections().items()}
     sections = [(name, kind, field(default_factory=kind)) for name, kind in kinds.items()]
     return make_dataclass("LaunchFile", sections, bases=(_EveryLaunch,), frozen=True)
+
+
+def read_toml(file: Path) -> dict[str, Any]:
+    """Raises:
+    LaunchError: it cannot be read, or is not TOML.
+    """
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise LaunchError(f"{file} is not TOML: {error}") from error
+    except OSError as error:
+        raise LaunchError(f"{file} cannot be read: {error.strerror}") from error
 
 
 def bundled(*parts: str) -> Path:

@@ -2,9 +2,9 @@
 
 One row for each row in: ``stamp_ns`` (T,), ``positions`` (T, 22, 3) metres in the input's frame, ``rotations``
 (T, 22, 4) local, xyzw, ``state`` (T, 22) `msgs.types.JointState`, ``sigma`` (T, 22) metres, ``anomaly`` (T,),
-``anomaly_flag`` (T,), ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s, ``world_positions`` (T, 22, 3) metres,
-and ``joint_names`` (22,). Where the prior gave no body, numbers are NaN and the state is UNKNOWN. With several
-bodies an axis for them comes after time, and ``body_id`` (B,) names them.
+``anomaly_flag`` (T,), ``joint_anomaly`` (T, 22), ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s,
+``world_positions`` (T, 22, 3) metres, and ``joint_names`` (22,). Where the prior gave no body, numbers are NaN and the
+state is UNKNOWN. With several bodies an axis for them comes after time, and ``body_id`` (B,) names them.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ _ROW = np.dtype(
         ("world_positions", np.float32, (22, 3)),
         ("rotations", np.float32, (22, 4)),
         ("sigma", np.float32, (22,)),
+        ("joint_anomaly", np.float32, (22,)),
         ("contacts", np.float32, (8,)),
         ("root_velocity", np.float64, (3,)),
         ("anomaly", np.float64),
@@ -51,7 +52,7 @@ class NpzCollector:
             for body in message.bodies:
                 row = self._newest[body.id] = _blank(())
                 row["stamp_ns"] = message.stamp_ns
-                for name in ("positions", "rotations", "state", "sigma", "anomaly", "anomaly_flag"):
+                for name in ("positions", "rotations", "state", "sigma", "anomaly", "anomaly_flag", "joint_anomaly"):
                     row[name] = getattr(body, name)
                 self._rows.setdefault(body.id, []).append(row)
         elif isinstance(message, PoseWorld):

@@ -1,7 +1,9 @@
 """Poses as ``.npz``: the plain arrays that a researcher has and wants, in place of a recording.
 
 In: ``positions`` (T, J, 3) metres, NaN where missing; ``skeleton``, a name; ``stamp_ns`` (T,) or ``fps``; and where
-known ``confidence`` (T, J) in 0..1 and ``up``, the axis that points up (``z``, ``y`` or ``-y``).
+known ``confidence`` (T, J) in 0..1 and ``up``, the axis that points up (``z``, ``y`` or ``-y``). Of several bodies,
+``positions`` (T, B, J, 3), all NaN where one is not there, ``confidence`` (T, B, J), and ``body_id`` (B,), their
+numbers, if they are not to be 0, 1, ….
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from steadypose.prior.body.layouts import SKELETONS
 STAMPS_END_NS = 2**31 * 10**9
 """ROS 2 counts seconds in 31 bits"""
 
-_ARRAYS = ("positions", "skeleton", "stamp_ns", "fps", "confidence", "up")
+_ARRAYS = ("positions", "skeleton", "stamp_ns", "fps", "confidence", "up", "body_id")
 
 
 class NpzError(ValueError):
@@ -46,22 +48,25 @@ class ArraySource:
         if self._skeleton not in SKELETONS:
             raise NpzError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {self._skeleton!r}")
         joints = len(SKELETONS[self._skeleton].joints)
-        self._positions = _numbers(path, arrays, "positions")
-        if self._positions.ndim != 3 or self._positions.shape[1:] != (joints, 3):
+        positions = _numbers(path, arrays, "positions")
+        if positions.ndim not in (3, 4) or positions.shape[-2:] != (joints, 3):
             raise NpzError(
-                f"{path}: positions: expected shape (T, {joints}, 3) for {self._skeleton}, got "
-                f"{self._positions.shape}; give one body a file, metres, and NaN for what is missing"
+                f"{path}: positions: expected shape (T, {joints}, 3), or (T, bodies, {joints}, 3), for "
+                f"{self._skeleton}, got {positions.shape}; in metres, NaN for what is missing"
             )
-        frames = len(self._positions)
+        frames = len(positions)
         if not frames:
             raise NpzError(f"{path}: positions: expected at least one frame, got none")
         self.stamps_ns = _stamps(path, arrays, frames)
         """(T,) int64"""
-        self._confidence = np.asarray(np.isfinite(self._positions).all(axis=-1), np.float32)
+        confidence = np.asarray(np.isfinite(positions).all(axis=-1), np.float32)
         if "confidence" in arrays:
-            self._confidence = _numbers(path, arrays, "confidence")
-            if self._confidence.shape != (frames, joints):
-                raise NpzError(f"{path}: confidence: expected {(frames, joints)}, got {self._confidence.shape}")
+            confidence = _numbers(path, arrays, "confidence")
+            if confidence.shape != positions.shape[:-1]:
+                raise NpzError(f"{path}: confidence: expected {positions.shape[:-1]}, got {confidence.shape}")
+        self._positions = positions.reshape(frames, -1, joints, 3)
+        self._confidence = confidence.reshape(frames, -1, joints)
+        self._ids = _ids(path, arrays, self._positions.shape[1])
         try:
             self._sensor_pose = Pose.from_up(_text(path, arrays, "up") if "up" in arrays else "z")
         except ValueError as error:
@@ -71,7 +76,13 @@ class ArraySource:
         return len(self._positions)
 
     def __iter__(self) -> Iterator[tuple[str, Message]]:
+        alone = len(self._ids) == 1
         for stamp_ns, positions, confidence in zip(self.stamps_ns, self._positions, self._confidence, strict=True):
+            bodies = [
+                RawBody(id=id, positions=joints, confidence=sure)
+                for id, joints, sure in zip(self._ids, positions, confidence, strict=True)
+                if alone or not np.isnan(joints).all()
+            ]
             yield (
                 POSE_RAW,
                 PoseRaw(
@@ -81,7 +92,7 @@ class ArraySource:
                     skeleton=self._skeleton,
                     sensor_pose=self._sensor_pose,
                     calibrated=False,
-                    bodies=[RawBody(id=0, positions=positions, confidence=confidence)],
+                    bodies=bodies,
                 ),
             )
 
@@ -128,6 +139,19 @@ def _text(path: Path, arrays: Mapping[str, NDArray[Any]], name: str) -> str:
     if array.dtype.kind != "U" or array.size != 1:
         raise NpzError(f"{path}: {name}: expected one text, got {array.dtype} of shape {array.shape}")
     return str(array.item())
+
+
+def _ids(path: Path, arrays: Mapping[str, NDArray[Any]], bodies: int) -> list[int]:
+    if "body_id" not in arrays:
+        return list(range(bodies))
+    ids = arrays["body_id"]
+    fit = ids.dtype.kind in "iu" and ids.shape == (bodies,) and len(set(ids.tolist())) == bodies
+    if not fit or np.abs(ids.astype(np.float64)).max(initial=0) >= 2**31:
+        raise NpzError(
+            f"{path}: body_id: expected {bodies} different integers of 32 bits, one for each body of positions; got "
+            f"{ids.dtype} of shape {ids.shape}"
+        )
+    return ids.tolist()
 
 
 def _stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:

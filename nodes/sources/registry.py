@@ -18,7 +18,7 @@ from steadypose.nodes.sources.oak import OakSettings, OakSource
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source
 from steadypose.nodes.sources.source import LiveSource, RecordedSource, SourceContext
-from steadypose.nodes.sources.webcam import WebcamSettings, WebcamSource
+from steadypose.nodes.sources.webcam import WebcamSettings, open_webcam
 
 _SOURCE = "source"
 
@@ -55,7 +55,7 @@ class InputSettings:
     recording: str = path_setting(_declare(lambda path, _: open_recording(path)))
     """rosbag2 directory, .mcap, .npz or .csv to play; a relative path starts at the launch file"""
     oak: OakSettings = field(default_factory=OakSettings, metadata=_declare(OakSource, extra="oak"))
-    webcam: WebcamSettings = field(default_factory=WebcamSettings, metadata=_declare(WebcamSource, extra="webcam"))
+    webcam: WebcamSettings = field(default_factory=WebcamSettings, metadata=_declare(open_webcam, extra="webcam"))
     ros2: Ros2Settings = field(default_factory=Ros2Settings, metadata=_declare(Ros2Source, extra="ros2"))
     merge: MergeSettings = field(default_factory=MergeSettings, metadata=_declare(MergeSource))
 

@@ -11,12 +11,16 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.settings import LaunchError, path_setting
 from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import CameraSource, Connection
 from steadypose.nodes.sources.source import SourceContext
+
+if TYPE_CHECKING:
+    from steadypose.nodes.sources.webcam_video import VideoSource
 
 MODEL = (
     "https://storage.googleapis.com/mediapipe-models/pose_landmarker/pose_landmarker_full/float16/latest/"
@@ -30,6 +34,8 @@ class WebcamSettings:
 
     camera: int = 0
     """its number: 0 is /dev/video0"""
+    video: str = path_setting()
+    """a film to look at in its place; a relative path starts at the launch file"""
     model: str = path_setting()
     """MediaPipe's pose landmarker, a .task file; a relative path starts at the launch file"""
     bodies: int = 1
@@ -38,29 +44,38 @@ class WebcamSettings:
     """radians, of the image's width, where the lens is not calibrated: scales how far away bodies seem"""
 
 
+def open_webcam(settings: WebcamSettings, context: SourceContext) -> WebcamSource | VideoSource:
+    """The camera, or the film in its place.
+
+    Raises:
+        LaunchError: the model is missing, or a setting cannot be used.
+    """
+    if settings.bodies < 1 or settings.camera < 0 or not 0 < settings.field_of_view < math.pi:
+        raise LaunchError(
+            "[input.webcam] expected camera of 0 or more, bodies of 1 or more and field_of_view in radians, "
+            f"0 to pi; got {settings.camera}, {settings.bodies} and {settings.field_of_view:g}"
+        )
+    if not Path(settings.model).is_file():
+        raise LaunchError(
+            f"[input.webcam] model: expected MediaPipe's pose landmarker, a .task file, got {settings.model!r}; "
+            f"download one, such as {MODEL}"
+        )
+    if not settings.video:
+        return WebcamSource(settings, context)
+    from steadypose.nodes.sources.webcam_video import VideoSource  # brings OpenCV
+
+    return VideoSource(settings, context.calibration)
+
+
 Connect = Callable[[WebcamSettings, CalibrationSettings, Clock], AbstractContextManager[Connection]]
 """opens the camera; raises RuntimeError if it cannot be opened now"""
 
 
 class WebcamSource(CameraSource):
-    """The skeletons that MediaPipe sees in a webcam's pictures.
-
-    Raises:
-        LaunchError: the model is missing, or a setting cannot be used.
-    """
+    """The skeletons that MediaPipe sees in a webcam's pictures."""
 
     def __init__(self, settings: WebcamSettings, context: SourceContext, connect: Connect | None = None) -> None:
         super().__init__(context)
-        if settings.bodies < 1 or settings.camera < 0 or not 0 < settings.field_of_view < math.pi:
-            raise LaunchError(
-                "[input.webcam] expected camera of 0 or more, bodies of 1 or more and field_of_view in radians, "
-                f"0 to pi; got {settings.camera}, {settings.bodies} and {settings.field_of_view:g}"
-            )
-        if not Path(settings.model).is_file():
-            raise LaunchError(
-                f"[input.webcam] model: expected MediaPipe's pose landmarker, a .task file, got {settings.model!r}; "
-                f"download one, such as {MODEL}"
-            )
         self._settings, self._calibration, self._connect = settings, context.calibration, connect
 
     def connect(self) -> AbstractContextManager[Connection]:

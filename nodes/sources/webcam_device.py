@@ -60,44 +60,60 @@ class Lens:
         return cv2.remap(image, *self._maps, cv2.INTER_LINEAR) if self._maps else image
 
 
+class PoseFinder:
+    """Bodies in the pictures of one camera, each picture later than the last.
+
+    Attributes:
+        counts: pictures that failed, by cause.
+    """
+
+    def __init__(
+        self, name: str, landmarker: Landmarker, settings: WebcamSettings, calibration: CalibrationSettings
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self._name, self._landmarker = name, landmarker
+        self._settings, self._calibration = settings, calibration
+        self._lens: Lens | None = None
+        self._started_ns: int | None = None
+        self._last_ms = -1
+
+    def find(self, image: NDArray[Any], stamp_ns: int) -> PoseRaw | None:
+        """The bodies in a picture (H, W, 3), BGR, taken at ``stamp_ns``; None, counted, if it fails."""
+        self._started_ns = stamp_ns if self._started_ns is None else self._started_ns
+        # the landmarker wants them to rise
+        self._last_ms = max((stamp_ns - self._started_ns) // 1_000_000, self._last_ms + 1)
+        size = (image.shape[1], image.shape[0])
+        if self._lens is None or self._lens.size != size:
+            self._lens = Lens(size, self._settings.field_of_view, self._calibration)
+        try:
+            picture = cv2.cvtColor(self._lens.undistort(image), cv2.COLOR_BGR2RGB)
+            result = self._landmarker(picture, self._last_ms)
+            return from_mediapipe(result, stamp_ns, size, self._lens.intrinsics, self._name)
+        except (cv2.error, ValueError) as error:  # a picture of another kind, a result that is none
+            count_failure(self.counts, self._name, error)
+            return None
+
+
 class Webcam:
     """A webcam that is open, and the landmarker that looks at its pictures."""
 
-    def __init__(
-        self,
-        capture: cv2.VideoCapture,
-        landmarker: Landmarker,
-        settings: WebcamSettings,
-        calibration: CalibrationSettings,
-        clock: Clock,
-    ) -> None:
-        self.name = f"webcam-{settings.camera}"
-        self.counts: Counter[str] = Counter()
-        self._capture, self._landmarker, self._clock = capture, landmarker, clock
-        self._settings, self._calibration = settings, calibration
+    def __init__(self, capture: cv2.VideoCapture, finder: PoseFinder, name: str, clock: Clock) -> None:
+        self.name = name
+        self._capture, self._finder, self._clock = capture, finder, clock
+
+    @property
+    def counts(self) -> Counter[str]:
+        return self._finder.counts
 
     def frames(self) -> Iterator[PoseRaw | None]:
-        started_ns = last_ms = lens = None
         while self._capture.grab():
             stamp_ns = self._clock.now_ns()  # of arrival: the system has no stamp of capture
-            started_ns = stamp_ns if started_ns is None else started_ns
             good, image = self._capture.retrieve()
-            if not good:
+            if good:
+                yield self._finder.find(image, stamp_ns)
+            else:
                 self.counts["picture that cannot be decoded"] += 1
                 yield None
-                continue
-            now_ms = (stamp_ns - started_ns) // 1_000_000
-            last_ms = now_ms if last_ms is None else max(now_ms, last_ms + 1)  # the landmarker wants them to rise
-            size = (image.shape[1], image.shape[0])
-            if lens is None or lens.size != size:
-                lens = Lens(size, self._settings.field_of_view, self._calibration)
-            frame = None
-            try:
-                result = self._landmarker(cv2.cvtColor(lens.undistort(image), cv2.COLOR_BGR2RGB), last_ms)
-                frame = from_mediapipe(result, stamp_ns, size, lens.intrinsics, self.name)
-            except (cv2.error, ValueError) as error:  # a picture of another kind, a result that is none
-                count_failure(self.counts, self.name, error)
-            yield frame
 
     def status(self) -> dict[str, str]:
         return {}
@@ -150,6 +166,7 @@ def connect(
             raise CameraError(f"camera {settings.camera} cannot be opened; `ls /dev/video*` lists them")
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest picture, not the oldest that waits
         with make_landmarker(settings) as landmarker:
-            yield Webcam(capture, landmarker, settings, calibration, clock)
+            name = f"webcam-{settings.camera}"
+            yield Webcam(capture, PoseFinder(name, landmarker, settings, calibration), name, clock)
     finally:
         capture.release()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -217,11 +218,36 @@ OPENPOSE25 = Skeleton(
     },
 )  # fmt: skip
 
-SKELETONS: Mapping[str, Skeleton] = {
+# The Kinect v2 as its SDK numbers it (JointType). What KINECT22 calls Spine, Chest, Head and HeadTip are its SpineMid,
+# SpineShoulder, Neck and Head.
+KINECT25 = Skeleton(
+    "kinect25",
+    (
+        "SpineBase", "SpineMid", "Neck", "Head", "ShoulderLeft", "ElbowLeft", "WristLeft", "HandLeft",
+        "ShoulderRight", "ElbowRight", "WristRight", "HandRight", "HipLeft", "KneeLeft", "AnkleLeft", "FootLeft",
+        "HipRight", "KneeRight", "AnkleRight", "FootRight", "SpineShoulder", "HandTipLeft", "ThumbLeft",
+        "HandTipRight", "ThumbRight",
+    ),
+    {
+        "pelvis": "SpineBase",
+        "spine3": "SpineMid",
+        "neck": "SpineShoulder",
+        "head": _mean("Neck", "Head"),
+        **_sides({f"left_{j}": f"{j.capitalize()}Left" for j in (*_ARMS_AND_LEGS, "foot")}, ("Left", "Right")),
+    },
+)  # fmt: skip
+
+_SKELETONS: dict[str, Skeleton] = {
     s.name: s
-    for s in (CANONICAL, COCO17, BLAZEPOSE33, H36M17, KINECT22, AZURE_KINECT32, ZED38, OPENPOSE25)
+    for s in (CANONICAL, COCO17, BLAZEPOSE33, H36M17, KINECT22, KINECT25, AZURE_KINECT32, ZED38, OPENPOSE25)
 }  # fmt: skip
-"""Every skeleton that ``pose/raw`` may name."""
+SKELETONS: Mapping[str, Skeleton] = MappingProxyType(_SKELETONS)
+"""Every skeleton that ``pose/raw`` may name: these, and those of the user's own (`own_layouts`)."""
+
+
+def add_skeleton(skeleton: Skeleton) -> None:
+    """Make a skeleton known by its name, to all of this process."""
+    _SKELETONS[skeleton.name] = skeleton
 
 
 def get_skeleton(name: str) -> Skeleton:

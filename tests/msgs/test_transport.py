@@ -315,8 +315,14 @@ def test_an_address_is_not_taken_from_another_publisher(endpoint: str):
 
 
 def test_an_address_that_cannot_be_made_is_refused(tmp_path: Path):
-    with pytest.raises(TransportError, match=r"cannot publish at .*No such file or directory"):
-        Publisher(f"ipc://{tmp_path}/missing/socket")
+    (tmp_path / "file").touch()
+    with pytest.raises(TransportError, match=r"cannot make .*file"):
+        Publisher(f"ipc://{tmp_path}/file/socket")
+
+
+def test_a_publisher_that_is_first_makes_the_folder(tmp_path: Path):
+    with Publisher(f"ipc://{tmp_path}/new/folder/socket"):
+        assert (tmp_path / "new" / "folder").stat().st_mode & 0o777 == 0o700
 
 
 def test_topics_are_checked(tmp_path: Path):

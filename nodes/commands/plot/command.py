@@ -55,6 +55,7 @@ def plot(
         raise PlotError(f"output: expected a name ending in .png, .svg or .pdf, got {output}")
     if not output.resolve().parent.is_dir():
         raise PlotError(f"output: {output.resolve().parent} is no directory; make it first")
+    _refuse_others(recording)
     history = read_history(recording)
     chosen = history.longest() if body is None else body
     if chosen is None:
@@ -90,3 +91,17 @@ def plot(
     draw_summary(figure.add_subplot(beside[2]), history, chosen, errors)
     figure.savefig(output, dpi=110)
     print(f"wrote {output}")
+
+
+def _refuse_others(path: Path) -> None:
+    """Raises:
+    PlotError: the path is not one recording, with what to draw instead.
+    """
+    if path.suffix in (".npz", ".csv"):
+        raise PlotError(
+            f"{path}: expected a recording, got {path.suffix}, which is arrays; clean it into one: "
+            f"steadypose clean {path} {path.stem}, then plot {path.stem}"
+        )
+    if path.is_dir() and not any(path.glob("*.mcap")) and (inside := sorted({f.parent for f in path.glob("*/*.mcap")})):
+        names = ", ".join(str(found) for found in inside[:4])
+        raise PlotError(f"{path}: expected one recording, got a folder of {len(inside)}; name one, such as {names}")

@@ -49,6 +49,7 @@ def test_npz_to_npz(tmp_path: Path, options: tuple[str, ...]) -> None:
         "state": (FRAMES, 22),
         "sigma": (FRAMES, 22),
         "anomaly": (FRAMES,),
+        "joint_anomaly": (FRAMES, 22),
         "anomaly_flag": (FRAMES,),
         "contacts": (FRAMES, 8),
         "root_velocity": (FRAMES, 3),

@@ -74,7 +74,7 @@ def test_what_cannot_be_done_is_said_in_a_line(capsys, arguments: list[str], exp
 def test_a_bad_npz_is_said_in_a_line(capsys, tmp_path: Path) -> None:
     np.savez(tmp_path / "in.npz", positions=np.zeros((3, 22)), skeleton="smpl22", fps=30)
     assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == USAGE_ERROR
-    assert "expected shape (T, 22, 3) for smpl22, got (3, 22)" in capsys.readouterr().err
+    assert "for smpl22, got (3, 22)" in capsys.readouterr().err
 
 
 def test_a_bug_keeps_its_traceback(monkeypatch) -> None:

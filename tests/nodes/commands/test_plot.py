@@ -144,3 +144,13 @@ def test_what_cannot_be_drawn_says_why(tmp_path: Path, output: str, options: dic
 def test_a_recording_without_bodies_says_so(tmp_path: Path) -> None:
     with pytest.raises(PlotError, match="found none"):
         plot(record(tmp_path / "bag", {POSE_RAW}, 0.2, bodies=0), tmp_path / "picture.png")
+
+
+def test_what_is_not_one_recording_says_what_to_draw(tmp_path: Path) -> None:
+    with pytest.raises(PlotError, match=r"steadypose clean x\.npz x, then plot x"):
+        plot(Path("x.npz"), tmp_path / "x.png")
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "x.mcap").touch()
+    with pytest.raises(PlotError, match=r"a folder of 2; name one, such as .*a, .*b"):
+        plot(tmp_path, tmp_path / "x.png")

@@ -203,7 +203,10 @@ GOOD = {"positions": np.zeros((5, 22, 3)), "skeleton": np.array("smpl22"), "fps"
         ({"skeleton": None}, "expected an array 'skeleton'"),
         ({"skeleton": np.array("smpl23")}, "expected one of smpl22"),
         ({"skeleton": np.array(3)}, "expected one text"),
-        ({"positions": np.zeros((5, 17, 3))}, r"expected shape \(T, 22, 3\) for smpl22, got \(5, 17, 3\)"),
+        (
+            {"positions": np.zeros((5, 17, 3))},
+            r"expected shape \(T, 22, 3\), or \(T, bodies, 22, 3\), for smpl22, got \(5, 17, 3\)",
+        ),
         ({"positions": np.zeros((5, 22))}, "expected shape"),
         ({"positions": np.zeros((0, 22, 3))}, "at least one frame"),
         ({"positions": np.full((5, 22, 3), "x")}, "expected numbers"),

@@ -18,13 +18,14 @@ from steadypose.nodes.graph import extras
 from steadypose.nodes.graph.clock import Clock, SystemClock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sources import webcam_device
+from steadypose.nodes.sources import webcam, webcam_device
 from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import PAUSES_S
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import SourceContext
 from steadypose.nodes.sources.webcam import WebcamSettings, WebcamSource
 from steadypose.nodes.sources.webcam_device import Lens
+from steadypose.nodes.sources.webcam_video import VideoSource
 
 SIZE = (320, 240)
 NOT_CALIBRATED = CalibrationSettings()
@@ -40,7 +41,10 @@ def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         writer.write(np.full((SIZE[1], SIZE[0], 3), (40 * index, 0, 0), np.uint8))
     writer.release()
     opened, film = cv2.VideoCapture, str(path)
-    monkeypatch.setattr(webcam_device.cv2, "VideoCapture", lambda number: opened(film) if number == 3 else opened())
+    cameras = {3: film, film: film}
+    monkeypatch.setattr(
+        webcam_device.cv2, "VideoCapture", lambda name: opened(cameras[name]) if name in cameras else opened()
+    )
     return path
 
 
@@ -116,6 +120,27 @@ def test_a_picture_that_fails_is_counted_and_the_next_one_comes(video: Path, mod
     assert not source.refused
 
 
+def test_a_film_gives_every_picture_at_its_own_time(video: Path, model: str) -> None:
+    seen = Seen()
+    source = VideoSource(WebcamSettings(video=str(video), model=model), NOT_CALIBRATED, seen.landmarker)
+    assert len(source) == FRAMES
+    for _ in range(2):
+        frames = [message for _, message in source if isinstance(message, PoseRaw)]
+        steps = np.diff([frame.stamp_ns for frame in frames])
+        np.testing.assert_allclose(steps, 1e9 / 30, rtol=0.02)
+        assert {frame.source for frame in frames} == {"film"}
+    colours = [int(colour[2]) for colour, _ in seen.pictures[:FRAMES]]
+    assert colours == sorted(set(colours)), "each picture, and each once"
+    assert not source.refused
+
+
+def test_a_film_that_cannot_be_read_says_so(model: str, tmp_path: Path) -> None:
+    (tmp_path / "x.mp4").write_bytes(b"no film")
+    settings = InputSettings(source="webcam", webcam=WebcamSettings(video=str(tmp_path / "x.mp4"), model=model))
+    with pytest.raises(LaunchError, match="expected a film that OpenCV can read"):
+        webcam.open_webcam(settings.webcam, SourceContext(SystemClock(), NOT_CALIBRATED))
+
+
 def test_a_lens_that_is_calibrated_is_used_for_pictures_of_any_size() -> None:
     told = CalibrationSettings([640, 480], [500.0, 510.0], [330.0, 235.0], [-0.3, 0.1, 0.0, 0.0, 0.0])
     guessed, lens, half = (
@@ -162,7 +187,7 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
 )
 def test_settings_that_cannot_be_used_say_so(settings: WebcamSettings, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
-        open_webcam(settings, SystemClock(), Seen())
+        webcam.open_webcam(settings, SourceContext(SystemClock(), NOT_CALIBRATED))
 
 
 def test_without_mediapipe_it_says_what_to_install(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
