@@ -8,9 +8,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import CleanBody, Pose, PoseClean, PoseRaw, RawBody
+from steadypose.prior.body.kinematics import quaternions, rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.clean.frame import CleanFrame, Floats
@@ -72,7 +72,7 @@ class SensorFrame(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _rotation(quaternion: bytes) -> Floats:
-    return Rotation.from_quat(np.frombuffer(quaternion)).as_matrix()
+    return rotation_matrix(np.frombuffer(quaternion))
 
 
 def layout_of(raw: PoseRaw, counters: Counter[str]) -> Skeleton | None:
@@ -140,7 +140,7 @@ def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int])
             CleanBody(
                 id=body_id,
                 positions=sensor.from_world(estimate.positions[slot]),
-                rotations=Rotation.from_matrix(rotations, assume_valid=True).as_quat(),
+                rotations=quaternions(rotations),
                 state=estimate.state[slot],
                 sigma=estimate.sigma[slot],
                 anomaly=float(score.anomaly[slot]),

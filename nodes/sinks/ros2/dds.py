@@ -22,9 +22,9 @@ from cyclonedds.idl.types import float64, int32, sequence, uint32
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
-from scipy.spatial.transform import Rotation
 
 from steadypose.nodes.sinks.ros2.rep155 import Links
+from steadypose.prior.body.kinematics import quaternions
 
 QOS = Qos(Policy.Reliability.Reliable(duration(milliseconds=100)), Policy.History.KeepLast(100))
 """as tf2's own broadcaster"""
@@ -134,14 +134,13 @@ def body_transforms(stamp_ns: int, world: str, name: str, links: Links) -> list[
     others = np.array([link != "body" for link in links])
     origins[others] = (origins[others] - root) @ heading
     turns[others] = heading.T @ turns[others]
-    quaternions = Rotation.from_matrix(turns, assume_valid=True).as_quat().tolist()
     return [
         TransformStamped(
             Header(_time(stamp_ns), world if link == "body" else f"body_{name}"),
             f"{link}_{name}",
             Transform(Vector3(*origin), Quaternion(*quaternion)),
         )
-        for link, origin, quaternion in zip(links, origins.tolist(), quaternions, strict=True)
+        for link, origin, quaternion in zip(links, origins.tolist(), quaternions(turns).tolist(), strict=True)
     ]
 
 

@@ -17,7 +17,6 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.time import Time
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState as JointAngles
 from std_msgs.msg import ColorRGBA, Header, String
 from visualization_msgs.msg import Marker, MarkerArray
@@ -25,6 +24,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from steadypose.msgs.types import Diagnostics, JointState, PoseWorld, Tracking, WorldBody
 from steadypose.nodes.sinks.ros2.dds import DdsOutput, body_transforms
 from steadypose.nodes.sinks.ros2.rep155 import Links, body_name, frames, joint_angles, joint_rotations, measures, urdf
+from steadypose.prior.body.kinematics import quaternions
 from steadypose.prior.body.skeleton import PARENTS, J
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ def _is_finite(body: WorldBody) -> bool:
 
 def _joint_poses(body: WorldBody) -> list[Pose]:
     """The 22 canonical joints in the world."""
-    turns = Rotation.from_matrix(joint_rotations(body), assume_valid=True).as_quat().tolist()
+    turns = quaternions(joint_rotations(body)).tolist()
     return [
         Pose(position=point, orientation=Quaternion(x=x, y=y, z=z, w=w))
         for point, (x, y, z, w) in zip(_points(body), turns, strict=True)

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import fk
@@ -7,6 +8,8 @@ from steadypose.prior.body.kinematics import (
     CONTACT_JOINTS,
     forward_kinematics,
     label_contacts,
+    quaternions,
+    rotation_matrix,
 )
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.models.layers import torch_kinematics
@@ -60,3 +63,13 @@ def test_contacts_do_not_depend_on_the_frame_rate() -> None:
         assert not contacts[time > 1.1, heel].any()
     assert not label_contacts(positions + [0, 0, 0.2], fps).any()
     assert label_contacts(positions[:1], fps).shape == (1, 8)
+
+
+def test_quaternions_are_scipys() -> None:
+    turns = Rotation.random(200, rng=np.random.default_rng(0))
+    matrices = turns.as_matrix().reshape(10, 20, 3, 3)
+    half_turns = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()
+    assert np.abs((quaternions(matrices).reshape(-1, 4) * turns.as_quat()).sum(axis=-1)) == pytest.approx(1.0)
+    assert np.array_equal(np.abs(quaternions(half_turns)).round(9), np.eye(3, 4))
+    for matrix, quaternion in zip(turns.as_matrix(), turns.as_quat(), strict=True):
+        assert rotation_matrix(3.0 * quaternion) == pytest.approx(matrix)
