@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
+from steadypose.prior.body.skeleton import MIRROR, PARENTS, limbs
 
 Floats = NDArray[np.float64]
 Fault = Callable[[Floats, np.random.Generator], tuple[Floats, NDArray[np.bool_]]]
@@ -20,9 +20,8 @@ BEGINS = 20
 LEAST_MOTION = 0.10
 """Metres: a joint that would have moved less is not told from one that is frozen, by anybody."""
 
-_ARMS = [J["left_elbow"], J["left_wrist"]]
-_LEGS = [J["left_knee"], J["left_ankle"], J["left_foot"]]
-_MOVERS = np.array([J[f"{side}_{n}"] for side in ("left", "right") for n in ("elbow", "wrist", "knee", "ankle")])
+_ARM, _LEG, *_ = limbs(("elbow", "wrist"), ("knee", "ankle", "foot"))
+_MOVERS = np.concatenate(limbs(("elbow", "wrist", "knee", "ankle")))
 
 
 def _all(windows: Floats) -> NDArray[np.bool_]:
@@ -74,7 +73,7 @@ def other_persons_limb(windows: Floats, rng: np.random.Generator) -> tuple[Float
     out = windows.copy()
     other = windows[rng.permutation(len(windows))]
     beside = windows[:, BEGINS:, :1] - other[:, BEGINS:, :1] + rng.normal(0.0, 0.3, (len(windows), 1, 1, 3))
-    out[:, BEGINS:, _ARMS] = other[:, BEGINS:, _ARMS] + beside
+    out[:, BEGINS:, _ARM] = other[:, BEGINS:, _ARM] + beside
     return out, _all(windows)
 
 
@@ -98,8 +97,8 @@ def reversed_in_time(windows: Floats, rng: np.random.Generator) -> tuple[Floats,
 
 FAULTS: Mapping[str, Fault] = {
     **{f"noise of {s} cm": partial(noise, sigma=s / 100) for s in (1, 2, 4, 8)},
-    "arms exchanged": partial(exchanged, limb=_ARMS),
-    "legs exchanged": partial(exchanged, limb=_LEGS),
+    "arms exchanged": partial(exchanged, limb=_ARM),
+    "legs exchanged": partial(exchanged, limb=_LEG),
     HELD: frozen,  # the protocol repeats what was seen, its noise and all
     "a joint at rest that should move": frozen,
     "left taken for right": relabelled,

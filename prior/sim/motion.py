@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, yaw_matrix
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, heading, yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.sim.body import TOE_HEIGHT
 from steadypose.prior.sim.gait import RATE, FootTrack, Plan, foot_track
@@ -341,8 +341,7 @@ def _smooth_ramp(u: Floats) -> Floats:
 
 def _upright(orientation: Floats) -> Floats:
     """Only the heading of orientations (T, 3, 3): arms hang by gravity, however the chest leans."""
-    left = orientation[:, :, 1]
-    return yaw_matrix(np.arctan2(-left[:, 0], left[:, 1]))
+    return yaw_matrix(heading(orientation))
 
 
 def _hanging(forward: Floats, sign: float, lengths: Floats) -> Floats:

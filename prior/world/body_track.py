@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import CleanBody, JointState, Tracking, WorldBody
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
-from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import HIPS, REST_POSITIONS, J, limbs
 from steadypose.prior.models.root_velocity.config import FRAME_S
 from steadypose.prior.world.ground import Ground
 from steadypose.prior.world.root_filter import RootFilter, RootNoise
@@ -73,18 +73,8 @@ _LEAST_NORM = 1e-6
 """Of a quaternion that is to mean a rotation."""
 
 _FOOT_CONTACTS = [CONTACT_JOINTS.index(joint) for joint in FEET]
-_PELVIS = [J[name] for name in ("pelvis", "left_hip", "right_hip")]
-_LEGS = [J[f"{side}_{part}"] for part in ("knee", "ankle", "foot") for side in ("left", "right")]
-
-
-def _rest_pose() -> Floats:
-    pose = np.zeros_like(REST_OFFSETS)
-    for joint, parent in enumerate(PARENTS[1:], start=1):
-        pose[joint] = pose[parent] + REST_OFFSETS[joint]
-    return pose
-
-
-_REST_POSE = _rest_pose()
+_PELVIS = [J["pelvis"], *HIPS]
+_LEGS = [joint for leg in limbs(("knee", "ankle", "foot")) for joint in leg]
 
 
 @dataclass(frozen=True)
@@ -184,7 +174,7 @@ class BodyTrack:
         assert sighting.root is not None
         self.stamp_ns = stamp_ns
         self._orientation = np.array([0.0, 0.0, 0.0, 1.0]) if sighting.orientation is None else sighting.orientation
-        self._window = np.repeat((_REST_POSE @ yaw_matrix(self.yaw).T)[None], context, axis=0)
+        self._window = np.repeat((REST_POSITIONS @ yaw_matrix(self.yaw).T)[None], context, axis=0)
         self._window[:] = self._local(sighting)
         self._window_ns = stamp_ns
         self._noise = noise

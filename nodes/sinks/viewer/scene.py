@@ -36,7 +36,7 @@ from steadypose.nodes.sinks.viewer.layout import (
     name_series,
 )
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
-from steadypose.prior.body.skeleton import J
+from steadypose.prior.body.skeleton import HIPS, SHOULDERS, J
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -53,7 +53,7 @@ BELOW_TRUNK = 0.25
 BACK_JUMP_NS = 1_000_000_000
 """a stamp so far behind the last one is a stream that starts again"""
 
-_TRUNK = [J[name] for name in ("pelvis", "left_hip", "right_hip", "left_shoulder", "right_shoulder")]
+_TRUNK = [J["pelvis"], *HIPS, *SHOULDERS]
 
 
 class PoseView:

@@ -210,7 +210,7 @@ def _bridge(track, above):
 
 @njit(cache=True)
 def _heading(positions):
-    """Of the mean of all vectors from right to left, over hips and shoulders."""
+    """`prior.body.kinematics.heading` of the mean of all vectors from right to left, over hips and shoulders."""
     a = b = 0.0
     for t in range(len(positions)):
         for k in range(len(_SIDES)):

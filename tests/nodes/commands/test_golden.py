@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,4 +54,5 @@ def test_a_stream_comes_out_as_it_did(name: str) -> None:
 
 
 if __name__ == "__main__":
-    np.savez_compressed(GOLDEN, **{part: array for name in NAMES for part, array in outcome(name).items()})
+    arrays: dict[str, Any] = {part: array for name in NAMES for part, array in outcome(name).items()}
+    np.savez_compressed(GOLDEN, **arrays)
