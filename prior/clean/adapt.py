@@ -9,16 +9,23 @@ from typing import NamedTuple
 
 import numpy as np
 
+from steadypose.msgs.contract import broken
 from steadypose.msgs.types import CleanBody, Pose, PoseClean, PoseRaw, RawBody
 from steadypose.prior.body.kinematics import quaternions, rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
-from steadypose.prior.body.skeleton import finite_joints
+from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, finite_joints
 from steadypose.prior.clean.frame import CleanFrame, Floats
 
 MAX_DISTANCE = 30.0
 """Metres from the sensor beyond which a joint is no sighting."""
+MAX_PLACE = 10_000.0
+"""Metres from the world's origin beyond which no sensor stands: joints lose their millimetres."""
+LARGEST, LEAST_BONES = 2.5, 4
+"""Of a body of which so many bones are seen, and in the middle are so many times the mean person's: nobody is."""
 UNIT_TOLERANCE = 0.01
 """How far from 1 the norm of a sensor pose's quaternion may be."""
+
+_REST_LENGTHS = np.linalg.norm(REST_OFFSETS[1:], axis=1)
 
 
 class Sighting(NamedTuple):
@@ -82,7 +89,8 @@ def layout_of(raw: PoseRaw, counters: Counter[str]) -> Skeleton | None:
         counters["unknown_skeleton"] += 1
         return None
     pose = raw.sensor_pose
-    if not (np.isfinite(pose.position).all() and abs(np.linalg.norm(pose.orientation) - 1) < UNIT_TOLERANCE):
+    near = bool((np.abs(pose.position) < MAX_PLACE).all())
+    if not (near and abs(np.linalg.norm(pose.orientation) - 1) < UNIT_TOLERANCE):
         counters["sensor_pose_invalid"] += 1
         return None
     return layout
@@ -111,6 +119,9 @@ def sightings(
             counters["body_id_repeated"] += 1
             continue
         positions, confidence = _sighting(body, layout, counters)
+        if _is_too_large(positions):
+            counters["body_too_large"] += 1
+            continue
         found[key] = Sighting(sensor.to_world(positions), confidence)
     return found
 
@@ -127,30 +138,40 @@ def _sighting(body: RawBody, layout: Skeleton, counters: Counter[str]) -> tuple[
     return to_canonical(layout, joints, np.clip(confidence, 0.0, 1.0))
 
 
-def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int]) -> list[CleanBody]:
-    """The bodies of a moment, as that sensor sees them; ``ids`` from slots to what they are called."""
+def _is_too_large(positions: Floats) -> bool:
+    """Whether joints (22, 3) are nobody's: one such frame would be learned from for seconds."""
+    lengths = np.linalg.norm(positions[1:] - positions[PARENT[1:]], axis=1)
+    seen = np.isfinite(lengths)
+    return bool(seen.sum() >= LEAST_BONES and np.median(lengths[seen] / _REST_LENGTHS[seen]) > LARGEST)
+
+
+def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int]) -> dict[int, CleanBody]:
+    """The bodies of a moment, by slot, as that sensor sees them; ``ids`` from slots to what they are called.
+
+    One that breaks what `msgs.contract` promises is not among them.
+    """
     estimate, score = frame.estimate, frame.score
-    bodies = []
+    bodies: dict[int, CleanBody] = {}
     for slot, body_id in ids.items():
         if not np.isfinite(estimate.positions[slot, 0, 0]):
             continue
         rotations = estimate.rotations[slot].copy()
         rotations[0] = sensor.rotation.T @ rotations[0]
-        bodies.append(
-            CleanBody(
-                id=body_id,
-                positions=sensor.from_world(estimate.positions[slot]),
-                rotations=quaternions(rotations),
-                state=estimate.state[slot],
-                sigma=estimate.sigma[slot],
-                anomaly=float(score.anomaly[slot]),
-                anomaly_flag=bool(score.flag[slot]),
-                joint_anomaly=score.joint_anomaly[slot],
-                bone_lengths=np.sqrt((estimate.offsets[slot] ** 2).sum(axis=-1)),
-                raw_positions=sensor.from_world(frame.observed[slot]),
-                raw_confidence=frame.confidence[slot],
-            )
+        body = CleanBody(
+            id=body_id,
+            positions=sensor.from_world(estimate.positions[slot]),
+            rotations=quaternions(rotations),
+            state=estimate.state[slot],
+            sigma=estimate.sigma[slot],
+            anomaly=float(score.anomaly[slot]),
+            anomaly_flag=bool(score.flag[slot]),
+            joint_anomaly=score.joint_anomaly[slot],
+            bone_lengths=np.sqrt((estimate.offsets[slot] ** 2).sum(axis=-1)),
+            raw_positions=sensor.from_world(frame.observed[slot]),
+            raw_confidence=frame.confidence[slot],
         )
+        if broken(body) is None:
+            bodies[slot] = body
     return bodies
 
 

@@ -12,6 +12,7 @@ that it follows clocks that drift.
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from dataclasses import dataclass
 
@@ -33,6 +34,7 @@ from steadypose.prior.clean.core import CleanCore
 from steadypose.prior.clean.frame import Bools, CleanFrame, Observation
 from steadypose.prior.clean.identify import Identify
 from steadypose.prior.clean.pipeline import BACKWARDS_NS
+from steadypose.prior.clean.sensor_pose import SensorPoseGate, Verdict
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.clean.slots import Slots
 from steadypose.prior.timing.resample import PERIOD_NS, Resampler
@@ -58,6 +60,7 @@ class _Stream:
         time_ns: of that message's capture.
         heard_ns: when it came.
         first_ns, newest_ns: the first and the newest grid time that it has given joints for; none yet if negative.
+        sensor_pose: where the sensor stands, as far as it is believed.
         late: how many of its frames in a row came too late.
     """
 
@@ -65,6 +68,7 @@ class _Stream:
     identify: Identify | None
     offset_ns: float
     last: PoseRaw
+    sensor_pose: SensorPoseGate
     time_ns: int = -1
     heard_ns: int = -1
     first_ns: int = -1
@@ -119,10 +123,12 @@ class StreamBatch:
         stream = self._streams.get(raw.source)
         if raw.end_of_stream:
             if stream:
-                stream.last, stream.heard_ns = raw, now_ns
+                # of the last message only the sensor's pose is used, and this one's was not looked at
+                stream.last = dataclasses.replace(raw, sensor_pose=stream.last.sensor_pose)
+                stream.heard_ns = now_ns
         else:
             layout = layout_of(raw, self.counters)
-            if layout is not None:
+            if layout is not None and self._is_believed(raw):
                 self._take(raw, layout, now_ns)
         cleaned += self._advance(now_ns, hurry)
         if self._streams and all(stream.last.end_of_stream for stream in self._streams.values()):
@@ -140,6 +146,19 @@ class StreamBatch:
         self._waiting.clear()
         self._done_ns = None
         return cleaned
+
+    def _is_believed(self, raw: PoseRaw) -> bool:
+        """Whether the sensor stands where it may; one that was put elsewhere begins anew."""
+        stream = self._streams.get(raw.source)
+        if stream is None or raw.stamp_ns <= stream.last.stamp_ns:
+            return True
+        verdict = stream.sensor_pose.judge(raw.sensor_pose, raw.stamp_ns)
+        if verdict is Verdict.DOUBTED:
+            self.counters["sensor_pose_jumped"] += 1
+        elif verdict is Verdict.MOVED:
+            self.counters["sensor_moved"] += 1
+            self._forget(raw.source)
+        return verdict is not Verdict.DOUBTED
 
     def _take(self, raw: PoseRaw, layout: Skeleton, now_ns: int) -> None:
         """Put a stream's message on the grid."""
@@ -162,6 +181,7 @@ class StreamBatch:
                 identify=Identify(identify, 2 * slots, self.counters) if identify.enabled else None,
                 offset_ns=now_ns - raw.stamp_ns,
                 last=raw,
+                sensor_pose=SensorPoseGate(),
                 heard_ns=now_ns,
             )
         stream.offset_ns = min(stream.offset_ns + DRIFT * (now_ns - stream.heard_ns), now_ns - raw.stamp_ns)
@@ -234,6 +254,7 @@ class StreamBatch:
         """The answer for all streams, as one message for each stream that was there."""
         stamp_ns = self._origin_ns + round(frame.estimate.stamp_s * 1e9)
         cleaned = []
+        answered: set[int] = set()
         for name, stream in list(self._streams.items()):
             # stamps were seconds on the way, and may be a nanosecond off the grid
             if not 0 <= stream.first_ns <= stamp_ns + 1000:
@@ -244,8 +265,10 @@ class StreamBatch:
                 continue
             ids = {slot: key[1] for slot, key in enumerate(self._slots.keys) if key is not None and key[0] == name}
             bodies = clean_bodies(frame, SensorFrame.of(stream.last.sensor_pose).levelled(), ids)
+            answered |= bodies.keys()
             own_ns = max(stamp_ns - round(stream.offset_ns), 0)
-            cleaned.append(clean_message(stream.last, own_ns, self.delay_frames, bodies))
+            cleaned.append(clean_message(stream.last, own_ns, self.delay_frames, list(bodies.values())))
+        self._core.note_answered(frame, answered)
         return cleaned
 
     def _forget(self, name: str) -> None:

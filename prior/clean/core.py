@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
+
+import numpy as np
 
 from steadypose.prior.clean.correct import Correct
 from steadypose.prior.clean.denoise import Denoise
@@ -21,6 +24,10 @@ from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.clean.slow_error import SlowError, SlowErrorEstimator
 from steadypose.prior.clean.smooth import Smooth
 from steadypose.prior.timing.fixed_lag import Smoothed
+from steadypose.prior.timing.rate import FPS
+
+SPOILED_S = 0.5
+"""Seconds that a body may be seen without an answer: then its state holds what is no number, and is given up."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +66,8 @@ class CleanCore:
     def __init__(self, settings: PriorSettings, counters: Counter[str]) -> None:
         slots, delay, noise = settings.max_bodies, settings.delay, settings.noise
         denoise, score, impute = settings.denoise.enabled, settings.score.enabled, settings.impute.enabled
-        self._slots, self._delay = slots, delay
+        self._slots, self._delay, self._counters = slots, delay, counters
+        self._silent = np.zeros(slots, dtype=np.int64)
         self._refine = Refine(settings.refine, delay, slots)
         self._gate = Gate(settings.gate, slots, counters)
         self._correct = Correct(settings.correct, slots) if settings.correct.sensor else None
@@ -119,6 +127,22 @@ class CleanCore:
                 step.forget(slot)
         if self._newest is not None:
             self._newest = dataclasses.replace(self._newest, present=self._newest.present & ~slot)
+
+    def note_answered(self, frame: CleanFrame, answered: Collection[int]) -> None:
+        """Begin anew with bodies that are seen and of which, for long, nothing could be said.
+
+        Args:
+            frame: as given.
+            answered: the slots of those of which it was fit to be published.
+        """
+        silent = np.isfinite(frame.observed).any(axis=(1, 2))
+        silent[list(answered)] = False
+        self._silent = np.where(silent, self._silent + 1, 0)
+        spoiled = self._silent > SPOILED_S * FPS
+        if spoiled.any():
+            self._counters["body_begun_anew"] += int(spoiled.sum())
+            self._silent[spoiled] = 0
+            self.forget(spoiled)
 
     def _denoised(self, smoothed: Smoothed, gated: Gated, back: int) -> Smoothed:
         """The smoother's estimate of the frame ``back`` before the newest, denoised, if that is wanted."""

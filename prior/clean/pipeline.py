@@ -23,6 +23,7 @@ from steadypose.prior.clean.adapt import (
 from steadypose.prior.clean.core import CleanCore
 from steadypose.prior.clean.frame import Bools, CleanFrame, Observation
 from steadypose.prior.clean.identify import Identify
+from steadypose.prior.clean.sensor_pose import SensorPoseGate, Verdict
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.clean.slots import Slots
 from steadypose.prior.timing.rate import FPS
@@ -49,6 +50,7 @@ class PriorPipeline:
         self._identify = Identify(settings.identify, 2 * slots, self.counters) if settings.identify.enabled else None
         self._slots: Slots[int] = Slots(slots, settings.timeout, self.counters)
         self._resampler = Resampler(slots)
+        self._sensor_pose = SensorPoseGate()
         self._last: PoseRaw | None = None
         self._origin_ns = 0  # stamps within are seconds since: a float of seconds since 1970 would round them
 
@@ -74,6 +76,14 @@ class PriorPipeline:
             if step <= 0 or step > self._timeout_ns:
                 self.counters["stamp_jumped_back" if step <= 0 else "stream_gap"] += 1
                 flushed = self.flush()
+        verdict = self._sensor_pose.judge(raw.sensor_pose, raw.stamp_ns)
+        if verdict is Verdict.DOUBTED:
+            self.counters["sensor_pose_jumped"] += 1
+            return flushed
+        if verdict is Verdict.MOVED:
+            self.counters["sensor_moved"] += 1
+            flushed += self.flush()
+            self._sensor_pose.judge(raw.sensor_pose, raw.stamp_ns)
         if self._last is None:
             self._origin_ns = raw.stamp_ns
         self._last = raw
@@ -87,6 +97,7 @@ class PriorPipeline:
         cleaned = [] if last is None else [self._message(frame, last) for frame in self._core.flush()]
         self._drop(np.ones_like(self._slots.present))
         self._resampler.reset()
+        self._sensor_pose.reset()
         self._last = None
         return cleaned
 
@@ -121,8 +132,9 @@ class PriorPipeline:
         """The answer, in the frame of the message that completed it."""
         ids = {slot: key for slot, key in enumerate(self._slots.keys) if key is not None}
         bodies = clean_bodies(frame, SensorFrame.of(raw.sensor_pose), ids)
+        self._core.note_answered(frame, bodies)
         stamp_ns = self._origin_ns + round(frame.estimate.stamp_s * 1e9)
-        return clean_message(raw, stamp_ns, self.delay_frames, bodies)
+        return clean_message(raw, stamp_ns, self.delay_frames, list(bodies.values()))
 
 
 @cache

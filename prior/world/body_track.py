@@ -298,6 +298,7 @@ class BodyTrack:
         place, spread = self._filter.position, self._filter.position_sigma
         positions = sighting.positions if sighting.root is None else sighting.positions + (place - sighting.root)
         positions = np.where(np.arange(len(positions))[:, None] == 0, place, positions)
+        state = np.where(np.isfinite(positions).all(axis=1), sighting.body.state, JointState.UNKNOWN)
         rotations = sighting.body.rotations.copy()
         rotations[0] = self._orientation
         if math.hypot(*spread[:2]) > lost_sigma:
@@ -312,7 +313,7 @@ class BodyTrack:
             covariance=self._filter.covariance,
             positions=positions,
             rotations=rotations,
-            state=sighting.body.state,
+            state=state,
             sigma=np.hypot(sighting.sigma, math.sqrt(float(np.mean(spread**2)))),
             contacts=contacts.astype(np.float32),
             tracking=tracking,

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.msgs.contract import broken
 from steadypose.msgs.types import CleanBody, PoseClean, PoseWorld, WorldBody
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.models.root_velocity.inference import LiveRootVelocity
@@ -128,7 +129,12 @@ class TrajectoryPipeline:
         s, bodies = self.settings, []
         for (track, sighting), motion in zip(followed, motions, strict=True):
             track.fuse(sighting, motion, scene.ground, s.network, s.contacts)
-            bodies.append(track.publish(sighting, motion.contacts, s.lost_sigma))
+            body = track.publish(sighting, motion.contacts, s.lost_sigma)
+            if (promise := broken(body)) is None:
+                bodies.append(body)
+            else:  # whatever made it so is in the track, which begins anew
+                self.counters[promise] += 1
+                del scene.tracks[body.id]
         return [_message(clean, scene.ground, bodies)]
 
     def _scene(self, clean: PoseClean) -> _Scene | None:

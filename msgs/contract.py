@@ -1,0 +1,52 @@
+"""What every `pose/clean` and `pose/world` promises, as a check; the nodes publish no body that breaks it.
+
+Where a joint's state is not UNKNOWN, its position, its deviation and its rotation are numbers. Rotations have norm 1,
+known or not. The root of a body in the world, its velocity and covariance are numbers, and the covariance is one.
+Stamps of a source rise, until its stream ends or begins anew.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import CleanBody, JointState, Pose, WorldBody
+
+NORM_TOLERANCE = 1e-3
+"""how far from 1 the norm of a quaternion may be"""
+
+
+def broken(body: CleanBody | WorldBody) -> str | None:
+    """Which promise a body breaks; None if it keeps them all."""
+    known = body.state != JointState.UNKNOWN
+    if not np.isfinite(body.positions[known]).all():
+        return "a position is not finite though its state is known"
+    if not (np.isfinite(body.sigma[known]).all() and (body.sigma[known] >= 0).all()):
+        return "a deviation is no number of 0 or more though its state is known"
+    if not _are_unit(body.rotations):
+        return "a rotation is not of norm 1"
+    if isinstance(body, CleanBody):
+        if not (np.isfinite(body.bone_lengths).all() and (body.bone_lengths >= 0).all()):
+            return "a bone's length is no number of 0 or more"
+        return None
+    root = np.concatenate([body.root_position, body.root_velocity, body.covariance.ravel()])
+    if not np.isfinite(root).all():
+        return "the root is not finite"
+    if not _are_unit(body.root_orientation):
+        return "the root's orientation is not of norm 1"
+    scale = np.abs(body.covariance).max()
+    if np.abs(body.covariance - body.covariance.T).max() > 1e-6 * scale:
+        return "the covariance is not symmetric"
+    if np.linalg.eigvalsh(body.covariance)[0] < -1e-6 * scale:
+        return "the covariance has a negative variance"
+    return None
+
+
+def is_pose(pose: Pose) -> bool:
+    """Whether a pose is one: finite, with a quaternion of norm 1."""
+    return bool(np.isfinite(pose.position).all()) and _are_unit(pose.orientation)
+
+
+def _are_unit(quaternions: NDArray[np.floating]) -> bool:
+    norms = np.linalg.norm(quaternions.astype(np.float64), axis=-1)
+    return bool((np.abs(norms - 1.0) < NORM_TOLERANCE).all())

@@ -1,0 +1,174 @@
+"""Whatever comes in: what goes out keeps its promises, and one bad frame is over within a second."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from conftest import raw, walk
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from steadypose.msgs.contract import broken, is_pose
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.types import JointState, Message, Pose, PoseClean, PoseRaw, PoseWorld
+from steadypose.nodes.commands.cleaning import stream
+from steadypose.nodes.graph.prior_node import make_prior
+from steadypose.nodes.graph.trajectory_node import make_trajectory
+
+FRAMES, BAD = 75, 30
+BASE = walk(FRAMES)
+Spoil = Callable[[PoseRaw], PoseRaw]
+
+
+@pytest.fixture(scope="module")
+def reference() -> dict[int, PoseWorld]:
+    return worlds(answers(BASE)[0])
+
+
+def answers(frames: list[PoseRaw]) -> tuple[list[Message], Counter[str]]:
+    prior, trajectory = make_prior({}), make_trajectory({})
+    messages = [message for _, message in stream([(POSE_RAW, frame) for frame in frames], prior, trajectory)]
+    return messages, prior.counters + trajectory.counters
+
+
+def worlds(messages: list[Message]) -> dict[int, PoseWorld]:
+    return {m.stamp_ns: m for m in messages if isinstance(m, PoseWorld) and m.bodies}
+
+
+def check_promises(messages: list[Message]) -> None:
+    for kind in (PoseClean, PoseWorld):
+        stamps = [m.stamp_ns for m in messages if isinstance(m, kind) and not m.end_of_stream]
+        assert all(later > before for before, later in itertools.pairwise(stamps)), "stamps rise"
+    for message in messages:
+        if isinstance(message, PoseClean | PoseWorld):
+            assert [broken(body) for body in message.bodies if broken(body)] == []
+        if isinstance(message, PoseClean) and message.bodies:
+            assert is_pose(message.sensor_pose)
+
+
+def with_pose(position: float, orientation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)) -> Spoil:
+    pose = Pose(np.full(3, position), np.array(orientation))
+    return lambda frame: dataclasses.replace(frame, sensor_pose=pose)
+
+
+def scaled(factor: float) -> Spoil:
+    def scale(frame: PoseRaw) -> PoseRaw:
+        bodies = [dataclasses.replace(body, positions=body.positions * factor) for body in frame.bodies]
+        return dataclasses.replace(frame, bodies=bodies)
+
+    return scale
+
+
+ONE_BAD_FRAME: dict[str, Spoil] = {
+    "a sensor at 1e300": with_pose(1e300),
+    "a sensor at 1e20": with_pose(1e20),
+    "a sensor at a kilometre": with_pose(1e3),
+    "a sensor at two metres": with_pose(2.0),
+    "a sensor upside down": with_pose(0.0, (1.0, 0.0, 0.0, 0.0)),
+    "a body twice as large": scaled(2.0),
+    "a body five times as large": scaled(5.0),
+    "a body in one point": scaled(0.0),
+}
+
+
+@pytest.mark.parametrize("kind", ONE_BAD_FRAME)
+def test_one_bad_frame_is_over_within_a_second(kind: str, reference: dict[int, PoseWorld]) -> None:
+    frames = [ONE_BAD_FRAME[kind](frame) if k == BAD else frame for k, frame in enumerate(BASE)]
+    messages, _ = answers(frames)
+    check_promises(messages)
+    found = worlds(messages)
+    assert BASE[-1].stamp_ns - max(found) < 60_000_000
+    after = BASE[BAD].stamp_ns + 1_000_000_000
+    off = {
+        stamp: float(np.abs(world.bodies[0].positions - reference[stamp].bodies[0].positions).max())
+        for stamp, world in found.items()
+        if stamp > after
+    }
+    assert len(off) > 10
+    assert max(off.values()) < 0.1
+
+
+@pytest.mark.parametrize("factor", [0.01, 0.3, 2.0, 2.4])
+def test_a_body_of_another_size_is_known_or_said_not_to_be(factor: float) -> None:
+    messages, _ = answers([scaled(factor)(frame) for frame in BASE[:40]])
+    check_promises(messages)
+    bodies = [body for m in messages if isinstance(m, PoseWorld) for body in m.bodies]
+    assert bodies
+    for body in bodies:
+        unknown = ~np.isfinite(body.positions).all(axis=1)
+        assert (body.state[unknown] == JointState.UNKNOWN).all()
+
+
+def test_a_body_that_nobody_is_is_refused_and_counted() -> None:
+    messages, counts = answers([scaled(3.0)(frame) for frame in BASE[:10]])
+    assert not worlds(messages)
+    assert counts["body_too_large"] == 10
+
+
+def test_a_sensor_that_was_put_elsewhere_is_believed_there_soon() -> None:
+    moved = [with_pose(5.0)(frame) if k >= BAD else frame for k, frame in enumerate(BASE)]
+    messages, counts = answers(moved)
+    check_promises(messages)
+    assert counts["sensor_moved"] == 1
+    assert counts["sensor_pose_jumped"] == 7, "a fifth of a second"
+    last = worlds(messages)[max(worlds(messages))].bodies[0].root_position
+    np.testing.assert_allclose(last, moved[-1].bodies[0].positions[0] + 5.0, atol=0.1)
+
+
+def test_a_sensor_that_moves_is_never_doubted() -> None:
+    frames = [
+        dataclasses.replace(
+            frame,
+            sensor_pose=Pose(
+                np.array([0.15 * k, 0.0, 0.0]), np.array([0.0, 0.0, np.sin(0.1 * k), np.cos(0.1 * k)])
+            ),  # 4.5 m/s and 6 rad/s
+        )
+        for k, frame in enumerate(BASE)
+    ]
+    assert not answers(frames)[1]["sensor_pose_jumped"]
+
+
+NUMBERS = st.one_of(
+    st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-300, 1e300, 3.4e38, 1e20, -1e3, 29.9, 30.1, 1e4]),
+    st.floats(-5.0, 5.0),
+)
+STAMP_STEPS = st.sampled_from([33_333_333] * 12 + [0, 1, 10_000_000, -33_333_333, 400_000_000, 700_000_000])
+
+
+@st.composite
+def evil_frames(draw: st.DrawFn) -> list[PoseRaw]:
+    """Good frames, among which some have any number anywhere, any pose of the sensor, any number of bodies."""
+    stamp, frames = BASE[0].stamp_ns, []
+    for k in range(draw(st.integers(8, 24))):
+        stamp += draw(STAMP_STEPS)
+        frame = BASE[k]
+        bodies = list(frame.bodies)
+        kind = draw(st.sampled_from(["good"] * 5 + ["joints", "scale", "pose", "bodies", "confidence"]))
+        pose = frame.sensor_pose
+        if kind == "joints":
+            positions = bodies[0].positions.copy()
+            for _ in range(draw(st.integers(1, 22))):
+                positions[draw(st.integers(0, 21)), draw(st.integers(0, 2))] = draw(NUMBERS)
+            bodies = [dataclasses.replace(bodies[0], positions=positions)]
+        elif kind == "scale":
+            bodies = scaled(draw(st.sampled_from([-1.0, 0.0, 0.1, 2.0, 7.0, 1e6])))(frame).bodies
+        elif kind == "pose":
+            pose = Pose(np.array([draw(NUMBERS) for _ in range(3)]), np.array([draw(NUMBERS) for _ in range(4)]))
+        elif kind == "bodies":
+            ids = draw(st.lists(st.integers(-3, 3), max_size=6))
+            bodies = [dataclasses.replace(bodies[0], id=i) for i in ids]
+        elif kind == "confidence":
+            bodies = [dataclasses.replace(bodies[0], confidence=np.array([draw(NUMBERS) for _ in range(22)]))]
+        frames.append(dataclasses.replace(raw(k), stamp_ns=max(stamp, 0), sensor_pose=pose, bodies=bodies))
+    return frames
+
+
+@given(evil_frames())
+@settings(max_examples=25, deadline=None)
+def test_what_goes_out_keeps_its_promises_whatever_comes_in(frames: list[PoseRaw]) -> None:
+    check_promises(answers(frames)[0])
