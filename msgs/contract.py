@@ -23,7 +23,7 @@ def broken(body: CleanBody | WorldBody) -> str | None:
         return "a position is not finite though its state is known"
     if not (np.isfinite(body.sigma[known]).all() and (body.sigma[known] >= 0).all()):
         return "a deviation is no number of 0 or more though its state is known"
-    if not _are_unit(body.rotations):
+    if not are_unit(body.rotations).all():
         return "a rotation is not of norm 1"
     if isinstance(body, CleanBody):
         if not (np.isfinite(body.bone_lengths).all() and (body.bone_lengths >= 0).all()):
@@ -32,7 +32,7 @@ def broken(body: CleanBody | WorldBody) -> str | None:
     root = np.concatenate([body.root_position, body.root_velocity, body.covariance.ravel()])
     if not np.isfinite(root).all():
         return "the root is not finite"
-    if not _are_unit(body.root_orientation):
+    if not are_unit(body.root_orientation).all():
         return "the root's orientation is not of norm 1"
     scale = np.abs(body.covariance).max()
     if np.abs(body.covariance - body.covariance.T).max() > 1e-6 * scale:
@@ -44,9 +44,11 @@ def broken(body: CleanBody | WorldBody) -> str | None:
 
 def is_pose(pose: Pose) -> bool:
     """Whether a pose is one: finite, with a quaternion of norm 1."""
-    return bool(np.isfinite(pose.position).all()) and _are_unit(pose.orientation)
+    return bool(np.isfinite(pose.position).all()) and bool(are_unit(pose.orientation).all())
 
 
-def _are_unit(quaternions: NDArray[np.floating]) -> bool:
-    norms = np.linalg.norm(quaternions.astype(np.float64), axis=-1)
-    return bool((np.abs(norms - 1.0) < NORM_TOLERANCE).all())
+def are_unit(quaternions: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which of quaternions (..., 4) are of norm 1."""
+    with np.errstate(over="ignore"):
+        norms = np.sqrt((quaternions.astype(np.float64) ** 2).sum(axis=-1))
+    return np.abs(norms - 1.0) < NORM_TOLERANCE

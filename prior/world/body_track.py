@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from steadypose.msgs.contract import are_unit
 from steadypose.msgs.types import CleanBody, JointState, Tracking, WorldBody
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
 from steadypose.prior.body.skeleton import HIPS, REST_POSITIONS, J, limbs
@@ -298,9 +299,12 @@ class BodyTrack:
         place, spread = self._filter.position, self._filter.position_sigma
         positions = sighting.positions if sighting.root is None else sighting.positions + (place - sighting.root)
         positions = np.where(np.arange(len(positions))[:, None] == 0, place, positions)
-        state = np.where(np.isfinite(positions).all(axis=1), sighting.body.state, JointState.UNKNOWN)
+        sigma = np.hypot(sighting.sigma, math.sqrt(float(np.mean(spread**2))))
+        told = np.isfinite(positions).all(axis=1) & np.isfinite(sigma)
+        state = np.where(told, sighting.body.state, JointState.UNKNOWN)
         rotations = sighting.body.rotations.copy()
         rotations[0] = self._orientation
+        rotations[~are_unit(rotations)] = [0.0, 0.0, 0.0, 1.0]  # a message of somebody who knows positions alone
         if math.hypot(*spread[:2]) > lost_sigma:
             tracking = Tracking.LOST
         else:
@@ -314,7 +318,7 @@ class BodyTrack:
             positions=positions,
             rotations=rotations,
             state=state,
-            sigma=np.hypot(sighting.sigma, math.sqrt(float(np.mean(spread**2)))),
+            sigma=sigma,
             contacts=contacts.astype(np.float32),
             tracking=tracking,
         )
