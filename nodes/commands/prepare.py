@@ -41,7 +41,7 @@ def prepare(mocap: Path, out: Path = Path("data"), speeds: tuple[float, ...] = (
     Try:
       steadypose prepare mocap/                        all of it, a few minutes
       steadypose prepare mocap/cmu_amc.tar.xz --out /tmp/cmu
-      steadypose prepare mocap/ --speeds 1 1.5 2       fast motion to train on
+      steadypose prepare mocap/ --speeds 1 --speeds 2   fast motion to train on
 
     Args:
         mocap: folder with these, or one of them.
