@@ -90,7 +90,7 @@ def impute_all(
     for b in range(len(truth)):
         hold[b], line[b] = _held(truth[b], observed[b], mean), _line(truth[b], observed[b], mean)
         guess[b] = _guess(positions[b], sizes[b], clean[b], observed[b], line[b])
-    live = LiveHGVAE(model.config, arrays_of(model), SENSOR_SIGMA, SLOW, 1)
+    live = LiveHGVAE(model.config, arrays_of(model), SENSOR_SIGMA, 1)
     hung = standardise(model, guess)
     completed, _ = model.completed(hung, torch.from_numpy(observed).float(), SLOW)
     guess_m, completed_m = (x.double().numpy() * SCALE + mean for x in (hung, completed))
@@ -100,7 +100,7 @@ def impute_all(
     passes: dict[str, list[Floats]] = {}
     for t, x, seen, size in zip(clean, guess, observed.astype(float), sizes, strict=True):
         tracks = t._replace(x=x, observed=seen)
-        reconstruction = live.reconstruct(x[None], seen[None])
+        reconstruction = live.reconstruct(x[None], seen[None], np.array([SLOW]))
         batch = Tracks(*(np.asarray(part)[None] for part in tracks))
         windows = BodyWindows(np.zeros(1, dtype=np.intp), batch, seen[None], np.array([size]), reconstruction, live)
         passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(tracks, reconstruction.mean[0]))

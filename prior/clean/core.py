@@ -76,7 +76,7 @@ class CleanCore:
         self._denoise = Denoise(delay, slots) if denoise else None
         self._slow_error = SlowErrorEstimator(noise.bias_sigma, slots)
         self._person = PersonEstimator(settings.bones, slots)
-        self._score = Scorer(settings.score, settings.encode.weights, noise, slots) if score else None
+        self._score = Scorer(settings.score, settings.encode.weights, slots) if score else None
         self._impute = Impute(settings.impute, delay, slots, counters) if impute else None
         self._fuse = Fuse(settings.fuse)
         self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
@@ -87,19 +87,24 @@ class CleanCore:
 
         In a hurry, hidden joints are imputed without gradient ascent: for a live node that falls behind.
         """
-        person, present = self._person.current, observation.present  # of the frame before: the one feedback
+        # of the frame before: all that is fed back
+        person, bias_sigma, present = self._person.current, self._slow_error.bias_sigma, observation.present
         gated = self._gate.update(observation, person)
         if self._correct:
             gated = self._correct.update(gated)
         self._history.append(gated)
         smoothed = self._smooth.update(gated)
-        windows = self._reconstruct.update(self._history, present, person) if self._reconstruct else None
+        windows = None
+        if self._reconstruct:
+            windows = self._reconstruct.update(self._history, present, person, bias_sigma)
         if self._denoise:
             self._denoise.update(windows, self._history)
         denoised = None if smoothed is None else self._denoised(smoothed, gated, self._delay)
         slow_error = self._slow_error.update(denoised, person.offsets, gated.jitter)
         person = self._person.update(denoised, slow_error.bias_sigma, present)
-        score = self._score.update(windows, gated.frozen) if self._score else Score.unscored(self._slots)
+        score = Score.unscored(self._slots)
+        if self._score:
+            score = self._score.update(windows, gated.frozen, np.hypot(gated.jitter, slow_error.bias_sigma))
         imputed = self._impute.update(windows, gated.jitter, hurry=hurry) if self._impute else None
         rotations = self._refine.update(gated, person)
         self._newest = newest = _Newest(gated, present, person, slow_error, rotations, score, imputed)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from steadypose.prior.clean.frame import BodyWindows, Bools, Floats, Score, SensorNoise
-from steadypose.prior.models.hgvae.anomaly import Calibration, decimals, joint_odds
+from steadypose.prior.clean.frame import BodyWindows, Bools, Floats, Score
+from steadypose.prior.models.hgvae.anomaly import SENSOR_SIGMAS, Calibration, decimals, joint_odds
 from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
 from steadypose.prior.timing.rate import FPS
 
@@ -37,13 +37,13 @@ class ScoreSettings:
 class Scorer:
     """Scores the newest window of each body, and raises the flag with hysteresis."""
 
-    def __init__(self, settings: ScoreSettings, weights: str, noise: SensorNoise, slots: int) -> None:
+    def __init__(self, settings: ScoreSettings, weights: str, slots: int) -> None:
         if not 0 < settings.false_alarms < 1:
             raise ValueError(f"score.false_alarms: expected a share between 0 and 1, got {settings.false_alarms:g}")
         self._height = -np.log10(settings.false_alarms)
         self._hold = settings.hold
-        self._network = LiveFaultNet.load(weights, noise.total_sigma, slots)
-        self._calibration = Calibration.load(weights).at(noise.total_sigma)
+        self._network = LiveFaultNet.load(weights, slots)
+        self._calibration = Calibration.load(weights)
         self._quiet_s = np.full(slots, np.inf)
         self._flag = np.zeros(slots, dtype=bool)
 
@@ -52,23 +52,28 @@ class Scorer:
         self._quiet_s[slot] = np.inf
         self._flag = self._flag & ~slot
 
-    def update(self, windows: BodyWindows | None, frozen: Bools) -> Score:
-        """The score of the newest frame, in which the joints ``frozen`` (S, 22) repeat themselves."""
+    def update(self, windows: BodyWindows | None, frozen: Bools, sensor_sigma: Floats) -> Score:
+        """The score of the newest frame, in which the joints ``frozen`` (S, 22) repeat themselves.
+
+        ``sensor_sigma`` (S,) metres along an axis is the error found of what is seen of each body: one that is met all
+        the time is no fault.
+        """
         anomaly, joint_anomaly = np.full(len(frozen), np.nan), np.full(frozen.shape, np.nan)
         if windows is not None:
             slots = windows.slots
-            anomaly[slots], joint_anomaly[slots] = self._score(windows, frozen[slots])
+            anomaly[slots], joint_anomaly[slots] = self._score(windows, frozen[slots], sensor_sigma[slots])
         with np.errstate(invalid="ignore"):
             self._quiet_s = np.where(anomaly > self._height / 2, 0.0, self._quiet_s + 1 / FPS)
             raised = anomaly > self._height
         self._flag = raised | self._flag & (self._quiet_s < self._hold)
         return Score(anomaly, self._flag, joint_anomaly)
 
-    def _score(self, windows: BodyWindows, frozen: Bools) -> tuple[Floats, Floats]:
+    def _score(self, windows: BodyWindows, frozen: Bools, sensor_sigma: Floats) -> tuple[Floats, Floats]:
         """The anomaly of each window (B,) and, on the same scale, of its joints (B, 22)."""
         tracks, found = windows.tracks, windows.reconstruction
-        odds = self._network(tracks.x, found.mean, found.sigma, tracks.observed)
+        sensor_sigma = np.clip(sensor_sigma, SENSOR_SIGMAS[0], SENSOR_SIGMAS[-1])  # of which the network was told
+        odds = self._network(tracks.x, found.mean, found.sigma, tracks.observed, sensor_sigma)
         odds = joint_odds(odds, tracks.observed, frozen)
         unseen = np.isinf(odds)
-        told = decimals(odds, self._calibration, unseen.sum(axis=-1))
+        told = decimals(odds, self._calibration.limits(unseen.sum(axis=-1), sensor_sigma))
         return told.max(axis=-1), np.where(unseen, np.nan, told)

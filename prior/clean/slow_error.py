@@ -67,15 +67,20 @@ class SlowErrorEstimator:
     Args:
         bias_sigma: metres along an axis, the slow error to be expected at most, before it is found.
         slots: bodies.
+
+    Attributes:
+        bias_sigma: (S,) metres along an axis, as last found.
     """
 
     def __init__(self, bias_sigma: float, slots: int) -> None:
-        self._bias_sigma = bias_sigma
+        self._expected = bias_sigma
+        self.bias_sigma = np.full(slots, bias_sigma)
         self._moments = np.zeros((4, slots, len(RIGID)))  # frames, mean, variance, variance by noise
 
     def forget(self, slot: Bools) -> None:
         """Start these slots afresh."""
         self._moments[:, slot] = 0.0
+        self.bias_sigma = np.where(slot, self._expected, self.bias_sigma)
 
     def update(self, smoothed: Smoothed | None, offsets: Floats, jitter: Floats) -> SlowError:
         """Take a smoothed frame in, if there is one.
@@ -85,10 +90,11 @@ class SlowErrorEstimator:
             offsets: (S, 22, 3) metres, the bones in use.
             jitter: (S,) metres along an axis, the noise from frame to frame.
         """
-        expected = np.minimum(self._bias_sigma, JITTER_RATIO * jitter)
+        expected = np.minimum(self._expected, JITTER_RATIO * jitter)
         bias, length = expected.copy(), np.full((len(offsets), len(RIGID)), UNKNOWN_VARIANCE)
         if smoothed is not None:
             _find(smoothed.positions, smoothed.sigma, offsets, expected, self._moments, bias, length)
+        self.bias_sigma = bias
         return SlowError(bias, length)
 
 

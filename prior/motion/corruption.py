@@ -79,6 +79,27 @@ def sensed(positions: Floats, sigma: Floats | float, rng: Rng, fast: Floats | fl
     return positions + sigma * (slow + np.sqrt(fast) * rng.standard_normal(positions.shape))
 
 
+def wandering(positions: Floats, sigma: Floats, rng: Rng, fast: Floats) -> Floats:
+    """Windows (B, T, 22, 3) as `sensed`, but of some joints more than of others, and what lasts wanders.
+
+    Args:
+        positions: metres.
+        sigma: (B,) metres along an axis, the sensor's error, over all joints.
+        rng: of what is drawn.
+        fast: (B,) share of its variance that is noise from frame to frame.
+    """
+    count, frames, joints, _ = positions.shape
+    factor = np.exp(rng.choice([0.0, 0.5], (count, 1)) * rng.standard_normal((count, joints)))
+    factor /= np.sqrt(np.square(factor).mean(axis=1, keepdims=True))
+    memory = 1.0 - 10 ** rng.uniform(-3.0, -0.7, (count, 1, 1))
+    slow, new = rng.standard_normal((count, frames, joints, 3)), np.sqrt(1.0 - memory**2)
+    for t in range(1, frames):
+        slow[:, t] = memory * slow[:, t - 1] + new * slow[:, t]
+    quick, lasts = (np.sqrt(share)[:, None, None, None] for share in (fast, 1.0 - fast))
+    noise = lasts * slow + quick * rng.standard_normal(slow.shape)
+    return positions + sigma[:, None, None, None] * factor[:, None, :, None] * noise
+
+
 def spoil(clean: Floats, faults: Sequence[Fault], share: float, rng: Rng) -> Floats:
     """Windows (B, T, 22, 3), a ``share`` of them with one of ``faults``, most of these to the window's end."""
     spoilt = clean.copy()

@@ -29,7 +29,7 @@ FROZEN_ODDS = 12.0
 SENSOR_SIGMAS = (0.003, 0.01, 0.02, 0.04)
 """Metres along an axis, errors of the sensor at which the scale was measured."""
 
-RATES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002)
+RATES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 """of clean windows that score higher than the quantiles kept"""
 
 
@@ -38,7 +38,7 @@ class Calibration:
     """What clean windows score, by joints missing and error of the sensor.
 
     Attributes:
-        quantiles: (M, S, R) of the window's score, at `RATES`.
+        quantiles: (M, S, R) of the window's score, at `MISSING`, `SENSOR_SIGMAS` and `RATES`.
     """
 
     quantiles: Floats
@@ -59,12 +59,12 @@ class Calibration:
         """Write as JSON."""
         path.write_text(json.dumps({"note": note, "quantiles": np.round(self.quantiles, 4).tolist()}) + "\n")
 
-    def at(self, sensor_sigma: float) -> Calibration:
-        """For one sensor: the same without the axis S."""
-        place = np.interp(np.log(sensor_sigma), np.log(SENSOR_SIGMAS), np.arange(len(SENSOR_SIGMAS)))
-        low = min(int(place), len(SENSOR_SIGMAS) - 2)
-        share = place - low
-        return Calibration((1 - share) * self.quantiles[:, low] + share * self.quantiles[:, low + 1])
+    def limits(self, missing: NDArray[np.integer], sensor_sigma: Floats) -> Floats:
+        """(B, R) what windows score, of which so many joints are ``missing`` (B,), seen by a sensor of error
+        ``sensor_sigma`` (B,) metres along an axis: interpolated between what was measured."""
+        by_missing = _between(np.asarray(missing, dtype=np.float64), np.array(MISSING, dtype=np.float64))
+        by_sensor = _between(np.log(sensor_sigma), np.log(SENSOR_SIGMAS))
+        return np.einsum("bm,bs,msr->br", by_missing, by_sensor, self.quantiles)
 
 
 def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Floats:
@@ -79,23 +79,22 @@ def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Flo
     return np.where(seen, np.where(frozen, np.maximum(odds, FROZEN_ODDS), odds), -np.inf)
 
 
-def decimals(score: Floats, calibration: Calibration, missing: NDArray[np.integer]) -> Floats:
+def decimals(score: Floats, limits: Floats) -> Floats:
     """-log10 of the rate at which clean windows score at least so high.
 
     Args:
         score: (B, K) of windows or of their joints.
-        calibration: for the sensor.
-        missing: (B,) joints of each window.
+        limits: (B, R) of `Calibration.limits`.
     """
     told = np.empty(score.shape)
-    _decimals(score, _between(missing) @ calibration.quantiles, -np.log10(RATES), told)
+    _decimals(score, limits, -np.log10(RATES), told)
     return told
 
 
-def _between(missing: NDArray[np.integer]) -> Floats:
-    """(B, M) weights of the two of `MISSING` on either side."""
-    place = np.interp(missing, MISSING, np.arange(len(MISSING)))
-    return np.maximum(1 - np.abs(place[:, None] - np.arange(len(MISSING))), 0.0)
+def _between(value: Floats, knots: Floats) -> Floats:
+    """(B, K) weights of the two of ``knots`` on either side of each value (B,); the ends go on."""
+    place = np.interp(value, knots, np.arange(len(knots)))
+    return np.maximum(1 - np.abs(place[:, None] - np.arange(len(knots))), 0.0)
 
 
 @njit(cache=True)

@@ -15,24 +15,30 @@ from steadypose.prior.models.weights_io import Arrays, part
 
 
 class LiveCompletion:
-    """A trained `CompletionNet`, for one sensor.
+    """A trained `CompletionNet`.
 
     Args:
         config: its sizes.
         weights: its state dict.
-        bias_sigma: metres along an axis, the errors of the sensor that last.
         max_batch: windows at once.
     """
 
-    def __init__(self, config: CompletionConfig, weights: Arrays, bias_sigma: float, max_batch: int) -> None:
-        p, self._patch, self._bias_sigma = Program(), config.patch, bias_sigma
+    def __init__(self, config: CompletionConfig, weights: Arrays, max_batch: int) -> None:
+        p, self._patch = Program(), config.patch
         nodes, inputs = len(weights["read.adjacency"]), len(weights["read.weight"])
         self._nodes = p.matrix(nodes, inputs)
         self._written = p.layer(p.trunk(self._nodes, weights), part(weights, "write"))
         self._net = Network(p, max_batch)
 
-    def complete(self, deviations: NDArray[np.floating], observed: NDArray[np.floating]) -> NDArray[np.float32]:
+    def complete(
+        self, deviations: NDArray[np.floating], observed: NDArray[np.floating], bias_sigma: NDArray[np.floating]
+    ) -> NDArray[np.float32]:
         """Put a better guess of what was not observed into windows (B, 66, T), in place; see `CompletionNet`.
+
+        Args:
+            deviations: (B, 66, T), changed.
+            observed: (B, 66, T) more than 0 where seen.
+            bias_sigma: (B,) metres along an axis, the errors of the sensor that last.
 
         Returns:
             (B, 66, T) how far to believe each entry, as `completion.belief` has it.
@@ -41,10 +47,8 @@ class LiveCompletion:
         partly = np.flatnonzero((observed == 0).any(axis=(-2, -1)))
         if not len(partly):
             return believed
-        features, rows = (
-            completion_features(deviations[partly], observed[partly], self._bias_sigma, self._patch),
-            slice(0, len(partly)),
-        )
+        features = completion_features(deviations[partly], observed[partly], bias_sigma[partly], self._patch)
+        rows = slice(0, len(partly))
         self._net.matrix(self._nodes, rows)[:] = features.nodes
         self._net.run(self._net.steps, rows)
         written = self._net.matrix(self._written, rows)

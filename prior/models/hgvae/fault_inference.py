@@ -14,24 +14,23 @@ Floats = NDArray[np.float64]
 
 
 class LiveFaultNet:
-    """A trained `FaultNet`, for one sensor.
+    """A trained `FaultNet`.
 
     Args:
         config: its sizes.
         weights: its state dict.
-        sensor_sigma: metres along an axis, what the sensor may be off by.
         max_batch: windows at once.
     """
 
-    def __init__(self, config: FaultNetConfig, weights: Arrays, sensor_sigma: float, max_batch: int) -> None:
+    def __init__(self, config: FaultNetConfig, weights: Arrays, max_batch: int) -> None:
         p = Program()
-        self._mean, self._sensor_sigma = weights["mean"].astype(np.float64), sensor_sigma
+        self._mean = weights["mean"].astype(np.float64)
         self._features = p.matrix(JOINT_NODES, 4 * config.frames + 2)
         self._odds = p.layer(p.trunk(self._features, weights), part(weights, "write"))
         self._net = Network(p, max_batch)
 
     @classmethod
-    def load(cls, weights: str, sensor_sigma: float, max_batch: int) -> LiveFaultNet:
+    def load(cls, weights: str, max_batch: int) -> LiveFaultNet:
         """The one beside HG-VAE's weights of this name.
 
         Raises:
@@ -39,13 +38,11 @@ class LiveFaultNet:
         """
         path = weights_path(weights, "hgvae").with_suffix(".faults.safetensors")
         arrays, config = load_weights(str(path), "hgvae")
-        return cls(FaultNetConfig.from_dict(config), arrays, sensor_sigma, max_batch)
+        return cls(FaultNetConfig.from_dict(config), arrays, max_batch)
 
-    def __call__(self, x: Floats, found: Floats, sigma: Floats, observed: Floats) -> Floats:
+    def __call__(self, x: Floats, found: Floats, sigma: Floats, observed: Floats, sensor_sigma: Floats) -> Floats:
         """(B, 22) logarithm of the odds that a joint is off; the arguments are those of `fault_features`."""
         rows = slice(0, len(x))
-        self._net.matrix(self._features, rows)[:] = fault_features(
-            x, found, sigma, observed, self._sensor_sigma, self._mean
-        )
+        self._net.matrix(self._features, rows)[:] = fault_features(x, found, sigma, observed, sensor_sigma, self._mean)
         self._net.run(self._net.steps, rows)
         return self._net.matrix(self._odds, rows)[..., 0].astype(np.float64)

@@ -34,8 +34,7 @@ class LiveHGVAE:
     Args:
         config: its sizes; without actions.
         weights: its state dict, which is copied.
-        sensor_sigma: metres, standard deviation of an observation.
-        bias_sigma: metres, what of it lasts.
+        sensor_sigma: metres, standard deviation of an observation, by which the score weighs it.
         max_batch: windows at once.
 
     Attributes:
@@ -44,14 +43,11 @@ class LiveHGVAE:
         scratch_row: the row in which `decode` leaves the window that it decoded last.
     """
 
-    def __init__(
-        self, config: HGVAEConfig, weights: Arrays, sensor_sigma: float, bias_sigma: float, max_batch: int
-    ) -> None:
+    def __init__(self, config: HGVAEConfig, weights: Arrays, sensor_sigma: float, max_batch: int) -> None:
         p = Program()
         self._completion = None
         if config.completion:
-            completion = part(weights, "completion")
-            self._completion = LiveCompletion(config.completion, completion, bias_sigma, max_batch)
+            self._completion = LiveCompletion(config.completion, part(weights, "completion"), max_batch)
         self.frames, self._mean = config.frames, weights["mean"].astype(np.float64)[:, None]
         self._x = p.matrix(JOINT_NODES, 2 * config.frames)  # the tracks, and beside them what was observed
         kept, dct, read = config.coefficients, weights["dct"], part(weights, "read")
@@ -101,26 +97,31 @@ class LiveHGVAE:
         self.latents = sum(end - begin for begin, end, _ in (self._net.places[number] for number in self._moves))
 
     @classmethod
-    def load(cls, weights: str, sensor_sigma: float, bias_sigma: float, max_batch: int) -> LiveHGVAE:
+    def load(cls, weights: str, sensor_sigma: float, max_batch: int) -> LiveHGVAE:
         """From the weights of this name.
 
         Raises:
             FileNotFoundError: there are none; says which there are.
         """
         arrays, config = load_weights(weights, "hgvae")
-        return cls(HGVAEConfig.from_dict(config), arrays, sensor_sigma, bias_sigma, max_batch)
+        return cls(HGVAEConfig.from_dict(config), arrays, sensor_sigma, max_batch)
 
-    def reconstruct(self, x: NDArray[np.float64], observed: NDArray[np.float64]) -> Reconstruction:
+    def reconstruct(
+        self, x: NDArray[np.float64], observed: NDArray[np.float64], bias_sigma: NDArray[np.float64]
+    ) -> Reconstruction:
         """Encode and decode windows. The model stands at them until the next; a window's row is its place here.
 
         Args:
             x: (B, 66, T) metres of a standard body; see `prior.models.hgvae.features`. NaN for a joint never seen.
             observed: (B, 66, T) how far to believe each entry: 0 where there was none, at most 1.
+            bias_sigma: (B,) metres along an axis, the errors of the sensor that last.
         """
         rows = slice(0, len(x))
         deviations = (x - self._mean) / SCALE
         hang_unseen(deviations)
-        believed = self._completion.complete(deviations, observed) if self._completion else observed > 0
+        believed = observed > 0
+        if self._completion:
+            believed = self._completion.complete(deviations, observed, bias_sigma)
         seen = self._net.matrix(self._x, rows)
         seen[..., : self.frames], seen[..., self.frames :] = deviations, believed
         self._trust[rows] = observed

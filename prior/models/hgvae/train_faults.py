@@ -36,19 +36,19 @@ from steadypose.prior.motion.corruption import (
     other_bones,
     other_builds,
     repeats,
-    sensed,
     sides_exchanged,
     somebody_elses,
     spoil,
     stands_still,
+    wandering,
 )
 from steadypose.prior.motion.dataset import MotionSet
 from steadypose.prior.timing.frozen_joints import LEAST_NOISE, frozen_joints
 
 Floats = NDArray[np.float64]
 
-WINDOWS = 2000
-"""for each error and number of joints missing"""
+WINDOWS = 6000
+"""for each error and number of joints missing, of which the rarest rate leaves a handful"""
 
 BATCH = 64
 """windows in each step of the fault network's optimiser"""
@@ -130,7 +130,7 @@ def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np
     sigma = np.exp(rng.uniform(np.log(SENSOR_SIGMAS[0]), np.log(SENSOR_SIGMAS[-1]), count))
     spoilt = spoil(clean, FAULTS, SPOILT, rng)
     fast = rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.8)  # some sensors smooth what they say
-    answered = sensed(spoilt, sigma[:, None, None, None], rng, fast[:, None, None, None])
+    answered = wandering(spoilt, sigma, rng, fast)
     seen = spoil(answered, (repeats,), REPEATED, rng)
     astray = np.sqrt(((spoilt - clean + seen - answered)[:, -RECENT:] ** 2).mean(axis=(1, 3)))
     repeated = (seen != answered)[:, -RECENT:].any(axis=-1).mean(axis=1)
@@ -184,8 +184,9 @@ def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, see
     conditions = [(m, s) for m in range(len(MISSING)) for s in range(len(SENSOR_SIGMAS))]
     quantiles = np.zeros((len(MISSING), len(SENSOR_SIGMAS), len(RATES)))
     for m, s in track(conditions, "calibrating"):
-        positions, sizes = windows.draw(count, model.config.frames, rng)
-        seen = hide_joints(sensed(positions, SENSOR_SIGMAS[s], rng), MISSING[m], rng)
+        positions, sizes = windows.draw(count, model.config.frames, rng, STRIDES)
+        sigma, fast = np.full(count, SENSOR_SIGMAS[s]), rng.uniform(0.0, 1.0, count)
+        seen = hide_joints(wandering(positions, sigma, rng, fast), MISSING[m], rng)
         odds = score_windows(network, model, seen, sizes, SENSOR_SIGMAS[s])
         quantiles[m, s] = np.quantile(odds.max(axis=1), 1 - np.array(RATES))
     return Calibration(quantiles)

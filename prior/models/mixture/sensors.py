@@ -19,10 +19,10 @@ Rng = np.random.Generator
 GATED = 0.18
 """Metres: what jumps farther is refused by the gate before the mixture sees it, mostly."""
 
-KINDS = ("perfect", "white", "lasting", "replayed", "mixed", "kinect")
-SHARES = np.array([0.16, 0.30, 0.15, 0.13, 0.12, 0.14])
+KINDS = ("perfect", "white", "lasting", "replayed", "mixed", "kinect", "monocular")
+SHARES = np.array([0.15, 0.28, 0.15, 0.11, 0.11, 0.11, 0.09])
 """Sensors and how often they are drawn: none, noise from frame to frame, noise that lasts, a Kinect's errors put on
-other motion, all of these together, and the real Kinect."""
+other motion, all of these together, the real Kinect, and a network that guesses each bone's depth from one picture."""
 
 _SWINGS = (
     ("elbow", ("wrist",)),
@@ -89,7 +89,8 @@ class Sensors:
                 told = rng.random() < 0.7
                 seen[clip] = truth[clip] + (noise * (0.8 / confidence[clip, ..., None]) if told else noise)
         self._spoil(seen, kind, rng)
-        about = np.flatnonzero(rng.random(count) < 0.08)  # as monocular networks have it: beside the hips
+        # as monocular networks have it: beside the hips
+        about = np.flatnonzero(rng.random(count) < np.where(kind == KINDS.index("monocular"), 0.8, 0.05))
         for places in (seen, truth):
             places[about] -= places[about][:, :, _HIPS].mean(axis=2, keepdims=True)
         return Sensed(seen, truth, confidence, kind)
@@ -135,6 +136,8 @@ class Sensors:
         shape = truth.shape
         if kind == "perfect":
             return 10 ** rng.uniform(-4, -3) * rng.standard_normal(shape) if rng.random() < 0.15 else np.zeros(shape)
+        if kind == "monocular":
+            return _guessed_depth(truth, rng)
         by_joint = np.exp(rng.choice([0.0, 0.5]) * rng.standard_normal((1, 22, 1)))
         noise = np.zeros(shape)
         if kind in ("white", "mixed"):
@@ -217,6 +220,25 @@ def _lasting(shape: tuple[int, ...], memory: float, rng: Rng) -> Floats:
     noise = rng.standard_normal(shape)
     for t in range(1, len(noise)):
         noise[t] = memory * noise[t - 1] + np.sqrt(1 - memory**2) * noise[t]
+    return noise
+
+
+def _guessed_depth(truth: Floats, rng: Rng) -> Floats:
+    """(T, 22, 3) errors of a network that sees a picture: bones' depths are wrong, for a while or by a jump, and down
+    the chain they add up; across, joints are off by little."""
+    frames = len(truth)
+    view = rng.standard_normal(3) * (1.0, 1.0, 0.2)
+    view /= np.linalg.norm(view)
+    depth = 10 ** rng.uniform(-1.6, -0.5) * _lasting((frames, 22), rng.uniform(0.6, 0.97), rng)
+    guesses = np.cumsum(rng.random((frames, 22)) < 10 ** rng.uniform(-3.0, -1.3), axis=0)  # which of them holds
+    levels = rng.standard_normal((guesses.max() + 1, 22)) * rng.uniform(0.0, 0.3)
+    depth += np.take_along_axis(levels, guesses, axis=0)
+    across = 10 ** rng.uniform(-2.8, -1.8)
+    noise = across * _lasting(truth.shape, rng.uniform(0.0, 0.8), rng)
+    for joint in range(1, 22):
+        bone = np.linalg.norm(truth[:, joint] - truth[:, PARENTS[joint]], axis=-1)
+        apart = (bone * depth[:, joint])[:, None] * view
+        noise[:, joint] += noise[:, PARENTS[joint]] + apart
     return noise
 
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from steadypose.prior.models.mixture.bank import (
@@ -56,6 +57,10 @@ SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.25, 0.4, 0.7, 1.5, 2.5)
 LEAST_SMOOTH_MM = 0.5
 """mm/frame², added to the acceleration error of the best expert."""
 
+FAST, MOST = 2.0, 3.0
+"""m/s at which a joint's place counts twice, and the most that one counts: joints are fast for a few frames, in which
+filters lag most and a mean over all of them does not show it."""
+
 UNSEEN = 0.15
 """Weight of the places of joints that are not seen."""
 
@@ -67,7 +72,7 @@ AVERAGE = 0.999
 
 
 class Batch(NamedTuple):
-    """Described clips, (C, T, ...): what `answer` takes, and the truth."""
+    """Described clips, (C, T, ...): what `answer` takes, the truth, and how much a joint counts by its speed."""
 
     features: Tensor
     experts: Tensor
@@ -75,6 +80,7 @@ class Batch(NamedTuple):
     scale: Tensor
     unseen: Tensor
     truth: Tensor
+    counts: Tensor
 
 
 def through_bank(sensed: Sensed, delay: int) -> Batch:
@@ -95,9 +101,15 @@ def through_bank(sensed: Sensed, delay: int) -> Batch:
     middle = np.where(np.isfinite(middle), middle, 0.0)  # so that single precision is enough
     arrays = (
         features, experts - middle.swapaxes(0, 1)[:, :, :, None], heading, scale, unseen,
-        (sensed.truth - middle)[:, :kept].swapaxes(0, 1),
+        (sensed.truth - middle)[:, :kept].swapaxes(0, 1), _counts(sensed.truth)[:, :kept].swapaxes(0, 1),
     )  # fmt: skip
     return Batch(*(torch.from_numpy(a.astype(np.float32)).transpose(0, 1) for a in arrays))
+
+
+def _counts(truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(C, T, 22) how much each joint's place counts, by its speed; see `FAST`."""
+    speed = np.linalg.norm(np.gradient(truth, axis=1), axis=-1) * FPS
+    return np.minimum(1.0 + np.nan_to_num(speed) / FAST, MOST)
 
 
 class Errors(NamedTuple):
@@ -107,13 +119,14 @@ class Errors(NamedTuple):
     acceleration: Tensor  # mm/frame²
 
 
-def errors(places: Tensor, truth: Tensor, weight: Tensor) -> Errors:
-    """Of places (C, T, 22, 3), weighed (C, T, 22); what weighs nothing may be NaN."""
+def errors(places: Tensor, truth: Tensor, weight: Tensor, counts: Tensor) -> Errors:
+    """Of places (C, T, 22, 3), weighed (C, T, 22), in position by ``counts`` too; what weighs nothing may be NaN."""
     off = torch.where(weight[..., None] > 0, places - truth, 0.0) * 1e3
     bent = off[:, 2:] - 2 * off[:, 1:-1] + off[:, :-2]
     seen = (weight[:, 2:] >= 1) & (weight[:, 1:-1] >= 1) & (weight[:, :-2] >= 1)
+    counted = weight * counts
     return Errors(
-        (weight * _length(off)).sum(dim=(1, 2)) / weight.sum(dim=(1, 2)).clamp(min=1),
+        (counted * _length(off)).sum(dim=(1, 2)) / counted.sum(dim=(1, 2)).clamp(min=1),
         (seen * _length(bent)).sum(dim=(1, 2)) / seen.sum(dim=(1, 2)).clamp(min=1),
     )
 
@@ -140,10 +153,10 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
     experts = torch.where(known[..., None, None], batch.experts, 0.0)
     places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.unseen)
     weight = known * torch.where(batch.unseen > 0, UNSEEN, 1.0)
-    own = errors(places, batch.truth, weight)
+    own = errors(places, batch.truth, weight, batch.counts)
     with torch.no_grad():
         seen = known * (batch.unseen == 0).float()
-        each = [errors(experts[:, :, :, m], batch.truth, seen) for m in range(EXPERTS)]
+        each = [errors(experts[:, :, :, m], batch.truth, seen, batch.counts) for m in range(EXPERTS)]
         position, acceleration = (torch.stack(values) for values in zip(*each, strict=True))
         best = (position + acceleration).argmin(dim=0, keepdim=True)
         position, acceleration = position.gather(0, best)[0], acceleration.gather(0, best)[0]

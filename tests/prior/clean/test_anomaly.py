@@ -7,7 +7,6 @@ import torch
 from tests.helpers.bodies import stream, waving
 
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
-from steadypose.prior.clean.frame import SensorNoise
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.score import Scorer, ScoreSettings
 from steadypose.prior.clean.settings import PriorSettings
@@ -22,9 +21,7 @@ from steadypose.prior.models.hgvae.anomaly import (
 )
 from steadypose.prior.models.hgvae.config import FaultNetConfig
 from steadypose.prior.models.hgvae.fault_features import OFF_SCALE, RECENT, ROUGH_SCALE, fault_features
-from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
 from steadypose.prior.models.hgvae.faults import FaultNet, load_fault_net
-from steadypose.prior.models.torch_weights import arrays_of
 
 HEIGHTS = np.linspace(0.0, 7.0, len(RATES))
 SCALE = Calibration(np.broadcast_to(HEIGHTS, (len(MISSING), len(SENSOR_SIGMAS), len(RATES))))
@@ -49,16 +46,6 @@ def awake() -> FaultNet:
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
     return network
-
-
-def test_the_live_fault_network_is_the_trained_one() -> None:
-    network, look = awake(), looks(3)
-    with torch.inference_mode():
-        odds = network(torch.from_numpy(fault_features(*look, 0.02, network.mean.numpy()))).numpy()
-    live = LiveFaultNet(network.config, arrays_of(network), 0.02, 4)
-    np.testing.assert_allclose(live(*look), odds, atol=1e-4)
-    x, found, sigma, observed = (part[1:] for part in look)
-    np.testing.assert_allclose(live(x, found, sigma, observed), odds[1:], atol=1e-4)
 
 
 def test_the_fault_network_is_told_of_what_was_seen_alone() -> None:
@@ -89,19 +76,20 @@ def test_a_joint_not_seen_of_late_has_no_odds_and_a_frozen_one_high_ones() -> No
 
 
 def test_the_scale_is_the_decimals_of_the_rate_among_clean_windows() -> None:
-    scale = SCALE.at(0.02)
-    missing = np.zeros(1, dtype=int)
-    np.testing.assert_allclose(decimals(HEIGHTS[None], scale, missing)[0], -np.log10(RATES), atol=1e-6)
-    beyond = decimals(np.array([[7.0, 8.0, 9.0]]), scale, missing)[0]
+    limits = SCALE.limits(np.zeros(1, dtype=int), np.full(1, 0.02))
+    np.testing.assert_allclose(decimals(HEIGHTS[None], limits)[0], -np.log10(RATES), atol=1e-6)
+    beyond = decimals(np.array([[7.0, 8.0, 9.0]]), limits)[0]
     assert beyond[2] - beyond[1] == pytest.approx(beyond[1] - beyond[0])
-    assert (decimals(np.array([[-50.0, -np.inf]]), scale, missing) == 0).all()
+    assert (decimals(np.array([[-50.0, -np.inf]]), limits) == 0).all()
 
 
 def test_between_measured_sensors_the_scale_is_between_theirs() -> None:
     quantiles = np.zeros_like(SCALE.quantiles)
     quantiles[:, 1] = 1.0
-    middle = Calibration(quantiles).at(float(np.sqrt(SENSOR_SIGMAS[1] * SENSOR_SIGMAS[2])))
-    np.testing.assert_allclose(middle.quantiles, 0.5)
+    between, coarser = np.sqrt(SENSOR_SIGMAS[1] * SENSOR_SIGMAS[2]), 2 * SENSOR_SIGMAS[-1]
+    limits = Calibration(quantiles).limits(np.array([0, 2]), np.array([between, coarser]))
+    np.testing.assert_allclose(limits[0], 0.5)
+    np.testing.assert_allclose(limits[1], 0.0)
 
 
 def test_the_weights_that_ship_find_the_wrist_of_which_the_last_answer_is_repeated() -> None:
@@ -139,12 +127,12 @@ def test_exchanged_arms_raise_the_flag_which_goes_down_after_they_are_over() -> 
 
 
 def test_a_flag_is_held_until_it_has_been_quiet_for_a_while() -> None:
-    stage = Scorer(ScoreSettings(false_alarms=0.01, hold=0.1), "default", SensorNoise(0.02, 0.0), 1)
+    stage = Scorer(ScoreSettings(false_alarms=0.01, hold=0.1), "default", 1)
     told = iter([0.0, 2.5, 1.5, 0.9, 0.9, 0.9, 0.9, 2.5])
     windows: Any = SimpleNamespace(slots=np.array([0]))
     frozen = np.zeros((1, 22), dtype=bool)
     stage._score = lambda *_: (np.array([next(told)]), np.zeros((1, 22)))  # type: ignore[method-assign]
-    flags = [bool(stage.update(windows, frozen).flag[0]) for _ in range(8)]
+    flags = [bool(stage.update(windows, frozen, np.full(1, 0.02)).flag[0]) for _ in range(8)]
     assert flags == [False, True, True, True, True, False, False, True]
 
 

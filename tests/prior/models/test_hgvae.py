@@ -43,7 +43,7 @@ def awake(config: HGVAEConfig = SMALL, seed: int = 0) -> HGVAE:
 
 
 def live_form(model: HGVAE, max_batch: int) -> LiveHGVAE:
-    return LiveHGVAE(model.config, arrays_of(model), sensor_sigma=0.01, bias_sigma=0.0, max_batch=max_batch)
+    return LiveHGVAE(model.config, arrays_of(model), sensor_sigma=0.01, max_batch=max_batch)
 
 
 def test_a_constant_track_has_one_cosine_coefficient_and_the_transform_is_its_own_inverse() -> None:
@@ -159,7 +159,7 @@ def test_the_live_model_is_the_trained_one() -> None:
     live = live_form(model, 4)
     rng = np.random.default_rng(0)
     x, observed = rng.normal(scale=0.3, size=(3, 66, 12)), (rng.random((3, 66, 12)) < 0.7).astype(float)
-    look = live.reconstruct(x, observed)
+    look = live.reconstruct(x, observed, np.zeros(len(x)))
     scaled = torch.from_numpy((x - model.mean.numpy()[:, None]) / 0.2).float()
     scaled, believed = model.completed(scaled, torch.from_numpy(observed).float(), 0.0)
     found = model(scaled, believed)
@@ -176,12 +176,12 @@ def test_what_the_live_model_makes_of_a_window_does_not_depend_on_the_others() -
     x[2, 30:33] = np.nan  # a joint never seen
     observed[2, 30:33], observed[1, 30:39, 4:] = 0, 0
     together, alone = live_form(model, 3), live_form(model, 1)
-    looks = together.reconstruct(x, observed)
+    looks = together.reconstruct(x, observed, np.zeros(len(x)))
     found = [(together.score(row), *together.gradient(row)) for row in range(3)]
     moved = rng.normal(scale=0.1, size=together.latents)
     scratch_row = together.decode(1, moved)
     for row in range(3):
-        look = alone.reconstruct(x[row : row + 1], observed[row : row + 1])
+        look = alone.reconstruct(x[row : row + 1], observed[row : row + 1], np.zeros(1))
         assert all((a[0] == b[row]).all() for a, b in zip(look, looks, strict=True))
         assert (alone.score(0), *alone.gradient(0)) == found[row]
         if row == 1:
@@ -192,7 +192,7 @@ def test_the_gradient_of_the_live_score_is_that_of_its_differences() -> None:
     live = live_form(awake(), 2)
     rng = np.random.default_rng(0)
     trust = (rng.random((2, 66, 12)) < 0.7) * rng.uniform(0.2, 1, (2, 66, 12))
-    live.reconstruct(rng.normal(scale=0.2, size=(2, 66, 12)), trust)
+    live.reconstruct(rng.normal(scale=0.2, size=(2, 66, 12)), trust, np.zeros(2))
     at = rng.normal(scale=0.1, size=live.latents)
     live.decode(1, at)
     gradient = live.gradient(live.scratch_row)
@@ -230,7 +230,7 @@ def test_the_weights_that_ship_reconstruct_motion_they_never_saw() -> None:
     model.load_state_dict(state)
     live = live_form(model, 7)
     tracks = to_tracks(np.stack([waving(120)[start : start + 50] for start in range(0, 70, 10)]), 1.0)
-    off = live.reconstruct(tracks.x, tracks.observed).mean - tracks.x
+    off = live.reconstruct(tracks.x, tracks.observed, np.zeros(len(tracks.x))).mean - tracks.x
     assert 1000 * np.sqrt(np.mean(np.square(off))) == pytest.approx(GOLDEN_RMS_MM, abs=1.0)
     assert (WEIGHTS / "hgvae-default.md").is_file()
 

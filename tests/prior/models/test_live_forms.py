@@ -43,8 +43,8 @@ def test_completion(seed: int) -> None:
     expected, expected_belief = model.completed(*torched, 0.01)
     completed = deviations.copy()
     assert model.config.completion is not None
-    live = LiveCompletion(model.config.completion, arrays_of(model.completion), 0.01, max_batch=5)
-    believed = live.complete(completed, observed)
+    live = LiveCompletion(model.config.completion, arrays_of(model.completion), max_batch=5)
+    believed = live.complete(completed, observed, np.full(len(completed), 0.01))
     np.testing.assert_allclose(completed, expected.numpy(), atol=2e-6)
     np.testing.assert_allclose(believed, expected_belief.numpy(), atol=2e-6)
     assert (completed[0] == deviations[0]).all()
@@ -58,11 +58,14 @@ def test_faults(seed: int) -> None:
     randomised(network, seed)
     x, found = rng.normal(scale=0.3, size=(2, 3, 66, 20))
     sigma, observed = rng.uniform(0.002, 0.1, (3, 66, 20)), (rng.random((3, 66, 20)) < 0.8).astype(float)
-    features = fault_features(x, found, sigma, observed, 0.02, network.mean.numpy().astype(np.float64))
+    sensor_sigma = rng.uniform(0.003, 0.04, 3)
+    features = fault_features(x, found, sigma, observed, sensor_sigma, network.mean.numpy().astype(np.float64))
     with torch.inference_mode():
         expected = network(torch.from_numpy(features)).numpy()
-    live = LiveFaultNet(config, arrays_of(network), 0.02, max_batch=4)
-    np.testing.assert_allclose(live(x, found, sigma, observed), expected, atol=1e-5 * np.abs(expected).max())
+    live = LiveFaultNet(config, arrays_of(network), max_batch=4)
+    np.testing.assert_allclose(
+        live(x, found, sigma, observed, sensor_sigma), expected, atol=1e-5 * np.abs(expected).max()
+    )
 
 
 @SEEDS

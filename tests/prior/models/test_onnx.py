@@ -101,7 +101,7 @@ def test_reconstruction_with_completion(bodies: int) -> None:
     tracks, confidence = windows(bodies)
     sigmas = np.full(bodies, BIAS_SIGMA)
     mean, sigma = answers("hgvae-default", tracks=tracks, confidence=confidence, bias_sigma=sigmas)
-    live = LiveHGVAE.load("default", SENSOR_SIGMA, BIAS_SIGMA, bodies).reconstruct(tracks, confidence)
+    live = LiveHGVAE.load("default", SENSOR_SIGMA, bodies).reconstruct(tracks, confidence, np.full(bodies, BIAS_SIGMA))
     np.testing.assert_allclose(mean, live.mean, atol=1e-5)  # metres
     np.testing.assert_allclose(sigma, live.sigma, rtol=1e-4)
 
@@ -116,7 +116,7 @@ def test_faults(bodies: int) -> None:
         "hgvae-default.faults",
         tracks=tracks, reconstructed=found, sigma=sigma, confidence=confidence, sensor_sigma=sigmas,
     )  # fmt: skip
-    live = LiveFaultNet.load("default", SENSOR_SIGMA, bodies)(tracks, found, sigma, confidence)
+    live = LiveFaultNet.load("default", bodies)(tracks, found, sigma, confidence, np.full(bodies, SENSOR_SIGMA))
     np.testing.assert_allclose(odds, live, atol=2e-4)
 
 
