@@ -112,6 +112,9 @@ class PriorNode(Node):
         }
         if isinstance(self._pipeline, StreamBatch):
             counts["streams"] = str(self._pipeline.streams)
+        if noise := self._pipeline.sensor_noise:
+            counts["sensor.jitter_mm"] = f"{1e3 * noise.jitter_sigma:.1f}"
+            counts["sensor.slow_error_mm"] = f"{1e3 * noise.bias_sigma:.1f}"
         return counts | {
             "bodies": str(self._bodies),
             "anomalies": str(self._anomalies),

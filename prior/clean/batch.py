@@ -31,7 +31,7 @@ from steadypose.prior.clean.adapt import (
     stacked,
 )
 from steadypose.prior.clean.core import CleanCore
-from steadypose.prior.clean.frame import Bools, CleanFrame, Observation
+from steadypose.prior.clean.frame import Bools, CleanFrame, Observation, SensorNoise
 from steadypose.prior.clean.identify import Identify
 from steadypose.prior.clean.pipeline import BACKWARDS_NS
 from steadypose.prior.clean.sensor_pose import SensorPoseGate, Verdict
@@ -134,6 +134,11 @@ class StreamBatch:
         if self._streams and all(stream.last.end_of_stream for stream in self._streams.values()):
             cleaned += self.flush()  # nobody is left for whose sake there will be another frame
         return cleaned
+
+    @property
+    def sensor_noise(self) -> SensorNoise | None:
+        """What the sensor was last found to be off by, the median over the bodies present; None before there was one."""
+        return self._core.sensor_noise
 
     def flush(self) -> list[PoseClean]:
         """Give the frames that the delay still holds, and forget all streams."""

@@ -11,7 +11,17 @@ import numpy as np
 
 from steadypose.prior.clean.correct import Correct
 from steadypose.prior.clean.denoise import Denoise
-from steadypose.prior.clean.frame import Bools, CleanFrame, Floats, Gated, Imputed, Observation, Person, Score
+from steadypose.prior.clean.frame import (
+    Bools,
+    CleanFrame,
+    Floats,
+    Gated,
+    Imputed,
+    Observation,
+    Person,
+    Score,
+    SensorNoise,
+)
 from steadypose.prior.clean.fuse import Fuse
 from steadypose.prior.clean.gate import Gate
 from steadypose.prior.clean.history import History
@@ -61,6 +71,9 @@ class CleanCore:
     Args:
         settings: of the prior.
         counters: gets what was refused or skipped, by cause.
+
+    Attributes:
+        sensor_noise: what the sensor was last found to be off by, the median over the bodies present.
     """
 
     def __init__(self, settings: PriorSettings, counters: Counter[str]) -> None:
@@ -81,6 +94,7 @@ class CleanCore:
         self._fuse = Fuse(settings.fuse)
         self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
         self._newest: _Newest | None = None
+        self.sensor_noise: SensorNoise | None = None
 
     def step(self, observation: Observation, *, hurry: bool = False) -> CleanFrame | None:
         """Take in a frame of the grid, and give what is said of the one ``delay`` before, once there is one.
@@ -107,6 +121,9 @@ class CleanCore:
             score = self._score.update(windows, gated.frozen, np.hypot(gated.jitter, slow_error.bias_sigma))
         imputed = self._impute.update(windows, gated.jitter, hurry=hurry) if self._impute else None
         rotations = self._refine.update(gated, person)
+        if present.any():
+            found = gated.jitter[present], slow_error.bias_sigma[present]
+            self.sensor_noise = SensorNoise(*(float(np.median(sigma)) for sigma in found))
         self._newest = newest = _Newest(gated, present, person, slow_error, rotations, score, imputed)
         return None if denoised is None else self._answer(denoised, newest, self._delay)
 

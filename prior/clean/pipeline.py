@@ -21,7 +21,7 @@ from steadypose.prior.clean.adapt import (
     stacked,
 )
 from steadypose.prior.clean.core import CleanCore
-from steadypose.prior.clean.frame import Bools, CleanFrame, Observation
+from steadypose.prior.clean.frame import Bools, CleanFrame, Observation, SensorNoise
 from steadypose.prior.clean.identify import Identify
 from steadypose.prior.clean.sensor_pose import SensorPoseGate, Verdict
 from steadypose.prior.clean.settings import PriorSettings
@@ -90,6 +90,11 @@ class PriorPipeline:
         ticks = self._resampler.update(raw.stamp_ns, *self._arranged(raw, layout))
         cleaned = [self._step(stamp_ns, Sighting(*joints), raw, hurry) for stamp_ns, *joints in ticks]
         return flushed + [message for message in cleaned if message is not None]
+
+    @property
+    def sensor_noise(self) -> SensorNoise | None:
+        """What the sensor was last found to be off by, the median over the bodies present; None before there was one."""
+        return self._core.sensor_noise
 
     def flush(self) -> list[PoseClean]:
         """Give the frames that the delay still holds, and forget the stream."""

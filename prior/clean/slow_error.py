@@ -128,7 +128,6 @@ def _find(positions, sigma, offsets, expected, moments, bias, length_variance):
                 lasting[known] = max(variance[k] - noise[k], 0.0)
                 known += 1
         found = 0.5 * median(lasting[:known]) if known else 0.0
-        most = min(most, MEMORY)
         square = (PRIOR_FRAMES * expected[s] ** 2 + most * found) / (PRIOR_FRAMES + most)
         bias[s] = math.sqrt(square)
         for k in range(len(RIGID)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +17,9 @@ from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.types import JOINTS, Diagnostics, PoseClean, PoseRaw, PoseWorld, Tracking
 from steadypose.nodes.sinks.drawing import to_world
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
+
+SENSOR = {"sensor.jitter_mm", "sensor.slow_error_mm"}
+"""diagnostics of the prior"""
 
 
 class Track(NamedTuple):
@@ -71,6 +75,8 @@ class History:
     observable: NDArray[np.bool_] = field(default_factory=lambda: np.ones(len(JOINTS), bool))
     """(22,) the joints that the sensor has at all"""
     origin: str = ""
+    sensor: dict[str, list[float]] = field(default_factory=dict)
+    """what the prior found the sensor to be off by, each second: ``jitter_mm`` and ``slow_error_mm``"""
     dropped_or_refused: Counter[str] = field(default_factory=Counter)
     """dropped and refused messages by node and cause, as the nodes counted them; and what could not be read"""
 
@@ -96,6 +102,9 @@ def read_history(recording: Path) -> History:
         for topic, stamp_ns, message in reader:
             if isinstance(message, Diagnostics):
                 dropped_or_refused[message.node] = message.values
+                for key in SENSOR & message.values.keys():
+                    with suppress(ValueError):  # of a recording that others wrote
+                        history.sensor.setdefault(key.removeprefix("sensor."), []).append(float(message.values[key]))
                 continue
             if message.end_of_stream:
                 continue

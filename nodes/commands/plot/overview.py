@@ -149,6 +149,9 @@ def draw_summary(ax: Axes, history: History, body: int, errors: dict[str, TrackE
     if clean is not None:
         shares = [f"{state.name.lower()} {(clean.state == state).mean():.1%}" for state in JointState]
         lines += ["", f"joints of body {body}:", "  " + "  ".join(shares)]
+    for key, name in (("jitter_mm", "from frame to frame"), ("slow_error_mm", "slow")):
+        if found := history.sensor.get(key):
+            lines.append(f"sensor's error, {name}: {np.median(found):.1f} mm along an axis")
     for topic, error in errors.items():
         mean, p95 = 100 * error.mean.mean(), 100 * np.percentile(error.mean, 95)
         lines.append(f"error {topic:<10} mean {mean:5.1f}  p95 {p95:5.1f} cm")

@@ -92,4 +92,6 @@ def test_every_node_says_how_it_did(
         assert float(values["latency_ms.p50"]) <= float(values["latency_ms.p99"])
         assert not [key for key in values if key.startswith(("dropped.", "refused."))]
     assert last["prior"].values["delay_frames"] == "4"
+    assert 0.0 < float(last["prior"].values["sensor.jitter_mm"]) < 100.0
+    assert 0.0 <= float(last["prior"].values["sensor.slow_error_mm"]) < 100.0
     assert float(last["prior"].values["compute_ms.p50"]) > 0

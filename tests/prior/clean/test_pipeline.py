@@ -296,3 +296,15 @@ def test_a_body_wholly_hidden_for_a_moment_stays_about_where_it_was() -> None:
     cleaned, _ = clean(stream(seen))
     error = np.linalg.norm(positions(cleaned) - truth[: len(cleaned)], axis=-1)
     assert error[30:42].max() < 0.4
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.005, 0.02])
+def test_the_noise_of_the_sensor_is_found(sigma: float) -> None:
+    pipeline = PriorPipeline(PriorSettings())
+    assert pipeline.sensor_noise is None
+    for message in stream(noisy(240, sigma)):
+        pipeline.process(message)
+    found = pipeline.sensor_noise
+    assert found is not None
+    assert found.jitter_sigma == pytest.approx(sigma, rel=0.4, abs=0.002)
+    assert found.bias_sigma < 0.006
