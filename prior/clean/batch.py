@@ -137,7 +137,7 @@ class StreamBatch:
 
     @property
     def sensor_noise(self) -> SensorNoise | None:
-        """What the sensor was last found to be off by, the median over the bodies present; None before there was one."""
+        """What the sensor was last found to be off by, the median over bodies; None before there was one."""
         return self._core.sensor_noise
 
     def flush(self) -> list[PoseClean]:

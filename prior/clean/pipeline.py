@@ -93,7 +93,7 @@ class PriorPipeline:
 
     @property
     def sensor_noise(self) -> SensorNoise | None:
-        """What the sensor was last found to be off by, the median over the bodies present; None before there was one."""
+        """What the sensor was last found to be off by, the median over bodies; None before there was one."""
         return self._core.sensor_noise
 
     def flush(self) -> list[PoseClean]:
