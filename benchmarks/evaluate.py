@@ -53,7 +53,7 @@ def _file(name: str, bench: Bench, result: Result, seconds: float, directory: Pa
     content = {
         "quick": bench.quick, "split": bench.split, "seeds": bench.seeds, "seconds": round(seconds, 1), **result.data
     }  # fmt: skip
-    path = save(name, options, result.tables, content, directory, program=("steadypose", "evaluate"))
+    path = save(name, options, result.tables, content, directory, ("steadypose", "evaluate"), result.measured)
     for stem, figure in result.figures.items():
         figure.savefig(directory / f"{stem}.png", dpi=110)
     return path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -19,26 +19,43 @@ RESULTS = Path(__file__).parent / "results"
 """Where the results lie that the README's tables are written from."""
 
 
+OF_CLEAN = ("prior weights", "prior settings")
+OF_WORLD = (*OF_CLEAN, "trajectory weights", "trajectory settings")
+"""what `pose/clean` and `pose/world` depend on, of what `ships`"""
+
+_PRIOR_MODELS = ("correction", "hgvae", "hmvae", "mixture")
+
+
 class UncommittedError(RuntimeError):
     """What would be measured is in no commit; the message says what to do."""
 
 
 @cache
 def ships() -> dict[str, str]:
-    """Digests of the weights that ship and of the settings that they run with."""
-    files = sorted(path for path in WEIGHTS.iterdir() if path.suffix in (".safetensors", ".json"))
-    weights = hashlib.sha256()
-    for path in files:
-        weights.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
-    settings = {"prior": asdict(PriorSettings()), "trajectory": asdict(TrajectorySettings())}
+    """Digests of the weights that ship and of the settings that they run with, of prior and trajectory."""
+    files = [path for path in WEIGHTS.iterdir() if path.suffix in (".safetensors", ".json")]
+    of_prior = {path for path in files if path.name.startswith(_PRIOR_MODELS)}
     return {
-        "weights": weights.hexdigest()[:16],
-        "settings": hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:16],
+        "prior weights": _digest_of_files(of_prior),
+        "prior settings": _digest_of_settings(asdict(PriorSettings())),
+        "trajectory weights": _digest_of_files(set(files) - of_prior),
+        "trajectory settings": _digest_of_settings(asdict(TrajectorySettings())),
     }
 
 
+def _digest_of_files(paths: Iterable[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:16]
+
+
+def _digest_of_settings(settings: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
 def stale(result: Mapping[str, Any]) -> list[str]:
-    """What has changed since a result was measured: some of ``weights`` and ``settings``; nothing where it holds.
+    """What has changed since a result was measured, of what `ships`; nothing where it holds.
 
     A result's ``measured`` has the digests of that time; one that depends on neither has none in it.
     """

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from steadypose.benchmarks.machine import ROOT, describe
-from steadypose.benchmarks.provenance import RESULTS, require_committed, ships
+from steadypose.benchmarks.provenance import OF_WORLD, RESULTS, require_committed, ships
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def save(
     data: dict[str, Any],
     directory: Path = RESULTS,
     program: Sequence[str] = (),
-    measured: Sequence[str] = ("weights", "settings"),
+    measured: Sequence[str] = OF_WORLD,
 ) -> Path:
     """Write ``NAME.json``: the command, the machine, the tables, and ``data``, whatever the benchmark found.
 

@@ -215,7 +215,7 @@ def main(args: Args) -> None:
     console = Console()
     table = _table(results)
     show(table, console)
-    path = save("identity", sys.argv[1:], [table], {"streams": results}, args.out, measured=("settings",))
+    path = save("identity", sys.argv[1:], [table], {"streams": results}, args.out, measured=("prior settings",))
     console.print(f"wrote {path}")
 
 

@@ -56,12 +56,13 @@ def test_a_result_is_stale_when_weights_or_settings_have_changed(
     save("importers", [], [replace(TABLE, name="files")], {}, tmp_path, measured=())
     results = load(tmp_path)
     assert stale(results["latency"]) == stale(results["importers"]) == []
-    assert stale({}) == ["weights", "settings"]
-    monkeypatch.setattr(provenance, "ships", lambda: {"weights": "others", "settings": ships()["settings"]})
-    assert (stale(results["latency"]), stale(results["importers"])) == (["weights"], [])
-    with pytest.raises(StaleError, match=r"systems\.latency.*weights"):
+    assert stale({}) == list(ships())
+    changed = ships() | {"prior weights": "others"}
+    monkeypatch.setattr(provenance, "ships", lambda: changed)
+    assert (stale(results["latency"]), stale(results["importers"])) == (["prior weights"], [])
+    with pytest.raises(StaleError, match=r"systems\.latency.*prior weights"):
         fill(TEXT, results)
-    assert "**stale: measured with other weights**" in fill(TEXT, results, allow_stale=True)
+    assert "**stale: measured with other prior weights**" in fill(TEXT, results, allow_stale=True)
     assert "stale" not in fill("<!-- results:files -->\n<!-- /results -->", results)
 
 
