@@ -23,7 +23,6 @@ COLOURS = {
     "temporal convolution": "#ff9da6",
     "HM-VAE": "#f2a5a5",
     "steadypose": "#e45756",
-    "steadypose, bias_sigma = 0.002": "#7a1423",
     "steadypose, research weights": "#d6179b",
     "steadypose, sensor known": "#5b2a86",
 }

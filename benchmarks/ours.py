@@ -37,7 +37,6 @@ OURS: Mapping[str, PriorSettings] = {
         fuse=FuseSettings(enabled=False),
     ),
     "steadypose": PriorSettings(),
-    "steadypose, bias_sigma = 0.002": PriorSettings(bias_sigma=0.002),
     **{
         f"steadypose, {weights} weights": PriorSettings(
             refine=RefineSettings(weights=weights), encode=ReconstructSettings(weights=weights)
@@ -46,8 +45,7 @@ OURS: Mapping[str, PriorSettings] = {
         if weights != RefineSettings().weights
     },
 }
-"""Every variant that each protocol runs; one line adds one. HM-VAE is the paper's refinement alone, unfused. The third
-is told what holds for motion capture and for independent noise, not for cameras: that the sensor has no slow error."""
+"""Every variant that each protocol runs; one line adds one. HM-VAE is the paper's refinement alone, unfused."""
 
 SIDE_BY_SIDE = 64
 """Clips in one stream: bodies do not touch each other, and many together take a fraction of the time."""
