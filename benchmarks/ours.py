@@ -34,15 +34,14 @@ OURS: Mapping[str, PriorSettings] = {
         denoise=DenoiseSettings(enabled=False),
         score=ScoreSettings(enabled=False),
         impute=ImputeSettings(enabled=False),
+        refine=RefineSettings(enabled=True),
         fuse=FuseSettings(enabled=False),
     ),
     "steadypose": PriorSettings(),
     **{
-        f"steadypose, {weights} weights": PriorSettings(
-            refine=RefineSettings(weights=weights), encode=ReconstructSettings(weights=weights)
-        )
-        for weights in weight_sets("hmvae")
-        if weights != RefineSettings().weights
+        f"steadypose, {weights} weights": PriorSettings(encode=ReconstructSettings(weights=weights))
+        for weights in weight_sets("hgvae")
+        if weights != ReconstructSettings().weights
     },
 }
 """Every variant that each protocol runs; one line adds one. HM-VAE is the paper's refinement alone, unfused."""

@@ -29,8 +29,8 @@ class PriorSettings:
     """Settings of the prior: ``[prior]`` of a launch file.
 
     Attributes:
-        delay: frames at 30 Hz to wait for before answering, 0 to twice the model's window (4, the default, half of
-            it, is the paper's centre-frame refinement).
+        delay: frames at 30 Hz to wait for before answering, 0 to 16 (4, the default, is half of HM-VAE's window: the
+            paper's centre-frame refinement).
         max_bodies: bodies followed at once.
         timeout: seconds without a sighting after which a body is dropped, and without a frame after which the
             stream starts anew.

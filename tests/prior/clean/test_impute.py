@@ -82,8 +82,9 @@ def test_a_node_in_a_hurry_does_without_the_climb_and_counts_it() -> None:
 
 
 def test_switched_off_hidden_joints_follow_the_refinement_model() -> None:
-    off, _ = answers(hidden_arm(), impute={"enabled": False}, score={"enabled": False})
-    scored, _ = answers(hidden_arm(), impute={"enabled": False})
+    refined = {"impute": {"enabled": False}, "refine": {"enabled": True}}
+    off, _ = answers(hidden_arm(), **refined, score={"enabled": False})
+    scored, _ = answers(hidden_arm(), **refined)
     assert all((a.positions == b.positions).all() for a, b in zip(off, scored, strict=True))
     assert all((b.state[ARM] == JointState.IMPUTED).all() for b in off[50:])
 
