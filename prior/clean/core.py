@@ -81,6 +81,7 @@ class CleanCore:
         denoise, score, impute = settings.denoise.enabled, settings.score.enabled, settings.impute.enabled
         self._slots, self._delay, self._counters = slots, delay, counters
         self._silent = np.zeros(slots, dtype=np.int64)
+        self._bias_sigma = noise.bias_sigma
         self._refine = Refine(settings.refine, delay, slots)
         self._gate = Gate(settings.gate, slots, counters)
         self._correct = Correct(settings.correct, slots) if settings.correct.sensor else None
@@ -118,7 +119,9 @@ class CleanCore:
         person = self._person.update(denoised, slow_error.bias_sigma, present)
         score = Score.unscored(self._slots)
         if self._score:
-            score = self._score.update(windows, gated.frozen, np.hypot(gated.jitter, slow_error.bias_sigma))
+            # bones do not show all of a sensor's slow error: less than is to be expected makes no fault of it
+            slow = np.maximum(slow_error.bias_sigma, self._bias_sigma)
+            score = self._score.update(windows, gated.frozen, np.hypot(gated.jitter, slow))
         imputed = self._impute.update(windows, gated.jitter, hurry=hurry) if self._impute else None
         rotations = self._refine.update(gated, person)
         if present.any():
