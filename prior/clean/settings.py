@@ -35,7 +35,8 @@ class PriorSettings:
         timeout: seconds without a sighting after which a body is dropped, and without a frame after which the
             stream starts anew.
         bias_sigma: metres along an axis, the sensor's slow error, which no filter averages out, as far as it is to be
-            expected before the stream shows what it is, and what a fault has to exceed. Depth cameras have 2 cm or more.
+            expected before the stream shows what it is, and what a fault has to exceed. Depth cameras have 2 cm or
+            more.
         identify: who tells bodies apart: the source (the default), or the prior.
         gate, correct, smooth, encode, denoise, bones, score, impute, refine, fuse: settings of the stages.
     """
