@@ -28,13 +28,13 @@ def compile_from_the_end() -> None:
     from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tracks
     from steadypose.prior.models.hgvae.inference import LiveHGVAE
 
-    size = body_size(REST_OFFSETS[None])
-    hgvae = LiveHGVAE.load("default", JITTER_SIGMA, JITTER_SIGMA, max_batch=1)
+    size, sigma = body_size(REST_OFFSETS[None]), np.array([JITTER_SIGMA])
+    hgvae = LiveHGVAE.load("default", JITTER_SIGMA, max_batch=1)
     windows = np.tile(REST_POSITIONS, (1, hgvae.frames, 1, 1))
     windows[:, -5:, -1] = np.nan
     tracks = to_tracks(windows, size)
-    found = hgvae.reconstruct(tracks.x, tracks.observed)
-    LiveFaultNet.load("default", JITTER_SIGMA, max_batch=1)(tracks.x, found.mean, found.sigma, tracks.observed)
+    found = hgvae.reconstruct(tracks.x, tracks.observed, sigma)
+    LiveFaultNet.load("default", max_batch=1)(tracks.x, found.mean, found.sigma, tracks.observed, sigma)
     from_tracks(found.mean, tracks, size)
     _, placed = solve_pose(REST_POSITIONS, REST_OFFSETS)
     fit_lengths(placed, REST_OFFSETS, np.ones(22))
