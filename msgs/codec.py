@@ -13,6 +13,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from steadypose.msgs.limits import check_size
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.types import (
     CleanBody,
@@ -74,6 +75,7 @@ def decode(topic: str, payload: bytes | memoryview) -> Message:
         raise DecodeError(f"unknown topic {topic!r}: expected one of {', '.join(TOPICS)}")
     codec = _CODECS[TOPICS[topic]]
     try:
+        check_size(topic, payload)
         return codec.from_wire(typestore().deserialize_cdr(payload, codec.wire_type))
     except (SerdeError, ValueError) as error:
         raise DecodeError(f"{topic}: {len(payload)} bytes are not a {codec.wire_type}: {error}") from error

@@ -18,6 +18,7 @@ import zmq
 from steadypose.msgs.addresses import TransportError, is_local, make_private, parse, refuse_used
 from steadypose.msgs.codec import encode, typestore
 from steadypose.msgs.keys import ClientList, Keys
+from steadypose.msgs.limits import check_size
 from steadypose.msgs.topics import TOPICS, check_topic
 from steadypose.msgs.types import Message
 from steadypose.msgs.wire import MAX_FRAME, PREFIX, VERSION, Listener, read_subscription, read_taken
@@ -136,10 +137,12 @@ class Publisher:
             whether it was sent; False only if it was waited for in vain, and then nobody got it.
 
         Raises:
-            ValueError: if the message is not of the topic's type, or encodes to more than `MAX_FRAME` bytes.
+            ValueError: if the message is not of the topic's type, encodes to more than `MAX_FRAME` bytes, or holds more
+                than `msgs.limits` allows.
         """
         check_topic(topic, message)
         payload = encode(message)
+        check_size(topic, payload)
         size = len(topic) + 1 + PREFIX.size + len(payload)
         if size > MAX_FRAME:
             raise ValueError(f"{topic}: expected a message of at most {MAX_FRAME} bytes, got {size}")

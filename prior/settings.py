@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 
 def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
@@ -33,5 +34,32 @@ def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
             value, (int, float) if wanted is float else wanted
         ):
             raise ValueError(f"[{path}] {key}: expected {wanted.__name__} such as {default!r}, got {value!r}")
+        if wanted is float and not math.isfinite(value):
+            raise ValueError(f"[{path}] {key}: expected a finite number such as {default!r}, got {value!r}")
+        if isinstance(value, (list, dict)) and (kind := _kind_of_items(cls, key)) is not None:
+            _check_items(f"[{path}] {key}", value, kind)
         values[key] = wanted(value)
     return cls(**values)
+
+
+def check_range(name: str, value: float, least: float, most: float) -> None:
+    """Raises:
+    ValueError: it is not between them.
+    """
+    if not least <= value <= most:
+        raise ValueError(f"{name}: expected {least:g} to {most:g}, got {value:g}")
+
+
+def _kind_of_items(cls: type, key: str) -> type | None:
+    """The kind of numbers that a list, or the values of a table, holds, as the dataclass says; None if of none."""
+    kinds = get_args(get_type_hints(cls)[key])
+    return kinds[-1] if kinds and kinds[-1] in (int, float) else None
+
+
+def _check_items(name: str, value: list[Any] | dict[str, Any], kind: type) -> None:
+    for item in value.values() if isinstance(value, dict) else value:
+        fits = isinstance(item, (int, float) if kind is float else kind) and (
+            kind is bool or not isinstance(item, bool)
+        )
+        if not fits or (isinstance(item, float) and not math.isfinite(item)):
+            raise ValueError(f"{name}: expected each to be a {kind.__name__}, got {item!r}")

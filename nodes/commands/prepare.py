@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from steadypose.prior.motion.clip import Clip
-from steadypose.prior.motion.datasets import DATA_SETS, SPLITS, DataSet, Dropped
+from steadypose.prior.motion.clip import Clip, MotionError, documented
+from steadypose.prior.motion.datasets import DATA_SETS, SPLITS, UNREADABLE, DataSet, Dropped
 from steadypose.prior.motion.prepare import FPS, Prepared, at_speed, prepare_clip, write_prepared
 
 
@@ -165,8 +165,8 @@ def _read(
         fraction = min(fraction, 0.99) if reading else 1.0
         progress.update(task, completed=fraction, count=count)
 
-    for clip in data_set.read(path, advance):
-        for part in [clip] if isinstance(clip, Dropped) else _played(clip, data_set, speeds):
+    for clip in _clips(path, data_set, advance):
+        for part in [clip] if isinstance(clip, Dropped) else _prepared(clip, data_set, speeds):
             if isinstance(part, Dropped):
                 result.dropped.append(part)
                 dropped += 1
@@ -176,6 +176,21 @@ def _read(
                 seconds += part.clip.seconds
     reading = False
     advance(1.0)
+
+
+def _clips(path: Path, data_set: DataSet, advance: Callable[[float], None]) -> Iterator[Clip | Dropped]:
+    """The recordings of a data set; where its archive cannot be read further, that is the last."""
+    try:
+        yield from data_set.read(path, advance)
+    except MotionError as error:
+        yield Dropped(path.name, data_set.name, UNREADABLE, str(error))
+
+
+def _prepared(clip: Clip, data_set: DataSet, speeds: Sequence[float]) -> list[Prepared | Dropped]:
+    try:
+        return documented(lambda: list(_played(clip, data_set, speeds)))()
+    except MotionError as error:
+        return [Dropped(clip.name, clip.source, UNREADABLE, str(error))]
 
 
 def _played(clip: Clip, data_set: DataSet, speeds: Sequence[float]) -> Iterator[Prepared | Dropped]:

@@ -20,6 +20,7 @@ from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Level
 from steadypose.nodes.checks.problem import from_values
+from steadypose.nodes.commands.printable import printable
 from steadypose.nodes.graph import health_file
 from steadypose.nodes.graph.clock import FRAME_NS, POLL_S, Clock, SystemClock
 from steadypose.nodes.graph.health_file import write_health
@@ -111,8 +112,8 @@ class _Run:
         waited_for = frozenset[str]().union(*map(launch.reliable_subscribers, POSE_NODES))
         self._required = {name for name in launch.nodes if not NODES[name].optional or name in waited_for}
         self._without: list[str] = []
-        self._progress_ns = clock.now_ns()
-        self._printed_ns = clock.now_ns()
+        self._progress_ns = clock.monotonic_ns()
+        self._printed_ns = clock.monotonic_ns()
         self._told_ns = 0
         self._ready = False
 
@@ -156,9 +157,9 @@ class _Run:
 
     def _tell(self, supervisor: Supervisor) -> None:
         """Say how things are to who is no person: once a second, a file and systemd."""
-        if self._clock.now_ns() - self._told_ns < TELL_NS:
+        if self._clock.monotonic_ns() - self._told_ns < TELL_NS:
             return
-        self._told_ns = self._clock.now_ns()
+        self._told_ns = self._clock.monotonic_ns()
         write_health(self._launch.transport.ipc_directory, sorted(self._required), supervisor, self._diagnostics)
         if not self._ready and all(name in self._diagnostics for name in self._required):
             self._ready = True
@@ -166,7 +167,7 @@ class _Run:
         notify(ALIVE)
 
     def _print(self, line: str) -> None:
-        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
     def _receive(self, received: tuple[str, object], supervisor: Supervisor) -> None:
         diagnostics = received[1]
@@ -175,7 +176,7 @@ class _Run:
         supervisor.children[diagnostics.node].heard()
         last = self._diagnostics.get(diagnostics.node)
         if last is None or _counts(last) != _counts(diagnostics):
-            self._progress_ns = self._clock.now_ns()
+            self._progress_ns = self._clock.monotonic_ns()
         self._diagnostics[diagnostics.node] = diagnostics
         self._tell_problems(diagnostics)
 
@@ -192,8 +193,8 @@ class _Run:
     def _show(self, supervisor: Supervisor, live: Live | None) -> None:
         if live:
             live.update(table(self._launch.nodes, self._diagnostics, supervisor), refresh=True)
-        elif self._clock.now_ns() - self._printed_ns >= LINE_NS:
-            self._printed_ns = self._clock.now_ns()
+        elif self._clock.monotonic_ns() - self._printed_ns >= LINE_NS:
+            self._printed_ns = self._clock.monotonic_ns()
             self._print(line(self._launch.nodes, self._diagnostics, supervisor))
 
     def _exit_status(self, supervisor: Supervisor) -> int | None:
@@ -206,7 +207,7 @@ class _Run:
             self._print(f"{', '.join(without)} cannot run; going on without")
         source = supervisor.children.get("pose_input")
         if source is None or source.state != "ended":
-            self._progress_ns = self._progress_ns if source else self._clock.now_ns()
+            self._progress_ns = self._progress_ns if source else self._clock.monotonic_ns()
             return None
         if self._drained():
             if "viewer" not in self._launch.nodes or not self._console.is_terminal:
@@ -215,7 +216,7 @@ class _Run:
                 self._over = True
                 self._print("the stream has ended; the picture stays until Ctrl-C")
             return None
-        if self._clock.now_ns() - self._progress_ns > STALL_NS:
+        if self._clock.monotonic_ns() - self._progress_ns > STALL_NS:
             self._print("the stream ended, but its end did not come through all nodes; see dropped and restarts")
             return 1
         return None
@@ -287,13 +288,13 @@ def table(
             }
         )
         if " " in state:
-            notes.append(Text(f"{name}: {state}"))
+            notes.append(Text(printable(f"{name}: {state}")))
         if latest and not summary:
             style = "bold red" if latest.level == Level.ERROR else "yellow"
             notes += [Text(f"{name}: {text}", style=style) for text in from_values(values).values()]
         causes = [f"{key} {n}" for key, n in values.items() if key.startswith(("dropped.", "refused."))]
         if latest and causes and (summary or latest.level != Level.OK):
-            notes.append(Text(f"{name}: {', '.join(causes)}", style="yellow"))
+            notes.append(Text(printable(f"{name}: {', '.join(causes)}"), style="yellow"))
     grid = Table(box=None, header_style="bold", pad_edge=False)
     for heading in rows[0]:
         if any(row[heading] not in ("", "0") for row in rows):

@@ -23,20 +23,27 @@ class Clock(Protocol):
     """Time for nodes; tests pass one of their own that does not wait."""
 
     def now_ns(self) -> int:
-        """Wall time, nanoseconds since 1970; never steps back."""
+        """Wall time, nanoseconds since 1970, for stamps; it steps when the system's clock is set."""
+        ...
+
+    def monotonic_ns(self) -> int:
+        """For durations, nanoseconds since some moment; never steps."""
         ...
 
     def sleep(self, duration_ns: int) -> None: ...
 
 
 class SystemClock:
-    """The wall clock as it was at the start, carried on by the monotonic clock, so that it never steps."""
+    """The system's clocks.
 
-    def __init__(self) -> None:
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
+    A machine without a battery begins at some time, and is set when it hears of the time; so the wall clock steps.
+    """
 
     def now_ns(self) -> int:
-        return self._offset_ns + time.monotonic_ns()
+        return time.time_ns()
+
+    def monotonic_ns(self) -> int:
+        return time.monotonic_ns()
 
     def sleep(self, duration_ns: int) -> None:
         time.sleep(max(duration_ns, 0) / 1e9)

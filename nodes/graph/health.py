@@ -47,19 +47,19 @@ class Health:
         self._published_before: Counter[str] = Counter()
         self._rates: dict[str, float] = {}
         self._lost_before = 0
-        self._reported_at = self._rated_at = clock.now_ns()
+        self._reported_at = self._rated_at = clock.monotonic_ns()
 
     @property
     def due(self) -> bool:
         """Whether it is time for the next report."""
-        return self._clock.now_ns() - self._reported_at >= REPORT_NS
+        return self._clock.monotonic_ns() - self._reported_at >= REPORT_NS
 
     def note_published(self, topic: str, at_ns: int, latency_ns: int | None) -> None:
         """A message was published.
 
         Args:
             topic: its topic.
-            at_ns: wall time.
+            at_ns: when, on the monotonic clock.
             latency_ns: from capture, less the delay that is meant; None where it is not known.
         """
         self.published[topic] += 1
@@ -86,7 +86,7 @@ class Health:
             status: what the node itself has to say.
             problems: that it found with its stream, the worst of which is the level and the message.
         """
-        self._reported_at = self._clock.now_ns()
+        self._reported_at = self._clock.monotonic_ns()
         self._measure_rates()
         counts = self.counts + received
         refused_by_node = sum(int(n) for key, n in status.items() if key.startswith(("refused.", "dropped.")))
@@ -114,7 +114,7 @@ class Health:
         )
 
     def _measure_rates(self) -> None:
-        now = self._clock.now_ns()
+        now = self._clock.monotonic_ns()
         elapsed = now - self._rated_at
         # a report out of turn, as at the end of a stream, sees too little time for a rate
         if elapsed < REPORT_NS // 2 and self._rates:

@@ -125,24 +125,36 @@ class Node(ABC):
             self._await_subscribers()
             declared = NODES[self.name]
             if declared.subscribes:
-                self._subscriber = stack.enter_context(
-                    Subscriber(
-                        [address for node in declared.subscribes for address in self.launch.addresses(node)],
-                        sorted(declared.topics),
-                        reliable=transport.lossless and self.queue_limit is None,
-                        lifespan_s=math.inf if self.queue_limit is None else transport.lifespan_s,
-                        keys=keys,
-                        clear_text=transport.clear_text,
-                        name=self.name,
+                self._subscribers = [
+                    stack.enter_context(
+                        Subscriber(
+                            addresses,
+                            sorted(declared.topics),
+                            reliable=transport.lossless and self.queue_limit is None,
+                            lifespan_s=math.inf if self.queue_limit is None else transport.lifespan_s,
+                            keys=keys,
+                            clear_text=transport.clear_text,
+                            name=self.name,
+                        )
                     )
-                )
-                self._inbox = Inbox(self._subscriber, self.queue_limit)
+                    for addresses in self._addresses()
+                ]
+                self._inbox = Inbox(self._subscribers, self.queue_limit)
             self.health.state = "running"
             self.report()
             notify(READY)
             self.work()
             self.health.state = "stopped"
             self.report()
+
+    def _addresses(self) -> Iterator[list[str]]:
+        """Of the publishers to hear; each kiosk by itself, so that none takes the share of another."""
+        nodes, kiosks = NODES[self.name].subscribes, self.launch.server.kiosks
+        if "pose_input" in nodes:
+            yield from ([address] for address in kiosks)
+        others = [address for node in nodes for address in self.launch.addresses(node) if address not in kiosks]
+        if others:
+            yield others
 
     def work(self) -> None:
         """Take messages until stopped."""
@@ -164,13 +176,13 @@ class Node(ABC):
                 self.timeline = Timeline.from_values(message.values)
         else:
             self.health.stamp_ns = message.stamp_ns
-        started, self._blocked_ns = self.clock.now_ns(), 0
+        started, self._blocked_ns = self.clock.monotonic_ns(), 0
         try:
             self.handle(topic, message)
         except Exception as error:
             self.refuse(topic, error)
         if not isinstance(message, Diagnostics):
-            self.health.note_computed(self.clock.now_ns() - started - self._blocked_ns)
+            self.health.note_computed(self.clock.monotonic_ns() - started - self._blocked_ns)
             if message.end_of_stream:
                 self.note_end(topic)
         return True
@@ -191,17 +203,20 @@ class Node(ABC):
         Returns:
             False if the node was stopped while it waited.
         """
-        requested_at = self.clock.now_ns()
+        requested_at = self.clock.monotonic_ns()
         self._await_subscribers()
         while not self._publisher.publish(topic, message, timeout_s=POLL_S):
             if self._stopping:
                 self.health.counts[f"dropped.stopped {topic}"] += 1
                 return False
             self.report_if_due()
-        now = self.clock.now_ns()
+        now = self.clock.monotonic_ns()
         self._blocked_ns += now - requested_at
         of_frame = not isinstance(message, Diagnostics) and not message.end_of_stream
-        latency_ns = now - self.timeline.wall(message.stamp_ns) - delay_ns if of_frame and self.timeline else None
+        latency_ns = None
+        if of_frame and self.timeline:  # the delay is of the stream's time, which may run faster
+            late_ns = self.clock.now_ns() - self.timeline.wall(message.stamp_ns)
+            latency_ns = late_ns - round(delay_ns / self.timeline.rate)
         self.health.note_published(topic, now, latency_ns)
         if not isinstance(message, Diagnostics):
             self.health.stamp_ns = message.stamp_ns
@@ -235,22 +250,23 @@ class Node(ABC):
         received = Counter({f"refused.{cause}": n for cause, n in self._disconnected.items()})
         if self._inbox is not None:
             received["dropped.late"] = self._inbox.overrun
-            received.update({f"dropped.lost {topic}": n for topic, n in self._subscriber.dropped.items()})
-            received.update({f"dropped.expired {topic}": n for topic, n in self._subscriber.late.items()})
-            received.update({f"refused.{cause}": n for cause, n in self._subscriber.refused.items()})
+            for subscriber in self._subscribers:
+                received.update({f"dropped.lost {topic}": n for topic, n in subscriber.dropped.items()})
+                received.update({f"dropped.expired {topic}": n for topic, n in subscriber.late.items()})
+                received.update({f"refused.{cause}": n for cause, n in subscriber.refused.items()})
         return self.health.report(self.name, received, self.status(), [*self._wire_problems(), *self.problems()])
 
     def _wire_problems(self) -> Iterator[Problem]:
         """What came and is no message, since this was last asked."""
         if self._inbox is None:
             return
-        refused = Counter(self._subscriber.refused)
+        refused = sum((subscriber.refused for subscriber in self._subscribers), Counter[str]())
         new, self._refused_before = refused - self._refused_before, refused
         if new:
             yield error(
                 "not_a_message",
                 f"{new.total()} of what came were no messages ({', '.join(sorted(new))}): expected the topic, a zero "
-                "byte, a header of 9 bytes, and CDR (docs/other_languages.md)",
+                "byte, a header of 17 bytes, and CDR (docs/other_languages.md)",
             )
 
     def _await_subscribers(self) -> None:

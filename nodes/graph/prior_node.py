@@ -76,7 +76,7 @@ class PriorNode(Node):
         self._checks.see(message, self.clock.now_ns())
         self._answers.asked(message)
         if isinstance(self._pipeline, StreamBatch):
-            cleaned = self._pipeline.process_at(message, self.clock.now_ns(), hurry=self.behind)
+            cleaned = self._pipeline.process_at(message, self.clock.monotonic_ns(), hurry=self.behind)
         else:
             cleaned = self._pipeline.process(message, hurry=self.behind)
         for clean in cleaned:

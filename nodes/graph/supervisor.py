@@ -69,23 +69,23 @@ class Child:
         """Since when it was not heard; 0 for one that does not run, or that is only starting."""
         if self.state not in ("running", "stale") or self._heard_ns is None:
             return 0.0
-        return (self._clock.now_ns() - self._heard_ns) / 1e9
+        return (self._clock.monotonic_ns() - self._heard_ns) / 1e9
 
     def heard(self) -> None:
         """It said something."""
         if self.state in ("running", "stale"):
-            self._heard_ns = self._clock.now_ns()
+            self._heard_ns = self._clock.monotonic_ns()
             self._was_heard = True
             self.state = "running"
 
     def excuse(self) -> None:
         """Who listens was away: silence begins to count from now."""
         if self._heard_ns is not None:
-            self._heard_ns = self._clock.now_ns()
+            self._heard_ns = self._clock.monotonic_ns()
 
     def poll(self) -> None:
         """See whether the process is still there, and start it again when that is due."""
-        now = self._clock.now_ns()
+        now = self._clock.monotonic_ns()
         if self.state == "crashed" and now >= self._due_ns:
             self.restarts += 1
             self._start()
@@ -103,7 +103,7 @@ class Child:
             self.state = "stale"
 
     def _note_exit(self, status: int) -> None:
-        if self._clock.now_ns() - self._started_ns > STEADY_S * 1e9:
+        if self._clock.monotonic_ns() - self._started_ns > STEADY_S * 1e9:
             self._crashes = 0
         self._crashes += 1
         if status == 0:
@@ -113,7 +113,7 @@ class Child:
         else:
             self.state = "crashed"
             pause_s = BACKOFF_S[min(self._crashes, len(BACKOFF_S)) - 1]
-            self._due_ns = self._clock.now_ns() + round(pause_s * 1e9)
+            self._due_ns = self._clock.monotonic_ns() + round(pause_s * 1e9)
             cause = signal.Signals(-status).name if status < 0 else f"status {status}"
             self._log(f"{self.name}: ended with {cause}; starting it again in {pause_s:g} s")
 
@@ -145,7 +145,7 @@ class Child:
         )
         self._reader = threading.Thread(target=self._read, args=(self._process,), daemon=True)
         self._reader.start()
-        self._started_ns = self._clock.now_ns()
+        self._started_ns = self._clock.monotonic_ns()
         self._heard_ns: int | None = None
         self.state = "running"
 
@@ -176,7 +176,7 @@ class Supervisor:
             log: where a line from a node, or about it, goes; called from several threads.
         """
         self._clock = clock
-        self._polled_ns = clock.now_ns()
+        self._polled_ns = clock.monotonic_ns()
         self.children = {
             name: Child(name, [*COMMAND, name, *arguments], clock, log)
             for name in sorted(nodes, key=ORDER.index, reverse=True)
@@ -184,7 +184,7 @@ class Supervisor:
 
     def poll(self) -> None:
         """See after all nodes; to be called several times a second, after what they said was taken."""
-        before, self._polled_ns = self._polled_ns, self._clock.now_ns()
+        before, self._polled_ns = self._polled_ns, self._clock.monotonic_ns()
         away = self._polled_ns - before > STALE_S * 1e9
         for child in self.children.values():
             if away:  # suspended, or starved: nobody listened

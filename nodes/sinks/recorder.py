@@ -159,7 +159,7 @@ class RecorderNode(Node):
         self.health.counts[NO_ROOM] += 1
 
     def _look_at_disk(self) -> None:
-        now = self.clock.now_ns()
+        now = self.clock.monotonic_ns()
         if self._checked_ns and now - self._checked_ns < CHECK_NS:
             return
         self._checked_ns = now

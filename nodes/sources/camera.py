@@ -94,8 +94,8 @@ class CameraSource(LiveSource):
             pause_s = PAUSES_S[min(tries, len(PAUSES_S) - 1)]
             tries += 1
             self._state = f"waiting for a camera: {trouble}; next try in {pause_s:g} s"
-            again_ns = self._clock.now_ns() + round(pause_s * 1e9)
-            while self._clock.now_ns() < again_ns:
+            again_ns = self._clock.monotonic_ns() + round(pause_s * 1e9)
+            while self._clock.monotonic_ns() < again_ns:
                 yield None
                 self._clock.sleep(round(POLL_S * 1e9))
 

@@ -8,6 +8,7 @@ numbers, if they are not to be 0, 1, ….
 
 from __future__ import annotations
 
+import zipfile
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Message, Pose, PoseRaw, RawBody
 from steadypose.prior.body.layouts import SKELETONS
+from steadypose.prior.npz_size import check_arrays
 
 STAMPS_END_NS = 2**31 * 10**9
 """ROS 2 counts seconds in 31 bits"""
@@ -110,6 +112,8 @@ class NpzSource(ArraySource):
 
 def _load(path: Path) -> dict[str, NDArray[Any]]:
     try:
+        if zipfile.is_zipfile(path):
+            check_arrays(path)
         with np.load(path, allow_pickle=False) as file:
             if not isinstance(file, np.lib.npyio.NpzFile):
                 raise NpzError(f"{path}: expected an .npz with named arrays, got a single array")

@@ -12,6 +12,7 @@ from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.settings import LaunchError, path_setting
 from steadypose.nodes.sources.camera import CameraSource, Connection
 from steadypose.nodes.sources.source import SourceContext
+from steadypose.prior.settings import check_range
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,10 @@ class OakSettings:
     """frames a second; 0: what the camera's own network does"""
     confidence: float = 0.5
     """of a person, below which it is none"""
+
+    def __post_init__(self) -> None:
+        check_range("[input.oak] fps", self.fps, 0, 1000)
+        check_range("[input.oak] confidence", self.confidence, 0, 1)
 
 
 Connect = Callable[[OakSettings, Clock], AbstractContextManager[Connection]]

@@ -45,6 +45,7 @@ class PoseInputNode(Node):
         self._pose = settings.calibration.pose
         self._last_ns: int | None = None
         self._at = Progress()
+        self._pace: Timeline | None = None  # on the monotonic clock, so that setting the wall clock halts nothing
         self._progress = ProgressFile(launch.transport.ipc_directory / "pose_input.progress", supervisor_id())
 
     def handle(self, topic: str, message: Message) -> None:
@@ -95,7 +96,14 @@ class PoseInputNode(Node):
     def problems(self) -> list[Problem]:
         return self._source.problems() if isinstance(self._source, LiveSource) else []
 
+    def _tell_pace(self) -> None:
+        """Say in wall time, which may have been set since, which stamp is played when."""
+        if self._pace:
+            set_ns = self.clock.now_ns() - self.clock.monotonic_ns()
+            self.timeline = dataclasses.replace(self._pace, wall_ns=self._pace.wall_ns + set_ns)
+
     def status(self) -> dict[str, str]:
+        self._tell_pace()
         refused = {f"refused.{cause}": str(n) for cause, n in self._source.refused.items() if n}
         camera = self._source.status() if isinstance(self._source, LiveSource) else {}
         return camera | refused | (self.timeline.values() if self.timeline else {})
@@ -124,11 +132,12 @@ class PoseInputNode(Node):
         last_ns, self._last_ns = self._last_ns, stamp_ns
         if not self._rate:
             return
-        if self.timeline is None or last_ns is None or abs(stamp_ns - last_ns) > LEAP_NS:
-            self.timeline = Timeline(stamp_ns, self.clock.now_ns(), self._rate)
+        if self._pace is None or last_ns is None or abs(stamp_ns - last_ns) > LEAP_NS:
+            self._pace = Timeline(stamp_ns, self.clock.monotonic_ns(), self._rate)
+            self._tell_pace()
             self.report()
-        due_ns = self.timeline.wall(stamp_ns)
-        while (left_ns := due_ns - self.clock.now_ns()) > 0 and not self.stopping:
+        due_ns = self._pace.wall(stamp_ns)
+        while (left_ns := due_ns - self.clock.monotonic_ns()) > 0 and not self.stopping:
             self.clock.sleep(min(left_ns, round(POLL_S * 1e9)))
             self.report_if_due()
 

@@ -18,6 +18,7 @@ from steadypose.nodes.graph.settings import LaunchError, path_setting
 from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import CameraSource, Connection
 from steadypose.nodes.sources.source import SourceContext
+from steadypose.prior.settings import check_range
 
 if TYPE_CHECKING:
     from steadypose.nodes.sources.webcam_video import VideoSource
@@ -42,6 +43,11 @@ class WebcamSettings:
     """number of bodies to look for"""
     field_of_view: float = 1.05
     """radians, of the image's width, where the lens is not calibrated: scales how far away bodies seem"""
+
+    def __post_init__(self) -> None:
+        check_range("[input.webcam] camera", self.camera, 0, 1000)
+        check_range("[input.webcam] bodies", self.bodies, 1, 64)
+        check_range("[input.webcam] field_of_view", self.field_of_view, 0.1, 3.0)
 
 
 def open_webcam(settings: WebcamSettings, context: SourceContext) -> WebcamSource | VideoSource:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 from steadypose.prior.clean.correct import CorrectSettings
@@ -18,7 +18,7 @@ from steadypose.prior.clean.reconstruct import ReconstructSettings
 from steadypose.prior.clean.refine import RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
 from steadypose.prior.clean.smooth import SmoothSettings
-from steadypose.prior.settings import build_settings
+from steadypose.prior.settings import build_settings, check_range
 
 JITTER_SIGMA = 0.02
 """Metres along an axis, of a joint seen with full confidence: what networks are told before noise is found."""
@@ -56,6 +56,17 @@ class PriorSettings:
     impute: ImputeSettings = field(default_factory=ImputeSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     fuse: FuseSettings = field(default_factory=FuseSettings)
+
+    def __post_init__(self) -> None:
+        check_range("[prior] max_bodies", self.max_bodies, 1, 64)
+        check_range("[prior] timeout", self.timeout, 0.05, 60.0)
+        check_range("[prior.bones] samples", self.bones.samples, 1, 1e6)
+        check_range("[prior.bones] every", self.bones.every, 1, 1e6)
+        for section in (f.name for f in fields(self) if is_dataclass(getattr(self, f.name))):
+            stage = getattr(self, section)
+            for f in fields(stage):
+                if isinstance(value := getattr(stage, f.name), int | float):
+                    check_range(f"[prior.{section}] {f.name}", value, 0, 1e6)
 
     @property
     def noise(self) -> SensorNoise:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from steadypose.prior.motion.clip import MotionError, forward
+from steadypose.prior.motion.clip import MotionError, documented, forward
 
 INCH = 0.0254
 """Metres. An ASF gives lengths in inches times its ``length`` unit."""
@@ -43,6 +43,7 @@ class _Bone:
     freedoms: tuple[str, ...]
 
 
+@documented
 def read_asf(text: str) -> Asf:
     """Read an Acclaim skeleton.
 
@@ -84,6 +85,7 @@ def read_asf(text: str) -> Asf:
     )
 
 
+@documented
 def read_amc(text: str, skeleton: Asf) -> NDArray[np.float64]:
     """Read an Acclaim motion.
 

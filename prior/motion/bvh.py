@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from steadypose.prior.motion.clip import MotionError, forward
+from steadypose.prior.motion.clip import MotionError, documented, forward
 
 
 @dataclass
@@ -50,6 +50,7 @@ class Bvh:
     fps: float
     values: NDArray[np.float64]
 
+    @documented
     def positions(self, lost_bones: Mapping[str, float] | None = None) -> NDArray[np.float64]:
         """(T, J, 3) in the file's unit and axes, by forward kinematics.
 
@@ -78,6 +79,7 @@ class Bvh:
         return forward(self.parents, steps, local)[0]
 
 
+@documented
 def read_bvh(text: str) -> Bvh:
     """Read a BVH file: any rotation order, position channels on any joint, several roots and end sites.
 

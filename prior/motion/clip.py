@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,25 @@ Y_UP_TO_Z_UP: NDArray[np.float64] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0],
 
 class MotionError(ValueError):
     """A motion file is not what it should be; the message says what was expected and what is there."""
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def documented(read: Callable[P, R]) -> Callable[P, R]:
+    """A reader whose every error is a `MotionError`: of damaged files numpy, zipfile and scipy raise dozens."""
+
+    @wraps(read)
+    def reader(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return read(*args, **kwargs)
+        except MotionError:
+            raise
+        except Exception as error:
+            raise MotionError(f"cannot be read: {type(error).__name__}: {error}") from error
+
+    return reader
 
 
 @dataclass(frozen=True)

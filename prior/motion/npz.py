@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
-from steadypose.prior.motion.clip import MotionError, forward
+from steadypose.prior.motion.clip import MotionError, documented, forward
 from steadypose.prior.motion.tables import CMU_BVH, CMU_METRES
+from steadypose.prior.npz_size import check_arrays
 
 
 @contextmanager
@@ -26,8 +27,12 @@ def open_npz(file: IO[bytes] | Path, *needs: str) -> Iterator[NpzFile]:
         MotionError: it is no .npz (or needs pickle, which can run code), or lacks an array.
     """
     try:
+        if zipfile.is_zipfile(file):
+            check_arrays(file)
+        if not isinstance(file, Path):
+            file.seek(0)
         archive = np.load(file)
-    except (BadZipFile, ValueError, EOFError) as error:
+    except Exception as error:  # of damaged bytes zipfile, zlib and numpy's parser of headers raise a dozen kinds
         raise MotionError(f"expected an .npz archive: {error}") from error
     if not isinstance(archive, NpzFile):
         raise MotionError("expected an .npz archive, got a single array")
@@ -66,6 +71,7 @@ def read_expmap(file: IO[bytes]) -> Iterator[tuple[float, str, float, NDArray[np
             yield done / len(names), name, fps, forward(parents, steps, local)[0][:, wanted]
 
 
+@documented
 def read_amass(file: IO[bytes]) -> tuple[float, NDArray[np.float64]]:
     """SMPL, SMPL-H or SMPL-X poses as AMASS stores them: ``poses``, ``trans`` and the frame rate.
 

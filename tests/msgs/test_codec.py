@@ -1,6 +1,7 @@
 """Whatever can be said arrives as it was said; whatever else arrives is a `DecodeError` and costs no memory."""
 
 import contextlib
+import dataclasses
 import struct
 import tracemalloc
 
@@ -11,8 +12,9 @@ from hypothesis import strategies as st
 from tests.helpers.msg_strategies import ANY, EXAMPLES, clean, diagnostics, raw
 
 from steadypose.msgs.codec import DecodeError, decode, encode, typestore, wire_type
+from steadypose.msgs.limits import MAX_BODIES, MAX_VALUES
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, TOPICS
-from steadypose.msgs.types import Message
+from steadypose.msgs.types import Diagnostics, Message
 
 PAYLOADS = {topic: encode(message) for topic, message in EXAMPLES.items()}
 TOPIC_NAMES = st.sampled_from(list(TOPICS))
@@ -134,3 +136,21 @@ def test_an_unknown_topic_is_refused():
 def _decode_or_refuse(topic: str, payload: bytes) -> None:
     with contextlib.suppress(DecodeError):
         assert type(decode(topic, payload)) is TOPICS[topic]
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_more_than_a_message_may_hold_is_refused_before_it_is_decoded(topic: str):
+    """A valid message of a million bytes, of bodies of nothing, would keep a node busy for seconds."""
+    example = EXAMPLES[topic]
+    if isinstance(example, Diagnostics):
+        large = dataclasses.replace(example, values={str(k): "" for k in range(MAX_VALUES + 1)})
+        fits = dataclasses.replace(example, values={str(k): "" for k in range(MAX_VALUES)})
+    else:
+        large = dataclasses.replace(example, bodies=example.bodies[:1] * (MAX_BODIES + 1))
+        fits = dataclasses.replace(example, bodies=example.bodies[:1] * MAX_BODIES)
+    assert decode(topic, encode(fits)) == fits
+    with pytest.raises(DecodeError, match="expected at most"):
+        decode(topic, encode(large))
+    # no more than counted is looked at
+    with pytest.raises(DecodeError, match="expected at most"):
+        decode(topic, encode(large)[:300])

@@ -44,6 +44,9 @@ class VirtualClock:
     def now_ns(self) -> int:
         return self.time_ns
 
+    def monotonic_ns(self) -> int:
+        return self.time_ns
+
     def sleep(self, duration_ns: int) -> None:
         self.slept_ns.append(duration_ns)
         self.time_ns += duration_ns

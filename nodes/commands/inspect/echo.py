@@ -23,6 +23,7 @@ from steadypose.nodes.commands.inspect.topic import (
     messages_of,
     plural,
 )
+from steadypose.nodes.commands.printable import printable
 
 
 def echo(
@@ -50,7 +51,8 @@ def echo(
     """
     left = sys.maxsize if count is None else count
     for topic, message in messages_of(target, topics, launch, endpoints, newest=True):
-        print(_yaml(topic, message) if full else "\n".join(_lines(topic, message)), flush=target in TOPICS)
+        lines = _yaml(topic, message).split("\n") if full else _lines(topic, message)
+        print("\n".join(map(printable, lines)), flush=target in TOPICS)
         left -= 1
         if left <= 0:
             return

@@ -25,6 +25,7 @@ from steadypose.nodes.commands.inspect.topic import (
     recording_at,
     subscribe,
 )
+from steadypose.nodes.commands.printable import printable
 from steadypose.nodes.graph.clock import POLL_S
 
 INFO_S = 2.0
@@ -91,6 +92,9 @@ class _Contents:
         self._names.setdefault(what, Counter())[name] += 1
 
     def __str__(self) -> str:
+        return printable(self._text())
+
+    def _text(self) -> str:
         parts = [f"{what} {', '.join(names)}" for what, names in self._names.items()]
         return "; ".join([*parts, f"bodies {_enumerate(sorted(self._bodies))}"] if self._bodies else parts)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -80,7 +82,7 @@ def frames(count: int) -> list[tuple[str, Message]]:
 
 
 def test_a_late_node_keeps_the_newest_frames_and_counts_the_others() -> None:
-    inbox = Inbox(Script(frames(20)), limit=3)  # type: ignore[arg-type]
+    inbox = Inbox([Script(frames(20))], limit=3)  # type: ignore[arg-type]
     assert [m.stamp_ns for _, m in iter(lambda: inbox.next(0), None)] == [raw(i).stamp_ns for i in (17, 18, 19)]
     assert inbox.overrun == 17
 
@@ -90,9 +92,27 @@ def test_a_late_node_keeps_the_end_of_the_stream_and_the_news() -> None:
     end.end_of_stream = True
     news = Diagnostics(0, "pose_input", Level.OK, "")
     script = [*frames(5), (POSE_RAW, end), (DIAGNOSTICS, news), *frames(5)]
-    inbox = Inbox(Script(script), limit=2)  # type: ignore[arg-type]
+    inbox = Inbox([Script(script)], limit=2)  # type: ignore[arg-type]
     assert [m for _, m in iter(lambda: inbox.next(0), None)] == [end, news]
     assert inbox.overrun == 10
+
+
+def test_publishers_take_turns_and_who_floods_loses_its_own(tmp_path: Path) -> None:
+    quiet, loud = (f"ipc://{tmp_path}/{name}" for name in ("quiet", "loud"))
+    with ExitStack() as stack:
+        publishers = [stack.enter_context(Publisher(address)) for address in (quiet, loud)]
+        subscribers = [stack.enter_context(Subscriber(a, POSE_RAW, name="test")) for a in (quiet, loud)]
+        for publisher in publishers:
+            assert publisher.wait_for_subscribers({"test"}, timeout_s=10)
+        for _ in range(50):
+            publishers[1].publish(POSE_RAW, raw(1))
+        for _ in range(3):
+            publishers[0].publish(POSE_RAW, raw(0))
+        inbox, got = Inbox(subscribers, limit=3), []
+        until(lambda: all(subscriber.socket.poll(0) for subscriber in subscribers))
+        until(lambda: (received := inbox.next(0.1)) is not None and not got.append(received[1]) and len(got) == 6)
+        assert sum(message.stamp_ns == raw(0).stamp_ns for message in got) == 3
+        assert inbox.overrun == 47
 
 
 def test_a_source_faster_than_reading_does_not_keep_a_node_from_working() -> None:
@@ -100,12 +120,12 @@ def test_a_source_faster_than_reading_does_not_keep_a_node_from_working() -> Non
         def receive(self, timeout_s: float) -> tuple[str, Message]:
             return POSE_RAW, raw(0)
 
-    assert Inbox(Endless([]), limit=3).next(0) is not None  # type: ignore[arg-type]
+    assert Inbox([Endless([])], limit=3).next(0) is not None  # type: ignore[arg-type]
 
 
 def test_a_lossless_node_leaves_the_rest_to_the_sender() -> None:
     script = Script(frames(500))
-    inbox = Inbox(script, limit=None)  # type: ignore[arg-type]
+    inbox = Inbox([script], limit=None)  # type: ignore[arg-type]
     assert inbox.next(0) is not None
     assert len(script.messages) == 500 - READ_AHEAD
     assert len(list(iter(lambda: inbox.next(0), None))) == 499
@@ -174,9 +194,18 @@ def test_latency_is_counted_from_capture_and_less_the_delay(make_launch: MakeLau
             stamp = START_NS + 2_000_000_000 - 2 * late_ms * 1_000_000
             node.publish(POSE_CLEAN, clean(raw(0, stamp_ns=stamp)), delay_ns=1_000_000)
         values = node.diagnostics().values
-    expected = np.percentile(np.arange(0, 100), (50, 95, 99))
+    expected = np.percentile(np.arange(1, 101) - 0.5, (50, 95, 99))  # the delay, too, passes twice as fast
     got = [float(values[f"latency_ms.p{p}"]) for p in (50, 95, 99)]
     np.testing.assert_allclose(got, expected, atol=1e-3)
+
+
+def test_a_delay_is_shorter_in_a_faster_replay(make_launch: MakeLaunch, clock: VirtualClock) -> None:
+    node = Echo(make_launch(nodes='["prior"]'), clock)
+    node.timeline = Timeline(START_NS, clock.time_ns, rate=3.0)
+    with Publisher(node.launch.transport.endpoint("prior")) as node._publisher:
+        clock.time_ns += 40_000_000
+        node.publish(POSE_CLEAN, clean(raw(0, stamp_ns=START_NS)), delay_ns=120_000_000)
+        assert float(node.diagnostics().values["latency_ms.p50"]) == 0.0
 
 
 def test_rates_are_of_the_last_second(make_launch: MakeLaunch, clock: VirtualClock) -> None:
