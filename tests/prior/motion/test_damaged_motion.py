@@ -98,20 +98,6 @@ def test_a_damaged_file_is_read_or_is_a_motion_error(kind: str, data: st.DataObj
     for _ in range(data.draw(st.integers(1, 3))):
         start = data.draw(st.integers(0, len(damaged)))
         end = data.draw(st.integers(start, min(start + 20, len(damaged))))
-        words = [
-            b"",
-            b"nan",
-            b"1e999",
-            b"-1",
-            b"0",
-            b"{",
-            b"}",
-            b"JOINT",
-            b"CHANNELS 99999",
-            b"\n",
-            b"\xff\0",
-            b"9" * 30,
-        ]
         damaged[start:end] = data.draw(st.one_of(st.sampled_from(WORDS), st.binary(max_size=8)))
     whole = damaged.decode("ascii", "replace") if isinstance(content, str) else bytes(damaged)
     with contextlib.suppress(MotionError):
