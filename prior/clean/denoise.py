@@ -18,6 +18,7 @@ from steadypose.prior.clean.frame import BodyWindows, Bools, Floats
 from steadypose.prior.clean.history import History
 from steadypose.prior.models.hgvae.features import from_tracks
 from steadypose.prior.timing.fixed_lag import Smoothed
+from steadypose.prior.timing.rate import FPS
 
 MODEL_SIGMA = 0.005
 """Metres along an axis: what HG-VAE is off by at least, apart from noise."""
@@ -30,6 +31,12 @@ MEMORY = 15
 
 SUDDEN = 3.0
 """Times the mean of its squared distance to what was smoothed, above which this very frame's counts."""
+
+LATE_S, LATE_NEWEST_S = 0.01, 0.03
+"""Seconds by which HG-VAE is behind a joint: of a frame that others have followed for `SETTLED`, and of the newest. What
+moves at 3 m/s it has 3 or 9 cm from where it is; what it was off by of late says little of a joint that has just begun."""
+
+SETTLED = 4
 
 RENEWAL = 0.5
 """How far a frame's answer goes to that of the next window: windows one frame apart disagree, which would be jitter."""
@@ -60,10 +67,12 @@ class Denoise:
         self._apart = np.zeros((slots, 22))  # m², mean square of the distance between the two along an axis
         self._frames = np.zeros((slots, 22))
         self._found = np.full((delay_frames + 1, slots, 22, 3), np.nan)
+        self._before = np.full((slots, 22, 3), np.nan)
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
         self._found[:, slot] = np.nan
+        self._before[slot] = np.nan
         self._apart[slot] = self._frames[slot] = 0.0
 
     def update(self, windows: BodyWindows | None, history: History) -> None:
@@ -87,7 +96,7 @@ class Denoise:
         The weights are those of least variance for two estimates of which the second holds the share `NOISE_LEFT` of
         the first one's noise and an error of its own. That error is what its distance to the first one shows beyond
         noise, in this joint and of late (innovations, as in adaptive Kalman filters: Mehra 1970): motion that HG-VAE
-        has never seen takes its belief away. Noise is what jumps from frame to frame, ``jitter`` (S,) metres as of
+        has never seen takes its belief away; and it is the later, the faster the joint. Noise is what jumps from frame to frame, ``jitter`` (S,) metres as of
         now: of an error that lasts, HG-VAE keeps all.
         """
         found = self._found[-1 - back]
@@ -101,6 +110,10 @@ class Denoise:
         self._apart += known * (square - self._apart) / np.clip(self._frames, 1, MEMORY)
         gained = (1.0 - NOISE_LEFT) * np.square(np.where(known, np.minimum(smoothed.sigma, jitter[:, None]), 0.0))
         own = np.maximum(np.maximum(self._apart, square / SUDDEN) - gained, MODEL_SIGMA**2)
+        late_s = np.interp(back, (0, SETTLED), (LATE_NEWEST_S, LATE_S))
+        step = np.nan_to_num(smoothed.positions - self._before)  # one frame
+        own += (late_s * FPS) ** 2 * np.square(step).mean(axis=-1)
+        self._before = smoothed.positions
         share = gained / (gained + own)
         return smoothed._replace(
             positions=smoothed.positions + share[..., None] * moved,
