@@ -33,8 +33,8 @@ SUDDEN = 3.0
 """Times the mean of its squared distance to what was smoothed, above which this very frame's counts."""
 
 LATE_S, LATE_NEWEST_S = 0.01, 0.03
-"""Seconds by which HG-VAE is behind a joint: of a frame that others have followed for `SETTLED`, and of the newest. What
-moves at 3 m/s it has 3 or 9 cm from where it is; what it was off by of late says little of a joint that has just begun."""
+"""Seconds by which HG-VAE is behind a joint: of a frame that others have followed for `SETTLED`, and of the newest. A
+joint at 3 m/s it has 3 or 9 cm from where it is; of one that has just begun, what it was off by of late says little."""
 
 SETTLED = 4
 
