@@ -319,7 +319,7 @@ class WorldBody(_Record):
     sigma: Float32
     """(22,) metres, standard deviation of a position along an axis"""
     contacts: Float32
-    """(8,) probability that each of `CONTACTS` rests on something"""
+    """(8,) probability that each of `CONTACTS` bears load on something: rests on it, or rolls over it"""
     tracking: Tracking
 
     def __post_init__(self) -> None:

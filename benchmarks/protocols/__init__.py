@@ -11,9 +11,14 @@ PROTOCOLS: dict[str, str] = {
     "reconstruction": "windows through the refinement model (HM-VAE, table 3)",
     "hgvae": "likelihood and depth, anomalies, imputation, actions (the HG-VAE paper)",
     "world": "root drift and foot skate",
+    "contacts": "load of feet, against force plates",
     "streaming": "delay found, jitter at matched delay, recovery, lost frames, jittering stamps",
 }
 """Module in this package: what it measures."""
 
-SENSORS = {"kinect_vicon": "ui_prmd.npz", "mediapipe": "mediapipe_pose.npz"}
-"""Protocols with a sensor's own recordings, and the file of them."""
+SENSORS = {
+    "kinect_vicon": "ui_prmd.npz",
+    "mediapipe": "mediapipe_pose.npz",
+    "contacts": "contacts_grf.npz",
+}
+"""Protocols with recordings of their own, and the file of them."""

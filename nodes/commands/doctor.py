@@ -42,7 +42,7 @@ INSTALL_EXTRA = (
 )
 KEY_PACKAGES = ("numpy", "numba", "rosbags", "pyzmq")
 """packages whose versions matter when something is wrong"""
-MODELS = ("hmvae", "hgvae", "trajectory")
+MODELS = ("hmvae", "hgvae", "trajectory", "contacts")
 FRAMES, WARM_UP = 100, 20
 FRAME_NS = 1_000_000_000 / 30
 TARGET_MS, BUDGET_MS = 10.0, 1000 / 30

@@ -19,6 +19,7 @@ def evaluate(
         "reconstruction",
         "hgvae",
         "world",
+        "contacts",
         "streaming",
     ],
     split: Literal["val", "test"] = "val",
@@ -34,10 +35,10 @@ def evaluate(
 
     Args:
         protocol: what to measure, or 'all'.
-        split: of the prepared motion that is scored. Kinect and MediaPipe have none.
+        split: of the prepared motion that is scored. Kinect, MediaPipe and force plates have none.
         quick: a few clips and points, to see that all works.
-        mocap: folder with ui_prmd.npz and mediapipe_pose.npz, for the protocols with these sensors; without it, they
-            are left out of 'all'.
+        mocap: folder with ui_prmd.npz, mediapipe_pose.npz and contacts_grf.npz, for the protocols with these sensors;
+            without it, they are left out of 'all'.
         data: prepared motion, as 'steadypose prepare' wrote it; without it, people of the project's own simulator
             stand in.
         out: folder to write to.

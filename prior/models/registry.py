@@ -13,7 +13,7 @@ from steadypose.prior.models.torch_weights import install as install_weights
 
 
 def train(
-    model: Literal["hmvae", "hgvae", "hgvae-wide", "trajectory", "correction", "mixture"],
+    model: Literal["hmvae", "hgvae", "hgvae-wide", "trajectory", "contacts", "correction", "mixture"],
     data: Path = Path("data/prepared.npz"),
     weights: Literal["default", "research", "kinect_v2"] | None = None,
     runs: Path = Path("runs"),
@@ -34,7 +34,7 @@ def train(
 
     Args:
         model: mixture (the smoother), hmvae (refinement), hgvae (anomaly score and imputation),
-            hgvae-wide (the same in the paper's size, for recordings), trajectory (root velocity and contacts), or
+            hgvae-wide (the same in the paper's size, for recordings), trajectory (root velocity), contacts, or
             correction (a sensor's own error).
         data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon; for the
             mixture, the folder of the recordings, which it takes at several speeds.
@@ -60,6 +60,8 @@ def train(
         from steadypose.prior.models.mixture.train import train_mixture as train_model
     elif model == "trajectory":
         from steadypose.prior.models.root_velocity.train import train_trajectory as train_model
+    elif model == "contacts":
+        from steadypose.prior.models.contacts.train import train_contacts as train_model
     else:
         from steadypose.prior.models.sensor_bias.train import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")

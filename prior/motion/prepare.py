@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.kinematics import CONTACT_SPEED, label_contacts
+from steadypose.prior.body.kinematics import REST_SPEED, label_contacts
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
 from steadypose.prior.motion.clip import Clip
 from steadypose.prior.motion.datasets import Dropped, Split, WeightSet
@@ -196,7 +196,7 @@ def floor_height(positions: NDArray[np.float64]) -> float:
     none ever does (a run in mid-stride), the second percentile of the lower toe.
     """
     toes, speed = _toes(positions)
-    still = toes[..., 2][speed < CONTACT_SPEED]
+    still = toes[..., 2][speed < REST_SPEED]
     resting = np.percentile(still, 5) if len(still) >= 5 else np.percentile(toes[..., 2].min(axis=1), 2)
     return float(resting) - TOE_HEIGHT
 
@@ -206,7 +206,7 @@ def stays_on_floor(positions: NDArray[np.float64]) -> bool:
     toes, speed = _toes(positions)
     lower = toes[..., 2].argmin(axis=1)[:, None]
     height = np.take_along_axis(toes[..., 2], lower, axis=1)
-    raised = (height > RAISED) & (np.take_along_axis(speed, lower, axis=1) < CONTACT_SPEED)
+    raised = (height > RAISED) & (np.take_along_axis(speed, lower, axis=1) < REST_SPEED)
     return float(raised.mean()) < 0.02
 
 

@@ -1,23 +1,29 @@
-"""One body's way through the world: its recent motion, and the fusion of what tells where it is."""
+"""One body's way through the world: its recent motion, and the fusion of what tells where it is.
+
+Where the root is seen, joints stay where `pose/clean` has them, but for the feet, which stand as far as they rest, and
+what of the legs hangs on them by bones. Where it is not, the body goes with its root.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.contract import are_unit
-from steadypose.msgs.types import CleanBody, JointState, Tracking, WorldBody
+from steadypose.msgs.types import JointState, Tracking, WorldBody
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
-from steadypose.prior.body.skeleton import HIPS, REST_POSITIONS, J, limbs
+from steadypose.prior.body.skeleton import REST_POSITIONS, J, limbs
+from steadypose.prior.models.contacts.inference import Contacts
 from steadypose.prior.models.root_velocity.config import FRAME_S
+from steadypose.prior.world.body_filter import BodyFilter, BodyNoise
+from steadypose.prior.world.contact_reader import Glimpse
 from steadypose.prior.world.ground import Ground
-from steadypose.prior.world.root_filter import RootFilter, RootNoise
+from steadypose.prior.world.legs import fit_legs, turn_legs
+from steadypose.prior.world.sighting import Sighting
 
 Floats = NDArray[np.float64]
 Sigma = TypeVar("Sigma", float, NDArray[np.float64])
@@ -32,8 +38,14 @@ motion, the mean over its five sources."""
 SOLE_SIGMA = 0.02
 """Metres, the standard deviation of that between sources and people."""
 
-CONTACT_ON, CONTACT_OFF = 0.6, 0.3
-"""Probabilities at which a foot comes to stand, and stands no more."""
+STANDING = 0.5
+"""Probability of rest from which on a foot tells the ground."""
+
+UPRIGHT_M = 0.45
+"""Metres from a foot up to the pelvis, at least, of a body whose feet tell the ground: not of one that lies."""
+
+EASE_S = 0.1
+"""Seconds in which a body whose root is seen again comes to be where it is seen."""
 
 UNSEEN_SIGMA = 1.0
 """Metres, the standard deviation of a first root that rests on nothing seen."""
@@ -41,20 +53,15 @@ UNSEEN_SIGMA = 1.0
 JITTER_SHARE = 0.3
 """Of the standard deviation of a joint or velocity, the error that is new in each frame; the rest lasts."""
 
-FOOT_SURPRISE = 4.0
-"""Standard deviations from its place at which a standing foot has evidently moved: it stands anew."""
-
-LEAST_SIGMA = 0.005
-"""Metres: no joint is taken to be known better, whatever the message says."""
-
-HUNG_SIGMA = 0.05
-"""Metres, added to a hidden root's standard deviation where other joints are seen: the prior hung it from them."""
+FOOT_SURPRISE = 3.0
+"""Standard deviations from where it is seen at which a standing foot has evidently moved: it stands anew."""
 
 IMPUTED_LEGS_SPEED = 0.5
 """m/s, added to the velocity's standard deviation as the legs that it is read from are themselves inferred."""
 
-REACH_M = 2.0
-"""Metres: no joint is this far from its own root."""
+DOUBTED = 1.0
+"""Standard deviations: where the network's velocity is farther from that of a root seen, its error is taken to be
+larger by as much (as in Huber's estimator): of motion that it does not know, it says what it knows."""
 
 JUMP_SIGMAS, JUMP_M, JUMP_FRAMES = 5.0, 0.3, 6
 """A root seen this many standard deviations and metres off is not believed, until it was so often in a row; one that
@@ -70,80 +77,9 @@ AT_ONE_SPEED = 0.3
 LONGEST_GAP_S = 0.3
 """Seconds without a message over which the motion between is drawn straight, and feet may go on standing."""
 
-_LEAST_NORM = 1e-6
-"""Of a quaternion that is to mean a rotation."""
-
+_UP = np.array([0.0, 0.0, 1.0])
 _FOOT_CONTACTS = [CONTACT_JOINTS.index(joint) for joint in FEET]
-_PELVIS = [J["pelvis"], *HIPS]
 _LEGS = [joint for leg in limbs(("knee", "ankle", "foot")) for joint in leg]
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """A body of one message, turned to the world.
-
-    Attributes:
-        body: as it came.
-        positions: (22, 3) metres, world; NaN where there is none.
-        orientation: (4,) xyzw of the root in the world, or None if it is not a rotation.
-        seen: (22,) whether the sensor saw the joint.
-        sigma: (22,) metres, at least `LEAST_SIGMA`; infinite where the message has no number.
-        root: (3,) metres, world; None if unknown.
-        root_sigma: metres, the standard deviation of `root`; infinite if nothing was seen that tells where it is.
-    """
-
-    body: CleanBody
-    positions: Floats
-    orientation: Floats | None
-    seen: NDArray[np.bool_]
-    sigma: Floats
-    root: Floats | None
-    root_sigma: float
-
-    @property
-    def root_seen(self) -> bool:
-        """Whether the place of `root` rests on observation."""
-        return math.isfinite(self.root_sigma)
-
-
-def sightings(bodies: Sequence[CleanBody], sensor: Rotation, place: Floats) -> list[Sighting]:
-    """What the bodies of a message are, as seen by a sensor with this orientation and place (3,) in the world."""
-    if not bodies:
-        return []
-    positions = np.array([body.positions for body in bodies], dtype=np.float64)
-    positions = np.where(np.isfinite(positions), positions, np.nan) @ sensor.as_matrix().T + place
-    state = np.array([body.state for body in bodies])
-    known = np.isfinite(positions).all(axis=-1) & (state != JointState.UNKNOWN)
-    known &= ~(np.linalg.norm(positions - positions[:, :1], axis=-1) > REACH_M)
-    positions[~known] = np.nan
-    seen = known & ((state == JointState.SEEN) | (state == JointState.REFINED))
-    sigma = np.array([body.sigma for body in bodies], dtype=np.float64)
-    sigma = np.maximum(np.where(sigma >= 0.0, sigma, math.inf), LEAST_SIGMA)
-    # A root of which no joint near is seen was hung by the prior from those that are.
-    root_sigma = np.where(seen[:, _PELVIS].any(axis=1), sigma[:, 0], np.hypot(sigma[:, 0], HUNG_SIGMA))
-    root_sigma = np.where(known[:, 0] & seen.any(axis=1), root_sigma, math.inf)
-    turned, turns = _orientations(np.array([body.rotations[0] for body in bodies], dtype=np.float64), sensor)
-    return [
-        Sighting(
-            body=body,
-            positions=positions[k],
-            orientation=turned[k] if turns[k] else None,
-            seen=seen[k],
-            sigma=sigma[k],
-            root=positions[k, 0] if known[k, 0] else None,
-            root_sigma=float(root_sigma[k]),
-        )
-        for k, body in enumerate(bodies)
-    ]
-
-
-def _orientations(quaternions: Floats, sensor: Rotation) -> tuple[Floats, NDArray[np.bool_]]:
-    """Quaternions (N, 4) of any length turned from the sensor's frame to the world, and which of them are rotations."""
-    with np.errstate(invalid="ignore"):
-        turns = np.linalg.norm(quaternions, axis=1) >= _LEAST_NORM
-        turns &= np.isfinite(quaternions).all(axis=1)
-    quaternions[~turns] = [0.0, 0.0, 0.0, 1.0]
-    return (sensor * Rotation.from_quat(quaternions)).as_quat(), turns
 
 
 @dataclass(frozen=True)
@@ -153,12 +89,10 @@ class Motion:
     Attributes:
         velocity: (3,) m/s.
         sigma: (3,) m/s, standard deviation of that.
-        contacts: (8,) probabilities.
     """
 
     velocity: Floats
     sigma: Floats
-    contacts: Floats
 
 
 class BodyTrack:
@@ -168,10 +102,13 @@ class BodyTrack:
         sighting: the first, with a root.
         stamp_ns: of that.
         context: frames of motion to remember.
-        noise: of the root.
+        noise: of root and feet.
+        memory: (hidden,) what the contact network remembers before a body's first frame.
     """
 
-    def __init__(self, sighting: Sighting, stamp_ns: int, context: int, noise: RootNoise) -> None:
+    def __init__(
+        self, sighting: Sighting, stamp_ns: int, context: int, noise: BodyNoise, memory: NDArray[np.float32]
+    ) -> None:
         assert sighting.root is not None
         self.stamp_ns = stamp_ns
         self._orientation = np.array([0.0, 0.0, 0.0, 1.0]) if sighting.orientation is None else sighting.orientation
@@ -182,13 +119,15 @@ class BodyTrack:
         self._filter = self._start(sighting, np.zeros(3))
         self._dt = 0.0
         self._jumps = 0
-        self._root_seen = sighting.root_seen
+        self._before = sighting
+        self._nothing = self._memory = memory
+        self._shift = np.zeros(3)
         self._odds = np.zeros(2)
         self._carried = False
 
-    def _start(self, sighting: Sighting, velocity: Floats) -> RootFilter:
+    def _start(self, sighting: Sighting, velocity: Floats) -> BodyFilter:
         sigma = min(sighting.root_sigma, UNSEEN_SIGMA)
-        return RootFilter(self._noise, sighting.positions[0], *_split(sigma), velocity, len(FEET))
+        return BodyFilter(self._noise, sighting.positions[0], *_split(sigma), velocity, len(FEET))
 
     def _local(self, sighting: Sighting) -> Floats:
         """(22, 3) metres from the root, world axes; a joint without a position stays where it last was."""
@@ -222,39 +161,64 @@ class BodyTrack:
         if steps:
             self._window_ns = stamp_ns
 
-    def fuse(self, sighting: Sighting, motion: Motion, ground: Ground, network: bool, hold: bool) -> None:
+    def glimpse(self, sighting: Sighting, ground: Ground) -> Glimpse:
+        """What the contact network is to read of the newest message."""
+        fresh = not 0.0 < self._dt <= LONGEST_GAP_S
+        before = sighting if fresh else self._before
+        root_seen = sighting.root_seen and before.root_seen
+        known = np.full(len(CONTACT_JOINTS), np.nan)
+        if root_seen:
+            soles = sighting.positions[list(FEET)] - SOLE[:, None] * _UP
+            lowest = np.argmin(np.nan_to_num(soles[:, 2], nan=np.inf))
+            known[:] = ground.under(soles[lowest])
+            known[_FOOT_CONTACTS] = np.fmax([ground.under(sole) for sole in soles], known[_FOOT_CONTACTS])
+        return Glimpse(
+            sighting.positions, before.positions, FRAME_S if fresh else self._dt, self.yaw, sighting.sigma, root_seen,
+            known, self._nothing if fresh else self._memory,
+        )  # fmt: skip
+
+    def fuse(
+        self, sighting: Sighting, motion: Motion, contacts: Contacts, ground: Ground, network: bool, hold: bool
+    ) -> None:
         """Move on to the newest message and weigh what it tells.
 
         Args:
             sighting: the message's.
             motion: what the network says of it.
+            contacts: what bears load and what rests in it.
             ground: is asked, and told.
             network: whether to use the velocity of ``motion``.
-            hold: whether feet in contact hold the root.
+            hold: whether feet that rest hold the root, and stand.
         """
         filter_ = self._filter
         inferred = 1.0 if sighting.root is None else 1.0 - float(sighting.seen[_LEGS].mean())
-        contacts = motion.contacts[_FOOT_CONTACTS]
-        held = hold and sighting.root is not None and self._dt <= LONGEST_GAP_S
-        standing = filter_.standing
+        if self._dt > LONGEST_GAP_S:
+            for foot in range(len(FEET)):
+                filter_.lose(foot)
+        held = hold and sighting.root is not None
+        believed = sighting.seen[list(FEET)] & (filter_.feet_off < FOOT_SURPRISE) & held
+        load, rest = (believed * said[_FOOT_CONTACTS].astype(np.float64) for said in (contacts.load, contacts.rest))
         if self._dt > 0.0:
-            filter_.predict(self._dt)
+            filter_.predict(self._dt, load, rest)
         self._weigh_legs(sighting, motion)
         if network and not self._carried:
-            filter_.observe_velocity(motion.velocity, *_split(np.hypot(motion.sigma, inferred * IMPUTED_LEGS_SPEED)))
-        contacts = np.where(held and not self._carried, contacts * sighting.seen[list(FEET)], 0.0)
-        self._observe_root(sighting)
-        for k, joint in enumerate(FEET):
-            if contacts[k] < (CONTACT_OFF if standing[k] else CONTACT_ON):
-                filter_.lift(k)
-                continue
-            from_root = sighting.positions[joint] - sighting.positions[0]
-            sigma = float(sighting.sigma[joint])
-            if standing[k] and filter_.foot_surprise(k, from_root, sigma) < FOOT_SURPRISE:
-                filter_.observe_foot(k, from_root, sigma)
-            else:
-                filter_.plant(k, from_root, sigma)
-        self._meet_ground(sighting, ground)
+            sigma = np.hypot(motion.sigma, inferred * IMPUTED_LEGS_SPEED)
+            if sighting.root_seen:
+                sigma = sigma * max(1.0, self._surprise(motion.velocity, sigma) / DOUBTED)
+            filter_.observe_velocity(motion.velocity, *_split(sigma))
+        in_the_world = self._observe_root(sighting)
+        self._observe_feet(sighting, in_the_world)
+        self._meet_ground(sighting, rest, ground)
+        if sighting.root is not None and not sighting.root_seen:
+            self._shift = self._filter.position - sighting.root
+        else:
+            self._shift *= math.exp(-self._dt / EASE_S)
+        self._before, self._memory = sighting, contacts.state
+
+    def _surprise(self, velocity: Floats, sigma: Floats) -> float:
+        """How many standard deviations a velocity (3,) is from the root's, along the worst axis."""
+        spread = np.diag(self._filter.covariance)[3:]
+        return float(np.max(np.abs(velocity - self._filter.velocity) / np.sqrt(spread + sigma**2)))
 
     def _weigh_legs(self, sighting: Sighting, motion: Motion) -> None:
         """Find out whether what the legs say of the motion can be reconciled with the root seen, horizontally."""
@@ -268,10 +232,11 @@ class BodyTrack:
         disagreement = float(np.linalg.norm((self._filter.velocity - motion.velocity)[:2]))
         self._carried = at_odds > AT_ODDS_SIGMAS or (self._carried and disagreement > AT_ONE_SPEED)
 
-    def _observe_root(self, sighting: Sighting) -> None:
-        came_back, self._root_seen = sighting.root_seen and not self._root_seen, sighting.root_seen
+    def _observe_root(self, sighting: Sighting) -> bool:
+        """Take the root as it is seen; whether it is believed, and so where other joints are seen as well."""
+        came_back = sighting.root_seen and not self._before.root_seen
         if sighting.root is None or not sighting.root_seen:
-            return
+            return False
         sigma = sighting.root_sigma
         off = np.abs(sighting.root - self._filter.position)
         likely = JUMP_SIGMAS * np.hypot(self._filter.position_sigma, sigma)
@@ -281,30 +246,51 @@ class BodyTrack:
         elif came_back or self._jumps == JUMP_FRAMES:
             self._filter = self._start(sighting, self._filter.velocity if came_back else np.zeros(3))
             self._jumps = 0
+        return not self._jumps
 
-    def _meet_ground(self, sighting: Sighting, ground: Ground) -> None:
+    def _observe_feet(self, sighting: Sighting, in_the_world: bool) -> None:
+        if sighting.root is None:
+            return
+        places = sighting.positions[list(FEET)] - (0.0 if in_the_world else sighting.root)
+        for foot, joint in enumerate(FEET):
+            if np.isfinite(places[foot]).all() and math.isfinite(sighting.sigma[joint]):
+                jitter, bias = _split(float(sighting.sigma[joint]))
+                self._filter.observe_foot(foot, places[foot], jitter, bias, from_root=not in_the_world)
+            else:
+                self._filter.lose(foot)
+
+    def _meet_ground(self, sighting: Sighting, rest: Floats, ground: Ground) -> None:
         """Tell the ground where feet stand while the root is seen, and be told it while it is not."""
-        feet = sighting.positions[list(FEET), 2] - SOLE
+        soles = sighting.positions[list(FEET)] - SOLE[:, None] * _UP
         if not ground.known and sighting.seen[list(FEET)].any():
-            ground.guess(float(np.nanmin(feet)))
-        for k in np.flatnonzero(self._filter.standing):
+            ground.guess(float(np.nanmin(soles[:, 2])))
+        for k in np.flatnonzero((rest > STANDING) & self._filter.placed):
             if sighting.root_seen:
-                ground.observe(float(feet[k]), math.hypot(sighting.sigma[FEET[k]], SOLE_SIGMA), max(self._dt, FRAME_S))
+                if sighting.positions[0, 2] - soles[k, 2] > UPRIGHT_M:
+                    sigma = math.hypot(sighting.sigma[FEET[k]], SOLE_SIGMA)
+                    ground.observe(soles[k], sigma, max(self._dt, FRAME_S))
             elif ground.known:
-                sigma = math.hypot(ground.sigma, SOLE_SIGMA)
-                self._filter.observe_foot_height(int(k), ground.height + SOLE[k], sigma)
+                under = ground.under(self._filter.feet[k] - SOLE[k] * _UP)
+                if math.isfinite(under):
+                    self._filter.observe_foot_height(int(k), under + SOLE[k], math.hypot(ground.sigma, SOLE_SIGMA))
 
-    def publish(self, sighting: Sighting, contacts: NDArray[np.floating], lost_sigma: float) -> WorldBody:
+    def publish(self, sighting: Sighting, contacts: Contacts, lost_sigma: float) -> WorldBody:
         """The body in the world, as of the newest message."""
         place, spread = self._filter.position, self._filter.position_sigma
-        positions = sighting.positions if sighting.root is None else sighting.positions + (place - sighting.root)
-        positions = np.where(np.arange(len(positions))[:, None] == 0, place, positions)
-        sigma = np.hypot(sighting.sigma, math.sqrt(float(np.mean(spread**2))))
+        strays = 0.0 if sighting.root_seen else float(np.mean(spread**2))
+        sigma = np.sqrt(sighting.sigma**2 + strays)
+        moved = sighting.positions + self._shift
+        placed = self._filter.placed
+        feet = np.array(FEET)[placed]
+        moved[feet], sigma[feet] = self._filter.feet[placed], self._filter.feet_sigma[placed]
+        moved[0], sigma[0] = place, math.sqrt(float(np.mean(spread**2)))
+        positions = fit_legs(moved, sigma, sighting.body.bone_lengths)
+        rotations = sighting.body.rotations.astype(np.float64)
+        rotations[0] = self._orientation
+        rotations = turn_legs(rotations, sighting.positions, positions)
+        rotations[~are_unit(rotations)] = [0.0, 0.0, 0.0, 1.0]  # a message of somebody who knows positions alone
         told = np.isfinite(positions).all(axis=1) & np.isfinite(sigma)
         state = np.where(told, sighting.body.state, JointState.UNKNOWN)
-        rotations = sighting.body.rotations.copy()
-        rotations[0] = self._orientation
-        rotations[~are_unit(rotations)] = [0.0, 0.0, 0.0, 1.0]  # a message of somebody who knows positions alone
         if math.hypot(*spread[:2]) > lost_sigma:
             tracking = Tracking.LOST
         else:
@@ -319,7 +305,7 @@ class BodyTrack:
             rotations=rotations,
             state=state,
             sigma=sigma,
-            contacts=contacts.astype(np.float32),
+            contacts=contacts.load,
             tracking=tracking,
         )
 
@@ -333,11 +319,3 @@ def _heading(orientation: Floats) -> float:
 def _split(sigma: Sigma) -> tuple[Sigma, Sigma]:
     """The standard deviations of the jitter and of the slow error that make up ``sigma``."""
     return JITTER_SHARE * sigma, math.sqrt(1.0 - JITTER_SHARE**2) * sigma
-
-
-def rotation(quaternion: NDArray[np.floating]) -> Rotation | None:
-    """The rotation of a quaternion (4,) xyzw of any length; None if it is none."""
-    q = np.asarray(quaternion, dtype=np.float64)
-    if not np.isfinite(q).all() or np.linalg.norm(q) < _LEAST_NORM:
-        return None
-    return Rotation.from_quat(q)

@@ -1,8 +1,8 @@
 """From clean poses in the sensor's frame to poses in the world: root velocity, contacts, floor and their fusion.
 
 A body's place comes from three sources that fail at different times: the observed root, where there is one; the root
-velocity that the network reads from the body's own motion (HM-VAE, section 3.3); and the feet in contact, which stay
-where they are. A small Kalman filter weighs them, and its covariance grows while the root is hidden.
+velocity that the network reads from the body's own motion (HM-VAE, section 3.3); and the feet at rest, which stay
+where they are. A Kalman filter weighs them, and its covariance grows while the root is hidden.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from steadypose.msgs.types import CleanBody, PoseClean, PoseWorld, WorldBody
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.models.root_velocity.inference import LiveRootVelocity
 from steadypose.prior.settings import build_settings
-from steadypose.prior.world.body_track import BodyTrack, Motion, Sighting, rotation, sightings
+from steadypose.prior.world.body_filter import BodyNoise
+from steadypose.prior.world.body_track import BodyTrack, Motion
+from steadypose.prior.world.contact_reader import ContactReader
 from steadypose.prior.world.ground import Ground
-from steadypose.prior.world.root_filter import RootNoise
+from steadypose.prior.world.sighting import Sighting, rotation, sightings
 
 Floats = NDArray[np.float64]
 
@@ -42,15 +44,17 @@ class TrajectorySettings:
     """What a launch file may set.
 
     Attributes:
-        weights: the weight set, or a path to a ``.safetensors`` file.
+        weights: the weight set of the root's velocity, or a path to a ``.safetensors`` file.
+        contact_weights: the same of the contacts.
         network: whether the network's root velocity is used.
-        contacts: whether standing feet hold the root.
+        contacts: whether feet that rest stand, and hold the root.
         acceleration: m/s² over √Hz, how quickly a root may change its velocity.
         lost_sigma: metres, the horizontal standard deviation beyond which a body counts as LOST.
         timeout_s: seconds after which a body that no message mentions is forgotten.
     """
 
     weights: str = "default"
+    contact_weights: str = "default"
     network: bool = True
     contacts: bool = True
     acceleration: float = 3.0
@@ -92,7 +96,8 @@ class TrajectoryPipeline:
         self.settings = settings
         self.counters: Counter[str] = Counter()
         self._reader = MotionReader(settings.weights)
-        self._noise = RootNoise(settings.acceleration, network_memory_s=self._reader.memory_s)
+        self._contacts = ContactReader(settings.contact_weights)
+        self._noise = BodyNoise(settings.acceleration, network_memory_s=self._reader.memory_s)
         self._scenes: dict[str, _Scene] = {}
 
     def process(self, clean: PoseClean) -> list[PoseWorld]:
@@ -119,17 +124,19 @@ class TrajectoryPipeline:
             if track is not None:
                 track.advance(sighting, clean.stamp_ns)
             elif sighting.root is not None:
-                track = BodyTrack(sighting, clean.stamp_ns, self._reader.context, self._noise)
+                memory = self._contacts.nothing
+                track = BodyTrack(sighting, clean.stamp_ns, self._reader.context, self._noise, memory)
                 scene.tracks[sighting.body.id] = track
             else:
                 self.counters["body without a root so far"] += 1
                 continue
             followed.append((track, sighting))
         motions = self._reader.read([track for track, _ in followed])
+        contacts = self._contacts.read([track.glimpse(sighting, scene.ground) for track, sighting in followed])
         s, bodies = self.settings, []
-        for (track, sighting), motion in zip(followed, motions, strict=True):
-            track.fuse(sighting, motion, scene.ground, s.network, s.contacts)
-            body = track.publish(sighting, motion.contacts, s.lost_sigma)
+        for (track, sighting), motion, touching in zip(followed, motions, contacts, strict=True):
+            track.fuse(sighting, motion, touching, scene.ground, s.network, s.contacts)
+            body = track.publish(sighting, touching, s.lost_sigma)
             if (promise := broken(body)) is None:
                 bodies.append(body)
             else:  # whatever made it so is in the track, which begins anew
@@ -179,14 +186,11 @@ class MotionReader:
         """What each track's body does, by its window of motion."""
         if not tracks:
             return []
-        velocity, log_sigma, contact_logits = self._net(np.stack([track.window() for track in tracks]))
-        contacts, variance = 1.0 / (1.0 + np.exp(-contact_logits)), np.exp(2.0 * log_sigma)
+        velocity, log_sigma, _ = self._net(np.stack([track.window() for track in tracks]))
+        variance = np.exp(2.0 * log_sigma)
         variance[:, :2] = variance[:, :2].mean(axis=1, keepdims=True)  # the filter's noise must not know the heading
         sigma = np.sqrt(variance) * self._scale
-        return [
-            Motion(yaw_matrix(track.yaw) @ v, sd, c)
-            for track, v, sd, c in zip(tracks, velocity, sigma, contacts, strict=True)
-        ]
+        return [Motion(yaw_matrix(track.yaw) @ v, sd) for track, v, sd in zip(tracks, velocity, sigma, strict=True)]
 
 
 def _message(clean: PoseClean, ground: Ground, bodies: list[WorldBody]) -> PoseWorld:

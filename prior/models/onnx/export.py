@@ -13,7 +13,9 @@ import torch
 from onnx import ModelProto, helper, numpy_helper
 from torch import nn
 
+from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.models import weights_io
+from steadypose.prior.models.contacts.network import ContactConfig, ContactNet
 from steadypose.prior.models.hgvae.config import JOINT_NODES, HGVAEConfig
 from steadypose.prior.models.hgvae.faults import load_fault_net
 from steadypose.prior.models.hgvae.network import HGVAE
@@ -22,7 +24,15 @@ from steadypose.prior.models.hmvae.network import HMVAE
 from steadypose.prior.models.mixture.bank import EXPERTS, FEATURES
 from steadypose.prior.models.mixture.form import OUTPUTS
 from steadypose.prior.models.mixture.network import MixtureConfig, MixtureNet
-from steadypose.prior.models.onnx.modules import Correction, Faults, Mixture, Reconstruction, Refinement, RootMotion
+from steadypose.prior.models.onnx.modules import (
+    Contacts,
+    Correction,
+    Faults,
+    Mixture,
+    Reconstruction,
+    Refinement,
+    RootMotion,
+)
 from steadypose.prior.models.root_velocity.config import TrajectoryConfig
 from steadypose.prior.models.root_velocity.network import TrajectoryNet
 from steadypose.prior.models.sensor_bias.features import HISTORY, CorrectionConfig
@@ -82,6 +92,13 @@ def _root_motion() -> Form:
     return Form(RootMotion(network), {"joints": (network.config.context, 22, 3)}, outputs)
 
 
+def _contacts() -> Form:
+    network = load_network(ContactNet, ContactConfig.from_dict, "default", "contacts")
+    inputs = {"positions": (22, 3), "before": (22, 3), "dt": (), "yaw": (), "sigma": (22,), "root_seen": ()}
+    inputs |= {"ground": (len(CONTACT_JOINTS),), "state": (network.config.hidden,)}
+    return Form(Contacts(network), inputs, ("load", "rest", "new_state"))
+
+
 def _correction() -> Form:
     network = load_network(CorrectionNet, CorrectionConfig.from_dict, "kinect_v2", "correction")
     return Form(Correction(network), {"history": (len(HISTORY), 22, 3), "camera": (3,)}, ("correction",))
@@ -93,6 +110,7 @@ FORMS: dict[str, Callable[[], Form]] = {
     "hgvae-default": _reconstruction,
     "hgvae-default.faults": _faults,
     "trajectory-default": _root_motion,
+    "contacts-default": _contacts,
     "correction-kinect_v2": _correction,
 }
 """by the name of the file"""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from steadypose.prior.models.contacts.network import ContactNet
 from steadypose.prior.models.hgvae.completion import belief
 from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.faults import FaultNet
@@ -13,6 +14,7 @@ from steadypose.prior.models.hmvae.network import HMVAE
 from steadypose.prior.models.mixture.network import MixtureNet, answer, kept_of
 from steadypose.prior.models.onnx.torch_features import (
     completion_features,
+    contact_features,
     correction_features,
     fault_features,
     hang_unseen,
@@ -110,6 +112,23 @@ class RootMotion(nn.Module):
     def forward(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         velocity, log_sigma, contact_logits = (part[:, -1] for part in self.network(joints))
         return velocity, log_sigma, contact_logits
+
+
+class Contacts(nn.Module):
+    """`LiveContacts` on `contact_features`: the arguments of these and state (B, hidden) to load and rest (B, 8), which
+    are probabilities, and the state after the frame."""
+
+    def __init__(self, network: ContactNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(
+        self, positions: Tensor, before: Tensor, dt: Tensor, yaw: Tensor, sigma: Tensor, root_seen: Tensor,
+        ground: Tensor, state: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+        features = contact_features(positions, before, dt, yaw, sigma, root_seen, ground)
+        load, rest, state = self.network.step(features, state)
+        return load.sigmoid(), rest.sigmoid(), state
 
 
 class Correction(nn.Module):

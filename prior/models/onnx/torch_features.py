@@ -9,7 +9,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT
 from steadypose.prior.body.skeleton import HIPS, PARENTS, SHOULDERS
+from steadypose.prior.models.contacts.features import (
+    FASTEST,
+    FROM_ROOT,
+    HEIGHT,
+    HIGHEST,
+    LEAST_SIGMA,
+    MOST_SIGMA,
+    SIGMA,
+)
 from steadypose.prior.models.hgvae.completion_features import BIAS_MIN, BIAS_SCALE, CENTIMETRE, GROWTH, LAG, NEAR, STILL
 from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.fault_features import OFF_SCALE, RECENT, ROUGH_SCALE, SENSOR_SCALE
@@ -129,6 +139,33 @@ def fault_features(
     rough = 0.5 * (square / count / ROUGH_SCALE**2 + 1e-3).log()
     sensor = (sensor_sigma / SENSOR_SCALE).log()[:, None, None].expand(-1, tracks.shape[1], 1)
     return torch.cat([deviations, off, (sigma / OFF_SCALE).log(), seen.float(), rough, sensor], dim=-1)
+
+
+def contact_features(
+    positions: Tensor, before: Tensor, dt: Tensor, yaw: Tensor, sigma: Tensor, root_seen: Tensor, ground: Tensor
+) -> Tensor:
+    """(B, FEATURES) as `contacts.features.contact_features`, which says what each is."""
+    joints = list(CONTACT_JOINTS)
+    now, then = positions[:, joints], before[:, joints]
+    known = ~(torch.isnan(now).any(dim=-1, keepdim=True) | torch.isnan(then).any(dim=-1, keepdim=True))
+    nought, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    back = torch.stack([yaw.cos(), -yaw.sin(), nought, yaw.sin(), yaw.cos(), nought, nought, nought, one], dim=-1)
+    back, step = back.reshape(-1, 3, 3), dt[:, None, None]
+    from_root, from_root_then = now - positions[:, :1], then - before[:, :1]
+    velocity = torch.where(root_seen[:, None, None] > 0, (now - then) / step, torch.nan)
+    height = now[..., 2] - ground - torch.from_numpy(REST_HEIGHT).float()
+    parts = [
+        from_root @ back / FROM_ROOT,
+        ((from_root - from_root_then) / step @ back).clamp(-FASTEST, FASTEST),
+        height[..., None].clamp(-HIGHEST, HIGHEST) / HEIGHT,
+        (velocity @ back).clamp(-FASTEST, FASTEST),
+        (sigma[:, joints, None].clamp(LEAST_SIGMA, MOST_SIGMA) / SIGMA).log(),
+        torch.ones_like(height[..., None]),
+    ]
+    of_joints = torch.cat(parts, dim=-1)
+    of_joints = torch.where(known & ~torch.isnan(of_joints), of_joints, 0.0)
+    of_body = torch.stack([root_seen, (~torch.isnan(ground)).any(dim=1).float()], dim=1)
+    return torch.cat([of_joints.flatten(1), of_body], dim=1)
 
 
 def trunk_frame(positions: Tensor) -> Tensor:

@@ -157,8 +157,8 @@ def test_missing_weights_are_missing_and_nothing_is_timed(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(checkpoint, "WEIGHTS", tmp_path / "weights")
     findings = module._examine(module.check_models)
-    assert [finding.verdict for finding in findings] == [Verdict.BAD] * 3
-    assert [finding.fix.split("steadypose train ")[1] for finding in findings] == ["hmvae", "hgvae", "trajectory"]
+    assert [finding.verdict for finding in findings] == [Verdict.BAD] * len(module.MODELS)
+    assert [finding.fix.split("steadypose train ")[1] for finding in findings] == list(module.MODELS)
 
 
 def test_damaged_weights_are_not_taken_for_whole(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

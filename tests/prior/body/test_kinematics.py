@@ -6,6 +6,7 @@ from tests.helpers.bodies import fk
 
 from steadypose.prior.body.kinematics import (
     CONTACT_JOINTS,
+    LOAD_SPEED,
     forward_kinematics,
     label_contacts,
     quaternions,
@@ -63,6 +64,7 @@ def test_contacts_do_not_depend_on_the_frame_rate() -> None:
         assert not contacts[time > 1.1, heel].any()
     assert not label_contacts(positions + [0, 0, 0.2], fps).any()
     assert label_contacts(positions[:1], fps).shape == (1, 8)
+    assert label_contacts(positions, fps, LOAD_SPEED).sum() >= label_contacts(positions, fps).sum()
 
 
 def test_quaternions_are_scipys() -> None:

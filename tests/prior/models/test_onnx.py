@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from onnx import numpy_helper
 from tests.helpers.bodies import waving
 
+from steadypose.prior.body.kinematics import CONTACT_JOINTS
+from steadypose.prior.models.contacts.features import contact_features
+from steadypose.prior.models.contacts.inference import LiveContacts
 from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
 from steadypose.prior.models.hgvae.features import to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
@@ -125,6 +128,24 @@ def test_root_motion() -> None:
     joints = np.random.default_rng(0).normal(scale=0.3, size=(3, live.config.context, 22, 3))
     for found, expected in zip(answers("trajectory-default", joints=joints), live(joints), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_contacts() -> None:
+    """Four bodies: one seen in full, one against its root, one on unknown ground, one without its root or a foot."""
+    rng, live = np.random.default_rng(0), LiveContacts.load("default")
+    positions = waving(40)[[0, 10, 20, 30]]
+    before = positions + rng.normal(scale=0.02, size=positions.shape)
+    positions[3, 0] = positions[3, CONTACT_JOINTS[2]] = np.nan
+    ground = np.zeros((4, 8))
+    ground[2], ground[1, 3] = np.nan, np.nan
+    inputs = {
+        "positions": positions, "before": before, "dt": np.full(4, 0.04), "yaw": rng.uniform(-3, 3, 4),
+        "sigma": rng.uniform(0.0, 0.05, (4, 22)), "root_seen": np.array([1.0, 0.0, 1.0, 1.0]), "ground": ground,
+    }  # fmt: skip
+    state = rng.normal(scale=0.5, size=(4, live.hidden)).astype(np.float32)
+    expected = live(contact_features(**inputs), state)
+    for found, wanted in zip(answers("contacts-default", **inputs, state=state), expected, strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-4)
 
 
 def test_sensor_correction() -> None:

