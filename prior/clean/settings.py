@@ -58,7 +58,7 @@ class PriorSettings:
     fuse: FuseSettings = field(default_factory=FuseSettings)
 
     def __post_init__(self) -> None:
-        check_range("[prior] max_bodies", self.max_bodies, 1, 64)
+        check_range("[prior] max_bodies", self.max_bodies, 1, 256)  # as many as the bench puts side by side
         check_range("[prior] timeout", self.timeout, 0.05, 60.0)
         check_range("[prior.bones] samples", self.bones.samples, 1, 1e6)
         check_range("[prior.bones] every", self.bones.every, 1, 1e6)
