@@ -62,6 +62,10 @@ class Timeline:
         """Nanoseconds of wall time at which ``stamp_ns`` is due."""
         return self.wall_ns + round((stamp_ns - self.stamp_ns) / self.rate)
 
+    def stamp_at(self, wall_ns: int) -> int:
+        """The moment of capture that is played at a wall time."""
+        return self.stamp_ns + round((wall_ns - self.wall_ns) * self.rate)
+
     @property
     def is_now(self) -> bool:
         """Whether stamps are of the wall clock: a live source's, not a replay's."""

@@ -23,10 +23,7 @@ EXTRAS: Mapping[str, Extra] = {
     "dev": Extra("the tests", ("pytest",)),
     "oak": Extra("an OAK camera as the source, and calibrating any camera", ("depthai", "cv2")),
     "ray": Extra("steadypose clean --ray, on a cluster", ("ray",)),
-    "ros2": Extra(
-        "the ROS 2 bridge, and skeletons from ROS 2 topics",
-        ("rclpy", "rmw_fastrtps_cpp", "visualization_msgs", "diagnostic_msgs", "sensor_msgs", "cyclonedds"),
-    ),
+    "ros2": Extra("the ROS 2 bridge, and skeletons from ROS 2 topics", ("cyclonedds",)),
     "train": Extra("steadypose train and evaluate", ("torch", "roma", "sklearn")),
     "view": Extra("the picture in the browser, and steadypose plot", ("rerun", "matplotlib")),
     "webcam": Extra("a webcam as the source", ("mediapipe",)),

@@ -88,9 +88,11 @@ NODES: Mapping[str, NodeDeclaration] = {
         node="steadypose.nodes.sinks.ros2.bridge:Ros2BridgeNode",
         subscribes={
             "trajectory": (POSE_WORLD, DIAGNOSTICS),
-            "prior": (DIAGNOSTICS,),
-            "pose_input": (DIAGNOSTICS,),
+            "prior": (POSE_CLEAN, DIAGNOSTICS),
+            "pose_input": (POSE_RAW, DIAGNOSTICS),
         },
+        section="ros2",
+        settings="steadypose.nodes.sinks.ros2.settings:Ros2BridgeSettings",
         preflight="steadypose.nodes.sinks.ros2.bridge:check_ros2",
     ),
     "viewer": NodeDeclaration(

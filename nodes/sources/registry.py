@@ -18,6 +18,7 @@ from steadypose.nodes.sources.oak import OakSettings, OakSource
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source
 from steadypose.nodes.sources.source import LiveSource, RecordedSource, SourceContext
+from steadypose.nodes.sources.tf import TfSettings
 from steadypose.nodes.sources.webcam import WebcamSettings, open_webcam
 
 _SOURCE = "source"
@@ -51,12 +52,13 @@ class InputSettings:
     loop: bool = False
     """start again at the end, with stamps that go on rising"""
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
+    tf: TfSettings = field(default_factory=TfSettings)
 
     recording: str = path_setting(_declare(lambda path, _: open_recording(path)))
     """rosbag2 directory, .mcap, .npz or .csv to play; a relative path starts at the launch file"""
     oak: OakSettings = field(default_factory=OakSettings, metadata=_declare(OakSource, extra="oak"))
     webcam: WebcamSettings = field(default_factory=WebcamSettings, metadata=_declare(open_webcam, extra="webcam"))
-    ros2: Ros2Settings = field(default_factory=Ros2Settings, metadata=_declare(Ros2Source, extra="ros2"))
+    ros2: Ros2Settings = field(default_factory=Ros2Settings, metadata=_declare(Ros2Source))
     merge: MergeSettings = field(default_factory=MergeSettings, metadata=_declare(MergeSource))
 
     def __post_init__(self) -> None:

@@ -5,14 +5,20 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Any
+
+from rosbags.serde import SerdeError
 
 from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.checks.problem import Problem, warning
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.settings import LaunchError, nearest
+from steadypose.nodes.ros2.connection import check_ros, connect
+from steadypose.nodes.ros2.definitions import deserialise
 from steadypose.nodes.sources.adapters import from_azure_kinect, from_pose_array
 from steadypose.nodes.sources.source import LiveSource, SourceContext
 from steadypose.prior.body.layouts import SKELETONS
+
+TYPES = {"MarkerArray": "visualization_msgs/msg/MarkerArray", "PoseArray": "geometry_msgs/msg/PoseArray"}
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,7 @@ class Ros2Source(LiveSource):
 
     def __init__(self, settings: Ros2Settings, context: SourceContext) -> None:
         super().__init__()
+        check_ros()
         if settings.skeleton not in SKELETONS:
             raise LaunchError(
                 f"[input.ros2] skeleton: expected one of {', '.join(SKELETONS)}, got {settings.skeleton!r}"
@@ -51,44 +58,49 @@ class Ros2Source(LiveSource):
         self._settings = settings
         self._queue: deque[PoseRaw] = deque()
         self._received = 0
+        self._wrong = ""
 
     def frames(self) -> Generator[PoseRaw | None, None, None]:
-        import rclpy  # pyright: ignore[reportMissingImports]
-        from geometry_msgs.msg import PoseArray  # pyright: ignore[reportMissingImports]
-        from rclpy.executors import SingleThreadedExecutor  # pyright: ignore[reportMissingImports]
-        from rclpy.qos import qos_profile_sensor_data  # pyright: ignore[reportMissingImports]
-        from rclpy.signals import SignalHandlerOptions  # pyright: ignore[reportMissingImports]
-        from visualization_msgs.msg import MarkerArray  # pyright: ignore[reportMissingImports]
-
-        context = rclpy.Context()
-        # Ctrl-C is the input node's business, not rclpy's
-        rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+        connection = connect("steadypose_input")
         try:
-            node: Any = rclpy.create_node("steadypose_input", context=context, enable_rosout=False)
-            kind = {"MarkerArray": MarkerArray, "PoseArray": PoseArray}[self._settings.type]
-            # best effort, which hears reliable publishers too
-            node.create_subscription(kind, self._settings.topic, self._on_message, qos_profile_sensor_data)
-            executor = SingleThreadedExecutor(context=context)
-            executor.add_node(node)
+            connection.subscribe(self._settings.topic.lstrip("/"), TYPES[self._settings.type], self._on_message)
             while True:
-                executor.spin_once(timeout_sec=POLL_S)
+                connection.spin(POLL_S)
                 yield self._queue.popleft() if self._queue else None
+                while self._queue:
+                    yield self._queue.popleft()
         finally:
-            context.shutdown()
+            connection.close()
 
-    def _on_message(self, message: Any) -> None:
+    def _on_message(self, cdr: bytes) -> None:
         self._received += 1
         try:
+            message = deserialise(cdr, TYPES[self._settings.type])
             if self._settings.type == "MarkerArray":
                 raw = from_azure_kinect(message, source=self._settings.topic)
             else:
                 skeleton = SKELETONS[self._settings.skeleton]
                 raw = from_pose_array(message, skeleton, self._settings.up, source=self._settings.topic)
-        except ValueError:
+        except (SerdeError, ValueError) as error:
             self.refused[f"not a {self._settings.type} of skeletons"] += 1
+            self._wrong = str(error)
             return
+        self._wrong = ""
         if raw:
             self._queue.append(raw)
+
+    def problems(self) -> list[Problem]:
+        if self._wrong:
+            return [warning("ros_message", f"{self._settings.topic}: {self._wrong}")]
+        if not self._received:
+            return [
+                warning(
+                    "ros_silent",
+                    f"nothing has come on {self._settings.topic}: expected a {TYPES[self._settings.type]}; see `ros2 "
+                    "topic list -t`, and that ROS_DOMAIN_ID is the same there and here",
+                )
+            ]
+        return []
 
     def status(self) -> dict[str, str]:
         return {"camera": f"{self._settings.topic}, {self._received} messages"}

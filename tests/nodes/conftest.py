@@ -22,7 +22,6 @@ from tests.helpers.synthetic_poses import walker
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
-from steadypose.nodes.graph.extras import EXTRAS
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.prior.models.hmvae.config import HMVAEConfig
@@ -128,9 +127,9 @@ def record(directory: Path, messages: list[PoseRaw]) -> Path:
 
 @pytest.fixture
 def ros(monkeypatch: pytest.MonkeyPatch) -> None:
-    """ROS 2, if it is installed, in a domain of this test's own."""
-    for package in EXTRAS["ros2"].modules:
-        pytest.importorskip(package, reason="the extra 'ros2' is not installed")
+    """ROS 2, if there are wheels of it for this machine, in a domain of this test's own."""
+    for package in ("cyclonedds", "rclpy"):
+        pytest.importorskip(package, reason="there are no wheels for this machine: only x86-64 has them")
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))  # above 101 a domain's ports may be taken by others
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 

@@ -1,19 +1,50 @@
-"""The ROS 2 bridge: ``pose/world`` and ``diagnostics`` out to ROS 2. docs/ros2.md lists the topics."""
+"""The ROS 2 bridge: poses and ``diagnostics`` out to ROS 2. docs/ros2.md lists the topics."""
 
 from __future__ import annotations
 
-from steadypose.msgs.types import Diagnostics, Message, PoseWorld
+from collections import Counter
+
+from steadypose.msgs.types import Message, PoseWorld
+from steadypose.nodes.checks.problem import Problem, warning
 from steadypose.nodes.graph.clock import Clock
-from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.ros2.connection import Connection, Publish, check_ros, connect
+from steadypose.nodes.sinks.ros2.settings import Ros2BridgeSettings
+from steadypose.nodes.sinks.ros2.topics import BodyTopics
 
 
 def check_ros2(launch: Launch) -> None:
     """Raises:
-    LaunchError: something of ROS 2 is not installed.
+    LaunchError: nothing that speaks ROS 2 is installed.
     """
-    require_extra("ros2")
+    check_ros()
+
+
+class RosOutput:
+    """Publishes each topic from its first message on."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._publish: dict[str, Publish] = {}
+        self.missing: dict[str, str] = {}
+        """topics whose types are not to be had, and what to do about it"""
+
+    def send(self, topic: str, kind: str, cdr: bytes, *, latched: bool = False) -> None:
+        if topic in self.missing:
+            return
+        if topic not in self._publish:
+            try:
+                self._publish[topic] = self._connection.publisher(topic, kind, latched=latched)
+            except LaunchError as error:
+                self.missing[topic] = str(error)
+                return
+        self._publish[topic](cdr)
+
+    def drop(self, topic: str) -> None:
+        if publish := self._publish.pop(topic, None):
+            self._connection.drop(publish)
 
 
 class Ros2BridgeNode(Node):
@@ -23,22 +54,31 @@ class Ros2BridgeNode(Node):
 
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
-        require_extra("ros2")
+        check_ros()
+        self._settings = launch.settings(Ros2BridgeSettings)
         self._bodies = 0
+        self._missing: Counter[str] = Counter()
 
     def work(self) -> None:
-        from steadypose.nodes.sinks.ros2.output import RosOutput
-
-        with RosOutput() as self._ros:
+        connection = connect("steadypose")
+        try:
+            self._output = RosOutput(connection)
+            self._topics = BodyTopics(self._output, self._settings)
             super().work()
+        finally:
+            connection.close()
 
     def handle(self, topic: str, message: Message) -> None:
-        if isinstance(message, Diagnostics):
-            self._ros.publish_diagnostics(message)
-        elif isinstance(message, PoseWorld):
+        if isinstance(message, PoseWorld):
             self._bodies = len(message.bodies)
-            if refused := self._ros.publish_bodies(message):
-                self.health.counts["refused.body not finite"] += refused
+            if self._settings.clock and self.timeline and not self.timeline.is_now:
+                self._topics.send_clock(self.timeline.stamp_at(self.clock.now_ns()))
+        if refused := self._topics.send(message):
+            self.health.counts["refused.body not finite"] += refused
+
+    def problems(self) -> list[Problem]:
+        missing = self._output.missing if hasattr(self, "_output") else {}
+        return [warning("ros_type", f"/{topic} is not published: {why}") for topic, why in list(missing.items())[:1]]
 
     def status(self) -> dict[str, str]:
         return {"bodies": str(self._bodies)}

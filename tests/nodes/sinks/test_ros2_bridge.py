@@ -1,11 +1,14 @@
-"""The ROS 2 bridge against a real ROS 2 node in another process, over DDS."""
+"""The ROS 2 bridge, heard by a real ROS 2 node (Jazzy's rclpy) in another process, and by a plain DDS one."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,160 +17,292 @@ from conftest import another_python, running, until
 from scipy.spatial.transform import Rotation
 from tests.helpers.synthetic_poses import messages
 
-from steadypose.msgs.topics import DIAGNOSTICS, POSE_WORLD
+from steadypose.msgs.codec import decode
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.transport import Publisher
-from steadypose.msgs.types import Diagnostics, Level, PoseWorld, Tracking
+from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseWorld, Tracking
+from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, check_ros2
+from steadypose.nodes.ros2 import connection
+from steadypose.nodes.ros2.definitions import deserialise, stamp_ns
+from steadypose.nodes.ros2.tf import TransformBuffer
+from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, RosOutput, check_ros2
 from steadypose.nodes.sinks.ros2.rep155 import JOINTS, LINKS, frames
+from steadypose.nodes.sinks.ros2.settings import Ros2BridgeSettings
+from steadypose.nodes.sinks.ros2.topics import BodyTopics
 
 LISTENER = """
 import json, sys
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray
+from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
-from cyclonedds.domain import Domain, DomainParticipant
-from cyclonedds.sub import DataReader
-from cyclonedds.topic import Topic
-from steadypose.nodes.ros2_dds import LOCALHOST, QOS, IdsList, TFMessage
 
 rclpy.init()
 node = rclpy.create_node("listener")
 heard = {}
 def note(name, convert):
     return lambda message: heard.setdefault(name, convert(message))
-def stamp(header):
-    return header.stamp.sec * 10**9 + header.stamp.nanosec
+def stamp(time):
+    return time.sec * 10**9 + time.nanosec
+def point(p):
+    return [p.x, p.y, p.z]
 latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 node.create_subscription(MarkerArray, "/steadypose/markers", note("markers", lambda m: [
-    {"ns": k.ns, "stamp": stamp(k.header), "frame": k.header.frame_id, "type": k.type, "text": k.text,
-     "points": [[p.x, p.y, p.z] for p in k.points], "colours": len(k.colors)} for k in m.markers]), 10)
-node.create_subscription(PoseArray, "/steadypose/poses", note("poses", lambda m: {"stamp": stamp(m.header), "poses": [
-    [p.position.x, p.position.y, p.position.z, p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w]
-    for p in m.poses]}), 10)
+    {"ns": k.ns, "stamp": stamp(k.header.stamp), "frame": k.header.frame_id, "points": [point(p) for p in k.points],
+     "colours": len(k.colors), "text": k.text} for k in m.markers]), 10)
+node.create_subscription(PoseArray, "/steadypose/poses", note("poses", lambda m: {"stamp": stamp(m.header.stamp),
+    "poses": [point(p.position) for p in m.poses]}), 10)
 node.create_subscription(JointState, "/humans/bodies/b1/joint_states", note("angles", lambda m: dict(
     zip(m.name, m.position))), 10)
+node.create_subscription(Odometry, "/humans/bodies/b1/odom", note("odom", lambda m: {"stamp": stamp(m.header.stamp),
+    "frames": [m.header.frame_id, m.child_frame_id], "position": point(m.pose.pose.position),
+    "velocity": point(m.twist.twist.linear), "pose_covariance": list(m.pose.covariance),
+    "twist_covariance": list(m.twist.covariance)}), 10)
 node.create_subscription(String, "/humans/bodies/b1/urdf", note("urdf", lambda m: m.data), latched)
-node.create_subscription(DiagnosticArray, "/diagnostics", note("diagnostics", lambda m: {
-    "name": m.status[0].name,
+node.create_subscription(Clock, "/clock", note("clock", lambda m: stamp(m.clock)), 10)
+node.create_subscription(DiagnosticArray, "/diagnostics", note("diagnostics", lambda m: {"name": m.status[0].name,
     "level": m.status[0].level[0], "values": {v.key: v.value for v in m.status[0].values}}), 10)
-domain = node.context.get_domain_id()
-configured = Domain(domain, LOCALHOST)
-participant = DomainParticipant(domain)
-readers = {"tf": DataReader(participant, Topic(participant, "rt/tf", TFMessage), qos=QOS),
-           "tracked": DataReader(participant, Topic(participant, "rt/humans/bodies/tracked", IdsList), qos=QOS)}
-def plain(value):
-    if hasattr(value, "__dataclass_fields__"):
-        return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__}
-    return [plain(v) for v in value] if isinstance(value, (list, tuple)) else value
+print("ready", flush=True)
 while len(heard) < 7:
     rclpy.spin_once(node, timeout_sec=0.05)
-    for name, reader in readers.items():
-        for sample in reader.take(1):
-            heard.setdefault(name, plain(sample))
-heard["types"] = dict(node.get_topic_names_and_types())
-heard["nodes"] = node.get_node_names()
-print(json.dumps(heard))
+heard["types"] = {k: v for k, v in node.get_topic_names_and_types()}
+info = node.get_publishers_info_by_topic("/humans/bodies/b1/odom")[0]
+heard["hash"] = str(info.topic_type_hash)
+print(json.dumps(heard), flush=True)
 """
 
 
-@pytest.fixture
-def worlds() -> list[PoseWorld]:
+@pytest.fixture(scope="module")
+def stream() -> tuple[list[PoseClean], list[PoseWorld]]:
     """A second of two bodies that walk, one of which has an arm hidden."""
-    found = [message for topic, message in messages(3.0, bodies=2) if topic == POSE_WORLD]
-    return [message for message in found if isinstance(message, PoseWorld)][-20:]
+    found = list(messages(3.0, bodies=2))
+    cleans = [message for topic, message in found if topic == POSE_CLEAN]
+    worlds = [message for topic, message in found if topic == POSE_WORLD]
+    return cleans[-20:], worlds[-20:]  # type: ignore[return-value]
 
 
 @pytest.mark.usefixtures("ros")
-def test_a_ros_node_hears_bodies(make_launch: Callable[..., Launch], tmp_path: Path, worlds: list[PoseWorld]) -> None:
-    launch = make_launch(nodes='["trajectory", "ros2_bridge"]', transport__lossless="true")
+def test_a_ros_node_hears_bodies(
+    make_launch: Callable[..., Launch], tmp_path: Path, stream: tuple[list[PoseClean], list[PoseWorld]]
+) -> None:
+    worlds = stream[1]
+    launch = make_launch(nodes='["trajectory", "ros2_bridge"]', transport__lossless="true", ros2__world_frame="odom")
     news = Diagnostics(1, "prior", Level.WARN, "late", {"dropped.late": "3"})
     bridge = Ros2BridgeNode(launch)
-    stream = cycle(worlds)
+    bridge.timeline = Timeline(worlds[0].stamp_ns, bridge.clock.now_ns(), 1.0)
+    turn = cycle(worlds)
     with (
         another_python(LISTENER, tmp_path) as listener,
         Publisher(launch.transport.endpoint("trajectory"), reliable={"ros2_bridge"}) as publisher,
         running(bridge),
     ):
-        assert publisher.wait_for_subscribers({"ros2_bridge"}, timeout_s=20)
+        assert listener.stdout
+        said: list[str] = []
+        threading.Thread(target=lambda: said.extend(listener.stdout or ()), daemon=True).start()
 
         def told() -> bool:
-            publisher.publish(POSE_WORLD, next(stream))
+            publisher.publish(POSE_WORLD, next(turn), timeout_s=1)
             publisher.publish(DIAGNOSTICS, news)
-            return listener.poll() is not None
+            return len(said) > 1
 
-        until(told, timeout_s=60)
-        assert listener.stdout
-        heard = json.loads(listener.stdout.read())
+        until(told, timeout_s=120)
+    heard = json.loads(said[-1])
     assert not bridge.health.counts
 
     by_stamp = {message.stamp_ns: message for message in worlds}
-    said = by_stamp[heard["poses"]["stamp"]]
-    poses = np.array(heard["poses"]["poses"]).reshape(2, 22, 7)
-    for body, found in zip(said.bodies, poses, strict=True):
-        np.testing.assert_array_equal(found[:, :3], body.positions.astype(float))
-        np.testing.assert_allclose((Rotation.from_quat(found[0, 3:]) * Rotation.from_quat(body.rotations[0]).inv())
-                                   .magnitude(), 0, atol=1e-6)  # fmt: skip
+    poses = np.array(heard["poses"]["poses"]).reshape(2, 22, 3)
+    for body, found in zip(by_stamp[heard["poses"]["stamp"]].bodies, poses, strict=True):
+        np.testing.assert_array_equal(found, body.positions.astype(float))
 
     marks = {mark["ns"]: mark for mark in heard["markers"]}
-    assert set(marks) == {f"{body}/{part}" for body in ("b0", "b1") for part in ("joints", "bones", "name")}
-    joints, bones = marks["b1/joints"], marks["b1/bones"]
-    assert (joints["frame"], joints["colours"], len(bones["points"]), bones["colours"]) == ("world", 22, 42, 42)
-    np.testing.assert_array_equal(joints["points"], by_stamp[joints["stamp"]].bodies[1].positions.astype(float))
+    parts = ("joints", "bones", "velocity", "name")
+    assert set(marks) == {f"{body}/{part}" for body in ("b0", "b1") for part in parts}
+    drawn, bones = marks["b1/joints"], marks["b1/bones"]
+    assert (drawn["frame"], drawn["colours"], len(bones["points"]), bones["colours"]) == ("odom", 22, 42, 42)
+    np.testing.assert_array_equal(drawn["points"], by_stamp[drawn["stamp"]].bodies[1].positions.astype(float))
 
-    # of one message, all bodies, and of each all links
-    transforms = {t["child_frame_id"]: t for t in heard["tf"]["transforms"]}
-    assert set(transforms) == {f"{link}_{body}" for link in LINKS for body in ("b0", "b1")}
-    stamp = transforms["body_b1"]["header"]["stamp"]
-    links = frames(by_stamp[stamp["sec"] * 10**9 + stamp["nanosec"]].bodies[1])
-    root = _pose(transforms["body_b1"]["transform"])
-    assert transforms["body_b1"]["header"]["frame_id"] == "world"
-    assert transforms["l_wrist_b1"]["header"]["frame_id"] == "body_b1"
-    wrist = root @ _pose(transforms["l_wrist_b1"]["transform"])
-    np.testing.assert_allclose(wrist[:3, 3], links["l_wrist"][0], atol=1e-6)
-    np.testing.assert_allclose(wrist[:3, :3], links["l_wrist"][1], atol=1e-6)
+    odom = heard["odom"]
+    body = by_stamp[odom["stamp"]].bodies[1]
+    assert odom["frames"] == ["odom", "body_b1"]
+    np.testing.assert_array_equal(odom["position"], body.root_position)
+    turned = Rotation.from_quat(body.root_orientation)
+    np.testing.assert_allclose(turned.apply(odom["velocity"]), body.root_velocity, atol=1e-9)
+    covariance = np.array(odom["pose_covariance"]).reshape(6, 6)
+    np.testing.assert_array_equal(covariance[:3, :3], body.covariance[:3, :3])
+    twist = turned.as_matrix() @ np.array(odom["twist_covariance"]).reshape(6, 6)[:3, :3] @ turned.as_matrix().T
+    np.testing.assert_allclose(twist, body.covariance[3:, 3:], atol=1e-9)
 
-    assert heard["tracked"]["ids"] == ["b0", "b1"]
     assert set(heard["angles"]) == {f"{joint}_b1" for joint in JOINTS}
     moving = {joint.get("name") for joint in ElementTree.fromstring(heard["urdf"]).iterfind("joint[@type='revolute']")}
     assert moving == set(heard["angles"])
     assert heard["diagnostics"] == {"name": "steadypose: prior", "level": 1, "values": {"dropped.late": "3"}}
-    # ROS 2 itself takes what Cyclone DDS publishes for what it is
+    assert heard["types"]["/steadypose/pose_world"] == ["steadypose_msgs/msg/PoseWorld"]
     assert heard["types"]["/tf"] == ["tf2_msgs/msg/TFMessage"]
     assert heard["types"]["/humans/bodies/tracked"] == ["hri_msgs/msg/IdsList"]
-    assert "steadypose" in heard["nodes"]
+    assert "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0" in heard["hash"], "as ROS has it"
 
 
-def _pose(transform: dict[str, dict[str, float]]) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(list(transform["rotation"].values())).as_matrix()
-    pose[:3, 3] = list(transform["translation"].values())
-    return pose
+class Kept:
+    """An output that keeps what is sent, in order."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[str, str, bytes, bool]] = []
+        self.dropped: list[str] = []
+
+    def send(self, topic: str, kind: str, cdr: bytes, *, latched: bool = False) -> None:
+        self.sent.append((topic, kind, cdr, latched))
+
+    def drop(self, topic: str) -> None:
+        self.dropped.append(topic)
+
+    def of(self, topic: str) -> list[Any]:
+        return [deserialise(cdr, kind) for name, kind, cdr, _ in self.sent if name == topic]
 
 
-@pytest.mark.usefixtures("ros")
-def test_bodies_that_cannot_be_shown_are_left_out(worlds: list[PoseWorld]) -> None:
-    from steadypose.nodes.sinks.ros2.output import RosOutput
+def test_the_whole_message_goes_out_in_its_own_type(stream: tuple[list[PoseClean], list[PoseWorld]]) -> None:
+    kept = Kept()
+    topics = BodyTopics(kept, Ros2BridgeSettings(world_frame="map"))
+    clean, world = stream[0][-1], stream[1][-1]
+    topics.send(clean)
+    topics.send(world)
+    sent = {topic: cdr for topic, _, cdr, _ in kept.sent}
+    assert decode(POSE_CLEAN, sent["steadypose/pose_clean"]) == clean
+    assert decode(POSE_WORLD, sent["steadypose/pose_world"]) == dataclasses.replace(world, frame_id="map")
 
-    message = worlds[0]
-    with RosOutput() as output:
-        assert output.publish_bodies(message) == 0
-        assert set(output._bodies) == {"b0", "b1"}
-        message.bodies[0].positions[3] = np.nan
-        message.bodies[1].tracking = Tracking.LOST
-        assert output.publish_bodies(message) == 1
-        assert not output._bodies, "their topics go with them"
-        message.bodies[0].positions[3] = 0.0
-        message.bodies[0].rotations[:] = 0.0
-        assert output.publish_bodies(message) == 1
+
+def test_transforms_lead_to_every_link(stream: tuple[list[PoseClean], list[PoseWorld]]) -> None:
+    kept, buffer, world = Kept(), TransformBuffer(), stream[1][-1]
+    BodyTopics(kept, Ros2BridgeSettings(world_frame="odom")).send(world)
+    (told,) = kept.of("tf")
+    buffer.add(told, static=False)
+    assert {it.child_frame_id for it in told.transforms} == {
+        f"{link}_{body}" for link in LINKS for body in ("b0", "b1")
+    }
+    for name, body in zip(("b0", "b1"), world.bodies, strict=True):
+        for link, (place, turned) in frames(body).items():
+            at, quaternion = buffer.lookup("odom", f"{link}_{name}", world.stamp_ns)
+            np.testing.assert_allclose(at, place, atol=1e-6)
+            np.testing.assert_allclose(Rotation.from_quat(quaternion).as_matrix(), turned, atol=1e-6)
+    (tracked,) = kept.of("humans/bodies/tracked")
+    assert (tracked.ids, stamp_ns(tracked.header)) == (["b0", "b1"], world.stamp_ns)
+
+
+def test_a_sensor_that_stands_is_static_and_one_that_moves_is_not(
+    stream: tuple[list[PoseClean], list[PoseWorld]],
+) -> None:
+    kept = Kept()
+    topics = BodyTopics(kept, Ros2BridgeSettings(world_frame="map"))
+    pose = Pose(np.array([1.0, 2.0, 1.5]), np.array([0.5, -0.5, 0.5, -0.5]))
+    still = dataclasses.replace(stream[0][-1], frame_id="camera", sensor_pose=pose, calibrated=True)
+    for _ in range(3):
+        topics.send(still)
+    (told,) = kept.of("tf_static")
+    assert [latched for topic, _, _, latched in kept.sent if topic == "tf_static"] == [True]
+    (transform,) = told.transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("map", "camera")
+    assert transform.transform.translation.y == 2.0
+    for step in range(3):
+        topics.send(dataclasses.replace(still, sensor_pose=Pose(pose.position + step + 1, pose.orientation)))
+    assert [it.transforms[0].transform.translation.x for it in kept.of("tf")] == [2.0, 3.0, 4.0]
+    silent = Kept()
+    for settings, message in (
+        (Ros2BridgeSettings(sensor_tf=False), still),
+        (Ros2BridgeSettings(), dataclasses.replace(still, calibrated=False)),
+        (Ros2BridgeSettings(), dataclasses.replace(still, frame_id="world")),
+    ):
+        BodyTopics(silent, settings).send(message)
+    assert not silent.of("tf_static")
+
+
+def test_who_is_gone_loses_its_topics_and_who_is_lost_is_not_published(
+    stream: tuple[list[PoseClean], list[PoseWorld]],
+) -> None:
+    kept = Kept()
+    topics = BodyTopics(kept, Ros2BridgeSettings())
+    world = stream[1][-1]
+    topics.send(world)
+    lost = dataclasses.replace(world.bodies[1], tracking=Tracking.LOST)
+    nowhere = dataclasses.replace(world.bodies[0], positions=np.full((22, 3), np.nan))
+    assert topics.send(dataclasses.replace(world, bodies=[world.bodies[0], lost])) == 0
+    assert set(kept.dropped) == {f"humans/bodies/b1/{topic}" for topic in ("joint_states", "odom", "urdf")}
+    assert topics.send(dataclasses.replace(world, bodies=[nowhere])) == 1
+    assert kept.of("humans/bodies/tracked")[-1].ids == []
+
+
+def test_a_type_that_is_not_to_be_had_is_told_and_the_rest_goes_on() -> None:
+    class Poor:
+        def publisher(self, topic: str, kind: str, *, latched: bool = False) -> Callable[[bytes], None]:
+            if kind.startswith("hri"):
+                raise LaunchError("sudo apt install ros-$ROS_DISTRO-hri-msgs")
+            return sent.append
+
+    sent: list[bytes] = []
+    output = RosOutput(Poor())  # type: ignore[arg-type]
+    for _ in range(2):
+        output.send("humans/bodies/tracked", "hri_msgs/msg/IdsList", b"1")
+        output.send("tf", "tf2_msgs/msg/TFMessage", b"2")
+    assert sent == [b"2", b"2"]
+    assert "apt install" in output.missing["humans/bodies/tracked"]
 
 
 def test_without_ros_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("steadypose.nodes.graph.extras.find_spec", lambda name: None)
-    with pytest.raises(LaunchError, match=r"steadypose\[ros2\]"):
+    monkeypatch.setattr(connection, "find_spec", lambda name: None)
+    with pytest.raises(LaunchError, match="--extra ros2"):
         check_ros2(Launch())
+
+
+@pytest.mark.parametrize("frame", ["", "/map"])
+def test_a_frame_that_ros_does_not_take(frame: str) -> None:
+    with pytest.raises(LaunchError, match="without a slash"):
+        Ros2BridgeSettings(world_frame=frame)
+
+
+@pytest.fixture(params=["dds", "rclpy"])
+def join(request: pytest.FixtureRequest, ros: None) -> Iterator[Callable[[], connection.Connection]]:
+    """Each way into ROS."""
+    opened: list[connection.Connection] = []
+
+    def open_one() -> connection.Connection:
+        if request.param == "dds":
+            from steadypose.nodes.ros2.dds import DdsConnection
+
+            opened.append(DdsConnection())
+        else:
+            from steadypose.nodes.ros2.rclpy_connection import RclpyConnection
+
+            opened.append(RclpyConnection("test"))
+        return opened[-1]
+
+    yield open_one
+    for one in opened:
+        one.close()
+
+
+def test_who_joins_late_gets_what_is_latched(join: Callable[[], connection.Connection]) -> None:
+    said = deserialise_text("a robot")
+    first = join()
+    first.publisher("description", "std_msgs/msg/String", latched=True)(said)
+    heard: list[bytes] = []
+    late = join()
+    late.subscribe("description", "std_msgs/msg/String", heard.append, latched=True)
+
+    def arrived() -> bool:
+        first.spin(0.0)
+        late.spin(0.05)
+        return bool(heard)
+
+    until(arrived, timeout_s=60)
+    assert deserialise(heard[0], "std_msgs/msg/String").data == "a robot"
+
+
+def deserialise_text(text: str) -> bytes:
+    from steadypose.nodes.ros2.definitions import new, serialise
+
+    return serialise(new("std_msgs/msg/String", data=text), "std_msgs/msg/String")

@@ -1,0 +1,80 @@
+"""A connection to ROS 2's topics: what publishes and subscribes serialised messages, whatever carries them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Protocol
+
+from steadypose.nodes.graph.settings import LaunchError
+
+Publish = Callable[[bytes], None]
+"""a message, as CDR"""
+DEPTH = 10
+"""messages held for a subscriber that is late"""
+
+
+class Connection(Protocol):
+    """A node in a ROS domain. Not thread-safe."""
+
+    def publisher(self, topic: str, kind: str, *, latched: bool = False) -> Publish:
+        """What publishes messages on a topic, reliably.
+
+        Args:
+            topic: such as ``tf``; without a leading slash.
+            kind: such as ``tf2_msgs/msg/TFMessage``.
+            latched: whether who joins late gets the last message (TRANSIENT_LOCAL).
+
+        Raises:
+            LaunchError: the type is not to be had.
+        """
+        ...
+
+    def subscribe(
+        self, topic: str, kind: str, heard: Callable[[bytes], None], *, latched: bool = False, depth: int = DEPTH
+    ) -> None:
+        """Call ``heard`` with each message of a topic from `spin`; publishers may be reliable or best-effort."""
+        ...
+
+    def spin(self, timeout_s: float) -> None:
+        """Wait until something comes, for so long at most, and give it to whom it concerns."""
+        ...
+
+    def drop(self, publish: Publish) -> None:
+        """Publish there no more."""
+        ...
+
+    def close(self) -> None: ...
+
+
+def check_ros() -> None:
+    """Raises:
+    LaunchError: neither a sourced ROS 2 nor Cyclone DDS is there.
+    """
+    if not has_sourced_ros() and find_spec("cyclonedds") is None:
+        raise LaunchError(
+            "ROS 2: needs Cyclone DDS, which comes with the extra 'ros2' (x86-64): `pip install 'steadypose[ros2]'`, "
+            "or in the checkout `.uv/bin/uv sync --frozen --inexact --extra ros2`; or a ROS 2 that is sourced, with a "
+            "Python of the same version"
+        )
+
+
+def has_sourced_ros() -> bool:
+    """Whether a whole ROS 2 is there, not only what PyPI has of it."""
+    return all(find_spec(package) is not None for package in ("rclpy", "tf2_msgs"))
+
+
+def connect(name: str) -> Connection:
+    """Join the ROS domain: through the rclpy of a ROS that is sourced, or else over plain DDS.
+
+    Raises:
+        LaunchError: nothing to do so with is installed.
+    """
+    check_ros()
+    if has_sourced_ros():
+        from steadypose.nodes.ros2.rclpy_connection import RclpyConnection
+
+        return RclpyConnection(name)
+    from steadypose.nodes.ros2.dds import DdsConnection
+
+    return DdsConnection()

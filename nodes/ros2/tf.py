@@ -1,0 +1,109 @@
+"""Transforms between named frames over time, as tf2 keeps them: looked up by stamp, interpolated, along the tree."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from steadypose.nodes.ros2.definitions import stamp_ns
+
+CACHE_NS = 10_000_000_000
+"""for how long transforms are kept, as tf2 does"""
+Floats = NDArray[np.float64]
+Moment = tuple[int, Floats, Floats]
+"""stamp, translation (3,) metres and quaternion (4,) xyzw, from the child's frame to the parent's"""
+
+
+class TransformError(LookupError):
+    """A transform that is not known, yet or at all. The text says which, and why."""
+
+
+class TransformBuffer:
+    """What was heard on ``/tf`` and ``/tf_static``."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, str] = {}
+        self._moments: dict[str, deque[Moment]] = {}
+        self._static: set[str] = set()
+
+    def add(self, message: Any, *, static: bool) -> None:
+        """Take a ``tf2_msgs/TFMessage``; what is no pose in it is left out."""
+        for told in message.transforms:
+            child, parent = told.child_frame_id.lstrip("/"), told.header.frame_id.lstrip("/")
+            at, turned = told.transform.translation, told.transform.rotation
+            place = np.array([at.x, at.y, at.z])
+            quaternion = np.array([turned.x, turned.y, turned.z, turned.w])
+            sound = np.isfinite(place).all() and abs(np.linalg.norm(quaternion) - 1.0) < 0.01
+            if not sound or not child or not parent or child == parent:
+                continue
+            if self._parents.get(child, parent) != parent:
+                self._moments.pop(child, None)
+            self._parents[child] = parent
+            (self._static.add if static else self._static.discard)(child)
+            moments = self._moments.setdefault(child, deque())
+            moment = stamp_ns(told.header), place, quaternion
+            if static or not moments:
+                self._moments[child] = deque([moment])
+            elif moment[0] > moments[-1][0]:
+                moments.append(moment)
+            elif moment[0] < moments[-1][0] - CACHE_NS:  # the clock was set back, as when a bag begins again
+                self._moments[child] = deque([moment])
+            while moments and moments[0][0] < moments[-1][0] - CACHE_NS:
+                moments.popleft()
+
+    def lookup(self, target: str, source: str, at_ns: int) -> tuple[Floats, Floats]:
+        """Where a frame is in another at a moment.
+
+        Returns:
+            position (3,) metres and quaternion (4,) xyzw of ``source`` in ``target``.
+
+        Raises:
+            TransformError: there is no way between the frames, or not at that moment.
+        """
+        up, down = self._way(source), self._way(target)
+        shared = next((frame for frame in up if frame in down), None)
+        if shared is None:
+            known = ", ".join(sorted({*self._parents, *self._parents.values()})) or "none"
+            raise TransformError(
+                f"no way from {source!r} to {target!r} in TF: expected one tree; frames heard of: {known}"
+            )
+        place, turned = self._chain(up[: up.index(shared)], at_ns)
+        other, back = self._chain(down[: down.index(shared)], at_ns)
+        inverse = back.inv()
+        return inverse.apply(place - other), (inverse * turned).as_quat()
+
+    def _way(self, frame: str) -> list[str]:
+        """From a frame up to the root of its tree."""
+        way = [frame]
+        while (parent := self._parents.get(way[-1])) is not None and parent not in way:
+            way.append(parent)
+        return way
+
+    def _chain(self, frames: list[str], at_ns: int) -> tuple[Floats, Rotation]:
+        place, turned = np.zeros(3), Rotation.identity()
+        for frame in frames:
+            step, turn = self._at(frame, at_ns)
+            place, turned = step + turn.apply(place), turn * turned
+        return place, turned
+
+    def _at(self, frame: str, at_ns: int) -> tuple[Floats, Rotation]:
+        moments = self._moments[frame]
+        if frame in self._static:
+            return moments[-1][1], Rotation.from_quat(moments[-1][2])
+        first, last = moments[0][0], moments[-1][0]
+        if not first <= at_ns <= last:
+            early = "older than the oldest" if at_ns < first else "newer than the newest"
+            off = (first - at_ns if at_ns < first else at_ns - last) / 1e9
+            raise TransformError(f"the transform of {frame!r} is wanted for a moment {off:.3f} s {early} heard on /tf")
+        after = next(index for index, moment in enumerate(moments) if moment[0] >= at_ns)
+        b = moments[after]
+        if b[0] == at_ns:
+            return b[1], Rotation.from_quat(b[2])
+        a = moments[after - 1]
+        share = (at_ns - a[0]) / (b[0] - a[0])
+        turned = Slerp([0.0, 1.0], Rotation.from_quat(np.stack([a[2], b[2]])))(share)
+        return a[1] + share * (b[1] - a[1]), turned

@@ -1,0 +1,207 @@
+"""``pose/clean``, ``pose/world`` and ``diagnostics`` as ROS 2 messages of standard types."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from steadypose.msgs.types import Diagnostics, JointState, PoseClean, PoseWorld, Tracking, WorldBody
+from steadypose.nodes.ros2.definitions import header, new
+from steadypose.nodes.sinks.ros2.rep155 import Links, body_name, joint_rotations
+from steadypose.prior.body.skeleton import PARENTS, J
+
+MARKER_LIFE_S = 0.5
+JOINT_SIZE, BONE_WIDTH, TEXT_SIZE = 0.05, 0.02, 0.12
+"""metres"""
+SPHERE_LIST, LINE_LIST, TEXT_VIEW_FACING, ARROW = 7, 5, 9, 0
+"""of ``visualization_msgs/Marker``"""
+UNKNOWN_VARIANCE = 1e6
+"""of what an odometry must have and nobody measured: in m², rad² and so on"""
+
+
+def _colour(r: float, g: float, b: float, a: float = 1.0) -> Any:
+    return new("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a)
+
+
+COLOURS: Mapping[int, Any] = {
+    JointState.UNKNOWN: _colour(0.5, 0.5, 0.5, 0.5),
+    JointState.SEEN: _colour(0.2, 0.8, 0.3),
+    JointState.REFINED: _colour(0.2, 0.6, 0.9),
+    JointState.IMPUTED: _colour(1.0, 0.6, 0.1),
+}
+
+
+def is_finite(body: WorldBody) -> bool:
+    """Whether a body can be published."""
+    return bool(np.isfinite(body.positions).all() and (np.abs(np.linalg.norm(body.rotations, axis=1) - 1) < 0.1).all())
+
+
+def pose_array(world: PoseWorld, bodies: Mapping[str, WorldBody]) -> Any:
+    """``geometry_msgs/PoseArray``: the 22 joints of one body after the other."""
+    poses = [pose for body in bodies.values() for pose in _joint_poses(body)]
+    return new("geometry_msgs/msg/PoseArray", header=header(world.stamp_ns, world.frame_id), poses=poses)
+
+
+def marker_array(world: PoseWorld, bodies: Mapping[str, WorldBody]) -> Any:
+    """``visualization_msgs/MarkerArray``: joints by where they come from, bones, velocity and name of each body."""
+    where = header(world.stamp_ns, world.frame_id)
+    markers = [mark for name, body in bodies.items() for mark in _marks(where, name, body)]
+    return new("visualization_msgs/msg/MarkerArray", markers=markers)
+
+
+def odometry(world: PoseWorld, name: str, body: WorldBody) -> Any:
+    """``nav_msgs/Odometry`` of a body's root: pose in the world, velocity in its own frame, both with covariance.
+
+    Rotations and angular velocities are without an estimate of their own: their variance is `UNKNOWN_VARIANCE`.
+    """
+    turned = Rotation.from_quat(body.root_orientation).as_matrix()
+    pose_covariance, twist_covariance = np.eye(6) * UNKNOWN_VARIANCE, np.eye(6) * UNKNOWN_VARIANCE
+    pose_covariance[:3, :3] = body.covariance[:3, :3]
+    twist_covariance[:3, :3] = turned.T @ body.covariance[3:, 3:] @ turned
+    pose = _pose(body.root_position, body.root_orientation)
+    twist = new("geometry_msgs/msg/Twist", linear=_vector(turned.T @ body.root_velocity))
+    return new(
+        "nav_msgs/msg/Odometry",
+        header=header(world.stamp_ns, world.frame_id),
+        child_frame_id=f"body_{name}",
+        pose=new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=pose_covariance.ravel()),
+        twist=new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=twist_covariance.ravel()),
+    )
+
+
+def joint_state(world: PoseWorld, name: str, angles: Mapping[str, float]) -> Any:
+    """``sensor_msgs/JointState`` of REP-155's joints."""
+    return new(
+        "sensor_msgs/msg/JointState",
+        header=header(world.stamp_ns, world.frame_id),
+        name=[f"{joint}_{name}" for joint in angles],
+        position=np.array(list(angles.values())),
+    )
+
+
+def ids_list(world: PoseWorld, names: list[str]) -> Any:
+    """``hri_msgs/IdsList`` of those that are followed."""
+    return new("hri_msgs/msg/IdsList", header=header(world.stamp_ns, world.frame_id), ids=names)
+
+
+def body_transforms(world: PoseWorld, name: str, links: Links) -> list[Any]:
+    """The links of one body: the ``body`` in the world, all others in the body, as REP-155 wants them."""
+    root, heading = links["body"]
+    origins = np.stack([origin for origin, _ in links.values()])
+    turns = np.stack([turn for _, turn in links.values()])
+    others = np.array([link != "body" for link in links])
+    origins[others] = (origins[others] - root) @ heading
+    turns[others] = heading.T @ turns[others]
+    quaternions = Rotation.from_matrix(turns, assume_valid=True).as_quat()
+    return [
+        transform(
+            world.stamp_ns, world.frame_id if link == "body" else f"body_{name}", f"{link}_{name}", origin, quaternion
+        )
+        for link, origin, quaternion in zip(links, origins, quaternions, strict=True)
+    ]
+
+
+def sensor_transform(clean: PoseClean, world_frame: str) -> Any:
+    """Where the sensor stands, as its calibration says."""
+    pose = clean.sensor_pose
+    return transform(clean.stamp_ns, world_frame, clean.frame_id, pose.position, pose.orientation)
+
+
+def transform(stamp_ns: int, parent: str, child: str, place: np.ndarray, quaternion: np.ndarray) -> Any:
+    """``geometry_msgs/TransformStamped``."""
+    return new(
+        "geometry_msgs/msg/TransformStamped",
+        header=header(stamp_ns, parent),
+        child_frame_id=child,
+        transform=new("geometry_msgs/msg/Transform", translation=_vector(place), rotation=_quaternion(quaternion)),
+    )
+
+
+def tf_message(transforms: list[Any]) -> Any:
+    return new("tf2_msgs/msg/TFMessage", transforms=transforms)
+
+
+def diagnostic_array(diagnostics: Diagnostics) -> Any:
+    """``diagnostic_msgs/DiagnosticArray`` of one status."""
+    status = new(
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        level=int(diagnostics.level),
+        name=f"steadypose: {diagnostics.node}",
+        message=diagnostics.message,
+        hardware_id=diagnostics.node,
+        values=[new("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in diagnostics.values.items()],
+    )
+    return new("diagnostic_msgs/msg/DiagnosticArray", header=header(diagnostics.stamp_ns, ""), status=[status])
+
+
+def clock(stamp_ns: int) -> Any:
+    """``rosgraph_msgs/Clock``."""
+    return new("rosgraph_msgs/msg/Clock", clock=header(stamp_ns, "").stamp)
+
+
+def _vector(values: np.ndarray) -> Any:
+    return new("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, values), strict=True)))
+
+
+def _point(values: np.ndarray) -> Any:
+    return new("geometry_msgs/msg/Point", **dict(zip("xyz", map(float, values), strict=True)))
+
+
+def _quaternion(values: np.ndarray) -> Any:
+    return new("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, values), strict=True)))
+
+
+def _pose(place: np.ndarray, quaternion: np.ndarray) -> Any:
+    return new("geometry_msgs/msg/Pose", position=_point(place), orientation=_quaternion(quaternion))
+
+
+def _joint_poses(body: WorldBody) -> Iterator[Any]:
+    """The 22 canonical joints in the world."""
+    turns = Rotation.from_matrix(joint_rotations(body), assume_valid=True).as_quat()
+    return (_pose(place, turn) for place, turn in zip(body.positions, turns, strict=True))
+
+
+def _marks(where: Any, name: str, body: WorldBody) -> list[Any]:
+    points, colours = [_point(place) for place in body.positions], [COLOURS[int(state)] for state in body.state]
+    life = new("builtin_interfaces/msg/Duration", nanosec=round(MARKER_LIFE_S * 1e9))
+
+    def mark(kind: int, part: str, scale: tuple[float, float, float], **more: Any) -> Any:
+        return new(
+            "visualization_msgs/msg/Marker",
+            header=where,
+            ns=f"{name}/{part}",
+            type=kind,
+            scale=_vector(np.array(scale)),
+            lifetime=life,
+            **{"pose": _pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))} | more,
+        )
+
+    ends = [joint for child, parent in enumerate(PARENTS) if parent >= 0 for joint in (parent, child)]
+    above = body.positions[J["head"]] + [0.0, 0.0, 3 * TEXT_SIZE]
+    root, velocity = body.root_position, body.root_velocity
+    return [
+        mark(SPHERE_LIST, "joints", (JOINT_SIZE,) * 3, points=points, colors=colours),
+        mark(
+            LINE_LIST, "bones", (BONE_WIDTH, 0.0, 0.0), points=[points[joint] for joint in ends],
+            colors=[colours[child] for child, parent in enumerate(PARENTS) if parent >= 0 for _ in range(2)],
+        ),
+        mark(
+            ARROW, "velocity", (BONE_WIDTH, 2 * BONE_WIDTH, 0.0), points=[_point(root), _point(root + velocity)],
+            color=_colour(1.0, 1.0, 1.0, 0.8),
+        ),
+        mark(
+            TEXT_VIEW_FACING, "name", (0.0, 0.0, TEXT_SIZE), color=_colour(1.0, 1.0, 1.0),
+            text=name if body.tracking == Tracking.OK else f"{name}, {body.tracking.name.lower()}",
+            pose=_pose(above, np.array([0.0, 0.0, 0.0, 1.0])),
+        ),
+    ]  # fmt: skip
+
+
+def names_of(world: PoseWorld) -> tuple[dict[str, WorldBody], int]:
+    """The bodies of a message that can be published, by their names in ROS, and how many are followed and cannot."""
+    followed = [body for body in world.bodies if body.tracking != Tracking.LOST]
+    found = {body_name(body.id): body for body in followed if is_finite(body)}
+    return found, len(followed) - len(found)
