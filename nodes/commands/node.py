@@ -21,7 +21,7 @@ def node(
     """Run one node of a launch file until it is stopped, with SIGTERM or Ctrl-C.
 
     Args:
-        name: pose_input, prior, trajectory, ros2_bridge, recorder or viewer.
+        name: pose_input, prior, trajectory, ros2_bridge, foxglove, recorder or viewer.
         launch: a launch file, or the name of one of the project's own.
         settings: any setting of the launch file, over what it says. May be given again.
     """

@@ -21,9 +21,11 @@ class Extra:
 
 EXTRAS: Mapping[str, Extra] = {
     "dev": Extra("the tests", ("pytest",)),
+    "foxglove": Extra("poses live in Foxglove", ("foxglove",)),
     "oak": Extra("an OAK camera as the source, and calibrating any camera", ("depthai", "cv2")),
     "ray": Extra("steadypose clean --ray, on a cluster", ("ray",)),
     "ros2": Extra("the ROS 2 bridge, and skeletons from ROS 2 topics", ("cyclonedds",)),
+    "ros2-test": Extra("the tests of ROS 2", ("rclpy",)),
     "train": Extra("steadypose train and evaluate", ("torch", "roma", "sklearn")),
     "view": Extra("the picture in the browser, and steadypose plot", ("rerun", "matplotlib")),
     "webcam": Extra("a webcam as the source", ("mediapipe",)),

@@ -95,6 +95,18 @@ NODES: Mapping[str, NodeDeclaration] = {
         settings="steadypose.nodes.sinks.ros2.settings:Ros2BridgeSettings",
         preflight="steadypose.nodes.sinks.ros2.bridge:check_ros2",
     ),
+    "foxglove": NodeDeclaration(
+        node="steadypose.nodes.sinks.ros2.foxglove:FoxgloveNode",
+        subscribes={
+            "trajectory": (POSE_WORLD, DIAGNOSTICS),
+            "prior": (POSE_CLEAN, DIAGNOSTICS),
+            "pose_input": (POSE_RAW, DIAGNOSTICS),
+        },
+        section="foxglove",
+        settings="steadypose.nodes.sinks.ros2.foxglove:FoxgloveSettings",
+        delivery=Delivery.BEST_EFFORT,
+        preflight="steadypose.nodes.sinks.ros2.foxglove:check_foxglove",
+    ),
     "viewer": NodeDeclaration(
         node="steadypose.nodes.sinks.viewer.node:ViewerNode",
         subscribes=_ALL_STREAMS,

@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import Any
 
 import rclpy
+from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
@@ -22,7 +23,7 @@ class RclpyConnection:
     """A ROS 2 node that sends and gets serialised messages; implements `Connection`."""
 
     def __init__(self, name: str) -> None:
-        self._context = rclpy.Context()
+        self._context = Context()
         # Ctrl-C is this process's business, not rclpy's
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._node: Any = rclpy.create_node(

@@ -18,7 +18,7 @@ from steadypose.nodes.sources.oak import OakSettings, OakSource
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source
 from steadypose.nodes.sources.source import LiveSource, RecordedSource, SourceContext
-from steadypose.nodes.sources.tf import TfSettings
+from steadypose.nodes.sources.tf import TfSettings, TfSource
 from steadypose.nodes.sources.webcam import WebcamSettings, open_webcam
 
 _SOURCE = "source"
@@ -95,9 +95,14 @@ def open_input(
     declared = SOURCES[settings.source]
     if declared.extra:
         require_extra(declared.extra)
-    return declared.opens(
+    source = declared.opens(
         getattr(settings, settings.source), SourceContext(clock, settings.calibration, keys, clear_text)
     )
+    if not settings.tf.fixed_frame:
+        return source
+    if not isinstance(source, LiveSource):
+        raise LaunchError(f"[input.tf] is for live sources: expected a camera or ros2, got {settings.source}")
+    return TfSource(source, settings.tf, clock)
 
 
 def check_input(launch: Launch) -> None:

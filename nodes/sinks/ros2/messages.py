@@ -183,7 +183,7 @@ def _marks(where: Any, name: str, body: WorldBody) -> list[Any]:
     above = body.positions[J["head"]] + [0.0, 0.0, 3 * TEXT_SIZE]
     root, velocity = body.root_position, body.root_velocity
     return [
-        mark(SPHERE_LIST, "joints", (JOINT_SIZE,) * 3, points=points, colors=colours),
+        mark(SPHERE_LIST, "joints", (JOINT_SIZE, JOINT_SIZE, JOINT_SIZE), points=points, colors=colours),
         mark(
             LINE_LIST, "bones", (BONE_WIDTH, 0.0, 0.0), points=[points[joint] for joint in ends],
             colors=[colours[child] for child, parent in enumerate(PARENTS) if parent >= 0 for _ in range(2)],

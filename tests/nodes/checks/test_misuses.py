@@ -326,7 +326,9 @@ def test_the_page_has_every_cause() -> None:
     page = (Path(__file__).parents[3] / "docs" / "troubleshooting.md").read_text()
     package = Path(__file__).parents[3] / "nodes"
     code = "".join(
-        file.read_text() for folder in ("checks", "graph", "sources") for file in (package / folder).glob("*.py")
+        file.read_text()
+        for folder in ("checks", "graph", "sources", "sinks/ros2")
+        for file in (package / folder).glob("*.py")
     )
     causes = set(re.findall(r'(?:error|warning)\(\s*"(\w+)"', code))
     assert causes >= {cause for _, cause, _ in MISUSES.values()}
