@@ -96,8 +96,8 @@ class Denoise:
         The weights are those of least variance for two estimates of which the second holds the share `NOISE_LEFT` of
         the first one's noise and an error of its own. That error is what its distance to the first one shows beyond
         noise, in this joint and of late (innovations, as in adaptive Kalman filters: Mehra 1970): motion that HG-VAE
-        has never seen takes its belief away; and it is the later, the faster the joint. Noise is what jumps from frame to frame, ``jitter`` (S,) metres as of
-        now: of an error that lasts, HG-VAE keeps all.
+        has never seen takes its belief away; and it is the later, the faster the joint. Noise is what jumps from frame
+        to frame, ``jitter`` (S,) metres as of now: of an error that lasts, HG-VAE keeps all.
         """
         found = self._found[-1 - back]
         seen = np.isfinite(history.positions[-1 - back][..., 0])
