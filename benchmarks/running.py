@@ -12,7 +12,7 @@ from rich.console import Console
 
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_WORLD
 from steadypose.msgs.transport import Subscriber
-from steadypose.msgs.types import Message
+from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.graph.clock import SystemClock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.supervisor import Supervisor
@@ -26,26 +26,31 @@ SILENCE_S = 30.0
 
 @contextmanager
 def running(
-    recording: Path, *, lossless: bool, rate: float = 1.0, loop: bool = False
+    recording: Path, *, lossless: bool, rate: float = 1.0, loop: bool = False, record: Path | None = None
 ) -> Iterator[tuple[Iterator[tuple[str, Message]], SystemClock]]:
-    """The node processes at work on a recording; gives what they publish, ``pose/world`` and ``diagnostics``."""
+    """The node processes at work on a recording, with a recorder where there is a place to ``record`` to; gives what
+    they publish, ``pose/world`` and ``diagnostics``."""
+    nodes = [*POSE_NODES, "recorder"] if record else [*POSE_NODES]
     console = Console(stderr=True)
     clock = SystemClock()
     with tempfile.TemporaryDirectory(prefix="steadypose-") as folder:
         settings = [
-            f"nodes={json.dumps(POSE_NODES)}",
+            f"nodes={json.dumps(nodes)}",
             f"input.recording={json.dumps(str(recording))}",
             f"input.rate={rate}",
             f"input.loop={json.dumps(loop)}",
             f"transport.directory={json.dumps(folder)}",
             f"transport.lossless={json.dumps(lossless)}",
         ]
+        if record:  # as on a machine that runs for months: parts, of which the oldest go
+            limits = {"directory": str(record), "split_mb": 50.0, "keep_mb": 200.0}
+            settings += [f"recorder.{name}={json.dumps(value)}" for name, value in limits.items()]
         arguments = ["--launch", "replay", *(word for setting in settings for word in ("--set", setting))]
         transport = Launch.read("replay", settings).transport
-        endpoints = [transport.endpoint(name) for name in POSE_NODES]
+        endpoints = [transport.endpoint(name) for name in nodes]
         with (
             Subscriber(endpoints, [POSE_WORLD, DIAGNOSTICS]) as subscriber,
-            Supervisor(POSE_NODES, arguments, clock, lambda line: console.print(line, markup=False)) as supervisor,
+            Supervisor(nodes, arguments, clock, lambda line: console.print(line, markup=False)) as supervisor,
         ):
             yield _received(subscriber, supervisor), clock
 
@@ -54,5 +59,7 @@ def _received(subscriber: Subscriber, supervisor: Supervisor) -> Iterator[tuple[
     waited_s = START_S
     while not supervisor.failed and (received := subscriber.receive(waited_s)):
         waited_s = SILENCE_S
+        if isinstance(message := received[1], Diagnostics) and message.node in supervisor.children:
+            supervisor.children[message.node].heard()
         supervisor.poll()
         yield received

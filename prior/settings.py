@@ -38,7 +38,7 @@ def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
             raise ValueError(f"[{path}] {key}: expected a finite number such as {default!r}, got {value!r}")
         if isinstance(value, (list, dict)) and (kind := _kind_of_items(cls, key)) is not None:
             _check_items(f"[{path}] {key}", value, kind)
-        values[key] = wanted(value)
+        values[key] = wanted(value)  # type: ignore[arg-type]  (it is of that type)
     return cls(**values)
 
 

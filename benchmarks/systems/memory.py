@@ -1,8 +1,9 @@
-"""What it costs in memory: every node while an hour of stream is replayed as fast as the nodes take it."""
+"""What lasts: the memory and pace of every node while hours of stream are replayed as fast as they go."""
 
 from __future__ import annotations
 
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,20 +37,27 @@ class Args:
 
 def memory(recording: Path, hours: float, progress: Progress) -> dict[str, Any]:
     """Resident memory of each node while a stream is replayed, again and again, as fast as the nodes take it."""
-    samples: dict[str, list[tuple[float, float]]] = {name: [] for name in POSE_NODES}
+    samples: dict[str, list[tuple[float, float]]] = {name: [] for name in (*POSE_NODES, "recorder")}
+    paces: dict[str, list[tuple[float, float]]] = {name: [] for name in samples}
     first_ns: int | None = None
     bar = progress.add_task(f"memory over {hours:g} h of stream", total=hours)
-    with running(recording, lossless=True, rate=0, loop=True) as (messages, _):
+    with (
+        tempfile.TemporaryDirectory(prefix="steadypose-") as folder,
+        running(recording, lossless=True, rate=0, loop=True, record=Path(folder, "soak")) as (messages, _),
+    ):
         for _, message in messages:
             if not isinstance(message, Diagnostics) or message.stamp_ns == 0:
                 continue
             first_ns = message.stamp_ns if first_ns is None else first_ns
             age = (message.stamp_ns - first_ns) / 3.6e12
             samples[message.node].append((age, float(message.values["memory_mb"])))
+            if "compute_ms.p50" in message.values:
+                paces[message.node].append((age, float(message.values["compute_ms.p50"])))
             progress.update(bar, completed=age)
             if all(s and s[-1][0] >= hours for s in samples.values()):
                 break
-    return {"hours": hours, "nodes": {name: growth(s, hours) for name, s in samples.items()}}
+    nodes = {name: growth(s, hours) | pace(paces[name], hours) for name, s in samples.items()}
+    return {"hours": hours, "nodes": nodes}
 
 
 def growth(samples: list[tuple[float, float]], hours: float) -> dict[str, float]:
@@ -59,6 +67,15 @@ def growth(samples: list[tuple[float, float]], hours: float) -> dict[str, float]
     slope = np.polyfit(ages[settled], sizes[settled], 1)[0]
     figures = {"first_mb": sizes[0], "last_mb": sizes[-1], "most_mb": sizes.max(), "slope_mb_per_hour": slope}
     return {name: round(float(value), 2) for name, value in figures.items()} | {"samples": len(samples)}
+
+
+def pace(samples: list[tuple[float, float]], hours: float) -> dict[str, float]:
+    """What (age in hours, milliseconds of a frame) samples say: the median in the second and in the last fifth."""
+    if not samples:
+        return {}
+    ages, spent = np.array(samples).T
+    fifths = {"early_ms": (ages >= 0.2 * hours) & (ages < 0.4 * hours), "late_ms": ages >= 0.8 * hours}
+    return {name: round(float(np.median(spent[fifth])), 3) for name, fifth in fifths.items() if fifth.any()}
 
 
 def main(args: Args) -> None:
@@ -77,10 +94,15 @@ def main(args: Args) -> None:
 def _table(result: dict[str, Any]) -> Table:
     return Table(
         name="memory",
-        title=f"Resident memory over {result['hours']:g} h of stream replayed fast, MB",
-        columns=["node", "first", "last", "most", "MB an hour"],
+        title=f"{result['hours']:g} h of stream replayed fast: resident memory, MB, and ms of a frame early and late",
+        columns=["node", "first", "last", "most", "MB an hour", "early ms", "late ms"],
         rows=[
-            [name, *(f"{n[k]:.0f}" for k in ("first_mb", "last_mb", "most_mb")), f"{n['slope_mb_per_hour']:+.1f}"]
+            [
+                name,
+                *(f"{n[k]:.0f}" for k in ("first_mb", "last_mb", "most_mb")),
+                f"{n['slope_mb_per_hour']:+.2f}",
+                *(f"{n[k]:.2f}" if k in n else "" for k in ("early_ms", "late_ms")),
+            ]
             for name, n in result["nodes"].items()
         ],
         note="MB an hour: the slope of a line through all but the first fifth.",

@@ -160,7 +160,7 @@ class CleanCore:
             frame: as given.
             answered: the slots of those of which it was fit to be published.
         """
-        silent = np.isfinite(frame.observed).any(axis=(1, 2))
+        silent: Bools = np.asarray(np.isfinite(frame.observed).any(axis=(1, 2)))
         silent[list(answered)] = False
         self._silent = np.where(silent, self._silent + 1, 0)
         spoiled = self._silent > SPOILED_S * FPS

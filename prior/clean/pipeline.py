@@ -154,5 +154,7 @@ def load_loops(settings: PriorSettings) -> None:
             positions[J["left_wrist"]] += 0.5
         if frame > 30:
             positions[J["right_wrist"]] = np.nan
-        body = RawBody(0, positions, np.ones(22, dtype=np.float32))
-        pipeline.process(PoseRaw(round(frame * 1e9 / FPS), "", "", CANONICAL.name, pose, False, [body]))
+        bodies = [RawBody(0, positions, np.ones(22, dtype=np.float32))]
+        if frame > 35:  # arrays of two bodies lie otherwise in memory, which is another loop
+            bodies.append(RawBody(1, positions + np.float32(1.0), np.ones(22, dtype=np.float32)))
+        pipeline.process(PoseRaw(round(frame * 1e9 / FPS), "", "", CANONICAL.name, pose, False, bodies))
