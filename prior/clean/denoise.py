@@ -8,6 +8,7 @@ are off by is mostly the same noise, so the best mean of them is not that of ind
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,21 +133,28 @@ def _place_pelvis(found, seen):
         found: (B, K, 22, 3) metres, of the newest frames.
         seen: (B, T, 22, 3) metres, NaN where not.
     """
-    frames, known = seen.shape[1], np.empty(3)
+    joints = len(_BESIDE_PELVIS)
+    lies, counts = np.empty((joints, 3)), np.empty(joints)
     for row in range(len(found)):
-        lies, counts = np.zeros((len(_BESIDE_PELVIS), 3)), np.zeros(len(_BESIDE_PELVIS))
-        for k, joint in enumerate(_BESIDE_PELVIS):
-            for t in range(frames):
-                beside = seen[row, t, 0] - seen[row, t, joint]
-                if not np.isnan(beside).any():
-                    lies[k] += beside
-                    counts[k] += 1
-        among = (counts > 0).sum()
+        among = 0
+        for k in range(joints):
+            joint, counts[k] = _BESIDE_PELVIS[k], 0.0
+            for axis in range(3):
+                lies[k, axis] = 0.0
+            for t in range(seen.shape[1]):
+                if math.isnan(seen[row, t, 0, 0] - seen[row, t, joint, 0]):
+                    continue
+                counts[k] += 1.0
+                for axis in range(3):
+                    lies[k, axis] += seen[row, t, 0, axis] - seen[row, t, joint, axis]
+            if counts[k] > 0:
+                among += 1
         if among == 0:
             continue
         for t in range(found.shape[1]):
-            known[:] = 0.0
-            for k, joint in enumerate(_BESIDE_PELVIS):
-                if counts[k] > 0:
-                    known += (found[row, t, joint] + lies[k] / counts[k]) / among
-            found[row, t, 0] = known
+            for axis in range(3):
+                place = 0.0
+                for k in range(joints):
+                    if counts[k] > 0:
+                        place += (found[row, t, _BESIDE_PELVIS[k], axis] + lies[k, axis] / counts[k]) / among
+                found[row, t, 0, axis] = place

@@ -11,6 +11,7 @@ from numba import njit
 
 from steadypose.prior.body.skeleton import CHILDREN, MIRROR, PARENT, limbs
 from steadypose.prior.clean.frame import Bools, Floats, Gated, Observation, Person
+from steadypose.prior.compiled import median
 from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
 from steadypose.prior.timing.frozen_joints import RECENT, frozen_joints
 from steadypose.prior.timing.rate import FPS
@@ -185,11 +186,15 @@ def _apart(a, b):
 @njit(cache=True)
 def _middle(distance):
     """(S,) the median of what is finite of each row, NaN where nothing is."""
-    middle = np.full(len(distance), np.nan)
+    middle, known = np.full(len(distance), np.nan), np.empty(distance.shape[1])
     for row in range(len(distance)):
-        known = distance[row][np.isfinite(distance[row])]
-        if len(known):
-            middle[row] = np.median(known)
+        count = 0
+        for value in distance[row]:
+            if math.isfinite(value):
+                known[count] = value
+                count += 1
+        if count:
+            middle[row] = median(known[:count])
     return middle
 
 

@@ -185,12 +185,14 @@ def _carried(off, observed, fade, edge):
     ``edge`` (N,): over how many frames beside a gap the mean is taken.
     """
     nodes, frames = off.shape
-    carried = np.where(observed > 0, off, 0.0)
+    carried = np.zeros((nodes, frames))
     for node in range(nodes):
         last = -1
         for t in range(frames + 1):
-            if t < frames and observed[node, t] == 0.0:
-                continue
+            if t < frames:
+                if observed[node, t] == 0.0:
+                    continue
+                carried[node, t] = off[node, t]
             if t > last + 1:
                 earlier, later = _beside_gap(off[node], observed[node], last, t, edge[node])
                 for u in range(last + 1, t):
