@@ -28,6 +28,21 @@ PATH_RGB = [235, 235, 235]
 RATE_RGB = {POSE_RAW: RAW_RGB, POSE_CLEAN: _rgb(STATE_COLOURS[JointState.REFINED]), POSE_WORLD: CONTACT_RGB}
 
 
+LEGEND = """
+| | |
+|---|---|
+| green | seen: as the sensor gave it |
+| blue | refined: seen, and corrected |
+| orange | imputed: not seen, inferred; the sphere is its standard deviation |
+| grey, raw | the sensor's own joints: the whiter, the surer |
+| grey, world | the truth of a simulated stream |
+| discs at feet, hands | contacts |
+| arrow | velocity: 1 m/s is 1 m |
+| axes at the origin | 0.5 m: x red, y green, z blue; the grid is 0.5 m |
+| red dots, dashed line | flagged; the score from which on a pose is |
+"""
+
+
 class Eye(NamedTuple):
     """Where a scene is looked at from, at first."""
 
@@ -50,6 +65,11 @@ def name_series(recording: rr.RecordingStream) -> None:
         recording.log(f"plots/rates/{topic}", rr.SeriesLines(names=topic, colors=colour, widths=2), static=True)
     flagged = rr.SeriesPoints(names="flagged", colors=ALARM_RGB, markers="circle", marker_sizes=3)
     recording.log("plots/anomaly/flagged", flagged, static=True)
+    threshold = rr.SeriesLines(names="flagged from here on", colors=ALARM_RGB, widths=1)
+    recording.log("plots/anomaly/threshold", threshold, static=True)
+    recording.log("legend", rr.TextDocument(LEGEND, media_type=rr.MediaType.MARKDOWN), static=True)
+    axes = rr.Arrows3D(vectors=0.5 * np.eye(3), colors=255 * np.eye(3, dtype=np.uint8), labels=["x", "y", "z"])
+    recording.log("world/axes", axes, static=True)
 
 
 def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool) -> rrb.Blueprint:
@@ -99,6 +119,7 @@ def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool) -> rrb.Bluepri
                 plot("correction", "mean correction of a joint, cm"),
                 plot("joints", "joints by state"),
                 plot("rates", "messages a second", (0.0, 40.0)),
+                rrb.TextDocumentView(origin="/legend", name="legend"),
             ),
             row_shares=[5, 2],
         ),

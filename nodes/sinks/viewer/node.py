@@ -7,14 +7,17 @@ keeps the last minutes of drawings and serves them with the page. Both need the 
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from steadypose.msgs.types import Message
 from steadypose.nodes.graph.clock import POLL_S
+from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.sinks.viewer.scene import PoseView
-from steadypose.nodes.sinks.viewer.server import ViewerServer
+from steadypose.nodes.sinks.viewer.server import LOOPBACK, ViewerServer
 from steadypose.nodes.sinks.viewer.settings import ViewerSettings
+from steadypose.prior.clean.settings import PriorSettings
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -29,10 +32,13 @@ class ViewerNode(Node):
     name = "viewer"
 
     def run(self) -> None:
-        with ViewerServer(self.launch.settings(ViewerSettings).port) as self._server:
+        settings = self.launch.settings(ViewerSettings)
+        with ViewerServer(settings.port, settings.host) as self._server:
             recording = connect(self._server)
-            self._view = PoseView(recording)
+            self._view = PoseView(recording, flagged_from(self.launch))
             print(f"viewer: {self._server.url}", flush=True)
+            if settings.host not in (LOOPBACK, "localhost", "::1"):
+                print(f"viewer: whoever reaches {settings.host} sees the people here, without a password", flush=True)
             try:
                 super().run()
             finally:
@@ -49,6 +55,11 @@ class ViewerNode(Node):
 
     def status(self) -> dict[str, str]:
         return {"address": self._server.url}
+
+
+def flagged_from(launch: Launch) -> float:
+    """The anomaly from which on the prior raises its flag."""
+    return -math.log10(PriorSettings.from_dict(launch.table("prior")).score.false_alarms)
 
 
 def connect(server: ViewerServer) -> rr.RecordingStream:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -64,8 +65,14 @@ class PoseView:
     counted from the first message.
     """
 
-    def __init__(self, recording: rr.RecordingStream) -> None:
-        self._recording = recording
+    def __init__(self, recording: rr.RecordingStream, threshold: float = math.nan) -> None:
+        """Draw into a recording.
+
+        Args:
+            recording: to draw into.
+            threshold: the anomaly from which on the prior raises its flag; drawn beside the score.
+        """
+        self._recording, self._threshold = recording, threshold
         self._origin_ns: int | None = None
         self._last: dict[str, tuple[int, int]] = {}
         self._eye: Eye | None = None
@@ -144,6 +151,8 @@ class PoseView:
             self._scored = True
             self._send_layout()
         self._scalar(path, body.anomaly)
+        if math.isfinite(self._threshold):
+            self._scalar("plots/anomaly/threshold", self._threshold)
         if body.anomaly_flag:
             self._scalar("plots/anomaly/flagged", body.anomaly)
 
@@ -167,6 +176,10 @@ class PoseView:
                 f"{path}/contacts",
                 rr.Points3D(positions[CONTACT_INDICES[touching]], colors=CONTACT_RGB, radii=0.035),
             )
+            arrow = rr.Arrows3D(
+                origins=[body.root_position], vectors=[body.root_velocity], colors=PATH_RGB, radii=0.012
+            )
+            self._log(f"{path}/velocity", arrow)
             standing = "" if body.tracking == Tracking.OK else f" · {body.tracking.name.lower()}"
             above = positions[[J["head"]]] + [0, 0, 0.28]
             label = rr.Points3D(above, labels=f"{body.id}{standing}", colors=PATH_RGB, radii=0.0)

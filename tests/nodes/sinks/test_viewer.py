@@ -30,7 +30,8 @@ from steadypose.nodes.sinks.drawing import STATE_COLOURS
 from steadypose.nodes.sinks.viewer import node as viewer_node
 from steadypose.nodes.sinks.viewer.node import ViewerNode
 from steadypose.nodes.sinks.viewer.scene import PATH_SECONDS, PoseView
-from steadypose.nodes.sinks.viewer.server import HOST, ViewerError, ViewerServer
+from steadypose.nodes.sinks.viewer.server import LOOPBACK, ViewerError, ViewerServer
+from steadypose.nodes.sinks.viewer.settings import ViewerSettings
 
 rr = pytest.importorskip("rerun", reason="the optional extra `view` is not installed")
 
@@ -220,10 +221,10 @@ def free_ports() -> int:
     """A port that is free together with the next."""
     while True:
         with socket.socket() as first, socket.socket() as second:
-            first.bind((HOST, 0))
+            first.bind((LOOPBACK, 0))
             port = first.getsockname()[1]
             try:
-                second.bind((HOST, port + 1))
+                second.bind((LOOPBACK, port + 1))
             except OSError:
                 continue
             return port
@@ -264,7 +265,7 @@ class Server:
     url = "http://somewhere"
     stopped = False
 
-    def __init__(self, port: int) -> None: ...
+    def __init__(self, port: int, host: str) -> None: ...
 
     def __enter__(self) -> Server:
         return self
@@ -311,3 +312,18 @@ def test_without_rerun_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "rerun" else found(name))
     with pytest.raises(LaunchError, match="--extra view"):
         ViewerServer(free_ports())
+
+
+def test_the_page_may_call_nobody_but_this_server() -> None:
+    """By itself Rerun's page sends telemetry and asks for news; its policy has the browser refuse that."""
+    port = free_ports()
+    with ViewerServer(port) as server, urllib.request.urlopen(server.url, timeout=20) as answer:
+        assert b"<html" in answer.read().lower()
+        rules = dict(rule.strip().split(" ", 1) for rule in answer.headers["Content-Security-Policy"].split(";"))
+    assert rules["connect-src"].split() == ["'self'", "blob:", "data:", f"http://127.0.0.1:{port + 1}"]
+    assert not [word for rule in rules.values() for word in rule.split() if word in ("*", "http:", "https:")]
+
+
+def test_a_host_that_is_none() -> None:
+    with pytest.raises(LaunchError, match="expected an address to serve at"):
+        ViewerSettings(host="")
