@@ -1,0 +1,43 @@
+"""A damaged recording: what is lost is said, the rest is cleaned, or saved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from conftest import record, walk
+
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.nodes.commands.clean import clean
+from steadypose.nodes.commands.inspect.info import info
+from steadypose.nodes.commands.repair import repair
+
+
+@pytest.fixture
+def damaged(tmp_path: Path) -> Path:
+    path = record(tmp_path / "in", walk(60))
+    file = next(path.glob("*.mcap"))
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    return path
+
+
+def test_what_is_left_is_saved_and_what_is_lost_is_said(
+    damaged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert repair(damaged, tmp_path / "out") == 1
+    assert "bytes in 1 places" in capsys.readouterr().out
+    with RecordingReader(tmp_path / "out") as recording:
+        assert recording.complete
+        assert 60 - 16 <= recording.count(POSE_RAW) < 60
+    assert repair(tmp_path / "out", tmp_path / "again") == 0
+    assert info(str(damaged)) == 0
+    assert "steadypose repair" in capsys.readouterr().out
+
+
+def test_clean_says_so_with_its_exit_status(damaged: Path, tmp_path: Path, weights: dict[str, str]) -> None:
+    options = tuple(f"{key.removeprefix('prior.')}={value}" for key, value in weights.items())
+    assert clean(damaged, tmp_path / "out.npz", settings=options) == 1
+    assert (tmp_path / "out.npz").exists()
