@@ -59,9 +59,9 @@ FOOT_SURPRISE = 3.0
 IMPUTED_LEGS_SPEED = 0.5
 """m/s, added to the velocity's standard deviation as the legs that it is read from are themselves inferred."""
 
-DOUBTED = 1.0
-"""Standard deviations: where the network's velocity is farther from that of a root seen, its error is taken to be
-larger by as much (as in Huber's estimator): of motion that it does not know, it says what it knows."""
+DOUBT_MEMORY_S = 0.5
+"""Seconds over which the network's velocity is held against how a root seen moves. While it is seen, the network's
+error is taken to be larger by what it is off in the mean: there is motion that it does not know."""
 
 JUMP_SIGMAS, JUMP_M, JUMP_FRAMES = 5.0, 0.3, 6
 """A root seen this many standard deviations and metres off is not believed, until it was so often in a row; one that
@@ -124,6 +124,7 @@ class BodyTrack:
         self._shift = np.zeros(3)
         self._odds = np.zeros(2)
         self._carried = False
+        self._off = np.zeros(3)
 
     def _start(self, sighting: Sighting, velocity: Floats) -> BodyFilter:
         sigma = min(sighting.root_sigma, UNSEEN_SIGMA)
@@ -204,7 +205,7 @@ class BodyTrack:
         if network and not self._carried:
             sigma = np.hypot(motion.sigma, inferred * IMPUTED_LEGS_SPEED)
             if sighting.root_seen:
-                sigma = sigma * max(1.0, self._surprise(motion.velocity, sigma) / DOUBTED)
+                sigma = np.hypot(sigma, self._off_by(sighting, motion))
             filter_.observe_velocity(motion.velocity, *_split(sigma))
         in_the_world = self._observe_root(sighting)
         self._observe_feet(sighting, in_the_world)
@@ -215,10 +216,12 @@ class BodyTrack:
             self._shift *= math.exp(-self._dt / EASE_S)
         self._before, self._memory = sighting, contacts.state
 
-    def _surprise(self, velocity: Floats, sigma: Floats) -> float:
-        """How many standard deviations a velocity (3,) is from the root's, along the worst axis."""
-        spread = np.diag(self._filter.covariance)[3:]
-        return float(np.max(np.abs(velocity - self._filter.velocity) / np.sqrt(spread + sigma**2)))
+    def _off_by(self, sighting: Sighting, motion: Motion) -> float:
+        """m/s, by how much the network's velocity is off of late from that of the root seen."""
+        if self._before.root_seen and self._dt > 0.0:
+            moved = (sighting.positions[0] - self._before.positions[0]) / self._dt
+            self._off += (1.0 - math.exp(-self._dt / DOUBT_MEMORY_S)) * (moved - motion.velocity - self._off)
+        return float(np.linalg.norm(self._off))
 
     def _weigh_legs(self, sighting: Sighting, motion: Motion) -> None:
         """Find out whether what the legs say of the motion can be reconciled with the root seen, horizontally."""
