@@ -34,20 +34,17 @@ INSTALL = (
     if PROJECT.exists()
     else "pip install --upgrade --force-reinstall steadypose"
 )
-"""installs whatever is missing"""
 INSTALL_EXTRA = (
     "in the checkout: .uv/bin/uv sync --frozen --inexact --extra {}"
     if PROJECT.exists()
     else "pip install 'steadypose[{}]'"
 )
 KEY_PACKAGES = ("numpy", "numba", "rosbags", "pyzmq")
-"""packages whose versions matter when something is wrong"""
-MODELS = ("hmvae", "hgvae", "trajectory", "contacts")
+MODELS = ("mixture", "hgvae", "trajectory", "contacts")
 FRAMES, WARM_UP = 100, 20
 FRAME_NS = 1_000_000_000 / 30
 TARGET_MS, BUDGET_MS = 10.0, 1000 / 30
-LONGEST_IPC_PATH = 107
-"""bytes of a unix socket's path that the system takes"""
+LONGEST_IPC_PATH = 107  # bytes of a unix socket's path that the system takes
 NEEDED_GB = 1.0
 LUXONIS_USB = "03e7"
 UDEV_RULE = (

@@ -85,7 +85,7 @@ def solve_rotations(
             if left out.
 
     Returns:
-        (..., 22, 3, 3) local rotation matrices, float64.
+        (..., 22, 3, 3) local.
     """
     return solve_pose(positions, offsets, fallback)[0]
 
@@ -138,8 +138,7 @@ def place_joints(rotations: NDArray[np.floating], offsets: NDArray[np.floating])
         rotations: (..., 22, 3, 3) local.
         offsets: (22, 3) or (..., 22, 3) metres.
     """
-    shape = np.shape(rotations)[:-1]
-    bones = _frames(offsets, shape)
+    bones = _frames(offsets, shape := np.shape(rotations)[:-1])
     placed = np.empty_like(bones)
     _place(np.array(rotations, dtype=np.float64, order="C").reshape(*bones.shape, 3), bones, placed)
     return placed.reshape(shape)
@@ -160,8 +159,7 @@ def _frames(values: NDArray[np.floating], shape: tuple[int, ...]) -> Floats:
 
 
 # ---------------------------------------------------------------------------------------------------------------
-# Vectors (x, y, z) and matrices (3, 3). Vectors are tuples: arrays of three would be made and dropped by the hundred,
-# and each assignment of one array to a part of another takes a second more to compile.
+# Vectors (x, y, z) are tuples: each assignment of an array to a part of another takes a second more to compile.
 
 
 @njit(cache=True)
@@ -176,12 +174,8 @@ def _less(a, b):
 
 @njit(cache=True)
 def _middle(points, joints):
-    a, b = joints
-    return (
-        (points[a, 0] + points[b, 0]) / 2.0,
-        (points[a, 1] + points[b, 1]) / 2.0,
-        (points[a, 2] + points[b, 2]) / 2.0,
-    )
+    (ax, ay, az), (bx, by, bz) = _at(points, joints[0]), _at(points, joints[1])
+    return (ax + bx) / 2.0, (ay + by) / 2.0, (az + bz) / 2.0
 
 
 @njit(cache=True)
