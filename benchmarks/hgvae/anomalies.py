@@ -124,7 +124,7 @@ def _false_alarms(bench: Bench, network: FaultNet, model: HGVAE, data: Data) -> 
         everything = MotionSet.load(data.prepared, "research", "val")
         known = np.isin(everything.subject, data.val.subject)
         if not known.all():
-            scale = Calibration.load("default").at(sigma).quantiles[0]
+            scale = Calibration.load("default").limits(np.zeros(1, dtype=int), np.full(1, sigma))[0]
             limits = np.interp(-np.log10(RATES), -np.log10(QUANTILES), scale)
             odds = scores(everything.only(~known), count)
             records.append(

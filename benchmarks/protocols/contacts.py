@@ -83,8 +83,8 @@ def read_trials(path: Path) -> list[Trial]:
                         k = names.index(marker)
                         joints[:, J[joint]] = _at(feet[key][:, k], times)
                         joints[:, J[joint], 2] += _HEIGHT[joint] - lowest[k]
-                    loaded = data[f"{key}/force"][rows] > LOADED_N
-                    seen = finite_joints(joints[:, [J[joint] for _, joint in _MARKERS]]).all(axis=1)
+                    loaded = np.asarray(data[f"{key}/force"])[rows] > LOADED_N
+                    seen = np.asarray(finite_joints(joints[:, [J[joint] for _, joint in _MARKERS]]).all(axis=1))
                     trials.append(Trial(kind, joints, loaded, data[f"{key}/valid"][rows] & seen[:, None]))
     return trials
 

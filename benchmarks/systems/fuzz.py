@@ -161,7 +161,7 @@ def _most_mb() -> float:
 
 def guided(name: str, target: Target, seconds: float) -> None:
     """Let atheris look for inputs, by what code they reach; it ends the process."""
-    import atheris  # pyright: ignore[reportMissingImports]
+    import atheris  # pyright: ignore[reportMissingImports, reportMissingModuleSource]
 
     def one(content: bytes) -> None:
         try:
@@ -172,7 +172,7 @@ def guided(name: str, target: Target, seconds: float) -> None:
     for module in [m for key, m in sys.modules.items() if key.startswith(("steadypose.", "mcap.")) and m]:
         for attribute, value in list(vars(module).items()):
             if isinstance(value, FunctionType) and value.__module__ == module.__name__:
-                setattr(module, attribute, atheris.instrument_func(value))
+                setattr(module, attribute, atheris.instrument_func(value))  # pyright: ignore[reportAttributeAccessIssue]
     with tempfile.TemporaryDirectory() as corpus:
         for number, seed in enumerate(target.seeds):
             Path(corpus, f"{name}{number}").write_bytes(seed)

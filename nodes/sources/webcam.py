@@ -6,7 +6,6 @@ OpenCV and MediaPipe is in `nodes.sources.webcam_device`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -56,11 +55,6 @@ def open_webcam(settings: WebcamSettings, context: SourceContext) -> WebcamSourc
     Raises:
         LaunchError: the model is missing, or a setting cannot be used.
     """
-    if settings.bodies < 1 or settings.camera < 0 or not 0 < settings.field_of_view < math.pi:
-        raise LaunchError(
-            "[input.webcam] expected camera of 0 or more, bodies of 1 or more and field_of_view in radians, "
-            f"0 to pi; got {settings.camera}, {settings.bodies} and {settings.field_of_view:g}"
-        )
     if not Path(settings.model).is_file():
         raise LaunchError(
             f"[input.webcam] model: expected MediaPipe's pose landmarker, a .task file, got {settings.model!r}; "

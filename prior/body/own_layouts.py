@@ -63,7 +63,8 @@ def _read(name: str, description: object) -> Skeleton:
         if joint not in JOINTS:
             raise ValueError(f"{where} canonical: expected joints of smpl22 ({', '.join(JOINTS)}), got {joint!r}")
         names = [source] if isinstance(source, str) else _texts(source)
-        if not names or (unknown := [name for name in names if name not in joints]):
+        unknown = [name for name in names if name not in joints]
+        if not names or unknown:
             raise ValueError(
                 f"{where} canonical {joint}: expected names of joints, got {unknown if names else source!r}"
             )

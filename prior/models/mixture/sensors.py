@@ -230,7 +230,8 @@ def _guessed_depth(truth: Floats, rng: Rng) -> Floats:
     view = rng.standard_normal(3) * (1.0, 1.0, 0.2)
     view /= np.linalg.norm(view)
     depth = 10 ** rng.uniform(-1.6, -0.5) * _lasting((frames, 22), rng.uniform(0.6, 0.97), rng)
-    guesses = np.cumsum(rng.random((frames, 22)) < 10 ** rng.uniform(-3.0, -1.3), axis=0)  # which of them holds
+    jumps = rng.random((frames, 22)) < 10 ** rng.uniform(-3.0, -1.3)
+    guesses = np.cumsum(jumps, axis=0, dtype=np.int64)  # which of them holds
     levels = rng.standard_normal((guesses.max() + 1, 22)) * rng.uniform(0.0, 0.3)
     depth += np.take_along_axis(levels, guesses, axis=0)
     across = 10 ** rng.uniform(-2.8, -1.8)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2.connection import Connection
+from steadypose.nodes.ros2.connection import Connection, Publish
 from steadypose.nodes.ros2.definitions import serialise
 from steadypose.nodes.ros2.tf import CACHE_NS, TransformBuffer, TransformError
 from steadypose.nodes.sinks.ros2.messages import tf_message, transform
@@ -83,6 +83,12 @@ class Robot(Connection):
     def __init__(self) -> None:
         self.heard: dict[str, Callable[[bytes], None]] = {}
         self.queue: list[tuple[str, Any]] = []
+
+    def publisher(self, topic: str, kind: str, *, latched: bool = False) -> Publish:
+        raise AssertionError("a source publishes nothing")
+
+    def drop(self, publish: Publish) -> None:
+        raise AssertionError("a source publishes nothing")
 
     def subscribe(
         self, topic: str, kind: str, heard: Callable[[bytes], None], *, latched: bool = False, depth: int = 10

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace as Made
+from typing import Any
 
 import cv2
 import numpy as np
@@ -178,9 +179,6 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        (WebcamSettings(bodies=0), "bodies of 1 or more"),
-        (WebcamSettings(camera=-1), "camera of 0 or more"),
-        (WebcamSettings(field_of_view=60.0), "field_of_view in radians"),
         (WebcamSettings(), r"a \.task file, got ''; download one, such as https"),
         (WebcamSettings(model="gone.task"), "got 'gone.task'; download one"),
     ],
@@ -188,6 +186,12 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
 def test_settings_that_cannot_be_used_say_so(settings: WebcamSettings, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
         webcam.open_webcam(settings, SourceContext(SystemClock(), NOT_CALIBRATED))
+
+
+@pytest.mark.parametrize("wrong", [{"bodies": 0}, {"camera": -1}, {"field_of_view": 60.0}])
+def test_values_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=rf"\[input\.webcam\] {next(iter(wrong))}: expected"):
+        WebcamSettings(**wrong)
 
 
 def test_without_mediapipe_it_says_what_to_install(model: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,7 +29,7 @@ def prepared(tmp_path: Path) -> Path:
     np.savez(
         path,
         positions=np.concatenate(clips).astype(np.float32),
-        rotations=np.tile(np.float32([0, 0, 0, 1]), (240, 22, 1)),
+        rotations=np.tile(np.array([0, 0, 0, 1], dtype=np.float32), (240, 22, 1)),
         offsets=np.repeat(REST_OFFSETS[None], 4, axis=0).astype(np.float32),
         contacts=np.zeros((240, 8), dtype=bool),
         clip_start=np.arange(5) * 60,

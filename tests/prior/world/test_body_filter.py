@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -25,6 +27,10 @@ def spring(rate: float, dt: float) -> NDArray[np.float64]:
     return np.asarray(expm(rate * dt * np.array([[0.0, 1.0], [-1.0, -2.0]])), dtype=np.float64)
 
 
+def diagonal(*blocks: Any) -> NDArray[np.float64]:
+    return np.asarray(block_diag(*blocks), dtype=np.float64)
+
+
 class Textbook:
     """One axis, dense matrices."""
 
@@ -39,14 +45,14 @@ class Textbook:
         root = spring(n.sensor_rate + speed / n.sensor_memory_m, dt)
         foot = spring(n.sensor_rate, dt)
         kept = np.exp(-dt / n.network_memory_s)
-        f: NDArray[np.float64] = block_diag([[1, dt], [0, 1]], root, kept, *[block_diag(1, foot)] * self.feet)
+        f = diagonal([[1, dt], [0, 1]], root, kept, *[diagonal(1, foot)] * self.feet)
         a = (n.acceleration + n.acceleration_at_speed * speed) ** 2
         q = [a * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(2) - root @ root.T, 1 - kept**2]
         for bears, r in zip(load, rest, strict=True):
             rolls = max(bears - r, 0.0)
             walk = n.rest ** (2 * r) * n.load ** (2 * rolls) * n.swing ** (2 * (1 - r - rolls)) * dt
             q += [walk, np.eye(2) - foot @ foot.T]
-        self.x, self.p = f @ self.x, f @ self.p @ f.T + block_diag(*q)
+        self.x, self.p = f @ self.x, f @ self.p @ f.T + diagonal(*q)
 
     def correct(self, entries, z, sigma):
         h = np.zeros(len(self.x))
