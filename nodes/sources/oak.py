@@ -65,4 +65,4 @@ class OakSource(CameraSource):
             from steadypose.nodes.sources.oak_device import connect  # brings depthai
 
             self._connect = connect
-        return self._connect(self._settings, self._clock)
+        return self._connect(self._settings, self._clock)  # pyright: ignore[reportArgumentType]  (one class, found under two names)

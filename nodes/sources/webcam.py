@@ -64,7 +64,7 @@ def open_webcam(settings: WebcamSettings, context: SourceContext) -> WebcamSourc
         return WebcamSource(settings, context)
     from steadypose.nodes.sources.webcam_video import VideoSource  # brings OpenCV
 
-    return VideoSource(settings, context.calibration)
+    return VideoSource(settings, context.calibration)  # pyright: ignore[reportArgumentType]  (one class, found under two names)
 
 
 Connect = Callable[[WebcamSettings, CalibrationSettings, Clock], AbstractContextManager[Connection]]
@@ -83,4 +83,4 @@ class WebcamSource(CameraSource):
             from steadypose.nodes.sources.webcam_device import connect  # brings OpenCV
 
             self._connect = connect
-        return self._connect(self._settings, self._calibration, self._clock)
+        return self._connect(self._settings, self._calibration, self._clock)  # pyright: ignore[reportArgumentType]
