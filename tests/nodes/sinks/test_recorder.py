@@ -69,7 +69,7 @@ def test_a_disk_that_is_full_before_it_was_noticed(
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"recorder__split_mb": "nan"}, "split_mb: expected 0 or more, got nan"),
+        ({"recorder__split_mb": "nan"}, "split_mb: expected a finite number"),
         ({"recorder__keep_mb": "10", "recorder__split_mb": "10"}, "expected two parts or more, 20, got 10"),
         ({"recorder__sync_s": "-1"}, "sync_s: expected 0 or more"),
     ],
