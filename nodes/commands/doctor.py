@@ -45,8 +45,7 @@ FRAMES, WARM_UP = 100, 20
 FRAME_NS = 1_000_000_000 / 30
 TARGET_MS, BUDGET_MS = 10.0, 1000 / 30
 LONGEST_IPC_PATH = 107  # bytes of a unix socket's path that the system takes
-NEEDED_GB = 1.0
-LUXONIS_USB = "03e7"
+NEEDED_GB, LUXONIS_USB = 1.0, "03e7"
 UDEV_RULE = (
     f"""echo 'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{LUXONIS_USB}", MODE="0666"' | """
     "sudo tee /etc/udev/rules.d/80-movidius.rules && sudo udevadm control --reload-rules && sudo udevadm trigger"
