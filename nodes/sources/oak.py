@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -52,11 +51,6 @@ class OakSource(CameraSource):
             raise LaunchError(
                 f"[input.oak] archive: expected a file that is an NN archive (.tar.xz), got {settings.archive}; "
                 "Luxonis' hub has some, their modelconverter makes others"
-            )
-        if not 0 <= settings.fps < math.inf or not 0 < settings.confidence < 1:
-            raise LaunchError(
-                "[input.oak] expected fps of 0 (as the camera can) or more and confidence between 0 and 1, got "
-                f"{settings.fps:g} and {settings.confidence:g}"
             )
         self._settings, self._connect = settings, connect
 
