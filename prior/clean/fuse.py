@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import JointState
 from steadypose.prior.body.inverse_kinematics import RIGID, fit_lengths, place_joints, solve_pose
-from steadypose.prior.body.skeleton import PARENT, PARENTS, limbs
+from steadypose.prior.body.skeleton import PARENT, PARENTS
 from steadypose.prior.clean.frame import Bools, Estimate, Floats, Imputed, Person
 from steadypose.prior.clean.slow_error import SlowError
 from steadypose.prior.timing.fixed_lag import Smoothed
@@ -49,14 +49,6 @@ _NEAR = 1 / (1 + _bones_between()) ** 2
 
 _LEAST_VARIANCE = 1e-10
 """m^2: a hundredth of a millimetre"""
-
-COASTS_S, RESTLESS = 0.2, 3.0
-"""Seconds after which an arm is not where it coasts to, as far as the smoother states, and by how many times its
-deviation a second more. Hidden for one to four seconds, arms are then 2 to 10 % nearer (validation); legs, which stand,
-would be 20 % farther."""
-
-_RESTLESS = np.zeros(len(PARENTS))
-_RESTLESS[[joint for arm in limbs(("collar", "shoulder", "elbow", "wrist")) for joint in arm]] = RESTLESS
 
 
 class Precision(NamedTuple):
@@ -117,7 +109,7 @@ class Fuse:
             body = np.where(np.isfinite(well[:, :1, :1]), hung, body)
             if imputed is not None:
                 completed, sigma = imputed.positions[slots], imputed.sigma[slots]
-                _complete(body, completed, sigma, seen, deviation, unseen, bias, precision)
+                _complete(body, completed, sigma, seen, unseen, bias, precision)
             # of a frame that was lost whole, the smoother knows more
             here = (unseen <= unseen.min(axis=1, keepdims=True)) & np.isfinite(deviation)
             variance = _join(body, seen, here, precision)
@@ -214,7 +206,7 @@ def _lay_over(body, seen, precision):
 
 
 @njit(cache=True)
-def _complete(body, completed, sigma, seen, deviation, unseen_s, bias_sigma, precision):
+def _complete(body, completed, sigma, seen, unseen_s, bias_sigma, precision):
     """Puts hidden joints where HG-VAE completes them, each moved as the seen ones near it are off there.
 
     A joint that the sensor does not have hangs: what is imputed of it shakes the joints seen beside it. Of a frame that
@@ -238,8 +230,6 @@ def _complete(body, completed, sigma, seen, deviation, unseen_s, bias_sigma, pre
             for axis in range(3):
                 body[row, joint, axis] = completed[row, joint, axis] + off[axis] / max(total, 1e-12)
             precision.prior[row, joint] = _inverse(sigma[row, joint] ** 2 + bias_sigma[row] ** 2)
-            coasted = deviation[row, joint] * (1.0 + _RESTLESS[joint] * max(unseen - COASTS_S, 0.0))
-            precision.seen[row, joint] = _inverse(coasted**2 + bias_sigma[row] ** 2)
 
 
 @njit(cache=True)

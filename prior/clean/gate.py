@@ -46,6 +46,7 @@ _LEAST_BONE, _BONE_NOISES = 0.1, 4.0  # metres, and times the noise, by which ev
 _NOISE_MEMORY = 15  # frames
 _DISTANCE_OF_NOISE = 2.6  # median distance to the expectation of white noise of 1 along each axis, by this filter
 _OWN_MEMORY, _OWN_TIMES = 9, 3.0  # frames in which a joint shows how far from expected it comes, and times that
+_SETS_OFF = 4.0  # m/s that a joint at rest may reach while it is not seen
 _BODY_JUMP = 0.5  # if more of the joints jump at once, the body did (a new track, a gap), not the joints
 
 
@@ -64,6 +65,7 @@ class Gate:
         self._jitter = np.zeros(slots)
         self._own = np.zeros((slots, 22))
         self._frames = np.zeros(slots, dtype=np.int64)
+        self._lost = np.zeros((slots, 22))
         self._refused = np.zeros((slots, 22))
         self._swapped = np.zeros((slots, len(_EXCHANGED)))
 
@@ -76,6 +78,7 @@ class Gate:
         self._jitter[slot] = 0.0
         self._own[slot] = 0.0
         self._frames[slot] = 0
+        self._lost[slot] = 0
         self._refused[slot] = 0
         self._swapped[slot] = 0
 
@@ -97,6 +100,7 @@ class Gate:
             self._measure_jitter(distance)
             if s.enabled:
                 self._judge(positions, person, expected, distance)
+        self._lost = np.where(np.isfinite(observation.positions[..., 0]), 0, self._lost + 1)
         self._filter.update(positions, observation.stamp_s)
         return Gated(observation, positions, self._jitter.copy(), frozen)
 
@@ -111,7 +115,9 @@ class Gate:
         # a limb thrown about comes far from where it was expected all the time, a joint that jumps once
         least = np.maximum(np.maximum(s.jump, _JUMP_NOISES * self._jitter)[:, None], _OWN_TIMES * self._own)
         self._own += np.where(seen & known, distance - self._own, 0.0) / _OWN_MEMORY
-        jumped = seen & known & (distance > least + 3 * expected.sigma)
+        # one that comes back may have turned round, or set off, while it was away
+        speed = np.maximum(2 * np.linalg.norm(self._filter.velocity, axis=-1), _SETS_OFF)
+        jumped = seen & known & (distance > least + speed * self._lost / FPS + 3 * expected.sigma)
         everywhere = jumped.sum(axis=1) > _BODY_JUMP * np.maximum((seen & known).sum(axis=1), 1)
         self._expect_anew(everywhere[:, None] & jumped)
         jumped &= ~everywhere[:, None]

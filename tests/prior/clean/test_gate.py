@@ -1,6 +1,7 @@
 from collections import Counter
 
 import numpy as np
+import pytest
 from tests.helpers.bodies import waving
 from tests.helpers.values import observation
 
@@ -45,6 +46,16 @@ def test_a_joint_that_stays_where_it_jumped_is_believed_before_long() -> None:
     refused = np.isnan(passed[:, WRIST, 0])
     assert refused[40]
     assert 2 <= refused.sum() <= 10
+
+
+@pytest.mark.parametrize("lost_at", [43, 45, 47, 57, 59])
+def test_a_joint_that_turned_round_or_set_off_while_it_was_away_is_believed_at_once(lost_at: int) -> None:
+    positions = np.repeat(waving(1), 90, axis=0)
+    positions[40:, WRIST, 0] += 0.5 * np.sin(2 * np.pi * 1.5 * np.arange(50) / 30)
+    positions[lost_at : lost_at + 6, WRIST] = np.nan
+    passed, counters = run(positions)
+    assert np.array_equal(passed, positions, equal_nan=True)
+    assert not counters
 
 
 def test_exchanged_legs_are_put_back() -> None:
