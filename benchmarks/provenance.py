@@ -23,7 +23,8 @@ OF_CLEAN = ("prior weights", "prior settings")
 OF_WORLD = (*OF_CLEAN, "trajectory weights", "trajectory settings")
 """what `pose/clean` and `pose/world` depend on, of what `ships`"""
 
-_PRIOR_MODELS = ("correction", "hgvae", "hmvae", "mixture")
+_PRIOR_MODELS = ("correction", "hgvae", "hmvae", "mixture", "occlusion")
+_TRAJECTORY_MODELS = ("contacts", "trajectory")
 
 
 class UncommittedError(RuntimeError):
@@ -34,11 +35,13 @@ class UncommittedError(RuntimeError):
 def ships() -> dict[str, str]:
     """Digests of the weights that ship and of the settings that they run with, of prior and trajectory."""
     files = [path for path in WEIGHTS.iterdir() if path.suffix in (".safetensors", ".json")]
-    of_prior = {path for path in files if path.name.startswith(_PRIOR_MODELS)}
+    of_prior, of_trajectory = (
+        [path for path in files if path.name.startswith(models)] for models in (_PRIOR_MODELS, _TRAJECTORY_MODELS)
+    )
     return {
         "prior weights": _digest_of_files(of_prior),
         "prior settings": _digest_of_settings(asdict(PriorSettings())),
-        "trajectory weights": _digest_of_files(set(files) - of_prior),
+        "trajectory weights": _digest_of_files(of_trajectory),
         "trajectory settings": _digest_of_settings(asdict(TrajectorySettings())),
     }
 

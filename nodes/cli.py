@@ -26,7 +26,7 @@ COMMANDS = {
     "repair": ("steadypose.nodes.commands.repair:repair", "what can be read of a damaged recording, as a whole one"),
     "plot": ("steadypose.nodes.commands.plot.command:plot", "what happened in a recording, as pictures"),
     "prepare": ("steadypose.nodes.commands.prepare:prepare", "motion capture into training data"),
-    "train": ("steadypose.prior.models.registry:train", "train a model of the prior"),
+    "train": ("steadypose.nodes.commands.train:train", "train a model of the prior"),
     "evaluate": (
         "steadypose.nodes.commands.evaluate:evaluate",
         "measure the prior against its tuned peers, by protocol",

@@ -5,23 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import PARENTS, J
+from steadypose.prior.body.skeleton import BONES_BETWEEN, J
 
 Floats = NDArray[np.float64]
 
 _ACROSS = tuple((J[f"left_{part}"], J[f"right_{part}"]) for part in ("hip", "shoulder"))
-
-
-def _bones_between() -> Floats:
-    """(22, 22) how many bones lie between two joints."""
-    count = np.where(np.eye(len(PARENTS), dtype=bool), 0.0, np.inf)
-    for joint, parent in enumerate(PARENTS):
-        if parent >= 0:
-            count[joint, :joint] = count[:joint, joint] = count[parent, :joint] + 1
-    return count
-
-
-_BONES = _bones_between()
 
 
 def beside(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
@@ -41,7 +29,7 @@ def beside(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
         c, j = np.nonzero(~known & np.isfinite(then[..., 0, 0]))
         was, now, rows = then[c, j], np.where(known[c, :, None], frame[c], np.nan), np.arange(len(c))
         offset = was[rows, j][:, None] - was
-        apart = _BONES[j] + 1e-3 * np.linalg.norm(offset, axis=-1)
+        apart = BONES_BETWEEN[j] + 1e-3 * np.linalg.norm(offset, axis=-1)
         nearest = np.where(np.isfinite(apart) & known[c], apart, np.inf).argmin(axis=1)
         moved = now[rows, nearest] + np.einsum("nab,nb->na", _turned(was, now), offset[rows, nearest])
         answers[t, c, j] = np.where(known[c].any(axis=1, keepdims=True), moved, was[rows, j])

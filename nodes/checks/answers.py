@@ -13,6 +13,8 @@ ENOUGH = 20
 """bodies between two looks, to judge by"""
 MOST = 0.7
 """of the joints refused, or of the poses flagged"""
+LOOKS = 2
+"""in a row that find nearly all flagged: a fault that is over within a second is the flag's own to tell"""
 
 
 class Answers:
@@ -25,6 +27,7 @@ class Answers:
     def __init__(self, counters: Counter[str]) -> None:
         self._counters = counters
         self._refused_before = 0
+        self._flagged_looks = 0
         self._forget()
 
     def asked(self, raw: PoseRaw) -> None:
@@ -49,7 +52,9 @@ class Answers:
                     "arrival, take those of capture",
                 )
             )
-        if self._out >= ENOUGH and self._flagged > MOST * self._out:
+        nearly_all = self._out >= ENOUGH and self._flagged > MOST * self._out
+        self._flagged_looks = self._flagged_looks + 1 if nearly_all else 0
+        if self._flagged_looks >= LOOKS:
             found.append(
                 warning(
                     "nearly_all_flagged",

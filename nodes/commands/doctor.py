@@ -40,7 +40,7 @@ INSTALL_EXTRA = (
     else "pip install 'steadypose[{}]'"
 )
 KEY_PACKAGES = ("numpy", "numba", "rosbags", "pyzmq")
-MODELS = ("mixture", "hgvae", "trajectory", "contacts")
+MODELS = ("mixture", "hgvae", "occlusion", "trajectory", "contacts")
 FRAMES, WARM_UP = 100, 20
 FRAME_NS = 1_000_000_000 / 30
 TARGET_MS, BUDGET_MS = 10.0, 1000 / 30

@@ -27,6 +27,18 @@ CHILDREN: tuple[tuple[int, ...], ...] = tuple(
 J: Mapping[str, int] = {name: i for i, name in enumerate(JOINTS)}
 """Index of each canonical joint by name."""
 
+
+def _bones_between() -> NDArray[np.int64]:
+    between = np.zeros((len(PARENTS), len(PARENTS)), dtype=np.int64)
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0:
+            between[joint, :joint] = between[:joint, joint] = between[parent, :joint] + 1
+    return between
+
+
+BONES_BETWEEN: NDArray[np.int64] = _bones_between()
+"""(22, 22) how many bones lie between two joints."""
+
 MIRROR: NDArray[np.intp] = np.array(
     [J[n.replace("left", "#").replace("right", "left").replace("#", "right")] for n in JOINTS]
 )

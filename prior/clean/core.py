@@ -73,6 +73,7 @@ class CleanCore:
         counters: gets what was refused or skipped, by cause.
 
     Attributes:
+        fuse: the last step.
         sensor_noise: what the sensor was last found to be off by, the median over the bodies present.
     """
 
@@ -92,7 +93,7 @@ class CleanCore:
         self._person = PersonEstimator(settings.bones, slots)
         self._score = Scorer(settings.score, settings.encode.weights, slots) if score else None
         self._impute = Impute(settings.impute, delay, slots, counters) if impute else None
-        self._fuse = Fuse(settings.fuse)
+        self.fuse = Fuse(settings.fuse, slots)
         self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
         self._newest: _Newest | None = None
         self.sensor_noise: SensorNoise | None = None
@@ -108,7 +109,7 @@ class CleanCore:
         if self._correct:
             gated = self._correct.update(gated)
         self._history.append(gated)
-        smoothed = self._smooth.update(gated)
+        smoothed = self._smooth.update(gated, self._history)
         windows = None
         if self._reconstruct:
             windows = self._reconstruct.update(self._history, present, person, bias_sigma)
@@ -135,7 +136,7 @@ class CleanCore:
         newest, self._newest = self._newest, None
         if newest is None:
             return []
-        held = self._smooth.flush()
+        held = self._smooth.flush(self._history)
         return [
             self._answer(self._denoised(smoothed, newest.gated, back), newest, back)
             for back, smoothed in zip(reversed(range(len(held))), held, strict=True)
@@ -145,7 +146,7 @@ class CleanCore:
         """Forget the bodies in these slots (S,)."""
         steps = (
             self._gate, self._correct, self._history, self._smooth, self._denoise, self._slow_error,
-            self._person, self._score, self._impute, self._refine,
+            self._person, self._score, self._impute, self._refine, self.fuse,
         )  # fmt: skip
         for step in steps:
             if step is not None:
@@ -176,13 +177,14 @@ class CleanCore:
     def _answer(self, denoised: Smoothed, newest: _Newest, back: int) -> CleanFrame:
         """What is said of the frame ``back`` before the newest."""
         at, imputed = -1 - back, newest.imputed
-        estimate = self._fuse.fuse(
+        estimate = self.fuse.fuse(
             denoised,
             newest.person,
             newest.slow_error,
             newest.rotations[at],
             imputed and Imputed(imputed.positions[at], imputed.sigma[at]),
             self._history.unseen_s[at],
+            self._history.seen_since(back),
             newest.present,
         )
         return CleanFrame(estimate, newest.score, self._history.observed[at], self._history.confidence[at])

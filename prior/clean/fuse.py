@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import JointState
 from steadypose.prior.body.inverse_kinematics import RIGID, fit_lengths, place_joints, solve_pose
-from steadypose.prior.body.skeleton import PARENT, PARENTS
+from steadypose.prior.body.skeleton import BONES_BETWEEN, PARENT
 from steadypose.prior.clean.frame import Bools, Estimate, Floats, Imputed, Person
+from steadypose.prior.clean.occluded import OccludedJoints
 from steadypose.prior.clean.slow_error import SlowError
 from steadypose.prior.timing.fixed_lag import Smoothed
 
@@ -27,24 +28,18 @@ class FuseSettings:
         prior_sigma: metres, of a joint placed by the refinement model, when its body is well seen.
         prior_drift: m/s, how fast that grows for a joint that is not seen.
         fade: seconds after which a joint not seen is unknown.
+        weights: set of the weights of the network that weighs where an occluded joint may be, or a path to a
+            ``.safetensors`` file.
     """
 
     enabled: bool = True
     prior_sigma: float = 0.1
     prior_drift: float = 0.25
     fade: float = 3.0
+    weights: str = "default"
 
 
-def _bones_between() -> NDArray[np.int64]:
-    """(22, 22) bones on the way from one joint to another."""
-    between = np.full((len(PARENTS), len(PARENTS)), -1)
-    for joint, parent in enumerate(PARENTS):
-        between[joint, :joint] = between[:joint, joint] = between[parent, :joint] + 1
-        between[joint, joint] = 0
-    return between
-
-
-_NEAR = 1 / (1 + _bones_between()) ** 2
+_NEAR = 1 / (1 + BONES_BETWEEN) ** 2
 """(22, 22) how much one joint's error tells of another's"""
 
 _LEAST_VARIANCE = 1e-10
@@ -66,13 +61,22 @@ class Precision(NamedTuple):
 class Fuse:
     """Joins the joints seen with what the prior says of the hidden ones.
 
-    A joint that is seen stays where smoothing and denoising have it. Hidden joints are where HG-VAE completes the body
-    or, without it, hang from those seen in the rotations decoded; smoother and completion are weighed by their
-    precisions, and the person's bones hold, as far as their lengths are known.
+    A joint that is seen stays where smoothing and denoising have it. Of hidden joints, the accounts of smoother and
+    completion and their place beside the body are weighed (`OccludedJoints`); without a completion, they hang from
+    those seen in the rotations decoded. The person's bones hold, as far as their lengths are known.
+
+    Attributes:
+        occluded: who weighs the accounts of hidden joints; None if nothing is to be fused.
     """
 
-    def __init__(self, settings: FuseSettings) -> None:
+    def __init__(self, settings: FuseSettings, slots: int) -> None:
         self._settings = settings
+        self.occluded = OccludedJoints(settings.weights, slots) if settings.enabled else None
+
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
+        if self.occluded:
+            self.occluded.forget(slot)
 
     def fuse(
         self,
@@ -82,9 +86,10 @@ class Fuse:
         rotations: Floats,
         imputed: Imputed | None,
         unseen_s: Floats,
+        again: Bools,
         present: Bools,
     ) -> Estimate:
-        """The estimate of one frame.
+        """The estimate of one frame; frames are to be given in order.
 
         Args:
             smoothed: what smoother and denoising make of the joints seen.
@@ -93,6 +98,7 @@ class Fuse:
             rotations: (S, 22, 3, 3) local, of the body as far as it is not seen.
             imputed: (S, 22, 3) and (S, 22), that frame as HG-VAE completes it; None without it.
             unseen_s: (S, 22) seconds for which each joint had not been seen by then.
+            again: (S, 22) whether it was seen in one of the frames since.
             present: (S,) who is there.
         """
         s = self._settings
@@ -103,13 +109,19 @@ class Fuse:
         precision = Precision(*_weigh(deviation, held_s, bias, s.prior_sigma, s.prior_drift, s.fade))
         body, fitted = place_joints(decoded, offsets), decoded
         well = _lay_over(body, seen, precision)
-        if s.enabled:
+        if self.occluded:
             # What is not seen hangs from what is, in the prior's rotations.
             hung = solve_pose(well, offsets, decoded)[1]
             body = np.where(np.isfinite(well[:, :1, :1]), hung, body)
+            completed_sigma = None
             if imputed is not None:
-                completed, sigma = imputed.positions[slots], imputed.sigma[slots]
-                _complete(body, completed, sigma, seen, unseen, bias, precision)
+                completed, completed_sigma = imputed.positions[slots], imputed.sigma[slots]
+                _complete(body, completed, completed_sigma, seen, unseen, bias, precision)
+            weighed = self.occluded.update(slots, seen, deviation, unseen, again[slots], body, completed_sigma)
+            if weighed is not None:
+                (whose, joint, *_), (positions, sigma) = weighed
+                body[whose, joint] = positions
+                precision.seen[whose, joint], precision.prior[whose, joint] = 0.0, 1.0 / np.square(sigma)
             # of a frame that was lost whole, the smoother knows more
             here = (unseen <= unseen.min(axis=1, keepdims=True)) & np.isfinite(deviation)
             variance = _join(body, seen, here, precision)

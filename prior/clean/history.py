@@ -47,6 +47,10 @@ class History:
         """(T, S, 22) seconds for which a joint had not been seen by then; 0 where it was, inf where it never was."""
         return self._unseen_s.all
 
+    def seen_since(self, back: int) -> Bools:
+        """(S, 22) whether a joint was seen in one of the ``back`` newest frames."""
+        return np.asarray((self.unseen_s[len(self.unseen_s) - back :] == 0.0).any(axis=0))
+
     def append(self, gated: Gated) -> None:
         """Take in the newest frame."""
         self._observed.push(gated.observation.positions)

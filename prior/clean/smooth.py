@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import PARENTS, limbs
+from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.clean.frame import Bools, Floats, Gated
+from steadypose.prior.clean.history import History
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.multiple_model import MultipleModelSmoother
@@ -23,18 +23,10 @@ from steadypose.prior.timing.rate import FPS
 MOST_DELAY = 16
 """frames, the longest delay that the mixture was trained for"""
 
-COASTS_S, RESTLESS = 0.2, 3.0
-"""Seconds after which an arm is not where it coasts to, as far as the mixture states, and by how many times its
-deviation a second more. Hidden for one to four seconds, arms are then 2 to 10 % nearer (validation); legs, which stand,
-would be 20 % farther."""
-
 SLOW, FAST = 1.5, 3.0
 """m/s from which a joint is joined with what the best predictions say of it, and at which in full: in 4 cm of noise,
 joints at 2 to 4 m/s are 7 % nearer, in noise that lasts, where predictions are too sure, accelerations of motion at 2.5
 times its speed 9 % worse (validation)."""
-
-_RESTLESS = np.zeros(len(PARENTS))
-_RESTLESS[[joint for arm in limbs(("collar", "shoulder", "elbow", "wrist")) for joint in arm]] = RESTLESS
 
 
 @dataclass(frozen=True)
@@ -54,49 +46,44 @@ class Smooth:
     def __init__(self, settings: SmoothSettings, delay_frames: int, slots: int) -> None:
         if not 0 <= delay_frames <= MOST_DELAY:
             raise ValueError(f"delay: expected 0 to {MOST_DELAY} frames, got {delay_frames}")
+        self._delay = delay_frames
         self._mixture = MixtureSmoother(delay_frames, slots, settings.weights)
         self._models = MultipleModelSmoother(delay_frames, slots, len(PARENTS))
         self._before = np.full((slots, len(PARENTS), 3), np.nan)
-        self._unseen = np.zeros((delay_frames + 1, slots, len(PARENTS)), dtype=np.int64)
+        self._apart = np.zeros((slots, len(PARENTS), 3))
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
         self._mixture.forget(slot)
         self._models.forget(slot)
         self._before[slot] = np.nan
-        self._unseen[:, slot] = 0
+        self._apart[slot] = 0.0
 
-    def update(self, gated: Gated) -> Smoothed | None:
-        """Take the newest frame in; None while there is no frame so long ago."""
-        observation = gated.observation
-        seen = np.isfinite(gated.positions).all(axis=-1)
-        self._unseen = np.concatenate([self._unseen[1:], np.where(seen, 0, self._unseen[-1] + 1)[None]])
-        frame = gated.positions, observation.stamp_s, observation.confidence
+    def update(self, gated: Gated, history: History) -> Smoothed | None:
+        """Take the newest frame in, which ``history`` has; None while there is no frame so long ago."""
+        frame = gated.positions, gated.observation.stamp_s, gated.observation.confidence
         by_models = self._models.update(*frame)
         mixed = self._mixture.update(*frame)
-        return None if mixed is None or by_models is None else self._joined(mixed, by_models, self._unseen)
+        return None if mixed is None or by_models is None else self._joined(mixed, by_models, history, self._delay)
 
-    def flush(self) -> list[Smoothed]:
+    def flush(self, history: History) -> list[Smoothed]:
         """The estimates of the last ``delay_frames`` frames (fewer if there were fewer), oldest first."""
         mixed, by_models = self._mixture.flush(), self._models.flush()
-        return [
-            self._joined(*both, self._unseen[k - len(mixed) :])
-            for k, both in enumerate(zip(mixed, by_models, strict=True))
-        ]
+        backs = reversed(range(len(mixed)))
+        return [self._joined(a, b, history, back) for a, b, back in zip(mixed, by_models, backs, strict=True)]
 
-    def _joined(self, mixed: Smoothed, by_models: Smoothed, unseen: NDArray[np.int64]) -> Smoothed:
-        """The answer of the first of the frames of which ``unseen`` (K, S, 22) says for how many a joint was not seen.
-
-        Frames are to be given in order.
-        """
-        hidden, known = unseen[0] > 0, np.isfinite(by_models.sigma)
-        again = hidden & known & (unseen == 0).any(axis=0)
-        coasting = mixed.sigma * (1.0 + _RESTLESS * np.maximum(unseen[0] / FPS - COASTS_S, 0.0))
+    def _joined(self, mixed: Smoothed, by_models: Smoothed, history: History, back: int) -> Smoothed:
+        """The answer of the frame ``back`` before the newest; frames are to be given in order."""
+        hidden, known = history.unseen_s[-1 - back] > 0, np.isfinite(by_models.sigma)
         share = np.where(hidden | ~known, 0.0, self._share(mixed, by_models.sigma))
-        share[again] = 1.0
-        moved = np.where(share[..., None] > 0.0, by_models.positions - mixed.positions, 0.0)
-        sigma = np.where(again, by_models.sigma, np.where(hidden, coasting, mixed.sigma))
-        return Smoothed(mixed.stamp_s, mixed.positions + share[..., None] * moved, sigma)
+        again = hidden & known & history.seen_since(back)
+        to_models = np.nan_to_num(by_models.positions - mixed.positions)
+        positions = mixed.positions + share[..., None] * to_models
+        # the two differ by what noise either lets through: a body that flickers is not to jump from one to the other
+        self._apart = np.where(hidden[..., None], self._apart, np.nan_to_num(positions - by_models.positions))
+        kept = np.where(hidden.all(axis=1)[:, None, None], self._apart, 0.0)
+        positions = np.where(again[..., None], by_models.positions + kept, positions)
+        return Smoothed(mixed.stamp_s, positions, np.where(again, by_models.sigma, mixed.sigma))
 
     def _share(self, mixed: Smoothed, sigma: Floats) -> Floats:
         """(S, 22) of the way from the network's answer to the best predictions', of deviation ``sigma``."""

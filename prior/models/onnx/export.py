@@ -24,11 +24,14 @@ from steadypose.prior.models.hmvae.network import HMVAE
 from steadypose.prior.models.mixture.bank import EXPERTS, FEATURES
 from steadypose.prior.models.mixture.form import OUTPUTS
 from steadypose.prior.models.mixture.network import MixtureConfig, MixtureNet
+from steadypose.prior.models.occlusion.candidates import FEATURES as OCCLUSION_FEATURES
+from steadypose.prior.models.occlusion.network import OcclusionConfig, OcclusionNet
 from steadypose.prior.models.onnx.modules import (
     Contacts,
     Correction,
     Faults,
     Mixture,
+    Occlusion,
     Reconstruction,
     Refinement,
     RootMotion,
@@ -65,6 +68,11 @@ def _mixture() -> Form:
     own, body = (22, sizes.own), (sizes.body,)
     memory = {"own": own, "own_weight": own, "body": body, "body_weight": body, "written": (22, OUTPUTS)}
     return Form(Mixture(network), {**bank, **memory}, ("positions", "sigma", *(f"{name}_next" for name in memory)))
+
+
+def _occlusion() -> Form:
+    network = load_network(OcclusionNet, OcclusionConfig.from_dict, "default", "occlusion")
+    return Form(Occlusion(network), {"features": (OCCLUSION_FEATURES,), "joint": ()}, ("weights", "sigma"))
 
 
 def _refinement() -> Form:
@@ -106,6 +114,7 @@ def _correction() -> Form:
 
 FORMS: dict[str, Callable[[], Form]] = {
     "mixture-default": _mixture,
+    "occlusion-default": _occlusion,
     "hmvae-default": _refinement,
     "hgvae-default": _reconstruction,
     "hgvae-default.faults": _faults,

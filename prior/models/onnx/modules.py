@@ -12,6 +12,7 @@ from steadypose.prior.models.hgvae.faults import FaultNet
 from steadypose.prior.models.hgvae.network import HGVAE
 from steadypose.prior.models.hmvae.network import HMVAE
 from steadypose.prior.models.mixture.network import MixtureNet, answer, kept_of
+from steadypose.prior.models.occlusion.network import OcclusionNet
 from steadypose.prior.models.onnx.torch_features import (
     completion_features,
     contact_features,
@@ -22,6 +23,19 @@ from steadypose.prior.models.onnx.torch_features import (
 )
 from steadypose.prior.models.root_velocity.network import TrajectoryNet
 from steadypose.prior.models.sensor_bias.network import CorrectionNet
+
+
+class Occlusion(nn.Module):
+    """`LiveOcclusion`'s network, of occluded joints in place of bodies: features (N, FEATURES) and which joint (N,), to
+    the weights (N, 3) of its candidates and metres (N,) of deviation along an axis."""
+
+    def __init__(self, network: OcclusionNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, features: Tensor, joint: Tensor) -> tuple[Tensor, Tensor]:
+        weights, log_sigma = self.network(features, joint.long())
+        return weights, 1e-3 * log_sigma.exp()
 
 
 class Mixture(nn.Module):

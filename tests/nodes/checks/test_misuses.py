@@ -350,8 +350,14 @@ def test_answers_that_are_of_no_use() -> None:
         1, np.zeros((22, 3)), np.zeros((22, 4)), np.ones(22), np.zeros(22), 5.0, True, np.zeros(22), np.zeros(22),
         np.zeros((22, 3)), np.ones(22),
     )  # fmt: skip
-    for raw in good:
-        answers.given(PoseClean(raw.stamp_ns, "camera", "mine", raw.sensor_pose, False, 4, [flagged]))
+
+    def flag_all() -> None:
+        for raw in good:
+            answers.given(PoseClean(raw.stamp_ns, "camera", "mine", raw.sensor_pose, False, 4, [flagged]))
+
+    flag_all()
+    assert not answers.problems()  # a second of it is the flag's own to tell
+    flag_all()
     assert [problem.cause for problem in answers.problems()] == ["nearly_all_flagged"]
     assert not answers.problems()
 

@@ -31,6 +31,8 @@ from steadypose.prior.models.mixture.bank import (
     new_bank,
 )
 from steadypose.prior.models.mixture.inference import MixtureSmoother
+from steadypose.prior.models.occlusion.candidates import FEATURES as OCCLUSION_FEATURES
+from steadypose.prior.models.occlusion.inference import OF_OTHERS, LiveOcclusion, Occluded
 from steadypose.prior.models.onnx.export import FORMS, export
 from steadypose.prior.models.root_velocity.inference import LiveRootVelocity
 from steadypose.prior.models.sensor_bias.features import HISTORY, features, trunk_frame
@@ -90,6 +92,16 @@ def test_mixture_frame_by_frame() -> None:
         memory = dict(zip(memory, kept, strict=True))
         np.testing.assert_allclose(found, expected.positions, atol=5e-6)  # metres
         np.testing.assert_allclose(sigma, expected.sigma, rtol=1e-4)
+
+
+def test_occlusion() -> None:
+    rng = np.random.default_rng(0)
+    features, joint = rng.normal(size=(30, OCCLUSION_FEATURES)).astype(np.float32), rng.integers(0, 22, 30)
+    rows = Occluded(np.zeros(30, dtype=np.intp), joint, rng.normal(size=(30, 3, 3)), features)
+    expected = LiveOcclusion.load("default")(rows)
+    weights, sigma = answers("occlusion-default", features=features, joint=joint)
+    np.testing.assert_allclose((weights[..., None] * rows.candidates).sum(axis=1), expected.positions, atol=1e-5)
+    np.testing.assert_allclose(OF_OTHERS * sigma, expected.sigma, rtol=1e-4)
 
 
 def test_refinement() -> None:

@@ -13,7 +13,7 @@ from steadypose.prior.models.torch_weights import install as install_weights
 
 
 def train(
-    model: Literal["hmvae", "hgvae", "hgvae-wide", "trajectory", "contacts", "correction", "mixture"],
+    model: Literal["hmvae", "hgvae", "hgvae-wide", "trajectory", "contacts", "correction", "mixture", "occlusion"],
     data: Path = Path("data/prepared.npz"),
     weights: Literal["default", "research", "kinect_v2"] | None = None,
     runs: Path = Path("runs"),
@@ -34,10 +34,10 @@ def train(
 
     Args:
         model: mixture (the smoother), hmvae (refinement), hgvae (anomaly score and imputation),
-            hgvae-wide (the same in the paper's size, for recordings), trajectory (root velocity), contacts, or
-            correction (a sensor's own error).
-        data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon; for the
-            mixture, the folder of the recordings, which it takes at several speeds.
+            hgvae-wide (the same in the paper's size, for recordings), trajectory (root velocity), contacts,
+            occlusion (what to believe of a hidden joint), or correction (a sensor's own error).
+        data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon; for
+            mixture and occlusion, the folder of the recordings, which they take at several speeds.
         weights: the set to train: 'default' takes only data free for products, 'research' all of it; a correction
             is named after its sensor, kinect_v2.
         runs: where checkpoints and curves go.
@@ -62,6 +62,8 @@ def train(
         from steadypose.prior.models.root_velocity.train import train_trajectory as train_model
     elif model == "contacts":
         from steadypose.prior.models.contacts.train import train_contacts as train_model
+    elif model == "occlusion":
+        from steadypose.prior.clean.train_occlusion import train_occlusion as train_model
     else:
         from steadypose.prior.models.sensor_bias.train import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")

@@ -1,0 +1,201 @@
+"""Where an occluded joint may be, by three accounts, and what tells which to believe: training and live node share it.
+
+The smoother lets a joint coast, which is right for a foot that stands. The completion network places it as a body would
+have it, which is right for an arm that swings. And a joint may keep its place beside the nearest one that is seen,
+turned with the trunk, which is right for an arm that rests. `prior.models.occlusion.network` weighs the three by
+`FEATURES` numbers, which do not change when the body stands elsewhere or faces elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from steadypose.prior.body.skeleton import BONES_BETWEEN, MIRROR, PARENT, J
+from steadypose.prior.timing.rate import FPS
+
+Floats = NDArray[np.float64]
+
+CANDIDATES = 3
+"""Coasting, completed, held beside the body."""
+
+FEATURES = 20
+"""Of each occluded joint."""
+
+LEAST = 1e-3
+"""Metres: what is smaller than this is nothing, in logarithms."""
+LEAST_SIGMA = 1e-4
+"""metres, of deviations"""
+LEAST_SPEED = 0.02
+"""m/s"""
+LEAST_HEIGHT = 0.01
+"""metres"""
+
+FADING = 0.4
+"""Weight of the newest speed in the running mean."""
+
+NEAR = 1e-3
+"""Bones per metre: of joints as many bones away, the nearest in space."""
+
+_MIRROR, _PARENT = np.asarray(MIRROR), np.maximum(PARENT, 0)
+_TRUNK = np.array([[J[f"{side}_{part}"] for side in ("left", "right")] for part in ("hip", "shoulder")])
+
+
+class Past(NamedTuple):
+    """What is kept of S bodies.
+
+    Attributes:
+        poses: (S, 22, 22, 3) metres, of each joint the pose, as held, of when it was last seen; NaN before.
+        place: (S, 22, 3) metres, the joints of the last frame; NaN before.
+        speed: (S, 22) m/s, running mean; and ``speed_seen`` (S, 22), that of when the joint was last seen.
+    """
+
+    poses: Floats
+    place: Floats
+    speed: Floats
+    speed_seen: Floats
+
+
+def new_past(slots: int) -> Past:
+    """Of bodies of which nothing was seen."""
+    past = Past(np.empty((slots, 22, 22, 3)), np.empty((slots, 22, 3)), np.empty((slots, 22)), np.empty((slots, 22)))
+    forget(past, np.ones(slots, dtype=bool))
+    return past
+
+
+def forget(past: Past, slot: NDArray[np.bool_]) -> None:
+    """Start these slots (S,) afresh."""
+    past.poses[slot] = past.place[slot] = np.nan
+    past.speed[slot] = past.speed_seen[slot] = 0.0
+
+
+@njit(cache=True)
+def look(past, slot, positions, sigma, unseen_s, held):
+    """Take in a body's frame, and write where its occluded joints are if they keep their place beside the body.
+
+    Args:
+        past: a `Past`.
+        slot: whose.
+        positions: (22, 3) metres, of the smoother; NaN of joints never seen.
+        sigma: (22,) metres, along an axis.
+        unseen_s: (22,) seconds, 0 of a joint that is seen.
+        held: (22, 3) metres, written: joints seen as they are; NaN of joints never seen.
+    """
+    poses, joints = past.poses[slot], len(positions)
+    seen = np.empty(joints, dtype=np.bool_)
+    for joint in range(joints):
+        seen[joint] = unseen_s[joint] == 0.0 and math.isfinite(positions[joint, 0] + sigma[joint])
+        moved = 0.0
+        for axis in range(3):
+            moved += (positions[joint, axis] - past.place[slot, joint, axis]) ** 2
+            past.place[slot, joint, axis] = held[joint, axis] = positions[joint, axis]
+        moved = math.sqrt(moved) * FPS if math.isfinite(moved) else 0.0
+        past.speed[slot, joint] += FADING * (moved - past.speed[slot, joint])
+        if seen[joint]:
+            past.speed_seen[slot, joint] = past.speed[slot, joint]
+    for joint in range(joints):
+        if not seen[joint]:
+            _hold(joint, poses[joint], positions, seen, held)
+    for joint in range(joints):
+        if seen[joint]:
+            for other in range(joints):
+                for axis in range(3):
+                    poses[joint, other, axis] = held[other, axis]
+
+
+@njit(cache=True)
+def _hold(joint, then, positions, seen, held):
+    """Write where a joint is that keeps its place beside the nearest joint seen, as in the pose ``then`` (22, 3)."""
+    nearest, least = -1, np.inf
+    for other in range(len(seen)):
+        if seen[other]:
+            square = 0.0
+            for axis in range(3):
+                square += (then[joint, axis] - then[other, axis]) ** 2
+            apart = BONES_BETWEEN[joint, other] + NEAR * math.sqrt(square)
+            if apart < least:  # never of what is not known
+                nearest, least = other, apart
+    if nearest < 0:
+        for axis in range(3):
+            held[joint, axis] = then[joint, axis]
+        return
+    angle = turned(then, positions, seen)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    x, y = then[joint, 0] - then[nearest, 0], then[joint, 1] - then[nearest, 1]
+    held[joint, 0] = positions[nearest, 0] + cosine * x - sine * y
+    held[joint, 1] = positions[nearest, 1] + sine * x + cosine * y
+    held[joint, 2] = positions[nearest, 2] + then[joint, 2] - then[nearest, 2]
+
+
+@njit(cache=True)
+def turned(then, now, seen):
+    """Radians about z by which hips and shoulders, those ``seen`` (22,), have turned from one pose to another."""
+    a, b = np.zeros(2), np.zeros(2)
+    for part in range(len(_TRUNK)):
+        left, right = _TRUNK[part]
+        if seen[left] and seen[right] and math.isfinite(then[left, 0] + then[right, 0]):
+            for axis in range(2):
+                a[axis] += then[left, axis] - then[right, axis]
+                b[axis] += now[left, axis] - now[right, axis]
+    cross, dot = a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1]
+    return math.atan2(cross, dot)
+
+
+@njit(cache=True)
+def describe(past, slot, joint, candidates, sigma, completed_sigma, unseen_s, again, features):
+    """Write the features (`FEATURES`,) of an occluded joint; after `look` at the same frame.
+
+    Args:
+        past: a `Past`.
+        slot: whose.
+        joint: which.
+        candidates: (3, 3) metres, as `CANDIDATES` has them.
+        sigma: (22,) metres, of the smoother.
+        completed_sigma: metres, of the joint as it is completed.
+        unseen_s: (22,) seconds.
+        again: whether it is seen again, in a frame that has come already.
+        features: float32, written.
+    """
+    place, then = past.place[slot], past.poses[slot, joint]
+    joints = len(place)
+    speed, noise, count, lowest = 0.0, 0.0, 0, np.inf
+    known = np.empty(joints, dtype=np.bool_)
+    for other in range(joints):
+        known[other] = math.isfinite(place[other, 0])
+        if unseen_s[other] == 0.0 and math.isfinite(sigma[other]):
+            speed += past.speed[slot, other]
+            noise += sigma[other]
+            count += 1
+        if then[other, 2] < lowest:
+            lowest = then[other, 2]
+    speed, noise = speed / max(count, 1), noise / max(count, 1)
+    features[0] = math.log(unseen_s[joint] * FPS)
+    features[1] = 1.0 if again else 0.0
+    features[2] = math.log(sigma[joint] + LEAST_SIGMA)
+    features[3] = math.log(completed_sigma + LEAST_SIGMA)
+    features[4] = _log_apart(candidates[0], candidates[1])
+    features[5] = _log_apart(candidates[0], candidates[2])
+    features[6] = _log_apart(candidates[1], candidates[2])
+    features[7] = _log_apart(then[0], place[0])
+    features[8] = abs(turned(then, place, known))
+    features[9] = math.log(speed + LEAST_SPEED)
+    features[10] = math.log(past.speed_seen[slot, joint] + LEAST_SPEED)
+    features[11] = 1.0 - count / joints
+    features[12] = 1.0 if unseen_s[_PARENT[joint]] > 0.0 else 0.0
+    features[13] = 1.0 if unseen_s[_MIRROR[joint]] > 0.0 else 0.0
+    features[14] = math.log(noise + LEAST_SIGMA)
+    for candidate in range(CANDIDATES):
+        features[15 + candidate] = _log_apart(candidates[candidate], then[joint])
+    features[18] = math.log(max(then[joint, 2] - lowest, 0.0) + LEAST_HEIGHT)
+    features[19] = 0.0 if not math.isfinite(then[0, 2] + place[0, 2]) else place[0, 2] - then[0, 2]
+
+
+@njit(cache=True)
+def _log_apart(a, b):
+    """Logarithm of the distance between two places (3,); of none, 0."""
+    square = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
+    return math.log(math.sqrt(square) + LEAST) if math.isfinite(square) else 0.0

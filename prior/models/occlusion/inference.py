@@ -1,0 +1,106 @@
+"""`OcclusionNet` as the live node asks it, without torch: row by row, so that no answer depends on the others."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from steadypose.prior.models.occlusion.candidates import CANDIDATES
+from steadypose.prior.models.occlusion.form import LEAST_LOG_SIGMA, MOST_LOG_SIGMA
+from steadypose.prior.models.weights_io import Arrays, load_weights
+
+Floats = NDArray[np.float64]
+
+OF_OTHERS = 1.1
+"""Times the deviation that the network states of people it was trained on: what people it has not seen are off, for
+0.2 s to four, 1.0 to 1.3 (validation)."""
+
+
+class Occluded(NamedTuple):
+    """N occluded joints of several bodies.
+
+    Attributes:
+        body: (N,) whose.
+        joint: (N,) which.
+        candidates: (N, 3, 3) metres, as `CANDIDATES` has them.
+        features: (N, `FEATURES`) float32.
+    """
+
+    body: NDArray[np.intp]
+    joint: NDArray[np.intp]
+    candidates: Floats
+    features: NDArray[np.float32]
+
+
+class Weighed(NamedTuple):
+    """Where they are.
+
+    Attributes:
+        positions: (N, 3) metres.
+        sigma: (N,) metres, standard deviation along an axis.
+    """
+
+    positions: Floats
+    sigma: Floats
+
+
+class LiveOcclusion:
+    """A trained `OcclusionNet`."""
+
+    def __init__(self, weights: Arrays) -> None:
+        per_deviation = (1.0 / weights["deviation"]).astype(np.float32)
+        read = weights["read.weight"] * per_deviation
+        self._layers = (
+            np.ascontiguousarray(read.T),
+            weights["joint"] + (weights["read.bias"] - read @ weights["mean"]),
+            np.ascontiguousarray(weights["think.weight"].T), weights["think.bias"],
+            np.ascontiguousarray(weights["write.weight"].T), weights["write.bias"],
+        )  # fmt: skip
+
+    @classmethod
+    def load(cls, weights: str) -> LiveOcclusion:
+        """From the weights of this name.
+
+        Raises:
+            FileNotFoundError: there are none; says which there are.
+        """
+        return cls(load_weights(weights, "occlusion")[0])
+
+    def __call__(self, rows: Occluded) -> Weighed:
+        """The joints where their candidates, weighed, have them."""
+        weighed = Weighed(np.empty((len(rows.joint), 3)), np.empty(len(rows.joint)))
+        _weigh(rows.features, rows.joint, rows.candidates, *self._layers, weighed.positions, weighed.sigma)
+        return weighed
+
+
+@njit(cache=True)
+def _weigh(features, joint, candidates, read, of_joint, think, think_bias, write, write_bias, positions, sigma):
+    hidden, zero = read.shape[1], np.float32(0)
+    first, second, out = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(CANDIDATES + 1)
+    for row in range(len(features)):
+        first[:] = of_joint[joint[row]]
+        for k in range(len(read)):
+            for h in range(hidden):
+                first[h] += features[row, k] * read[k, h]
+        second[:] = think_bias
+        for k in range(hidden):
+            first[k] = max(first[k], zero)
+            for h in range(hidden):
+                second[h] += first[k] * think[k, h]
+        out[:] = write_bias
+        for k in range(hidden):
+            added = max(second[k], zero) + first[k]
+            for c in range(CANDIDATES + 1):
+                out[c] += added * write[k, c]
+        most, total = out[:CANDIDATES].max(), 0.0
+        for c in range(CANDIDATES):
+            out[c] = np.exp(out[c] - most)
+            total += out[c]
+        for axis in range(3):
+            positions[row, axis] = 0.0
+            for c in range(CANDIDATES):
+                positions[row, axis] += out[c] / total * candidates[row, c, axis]
+        sigma[row] = OF_OTHERS * 1e-3 * np.exp(min(max(out[CANDIDATES], LEAST_LOG_SIGMA), MOST_LOG_SIGMA))

@@ -1,0 +1,62 @@
+"""The network that weighs where an occluded joint may be: a mixture of three accounts, and how sure it is.
+
+Stacked generalisation (Wolpert 1992): what to believe of several models is learned from how far each is off where it
+has to answer. The answer lies between the candidates, so that it cannot do great harm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from steadypose.prior.models.occlusion.candidates import CANDIDATES, FEATURES
+from steadypose.prior.models.occlusion.form import LEAST_LOG_SIGMA, MOST_LOG_SIGMA
+
+JOINTS = 22
+
+FIRST_LOG_SIGMA = 4.0
+"""What training begins with, of millimetres."""
+
+
+@dataclass(frozen=True)
+class OcclusionConfig:
+    """Sizes.
+
+    Attributes:
+        hidden: of each layer.
+    """
+
+    hidden: int = 48
+
+    @classmethod
+    def from_dict(cls, config: dict[str, Any]) -> OcclusionConfig:
+        """From the JSON of a weights file."""
+        return cls(**config)
+
+
+class OcclusionNet(nn.Module):
+    """Two layers, of which the first knows which joint it is."""
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, config: OcclusionConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.register_buffer("mean", torch.zeros(FEATURES))
+        self.register_buffer("deviation", torch.ones(FEATURES))
+        self.joint = nn.Parameter(torch.zeros(JOINTS, config.hidden))
+        self.read = nn.Linear(FEATURES, config.hidden)
+        self.think = nn.Linear(config.hidden, config.hidden)
+        self.write = nn.Linear(config.hidden, CANDIDATES + 1)
+        nn.init.constant_(self.write.bias[CANDIDATES:], FIRST_LOG_SIGMA)
+
+    def forward(self, features: Tensor, joint: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights (N, 3) of the candidates, and the logarithm (N,) of the standard deviation along an axis in
+        millimetres, of features (N, `FEATURES`) of joints (N,)."""
+        read = torch.relu(self.read((features - self.mean) / self.deviation) + self.joint[joint])
+        written = self.write(torch.relu(self.think(read)) + read)
+        return written[:, :CANDIDATES].softmax(dim=-1), written[:, CANDIDATES].clamp(LEAST_LOG_SIGMA, MOST_LOG_SIGMA)

@@ -1,0 +1,135 @@
+"""Occluded joints: what is said of them against naive references, and the network that weighs it against torch."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from tests.helpers.bodies import waving
+
+from steadypose.benchmarks.peers.beside import beside
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.occluded import OccludedJoints
+from steadypose.prior.models.occlusion.candidates import FEATURES
+from steadypose.prior.models.occlusion.inference import OF_OTHERS, LiveOcclusion, Occluded, Weighed
+from steadypose.prior.models.occlusion.network import OcclusionConfig, OcclusionNet
+from steadypose.prior.models.torch_weights import arrays_of
+
+Floats = NDArray[np.float64]
+
+FRAMES, ARM = 40, [J["left_elbow"], J["left_wrist"]]
+
+
+class Asked:
+    """Stands in for the network, and remembers what it was asked of."""
+
+    def __init__(self) -> None:
+        self.rows: list[Occluded] = []
+
+    def __call__(self, rows: Occluded) -> Weighed:
+        self.rows.append(rows)
+        return Weighed(rows.candidates[:, 0], np.ones(len(rows.joint)))
+
+
+def walking(bodies: int = 1) -> Floats:
+    """(T, B, 22, 3) metres: bodies that wave, turn and go."""
+    motion = np.stack([waving(FRAMES + 9 * body)[9 * body :] for body in range(bodies)], axis=1)
+    angle = np.linspace(0.0, 1.2, FRAMES)[:, None]
+    turned = motion.copy()
+    turned[..., 0] = np.cos(angle)[..., None] * motion[..., 0] - np.sin(angle)[..., None] * motion[..., 1]
+    turned[..., 1] = np.sin(angle)[..., None] * motion[..., 0] + np.cos(angle)[..., None] * motion[..., 1]
+    return turned + np.linspace(0.0, 1.0, FRAMES)[:, None, None, None] * (1.0, 0.4, 0.0)
+
+
+def occlusions(bodies: int, seed: int) -> NDArray[np.bool_]:
+    """(T, B, 22) joints that come and go, after five frames in which all is seen, and one that is always there."""
+    rng = np.random.default_rng(seed)
+    hidden = np.repeat(rng.random((FRAMES // 4, bodies, 22)) < 0.3, 4, axis=0)
+    hidden[:5], hidden[:, :, J["neck"]] = False, False
+    return hidden
+
+
+def asked_of(truth: Floats, hidden: NDArray[np.bool_]) -> list[Occluded]:
+    """The rows of every frame, of joints that coast where they were last seen, and are completed as they truly are."""
+    bodies = truth.shape[1]
+    joints, asked = OccludedJoints("default", bodies), Asked()
+    joints.weigher = asked
+    place, unseen = truth[0].copy(), np.zeros((bodies, 22))
+    for frame, gone in zip(truth, hidden, strict=True):
+        unseen = np.where(gone, unseen + 1 / 30, 0.0)
+        place = np.where(gone[..., None], place, frame)
+        sigma = 0.005 + unseen
+        again = np.zeros(gone.shape, dtype=bool)
+        joints.update(np.arange(bodies), place, sigma, unseen, again, frame, np.full(sigma.shape, 0.03))
+    return asked.rows
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20, deadline=None)
+def test_joints_keep_their_place_beside_the_body(seed: int) -> None:
+    truth, hidden = walking(2), occlusions(2, seed)
+    expected = beside(np.where(hidden[..., None], np.nan, truth), np.arange(FRAMES) / 30, 0)
+    times = np.flatnonzero(hidden.any(axis=(1, 2)))
+    rows = asked_of(truth, hidden)
+    assert len(rows) == len(times)
+    for t, row in zip(times, rows, strict=True):
+        assert set(zip(row.body, row.joint, strict=True)) == set(zip(*np.nonzero(hidden[t]), strict=True))
+        np.testing.assert_allclose(row.candidates[:, 2], expected[t, row.body, row.joint], atol=1e-9)
+
+
+def test_place_and_heading_of_the_body_change_no_feature() -> None:
+    truth, hidden = walking(), occlusions(1, 0)
+    angle = 2.0
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    there = asked_of(truth @ turn.T + (3.0, -2.0, 0.5), hidden)
+    for a, b in zip(asked_of(truth, hidden), there, strict=True):
+        np.testing.assert_allclose(a.features, b.features, atol=2e-4)
+
+
+def test_nothing_is_said_of_a_frame_lost_whole_and_of_a_joint_never_seen() -> None:
+    truth, hidden = walking(), np.zeros((FRAMES, 1, 22), dtype=bool)
+    hidden[10:12] = True
+    assert not asked_of(truth, hidden)
+    hidden[:] = False
+    hidden[:, :, ARM] = True
+    never = truth.copy()
+    never[:, :, ARM] = np.nan
+    assert not asked_of(never, hidden)
+
+
+def test_live_form_gives_what_torch_gives_between_the_candidates() -> None:
+    torch.manual_seed(1)
+    network = OcclusionNet(OcclusionConfig())
+    with torch.no_grad():
+        for tensor in (*network.parameters(), network.mean):
+            tensor.normal_(0.0, 0.3)
+        network.deviation.uniform_(0.5, 2.0)
+    rng = np.random.default_rng(0)
+    features, joint = rng.normal(size=(50, FEATURES)).astype(np.float32), rng.integers(0, 22, 50)
+    rows = Occluded(np.zeros(50, dtype=np.intp), joint, rng.normal(size=(50, 3, 3)), features)
+    live = LiveOcclusion(arrays_of(network))(rows)
+    with torch.no_grad():
+        weights, log_sigma = network(torch.from_numpy(features), torch.from_numpy(joint))
+    expected = np.einsum("nc,nca->na", weights.numpy().astype(float), rows.candidates)
+    np.testing.assert_allclose(live.positions, expected, atol=1e-5)
+    np.testing.assert_allclose(live.sigma, OF_OTHERS * 1e-3 * np.exp(log_sigma.numpy()), rtol=1e-4)
+    assert (live.positions <= rows.candidates.max(axis=1) + 1e-9).all()
+    assert (live.positions >= rows.candidates.min(axis=1) - 1e-9).all()
+
+
+def test_what_ships_believes_a_foot_that_stands_more_than_its_completion() -> None:
+    joints, feet = OccludedJoints("default", 1), [J["left_ankle"], J["left_foot"]]
+    standing, unseen, found = waving(1), np.zeros((1, 22)), []
+    wrong = standing + (0.0, 0.2, 0.0)
+    for frame in range(60):
+        unseen[:, feet] = max(frame - 10, 0) / 30
+        sigma = 0.003 + 0.1 * unseen
+        answer = joints.update(
+            np.arange(1), standing, sigma, unseen.copy(), np.zeros((1, 22), dtype=bool), wrong, np.full((1, 22), 0.1)
+        )
+        if answer is not None:
+            found.append(answer[1])
+    off = np.array([np.linalg.norm(each.positions - standing[0, feet], axis=-1) for each in found])
+    assert off.max() < 0.06
