@@ -20,6 +20,10 @@ COMMANDS = {
     "run": ("steadypose.nodes.commands.run:run", "start the nodes of a launch file, watch them, show how they do"),
     "node": ("steadypose.nodes.commands.node:node", "one node, for another machine or a supervisor such as systemd"),
     "clean": ("steadypose.nodes.commands.clean:clean", "clean a recording or .npz offline, with the nodes' own code"),
+    "fit": (
+        "steadypose.nodes.commands.fit:fit",
+        "fit a motion to a recording: slower than clean, and with all of it in view",
+    ),
     "echo": ("steadypose.nodes.commands.inspect.echo:echo", "print the messages of a topic or recording"),
     "hz": ("steadypose.nodes.commands.inspect.hz:hz", "measure the rate of a topic or recording"),
     "info": ("steadypose.nodes.commands.inspect.info:info", "what is in a recording, or on a topic"),

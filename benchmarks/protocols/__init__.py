@@ -12,6 +12,7 @@ PROTOCOLS: dict[str, str] = {
     "hgvae": "likelihood and depth, anomalies, imputation, actions (the HG-VAE paper)",
     "world": "root drift and foot skate",
     "contacts": "load of feet, against force plates",
+    "humor": "futures, noisy and hidden joints, a simulated detector and depth camera (the HuMoR paper)",
     "streaming": "delay found, jitter at matched delay, recovery, lost frames, jittering stamps",
 }
 """Module in this package: what it measures."""

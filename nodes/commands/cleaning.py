@@ -105,7 +105,7 @@ def clean_recording(
     if os.path.lexists(out):
         if not replace:
             raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
-        _check_replaceable(out, to_npz=to_npz)
+        check_replaceable(out, to_npz=to_npz)
     add_layouts(settings.get("skeletons", {}))
     frames = open_recording(source)
     # these bring torch, which takes seconds: not before it is known that there is something to do
@@ -161,7 +161,7 @@ def clean_recording(
     )
 
 
-def _check_replaceable(out: Path, *, to_npz: bool) -> None:
+def check_replaceable(out: Path, *, to_npz: bool) -> None:
     """Raises:
     LaunchError: it is nothing that this command makes, so nothing that it removes.
     """

@@ -20,6 +20,7 @@ def evaluate(
         "hgvae",
         "world",
         "contacts",
+        "humor",
         "streaming",
     ],
     split: Literal["val", "test"] = "val",

@@ -13,7 +13,9 @@ from steadypose.prior.models.torch_weights import install as install_weights
 
 
 def train(
-    model: Literal["hmvae", "hgvae", "hgvae-wide", "trajectory", "contacts", "correction", "mixture", "occlusion"],
+    model: Literal[
+        "hmvae", "hgvae", "hgvae-wide", "trajectory", "contacts", "humor", "correction", "mixture", "occlusion"
+    ],
     data: Path = Path("data/prepared.npz"),
     weights: Literal["default", "research", "kinect_v2"] | None = None,
     runs: Path = Path("runs"),
@@ -35,6 +37,7 @@ def train(
     Args:
         model: mixture (the smoother), hmvae (refinement), hgvae (anomaly score and imputation),
             hgvae-wide (the same in the paper's size, for recordings), trajectory (root velocity), contacts,
+            humor (transitions, for 'steadypose fit'),
             occlusion (what to believe of a hidden joint), or correction (a sensor's own error).
         data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon; for
             mixture and occlusion, the folder of the recordings, which they take at several speeds.
@@ -64,6 +67,8 @@ def train(
         from steadypose.prior.models.contacts.train import train_contacts as train_model
     elif model == "occlusion":
         from steadypose.prior.clean.train_occlusion import train_occlusion as train_model
+    elif model == "humor":
+        from steadypose.prior.models.humor.train import train_humor as train_model
     else:
         from steadypose.prior.models.sensor_bias.train import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")

@@ -26,7 +26,7 @@ EXTRAS: Mapping[str, Extra] = {
     "ray": Extra("steadypose clean --ray, on a cluster", ("ray",)),
     "ros2": Extra("the ROS 2 bridge, and skeletons from ROS 2 topics", ("cyclonedds",)),
     "ros2-test": Extra("the tests of ROS 2", ("rclpy",)),
-    "train": Extra("steadypose train and evaluate", ("torch", "roma", "sklearn")),
+    "train": Extra("steadypose train, fit and evaluate", ("torch", "roma", "sklearn")),
     "view": Extra("the picture in the browser, and steadypose plot", ("rerun", "matplotlib")),
     "webcam": Extra("a webcam as the source", ("mediapipe",)),
 }

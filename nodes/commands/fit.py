@@ -1,0 +1,242 @@
+"""``steadypose fit``: test-time optimisation of one recording (HuMoR, section 4)."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+
+from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.types import JOINTS, Message, PoseRaw
+from steadypose.nodes.commands.cleaning import check_replaceable, stream
+from steadypose.nodes.commands.fitting import Fit, bodies_seen, fit_body, ground_plane, rewritten
+from steadypose.nodes.commands.key_points import arrays_of_fit, fit_key_points, has_key_points, read_key_points
+from steadypose.nodes.graph.extras import require_extra
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sinks.recorder import LogTimes
+from steadypose.nodes.sources.npz import NpzError
+from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.clean.adapt import SensorFrame
+
+Floats = NDArray[np.float64]
+
+
+def fit(
+    source: Annotated[Path, tyro.conf.arg(name="in", metavar="IN")],
+    out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
+    weights: Annotated[str, tyro.conf.arg(metavar="NAME")] = "default",
+    delay: Annotated[int, tyro.conf.arg(metavar="K")] = 8,
+    force: bool = False,
+) -> int:
+    """Fit a motion to a recording, with all of it in view: what `clean` cannot do while frames come in.
+
+    Starts from what `clean` says, and moves poses, bones and floor until joints lie where they were seen, every step is
+    one that people take, and feet that stand stay where they are (HuMoR). Takes seconds for a second of a body; what
+    is done is kept, so that the same call goes on where it was stopped. Where a fit fails, what `clean` said stays,
+    flagged as an anomaly.
+
+    An .npz may hold, instead of positions, what one camera saw of one person: `keypoints` (T, J, 2) pixels, skeleton,
+    fps or stamp_ns, `focal` and `centre` in pixels, and where known confidence (T, J), `up` (-y, a level camera, unless
+    given) and `camera_height` in metres. Beside either, `points` (T, N, 3) metres of the body's surface, in the same
+    frame, from a depth camera.
+
+    Beside OUT lie OUT's name with .misfit.npz, what stays unexplained of each joint and frame, with bones and ground,
+    and with .fit.png, a picture of it.
+
+    Args:
+        source: a recording, a .csv or .npz, as for `clean`; or an .npz with key points.
+        out: the recording to make, or .npz with one row for each row of the input; of key points, .npz at 30 Hz.
+        weights: of the model of transitions: 'default', or a .safetensors file.
+        delay: frames that `clean` waits for, from whose answer the fit starts.
+        force: replace what is at OUT, if it is a recording or an .npz.
+    """
+    if not source.exists():
+        raise LaunchError(f"{source} does not exist: expected a recording, an .npz or a .csv")
+    if source.resolve() == out.resolve():
+        raise LaunchError(f"{out}: expected another path than the input's; nothing is fitted in place")
+    if not out.resolve().parent.is_dir():
+        raise LaunchError(f"{out}: expected its folder {out.resolve().parent} to exist; make it first")
+    if os.path.lexists(out):
+        if not force:
+            raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
+        check_replaceable(out, to_npz=out.suffix == ".npz")
+    two_d = has_key_points(source)
+    if two_d and out.suffix != ".npz":
+        raise LaunchError(f"{out}: expected an .npz, for key points have no recording to go with; got {out.name}")
+    require_extra("train")
+    import torch
+
+    from steadypose.prior.models.humor.network import HumorConfig, HumorNet
+    from steadypose.prior.models.torch_weights import load_network
+
+    torch.set_num_threads(max((os.cpu_count() or 2) // 2, 1))
+    model = load_network(HumorNet, HumorConfig.from_dict, weights, "humor")
+    console, started = Console(stderr=True), time.perf_counter()
+    folder = out.with_name(f".{out.name}.fit")
+    folder.mkdir(exist_ok=True)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        frames, lines = (_fit_picture if two_d else _fit_poses)(source, out, model, folder, delay, progress)
+    shutil.rmtree(folder)
+    spent = time.perf_counter() - started
+    console.print(f"{out}: {frames} frames, fitted in {spent:.1f} s", highlight=False, soft_wrap=True)
+    for line in lines:
+        console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
+    return 0
+
+
+def _fit_poses(
+    source: Path, out: Path, model: Any, folder: Path, delay: int, progress: Progress
+) -> tuple[int, list[str]]:
+    """Of joints in space, by way of the nodes' own pipelines."""
+    from steadypose.nodes.graph.prior_node import make_prior
+    from steadypose.nodes.graph.trajectory_node import make_trajectory
+    from steadypose.prior.offline.solve import FitSettings
+    from steadypose.prior.offline.windows import LEAST_FRAMES, window_bounds
+
+    frames = open_recording(source)
+    points = _points(source, len(frames))
+    messages = list(stream(frames, make_prior({"delay": delay}), make_trajectory({})))
+    bodies = bodies_seen(messages, LEAST_FRAMES)
+    if not bodies:
+        raise LaunchError(
+            f"{source}: expected somebody who is seen for {LEAST_FRAMES} frames or more, found nobody; is the skeleton "
+            "right, are the units metres? `steadypose info` says what it holds"
+        )
+    stamps = np.array([m.stamp_ns for _, m in messages if isinstance(m, PoseRaw) and not m.end_of_stream], np.int64)
+    total = sum(len(window_bounds(len(seen.bodies))) for seen in bodies)
+    bar = progress.add_task(source.name, total=total)
+    fits = []
+    for number, seen in enumerate(bodies):
+        own = folder / f"{number:04d}"
+        own.mkdir(exist_ok=True)
+        near = None if points is None else points[np.abs(stamps[None] - seen.stamps_ns[:, None]).argmin(axis=1)]
+        if near is not None:
+            near = np.stack([
+                SensorFrame.of(message.sensor_pose).to_world(frame)
+                for message, frame in zip(seen.clean, near, strict=True)
+            ])  # fmt: skip
+        fits.append(fit_body(model, seen, near, FitSettings(), own, lambda: progress.advance(bar)))
+    fitted = rewritten(messages, fits)
+    _write(out, folder, fitted, stamps, fits)
+    _explain(out, [(fit.seen.id, fit.seen.stamps_ns, fit.misfit, fit.track) for fit in fits], "m")
+    return len(stamps), [_line(fit) for fit in fits]
+
+
+def _line(fit: Fit) -> str:
+    who = f"body {fit.seen.id}, {len(fit.misfit)} frames"
+    if fit.track is None:
+        return f"{who}: not explained, left as `clean` has it and flagged"
+    known = fit.misfit[np.isfinite(fit.misfit)]
+    far = f"; joints seen lie {np.median(known) * 1e3:.0f} mm off in the median" if len(known) else ""
+    return f"{who}: floor at {fit.track.ground[:, 0].mean():.3f} m{far}"
+
+
+def _fit_picture(
+    source: Path, out: Path, model: Any, folder: Path, delay: int, progress: Progress
+) -> tuple[int, list[str]]:
+    """Of key points."""
+    from steadypose.prior.offline.solve import FitSettings
+    from steadypose.prior.offline.windows import LEAST_FRAMES, window_bounds
+
+    recording = read_key_points(source)
+    frames = len(recording.stamps_ns)
+    if frames < LEAST_FRAMES:
+        raise NpzError(f"{source}: expected {LEAST_FRAMES} frames at 30 Hz or more, got {frames}")
+    bar = progress.add_task(source.name, total=len(window_bounds(frames)))
+    track = fit_key_points(model, recording, FitSettings(), folder, lambda: progress.advance(bar))
+    part = folder / out.name
+    arrays: dict[str, Any] = _added(arrays_of_fit(recording, track), track)
+    np.savez(part, **arrays)
+    part.replace(out)
+    misfit = track.misfit[0]
+    _explain(out, [(0, recording.stamps_ns, misfit, track)], "pixels")
+    return frames, [f"key points lie {np.nanmedian(misfit):.1f} pixels off in the median"]
+
+
+def _points(source: Path, frames: int) -> Floats | None:
+    """(T, N, 3) metres of an .npz that has points of the surface."""
+    if source.suffix != ".npz":
+        return None
+    with np.load(source, allow_pickle=False) as file:
+        if "points" not in file:
+            return None
+        points = np.asarray(file["points"], dtype=np.float64)
+    if points.ndim != 3 or len(points) != frames or points.shape[-1] != 3:
+        raise NpzError(
+            f"{source}: points: expected ({frames}, N, 3) metres, NaN for what is missing, got {points.shape}"
+        )
+    return points
+
+
+def _added(arrays: dict[str, NDArray[Any]], track: Any) -> dict[str, NDArray[Any]]:
+    """With what belongs to one person and the place: of several, .misfit.npz has it for each."""
+    bones = np.linalg.norm(track.offsets.mean(axis=0), axis=-1)
+    return arrays | {"bone_lengths": bones, "ground_plane": ground_plane(track.ground.mean(axis=0))}
+
+
+def _write(
+    out: Path,
+    folder: Path,
+    messages: Sequence[tuple[str, Message]],
+    stamps: NDArray[np.int64],
+    fits: Sequence[Fit],
+) -> None:
+    """The output is there whole, or not at all."""
+    part = folder / out.name
+    if out.suffix == ".npz":
+        collector = NpzCollector()
+        for _, message in messages:
+            collector.add(message)
+        arrays: dict[str, Any] = collector.arrays(stamps)
+        tracks = {fit.seen.id: fit.track for fit in fits if fit.track is not None}
+        if len(tracks) == 1:
+            arrays = _added(arrays, next(iter(tracks.values())))
+        np.savez(part, **arrays)
+    else:
+        log_times = LogTimes()
+        if part.exists():
+            shutil.rmtree(part)
+        with RecordingWriter(part) as writer:
+            for topic, message in messages:
+                writer.write(topic, message, log_times.next(topic, message.stamp_ns))
+        if out.exists():
+            shutil.rmtree(out)
+    part.replace(out)
+
+
+def _explain(out: Path, fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit: str) -> None:
+    """What stays unexplained, as arrays and as a picture."""
+    arrays: dict[str, Any] = {"joint_names": np.array(JOINTS), "unit": np.array(unit)}
+    for number, (body, stamps, misfit, track) in enumerate(fits):
+        arrays |= {f"{number}/body_id": np.array(body), f"{number}/stamp_ns": stamps, f"{number}/misfit": misfit}
+        if track is not None:
+            arrays |= {f"{number}/offsets": track.offsets, f"{number}/ground": track.ground}
+            arrays |= {f"{number}/energies": track.energies}
+    np.savez(out.with_name(f"{out.name}.misfit.npz"), **arrays)
+    _picture(out.with_name(f"{out.name}.fit.png"), fits, unit)
+
+
+def _picture(path: Path, fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit: str) -> None:
+    from matplotlib.figure import Figure
+
+    shown = fits[:6]
+    figure = Figure(figsize=(9, 1.2 + 2.6 * len(shown)), layout="constrained")
+    for axis, (body, stamps, misfit, _) in zip(figure.subplots(len(shown), 1, squeeze=False)[:, 0], shown, strict=True):
+        seconds = (stamps[[0, -1]] - fits[0][1][0]) * 1e-9
+        image = axis.imshow(
+            misfit.T, aspect="auto", interpolation="nearest", extent=(*seconds, len(JOINTS) - 0.5, -0.5), cmap="magma"
+        )
+        axis.set_yticks(range(len(JOINTS)), JOINTS, fontsize=5)
+        axis.set(title=f"body {body}: how far joints lie from where they were seen, {unit}", xlabel="seconds")
+        figure.colorbar(image, ax=axis)
+    figure.savefig(path, dpi=110)

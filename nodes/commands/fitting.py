@@ -1,0 +1,232 @@
+"""How one recording is fitted offline: what the nodes make of it is where test-time optimisation begins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import CleanBody, JointState, Message, PoseClean, PoseWorld, WorldBody
+from steadypose.nodes.graph.clock import FRAME_NS
+from steadypose.prior.body.bone_lengths import estimate_offsets
+from steadypose.prior.body.inverse_kinematics import solve_rotations
+from steadypose.prior.body.kinematics import REST_HEIGHT, quaternions
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.adapt import SensorFrame
+
+if TYPE_CHECKING:
+    from steadypose.prior.models.humor.network import HumorNet
+    from steadypose.prior.offline.solve import FitSettings
+    from steadypose.prior.offline.windows import FittedTrack, Track
+
+Floats = NDArray[np.float64]
+
+LEAST_SIGMA = 0.01
+"""Metres: no sensor means the joints that our bones end in to less."""
+
+LOWEST = 5.0
+"""Per cent of frames in which the lower foot is taken to stand on the floor, where the floor is not known."""
+
+WORSE, WORSE_M = 2.0, 0.02
+"""A fit whose median misfit is larger than so many times that of ``pose/clean``, and by so many metres more, has
+failed."""
+
+_MEDIAN_NORM, _THIRD = 1.538, np.sqrt(20.0)
+"""Of the median length of a normal vector in space, and of the deviation of third differences of white noise."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One body for as long as it was seen without a gap, at 30 Hz.
+
+    Attributes:
+        id: of the body.
+        clean: (T,) messages, of which it is a part.
+        bodies: (T,) what ``pose/clean`` says of it.
+        calibrated: whether the world's floor is at 0.
+    """
+
+    id: int
+    clean: Sequence[PoseClean]
+    bodies: Sequence[CleanBody]
+    calibrated: bool
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(T,)"""
+        return np.array([message.stamp_ns for message in self.clean])
+
+    def in_world(self, name: str) -> Floats:
+        """(T, 22, 3) metres: positions or raw positions, z up."""
+        return np.stack([
+            SensorFrame.of(message.sensor_pose).to_world(np.asarray(getattr(body, name), dtype=np.float64))
+            for message, body in zip(self.clean, self.bodies, strict=True)
+        ])  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What came of a body.
+
+    Attributes:
+        seen: of which.
+        track: the fit; None where it failed and ``pose/clean`` stays.
+        misfit: (T, 22) metres or pixels that stay unexplained; NaN where a joint was not seen.
+    """
+
+    seen: Seen
+    track: FittedTrack | None
+    misfit: Floats
+
+
+def bodies_seen(messages: Sequence[tuple[str, Message]], least: int) -> list[Seen]:
+    """Every body of a cleaned stream, for as long as it was there without a gap, at least so many frames."""
+    found: list[Seen] = []
+    of_body: dict[int, list[tuple[PoseClean, CleanBody]]] = {}
+    for _, message in messages:
+        if isinstance(message, PoseClean):
+            for body in message.bodies:
+                of_body.setdefault(body.id, []).append((message, body))
+    for number, rows in of_body.items():
+        stamps = np.array([message.stamp_ns for message, _ in rows])
+        cuts = np.flatnonzero(np.diff(stamps) > 1.5 * FRAME_NS) + 1
+        for first, last in zip([0, *cuts], [*cuts, len(rows)], strict=True):
+            clean, bodies = zip(*rows[first:last], strict=True)
+            if last - first >= least and np.isfinite([body.positions for body in bodies]).all():
+                found.append(Seen(number, clean, bodies, clean[0].calibrated))
+    return found
+
+
+def track_of(seen: Seen, points: Floats | None) -> Track:
+    """What is to be fitted of a body, from where ``pose/clean`` left it.
+
+    Args:
+        seen: the body.
+        points: (T, N, 3) metres, world, of its surface, NaN where there are fewer; None where there are none.
+    """
+    import torch
+
+    from steadypose.prior.offline.observations import Observed, SeenJoints, SurfacePoints
+    from steadypose.prior.offline.solve import Start
+    from steadypose.prior.offline.windows import Track
+
+    def tensor(values: Floats) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values)).float()
+
+    positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
+    offsets = estimate_offsets(positions)
+    start = Start(
+        tensor(positions[:, 0]), tensor(solve_rotations(positions, offsets)), tensor(offsets),
+        0.0 if seen.calibrated else lowest_floor(positions), seen.calibrated,
+    )  # fmt: skip
+    confidence = np.clip(np.stack([body.raw_confidence for body in seen.bodies]), 0.05, 1.0)
+    sigma = noise_of(raw) / np.sqrt(confidence)
+    observed: list[Observed] = [SeenJoints(tensor(raw), tensor(sigma))]
+    if points is not None:
+        observed.append(SurfacePoints(tensor(points)))
+    return Track([start], observed)
+
+
+def lowest_floor(positions: Floats) -> float:
+    """Metres: where the floor lies if the lower foot stands on it in the lowest few frames of (T, 22, 3)."""
+    feet = [J[f"{side}_foot"] for side in ("left", "right")]
+    rest = REST_HEIGHT[4]
+    return float(np.percentile(positions[:, feet, 2].min(axis=1), LOWEST) - rest)
+
+
+def noise_of(raw: Floats) -> float:
+    """Metres along an axis, of joints (T, 22, 3), by third differences, which motion hardly has."""
+    third = np.linalg.norm(np.diff(raw, n=3, axis=0), axis=-1)
+    third = third[np.isfinite(third)]
+    return max(float(np.median(third)) / _MEDIAN_NORM / float(_THIRD), LEAST_SIGMA) if len(third) else LEAST_SIGMA
+
+
+def fit_body(
+    model: HumorNet,
+    seen: Seen,
+    points: Floats | None,
+    settings: FitSettings,
+    folder: Path | None,
+    advanced: Callable[[], None] = lambda: None,
+) -> Fit:
+    """Fit one body; where that fails, ``pose/clean`` stays, and its anomaly is flagged."""
+    from steadypose.prior.offline.windows import fit_track
+
+    fitted = fit_track(model, track_of(seen, points), settings, folder, advanced=advanced)
+    misfit = fitted.misfit[0]
+    before = np.linalg.norm(seen.in_world("positions") - seen.in_world("raw_positions"), axis=-1)
+    known = np.isfinite(before)
+    if not np.isfinite(fitted.joints).all() or (
+        known.any() and np.median(misfit[known]) > WORSE * np.median(before[known]) + WORSE_M
+    ):
+        return Fit(seen, None, before)
+    return Fit(seen, fitted, misfit)
+
+
+def rewritten(messages: Sequence[tuple[str, Message]], fits: Sequence[Fit]) -> list[tuple[str, Message]]:
+    """The messages of a cleaned stream with what was fitted in place of what the nodes said."""
+    clean: dict[tuple[int, int], CleanBody] = {}
+    world: dict[tuple[int, int], tuple[Fit, int]] = {}
+    planes: dict[int, Floats] = {}
+    for fit in fits:
+        for row, (message, body) in enumerate(zip(fit.seen.clean, fit.seen.bodies, strict=True)):
+            key = message.stamp_ns, body.id
+            if fit.track is None:
+                clean[key] = replace(body, anomaly_flag=True)
+                continue
+            clean[key] = _fitted_clean(fit.track, row, message, body)
+            world[key] = fit, row
+            planes[message.stamp_ns] = ground_plane(fit.track.ground.mean(axis=0))
+    out: list[tuple[str, Message]] = []
+    for topic, message in messages:
+        if isinstance(message, PoseClean):
+            message = replace(message, bodies=[clean.get((message.stamp_ns, body.id), body) for body in message.bodies])
+        elif isinstance(message, PoseWorld):
+            bodies = [
+                _fitted_world(*world[key], body) if (key := (message.stamp_ns, body.id)) in world else body
+                for body in message.bodies
+            ]
+            plane = planes.get(message.stamp_ns, message.ground_plane)
+            message = replace(message, bodies=bodies, ground_plane=plane)
+        out.append((topic, message))
+    return out
+
+
+def ground_plane(ground: Floats) -> Floats:
+    """(4,) as in `PoseWorld`, of a height and two tilts."""
+    from scipy.spatial.transform import Rotation
+
+    normal = Rotation.from_rotvec([ground[1], ground[2], 0.0]).as_matrix()[:, 2]
+    return np.array([*normal, -normal[2] * ground[0]])
+
+
+def _fitted_clean(track: FittedTrack, row: int, message: PoseClean, body: CleanBody) -> CleanBody:
+    sensor = SensorFrame.of(message.sensor_pose)
+    rotations = track.rotations[row].copy()
+    rotations[0] = sensor.rotation.T @ rotations[0]
+    state = np.where(body.state == JointState.SEEN, JointState.REFINED, body.state)
+    return replace(
+        body,
+        positions=sensor.from_world(track.joints[row]),
+        rotations=quaternions(rotations),
+        state=state,
+        bone_lengths=np.linalg.norm(track.offsets.mean(axis=0), axis=-1),
+    )
+
+
+def _fitted_world(fit: Fit, row: int, body: WorldBody) -> WorldBody:
+    track = fit.track
+    assert track is not None
+    joints = track.joints
+    around = slice(max(row - 1, 0), row + 2)
+    velocity = np.gradient(joints[around, 0], 1e-9 * FRAME_NS, axis=0)[min(row, 1)]
+    turned = quaternions(track.rotations[row])
+    load = body.contacts if np.isnan(track.load[row]).any() else track.load[row]
+    return replace(
+        body, root_position=joints[row, 0], root_orientation=turned[0], root_velocity=velocity, positions=joints[row],
+        rotations=turned, contacts=load,
+    )  # fmt: skip

@@ -1,0 +1,210 @@
+"""Key points of a picture as ``.npz``, with the camera that took it: what ``steadypose fit`` lifts to a motion.
+
+In: ``keypoints`` (T, J, 2) pixels, NaN where not found; ``skeleton``, a name; ``stamp_ns`` (T,) or ``fps``; ``focal``,
+pixels, one number or two; ``centre`` (2,) pixels; and where known ``confidence`` (T, J) in 0..1, ``up``, the axis of
+the camera that points up (``-y``, a level camera, unless given), ``camera_height``, metres above the floor, and
+``points`` (T, N, 3) metres in the camera's frame, of the body's surface, from a depth camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import JOINTS, JointState, Pose
+from steadypose.nodes.graph.clock import FRAME_NS
+from steadypose.nodes.sources.npz import NpzError
+from steadypose.prior.body.kinematics import quaternions, rotation_matrix
+from steadypose.prior.body.layouts import SKELETONS
+from steadypose.prior.body.skeleton import REST_OFFSETS
+
+if TYPE_CHECKING:
+    from steadypose.prior.models.humor.network import HumorNet
+    from steadypose.prior.offline.solve import FitSettings
+    from steadypose.prior.offline.windows import FittedTrack, Track
+
+Floats = NDArray[np.float64]
+
+PIXEL_SIGMA = 0.01
+"""Of the focal length: what a key point is off by in the picture."""
+
+CAMERA_HEIGHT, CAMERA_HEIGHT_SIGMA = 1.3, 0.3
+"""Metres above the floor at which a camera hangs of which that is not known."""
+
+LONGEST_GAP_NS = 200_000_000
+"""over which key points are interpolated"""
+
+
+@dataclass(frozen=True)
+class KeyPointRecording:
+    """One person's key points at the times of a 30 Hz grid, in canonical joints.
+
+    Attributes:
+        stamps_ns: (T,) of the grid.
+        pixels: (T, 22, 2); NaN where not found.
+        confidence: (T, 22).
+        focal: (2,) pixels.
+        centre: (2,) pixels.
+        rotation: (3, 3) from the camera's frame to one that is z up.
+        camera_height: metres; None where not known.
+        points: (T, N, 3) metres, in the camera's frame; None where there are none.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    pixels: Floats
+    confidence: Floats
+    focal: Floats
+    centre: Floats
+    rotation: Floats
+    camera_height: float | None
+    points: Floats | None
+
+
+def has_key_points(path: Path) -> bool:
+    """Whether an ``.npz`` holds key points of a picture, not positions."""
+    if path.suffix != ".npz" or not path.is_file():
+        return False
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return "keypoints" in file and "positions" not in file
+    except (OSError, ValueError):
+        return False
+
+
+def read_key_points(path: Path) -> KeyPointRecording:
+    """Read and check it.
+
+    Raises:
+        NpzError: an array is missing, or has the wrong form; says what was expected.
+    """
+    with np.load(path, allow_pickle=False) as file:
+        arrays: dict[str, NDArray[Any]] = dict(file)
+    missing = [name for name in ("skeleton", "focal", "centre") if name not in arrays]
+    if missing:
+        raise NpzError(f"{path}: expected {', '.join(missing)} beside keypoints; it has {', '.join(arrays)}")
+    name = str(arrays["skeleton"])
+    if name not in SKELETONS:
+        raise NpzError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {name!r}")
+    layout, keypoints = SKELETONS[name], np.asarray(arrays["keypoints"], dtype=np.float64)
+    joints = len(layout.joints)
+    if keypoints.ndim != 3 or keypoints.shape[1:] != (joints, 2) or len(keypoints) < 2:
+        raise NpzError(f"{path}: keypoints: expected (T, {joints}, 2) pixels for {name}, T of 2 or more, got "
+                       f"{keypoints.shape}")  # fmt: skip
+    confidence = np.asarray(arrays.get("confidence", np.ones(keypoints.shape[:2])), dtype=np.float64)
+    focal = np.broadcast_to(np.asarray(arrays["focal"], dtype=np.float64).ravel(), (2,))
+    centre = np.asarray(arrays["centre"], dtype=np.float64).ravel()
+    for what, value, fits in (
+        ("confidence", confidence, confidence.shape == keypoints.shape[:2]),
+        ("focal", focal, bool((focal > 0).all())),
+        ("centre", centre, centre.shape == (2,)),
+    ):
+        if not fits or not np.isfinite(value).all():
+            raise NpzError(
+                f"{path}: {what}: expected finite numbers, of each key point, or of x and y; got {value!r:.80}"
+            )
+    try:
+        pose = Pose.from_up(str(arrays.get("up", "-y")))
+    except ValueError as error:
+        raise NpzError(f"{path}: {error}") from error
+    stamps = _stamps(path, arrays, len(keypoints))
+    weights = layout.to_canonical
+    pixels = np.einsum("cj,tjx->tcx", weights, np.nan_to_num(keypoints))
+    found = np.isfinite(keypoints).all(axis=-1)
+    needed = weights > 0
+    sure = np.where(needed, np.where(found, confidence, 0.0)[:, None], np.inf).min(axis=-1)
+    sure = np.where(needed.any(axis=1), sure, 0.0)
+    pixels[sure <= 0] = np.nan
+    grid = np.arange(stamps[0], stamps[-1] + 1, FRAME_NS, dtype=np.int64)
+    nearest = np.abs(stamps[None] - grid[:, None]).argmin(axis=1)
+    points = arrays.get("points")
+    if points is not None and (points.ndim != 3 or points.shape[0] != len(stamps) or points.shape[2] != 3):
+        raise NpzError(f"{path}: points: expected ({len(stamps)}, N, 3) metres, got {points.shape}")
+    return KeyPointRecording(
+        grid, *_on_grid(pixels, sure, stamps, grid, nearest), focal, centre, rotation_matrix(pose.orientation),
+        float(arrays["camera_height"]) if "camera_height" in arrays else None,
+        None if points is None else np.asarray(points, dtype=np.float64)[nearest],
+    )  # fmt: skip
+
+
+def _stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:
+    if "stamp_ns" in arrays and arrays["stamp_ns"].shape == (frames,):
+        stamps = arrays["stamp_ns"].astype(np.int64)
+        if (np.diff(stamps) > 0).all():
+            return stamps
+    elif "fps" in arrays and float(arrays["fps"]) > 0:
+        return np.round(np.arange(frames) * (1e9 / float(arrays["fps"]))).astype(np.int64)
+    raise NpzError(f"{path}: expected fps, or stamp_ns ({frames},) that grow; got {', '.join(arrays)}")
+
+
+def _on_grid(
+    pixels: Floats, sure: Floats, stamps: NDArray[np.int64], grid: NDArray[np.int64], nearest: NDArray[np.intp]
+) -> tuple[Floats, Floats]:
+    """Interpolated between neighbours that both have a key point, if they are near in time."""
+    after = np.clip(np.searchsorted(stamps, grid, side="right"), 1, len(stamps) - 1)
+    span = stamps[after] - stamps[after - 1]
+    share = np.where(span > 0, (grid - stamps[after - 1]) / np.maximum(span, 1), 0.0)[:, None, None]
+    mixed = (1 - share) * pixels[after - 1] + share * pixels[after]
+    mixed[span > LONGEST_GAP_NS] = np.nan
+    return np.where(np.isfinite(mixed), mixed, pixels[nearest]), sure[nearest]
+
+
+def track_of_key_points(recording: KeyPointRecording) -> Track:
+    """What is to be fitted, from two bodies at rest."""
+    import torch
+
+    from steadypose.prior.offline.lift import starts_of_key_points
+    from steadypose.prior.offline.observations import KeyPoints, Observed, Pinhole, SurfacePoints
+    from steadypose.prior.offline.windows import Track
+
+    def tensor(values: Floats) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values)).float()
+
+    camera = Pinhole(tensor(recording.focal), tensor(recording.centre), tensor(recording.rotation), torch.zeros(3))
+    floor = -(recording.camera_height or CAMERA_HEIGHT)
+    sigma = PIXEL_SIGMA * float(recording.focal.mean())
+    observed: list[Observed] = [KeyPoints(tensor(recording.pixels), tensor(recording.confidence), camera, sigma)]
+    if recording.points is not None:
+        observed.append(SurfacePoints(tensor(recording.points @ recording.rotation.T)))
+    return Track(starts_of_key_points(recording.pixels, camera, REST_OFFSETS, floor), observed)
+
+
+def fit_key_points(
+    model: HumorNet,
+    recording: KeyPointRecording,
+    settings: FitSettings,
+    folder: Path | None,
+    advanced: Callable[[], None] = lambda: None,
+) -> FittedTrack:
+    """Fit one person."""
+    from steadypose.prior.offline.windows import fit_track
+
+    if recording.camera_height is None:
+        settings = replace(settings, ground_height_sigma=CAMERA_HEIGHT_SIGMA)
+    return fit_track(model, track_of_key_points(recording), settings, folder, advanced=advanced)
+
+
+def arrays_of_fit(recording: KeyPointRecording, track: FittedTrack) -> dict[str, NDArray[Any]]:
+    """As ``steadypose clean`` writes them, in the camera's frame, at 30 Hz; of deviations and anomalies, none."""
+    rotations = track.rotations.copy()
+    rotations[:, 0] = recording.rotation.T @ rotations[:, 0]
+    seen = np.asarray(np.isfinite(recording.pixels).all(axis=-1))
+    unknown = np.full(seen.shape, np.nan, dtype=np.float32)
+    return {
+        "stamp_ns": recording.stamps_ns,
+        "positions": (track.joints @ recording.rotation).astype(np.float32),
+        "rotations": quaternions(rotations).astype(np.float32),
+        "state": np.where(seen, JointState.REFINED, JointState.IMPUTED).astype(np.uint8),
+        "sigma": unknown,
+        "anomaly": unknown[:, 0].astype(np.float64),
+        "anomaly_flag": np.zeros(len(seen), dtype=bool),
+        "joint_anomaly": unknown,
+        "contacts": track.load.astype(np.float32),
+        "root_velocity": np.gradient(track.joints[:, 0], FRAME_NS * 1e-9, axis=0),
+        "world_positions": track.joints.astype(np.float32),
+        "joint_names": np.array(JOINTS),
+    }

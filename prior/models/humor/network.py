@@ -1,0 +1,211 @@
+"""The transition model: a conditional VAE of the next state given this one (HuMoR, section 3, equations 1 to 4).
+
+Encoder and prior say of a step which latent it takes, the decoder what the latent does to the state. What this differs
+in from the paper: joints and velocities follow from root, rotations and bones (`state`), features are standardised,
+networks are half as wide, and contact has two labels, load and rest.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from steadypose.prior.body.kinematics import CONTACT_JOINTS
+from steadypose.prior.models.humor.state import (
+    CHANGE,
+    FEATURES,
+    JOINT_COUNT,
+    State,
+    canonical,
+    features,
+    moved_by,
+    placed,
+    posed,
+)  # fmt: skip
+
+GROUPS = 16
+"""of the group normalisation"""
+
+STEP_SCALE = 0.02
+"""Metres and radians: what a decoder's output of 1 stands for, about a deviation of what a frame changes."""
+
+LOG_VARIANCES = (-10.0, 6.0)
+"""The official code bounds them not at all, and drops steps that are not numbers without a word."""
+
+POSE = 3 + 6 * JOINT_COUNT
+"""Outputs of a decoder that says the next pose, not the change: root, and two columns of each rotation."""
+
+
+@dataclass(frozen=True)
+class HumorConfig:
+    """Sizes, and what the ablations leave out.
+
+    Attributes:
+        latent: numbers of a transition.
+        hidden: width of the hidden layers.
+        learned_prior: whether the prior reads the state; else it is N(0, I), as in a Motion VAE.
+        residual: whether the decoder says the change of the state; else the next pose itself.
+        contacts: whether it says contacts.
+        components: of the mixture of initial states.
+    """
+
+    latent: int = 48
+    hidden: int = 512
+    learned_prior: bool = True
+    residual: bool = True
+    contacts: bool = True
+    components: int = 12
+
+    @classmethod
+    def from_dict(cls, config: dict[str, Any]) -> HumorConfig:
+        """From the JSON of a weights file."""
+        return cls(**config)
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """Diagonal, of latents.
+
+    Attributes:
+        mean: (..., latent).
+        log_variance: the same shape.
+    """
+
+    mean: Tensor
+    log_variance: Tensor
+
+    @property
+    def sigma(self) -> Tensor:
+        """(..., latent) deviations."""
+        return (0.5 * self.log_variance).exp()
+
+    def sample(self, generator: torch.Generator | None = None) -> Tensor:
+        """One draw of each."""
+        return self.mean + self.sigma * torch.randn(self.mean.shape, generator=generator)
+
+    def divergence(self, other: Gaussian) -> Tensor:
+        """(...) nats, of this one from ``other``."""
+        spread = (self.log_variance - other.log_variance).exp()
+        off = (self.mean - other.mean).square() * (-other.log_variance).exp()
+        return 0.5 * (spread + off - 1.0 - (self.log_variance - other.log_variance)).sum(dim=-1)
+
+
+class HumorNet(nn.Module):
+    """The three networks, and the mixture of initial states beside them (`initial`).
+
+    Buffers:
+        mean, scale: (`FEATURES`,) what features are standardised by.
+        mixture_log_weights (K,), mixture_means (K, 133), mixture_precisions (K, 133, 133): of standardised
+            `pose_features`, the last the Cholesky factors of the inverse covariances.
+    """
+
+    mean: Tensor
+    scale: Tensor
+    mixture_log_weights: Tensor
+    mixture_means: Tensor
+    mixture_precisions: Tensor
+
+    def __init__(self, config: HumorConfig) -> None:
+        super().__init__()
+        self.config = config
+        latent, hidden = config.latent, config.hidden
+        self.encoder = _perceptron([2 * FEATURES, hidden, hidden, 2 * latent])
+        self.prior = _perceptron([FEATURES, hidden, hidden, 2 * latent]) if config.learned_prior else None
+        outputs = (CHANGE if config.residual else POSE) + 2 * len(CONTACT_JOINTS) * config.contacts
+        self.decoder = Decoder([FEATURES, hidden, hidden, hidden // 2, outputs], latent)
+        known = 1 + FEATURES - 3 - 6 * JOINT_COUNT
+        self.register_buffer("mean", torch.zeros(FEATURES))
+        self.register_buffer("scale", torch.ones(FEATURES))
+        self.register_buffer("mixture_log_weights", torch.zeros(config.components))
+        self.register_buffer("mixture_means", torch.zeros(config.components, known))
+        self.register_buffer("mixture_precisions", torch.eye(known).expand(config.components, -1, -1).clone())
+
+    def standardised(self, told: Tensor) -> Tensor:
+        """`features` (..., `FEATURES`) as the networks take them."""
+        return (told - self.mean) / self.scale
+
+    def expected(self, told: Tensor) -> Gaussian:
+        """p(z | x): of standardised features of states (..., `FEATURES`) in their own frames."""
+        if self.prior is None:
+            zero = told.new_zeros(*told.shape[:-1], self.config.latent)
+            return Gaussian(zero, zero)
+        return _gaussian(self.prior(told))
+
+    def inferred(self, told: Tensor, following: Tensor) -> Gaussian:
+        """q(z | x, x'): of these and of the states that follow, in the same frames."""
+        return _gaussian(self.encoder(torch.cat([told, following], dim=-1)))
+
+    def decoded(self, state: State, told: Tensor, latent: Tensor, offsets: Tensor) -> tuple[State, Tensor]:
+        """The state that follows on canonical states, in their frames, and logits of contacts (..., 16).
+
+        Args:
+            state: (...) canonical.
+            told: (..., `FEATURES`) their features, standardised.
+            latent: (..., latent).
+            offsets: (..., 22, 3) metres, bones.
+        """
+        said = self.decoder(told, latent)
+        if self.config.residual:
+            step, logits = said[..., :CHANGE] * STEP_SCALE, said[..., CHANGE:]
+            return moved_by(state, step, offsets), logits
+        pose, logits = said[..., :POSE], said[..., POSE:]
+        mean, scale = self.mean[:POSE], self.scale[:POSE]
+        pose = pose * scale + mean
+        return posed(state, pose[..., :3], _orthonormal(pose[..., 3:]), offsets), logits
+
+    def step(self, state: State, latent: Tensor, offsets: Tensor) -> tuple[State, Tensor]:
+        """The states that follow on any states (...) with these latents, and logits of contacts."""
+        own = canonical(state, state)
+        following, logits = self.decoded(own, self.standardised(features(own)), latent, offsets)
+        return placed(following, state), logits
+
+
+class Decoder(nn.Module):
+    """A perceptron that is told the latent in front of every layer, lest it does without."""
+
+    def __init__(self, widths: list[int], latent: int) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Linear(a + latent, b) for a, b in itertools.pairwise(widths))
+        self.norms = nn.ModuleList(nn.GroupNorm(GROUPS, b) for b in widths[1:-1])
+
+    def forward(self, told: Tensor, latent: Tensor) -> Tensor:
+        x = told.reshape(-1, told.shape[-1])
+        z = latent.reshape(-1, latent.shape[-1])
+        for layer, norm in zip(self.layers, self.norms, strict=False):
+            x = torch.relu(norm(layer(torch.cat([x, z], dim=-1))))
+        x = self.layers[-1](torch.cat([x, z], dim=-1))
+        return x.reshape(*told.shape[:-1], -1)
+
+
+def _perceptron(widths: list[int]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for a, b in itertools.pairwise(widths[:-1]):
+        layers += [nn.Linear(a, b), _Groups(b), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(widths[-2], widths[-1]))
+
+
+class _Groups(nn.GroupNorm):
+    """Group normalisation of the last dimension of (..., C)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(GROUPS, channels)
+
+    def forward(self, input: Tensor) -> Tensor:
+        return super().forward(input.reshape(-1, input.shape[-1])).reshape(input.shape)
+
+
+def _gaussian(said: Tensor) -> Gaussian:
+    mean, log_variance = said.chunk(2, dim=-1)
+    return Gaussian(mean, log_variance.clamp(*LOG_VARIANCES))
+
+
+def _orthonormal(columns: Tensor) -> Tensor:
+    """Rotations (..., 22, 3, 3) of two columns each (..., 132), by Gram and Schmidt."""
+    first, second = columns.unflatten(-1, (JOINT_COUNT, 2, 3)).unbind(dim=-2)
+    first = nn.functional.normalize(first, dim=-1)
+    second = nn.functional.normalize(second - (first * second).sum(dim=-1, keepdim=True) * first, dim=-1)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)

@@ -1,0 +1,292 @@
+"""Training of the transition model: ``steadypose train humor`` (HuMoR, section 3.2 and appendix B.2)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, REST_SPEED, label_contacts
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.models.humor.initial import fit_initial
+from steadypose.prior.models.humor.network import HumorConfig, HumorNet
+from steadypose.prior.models.humor.rollout import roll_out, sample, transitions
+from steadypose.prior.models.humor.state import State, canonical, choose, features, stack, states_of
+from steadypose.prior.models.torch_weights import started
+from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.weights_io import LICENCES
+from steadypose.prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations
+from steadypose.prior.timing.rate import FPS
+
+Rng = np.random.Generator
+
+STEPS = 10
+"""Steps of a training sequence."""
+
+SCALES = (0.9, 1.1)
+"""Range of factors on people's sizes."""
+
+LEAST_SPEED = 0.1
+"""m/s: a sequence is drawn as often as its feet are fast, and one that stands as if they were this fast."""
+
+KL_WEIGHT, KL_SHARE = 4e-4, 0.25
+"""As the official code: nats are summed over the latent, all other terms are means. The share of the training in which
+it grows from 0."""
+
+JOINTS_WEIGHT, ROTATIONS_WEIGHT = 100.0, 10.0
+"""Of square metres and of square entries of rotation matrices, beside 1 of (m/s)². A velocity that is a difference
+weighs 900 times its joint: with 1, as in the paper, whose decoder says velocities by themselves, a rollout that is off
+would take half a minute to come back to where it should be; so it takes a third of a second."""
+
+CONTACT_WEIGHT, STILL_WEIGHT = 0.01, 0.01
+"""Of the contacts' cross-entropy, and of the square velocity of what rests."""
+
+TRUE_UNTIL, OWN_FROM = 0.15, 0.35
+"""Scheduled sampling: shares of the training before which each step starts from the true state, and after which each
+starts from what the step before made; between, from either by chance."""
+
+LEAST_SCALE = 0.02
+"""of a feature's deviation: some do not vary, such as where in its own frame a root stands"""
+
+_MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
+_STATES_OF_MIXTURE = 40_000
+
+
+@dataclass(frozen=True)
+class Sequences:
+    """Motion that is consistent: joints are where rotations and bones put them.
+
+    Attributes:
+        motion: as prepared.
+        load: (N, 8) labels.
+        rest: (N, 8).
+        starts: where a sequence may start.
+        chances: of each of these.
+    """
+
+    motion: MotionSet
+    load: Tensor
+    rest: Tensor
+    starts: np.ndarray
+    chances: np.ndarray
+
+    @classmethod
+    def of(cls, motion: MotionSet) -> Sequences:
+        """All of it."""
+        ends = zip(motion.clip_start, motion.clip_start[1:], strict=False)
+        clips = [motion.positions[a:b].numpy() for a, b in ends]
+        load, rest = (
+            torch.from_numpy(np.concatenate([label_contacts(clip, FPS, speed) for clip in clips]))
+            for speed in (LOAD_SPEED, REST_SPEED)
+        )
+        rows = motion.all_windows(STEPS + 2, 1)
+        feet = motion.positions[:, [J["left_ankle"], J["right_ankle"]]]
+        moved = np.concatenate([[0.0], feet.diff(dim=0).norm(dim=-1).mean(dim=1).double().cumsum(0).numpy()])
+        chances = LEAST_SPEED + (moved[rows[:, -1]] - moved[rows[:, 0]]) * FPS / (STEPS + 1)
+        return cls(motion, load, rest, rows[:, 0], chances / chances.sum())
+
+    def draw(self, count: int, steps: int, rng: Rng) -> Batch:
+        """Random sequences of ``steps + 1`` states: as other builds, half of them mirrored."""
+        first = rng.choice(self.starts, size=count, p=self.chances)
+        return self.at(first[:, None] + np.arange(steps + 2), rng)
+
+    def at(self, rows: np.ndarray, rng: Rng | None = None) -> Batch:
+        """The sequences of these frames (B, T), changed at random if ``rng`` is given."""
+        motion = self.motion
+        root, rotations = motion.positions[rows, 0], motion.rotations[rows]
+        offsets, load, rest = motion.offsets[rows[:, 0]], self.load[rows], self.rest[rows]
+        if rng is not None:
+            half = len(rows) // 2
+            size = torch.from_numpy(rng.uniform(*SCALES, (len(rows), 1, 1))).float()
+            root, offsets = root * size, offsets * size
+            root[:half] *= root.new_tensor([1.0, -1.0, 1.0])
+            rotations[:half], offsets[:half] = mirror_rotations(rotations[:half]), mirror_offsets(offsets[:half])
+            for labels in (load, rest):
+                labels[:half] = labels[:half][..., _MIRRORED_CONTACTS]
+        contacts = torch.cat([load, rest], dim=-1).float()
+        return Batch(states_of(root, rotations, offsets), offsets, contacts[:, 2:])
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B sequences of T steps.
+
+    Attributes:
+        states: (B, T + 1).
+        offsets: (B, 22, 3) metres.
+        contacts: (B, T, 16) labels of load, then of rest, after each step.
+    """
+
+    states: State
+    offsets: Tensor
+    contacts: Tensor
+
+
+def train_humor(
+    data: Path,
+    runs: Path,
+    weights: str = "default",
+    iterations: int = 6_000,
+    batch: int = 128,
+    learning_rate: float = 7e-4,
+    seed: int = 0,
+    start: str | None = None,
+) -> Path:
+    """Train the transition model on prepared motion and write weights, card and curves.
+
+    Args:
+        data: ``prepared.npz``.
+        runs: folder of training runs; a killed run of the same name resumes there.
+        weights: which set: ``default`` or ``research``.
+        iterations: optimiser steps.
+        batch: sequences of `STEPS` steps.
+        learning_rate: of Adam at the start; it falls along a cosine.
+        seed: of weights and of sampling.
+        start: weights to go on from: a set or a path.
+
+    Returns:
+        The path of the weights.
+    """
+    name = f"humor-{weights}"
+    train, val = (MotionSet.load(data, weights, split, flat=True) for split in ("train", "val"))
+    config = HumorConfig()
+    told = {
+        "Model": f"transitions of HuMoR: latent of {config.latent}, layers of {config.hidden}, "
+        f"{config.components} Gaussians of initial states",
+        "Data": data_told(weights, train, val),
+        "Licence": LICENCES[weights],
+        "Training": f"`steadypose train humor --weights {weights} --iterations {iterations}`: {batch} sequences of "
+        f"{STEPS} steps a step, Adam {learning_rate:g}, seed {seed}",
+    }  # fmt: skip
+    return fit_transitions(
+        config, train, val, runs / name / f"{name}.safetensors", told, iterations, batch, learning_rate, seed, start
+    )
+
+
+def fit_transitions(
+    config: HumorConfig,
+    train: MotionSet,
+    val: MotionSet,
+    path: Path,
+    card: dict[str, str],
+    iterations: int,
+    batch: int,
+    learning_rate: float,
+    seed: int,
+    start: str | None = None,
+    known: HumorNet | None = None,
+) -> Path:
+    """The same for any configuration and motion: what the ablations are trained by; ``path``'s folder is the run's.
+
+    ``known`` is a model whose statistics of states are taken over, which take a minute.
+    """
+    sequences, unseen = Sequences.of(train), Sequences.of(val)
+    torch.manual_seed(seed)
+    model = HumorNet(config)
+    origin = started(model, "humor", start)
+    if known is not None:
+        model.load_state_dict(dict(known.named_buffers()), strict=False)
+    elif start is None and not (path.parent / "checkpoint.pt").exists():
+        _know_states(model, sequences, seed)
+    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=learning_rate / 100)
+    run = TrainingRun(path.parent, model, schedule, iterations, evaluations=40)
+
+    def loss_of(count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        return transition_loss(model, sequences.draw(count, STEPS, rng), done, rng)
+
+    run.minimise(loss_of, lambda: evaluate_humor(model, unseen), batch, seed, clip=1.0)
+    return run.save(path, model, asdict(config), {**card, "Training": card["Training"] + origin})
+
+
+@torch.no_grad()
+def _know_states(model: HumorNet, sequences: Sequences, seed: int) -> None:
+    """Fit what is not learned by gradients: by what features are standardised, and the mixture of initial states."""
+    rng = np.random.default_rng(seed)
+    states = sequences.draw(_STATES_OF_MIXTURE, 0, rng).states[:, 0]
+    told = features(canonical(states, states))
+    model.mean.copy_(told.mean(dim=0))
+    model.scale.copy_(told.std(dim=0).clamp(min=LEAST_SCALE))
+    fit_initial(model, model.standardised(told), seed)
+
+
+def transition_loss(model: HumorNet, batch: Batch, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+    """Equation 7: reconstruction, divergence and regularisers, of steps from states as scheduled sampling has them.
+
+    Args:
+        model: in training.
+        batch: of sequences.
+        done: the share of the training.
+        rng: of which states are true.
+    """
+    own = float(np.clip((done - TRUE_UNTIL) / (OWN_FROM - TRUE_UNTIL), 0.0, 1.0))
+    true = batch.states[:, :-1]
+    before = _own_states(model, batch, own, rng) if own > 0.0 else true
+    origin, target = canonical(before, before), canonical(batch.states[:, 1:], true)
+    told, following = model.standardised(features(origin)), model.standardised(features(target))
+    prior, posterior = model.expected(told), model.inferred(told, following)
+    said, logits = model.decoded(origin, told, posterior.sample(), batch.offsets.unsqueeze(1))
+    l_root = (said.root - target.root).square().mean()
+    l_rotation = (said.rotations - target.rotations).square().mean()
+    l_joint = (said.joints - target.joints).square().mean()
+    l_velocity = (said.velocity - target.velocity).square().mean()
+    l_divergence = posterior.divergence(prior).mean()
+    warmth = min(done / KL_SHARE, 1.0)
+    loss = (
+        JOINTS_WEIGHT * (l_joint + l_root) + ROTATIONS_WEIGHT * l_rotation + l_velocity
+        + KL_WEIGHT * warmth * l_divergence
+    )  # fmt: skip
+    terms = {"L_velocity": l_velocity.item(), "KL, nats": l_divergence.item()}
+    if model.config.contacts:
+        l_contact = F.binary_cross_entropy_with_logits(logits, batch.contacts)
+        resting = torch.sigmoid(logits[..., len(CONTACT_JOINTS) :])
+        still = (resting * said.velocity[..., list(CONTACT_JOINTS), :].square().sum(dim=-1)).mean()
+        loss = loss + CONTACT_WEIGHT * l_contact + STILL_WEIGHT * still
+        terms["L_contact"] = l_contact.item()
+    return loss, terms
+
+
+@torch.no_grad()
+def _own_states(model: HumorNet, batch: Batch, own: float, rng: Rng) -> State:
+    """The states (B, T) that steps start from: each, by the chance ``own``, the one that the step before made."""
+    states = [batch.states[:, 0]]
+    count, steps = batch.contacts.shape[:2]
+    for t in range(steps - 1):
+        before, true = states[-1], batch.states[:, t]
+        origin = canonical(before, before)
+        told = model.standardised(features(origin))
+        following = model.standardised(features(canonical(batch.states[:, t + 1], true)))
+        made = model.step(before, model.inferred(told, following).sample(), batch.offsets)[0]
+        states.append(choose(torch.from_numpy(rng.random(count) < own), made, batch.states[:, t + 1]))
+    return stack(states, 1)
+
+
+def evaluate_humor(model: HumorNet, unseen: Sequences) -> dict[str, float]:
+    """On unseen people, seconds of motion that move: how well latents say it, and how well it is foreseen.
+
+    Returns:
+        ``val told mm``, the mean error of joints at the end of a second rolled out by the posterior's means;
+        ``val foreseen mm``, after half a second, by the prior's; ``val rest F1`` of heels and toes along the former.
+    """
+    steps = int(FPS)
+    rows = unseen.motion.all_windows(steps + 2, steps)
+    path = unseen.motion.positions[rows[:, -1], 0] - unseen.motion.positions[rows[:, 0], 0]
+    batch = unseen.at(rows[np.argsort(-path.norm(dim=-1).numpy(), kind="stable")[:128]])
+    posterior, _ = transitions(model, batch.states)
+    first = batch.states[:, 0]
+    told = roll_out(model, first, posterior.mean, batch.offsets)
+    foreseen = sample(model, first, steps // 2, batch.offsets, None)
+
+    def error(said: State, step: int) -> float:
+        return float((said.joints[:, step - 1] - batch.states.joints[:, step]).norm(dim=-1).mean()) * 1e3
+
+    found = {"val told mm": error(told.states, steps), "val foreseen mm": error(foreseen.states, steps // 2)}
+    if model.config.contacts:
+        feet = slice(len(CONTACT_JOINTS) + 2, len(CONTACT_JOINTS) + 6)
+        said, true = told.contacts[..., feet] > 0, batch.contacts[..., feet] > 0.5
+        found["val rest F1"] = float(2 * (said & true).sum() / (said.sum() + true.sum()).clamp(min=1))
+    return found

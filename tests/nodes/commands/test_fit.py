@@ -1,0 +1,180 @@
+"""`steadypose fit`: what it writes for recordings, arrays and key points, and what it says of what it cannot do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import walk
+
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.types import PoseClean
+from steadypose.nodes.cli import main
+from steadypose.nodes.commands.fitting import ground_plane, noise_of
+from steadypose.nodes.commands.key_points import read_key_points
+from steadypose.nodes.sources.npz import NpzError
+from steadypose.prior.offline import solve
+from steadypose.prior.offline.solve import FitSettings
+
+FRAMES = 24
+
+
+@pytest.fixture(autouse=True)
+def brief(monkeypatch) -> None:
+    """Few steps: what comes of many is measured elsewhere."""
+    monkeypatch.setattr(solve, "FitSettings", lambda: FitSettings(root_steps=0, pose_steps=10, motion_steps=10))
+
+
+def positions() -> np.ndarray:
+    return np.array([frame.bodies[0].positions for frame in walk(FRAMES, 1)])
+
+
+@pytest.fixture
+def seen(tmp_path: Path) -> Path:
+    path = tmp_path / "in.npz"
+    np.savez(path, positions=positions(), skeleton="smpl22", fps=30.0)
+    return path
+
+
+@pytest.fixture
+def pictured(tmp_path: Path) -> Path:
+    """The same by a level camera, 4 m away."""
+    path = tmp_path / "keys.npz"
+    np.savez(path, **key_points())
+    return path
+
+
+def key_points(**more: object) -> dict:
+    body = positions().astype(float)
+    optical = np.stack([-body[..., 1], 1.3 - body[..., 2], 4.0 + body[..., 0] - body[:, :1, 0].mean()], axis=-1)
+    pixels = optical[..., :2] / optical[..., 2:] * 900.0 + [640.0, 360.0]
+    pixels[3, 4] = np.nan
+    told = {"keypoints": pixels, "skeleton": "smpl22", "fps": 30.0, "focal": 900.0, "centre": [640.0, 360.0]}
+    return told | {"camera_height": 1.3} | more
+
+
+def test_arrays_in_and_out(seen: Path, tmp_path: Path, capsys) -> None:
+    assert main(["fit", str(seen), str(tmp_path / "out.npz")]) == 0
+    with np.load(tmp_path / "out.npz") as out:
+        assert out["positions"].shape == (FRAMES, 22, 3)
+        for name in ("positions", "rotations", "world_positions", "root_velocity", "contacts"):
+            assert np.isfinite(out[name]).all(), name
+        lengths = np.linalg.norm(out["positions"][:, 4] - out["positions"][:, 1], axis=-1)
+        off = np.linalg.norm(out["positions"] - positions(), axis=-1)
+    np.testing.assert_allclose(lengths, lengths[0], atol=1e-3)
+    assert off.mean() < 0.05
+    with np.load(tmp_path / "out.npz.misfit.npz") as misfit:
+        assert misfit["0/misfit"].shape[1] == 22
+        assert misfit["0/offsets"].shape[1:] == (22, 3)
+    assert (tmp_path / "out.npz.fit.png").stat().st_size > 1000
+    assert not (tmp_path / ".out.npz.fit").exists()
+    assert f"{FRAMES} frames, fitted in" in capsys.readouterr().err
+
+
+def test_a_recording_has_all_topics(seen: Path, tmp_path: Path) -> None:
+    assert main(["fit", str(seen), str(tmp_path / "out")]) == 0
+    with RecordingReader(tmp_path / "out") as recording:
+        messages = list(recording)
+    assert {POSE_RAW, POSE_CLEAN, POSE_WORLD} <= {topic for topic, _, _ in messages}
+    bodies = [body for _, _, message in messages if isinstance(message, PoseClean) for body in message.bodies]
+    assert len(bodies) >= FRAMES - 1
+    for body in bodies:
+        np.testing.assert_array_equal(body.bone_lengths, bodies[0].bone_lengths)
+
+
+def test_key_points_become_a_motion_in_the_cameras_frame(pictured: Path, tmp_path: Path) -> None:
+    assert main(["fit", str(pictured), str(tmp_path / "out.npz")]) == 0
+    with np.load(tmp_path / "out.npz") as out, np.load(pictured) as told:
+        assert out["positions"].shape == (FRAMES, 22, 3)
+        assert out["positions"][:, 0, 2].mean() == pytest.approx(4.0, abs=1.0)
+        projected = out["positions"][..., :2] / out["positions"][..., 2:] * 900.0 + [640.0, 360.0]
+        assert np.nanmedian(np.linalg.norm(projected - told["keypoints"], axis=-1)) < 40.0
+        normal = out["ground_plane"][:3]
+        assert normal[2] > 0.95
+
+
+def test_what_is_there_is_kept(seen: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out.npz"
+    out.write_bytes(b"mine")
+    assert main(["fit", str(seen), str(out)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert out.read_bytes() == b"mine"
+    assert main(["fit", str(seen), str(out), "--force"]) == 0
+    assert out.read_bytes()[:2] == b"PK"
+
+
+@pytest.mark.parametrize(
+    ("source", "out", "says"),
+    [
+        ("nowhere.npz", "out.npz", "does not exist"),
+        ("in.npz", "in.npz", "in place"),
+        ("in.npz", "nowhere/out.npz", "make it first"),
+        ("keys.npz", "out", "expected an .npz"),
+    ],
+)
+def test_what_cannot_be_done_is_said(
+    source: str, out: str, says: str, seen: Path, pictured: Path, tmp_path: Path, capsys
+) -> None:
+    assert main(["fit", str(tmp_path / source), str(tmp_path / out)]) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_without_torch_it_says_what_to_install(seen: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("steadypose.nodes.graph.extras.find_spec", lambda name: None)
+    assert main(["fit", str(seen), str(tmp_path / "out.npz")]) == 2
+    assert "steadypose[train]" in capsys.readouterr().err
+
+
+def test_nobody_in_it_is_said(tmp_path: Path, capsys) -> None:
+    path = tmp_path / "empty.npz"
+    np.savez(path, positions=np.full((FRAMES, 22, 3), np.nan), skeleton="smpl22", fps=30.0)
+    assert main(["fit", str(path), str(tmp_path / "out.npz")]) == 2
+    assert "found nobody" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ({"focal": -1.0}, "focal"),
+        ({"centre": [1.0]}, "centre"),
+        ({"skeleton": "nobody"}, "skeleton"),
+        ({"keypoints": np.zeros((4, 3, 2))}, "keypoints"),
+        ({"confidence": np.zeros((2, 2))}, "confidence"),
+        ({"up": "x"}, "up"),
+        ({"fps": 0.0}, "fps"),
+        ({"points": np.zeros((3, 5, 3))}, "points"),
+    ],
+)
+def test_what_is_wrong_with_key_points_is_said(more: dict, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "wrong.npz"
+    np.savez(path, **key_points(**more))
+    with pytest.raises(NpzError, match=says):
+        read_key_points(path)
+
+
+def test_key_points_are_put_on_the_grid(tmp_path: Path) -> None:
+    path = tmp_path / "slow.npz"
+    told = key_points(fps=15.0)
+    np.savez(path, **told)
+    found = read_key_points(path)
+    assert len(found.stamps_ns) == 2 * FRAMES - 1
+    np.testing.assert_allclose(found.pixels[::2][5], told["keypoints"][5], atol=0.1)
+    np.testing.assert_allclose(found.pixels[1], (told["keypoints"][0] + told["keypoints"][1]) / 2, atol=0.1)
+    assert found.confidence[6, 4] == 0.0
+
+
+def test_noise_is_found_in_what_moves() -> None:
+    rng = np.random.default_rng(0)
+    t = np.arange(90)[:, None, None] / 30
+    moving = np.sin(2 * t) + np.zeros((90, 22, 3))
+    assert noise_of(moving + 0.04 * rng.standard_normal((90, 22, 3))) == pytest.approx(0.04, rel=0.1)
+    assert noise_of(moving) == pytest.approx(0.01)
+    assert noise_of(np.full((90, 22, 3), np.nan)) == pytest.approx(0.01)
+
+
+def test_the_plane_of_the_ground_holds_its_points() -> None:
+    plane = ground_plane(np.array([0.2, 0.05, -0.03]))
+    assert plane @ [0.0, 0.0, 0.2, 1.0] == pytest.approx(0.0)
+    assert np.linalg.norm(plane[:3]) == pytest.approx(1.0)
