@@ -25,13 +25,9 @@ OF_WORLD = (*OF_CLEAN, "trajectory weights", "trajectory settings")
 OF_FIT = (*OF_CLEAN, "offline weights", "offline settings")
 """what `pose/clean`, `pose/world` and ``steadypose fit`` depend on, of what `ships`"""
 
-<<<<<<< HEAD
 _PRIOR_MODELS = ("correction", "hgvae", "hmvae", "mixture", "occlusion")
 _TRAJECTORY_MODELS = ("contacts", "trajectory")
-=======
-_PRIOR_MODELS = ("correction", "hgvae", "hmvae", "mixture")
 _OFFLINE_MODELS = ("humor",)
->>>>>>> 5146d3d (steadypose fit: test-time optimisation with a transition model, after HuMoR)
 
 
 class UncommittedError(RuntimeError):
@@ -42,22 +38,14 @@ class UncommittedError(RuntimeError):
 def ships() -> dict[str, str]:
     """Digests of the weights that ship and of the settings that they run with, of prior, trajectory and offline."""
     files = [path for path in WEIGHTS.iterdir() if path.suffix in (".safetensors", ".json")]
-<<<<<<< HEAD
-    of_prior, of_trajectory = (
-        [path for path in files if path.name.startswith(models)] for models in (_PRIOR_MODELS, _TRAJECTORY_MODELS)
+    of_prior, of_trajectory, of_fit = (
+        [path for path in files if path.name.startswith(models)]
+        for models in (_PRIOR_MODELS, _TRAJECTORY_MODELS, _OFFLINE_MODELS)
     )
     return {
         "prior weights": _digest_of_files(of_prior),
         "prior settings": _digest_of_settings(asdict(PriorSettings())),
         "trajectory weights": _digest_of_files(of_trajectory),
-=======
-    of_prior = {path for path in files if path.name.startswith(_PRIOR_MODELS)}
-    of_fit = {path for path in files if path.name.startswith(_OFFLINE_MODELS)}
-    return {
-        "prior weights": _digest_of_files(of_prior),
-        "prior settings": _digest_of_settings(asdict(PriorSettings())),
-        "trajectory weights": _digest_of_files(set(files) - of_prior - of_fit),
->>>>>>> 5146d3d (steadypose fit: test-time optimisation with a transition model, after HuMoR)
         "trajectory settings": _digest_of_settings(asdict(TrajectorySettings())),
         "offline weights": _digest_of_files(of_fit),
         "offline settings": _digest_of_settings(asdict(FitSettings())),

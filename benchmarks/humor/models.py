@@ -24,9 +24,6 @@ BRIEF = "HuMoR, briefly trained"
 
 VARIANTS: Mapping[str, HumorConfig] = {
     BRIEF: HumorConfig(),
-    "no learned prior": HumorConfig(learned_prior=False),
-    "no delta": HumorConfig(residual=False),
-    "no contacts": HumorConfig(contacts=False),
     MVAE: HumorConfig(learned_prior=False, residual=False, contacts=False),
 }
 

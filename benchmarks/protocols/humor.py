@@ -37,7 +37,7 @@ from steadypose.prior.offline.solve import FitSettings
 
 FRAMES = 90
 DELAY = 8
-CLIPS, PICTURES, FUTURES = 8, 4, 24
+CLIPS, PICTURES, FUTURES = 4, 2, 12
 """Clips of each table, taken evenly from all sources of the split."""
 
 _STILL, _RAW, _TRUTH = "stands still", "as seen", "truth"
@@ -107,12 +107,7 @@ def _pictures(bench: Bench, clips: MotionClips, models: dict[str, Any], *, depth
     truth = np.stack([picture.truth for picture in taken], axis=1)
     unseen = np.stack([~np.isfinite(picture.key_points.pixels.numpy()).all(axis=-1) for picture in taken], axis=1)
     load = load_labels(clips)
-    fits = {
-        _PER_FRAME: (models[SHIPS], 2),
-        MVAE: (models[MVAE], 3),
-        BRIEF: (models[BRIEF], 3),
-        SHIPS: (models[SHIPS], 3),
-    }
+    fits = {_PER_FRAME: (models[SHIPS], 2), MVAE: (models[MVAE], 3), SHIPS: (models[SHIPS], 3)}
     records = [{"method": _TRUTH, **scores(_each(truth), truth, unseen, load, -CAMERA_HEIGHT)}]
     for name, (model, stages) in bench.progress.track(fits.items(), description="depth" if depth else "detector"):
         found = [
