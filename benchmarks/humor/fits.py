@@ -183,8 +183,9 @@ def load_labels(clips: MotionClips) -> NDArray[np.bool_]:
     return np.stack([label_contacts(clips.positions[:, c], FPS, LOAD_SPEED) for c in range(clip_count)], axis=1)
 
 
-def _mm(values: Floats) -> float:
-    return round(float(np.nanmean(values)) * 1e3, 1)
+def _mm(values: Floats) -> float | None:
+    known = values[np.isfinite(values)]
+    return round(float(known.mean()) * 1e3, 1) if len(known) else None
 
 
 def _t(values: Floats) -> torch.Tensor:

@@ -1,0 +1,81 @@
+"""HuMoR's tables: scores of answers that are known, and the whole protocol in small."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rich.progress import Progress
+
+from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.humor import fits, models
+from steadypose.benchmarks.humor.fits import Answer, load_labels, pictures, scores
+from steadypose.benchmarks.humor.models import MVAE, SHIPS
+from steadypose.benchmarks.humor.prediction import predict, stand_still
+from steadypose.benchmarks.motion import MotionClips, simulated_clips
+from steadypose.benchmarks.protocols import humor
+from steadypose.prior.models.humor.network import HumorConfig, HumorNet
+from steadypose.prior.offline.solve import FitSettings
+
+
+@pytest.fixture(scope="module")
+def clips() -> MotionClips:
+    return simulated_clips(20, 2, seed=0)
+
+
+def test_the_truth_has_no_error_and_what_sinks_goes_through_the_floor(clips: MotionClips) -> None:
+    truth, hidden = clips.positions, np.zeros(clips.positions.shape[:3], dtype=bool)
+    load = load_labels(clips)
+    exact = [Answer(truth[:, c], load[:, c].astype(float), 2.0) for c in range(2)]
+    found = scores(exact, truth, hidden, load)
+    assert found["all_mm"] == found["legs_mm"] == found["acceleration_error_m_s2"] == 0.0
+    assert found["contact_accuracy"] == 1.0
+    assert found["seconds"] == 2.0
+    assert "hidden_mm" not in found
+    sunk = [Answer(truth[:, c] - [0.0, 0.0, 0.5]) for c in range(2)]
+    found = scores(sunk, truth, hidden | (truth[..., 2] < 0.9), load)
+    assert found["all_mm"] == found["hidden_mm"] == pytest.approx(500.0)
+    assert found["rooted_mm"] == 0.0
+    assert found["penetration_percent"] > 90
+    assert "contact_accuracy" not in found
+
+
+def test_a_camera_sees_what_is_projected(clips: MotionClips) -> None:
+    taken = pictures(clips, 0, np.random.default_rng(0))
+    seen = taken.key_points.pixels.numpy()
+    expected = taken.key_points.camera.project(torch.from_numpy(taken.truth).float()).numpy()
+    off = np.linalg.norm(seen - expected, axis=-1)
+    assert np.nanmedian(off) == pytest.approx(1.18 * fits.PIXELS, rel=0.2)
+    assert np.isnan(off).mean() == pytest.approx(fits.MISSED, abs=0.05)
+    points = taken.points.points.numpy()
+    middle = np.nanmean(points, axis=1)
+    assert np.linalg.norm(middle - taken.truth.mean(axis=1), axis=-1).max() < 0.4
+
+
+def test_futures_of_any_model_are_scored(clips: MotionClips) -> None:
+    torch.manual_seed(0)
+    found = predict(HumorNet(HumorConfig(hidden=64)).eval(), clips, 2)
+    assert found["ade_mm"] > 0
+    assert 0 <= found["contact_accuracy"] <= 1
+    assert found["apd_mm"] > 0
+    assert stand_still(clips)["ade_mm"] > 0
+    assert "contact_accuracy" not in predict(HumorNet(HumorConfig(hidden=64, contacts=False)).eval(), clips, 2)
+
+
+def test_the_protocol_in_small(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(models, "VARIANTS", {MVAE: models.VARIANTS[MVAE], models.BRIEF: models.VARIANTS[models.BRIEF]})
+    for module in (humor, fits):
+        monkeypatch.setattr(module, "FitSettings", lambda: FitSettings(root_steps=0, pose_steps=10, motion_steps=10))
+    with Progress(disable=True) as progress:
+        result = humor.run(Bench(quick=True, mocap=None, data=tmp_path / "nowhere.npz", progress=progress))
+    assert [table.name for table in result.tables] == [
+        "humor-futures", "humor-noisy", "humor-hidden", "humor-detector", "humor-depth",
+    ]  # fmt: skip
+    for table in result.tables:
+        assert all(len(row) == len(table.columns) for row in table.rows)
+        assert any(row[0] == SHIPS for row in table.rows)
+    noisy = {record["method"]: record for record in result.data["records"]["noisy"]}
+    assert noisy[SHIPS]["all_mm"] < noisy["as seen"]["all_mm"]
+    assert noisy["truth"]["all_mm"] == 0.0
