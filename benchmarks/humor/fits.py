@@ -54,7 +54,7 @@ class Answer:
     Attributes:
         joints: (T, 22, 3) metres, world.
         load: (T, 8) probabilities, or None.
-        seconds: that it took; None of methods that take all clips at once.
+        seconds: of a processor, that it took; None of methods that take all clips at once.
     """
 
     joints: Floats
@@ -77,13 +77,13 @@ def fitted(
     model: HumorNet, starts: Sequence[Start], observed: Sequence[Observed], stages: int, settings: FitSettings
 ) -> Answer:
     """The fit of least energy from any start."""
-    began = time.perf_counter()
+    began = time.process_time()
     found = [fit_window(model, start, observed, settings, stages=stages) for start in starts]
     best = min(found, key=lambda fit: fit.energies[-1])
     return Answer(
         best.motion.world_joints.double().numpy(),
         load_of(best.motion) if stages == 3 and model.config.contacts else None,
-        time.perf_counter() - began,
+        time.process_time() - began,
     )
 
 

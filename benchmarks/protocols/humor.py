@@ -159,7 +159,7 @@ def _fit_tables(records: dict[str, list[dict[str, Any]]], few: int) -> list[Tabl
             title=title,
             columns=["method", *keys.values()],
             rows=[[r["method"], *(_cell(r, key) for key in keys)] for r in records[name]],
-            note="Mean over all joints, without alignment; legs: knees, ankles, toes. Seconds are of one core.",
+            note="Mean over all joints, without alignment; legs: knees, ankles, toes. Seconds are of a processor.",
         )
         for name, title in titles.items()
     ]

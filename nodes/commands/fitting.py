@@ -84,19 +84,20 @@ class Fit:
 
 
 def bodies_seen(messages: Sequence[tuple[str, Message]], least: int) -> list[Seen]:
-    """Every body of a cleaned stream, for as long as it was there without a gap, at least so many frames."""
+    """Every body of a cleaned stream, for as long as it was there whole and without a gap, so many frames at least."""
     found: list[Seen] = []
     of_body: dict[int, list[tuple[PoseClean, CleanBody]]] = {}
     for _, message in messages:
         if isinstance(message, PoseClean):
             for body in message.bodies:
-                of_body.setdefault(body.id, []).append((message, body))
+                if np.isfinite(body.positions).all():
+                    of_body.setdefault(body.id, []).append((message, body))
     for number, rows in of_body.items():
         stamps = np.array([message.stamp_ns for message, _ in rows])
         cuts = np.flatnonzero(np.diff(stamps) > 1.5 * FRAME_NS) + 1
         for first, last in zip([0, *cuts], [*cuts, len(rows)], strict=True):
             clean, bodies = zip(*rows[first:last], strict=True)
-            if last - first >= least and np.isfinite([body.positions for body in bodies]).all():
+            if last - first >= least:
                 found.append(Seen(number, clean, bodies, clean[0].calibrated))
     return found
 
