@@ -28,6 +28,9 @@ Floats = NDArray[np.float64]
 LEAST_SIGMA = 0.01
 """Metres: no sensor means the joints that our bones end in to less."""
 
+FAR = 0.1
+"""Metres, and five times the noise: what ``pose/clean`` has moved farther was another limb's, or no joint at all."""
+
 LOWEST = 5.0
 """Per cent of frames in which the lower foot is taken to stand on the floor, where the floor is not known."""
 
@@ -124,8 +127,10 @@ def track_of(seen: Seen, points: Floats | None) -> Track:
         tensor(positions[:, 0]), tensor(solve_rotations(positions, offsets)), tensor(offsets),
         0.0 if seen.calibrated else lowest_floor(positions), seen.calibrated,
     )  # fmt: skip
+    noise = noise_of(raw)
+    raw = np.where(np.linalg.norm(raw - positions, axis=-1, keepdims=True) > FAR + 5.0 * noise, np.nan, raw)
     confidence = np.clip(np.stack([body.raw_confidence for body in seen.bodies]), 0.05, 1.0)
-    sigma = noise_of(raw) / np.sqrt(confidence)
+    sigma = noise / np.sqrt(confidence)
     observed: list[Observed] = [SeenJoints(tensor(raw), tensor(sigma))]
     if points is not None:
         observed.append(SurfacePoints(tensor(points)))
@@ -158,8 +163,8 @@ def fit_body(
     from steadypose.prior.offline.windows import fit_track
 
     fitted = fit_track(model, track_of(seen, points), settings, folder, advanced=advanced)
-    misfit = fitted.misfit[0]
-    before = np.linalg.norm(seen.in_world("positions") - seen.in_world("raw_positions"), axis=-1)
+    raw = seen.in_world("raw_positions")
+    misfit, before = (np.linalg.norm(said - raw, axis=-1) for said in (fitted.joints, seen.in_world("positions")))
     known = np.isfinite(before)
     if not np.isfinite(fitted.joints).all() or (
         known.any() and np.median(misfit[known]) > WORSE * np.median(before[known]) + WORSE_M

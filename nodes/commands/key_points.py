@@ -119,7 +119,8 @@ def read_key_points(path: Path) -> KeyPointRecording:
     sure = np.where(needed, np.where(found, confidence, 0.0)[:, None], np.inf).min(axis=-1)
     sure = np.where(needed.any(axis=1), sure, 0.0)
     pixels[sure <= 0] = np.nan
-    grid = np.arange(stamps[0], stamps[-1] + 1, FRAME_NS, dtype=np.int64)
+    count = int((stamps[-1] - stamps[0]) / FRAME_NS + 1e-3) + 1
+    grid = stamps[0] + np.round(np.arange(count) * FRAME_NS).astype(np.int64)
     nearest = np.abs(stamps[None] - grid[:, None]).argmin(axis=1)
     points = arrays.get("points")
     if points is not None and (points.ndim != 3 or points.shape[0] != len(stamps) or points.shape[2] != 3):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,15 @@ from conftest import walk
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.types import PoseClean
+from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
 from steadypose.nodes.cli import main
-from steadypose.nodes.commands.fitting import ground_plane, noise_of
+from steadypose.nodes.commands.fitting import Fit, bodies_seen, ground_plane, noise_of, rewritten, track_of
 from steadypose.nodes.commands.key_points import read_key_points
+from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.sources.npz import NpzError
+from steadypose.prior.body.skeleton import REST_POSITIONS
 from steadypose.prior.offline import solve
+from steadypose.prior.offline.observations import SeenJoints
 from steadypose.prior.offline.solve import FitSettings
 
 FRAMES = 24
@@ -178,3 +182,49 @@ def test_the_plane_of_the_ground_holds_its_points() -> None:
     plane = ground_plane(np.array([0.2, 0.05, -0.03]))
     assert plane @ [0.0, 0.0, 0.2, 1.0] == pytest.approx(0.0)
     assert np.linalg.norm(plane[:3]) == pytest.approx(1.0)
+
+
+def seen_body(frames: int = 12) -> list[tuple[str, PoseClean]]:
+    """A body at rest, as ``pose/clean`` says it, in messages."""
+    still = REST_POSITIONS + [0.0, 0.0, 0.9]
+    body = CleanBody(
+        id=7, positions=still, rotations=np.tile([0.0, 0.0, 0.0, 1.0], (22, 1)), state=np.full(22, JointState.REFINED),
+        sigma=np.full(22, 0.01), anomaly=0.0, anomaly_flag=False, joint_anomaly=np.zeros(22),
+        bone_lengths=np.ones(22), raw_positions=still, raw_confidence=np.ones(22),
+    )  # fmt: skip
+    return [
+        (POSE_CLEAN, PoseClean(round(t * FRAME_NS), "camera", "test", Pose.identity(), True, 4, [replace(body)]))
+        for t in range(frames)
+    ]
+
+
+def test_a_body_that_was_away_or_not_whole_is_two() -> None:
+    messages = seen_body(30)
+    messages[14][1].bodies = []
+    assert [len(seen.bodies) for seen in bodies_seen(messages, 8)] == [14, 15]
+    broken = seen_body(30)
+    broken[10][1].bodies[0].positions = np.full((22, 3), np.nan, np.float32)
+    assert [len(seen.bodies) for seen in bodies_seen(broken, 8)] == [10, 19]
+    assert bodies_seen(broken, 25) == []
+
+
+def test_what_clean_has_moved_far_is_not_believed() -> None:
+    messages = seen_body()
+    jumped = messages[3][1].bodies[0].raw_positions.copy()
+    jumped[20] += 0.5
+    messages[3][1].bodies[0].raw_positions = jumped
+    observed = track_of(bodies_seen(messages, 8)[0], None).observed[0]
+    assert isinstance(observed, SeenJoints)
+    hidden = np.asarray(~np.isfinite(observed.positions.numpy()).all(axis=-1))
+    assert hidden.sum() == 1
+    assert hidden[3, 20]
+
+
+def test_a_fit_that_fails_leaves_clean_and_is_flagged() -> None:
+    messages = seen_body()
+    seen = bodies_seen(messages, 8)[0]
+    out = rewritten(messages, [Fit(seen, None, np.zeros((12, 22)))])
+    for (_, before), (_, after) in zip(messages, out, strict=True):
+        assert isinstance(after, PoseClean)
+        np.testing.assert_array_equal(after.bodies[0].positions, before.bodies[0].positions)
+        assert after.bodies[0].anomaly_flag
