@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.models.completer.config import BENDS, CompleterConfig
-from steadypose.prior.models.completer.features import anchored, read_window, rotations_of_6d
+from steadypose.prior.models.completer.features import anchored, read_window, rotations_of_6d, say
 from steadypose.prior.models.layers.dense import Floats as Floats32
 from steadypose.prior.models.weights_io import Arrays, load_weights, part
 
@@ -52,9 +52,12 @@ class LiveCompleter:
         window = read_window(positions, offsets, self.usual)
         said = self.forward(window.features).astype(np.float64)
         turns, steps, taken = np.split(said, [BENDS - 3, BENDS], axis=-1)
-        bend = window.bend / (1.0 + np.exp(-taken[..., None]))
-        turns = anchored(turns.reshape(*said.shape[:2], 22, 6), window.line, slice(0, 22)) + bend[:, :, :22]
-        steps = anchored(steps[:, :, None], window.line, slice(22, 23))[:, :, 0] + bend[:, :, 22, :3]
+        share = say(window.line).astype(np.float64)
+        bend = window.bend * (1.0 - share / (1.0 + np.exp(taken[..., None])))
+        turns = anchored(turns.reshape(*said.shape[:2], 22, 6), window.line, slice(0, 22))
+        steps = anchored(steps[:, :, None], window.line, slice(22, 23))[:, :, 0]
+        turns = share[:, :, :22] * turns + bend[:, :, :22]
+        steps = share[:, :, 22] * steps + bend[:, :, 22, :3]
         columns = window.rotations[..., :2].swapaxes(-1, -2).reshape(turns.shape) + turns
         rotations = rotations_of_6d(columns)
         rotations[:, :, 0] = window.turn[:, None] @ rotations[:, :, 0]

@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.skeleton import J, limbs
 from steadypose.prior.models.completer.config import BENDS, CompleterConfig
-from steadypose.prior.models.completer.features import Bools, Line, Window, read_window
+from steadypose.prior.models.completer.features import Bools, Line, Window, read_window, say
 from steadypose.prior.models.completer.network import Completer
 from steadypose.prior.models.hmvae.network import from_6d, to_6d
 from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
@@ -233,11 +233,12 @@ def answer(model: Completer, window: Window) -> tuple[Tensor, Tensor]:
     with torch.autocast("cpu", torch.bfloat16, enabled=model.training):
         said = model(torch.from_numpy(window.features))
     rotations, root, taken = said.float().split([BENDS - 3, 3, 23], dim=-1)
-    bend = torch.from_numpy(window.bend) * torch.sigmoid(taken)[..., None]
+    share = torch.from_numpy(say(line))
+    bend = torch.from_numpy(window.bend) * (1.0 - share * torch.sigmoid(-taken)[..., None])
     rotations = _gathered(rotations.unflatten(-1, (22, 6)), line, slice(0, 22))
     root = _gathered(root.unflatten(-1, (1, 3)), line, slice(22, 23))[:, :, 0]
     base = torch.from_numpy(window.rotations).float()
-    rotations, root = rotations + bend[:, :, :22], root + bend[:, :, 22, :3]
+    rotations, root = share[:, :, :22] * rotations + bend[:, :, :22], share[:, :, 22] * root + bend[:, :, 22, :3]
     return from_6d(to_6d(base) + rotations), torch.from_numpy(window.root).float() + root
 
 
