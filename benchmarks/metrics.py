@@ -116,6 +116,27 @@ def reliability(error: Floats, sigma: Floats, bins: int = 10) -> list[tuple[floa
     ]
 
 
+def quaternion_distance(estimate: Floats, truth: Floats) -> Floats:
+    """L2Q of LAFAN1 (Harvey et al. 2020): of global rotations (T, J, 4), the norm of all components' difference, (T,).
+
+    A quaternion and its opposite are the same rotation: each is compared by the nearer of the two.
+    """
+    sign = np.where((estimate * truth).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    return np.sqrt(((sign * estimate - truth) ** 2).sum(axis=(-1, -2)))
+
+
+def npss(estimate: Floats, truth: Floats) -> float:
+    """Normalised power spectrum similarity of motions (N, T, D): 0 is the same (Gopalakrishnan et al. 2019).
+
+    The power spectra over time, made to sum to 1, are compared by how much has to be moved from frequency to frequency;
+    tracks count by the power that they have in truth.
+    """
+    power = [np.abs(np.fft.fft(x, axis=1)) ** 2 for x in (truth, estimate)]
+    total = power[0].sum(axis=1)
+    shares = [np.cumsum(p / np.maximum(p.sum(axis=1, keepdims=True), 1e-12), axis=1) for p in power]
+    return float((np.abs(shares[1] - shares[0]).sum(axis=1) * total).sum() / total.sum())
+
+
 def body_frame(left_hip: Floats, right_hip: Floats, left_shoulder: Floats, right_shoulder: Floats) -> Floats:
     """Axes forward, left, up of the trunk as columns: (..., 3, 3). Up runs from the hips to the shoulders.
 

@@ -24,10 +24,13 @@ OF_CLEAN = ("prior weights", "prior settings")
 OF_WORLD = (*OF_CLEAN, "trajectory weights", "trajectory settings")
 OF_FIT = (*OF_CLEAN, "offline weights", "offline settings")
 """what `pose/clean`, `pose/world` and ``steadypose fit`` depend on, of what `ships`"""
+OF_COMPLETION = ("completion weights", "trajectory weights", "prior weights")
+"""what ``steadypose complete`` depends on"""
 
-_PRIOR_MODELS = ("correction", "hgvae", "hmvae", "mixture", "occlusion")
+_PRIOR_MODELS = ("correction", "hgvae", "hmvae-", "mixture", "occlusion")
 _TRAJECTORY_MODELS = ("contacts", "trajectory")
 _OFFLINE_MODELS = ("humor",)
+_COMPLETION_MODELS = ("completer", "hmvae64")
 
 
 class UncommittedError(RuntimeError):
@@ -38,14 +41,15 @@ class UncommittedError(RuntimeError):
 def ships() -> dict[str, str]:
     """Digests of the weights that ship and of the settings that they run with, of prior, trajectory and offline."""
     files = [path for path in WEIGHTS.iterdir() if path.suffix in (".safetensors", ".json")]
-    of_prior, of_trajectory, of_fit = (
+    of_prior, of_trajectory, of_fit, of_completion = (
         [path for path in files if path.name.startswith(models)]
-        for models in (_PRIOR_MODELS, _TRAJECTORY_MODELS, _OFFLINE_MODELS)
+        for models in (_PRIOR_MODELS, _TRAJECTORY_MODELS, _OFFLINE_MODELS, _COMPLETION_MODELS)
     )
     return {
         "prior weights": _digest_of_files(of_prior),
         "prior settings": _digest_of_settings(asdict(PriorSettings())),
         "trajectory weights": _digest_of_files(of_trajectory),
+        "completion weights": _digest_of_files(of_completion),
         "trajectory settings": _digest_of_settings(asdict(TrajectorySettings())),
         "offline weights": _digest_of_files(of_fit),
         "offline settings": _digest_of_settings(asdict(FitSettings())),

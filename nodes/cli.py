@@ -24,6 +24,10 @@ COMMANDS = {
         "steadypose.nodes.commands.fit:fit",
         "fit a motion to a recording: slower than clean, and with all of it in view",
     ),
+    "complete": (
+        "steadypose.nodes.commands.complete:complete",
+        "key frames to motion, a part of a body to all of it, offline",
+    ),
     "echo": ("steadypose.nodes.commands.inspect.echo:echo", "print the messages of a topic or recording"),
     "hz": ("steadypose.nodes.commands.inspect.hz:hz", "measure the rate of a topic or recording"),
     "info": ("steadypose.nodes.commands.inspect.info:info", "what is in a recording, or on a topic"),

@@ -9,6 +9,8 @@ PROTOCOLS: dict[str, str] = {
     "noisy_joints": "independent and correlated noise, spikes, exchanged limbs",
     "hidden_joints": "joints below 0.9 m, an arm behind the body, limbs away for 0.2 to 2 s",
     "reconstruction": "windows through the refinement model (HM-VAE, table 3)",
+    "interpolation": "motion in gaps of 5 to 45 frames (HM-VAE, table 2)",
+    "completion": "a part of the body from the rest",
     "hgvae": "likelihood and depth, anomalies, imputation, actions (the HG-VAE paper)",
     "world": "root drift and foot skate",
     "contacts": "load of feet, against force plates",

@@ -125,7 +125,7 @@ def clean_recording(
     check = StreamCheck(prior_settings.max_bodies, identified=prior_settings.identify.enabled)
     log_times = LogTimes()
     started = time.perf_counter()
-    with _unfinished(out) as part:
+    with unfinished(out) as part:
         with nullcontext() if to_npz else RecordingWriter(part) as writer:
             for topic, message in stream(frames, prior, trajectory):
                 if writer:
@@ -176,7 +176,7 @@ def check_replaceable(out: Path, *, to_npz: bool) -> None:
 
 
 @contextmanager
-def _unfinished(out: Path) -> Iterator[Path]:
+def unfinished(out: Path) -> Iterator[Path]:
     """Where to write what becomes ``out``: beside it, under the same name, because a recording's file has its name."""
     folder = out.with_name(f".{out.name}.part")
     mark = folder / ".steadypose"

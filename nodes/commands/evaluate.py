@@ -17,6 +17,8 @@ def evaluate(
         "noisy_joints",
         "hidden_joints",
         "reconstruction",
+        "interpolation",
+        "completion",
         "hgvae",
         "world",
         "contacts",

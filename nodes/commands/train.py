@@ -14,7 +14,17 @@ from steadypose.prior.models.torch_weights import install as install_weights
 
 def train(
     model: Literal[
-        "hmvae", "hgvae", "hgvae-wide", "trajectory", "contacts", "humor", "correction", "mixture", "occlusion"
+        "hmvae",
+        "hmvae64",
+        "hgvae",
+        "hgvae-wide",
+        "trajectory",
+        "contacts",
+        "completer",
+        "humor",
+        "correction",
+        "mixture",
+        "occlusion",
     ],
     data: Path = Path("data/prepared.npz"),
     weights: Literal["default", "research", "kinect_v2"] | None = None,
@@ -35,10 +45,10 @@ def train(
     runs/MODEL-SET; a launch file takes their path. Those that ship are replaced only when asked to, and kept.
 
     Args:
-        model: mixture (the smoother), hmvae (refinement), hgvae (anomaly score and imputation),
-            hgvae-wide (the same in the paper's size, for recordings), trajectory (root velocity), contacts,
-            humor (transitions, for 'steadypose fit'),
-            occlusion (what to believe of a hidden joint), or correction (a sensor's own error).
+        model: mixture (the smoother), hmvae (refinement), hmvae64 ('complete --optimise'), hgvae (anomaly score and
+            imputation), hgvae-wide (the same in the paper's size, for recordings), trajectory (root velocity),
+            contacts, humor (transitions, for 'steadypose fit'), occlusion (what to believe of a hidden joint),
+            completer ('steadypose complete'), or correction (a sensor's own error).
         data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon; for
             mixture and occlusion, the folder of the recordings, which they take at several speeds.
         weights: the set to train: 'default' takes only data free for products, 'research' all of it; a correction
@@ -55,6 +65,8 @@ def train(
     torch.set_num_threads(max(threads // neighbours(), 1))
     if model == "hmvae":
         from steadypose.prior.models.hmvae.train import train_hmvae as train_model
+    elif model == "hmvae64":
+        from steadypose.prior.models.hmvae.train import train_long_hmvae as train_model
     elif model == "hgvae":
         from steadypose.prior.models.hgvae.train import train_hgvae as train_model
     elif model == "hgvae-wide":
@@ -63,6 +75,8 @@ def train(
         from steadypose.prior.models.mixture.train import train_mixture as train_model
     elif model == "trajectory":
         from steadypose.prior.models.root_velocity.train import train_trajectory as train_model
+    elif model == "completer":
+        from steadypose.prior.models.completer.train import train_completer as train_model
     elif model == "contacts":
         from steadypose.prior.models.contacts.train import train_contacts as train_model
     elif model == "occlusion":

@@ -22,6 +22,8 @@ class HMVAEConfig:
         strides: of the four encoder blocks (official: 1, 2, 2, 1 for T = 8; 2, 2, 2, 2 for T = 64).
         local_latent: dimensions of z_l an edge (official: 6; 12).
         global_latent: dimensions of z_g an edge (official: 6; 24).
+        about_mean: whether the decoder tells how a window differs from its mean pose, which is observed, and not, as
+            the paper's, the pose itself. Most of what that one errs is the same over the window.
     """
 
     window: int = 8
@@ -29,6 +31,7 @@ class HMVAEConfig:
     strides: tuple[int, int, int, int] = (1, 2, 2, 1)
     local_latent: int = 6
     global_latent: int = 6
+    about_mean: bool = False
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> HMVAEConfig:

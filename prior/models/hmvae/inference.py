@@ -28,7 +28,7 @@ class LiveHMVAE:
     """
 
     def __init__(self, config: HMVAEConfig, weights: Arrays) -> None:
-        self.window = config.window
+        self.window, self._about_mean = config.window, config.about_mean
         steps, levels, none = config.steps, pooling_levels(PARENTS), np.zeros(1, dtype=np.float32)
         edges = [len(level.groups) for level in levels]
         self._encoder = []
@@ -86,7 +86,8 @@ class LiveHMVAE:
         features = self._from_deep(self._deep(features))
         for layer in self._decoder:
             features = layer(leaky_relu(features))
-        return (features + local).reshape(*x.shape[:2], -1, ROTATION_FEATURES)
+        decoded = (features + local).reshape(*x.shape[:2], -1, ROTATION_FEATURES)
+        return decoded + x.mean(axis=1, keepdims=True) if self._about_mean else decoded
 
 
 class _TemporalLinear:

@@ -66,12 +66,16 @@ class MotionVAE(nn.Module, ABC):
 
     @abstractmethod
     def decode(self, local: Tensor, deep: Tensor) -> Tensor:
-        """Windows (B, T, 22, 6) of z_l (B, edges, d) and z_g (B, edges, d)."""
+        """Windows (B, T, 22, 6), less `around`, of z_l (B, edges, d) and z_g (B, edges, d)."""
+
+    def around(self, x: Tensor) -> Tensor:
+        """What of windows x (B, T, 22, 6) the decoder does not tell: added to what it says."""
+        return x.new_zeros(())
 
     def reconstruct(self, x: Tensor) -> Tensor:
         """Decode the posterior's mean: what refinement does with each window (equations 10 and 11)."""
         posterior = self.encode(x)
-        return self.decode(posterior.local_mean, posterior.global_mean)
+        return self.around(x) + self.decode(posterior.local_mean, posterior.global_mean)
 
 
 class HMVAE(MotionVAE):
@@ -107,6 +111,10 @@ class HMVAE(MotionVAE):
             )
             for k, level in reversed(list(enumerate(self.levels)))
         )
+
+    def around(self, x: Tensor) -> Tensor:
+        """The mean pose (B, 1, 22, 6) of windows, if the decoder is about that; else nothing."""
+        return x.mean(dim=1, keepdim=True) if self.config.about_mean else super().around(x)
 
     def encode(self, x: Tensor) -> Posterior:
         """The posterior of windows x (B, T, 22, 6), equations 2 and 4."""

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from steadypose.prior.models import registry, torch_weights
+from steadypose.nodes.commands import train as command
+from steadypose.prior.models import torch_weights
 
 
 @pytest.fixture
@@ -28,14 +29,14 @@ def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_training_leaves_the_weights_that_ship_alone(shipped: Path, tmp_path: Path) -> None:
-    registry.train("hmvae", runs=tmp_path / "runs", iterations=1)
+    command.train("hmvae", runs=tmp_path / "runs", iterations=1)
     assert (shipped / "hmvae-default.safetensors").read_text() == "shipped"
     assert (tmp_path / "runs/hmvae-default/hmvae-default.md").is_file()
     assert not (shipped / "previous").exists()
 
 
 def test_installed_weights_replace_the_old_which_are_kept(shipped: Path, tmp_path: Path, capsys) -> None:
-    registry.train("hmvae", runs=tmp_path / "runs", iterations=1, install=True)
+    command.train("hmvae", runs=tmp_path / "runs", iterations=1, install=True)
     made = tmp_path / "runs/hmvae-default/hmvae-default.safetensors"
     assert (shipped / made.name).read_bytes() == made.read_bytes()
     kept = sorted(file.name for file in (shipped / "previous").iterdir())

@@ -1,0 +1,112 @@
+"""``steadypose complete``: key frames to motion, a part of a body to all of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+
+from steadypose.nodes.graph.launch import read_toml
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.graph.threads import one_thread
+from steadypose.prior.body.own_layouts import add_layouts
+
+
+def complete(
+    source: Annotated[Path, tyro.conf.arg(name="in", metavar="IN")],
+    out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
+    optimise: bool = False,
+    weights: Annotated[str, tyro.conf.arg(metavar="NAME")] = "default",
+    skeletons: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    force: bool = False,
+) -> int:
+    """Complete recorded poses: motion between key frames, and the parts of a body that nobody saw.
+
+    What is missing is what the input leaves out: joints that are NaN or of confidence 0, in any frames; and frames that
+    it does not have, between stamps more than 1/20 s apart. What is there stays as it is, to the last bit, so clean a
+    noisy recording first: steadypose clean IN CLEAN. OUT has a frame every 1/30 s, from the first stamp to the last;
+    joints that were completed have the state IMPUTED, and a standard deviation that grows with the time from the next
+    sighting. Gaps of up to two seconds are filled with motion like people's; in longer ones it is less and less theirs,
+    and after 8 s without any joint a new stretch begins.
+
+    Where the pelvis lies at the origin all the time, as in many files of poses lifted from images, the way over the
+    floor is read from the motion of the body; world_positions, or pose/world, have it.
+
+    Examples:
+        steadypose complete keyframes.npz motion.npz
+        steadypose complete upper_body.npz whole.npz --picture whole.png
+        steadypose complete few_joints.npz motion/ --optimise
+
+    Args:
+        source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
+            what is missing is NaN, or 0 in confidence (T, J).
+        out: the recording to make, or .npz.
+        optimise: search HM-VAE for the motion that fits what is known, as the paper does: first its latent vectors,
+            then its decoder, from the answer of the feed-forward completer. Takes seconds for each window of 64
+            frames, and the extra 'train'. docs/complete.md says what it gains.
+        weights: weight set of the completer: 'default', or a .safetensors file of your own.
+        skeletons: TOML with [skeletons.NAME] of joint layouts of your own; a launch file with them will do.
+        picture: what was done, as .png, .svg or .pdf.
+        force: replace what is at OUT, if it is a recording or an .npz.
+    """
+    if skeletons is not None:
+        add_layouts(read_toml(skeletons).get("skeletons", {}))
+    if source.resolve() == out.resolve():
+        raise LaunchError(f"{out}: expected another path than the input's; nothing is completed in place")
+    for path in (out, picture):
+        if path is not None and not path.resolve().parent.is_dir():
+            raise LaunchError(f"{path}: expected its folder {path.resolve().parent} to exist; make it first")
+    if picture is not None and picture.suffix not in (".png", ".svg", ".pdf"):
+        raise LaunchError(f"--picture: expected a name ending in .png, .svg or .pdf, got {picture}")
+    one_thread()
+    # these compile and load: not before it is known that there is something to do
+    from steadypose.nodes.commands.completing import complete_recording
+    from steadypose.prior.models.completer.inference import LiveCompleter
+    from steadypose.prior.offline.parts import SURER, PartsCompleter
+    from steadypose.prior.offline.sigma import Doubt
+
+    try:
+        completer = LiveCompleter.load(weights)
+    except FileNotFoundError as error:
+        raise LaunchError(str(error)) from error
+    fill = PartsCompleter(completer)
+    if optimise:
+        from steadypose.prior.offline.optimise import Optimiser
+
+        fill = Optimiser.load("default", fill)
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        bar = progress.add_task(source.name, total=None)
+        done = complete_recording(
+            source,
+            out,
+            fill,
+            Doubt([SURER * sigma for sigma in completer.config.never_sigma], completer.config.half_frames),
+            replace=force,
+            began=lambda frames: progress.update(bar, total=frames),
+            advanced=lambda frame: progress.update(bar, completed=frame),
+        )
+    bodies = "1 body" if done.bodies == 1 else f"{done.bodies} bodies"
+    console.print(
+        f"{out}: {done.frames} frames of {bodies}; {done.given:.0%} of their joints were given, the rest completed; "
+        f"the longest gap was {done.longest_gap / 30:.1f} s",
+        highlight=False,
+    )
+    if done.unreached:
+        console.print(
+            f"  left out, for nothing near them is known: {done.unreached} joints", highlight=False, style="yellow"
+        )
+    for body in done.centred:
+        console.print(f"  body {body} stands on its pelvis: its way is read from its motion", highlight=False)
+    for cause, count in done.refused.items():
+        console.print(f"  refused or dropped, {cause}: {count}", highlight=False)
+    if picture is not None:
+        from steadypose.nodes.commands.complete_picture import draw
+
+        draw(done, source.name, picture)
+        console.print(f"wrote {picture}", highlight=False)
+    return 0

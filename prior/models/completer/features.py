@@ -1,0 +1,322 @@
+"""What the completer reads of a window, and the line that it corrects: compiled loops, in training and live alike.
+
+Rotations and root are filled by slerp and lerp between what is known before and after, each joint for itself. What is
+known of one side only is held; what is never known is as it usually is. Beside the line is its bend: what a cubic with
+the velocities at both ends differs from it by, of which the network says how much to take. What else it corrects is
+taken less the line through its corrections (`anchored`): so they vanish where something is known and meet it without a
+step.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
+from steadypose.prior.body.kinematics import heading, quaternions, yaw_matrix
+from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENTS, J, finite_joints
+from steadypose.prior.models.completer.config import BENDS, FEATURES
+from steadypose.prior.timing.rate import FPS
+
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+
+NEAR = 8.0
+"""Frames from something known at which its nearness is a half: 1 / (1 + d / NEAR)."""
+
+SHORT_SAY, LONG_SAY, LONG_GAP = 0.2, 0.75, 30.0
+"""Shares of the network's answer that are taken in gaps of no frame and from so many frames on."""
+
+STEEPEST = 2.0
+"""The most that a bend may be."""
+
+_FASTEST = 10.0  # m/s
+_SPINE = [J["spine1"], J["spine2"]]
+_LEAVES = [joint for joint, children in enumerate(CHILDREN) if not children]
+
+
+class Line(NamedTuple):
+    """Between which frames each track of B windows is drawn: 22 rotations and, last, the root's place.
+
+    Attributes:
+        before: (B, T, 23) the frame known last, or next if none is before.
+        after: (B, T, 23) the frame known next, or last if none is after.
+        weight: (B, T, 23) float32, how far from the one to the other.
+        known: (B, T, 23) whether this frame itself is.
+        ever: (B, 23) whether any is.
+    """
+
+    before: NDArray[np.int64]
+    after: NDArray[np.int64]
+    weight: Floats32
+    known: Bools
+    ever: Bools
+
+
+class Window(NamedTuple):
+    """B windows as the completer reads them; all turned and moved so that the first root known faces +x at the origin.
+
+    Attributes:
+        features: (B, T, FEATURES) float32.
+        rotations: (B, T, 22, 3, 3) local, the line's.
+        root: (B, T, 3) metres, the line's.
+        bend: (B, T, 23, 6) what to add to the line's first columns, and last to the root, three numbers and no more,
+            to make cubics of them.
+        line: between what.
+        turn: (B, 3, 3) rotations back.
+        origin: (B, 3) metres, where the root first known is.
+    """
+
+    features: Floats32
+    rotations: Floats
+    root: Floats
+    bend: Floats32
+    line: Line
+    turn: Floats
+    origin: Floats
+
+
+def solved_rotations(positions: Floats, offsets: Floats, usual: Floats) -> tuple[Floats, Bools]:
+    """Local rotations (..., 22, 3, 3), NaN where nothing tells them, and which (..., 22) are known for certain.
+
+    A rotation is known where its joint and the one below are and that of the joint above is. A chest that hangs from a
+    spine nobody saw, as of sensors that know of no spine, is known: the spine is then as it usually is.
+
+    Args:
+        positions: (..., 22, 3) metres, z up; NaN where not known.
+        offsets: (..., 22, 3) metres.
+        usual: (22, 3, 3)
+    """
+    known = finite_joints(positions)
+    fallback = np.full((*positions.shape, 3), np.nan)
+    fallback[..., _SPINE, :, :] = usual[_SPINE]
+    fallback[..., _LEAVES, :, :] = np.eye(3)
+    rotations = solve_rotations(positions, offsets, fallback)
+    found = known & np.isfinite(rotations).all(axis=(-1, -2))
+    chest = np.isfinite(rotations[..., J["spine3"], :, :]).all(axis=(-1, -2))
+    for joint, children in enumerate(CHILDREN):
+        if joint == 0:
+            found[..., 0] &= known[..., HIPS].all(axis=-1)
+        elif joint in _SPINE or joint == J["spine3"]:
+            found[..., joint] = chest & found[..., 0]
+        else:
+            found[..., joint] &= found[..., PARENTS[joint]]
+            for child in children:
+                found[..., joint] &= known[..., child]
+    return rotations, found
+
+
+def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
+    """Windows as the completer reads them.
+
+    Args:
+        positions: (B, T, 22, 3) metres, z up; NaN where not known.
+        offsets: (B, 22, 3) metres, the person's bones.
+        usual: (22, 4) quaternions, xyzw, of what is never known.
+    """
+    count, frames = positions.shape[:2]
+    known = finite_joints(positions)
+    bones = np.broadcast_to(offsets[:, None], positions.shape)
+    rotations, rotations_known = solved_rotations(positions, bones, rotation_matrices(usual))
+    line = draw_line(np.concatenate([rotations_known, known[..., :1]], axis=-1))
+    rows = np.arange(count)
+    facing = np.asarray(np.isfinite(rotations[:, :, 0]).all(axis=(-1, -2)))
+    yaw = np.where(facing.any(axis=1), heading(rotations[rows, facing.argmax(axis=1), 0]), 0.0)
+    turn = yaw_matrix(yaw)
+    rooted = known[..., 0]
+    somewhere = np.where(rooted.any(axis=1), rooted.argmax(axis=1), known.any(axis=2).argmax(axis=1))
+    which = np.where(rooted.any(axis=1), 0, known[rows, somewhere].argmax(axis=1))
+    origin = np.nan_to_num(positions[rows, somewhere, which])
+    turned = np.where(rotations_known[..., None, None], rotations, np.eye(3))
+    turned[:, :, 0] = turn.swapaxes(1, 2)[:, None] @ turned[:, :, 0]
+    filled = np.empty((count, frames, 22, 4))
+    _slerp(quaternions(turned), line.before, line.after, line.weight, line.ever, usual, filled)
+    matrices = rotation_matrices(filled)
+    moved = np.nan_to_num((positions - origin[:, None, None]) @ turn[:, None])
+    path = _lerp(moved[:, :, :1], line, slice(22, 23))[:, :, 0]
+    values = np.zeros((count, frames, 23, 6))
+    values[:, :, :22] = turned[..., :2].swapaxes(-1, -2).reshape(count, frames, 22, 6)
+    values[:, :, 22, :3] = moved[:, :, 0]
+    bend = np.zeros(values.shape, dtype=np.float32)
+    _bends(values, line.known, line.before, line.after, line.weight, bend)
+    placed = np.where(known[..., None], moved - path[:, :, None], place_joints(matrices, bones))
+    features = np.empty((count, frames, FEATURES), dtype=np.float32)
+    _write(matrices, placed, path, known, features)
+    features[..., -BENDS:] = bend.reshape(count, frames, -1)[..., :BENDS]
+    return Window(features, matrices, path, bend, line, turn, origin)
+
+
+def draw_line(known: Bools) -> Line:
+    """Of tracks (B, T, K) that are known in some frames."""
+    shape = known.shape
+    before, after = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
+    weight = np.zeros(shape, dtype=np.float32)
+    _neighbours(known, before, after, weight)
+    return Line(before, after, weight, known, np.asarray(known.any(axis=1)))
+
+
+def say(line: Line) -> Floats32:
+    """(B, T, 23, 1) how much of the network's answer is taken, in place of the cubic alone: by validation, the less the
+    shorter a gap is; all of it where something is known on one side only, or never."""
+    length = (line.after - line.before)[..., None].astype(np.float32)
+    between = SHORT_SAY + (LONG_SAY - SHORT_SAY) * np.minimum(length / LONG_GAP, 1.0)
+    return np.where(length > 0, between, 1.0).astype(np.float32)
+
+
+def _lerp(values: Floats, line: Line, tracks: slice) -> Floats:
+    """Values (B, T, K, d) of what is known, along the line; 0 where nothing ever is."""
+    first = np.take_along_axis(values, line.before[..., tracks, None], axis=1)
+    second = np.take_along_axis(values, line.after[..., tracks, None], axis=1)
+    weight = line.weight[..., tracks, None]
+    return np.where(line.ever[:, None, tracks, None], (1 - weight) * first + weight * second, 0.0)
+
+
+def anchored(values: Floats, line: Line, tracks: slice) -> Floats:
+    """What a network says (B, T, K, d) of these tracks, less the line through what it says where they are known."""
+    return values - _lerp(values, line, tracks)
+
+
+def rotation_matrices(q: Floats) -> Floats:
+    """(..., 3, 3) of unit quaternions (..., 4), xyzw."""
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return np.stack(rows, axis=-1).reshape(*q.shape[:-1], 3, 3)
+
+
+def rotations_of_6d(x: Floats) -> Floats:
+    """(..., 3, 3) rotations whose first columns (..., 6) are nearest to ``x``, by Gram and Schmidt."""
+    first = x[..., :3] / np.linalg.norm(x[..., :3], axis=-1, keepdims=True)
+    second = x[..., 3:] - (first * x[..., 3:]).sum(axis=-1, keepdims=True) * first
+    second /= np.linalg.norm(second, axis=-1, keepdims=True)
+    return np.stack([first, second, np.cross(first, second)], axis=-1)
+
+
+@njit(cache=True)
+def _neighbours(known, before, after, weight):
+    count, frames, tracks = known.shape
+    for row in range(count):
+        for k in range(tracks):
+            last = -1
+            for t in range(frames):
+                if known[row, t, k]:
+                    last = t
+                before[row, t, k] = last
+            last = -1
+            for t in range(frames - 1, -1, -1):
+                if known[row, t, k]:
+                    last = t
+                after[row, t, k] = last
+            for t in range(frames):
+                a, b = before[row, t, k], after[row, t, k]
+                if a < 0 and b < 0:
+                    before[row, t, k] = after[row, t, k] = 0
+                elif a < 0:
+                    before[row, t, k] = b
+                elif b < 0:
+                    after[row, t, k] = a
+                elif b > a:
+                    weight[row, t, k] = (t - a) / (b - a)
+
+
+@njit(cache=True)
+def _bends(values, known, before, after, weight, out):
+    """Hermite's cubic less the line. At an end of which no velocity is known the cubic is straight."""
+    count, frames, tracks, size = values.shape
+    for row in range(count):
+        for t in range(frames):
+            for k in range(tracks):
+                a, b = before[row, t, k], after[row, t, k]
+                if known[row, t, k] or b <= a:
+                    continue
+                s, length = weight[row, t, k], b - a
+                left = a > 0 and known[row, a - 1, k]
+                right = b + 1 < frames and known[row, b + 1, k]
+                if not left and not right:
+                    continue
+                for i in range(size):
+                    p, q = values[row, a, k, i], values[row, b, k, i]
+                    way, start, end = q - p, 0.0, 0.0  # each velocity as what it would make of the way, less the way
+                    if left:
+                        start = p - values[row, a - 1, k, i]
+                        if a > 1 and known[row, a - 2, k]:
+                            start += 0.5 * (p - 2 * values[row, a - 1, k, i] + values[row, a - 2, k, i])
+                        start = length * start - way
+                    if right:
+                        end = values[row, b + 1, k, i] - q
+                        if b + 2 < frames and known[row, b + 2, k]:
+                            end -= 0.5 * (q - 2 * values[row, b + 1, k, i] + values[row, b + 2, k, i])
+                        end = length * end - way
+                    if not right:
+                        end = -0.5 * start
+                    if not left:
+                        start = -0.5 * end
+                    bend = (s * s * s - 2 * s * s + s) * start + (s * s * s - s * s) * end
+                    out[row, t, k, i] = min(max(bend, -STEEPEST), STEEPEST)
+
+
+@njit(cache=True)
+def _slerp(q, before, after, weight, ever, usual, out):
+    count, frames, joints = q.shape[:3]
+    for row in range(count):
+        for t in range(frames):
+            for j in range(joints):
+                if not ever[row, j]:
+                    out[row, t, j] = usual[j]
+                    continue
+                a, b = q[row, before[row, t, j], j], q[row, after[row, t, j], j]
+                cos = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+                sign = 1.0 if cos >= 0 else -1.0
+                angle = math.acos(min(abs(cos), 1.0))
+                w = weight[row, t, j]
+                first, second = 1.0 - w, w
+                if angle > 1e-4:
+                    first, second = math.sin(first * angle) / math.sin(angle), math.sin(w * angle) / math.sin(angle)
+                length = 0.0
+                for i in range(4):
+                    out[row, t, j, i] = first * a[i] + sign * second * b[i]
+                    length += out[row, t, j, i] ** 2
+                for i in range(4):
+                    out[row, t, j, i] /= math.sqrt(length)
+
+
+@njit(cache=True)
+def _write(matrices, placed, path, known, out):
+    count, frames, joints = known.shape
+    for row in range(count):
+        for t in range(frames):
+            here = out[row, t]
+            for j in range(joints):
+                at = 15 * j
+                for i in range(3):
+                    here[at + i] = matrices[row, t, j, i, 0]
+                    here[at + 3 + i] = matrices[row, t, j, i, 1]
+                    here[at + 6 + i] = placed[row, t, j, i]
+                    step = placed[row, t, j, i] - placed[row, t - 1, j, i] if t else 0.0
+                    here[at + 9 + i] = min(max(step * FPS, -_FASTEST), _FASTEST)
+            at = 15 * joints
+            for i in range(3):
+                here[at + i] = path[row, t, i]
+                step = path[row, t, i] - path[row, t - 1, i] if t else 0.0
+                here[at + 3 + i] = min(max(step * FPS, -_FASTEST), _FASTEST)
+        for k in range(joints + 1):
+            j, at = (k, 15 * k + 12) if k < joints else (0, 15 * joints + 6)
+            last = -1
+            for t in range(frames):
+                if known[row, t, j]:
+                    last = t
+                out[row, t, at] = known[row, t, j]
+                out[row, t, at + 1] = 1.0 / (1.0 + (t - last) / NEAR) if last >= 0 else 0.0
+            last = -1
+            for t in range(frames - 1, -1, -1):
+                if known[row, t, j]:
+                    last = t
+                out[row, t, at + 2] = 1.0 / (1.0 + (last - t) / NEAR) if last >= 0 else 0.0

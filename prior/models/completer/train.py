@@ -1,0 +1,359 @@
+"""Training of the completer: ``steadypose train completer``.
+
+Windows of true motion lose what somebody could want completed: all between two ends, frames between key frames, parts
+of the body, and these together; and some keep a little noise where they are known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from steadypose.prior.body.inverse_kinematics import place_joints
+from steadypose.prior.body.skeleton import J, limbs
+from steadypose.prior.models.completer.config import BENDS, CompleterConfig
+from steadypose.prior.models.completer.features import Bools, Line, Window, read_window, say
+from steadypose.prior.models.completer.network import Completer
+from steadypose.prior.models.hmvae.network import from_6d, to_6d
+from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
+from steadypose.prior.models.torch_weights import started
+from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.weights_io import LICENCES
+from steadypose.prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations
+from steadypose.prior.timing.rate import FPS
+
+Rng = np.random.Generator
+
+GAPS = (5, 64)
+"""Range of frames of a gap."""
+
+CONTEXT = (2, 14)
+"""Range of frames that are known around it, before and after together."""
+
+LEAST_SPEED = 0.25
+"""m/s: a window is drawn as often as its joints are fast, and one that stands still as if they were this fast."""
+
+STRIDES = (1, 1, 1, 2)
+"""Frame rates, as frames from one to the next."""
+
+SCALES = (0.85, 1.15)
+"""Range of factors on people's sizes."""
+
+NOISY, NOISE = 0.3, 0.015
+"""Share of windows whose known joints are noisy, and by how much at most: standard deviation along an axis, metres."""
+
+POSE_WEIGHT, PATH_WEIGHT, ROTATION_WEIGHT, VELOCITY_WEIGHT = 4.0, 4.0, 1.0, 10.0
+"""Of joints about the root and the root itself, metres; global rotation matrices; metres a frame of joints."""
+
+EASY = 0.05
+"""Metres, the error of the line that makes a window count half as much as one of which the line is right: in each, it
+is the share of the line's error that counts, and not most of all in those who jump."""
+
+_ARMS = limbs(("elbow", "wrist"), ("shoulder", "elbow", "wrist"))
+_LEGS = limbs(("knee", "ankle", "foot"), ("ankle", "foot"))
+_LOWER = sorted(_LEGS[0] + _LEGS[2])
+_BOTH_ARMS = sorted(_ARMS[1] + _ARMS[3])
+_PARTS = (*_ARMS, *_LEGS, _LOWER, _LOWER, _BOTH_ARMS, [*_BOTH_ARMS, J["head"], J["neck"]], [J["pelvis"], *_LOWER])
+_ENDS = [J[name] for name in ("pelvis", "spine3", "head", "left_wrist", "right_wrist", "left_ankle", "right_ankle")]
+
+
+def train_completer(
+    data: Path,
+    runs: Path,
+    weights: str = "default",
+    iterations: int = 20_000,
+    batch: int = 1536,
+    learning_rate: float = 8e-4,
+    seed: int = 0,
+    start: str | None = None,
+    config: CompleterConfig | None = None,
+) -> Path:
+    """Train the completer on prepared motion and write weights, card and curves.
+
+    Args:
+        data: ``prepared.npz``.
+        runs: folder of training runs; a killed run of the same name resumes there.
+        weights: which set: ``default`` or ``research``.
+        iterations: optimiser steps.
+        batch: frames a step.
+        learning_rate: of AdamW at its highest; it falls along a cosine.
+        seed: of weights and of sampling.
+        start: weights to go on from: a set or a path.
+        config: sizes.
+
+    Returns:
+        The path of the weights.
+    """
+    name = f"completer-{weights}"
+    torch.manual_seed(seed)
+    train, val = (MotionSet.load(data, weights, split) for split in ("train", "val"))
+    model = Completer(config or CompleterConfig())
+    model.usual.copy_(roma.rotmat_to_unitquat(roma.special_procrustes(train.rotations.mean(dim=0))))
+    origin = started(model, "completer", start)
+    optimiser = torch.optim.AdamW(model.parameters(), lr=learning_rate, weight_decay=0.01)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, learning_rate, total_steps=iterations + 1, pct_start=0.05, final_div_factor=40
+    )
+    run = TrainingRun(runs / name, model, schedule, iterations, evaluations=40)
+    sampler = Sampler(train)
+
+    def loss_of(count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        gap, context = int(rng.integers(GAPS[0], GAPS[1] + 1)), int(rng.integers(CONTEXT[0], CONTEXT[1] + 1))
+        frames = gap + context
+        rows = sampler.draw(max(count // frames, 1), frames, rng)
+        return loss(model, Truth.of(train, rows, rng), masks(len(rows), gap, context, rng), rng)
+
+    run.minimise(loss_of, lambda: evaluate_completer(model, val), batch, seed, clip=1.0)
+    return run.save(runs / name / f"{name}.safetensors", model, asdict(calibrate(model, val)), {
+        "Model": f"a transformer of {model.config.layers} layers, {model.config.width} wide, over a window's frames",
+        "Data": data_told(weights, train, val),
+        "Licence": LICENCES[weights],
+        "Training": f"`steadypose train completer --weights {weights} --iterations {iterations}`: {batch} frames a "
+        f"step in windows of {GAPS[0] + CONTEXT[0]} to {GAPS[1] + CONTEXT[1]}, AdamW {learning_rate:g}, "
+        f"seed {seed}{origin}",
+    })  # fmt: skip
+
+
+class Truth:
+    """Windows of true motion.
+
+    Attributes:
+        rotations: (B, T, 22, 3, 3) local.
+        root: (B, T, 3) metres.
+        offsets: (B, 22, 3) metres.
+    """
+
+    def __init__(self, rotations: Tensor, root: Tensor, offsets: Tensor) -> None:
+        self.rotations, self.root, self.offsets = rotations, root, offsets
+
+    @classmethod
+    def of(cls, motion: MotionSet, rows: NDArray[np.int64], rng: Rng | None = None) -> Truth:
+        """These frames (B, T); half mirrored and all scaled at random, with random numbers."""
+        rotations, root, offsets = motion.rotations[rows], motion.positions[rows, 0], motion.offsets[rows[:, 0]]
+        if rng is not None:
+            half = len(rows) // 2
+            # across the world's xz plane, which is as good as any
+            flip = torch.tensor([1.0, -1.0, 1.0])
+            rotations = torch.cat([mirror_rotations(rotations[:half]), rotations[half:]])
+            root = torch.cat([root[:half] * flip, root[half:]])
+            offsets = torch.cat([mirror_offsets(offsets[:half]), offsets[half:]])
+            scale = torch.from_numpy(rng.uniform(*SCALES, (len(rows), 1, 1))).float()
+            root, offsets = root * scale, offsets * scale
+        return cls(rotations, root, offsets)
+
+    def seen(self, known: Bools, usual: Tensor, rng: Rng | None = None) -> Window:
+        """What the completer reads where these joints (B, T, 22) are known; with random numbers, some are noisy."""
+        joints = forward_kinematics(self.rotations, self.offsets[:, None], self.root)[0].double().numpy()
+        if rng is not None:
+            sigma = rng.uniform(0.0, NOISE, (len(joints), 1, 1, 1)) * (rng.random((len(joints), 1, 1, 1)) < NOISY)
+            joints += sigma * rng.standard_normal(joints.shape)
+        joints[~known] = np.nan
+        return read_window(joints, self.offsets.double().numpy(), usual.double().numpy())
+
+
+class Sampler:
+    """Draws windows of motion, the faster the likelier; and of a source as many as the root of what it has, for a large
+    one of ten exercises is not most of the world."""
+
+    def __init__(self, motion: MotionSet) -> None:
+        lengths = np.diff(motion.clip_start)
+        speed = (motion.positions[1:] - motion.positions[:-1]).norm(dim=-1).mean(dim=1).double().numpy() * FPS
+        speed = np.append(speed, 0.0)
+        speed[motion.clip_start[1:] - 1] = 0.0
+        self._passed = np.concatenate([[0.0], np.cumsum(LEAST_SPEED + speed)])
+        self._room = np.repeat(motion.clip_start[1:], lengths) - np.arange(lengths.sum())
+        self._source = np.repeat(np.unique(motion.source, return_inverse=True)[1], lengths)
+
+    def draw(self, count: int, frames: int, rng: Rng) -> NDArray[np.int64]:
+        """(count, frames) frame numbers of windows inside clips, at a random frame rate."""
+        stride = int(rng.choice(STRIDES))
+        span = (frames - 1) * stride + 1
+        starts = np.flatnonzero(self._room >= span)
+        worth = self._passed[starts + span] - self._passed[starts]
+        source = self._source[starts]
+        chances = np.cumsum(worth / np.sqrt(np.bincount(source, worth))[source])
+        chosen = np.searchsorted(chances, rng.random(count) * chances[-1])
+        return starts[np.minimum(chosen, len(starts) - 1)][:, None] + stride * np.arange(frames)
+
+
+def masks(count: int, gap: int, context: int, rng: Rng) -> Bools:
+    """(count, gap + context, 22) which joints are known, of windows as somebody could want them completed."""
+    frames = gap + context
+    known = np.ones((count, frames, 22), dtype=bool)
+    for row in known:
+        kind = rng.random()
+        if kind < 0.52 or kind > 0.92:
+            if rng.random() < 0.03:
+                before = context
+            else:
+                before = context - 1 if rng.random() < 0.5 else int(rng.integers(1, context))
+            row[before : before + gap] = False
+        elif kind < 0.62:
+            step = int(rng.integers(3, 31))
+            row[np.arange(frames) % step != int(rng.integers(0, step))] = False
+            row[0] = True
+        if kind > 0.62:
+            span = slice(None)
+            if rng.random() < 0.4:
+                length = int(rng.integers(1, frames + 1))
+                start = int(rng.integers(0, frames - length + 1))
+                span = slice(start, start + length)
+            if rng.random() < 0.75:
+                hidden = _PARTS[int(rng.integers(len(_PARTS)))]
+            elif rng.random() < 0.5:
+                hidden = np.flatnonzero(rng.random(22) < rng.uniform(0.05, 0.6))
+            else:
+                hidden = np.setdiff1d(np.arange(22), _ENDS)
+            row[span, hidden] = False
+    return known
+
+
+def _gathered(values: Tensor, line: Line, tracks: slice) -> Tensor:
+    """`features.anchored`, with gradients."""
+
+    def at(frames: NDArray[np.int64]) -> Tensor:
+        index = torch.from_numpy(frames[..., tracks, None]).expand_as(values)
+        return values.gather(1, index)
+
+    weight = torch.from_numpy(line.weight[..., tracks, None])
+    ever = torch.from_numpy(line.ever[:, None, tracks, None])
+    return values - torch.where(ever, torch.lerp(at(line.before), at(line.after), weight), 0.0)
+
+
+def answer(model: Completer, window: Window) -> tuple[Tensor, Tensor]:
+    """Local rotations (B, T, 22, 3, 3) and root (B, T, 3), with gradients, where `read_window` turned and put them."""
+    line = window.line
+    with torch.autocast("cpu", torch.bfloat16, enabled=model.training):
+        said = model(torch.from_numpy(window.features))
+    rotations, root, taken = said.float().split([BENDS - 3, 3, 23], dim=-1)
+    share = torch.from_numpy(say(line))
+    bend = torch.from_numpy(window.bend) * (1.0 - share * torch.sigmoid(-taken)[..., None])
+    rotations = _gathered(rotations.unflatten(-1, (22, 6)), line, slice(0, 22))
+    root = _gathered(root.unflatten(-1, (1, 3)), line, slice(22, 23))[:, :, 0]
+    base = torch.from_numpy(window.rotations).float()
+    rotations, root = share[:, :, :22] * rotations + bend[:, :, :22], share[:, :, 22] * root + bend[:, :, 22, :3]
+    return from_6d(to_6d(base) + rotations), torch.from_numpy(window.root).float() + root
+
+
+def loss(model: Completer, truth: Truth, known: Bools, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+    """How far the answer is off where something was hidden; every term a mean of absolute values."""
+    window = truth.seen(known, model.usual, rng)
+    rotations, root = answer(model, window)
+    turn, origin = torch.from_numpy(window.turn).float(), torch.from_numpy(window.origin).float()
+    true = truth.rotations.clone()
+    true[:, :, 0] = turn.mT[:, None] @ true[:, :, 0]
+    true_root = (truth.root - origin[:, None]) @ turn
+    joints, turned = forward_kinematics(torch.stack([rotations, true]), truth.offsets[:, None])
+    hidden = torch.from_numpy(~known)
+    frames = hidden.any(dim=-1)
+    rotations_hidden = torch.from_numpy(~window.line.known[..., :22])[..., None, None]
+    missed = joints[0] - joints[1]
+    world = missed + (root - true_root)[:, :, None]
+    line = place_joints(window.rotations, truth.offsets[:, None].double().numpy()) + window.root[:, :, None]
+    off = torch.from_numpy(line).float() - joints[1].detach() - true_root[:, :, None]
+    per = frames.sum(dim=1).clamp(min=1)[:, None]
+    worth = 1.0 / ((off.norm(dim=-1).mean(dim=-1) * frames).sum(dim=1, keepdim=True) / per + EASY)
+    worth = worth / worth.mean() * frames.float()
+
+    def mean(values: Tensor) -> Tensor:
+        return (values * worth[:, :, None, None]).sum() / worth.sum().clamp(min=1.0) / values[0, 0].numel()
+
+    l_pose, l_path = mean(missed.abs()), mean((root - true_root).abs()[:, :, None] * hidden[..., :1, None])
+    l_rotation = mean((turned[0] - turned[1]).abs().flatten(3)) + mean(
+        ((rotations - true).abs() * rotations_hidden).flatten(3)
+    )
+    l_velocity = mean(F.pad(world.diff(dim=1).abs(), (0, 0, 0, 0, 1, 0)))
+    total = (
+        POSE_WEIGHT * l_pose + PATH_WEIGHT * l_path + ROTATION_WEIGHT * l_rotation + VELOCITY_WEIGHT * l_velocity
+    )  # fmt: skip
+    return total, {"loss": total.item(), "pose mm": 1e3 * l_pose.item(), "path mm": 1e3 * l_path.item()}
+
+
+PROTOCOL = (10, 1)
+"""Frames known before a gap and after it, in the protocol of LAFAN1 (Harvey et al. 2020)."""
+
+
+@torch.no_grad()
+def evaluate_completer(model: Completer, motion: MotionSet, windows: int = 192) -> dict[str, float]:
+    """Errors on unseen people.
+
+    Returns:
+        for gaps of 15 and 30 frames, ``val 15 of line`` the error of joints as a share of slerp's and lerp's; ``val
+        legs mm`` that of knees, ankles and feet never seen.
+    """
+    found = {}
+    for gap in (15, 30):
+        frames = sum(PROTOCOL) + gap
+        known = np.ones((frames, 22), dtype=bool)
+        known[PROTOCOL[0] : PROTOCOL[0] + gap] = False
+        ours, line = _errors(model, motion, known, windows)
+        found[f"val {gap} of line"] = float(ours[~known].mean() / line[~known].mean())
+    known = np.ones((40, 22), dtype=bool)
+    known[:, _LOWER] = False
+    found["val legs mm"] = float(_errors(model, motion, known, windows)[0][~known].mean() * 1e3)
+    return found
+
+
+HIDDEN_PARTS = (
+    _ARMS[1],
+    _ARMS[3],
+    _LEGS[0],
+    _LEGS[2],
+    [J["head"], J["neck"]],
+    np.setdiff1d(np.arange(22), _ENDS).tolist(),
+)
+"""What is hidden to see how far off joints are that are never known; by the first in which a joint is."""
+
+
+@torch.no_grad()
+def calibrate(model: Completer, motion: MotionSet, windows: int = 128) -> CompleterConfig:
+    """The model's configuration with how far off validation finds its answers along an axis, root mean squares.
+
+    The frames are those with which the error in a gap grows from its ends most like the errors found.
+    """
+    never = np.full(22, np.nan)
+    for part in (*HIDDEN_PARTS, [J["pelvis"]], [J["spine3"]]):
+        known = np.ones((50, 22), dtype=bool)
+        known[:, part] = False
+        off = _errors(model, motion, known, windows, squared=True)[0].mean(dim=0).sqrt().numpy() / np.sqrt(3)
+        never = np.where(np.isnan(never) & ~known[0], off, never)
+    gap = 60
+    known = np.ones((gap + 14, 22), dtype=bool)
+    known[7:-7] = False
+    off = _errors(model, motion, known, windows, squared=True)[0][7:-7].sqrt().numpy() / np.sqrt(3)
+    apart = np.minimum(np.arange(1, gap + 1), np.arange(gap, 0, -1))[:, None]
+    halves = np.arange(1.0, 61.0)
+    fits = [np.abs(np.log(never * apart / (apart + half)) - np.log(np.maximum(off, 1e-4))).mean() for half in halves]
+    return replace(
+        model.config,
+        never_sigma=tuple(round(float(v), 4) for v in never),
+        half_frames=float(halves[int(np.argmin(fits))]),
+    )
+
+
+def _errors(
+    model: Completer, motion: MotionSet, known: Bools, windows: int, *, squared: bool = False
+) -> tuple[Tensor, Tensor]:
+    """(T, 22) mean distances of joints from the truth, metres, or their mean squares: of the answer, and the line."""
+    rows = motion.all_windows(len(known), step=5)
+    rows = rows[np.linspace(0, len(rows) - 1, windows).astype(int)]
+    truth = Truth.of(motion, rows)
+    window = truth.seen(np.broadcast_to(known, (windows, *known.shape)).copy(), model.usual)
+    turn, origin = torch.from_numpy(window.turn).float(), torch.from_numpy(window.origin).float()
+    true = truth.rotations.clone()
+    true[:, :, 0] = turn.mT[:, None] @ true[:, :, 0]
+    aim, _ = forward_kinematics(true, truth.offsets[:, None], (truth.root - origin[:, None]) @ turn)
+
+    def error(rotations: Tensor, root: Tensor) -> Tensor:
+        off = (forward_kinematics(rotations, truth.offsets[:, None], root)[0] - aim).norm(dim=-1)
+        return (off.square() if squared else off).mean(dim=0)
+
+    base = torch.from_numpy(window.rotations).float(), torch.from_numpy(window.root).float()
+    return error(*answer(model, window)), error(*base)

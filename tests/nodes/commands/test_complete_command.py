@@ -1,0 +1,113 @@
+"""`steadypose complete`: what it fills in, what it leaves, and what it says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.helpers.bodies import waving
+
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.types import JointState, PoseClean
+from steadypose.nodes.commands.complete import complete
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.prior.body.skeleton import J
+
+
+def write(path: Path, positions: np.ndarray, **more: object) -> Path:
+    arrays = {"positions": positions, "skeleton": "smpl22", "fps": 30.0} | more
+    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})  # type: ignore[arg-type]
+    return path
+
+
+def test_key_frames_become_motion_and_stay_what_they_are(tmp_path: Path, capsys) -> None:
+    positions = waving(91)
+    keys = np.arange(0, 91, 15)
+    stamps = 10**9 + np.round(keys * 1e9 / 30).astype(np.int64)
+    source = write(tmp_path / "keys.npz", positions[keys], stamp_ns=stamps, fps=None)
+    assert complete(source, tmp_path / "out.npz", picture=tmp_path / "out.png") == 0
+    out = np.load(tmp_path / "out.npz")
+    assert out["positions"].shape == (91, 22, 3)
+    assert np.abs(out["positions"][keys] - positions[keys]).max() < 1e-6
+    assert (out["state"][keys] == JointState.SEEN).all()
+    assert (np.delete(out["state"], keys, axis=0) == JointState.IMPUTED).all()
+    for name in ("positions", "rotations", "sigma", "world_positions", "contacts"):
+        assert np.isfinite(out[name]).all(), name
+    assert np.linalg.norm(out["positions"] - positions, axis=-1).mean() < 0.03
+    assert (tmp_path / "out.png").stat().st_size > 10_000
+    assert "8% of their joints were given" in capsys.readouterr().err
+
+
+def test_no_confidence_is_as_good_as_no_joint_and_a_recording_comes_of_it(tmp_path: Path) -> None:
+    positions = waving(40)
+    confidence = np.ones((40, 22))
+    confidence[:, J["right_wrist"]] = 0.0
+    complete(write(tmp_path / "in.npz", positions, confidence=confidence), tmp_path / "a")
+    hidden = positions.copy()
+    hidden[:, J["right_wrist"]] = np.nan
+    complete(write(tmp_path / "nan.npz", hidden), tmp_path / "b.npz")
+    with RecordingReader(tmp_path / "a") as recording:
+        assert {POSE_RAW, POSE_CLEAN, POSE_WORLD} <= set(recording.topics)
+        cleaned = [m for _, _, m in recording.messages([POSE_CLEAN]) if isinstance(m, PoseClean) and m.bodies]
+    found = np.array([message.bodies[0].positions for message in cleaned])
+    assert np.array_equal(found, np.load(tmp_path / "b.npz")["positions"])
+    assert [message.bodies[0].state[J["right_wrist"]] for message in cleaned] == [JointState.IMPUTED] * 40
+    assert np.isnan(cleaned[0].bodies[0].raw_positions[J["right_wrist"]]).all()
+
+
+def test_another_axis_may_point_up(tmp_path: Path) -> None:
+    positions = waving(30)
+    positions[10:20] = np.nan
+    complete(write(tmp_path / "z.npz", positions), tmp_path / "z_out.npz")
+    turned = np.stack([positions[..., 0], -positions[..., 2], positions[..., 1]], axis=-1)
+    complete(write(tmp_path / "y.npz", turned, up="-y"), tmp_path / "y_out.npz")
+    z, y = (np.load(tmp_path / f"{name}_out.npz") for name in ("z", "y"))
+    expected = np.stack([z["positions"][..., 0], -z["positions"][..., 2], z["positions"][..., 1]], axis=-1)
+    assert np.allclose(y["positions"], expected, atol=1e-4)
+    assert np.allclose(y["rotations"][:, 1:], z["rotations"][:, 1:], atol=1e-3)
+
+
+def test_several_people_and_one_who_was_away(tmp_path: Path) -> None:
+    positions = np.stack([waving(60), waving(60) + [2.0, 0.0, 0.0]], axis=1)
+    positions[20:30, 0] = np.nan
+    complete(write(tmp_path / "two.npz", positions), tmp_path / "out.npz")
+    out = np.load(tmp_path / "out.npz")
+    assert out["positions"].shape == (60, 2, 22, 3)
+    assert np.isfinite(out["positions"]).all()
+    long = np.full((400, 22, 3), np.nan)
+    long[:40], long[-40:] = waving(40), waving(40)
+    complete(write(tmp_path / "away.npz", long), tmp_path / "away_out.npz")
+    assert len(np.load(tmp_path / "away_out.npz")["stamp_ns"]) == 80, "nobody knows what happened in ten seconds"
+
+
+def test_who_stands_on_the_pelvis_is_given_a_way(tmp_path: Path, capsys) -> None:
+    positions = waving(60)
+    complete(write(tmp_path / "in.npz", positions - positions[:, :1]), tmp_path / "out.npz")
+    assert "its way is read from its motion" in capsys.readouterr().err
+    out = np.load(tmp_path / "out.npz")
+    assert np.ptp(out["positions"][:, 0], axis=0).max() < 1e-6
+    assert np.ptp(out["world_positions"][:, 0, :2], axis=0).max() > 1e-3
+
+
+def test_what_cannot_be_is_said(tmp_path: Path) -> None:
+    source = write(tmp_path / "in.npz", waving(20))
+    with pytest.raises(LaunchError, match="nothing is completed in place"):
+        complete(source, source)
+    with pytest.raises(LaunchError, match="make it first"):
+        complete(source, tmp_path / "no" / "out.npz")
+    with pytest.raises(LaunchError, match=r"ending in \.png"):
+        complete(source, tmp_path / "out.npz", picture=tmp_path / "a.txt")
+    with pytest.raises(LaunchError, match="no weights 'nobody'"):
+        complete(source, tmp_path / "out.npz", weights="nobody")
+    with pytest.raises(LaunchError, match="expected metres"):
+        complete(write(tmp_path / "mm.npz", waving(20) * 1000), tmp_path / "out.npz")
+    with pytest.raises(LaunchError, match="expected a body with joints"):
+        complete(write(tmp_path / "none.npz", np.full((5, 22, 3), np.nan)), tmp_path / "out.npz")
+    (tmp_path / "out.npz").write_text("mine")
+    with pytest.raises(LaunchError, match="--force"):
+        complete(source, tmp_path / "out.npz")
+    assert (tmp_path / "out.npz").read_text() == "mine"
+    complete(source, tmp_path / "out.npz", force=True)
+    assert np.load(tmp_path / "out.npz")["positions"].shape == (20, 22, 3)

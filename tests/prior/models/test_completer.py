@@ -1,0 +1,203 @@
+"""The completer: the line that it corrects, both of its forms, and its training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation, Slerp
+from test_hmvae import prepared
+from tests.helpers.bodies import random_pose, waving
+
+from steadypose.prior.body.bone_lengths import estimate_offsets
+from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
+from steadypose.prior.body.skeleton import REST_OFFSETS, J
+from steadypose.prior.models.completer.config import FEATURES, CompleterConfig
+from steadypose.prior.models.completer.features import (
+    anchored,
+    draw_line,
+    read_window,
+    rotation_matrices,
+    solved_rotations,
+)
+from steadypose.prior.models.completer.inference import LiveCompleter
+from steadypose.prior.models.completer.network import Completer
+from steadypose.prior.models.completer.train import Truth, answer, masks, train_completer
+from steadypose.prior.models.torch_weights import arrays_of
+from steadypose.prior.motion.dataset import MotionSet
+
+SMALL = CompleterConfig(width=16, heads=2, layers=2)
+USUAL = np.tile([0.0, 0.0, 0.0, 1.0], (22, 1))
+
+
+def network(config: CompleterConfig = SMALL) -> Completer:
+    """Untrained, and loud: what it says is no small matter."""
+    torch.manual_seed(0)
+    model = Completer(config).eval()
+    with torch.no_grad():
+        model.write.weight.mul_(40.0)
+    return model
+
+
+def moving(frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Joints (T, 22, 3) and bones of somebody who waves."""
+    positions = waving(frames)
+    return positions, REST_OFFSETS.copy()
+
+
+@given(seed=st.integers(0, 10_000), gap=st.integers(1, 20), context=st.integers(2, 8))
+@settings(max_examples=25, deadline=None)
+def test_whatever_the_network_says_what_is_known_stays(seed: int, gap: int, context: int) -> None:
+    positions, offsets = moving(gap + context)
+    known = masks(1, gap, context, np.random.default_rng(seed))[0]
+    seen = np.where(known[..., None], positions, np.nan)
+    live = LiveCompleter(SMALL, arrays_of(network()))
+    rotations, root = live(seen[None], offsets[None])
+    solved, sure = solved_rotations(seen, offsets, rotation_matrices(USUAL))
+    assert np.isfinite(rotations).all()
+    assert np.allclose(rotations[0][sure], solved[sure], atol=1e-6)
+    assert np.allclose(root[0][known[:, 0]], positions[known[:, 0], 0], atol=1e-9)
+    assert np.allclose(rotations @ rotations.swapaxes(-1, -2), np.eye(3), atol=1e-9)
+
+
+def test_the_answer_turns_and_moves_with_the_body() -> None:
+    positions, offsets = moving(40)
+    seen = positions.copy()
+    seen[10:30] = np.nan
+    seen[:, [J["left_elbow"], J["left_wrist"]]] = np.nan
+    turn = Rotation.from_euler("z", 2.0).as_matrix()
+    live = LiveCompleter(SMALL, arrays_of(network()))
+    rotations, root = live(seen[None], offsets[None])
+    turned, moved = live(seen[None] @ turn.T + [3.0, -2.0, 0.5], offsets[None])
+    assert np.allclose(moved, root @ turn.T + [3.0, -2.0, 0.5], atol=1e-4)
+    assert np.allclose(turned[:, :, 0], turn @ rotations[:, :, 0], atol=1e-4)
+    assert np.allclose(turned[:, :, 1:], rotations[:, :, 1:], atol=1e-4)
+
+
+def test_the_live_form_gives_what_the_network_gives() -> None:
+    model = network()
+    live = LiveCompleter(SMALL, arrays_of(model))
+    x = np.random.default_rng(0).standard_normal((3, 70, FEATURES)).astype(np.float32)
+    assert np.allclose(live.forward(x), model(torch.from_numpy(x)).detach().numpy(), atol=1e-4)
+    positions, offsets = moving(30)
+    seen = np.stack([positions, positions])
+    seen[0, 8:25], seen[1, :, 16:] = np.nan, np.nan
+    both = np.stack([offsets, offsets])
+    window = read_window(seen, both, USUAL)
+    rotations, root = (part.detach().double().numpy() for part in answer(model, window))
+    live_rotations, live_root = live(seen, both)
+    live_rotations[:, :, 0] = window.turn.swapaxes(1, 2)[:, None] @ live_rotations[:, :, 0]
+    assert np.allclose(rotations, live_rotations, atol=1e-4)
+    assert np.allclose(root, (live_root - window.origin[:, None]) @ window.turn, atol=1e-4)
+
+
+def test_the_line_is_slerp_and_lerp_and_its_bend_makes_it_a_cubic() -> None:
+    rng = np.random.default_rng(3)
+    poses = random_pose(rng, 4, 0.2)
+    local = np.stack(
+        [Slerp([0, 30], Rotation.from_matrix(poses[:2, j]))(np.arange(31)).as_matrix() for j in range(22)], 1
+    )
+    root = np.cumsum(rng.normal(0.0, 0.02, (31, 3)), axis=0)
+    joints = place_joints(local, REST_OFFSETS) + root[:, None]
+    seen = joints.copy()
+    seen[10:25] = np.nan
+    window = read_window(seen[None], REST_OFFSETS[None], USUAL)
+    solved = solve_rotations(joints, REST_OFFSETS)
+    back = window.rotations[0].copy()
+    back[:, 0] = window.turn[0] @ back[:, 0]
+    for joint in range(22):
+        ends = Rotation.from_matrix(solved[[9, 25], joint])
+        assert np.allclose(back[:, joint][9:26], Slerp([9, 25], ends)(np.arange(9, 26)).as_matrix(), atol=1e-6)
+    way = window.root[0] @ window.turn[0].T + window.origin[0]
+    assert np.allclose(way[9:26], np.linspace(root[9], root[25], 17), atol=1e-9)
+    bend = window.bend[0, :, 22, :3] @ window.turn[0].T
+    before = root[9] - root[8] + 0.5 * (root[9] - 2 * root[8] + root[7])
+    after = root[26] - root[25] - 0.5 * (root[25] - 2 * root[26] + root[27])
+    cubic = CubicHermiteSpline([9, 25], root[[9, 25]], [before, after])(np.arange(9, 26))
+    assert np.allclose((way + bend)[9:26], cubic, atol=1e-5)
+    assert not window.bend[0, :10].any()
+    assert not window.bend[0, 25:].any()
+
+
+def test_the_line_knows_what_is_before_and_after() -> None:
+    known = np.array([0, 1, 0, 0, 1, 0], dtype=bool)
+    line = draw_line(np.stack([known, np.zeros(6, bool)], axis=-1)[None])
+    assert line.before[0, :, 0].tolist() == [1, 1, 1, 1, 4, 4]
+    assert line.after[0, :, 0].tolist() == [1, 1, 4, 4, 4, 4]
+    assert np.allclose(line.weight[0, :, 0], [0, 0, 1 / 3, 2 / 3, 0, 0])
+    assert line.ever.tolist() == [[True, False]]
+    values = np.random.default_rng(0).standard_normal((1, 6, 2, 3))
+    left = anchored(values, line, slice(0, 2))
+    assert np.allclose(left[0, known, 0], 0.0)
+    assert np.array_equal(left[:, :, 1], values[:, :, 1])
+
+
+def test_rotations_are_known_where_joints_tell_them() -> None:
+    positions, offsets = moving(1)
+    usual = rotation_matrices(USUAL)
+
+    def sure(*hidden: str) -> np.ndarray:
+        seen = positions.copy()
+        seen[:, [J[name] for name in hidden]] = np.nan
+        return solved_rotations(seen, offsets, usual)[1][0]
+
+    assert sure().all()
+    lost = {name for name, j in J.items() if not sure("left_knee")[j]}
+    assert lost == {"left_hip", "left_knee", "left_ankle", "left_foot"}
+    assert not sure("left_hip").any(), "the pelvis' frame is gone, and so is what it carries"
+    lost = {name for name, j in J.items() if not sure("spine1", "spine2", "spine3")[j]}
+    assert not lost & {"left_shoulder", "right_elbow", "neck"}, "sensors that know of no spine show arms all the same"
+
+
+def test_windows_of_training_are_of_one_person_and_keep_something() -> None:
+    for seed in range(40):
+        known = masks(8, 20, 5, np.random.default_rng(seed))
+        assert known.any(axis=(1, 2)).all()
+        assert (~known).any(axis=(1, 2)).mean() > 0.5
+
+
+def test_training_learns_to_fill_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("steadypose.prior.models.completer.train.GAPS", (5, 12))
+    monkeypatch.setattr("steadypose.prior.models.completer.train.evaluate_completer", lambda *_: {"val": 1.0})
+    monkeypatch.setattr("steadypose.prior.models.completer.train.calibrate", lambda model, _: model.config)
+    data = prepared(tmp_path / "m.npz")
+    settings_ = {"batch": 60, "config": SMALL}
+    whole = train_completer(data, tmp_path / "a", iterations=4, **settings_).read_bytes()
+    steps = iter(range(100))
+    original = torch.optim.AdamW.step
+
+    def dies(*args: object, **keywords: object) -> object:
+        if next(steps) == 2:
+            raise KeyboardInterrupt
+        return original(*args, **keywords)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(torch.optim.AdamW, "step", dies)
+    with pytest.raises(KeyboardInterrupt):
+        train_completer(data, tmp_path / "b", iterations=4, **settings_)
+    monkeypatch.setattr(torch.optim.AdamW, "step", original)
+    assert train_completer(data, tmp_path / "b", iterations=4, **settings_).read_bytes() == whole
+    motion = MotionSet.load(data, "default", "train")
+    truth = Truth.of(motion, motion.all_windows(12, 40)[:2])
+    assert np.isfinite(truth.seen(np.ones((2, 12, 22), bool), torch.from_numpy(USUAL)).features).all()
+
+
+def test_the_weights_that_ship_fill_a_gap_better_than_a_line() -> None:
+    positions = waving(60)
+    offsets = estimate_offsets(positions)
+    seen = positions.copy()
+    seen[20:35] = np.nan
+    live = LiveCompleter.load("default")
+    rotations, root = live(seen[None], offsets[None])
+    filled = place_joints(rotations[0], offsets) + root[0][:, None]
+    window = read_window(seen[None], offsets[None], live.usual)
+    line = window.rotations[0].copy()
+    line[:, 0] = window.turn[0] @ line[:, 0]
+    way = window.root[0] @ window.turn[0].T + window.origin[0]
+    drawn = place_joints(line, offsets) + way[:, None]
+    ours, theirs = (np.linalg.norm(x - positions, axis=-1)[20:35].mean() for x in (filled, drawn))
+    assert ours < 0.8 * theirs
