@@ -47,7 +47,7 @@ def complete(
         out: the recording to make, or .npz.
         optimise: search HM-VAE for the motion that fits what is known, as the paper does: first its latent vectors,
             then its decoder, from the answer of the feed-forward completer. Takes seconds for each window of 64
-            frames, and the extra 'train'. docs/complete.md says what it gains.
+            frames, the extra 'train', and weights of your own, for none ship: steadypose train hmvae64 --install.
         weights: weight set of the completer: 'default', or a .safetensors file of your own.
         skeletons: TOML with [skeletons.NAME] of joint layouts of your own; a launch file with them will do.
         picture: what was done, as .png, .svg or .pdf.

@@ -101,6 +101,8 @@ def test_what_cannot_be_is_said(tmp_path: Path) -> None:
         complete(source, tmp_path / "out.npz", picture=tmp_path / "a.txt")
     with pytest.raises(LaunchError, match="no weights 'nobody'"):
         complete(source, tmp_path / "out.npz", weights="nobody")
+    with pytest.raises(FileNotFoundError, match="steadypose train hmvae64"):
+        complete(source, tmp_path / "out.npz", optimise=True)
     with pytest.raises(LaunchError, match="expected metres"):
         complete(write(tmp_path / "mm.npz", waving(20) * 1000), tmp_path / "out.npz")
     with pytest.raises(LaunchError, match="expected a body with joints"):
