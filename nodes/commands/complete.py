@@ -27,8 +27,9 @@ def complete(
     """Complete recorded poses: motion between key frames, and the parts of a body that nobody saw.
 
     What is missing is what the input leaves out: joints that are NaN or of confidence 0, in any frames; and frames that
-    it does not have, between stamps more than 1/20 s apart. What is there stays as it is, to the last bit, so clean a
-    noisy recording first: steadypose clean IN CLEAN. OUT has a frame every 1/30 s, from the first stamp to the last;
+    it does not have, between stamps more than 1/20 s apart. What is there stays as it is, so clean a noisy recording
+    first: steadypose clean IN CLEAN. OUT has a frame every 1/30 s, from the first stamp to the last, and where the
+    input has others, is interpolated between them;
     joints that were completed have the state IMPUTED, and a standard deviation that grows with the time from the next
     sighting. Gaps of up to two seconds are filled with motion like people's; in longer ones it is less and less theirs,
     and after 8 s without any joint a new stretch begins.
@@ -36,10 +37,8 @@ def complete(
     Where the pelvis lies at the origin all the time, as in many files of poses lifted from images, the way over the
     floor is read from the motion of the body; world_positions, or pose/world, have it.
 
-    Examples:
-        steadypose complete keyframes.npz motion.npz
-        steadypose complete upper_body.npz whole.npz --picture whole.png
-        steadypose complete few_joints.npz motion/ --optimise
+    Key frames to motion: steadypose complete keys.npz motion.npz. A part of a body to all of it, as a recording, and a
+    picture of what was done: steadypose complete upper_body.npz whole --picture whole.png. More in docs/complete.md.
 
     Args:
         source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
