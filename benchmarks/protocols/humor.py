@@ -159,7 +159,8 @@ def _fit_tables(records: dict[str, list[dict[str, Any]]], few: int) -> list[Tabl
             title=title,
             columns=["method", *keys.values()],
             rows=[[r["method"], *(_cell(r, key) for key in keys)] for r in records[name]],
-            note="Mean over all joints, without alignment; legs: knees, ankles, toes. Seconds are of a processor.",
+            note="Mean over all joints, without alignment; legs: knees, ankles, toes; a filter has no answer "
+            "for what it never saw. Seconds are of a processor.",
         )
         for name, title in titles.items()
     ]
@@ -167,4 +168,4 @@ def _fit_tables(records: dict[str, list[dict[str, Any]]], few: int) -> list[Tabl
 
 def _cell(record: dict[str, Any], key: str) -> str:
     value = record.get(key)
-    return "–" if value is None else f"{value:.3f}" if key == "contact_accuracy" else f"{value:.1f}"
+    return "–" if value is None or np.isnan(value) else f"{value:.3f}" if key == "contact_accuracy" else f"{value:.1f}"
