@@ -46,7 +46,7 @@ HIDDEN: Mapping[str, list[int]] = {
     "left arm": [J["left_shoulder"], J["left_elbow"], J["left_wrist"]],
     "right arm": [J["right_shoulder"], J["right_elbow"], J["right_wrist"]],
     "both lower arms": _named("elbow", "wrist"),
-    "all but pelvis, head, hands, feet": [
+    "all but pelvis, chest, head, wrists, ankles": [
         joint for joint, name in enumerate(JOINTS) if not name.endswith(("pelvis", "head", "wrist", "ankle", "spine3"))
     ],
 }

@@ -65,7 +65,7 @@ def complete(
     # these compile and load: not before it is known that there is something to do
     from steadypose.nodes.commands.completing import complete_recording
     from steadypose.prior.models.completer.inference import LiveCompleter
-    from steadypose.prior.offline.parts import SURER, PartsCompleter
+    from steadypose.prior.offline.parts import PartsCompleter
     from steadypose.prior.offline.sigma import Doubt
 
     try:
@@ -84,7 +84,7 @@ def complete(
             source,
             out,
             fill,
-            Doubt([SURER * sigma for sigma in completer.config.never_sigma], completer.config.half_frames),
+            Doubt(completer.config.never_sigma, completer.config.half_frames),
             replace=force,
             began=lambda frames: progress.update(bar, total=frames),
             advanced=lambda frame: progress.update(bar, completed=frame),

@@ -27,9 +27,6 @@ SMOOTH = 3.0
 """Frames, standard deviation: what the opinions differ by is smoothed so much, for HG-VAE's completion shakes limbs
 that it does not see ten times as much as people move them."""
 
-SURER = 0.75
-"""What hidden parts are off by with the second opinion, of what they are without, by validation: 0.69 to 0.84."""
-
 _FIRM = 1e-6  # mobility of a joint that is known, beside 1 of one that is not
 
 
