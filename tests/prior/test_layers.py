@@ -7,7 +7,7 @@ from collections import defaultdict
 
 from steadypose import PACKAGE
 
-FLOORS = ("body", "timing", "camera", "motion", "models", "clean", "world", "sim")
+FLOORS = ("body", "timing", "camera", "motion", "models", "clean", "world", "sim", "offline")
 """from the ground up: a room imports from those before it"""
 
 AT_MOST = 25

@@ -99,7 +99,7 @@ def test_occlusion() -> None:
     features, joint = rng.normal(size=(30, OCCLUSION_FEATURES)).astype(np.float32), rng.integers(0, 22, 30)
     rows = Occluded(np.zeros(30, dtype=np.intp), joint, rng.normal(size=(30, 3, 3)), features)
     expected = LiveOcclusion.load("default")(rows)
-    weights, sigma = answers("occlusion-default", features=features, joint=joint)
+    weights, sigma = answers("occlusion-default", features=features, joint=joint.astype(np.float32))
     np.testing.assert_allclose((weights[..., None] * rows.candidates).sum(axis=1), expected.positions, atol=1e-5)
     np.testing.assert_allclose(OF_OTHERS * sigma, expected.sigma, rtol=1e-4)
 
