@@ -13,8 +13,8 @@ ENOUGH = 20
 """bodies between two looks, to judge by"""
 MOST = 0.7
 """of the joints refused, or of the poses flagged"""
-LOOKS = 2
-"""in a row that find nearly all flagged: a fault that is over within a second is the flag's own to tell"""
+LOOKS = 3
+"""in a row that find nearly all flagged: a fault that is over within two seconds is the flag's own to tell"""
 
 
 class Answers:

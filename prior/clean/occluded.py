@@ -60,7 +60,7 @@ class OccludedJoints:
         occluded = (unseen_s > unseen_s.min(axis=1, keepdims=True)) & np.isfinite(
             unseen_s + sigma + completed_sigma + held[..., 0] + completed[..., 0]
         )
-        body, joint = np.nonzero(occluded)
+        body, joint = (np.ascontiguousarray(index) for index in np.nonzero(occluded))  # else another loop for many
         if not len(body):
             return None
         candidates = np.stack([account[body, joint] for account in (seen, completed, held)], axis=1)

@@ -355,8 +355,9 @@ def test_answers_that_are_of_no_use() -> None:
         for raw in good:
             answers.given(PoseClean(raw.stamp_ns, "camera", "mine", raw.sensor_pose, False, 4, [flagged]))
 
-    flag_all()
-    assert not answers.problems()  # a second of it is the flag's own to tell
+    for _ in range(2):
+        flag_all()
+        assert not answers.problems()  # two seconds of it are the flag's own to tell
     flag_all()
     assert [problem.cause for problem in answers.problems()] == ["nearly_all_flagged"]
     assert not answers.problems()
