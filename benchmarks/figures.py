@@ -23,7 +23,6 @@ COLOURS = {
     "temporal convolution": "#ff9da6",
     "HM-VAE": "#f2a5a5",
     "steadypose": "#e45756",
-    "steadypose, research weights": "#d6179b",
     "steadypose, sensor known": "#5b2a86",
 }
 """One colour a method in every picture; one not named here takes matplotlib's next."""

@@ -15,18 +15,11 @@ from steadypose.prior.clean.denoise import DenoiseSettings
 from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.impute import ImputeSettings
 from steadypose.prior.clean.pipeline import PriorPipeline
-from steadypose.prior.clean.reconstruct import ReconstructSettings
 from steadypose.prior.clean.refine import RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.models.weights_io import WEIGHTS
 
 Floats = NDArray[np.float64]
-
-
-def weight_sets(model: str) -> list[str]:
-    """The sets of weights that there are for a model: ``default``, free for products, and ``research``."""
-    return [name for name in ("default", "research") if (WEIGHTS / f"{model}-{name}.safetensors").is_file()]
 
 
 OURS: Mapping[str, PriorSettings] = {
@@ -38,11 +31,6 @@ OURS: Mapping[str, PriorSettings] = {
         fuse=FuseSettings(enabled=False),
     ),
     "steadypose": PriorSettings(),
-    **{
-        f"steadypose, {weights} weights": PriorSettings(encode=ReconstructSettings(weights=weights))
-        for weights in weight_sets("hgvae")
-        if weights != ReconstructSettings().weights
-    },
 }
 """Every variant that each protocol runs; one line adds one. HM-VAE is the paper's refinement alone, unfused."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import socket as posix
@@ -38,6 +39,8 @@ MAX_SUBSCRIPTIONS = 4096
 """different ones, of all subscribers together; who goes beyond is disconnected"""
 MAX_NEW_SUBSCRIPTIONS = 256
 """of one connection in a second"""
+REBIND_S = 5.0
+"""how long to wait for an address of our own: ZeroMQ gives it back in a thread, some time after the socket was closed"""
 
 _CUT = "subscriptions"
 _DOMAIN = "steadypose"
@@ -184,6 +187,7 @@ class Publisher:
 
         Raises:
             RuntimeError: keys are not checked any more, so that nobody new is let in: make another publisher.
+            TransportError: somebody else took the address meanwhile.
         """
         if self._authenticator and not self._authenticator.is_alive():
             raise RuntimeError("the thread that checks keys has ended; nobody is let in any more")
@@ -198,7 +202,15 @@ class Publisher:
         self._socket.close(0)
         self._listeners.clear()
         self._subscriptions.clear()
-        self._socket = self._bind(self.endpoint)
+        deadline = time.monotonic() + REBIND_S
+        while True:
+            try:
+                self._socket = self._bind(self.endpoint)
+                return
+            except zmq.ZMQError as error:
+                if error.errno != errno.EADDRINUSE or time.monotonic() > deadline:
+                    raise TransportError(f"cannot publish at {self.endpoint} again: {error.strerror}") from error
+            time.sleep(0.01)
 
     def _is_behind(self, topic: str) -> bool:
         following = self._sequence[topic]

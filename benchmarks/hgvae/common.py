@@ -11,7 +11,7 @@ from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.motion import as_set, digest
 from steadypose.prior.motion.dataset import MotionSet
 
-NAMES = {"default": "live", "wide-default": "wide (256 features)", "research": "live, research weights"}
+NAMES = {"default": "live", "wide-default": "wide (256 features)"}
 """Of weights, as tables have them."""
 
 

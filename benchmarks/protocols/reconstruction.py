@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 
 from steadypose.benchmarks.bench import Bench, Result
-from steadypose.benchmarks.ours import weight_sets
 from steadypose.benchmarks.peers import window_vaes
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import figures, score
@@ -51,16 +50,15 @@ def run(bench: Bench) -> Result:
         return {"method": method, "window": frames, **figures(score(joints(decode(windows), on), truth, nothing))}
 
     records = [scored("centre frame held", 8, lambda windows: windows[:, 3, None].expand_as(windows))]
-    for weights in weight_sets("hmvae"):
-        model, name = shipped(weights), f"HM-VAE as shipped, {weights} weights"
-        records += [
-            scored(name, 8, lambda windows, model=model: reconstruct(model, windows)),
-            scored(
-                f"{name}, 8 frames side by side", FRAMES,
-                lambda _, model=model: reconstruct(model, pieces).unflatten(0, (-1, FRAMES // 8)).flatten(1, 2),
-            ),
-            scored(f"{name}, 8 frames sliding", FRAMES, lambda windows, model=model: slide(model, windows)),
-        ]  # fmt: skip
+    model, name = shipped(), "HM-VAE as shipped"
+    records += [
+        scored(name, 8, lambda windows: reconstruct(model, windows)),
+        scored(
+            f"{name}, 8 frames side by side", FRAMES,
+            lambda _: reconstruct(model, pieces).unflatten(0, (-1, FRAMES // 8)).flatten(1, 2),
+        ),
+        scored(f"{name}, 8 frames sliding", FRAMES, lambda windows: slide(model, windows)),
+    ]  # fmt: skip
     for frames in window_vaes.CONFIGS:
         for name in window_vaes.MODELS:
             model = bench.window_vae(name, frames)
@@ -94,9 +92,9 @@ def _table(records: list[dict[str, Any]], clips: int, own_acceleration_mm: float
     )
 
 
-def shipped(weights: str) -> HMVAE:
-    """The refinement model with one of the sets of weights that ship."""
-    return load_network(HMVAE, HMVAEConfig.from_dict, weights, "hmvae")
+def shipped() -> HMVAE:
+    """The refinement model that ships."""
+    return load_network(HMVAE, HMVAEConfig.from_dict, "default", "hmvae")
 
 
 @torch.inference_mode()

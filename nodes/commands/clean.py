@@ -38,7 +38,7 @@ def clean(
         source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
             or a folder with any number of these, at any depth.
         out: the recording to make, or .npz with one row for each row of the input; or the folder for them.
-        weights: weight set of the models: 'default', unless given, or 'research', for non-commercial use only.
+        weights: weight set of the models: 'default', which ships, unless given, or one of your own (see train).
             An HG-VAE of the paper's size, made by 'steadypose train hgvae-wide': --set encode.weights=wide-default.
         delay: frames at 30 Hz to wait for, 0 to 16; more is smoother. 4 unless given.
         settings: any setting of [prior], such as gate.enabled=false, or of [trajectory], such as

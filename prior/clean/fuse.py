@@ -116,7 +116,7 @@ class Fuse:
             completed_sigma = None
             if imputed is not None:
                 completed, completed_sigma = imputed.positions[slots], imputed.sigma[slots]
-                _complete(body, completed, completed_sigma, seen, unseen, bias, precision)
+                _complete(body, completed, seen, unseen, precision.seen)
             weighed = self.occluded.update(slots, seen, deviation, unseen, again[slots], body, completed_sigma)
             if weighed is not None:
                 (whose, joint, *_), (positions, sigma) = weighed
@@ -218,7 +218,7 @@ def _lay_over(body, seen, precision):
 
 
 @njit(cache=True)
-def _complete(body, completed, sigma, seen, unseen_s, bias_sigma, precision):
+def _complete(body, completed, seen, unseen_s, precision):
     """Puts hidden joints where HG-VAE completes them, each moved as the seen ones near it are off there.
 
     A joint that the sensor does not have hangs: what is imputed of it shakes the joints seen beside it. Of a frame that
@@ -235,13 +235,12 @@ def _complete(body, completed, sigma, seen, unseen_s, bias_sigma, precision):
             for other in range(joints):
                 if unseen_s[row, other] > 0.0:
                     continue
-                weight = _NEAR[joint, other] * precision.seen[row, other]
+                weight = _NEAR[joint, other] * precision[row, other]
                 total += weight
                 for axis in range(3):
                     off[axis] += weight * (seen[row, other, axis] - completed[row, other, axis])
             for axis in range(3):
                 body[row, joint, axis] = completed[row, joint, axis] + off[axis] / max(total, 1e-12)
-            precision.prior[row, joint] = _inverse(sigma[row, joint] ** 2 + bias_sigma[row] ** 2)
 
 
 @njit(cache=True)

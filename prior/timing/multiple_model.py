@@ -15,25 +15,27 @@ from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
 
 Floats = NDArray[np.float64]
 
-DENSITIES = np.array([0.01, 0.045, 0.2, 0.9, 4.0, 15.0, 60.0, 400.0])
-"""m²/s³, process densities, stiff to loose, for a measurement of `MEASUREMENT_SIGMA`."""
-
-MEASUREMENT_SIGMA = 0.02
-"""Metres along an axis, at full confidence. Only its ratio to the density matters."""
-
 MEMORY = 9
 """Sightings over which a prediction's likelihood fades: 5 to 15 differ by 3 % at most (validation)."""
 
 LEAST_SCALE = 1e-4
-"""Added, per sighting remembered, to the squared innovations: a hundredth of `MEASUREMENT_SIGMA`."""
+"""Added, per sighting remembered, to the squared innovations: a hundredth of the measurement's deviation."""
 
 
 class MultipleModelSmoother:
-    """Smooths the joints of several bodies; each frame is answered ``delay`` frames later."""
+    """Smooths the joints of several bodies; each frame is answered ``delay`` frames later.
 
-    def __init__(self, delay: int, slots: int, joints: int) -> None:
-        self._bank = FixedLagRTS(delay, DENSITIES, MEASUREMENT_SIGMA)
-        shape = (slots, joints, len(DENSITIES))
+    Args:
+        delay: frames.
+        slots: bodies.
+        joints: of a body.
+        densities: (M,) m²/s³, process densities of the smoothers, for a measurement of ``sigma``.
+        sigma: metres along an axis, at full confidence. Only its ratio to the densities matters.
+    """
+
+    def __init__(self, delay: int, slots: int, joints: int, densities: Floats, sigma: float) -> None:
+        self._bank, self._sigma = FixedLagRTS(delay, densities, sigma), sigma
+        shape = (slots, joints, len(densities))
         self._misfit, self._spread, self._count = np.zeros(shape), np.zeros(shape), np.zeros(shape[:2])
 
     def update(self, positions: Floats, stamp_s: float, confidence: Floats) -> Smoothed | None:
@@ -44,11 +46,11 @@ class MultipleModelSmoother:
             stamp_s: seconds of capture, increasing.
             confidence: (S, J) 0 to 1.
         """
-        sigma = MEASUREMENT_SIGMA / np.clip(confidence, 0.1, 1.0)
+        sigma = self._sigma / np.clip(confidence, 0.1, 1.0)
         expected = self._bank.predict(stamp_s)
         if expected is not None:
             _remember(positions, sigma, expected.positions, expected.sigma, self._misfit, self._spread, self._count)
-        each = (*positions.shape[:2], len(DENSITIES))
+        each = self._misfit.shape
         smoothed = self._bank.update(
             np.broadcast_to(positions[:, :, None], (*each, 3)), stamp_s, np.broadcast_to(sigma[..., None], each)
         )

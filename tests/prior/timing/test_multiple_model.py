@@ -5,10 +5,11 @@ import pytest
 from numpy.typing import NDArray
 
 from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
-from steadypose.prior.timing.multiple_model import DENSITIES, MEASUREMENT_SIGMA, MEMORY, MultipleModelSmoother
+from steadypose.prior.timing.multiple_model import MEMORY, MultipleModelSmoother
 
 Floats = NDArray[np.float64]
 DELAY, FRAMES = 4, 60
+DENSITIES, MEASUREMENT_SIGMA = np.array([0.01, 0.2, 4.0, 60.0, 400.0]), 0.02
 
 
 def _swinging(noise: float, seed: int = 0) -> tuple[Floats, Floats]:
@@ -20,7 +21,7 @@ def _swinging(noise: float, seed: int = 0) -> tuple[Floats, Floats]:
 
 
 def _run(seen: Floats, delay: int = DELAY) -> list[Smoothed]:
-    smoother = MultipleModelSmoother(delay, *seen.shape[1:3])
+    smoother = MultipleModelSmoother(delay, *seen.shape[1:3], DENSITIES, MEASUREMENT_SIGMA)
     confidence = np.ones(seen.shape[1:3])
     answers = [smoother.update(frame, t / 30, confidence) for t, frame in enumerate(seen)]
     return [answer for answer in answers if answer is not None] + smoother.flush()
@@ -75,7 +76,7 @@ def test_bodies_do_not_know_of_each_other_and_a_slot_begins_anew() -> None:
     both, alone = _run(seen), _run(seen[:, :1])
     for a, b in zip(both, alone, strict=True):
         np.testing.assert_array_equal(a.positions[:1], b.positions)
-    smoother, fresh = (MultipleModelSmoother(0, 1, 3) for _ in range(2))
+    smoother, fresh = (MultipleModelSmoother(0, 1, 3, DENSITIES, MEASUREMENT_SIGMA) for _ in range(2))
     for t, frame in enumerate(seen[:20, :1]):
         smoother.update(frame, t / 30, np.ones((1, 3)))
     smoother.forget(np.array([True]))
