@@ -40,7 +40,7 @@ MAX_SUBSCRIPTIONS = 4096
 MAX_NEW_SUBSCRIPTIONS = 256
 """of one connection in a second"""
 REBIND_S = 5.0
-"""how long to wait for an address of our own: ZeroMQ gives it back in a thread, some time after the socket was closed"""
+"""how long to wait for an address of our own: ZeroMQ gives it back in a thread, soon after the socket was closed"""
 
 _CUT = "subscriptions"
 _DOMAIN = "steadypose"
