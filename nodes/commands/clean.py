@@ -19,7 +19,6 @@ from steadypose.prior.body.own_layouts import add_layouts
 def clean(
     source: Annotated[Path, tyro.conf.arg(name="in", metavar="IN")],
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
-    weights: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
     delay: Annotated[int | None, tyro.conf.arg(metavar="K")] = None,
     settings: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="STAGE.OPTION=VALUE")] = (),
     skeletons: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
@@ -38,11 +37,10 @@ def clean(
         source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
             or a folder with any number of these, at any depth.
         out: the recording to make, or .npz with one row for each row of the input; or the folder for them.
-        weights: weight set of the models: 'default', which ships, unless given, or one of your own (see train).
-            An HG-VAE of the paper's size, made by 'steadypose train hgvae-wide': --set encode.weights=wide-default.
         delay: frames at 30 Hz to wait for, 0 to 16; more is smoother. 4 unless given.
         settings: any setting of [prior], such as gate.enabled=false, or of [trajectory], such as
-            trajectory.contacts=false. May be given again.
+            trajectory.contacts=false. May be given again. Weights of your own ('steadypose train') are settings too:
+            smooth.weights, encode.weights, trajectory.weights=NAME, or the path of a .safetensors file.
         skeletons: TOML with [skeletons.NAME] of joint layouts of your own; a launch file with them will do.
         jobs: of a folder, how many recordings at once, each in a process of its own that takes about 1 GB of
             memory; as many as there are cores unless given.
@@ -52,9 +50,6 @@ def clean(
             replaced without being asked for, and all else is kept in any case.
     """
     table: dict[str, Any] = {"prior": {}, "trajectory": {}}
-    if weights is not None:
-        of_prior = {stage: {"weights": weights} for stage in ("refine", "encode")}
-        table = {"prior": of_prior, "trajectory": {"weights": weights}}
     if delay is not None:
         table["prior"]["delay"] = delay
     for override in settings:

@@ -107,7 +107,7 @@ def test_settings_reach_the_stages(tmp_path: Path, options: tuple[str, ...]) -> 
         ({"settings": ("trajectory.contact=false",)}, "contacts"),
         ({"settings": ("delay",)}, "expected section.key=value"),
         ({"delay": 99}, "expected 0 to 16 frames"),
-        ({"weights": "nothing"}, "no weights 'nothing'"),
+        ({"settings": ("smooth.weights=nothing",)}, "no weights 'nothing'"),
         ({"out": Path("in.npz")}, "another path"),
         ({"out": Path("nowhere/out.npz")}, "to exist"),
         ({"source": Path("nowhere.npz")}, "does not exist"),
@@ -116,8 +116,8 @@ def test_settings_reach_the_stages(tmp_path: Path, options: tuple[str, ...]) -> 
 def test_what_cannot_be_done_is_said(tmp_path: Path, monkeypatch, options, arguments: dict, expected: str) -> None:
     monkeypatch.chdir(tmp_path)
     write_npz(Path("in.npz"))
-    given_settings = (*options, *arguments.pop("settings", ())) if "weights" not in arguments else ()
-    asked = {"source": Path("in.npz"), "out": Path("out.npz"), "settings": given_settings} | arguments
+    settings = (*options, *arguments.pop("settings", ()))
+    asked = {"source": Path("in.npz"), "out": Path("out.npz"), "settings": settings} | arguments
     with pytest.raises(LaunchError, match=expected):
         clean(**asked)
     assert not Path("out.npz").exists()
