@@ -18,7 +18,6 @@ from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_clips, prepared_set, simulated_clips
 from steadypose.benchmarks.peers import smoothnet, window_vaes
 from steadypose.benchmarks.peers.filters import PEERS, Peer
-from steadypose.benchmarks.provenance import OF_CLEAN
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.tuning import Tuned, search
 from steadypose.prior.clean.settings import PriorSettings
@@ -112,13 +111,11 @@ class Result:
         tables: for people; the first is printed first.
         data: for programs.
         figures: by name of the file.
-        measured: what the figures depend on, of what `provenance.ships`.
     """
 
     tables: list[Table]
     data: dict[str, Any]
     figures: Mapping[str, Figure] = field(default_factory=dict)
-    measured: Sequence[str] = OF_CLEAN
 
 
 class Answer(NamedTuple):

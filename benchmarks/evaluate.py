@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -33,7 +34,8 @@ def evaluate(protocol: str, *, split: str, quick: bool, mocap: Path | None, data
                 console.print(f"{name}: left out, it needs {SENSORS[name]} (--mocap)", highlight=False)
                 continue
             started = time.perf_counter()
-            result: Result = importlib.import_module(f"steadypose.benchmarks.protocols.{name}").run(bench)
+            module = importlib.import_module(f"steadypose.benchmarks.protocols.{name}")
+            result: Result = module.run(bench)
             seconds = time.perf_counter() - started
             for task in progress.task_ids:
                 progress.remove_task(task)
@@ -41,19 +43,19 @@ def evaluate(protocol: str, *, split: str, quick: bool, mocap: Path | None, data
                 show(table, console)
             console.print(f"{name}: {seconds:.0f} s", highlight=False)
             if out is not None:
-                console.print(f"wrote {_file(name, bench, result, seconds, out)}", highlight=False)
+                console.print(f"wrote {_file(name, bench, result, module.DEPENDS_ON, seconds, out)}", highlight=False)
     if out is None:
         console.print("written nowhere: --out DIR, or --split test without --quick, writes", highlight=False)
 
 
-def _file(name: str, bench: Bench, result: Result, seconds: float, directory: Path) -> Path:
+def _file(name: str, bench: Bench, result: Result, depends_on: Sequence[str], seconds: float, directory: Path) -> Path:
     options = [name, "--split", bench.split, *(["--quick"] if bench.quick else [])]
     if name in SENSORS:
         options += ["--mocap", "mocap"]
     content = {
         "quick": bench.quick, "split": bench.split, "seeds": bench.seeds, "seconds": round(seconds, 1), **result.data
     }  # fmt: skip
-    path = save(name, options, result.tables, content, directory, ("steadypose", "evaluate"), result.measured)
+    path = save(name, options, result.tables, content, depends_on, directory, ("steadypose", "evaluate"))
     for stem, figure in result.figures.items():
         figure.savefig(directory / f"{stem}.png", dpi=110)
     return path

@@ -1,11 +1,11 @@
-"""What a result was measured with, so that none outlives it: weights and default settings, as digests."""
+"""What a result depends on, so that none outlives it: weights and default settings, as digests."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,18 +19,17 @@ from steadypose.prior.world.pipeline import TrajectorySettings
 RESULTS = Path(__file__).parent / "results"
 """Where the results lie that the README's tables are written from."""
 
+CLEAN = ("mixture weights", "occlusion weights", "hgvae weights", "prior settings")
+"""What `pose/clean` depends on with default settings, of what `ships`."""
 
-OF_CLEAN = ("prior weights", "prior settings")
-OF_WORLD = (*OF_CLEAN, "trajectory weights", "trajectory settings")
-OF_FIT = (*OF_CLEAN, "offline weights", "offline settings")
-"""what `pose/clean`, `pose/world` and ``steadypose fit`` depend on, of what `ships`"""
-OF_COMPLETION = ("completion weights", "trajectory weights", "prior weights")
-"""what ``steadypose complete`` depends on"""
+VARIANTS = (*CLEAN, "hmvae weights")
+"""The same of all variants of `benchmarks.ours`: one refines with HM-VAE, which the default does not."""
 
-_PRIOR_MODELS = ("correction", "hgvae", "hmvae-", "mixture", "occlusion")
-_TRAJECTORY_MODELS = ("contacts", "trajectory")
-_OFFLINE_MODELS = ("humor",)
-_COMPLETION_MODELS = ("completer", "hmvae64")
+WORLD = (*CLEAN, "contacts weights", "trajectory weights", "trajectory settings")
+"""What `pose/world` depends on."""
+
+_WEIGHT_SETS = ("default", "kinect_v2")
+"""Those that ship; others may have been installed beside them."""
 
 
 class UncommittedError(RuntimeError):
@@ -39,42 +38,48 @@ class UncommittedError(RuntimeError):
 
 @cache
 def ships() -> dict[str, str]:
-    """Digests of the weights that ship and of the settings that they run with, of prior, trajectory and offline."""
-    files = [path for path in WEIGHTS.iterdir() if path.suffix in (".safetensors", ".json")]
-    of_prior, of_trajectory, of_fit, of_completion = (
-        [path for path in files if path.name.startswith(models)]
-        for models in (_PRIOR_MODELS, _TRAJECTORY_MODELS, _OFFLINE_MODELS, _COMPLETION_MODELS)
-    )
+    """Digests of all that a result can depend on.
+
+    By name: ``MODEL weights`` of each model, ``SECTION settings`` of each table of a launch file, such as ``prior``
+    and ``prior.impute``, and of ``offline``, the settings of ``steadypose fit``.
+    """
+    weights: dict[str, list[Path]] = {}
+    for path in sorted(WEIGHTS.iterdir()):
+        model, _, rest = path.name.partition("-")
+        if rest.partition(".")[0] in _WEIGHT_SETS and path.suffix in (".safetensors", ".json"):
+            weights.setdefault(model, []).append(path)
     return {
-        "prior weights": _digest_of_files(of_prior),
-        "prior settings": _digest_of_settings(asdict(PriorSettings())),
-        "trajectory weights": _digest_of_files(of_trajectory),
-        "completion weights": _digest_of_files(of_completion),
-        "trajectory settings": _digest_of_settings(asdict(TrajectorySettings())),
-        "offline weights": _digest_of_files(of_fit),
-        "offline settings": _digest_of_settings(asdict(FitSettings())),
-    }
+        **{f"{model} weights": _digest(*(part for p in paths for part in (p.name.encode(), p.read_bytes())))
+           for model, paths in weights.items()},
+        **dict(_settings("prior", PriorSettings())),
+        **dict(_settings("trajectory", TrajectorySettings())),
+        **dict(_settings("offline", FitSettings())),
+    }  # fmt: skip
 
 
-def _digest_of_files(paths: Iterable[Path]) -> str:
+def _settings(name: str, settings: Any) -> Iterator[tuple[str, str]]:
+    """The digest of a dataclass, and of each dataclass in it."""
+    yield f"{name} settings", _digest(json.dumps(asdict(settings), sort_keys=True, default=str).encode())
+    for field in fields(settings):
+        if is_dataclass(value := getattr(settings, field.name)):
+            yield from _settings(f"{name}.{field.name}", value)
+
+
+def _digest(*parts: bytes) -> str:
     digest = hashlib.sha256()
-    for path in sorted(paths):
-        digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    for part in parts:
+        digest.update(hashlib.sha256(part).digest())
     return digest.hexdigest()[:16]
-
-
-def _digest_of_settings(settings: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
 def stale(result: Mapping[str, Any]) -> list[str]:
     """What has changed since a result was measured, of what `ships`; nothing where it holds.
 
-    A result's ``measured`` has the digests of that time; one that depends on neither has none in it.
+    A result's ``measured`` has the digests of that time; one that depends on nothing has none in it.
     """
     measured = result.get("measured")
     if measured is None:
-        return list(ships())
+        return ["weights", "settings"]
     return [part for part, digest in measured.items() if ships().get(part) != digest]
 
 

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from steadypose.benchmarks.machine import ROOT, describe
-from steadypose.benchmarks.provenance import OF_WORLD, RESULTS, require_committed, ships
+from steadypose.benchmarks.provenance import RESULTS, require_committed, ships
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ def save(
     arguments: list[str],
     tables: list[Table],
     data: dict[str, Any],
+    depends_on: Sequence[str],
     directory: Path = RESULTS,
     program: Sequence[str] = (),
-    measured: Sequence[str] = OF_WORLD,
 ) -> Path:
     """Write ``NAME.json``: the command, the machine, the tables, and ``data``, whatever the benchmark found.
 
@@ -62,9 +62,9 @@ def save(
         arguments: of the command; folders are cut to their last part.
         tables: for the README.
         data: figures; JSON types.
+        depends_on: names of `ships`: when one of them changes, the figures are stale.
         directory: where to.
         program: what makes it; ``python -m steadypose.benchmarks.systems.NAME`` if left out.
-        measured: what the figures depend on, of what `ships`: when that changes, they are stale.
 
     Raises:
         UncommittedError: see `require_committed`, which is best asked before measuring.
@@ -75,7 +75,7 @@ def save(
     )
     path = directory / f"{name}.json"
     content = {"benchmark": name, "command": command, "machine": describe()}
-    content["measured"] = {part: ships()[part] for part in measured}
+    content["measured"] = {part: ships()[part] for part in depends_on}
     content |= {"tables": [asdict(t) for t in tables], **data}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(_nan_to_null(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n")

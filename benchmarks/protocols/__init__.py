@@ -1,4 +1,8 @@
-"""The protocols of ``steadypose evaluate``, one module each, by name."""
+"""The protocols of ``steadypose evaluate``, one module each, by name.
+
+Each has ``run``, from a `Bench` to a `Result`, and ``DEPENDS_ON``, names of `provenance.ships`: when one of these
+changes, its results are stale.
+"""
 
 from __future__ import annotations
 

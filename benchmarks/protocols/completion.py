@@ -17,7 +17,6 @@ from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.metrics import bootstrap_ratio
 from steadypose.benchmarks.motion import as_set, prepared_set
 from steadypose.benchmarks.peers.inbetween import NearestPose
-from steadypose.benchmarks.provenance import OF_CLEAN, OF_COMPLETION
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import interval
 from steadypose.prior.body.kinematics import heading
@@ -33,6 +32,8 @@ from steadypose.prior.offline.complete import Fill, complete
 from steadypose.prior.offline.parts import PartsCompleter
 
 Floats = NDArray[np.float64]
+
+DEPENDS_ON = ("completer weights", "hgvae weights")
 
 FRAMES = 50
 
@@ -104,8 +105,7 @@ def run(bench: Bench) -> Result:
         if peer != _NETWORK
     ]
     data = {"data": clips.source, "records": records, "completer over peer": ratios}
-    measured = tuple(dict.fromkeys((*OF_COMPLETION, *OF_CLEAN)))
-    return Result([_table(records, ratios, len(clips.offsets))], data, measured=measured)
+    return Result([_table(records, ratios, len(clips.offsets))], data)
 
 
 def usual(completer: LiveCompleter) -> Fill:

@@ -28,6 +28,8 @@ from steadypose.prior.timing.rate import FPS
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+DEPENDS_ON = ("mixture weights", "contacts weights")
+
 LOADED_N = 30.0
 """Newtons from which on a foot bears load."""
 PHASES = 3

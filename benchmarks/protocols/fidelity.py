@@ -22,12 +22,15 @@ from steadypose.benchmarks.corruption import along_sight, gaussian
 from steadypose.benchmarks.metrics import acceleration_error, position_error, sigma_ratio
 from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.peers.filters import FILTERS, Peer
+from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import pivot
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
+
+DEPENDS_ON = CLEAN
 
 DELAYS = (0, 2, 4, 8, 16)
 SPEEDS = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, np.inf)

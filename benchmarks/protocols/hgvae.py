@@ -22,6 +22,9 @@ from steadypose.prior.models.hgvae.windows import Batch, Windows
 from steadypose.prior.models.torch_weights import load_network
 from steadypose.prior.models.weights_io import WEIGHTS
 
+DEPENDS_ON = ("hgvae weights", "prior.impute settings")
+"""No table runs pose/clean; one imputes as it does."""
+
 
 def run(bench: Bench) -> Result:
     """All tables and pictures; models for the tables are trained on the way, or found in ``runs``."""

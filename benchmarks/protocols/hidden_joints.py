@@ -18,11 +18,14 @@ from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
 from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
+from steadypose.benchmarks.provenance import VARIANTS
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import pivot
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
+
+DEPENDS_ON = VARIANTS
 
 BESIDE = "held beside the body"
 

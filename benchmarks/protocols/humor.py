@@ -31,9 +31,11 @@ from steadypose.benchmarks.humor.models import BRIEF, MVAE, SHIPS, VARIANTS, mod
 from steadypose.benchmarks.humor.prediction import SAMPLES, predict, stand_still
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.peers.bank import bank
-from steadypose.benchmarks.provenance import OF_FIT
+from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Table
 from steadypose.prior.offline.solve import FitSettings
+
+DEPENDS_ON = (*CLEAN, "humor weights", "offline settings")
 
 FRAMES = 90
 DELAY = 8
@@ -63,7 +65,6 @@ def run(bench: Bench) -> Result:
     return Result(
         [_futures_table(futures, count), *_fit_tables(records, len(clips.offsets))],
         {"data": clips.source, "records": records},
-        measured=OF_FIT,
     )
 
 

@@ -19,7 +19,6 @@ from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.metrics import contact_speed, npss, quaternion_distance
 from steadypose.benchmarks.motion import MotionClips, as_set, prepared_set
 from steadypose.benchmarks.peers import inbetween
-from steadypose.benchmarks.provenance import OF_COMPLETION
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import interval
 from steadypose.prior.body.inverse_kinematics import place_joints
@@ -31,6 +30,8 @@ from steadypose.prior.motion.dataset import MotionSet
 from steadypose.prior.offline.root_path import bridge
 
 Floats = NDArray[np.float64]
+
+DEPENDS_ON = ("completer weights", "trajectory weights")
 
 GAPS = (5, 15, 30, 45)
 BEFORE, AFTER = 10, 1
@@ -104,7 +105,6 @@ def run(bench: Bench) -> Result:
         [_table(records, len(clips.offsets)), _paths_table(paths, len(clips.offsets))],
         {"data": source, "records": records, "root paths": paths},
         figures,
-        OF_COMPLETION,
     )
 
 

@@ -25,9 +25,13 @@ from steadypose.benchmarks.kinect.methods import KNOWN, TCN, UNKNOWN, Kinect, Me
 from steadypose.benchmarks.kinect.scoring import Scores, align, deviation, learn_offset, move, score, summary
 from steadypose.benchmarks.metrics import bootstrap_ratio, length_variation, position_error, reliability
 from steadypose.benchmarks.peers.filters import FILTERS, OFFLINE
+from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.tuning import loss
 from steadypose.prior.timing.rate import FPS
+
+DEPENDS_ON = CLEAN
+"""No correction that ships: each is trained here, without the person left out."""
 
 OFFSET_CLIPS, TUNING_CLIPS = 3, 5
 """Offsets are learned on every n-th of the others' clips, filters tuned on every n-th."""

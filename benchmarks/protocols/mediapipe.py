@@ -20,6 +20,7 @@ from steadypose.benchmarks.kinect.clips import side_by_side
 from steadypose.benchmarks.metrics import acceleration_error, position_error
 from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.peers.filters import FILTERS, Peer
+from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.scores import pivot
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import BLAZEPOSE33, to_canonical
@@ -27,6 +28,8 @@ from steadypose.prior.body.skeleton import HIPS
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
+
+DEPENDS_ON = CLEAN
 
 CAMERAS = ("cam01", "cam03", "cam04", "cam02")
 EXCHANGED = "cam02"

@@ -16,9 +16,12 @@ from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.corruption import correlated, gaussian, spiked, swapped
 from steadypose.benchmarks.peers.filters import FILTERS
 from steadypose.benchmarks.protocols.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
+from steadypose.benchmarks.provenance import VARIANTS
 from steadypose.benchmarks.scores import pivot
 
 Floats = NDArray[np.float64]
+
+DEPENDS_ON = VARIANTS
 
 LEVELS_CM = (1, 2, 4, 8)
 

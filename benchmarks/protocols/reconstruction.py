@@ -29,6 +29,8 @@ from steadypose.prior.motion.dataset import remove_heading
 
 Floats = NDArray[np.float64]
 
+DEPENDS_ON = ("hmvae weights",)
+
 FRAMES = 64
 
 

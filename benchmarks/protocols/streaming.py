@@ -22,11 +22,14 @@ from steadypose.benchmarks.corruption import LIMBS, bursts, gaussian, hide
 from steadypose.benchmarks.metrics import found_delay
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.peers.filters import OFFLINE, PEERS, Peer, missing, raw
+from steadypose.benchmarks.provenance import VARIANTS
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import figures, score
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
+
+DEPENDS_ON = VARIANTS
 
 NOISE = 0.02
 """Metres."""

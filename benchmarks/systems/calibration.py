@@ -35,6 +35,8 @@ from steadypose.prior.camera.calibration import (
 
 Floats = NDArray[np.float64]
 
+DEPENDS_ON = ()
+
 LENS = Intrinsics((1280, 720), (860.0, 855.0), (645.0, 352.0), (0.05, -0.12, 0.0008, -0.0005, 0.03))
 """of an OAK's colour camera, about; the distortion is stronger"""
 BOARD = Board()
@@ -195,7 +197,7 @@ def main(args: Args) -> None:
     }
     table = _table(found, lens, missed)
     show(table, console)
-    console.print(f"wrote {save('calibration', sys.argv[1:], [table], data, args.out, measured=())}")
+    console.print(f"wrote {save('calibration', sys.argv[1:], [table], data, DEPENDS_ON, args.out)}")
 
 
 def _table(found: dict[str, list[tuple[float, float]]], lens: Intrinsics, missed: int) -> Table:

@@ -33,6 +33,8 @@ from steadypose.prior.sim.sensors import mount
 
 Floats = NDArray[np.float64]
 
+DEPENDS_ON = ()
+
 DISTANCES = (2.0, 3.0, 4.0)
 KEYPOINT_NOISE = (0.0, 1.5, 4.0)
 ON_THE_BACKGROUND = 0.25
@@ -184,7 +186,7 @@ def main(args: Args) -> None:
     show(table, console)
     if args.out or not args.quick:
         data: dict[str, Any] = {"depth_lifting": figures}
-        console.print(f"wrote {save('depth_lifting', sys.argv[1:], [table], data, args.out or RESULTS, measured=())}")
+        console.print(f"wrote {save('depth_lifting', sys.argv[1:], [table], data, DEPENDS_ON, args.out or RESULTS)}")
 
 
 def _row(name: str, distance: float, noise: float, found: dict[str, float]) -> list[str]:

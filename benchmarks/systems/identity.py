@@ -30,6 +30,8 @@ from steadypose.prior.body.layouts import get_skeleton, to_canonical
 from steadypose.prior.clean.identify import Identify, IdentifySettings
 from steadypose.prior.sim.streams import Stream, make, read_manifest
 
+DEPENDS_ON = ("prior.identify settings",)
+
 MANIFEST = ROOT / "sim_data" / "manifest.json"
 ROWS = 16
 HIDDEN_S = 1.0
@@ -215,7 +217,7 @@ def main(args: Args) -> None:
     console = Console()
     table = _table(results)
     show(table, console)
-    path = save("identity", sys.argv[1:], [table], {"streams": results}, args.out, measured=("prior settings",))
+    path = save("identity", sys.argv[1:], [table], {"streams": results}, DEPENDS_ON, args.out)
     console.print(f"wrote {path}")
 
 

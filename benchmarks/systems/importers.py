@@ -49,6 +49,8 @@ from steadypose.prior.motion.tables import CMU_AMC, CMU_BVH, ICLONE
 
 Floats = NDArray[np.float64]
 
+DEPENDS_ON = ()
+
 MAX_LAG = 0.1
 """Seconds."""
 
@@ -97,7 +99,7 @@ def main(args: Args) -> None:
     console = Console()
     for table in tables:
         show(table, console)
-    console.print(f"wrote {save('importers', sys.argv[1:], tables, {}, args.results, measured=())}")
+    console.print(f"wrote {save('importers', sys.argv[1:], tables, {}, DEPENDS_ON, args.results)}")
 
 
 def read(mocap: Path) -> tuple[dict[str, Floats], dict[str, str]]:

@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.benchmarks.machine import ROOT
-from steadypose.benchmarks.provenance import require_committed
+from steadypose.benchmarks.provenance import WORLD, require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.benchmarks.running import START_S, running
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
@@ -38,6 +38,8 @@ from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+
+DEPENDS_ON = WORLD
 
 CROWDS = (1, 4, 8)
 LIVE_CROWDS = (1, 4, 8)
@@ -190,7 +192,7 @@ def main(args: Args) -> None:
         show(table, console)
     if args.out or not args.quick:
         data = {"compute": computed, "live": lived}
-        console.print(f"wrote {save('latency', sys.argv[1:], tables, data, args.out or RESULTS)}")
+        console.print(f"wrote {save('latency', sys.argv[1:], tables, data, DEPENDS_ON, args.out or RESULTS)}")
 
 
 def _compute_table(results: list[dict[str, Any]]) -> Table:

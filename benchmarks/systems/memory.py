@@ -14,11 +14,13 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.benchmarks.machine import ROOT
-from steadypose.benchmarks.provenance import require_committed
+from steadypose.benchmarks.provenance import WORLD, require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.benchmarks.running import running
 from steadypose.msgs.types import Diagnostics
 from steadypose.nodes.graph.topology import POSE_NODES
+
+DEPENDS_ON = WORLD
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,9 @@ def main(args: Args) -> None:
     table = _table(result)
     show(table, console)
     if args.out or not args.quick:
-        console.print(f"wrote {save('memory', sys.argv[1:], [table], {'memory': result}, args.out or RESULTS)}")
+        console.print(
+            f"wrote {save('memory', sys.argv[1:], [table], {'memory': result}, DEPENDS_ON, args.out or RESULTS)}"
+        )
 
 
 def _table(result: dict[str, Any]) -> Table:

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.benchmarks.machine import ROOT
-from steadypose.benchmarks.provenance import require_committed
+from steadypose.benchmarks.provenance import WORLD, require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.benchmarks.systems.latency import WARM_UP, crowd, percentiles
 from steadypose.msgs.recording import RecordingReader
@@ -33,6 +33,8 @@ from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+
+DEPENDS_ON = WORLD
 
 KIOSKS = (1, 4, 8, 16)
 NETWORK_NS = 3_000_000
@@ -125,7 +127,7 @@ def main(args: Args) -> None:
     show(table, console)
     if args.out or not args.quick:
         data = {"served": served, "cleaned": cleaned, "streams_a_core": _streams_a_core(served)}
-        console.print(f"wrote {save('scale', sys.argv[1:], [table], data, args.out or RESULTS)}")
+        console.print(f"wrote {save('scale', sys.argv[1:], [table], data, DEPENDS_ON, args.out or RESULTS)}")
 
 
 def _streams_a_core(served: list[dict[str, Any]]) -> dict[str, int]:

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.metrics import acceleration_error, contact_speed, length_variation, position_error
-from steadypose.benchmarks.provenance import require_committed
+from steadypose.benchmarks.provenance import WORLD, require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.msgs.types import CONTACTS, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.commands.cleaning import stream
@@ -39,6 +39,8 @@ from steadypose.prior.timing.fixed_lag import FixedLagRTS
 from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
 Floats = NDArray[np.float64]
+
+DEPENDS_ON = WORLD
 
 FEET = tuple(name for name in CONTACTS if name.endswith(("ankle", "foot")))
 GAP_S = 0.5
@@ -289,7 +291,7 @@ def main(args: Args) -> None:
     show(tables[0], console)
     if args.out or not args.quick:
         data = {"delay": args.delay, "streams": results, "tuning": tried}
-        console.print(f"wrote {save('simulated', sys.argv[1:], tables, data, args.out or RESULTS)}")
+        console.print(f"wrote {save('simulated', sys.argv[1:], tables, data, DEPENDS_ON, args.out or RESULTS)}")
 
 
 def _table(results: dict[str, dict[str, Any]], delay: int, density: float) -> Table:

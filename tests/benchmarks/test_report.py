@@ -1,4 +1,6 @@
+import importlib
 import io
+import pkgutil
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -6,9 +8,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from steadypose.benchmarks import provenance
+from steadypose.benchmarks import protocols, provenance, systems
 from steadypose.benchmarks.machine import describe
-from steadypose.benchmarks.provenance import UncommittedError, ships, stale
+from steadypose.benchmarks.provenance import WORLD, UncommittedError, ships, stale
 from steadypose.benchmarks.report import Args, StaleError, fill, main
 from steadypose.benchmarks.results import Table, load, save, show
 
@@ -17,7 +19,9 @@ TEXT = "# Title\n<!-- results:speed -->\nold\n<!-- /results -->\ntail\n"
 
 
 def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tmp_path: Path) -> None:
-    save("latency", ["--quick", str(tmp_path / "input")], [TABLE], {"rows": [1, {"none": float("nan")}]}, tmp_path)
+    save(
+        "latency", ["--quick", str(tmp_path / "input")], [TABLE], {"rows": [1, {"none": float("nan")}]}, WORLD, tmp_path
+    )
     results = load(tmp_path)
     assert results["latency"]["rows"] == [1, {"none": None}]
     assert str(tmp_path) not in (tmp_path / "latency.json").read_text()
@@ -37,13 +41,13 @@ def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tm
 
 
 def test_a_marker_without_a_result_is_an_error_that_names_those_there_are(tmp_path: Path) -> None:
-    save("latency", [], [TABLE], {}, tmp_path)
+    save("latency", [], [TABLE], {}, WORLD, tmp_path)
     with pytest.raises(KeyError, match=r"results:other.*speed"):
         fill("<!-- results:other -->\n<!-- /results -->", load(tmp_path))
 
 
 def test_blocks_do_not_swallow_each_other(tmp_path: Path) -> None:
-    save("latency", [], [TABLE], {}, tmp_path)
+    save("latency", [], [TABLE], {}, WORLD, tmp_path)
     filled = fill(TEXT + "between\n" + TEXT, load(tmp_path))
     assert filled.count("| ours |") == 2
     assert "between" in filled
@@ -52,18 +56,33 @@ def test_blocks_do_not_swallow_each_other(tmp_path: Path) -> None:
 def test_a_result_is_stale_when_weights_or_settings_have_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    save("latency", [], [TABLE], {}, tmp_path)
-    save("importers", [], [replace(TABLE, name="files")], {}, tmp_path, measured=())
+    save("latency", [], [TABLE], {}, WORLD, tmp_path)
+    save("hgvae", [], [replace(TABLE, name="levels")], {}, ("hgvae weights",), tmp_path)
     results = load(tmp_path)
-    assert stale(results["latency"]) == stale(results["importers"]) == []
-    assert stale({}) == list(ships())
-    changed = ships() | {"prior weights": "others"}
+    assert stale(results["latency"]) == stale(results["hgvae"]) == []
+    assert stale({}) == ["weights", "settings"]
+    changed = ships() | {"mixture weights": "others"}
     monkeypatch.setattr(provenance, "ships", lambda: changed)
-    assert (stale(results["latency"]), stale(results["importers"])) == (["prior weights"], [])
-    with pytest.raises(StaleError, match=r"systems\.latency.*prior weights"):
+    assert (stale(results["latency"]), stale(results["hgvae"])) == (["mixture weights"], [])
+    with pytest.raises(StaleError, match=r"systems\.latency.*mixture weights"):
         fill(TEXT, results)
-    assert "**stale: measured with other prior weights**" in fill(TEXT, results, allow_stale=True)
-    assert "stale" not in fill("<!-- results:files -->\n<!-- /results -->", results)
+    assert "**stale: measured with other mixture weights**" in fill(TEXT, results, allow_stale=True)
+    assert "stale" not in fill("<!-- results:levels -->\n<!-- /results -->", results)
+
+
+def test_what_a_bench_says_it_depends_on_is_something_that_ships() -> None:
+    for package in (protocols, systems):
+        for name in (module.name for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}.")):
+            assert set(getattr(importlib.import_module(name), "DEPENDS_ON", ())) <= set(ships()), name
+
+
+def test_weights_that_do_not_ship_change_no_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(provenance, "WEIGHTS", tmp_path)
+    digests = []
+    for name, weights in (("hgvae-default", b"1"), ("hgvae-research", b"2"), ("hgvae-default.faults", b"3")):
+        (tmp_path / f"{name}.safetensors").write_bytes(weights)
+        digests.append(ships.__wrapped__()["hgvae weights"])
+    assert digests[0] == digests[1] != digests[2]
 
 
 def test_what_no_commit_can_make_again_is_refused_among_the_results_alone(
@@ -71,8 +90,8 @@ def test_what_no_commit_can_make_again_is_refused_among_the_results_alone(
 ) -> None:
     monkeypatch.setattr(provenance, "uncommitted", lambda: ["prior/clean/fuse.py"])
     with pytest.raises(UncommittedError, match=r"fuse\.py.*--out"):
-        save("latency", [], [TABLE], {})
-    assert save("latency", [], [TABLE], {}, tmp_path).is_file()
+        save("latency", [], [TABLE], {}, WORLD)
+    assert save("latency", [], [TABLE], {}, WORLD, tmp_path).is_file()
 
 
 def test_results_that_no_longer_hold_are_named() -> None:
