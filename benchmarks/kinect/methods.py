@@ -24,6 +24,7 @@ from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.correct import CorrectSettings
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.models.sensor_bias.train import train_correction
+from steadypose.prior.models.training import TrainingOptions
 from steadypose.prior.timing.rate import FPS
 
 RIDGE, RIDGE_PENALTY = "ridge regression", 2200.0
@@ -143,7 +144,7 @@ class Kinect:
         if not path.is_file():
             self.bench.progress.stop()  # training draws a bar of its own
             subjects = tuple(s for s in dict.fromkeys(c.subject for c in self.taught) if s != left_out)
-            train_correction(self.data, folder, f"without-{left_out}", steps, subjects=subjects)
+            train_correction(TrainingOptions(self.data, folder, f"without-{left_out}", steps), subjects)
             self.bench.progress.start()
         return path
 

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from steadypose.prior.models.hmvae.config import CHANNELS, ROTATION_FEATURES, HMVAEConfig
 from steadypose.prior.models.hmvae.network import HMVAE, MotionVAE, Posterior
-from steadypose.prior.models.hmvae.train import STRIDES, fit
+from steadypose.prior.models.hmvae.train import STRIDES, Hyperparameters, fit
 from steadypose.prior.models.layers.dense import SLOPE
 from steadypose.prior.models.layers.skeleton_conv import EdgeLinear, SkeletonConv
 from steadypose.prior.motion.dataset import MotionSet
@@ -144,5 +144,6 @@ def trained(name: str, frames: int, train: MotionSet, val: MotionSet, runs: Path
     torch.manual_seed(0)
     model = MODELS[name](CONFIGS[frames])
     directory = runs / f"{name.lower()}-{frames}-{steps}"
-    fit(model, train, val, directory, steps, FRAMES_A_STEP // frames, _LEARNING_RATE, _STRIDES[frames], seed=0)
+    hyperparameters = Hyperparameters(steps, FRAMES_A_STEP // frames, _LEARNING_RATE, _STRIDES[frames])
+    fit(model, train, val, directory, hyperparameters, seed=0)
     return model

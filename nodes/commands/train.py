@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +9,7 @@ import torch
 
 from steadypose.prior.models.distributed import join, neighbours, writes
 from steadypose.prior.models.torch_weights import install as install_weights
+from steadypose.prior.models.training import TrainingOptions
 
 
 def train(
@@ -86,12 +86,8 @@ def train(
     else:
         from steadypose.prior.models.sensor_bias.train import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")
-    if iterations is not None:
-        train_model = partial(train_model, iterations=iterations)
-    if start is not None:
-        if model == "correction":
-            raise ValueError("--start: a correction is trained from the beginning, in minutes; leave it out")
-        train_model = partial(train_model, start=start)
-    path = train_model(data, runs, weights=name, seed=seed)
+    if start is not None and model == "correction":
+        raise ValueError("--start: a correction is trained from the beginning, in minutes; leave it out")
+    path = train_model(TrainingOptions(data, runs, name, iterations, seed, start))
     if writes():
         print(f"weights: {install_weights(path) if install else path}")

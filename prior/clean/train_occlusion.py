@@ -26,7 +26,7 @@ from steadypose.prior.models.mixture.sensors import Sensors
 from steadypose.prior.models.occlusion.inference import Occluded, Weighed
 from steadypose.prior.models.occlusion.network import OcclusionConfig, OcclusionNet
 from steadypose.prior.models.torch_weights import save_weights, started
-from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS
 from steadypose.prior.timing.rate import FPS
@@ -34,6 +34,9 @@ from steadypose.prior.timing.rate import FPS
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Rng = np.random.Generator
+
+ITERATIONS, BATCH, LEARNING_RATE = 3_000, 4096, 3e-3
+"""Occluded joints a step; AdamW's rate at the start, which falls along a cosine."""
 
 FRAMES, CLIPS = 120, 64
 """of a clip, and clips side by side"""
@@ -159,46 +162,26 @@ def loss_of(network: OcclusionNet, rows: dict[str, Tensor]) -> tuple[Tensor, Ten
     return (error / (LEAST_MM + best)).mean() + DEVIATION * likelihood.mean(), error, best
 
 
-def train_occlusion(
-    data: Path,
-    runs: Path,
-    weights: str = "default",
-    iterations: int = 3_000,
-    batch: int = 4096,
-    learning_rate: float = 3e-3,
-    seed: int = 0,
-    start: str | None = None,
-) -> Path:
-    """Train the occlusion network on the recordings in the folder ``data`` that are free for products.
+def train_occlusion(options: TrainingOptions) -> Path:
+    """Train the occlusion network on the recordings in the folder ``options.data``; the path of the weights.
 
-    Args:
-        data: folder of the recordings, as of the mixture, whose prepared arrays serve too.
-        runs: folder of training runs; a killed run of the same name resumes there.
-        weights: which set: ``default``.
-        iterations: optimiser steps.
-        batch: occluded joints a step.
-        learning_rate: of Adam at the start; it falls along a cosine.
-        seed: of weights and of sampling.
-        start: weights to go on from: a set or a path.
-
-    Returns:
-        The path of the weights.
+    They are those of the mixture that are free for products; its prepared arrays serve too.
     """
-    name = f"occlusion-{weights}"
-    directory = runs / name
+    iterations, seed, path = options.iterations or ITERATIONS, options.seed, options.path("occlusion")
+    directory = path.parent
     arrays = directory / "arrays"
     if not (arrays / "pairs.npz").is_file():
-        write_arrays(data, arrays)
+        write_arrays(options.data, arrays)
     torch.manual_seed(seed)
     model = OcclusionNet(OcclusionConfig())
-    origin = started(model, "occlusion", start)
+    origin = started(model, "occlusion", options.start)
     rows = {split: _rows(directory, model, split, seed) for split in RECORDED}
     train, val = ({key: torch.from_numpy(value) for key, value in vars(rows[split]).items()} for split in RECORDED)
-    if start is None:
+    if options.start is None:
         model.mean.copy_(train["features"].mean(dim=0))
         model.deviation.copy_(train["features"].std(dim=0).clamp(min=0.05))
-    optimiser = torch.optim.AdamW(model.parameters(), lr=learning_rate, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=learning_rate / 100)
+    optimiser = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=LEARNING_RATE / 100)
     run = TrainingRun(directory, model, schedule, iterations, evaluations=20)
 
     def loss_of_step(count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
@@ -210,13 +193,13 @@ def train_occlusion(
         total, error, best = loss_of(model, val)
         return {"val": total.item(), "val mm": error.mean().item(), "val best of three": best.mean().item()}
 
-    run.minimise(loss_of_step, evaluate, batch, seed, clip=1.0)
-    return run.save(directory / f"{name}.safetensors", model, asdict(model.config), {
+    run.minimise(loss_of_step, evaluate, BATCH, seed, clip=1.0)
+    return run.save(path, model, asdict(model.config), {
         "Model": "weights of three accounts of where an occluded joint is, and a deviation",
         "Data": "as the mixture's, through simulated sensors, occlusions and the pipeline itself",
-        "Licence": LICENCES[weights],
-        "Training": f"`steadypose train occlusion --iterations {iterations}`: {batch} of {len(train['joint'])} "
-        f"occluded joints a step, AdamW {learning_rate:g}, seed {seed}{origin}",
+        "Licence": LICENCES[options.weights],
+        "Training": f"`steadypose train occlusion --iterations {iterations}`: {BATCH} of {len(train['joint'])} "
+        f"occluded joints a step, AdamW {LEARNING_RATE:g}, seed {seed}{origin}",
     })  # fmt: skip
 
 

@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,36 @@ from steadypose.prior.models.torch_weights import save_weights
 Loss = Callable[[int, float, np.random.Generator], tuple[Tensor, dict[str, float]]]
 """Of a random batch: how many samples to draw, the share of the training that is done, in [0, 1), and random numbers to
 draw them by, which torchrun's processes do not share; to what is to be minimised, and the terms to plot."""
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """What the training of every model takes, as ``steadypose train`` has it.
+
+    Attributes:
+        data: ``prepared.npz``; where a model learns from something else, that.
+        runs: folder of training runs; a killed run of the same name resumes there.
+        weights: which set: ``default`` or ``research``; of a sensor's correction, the sensor's name.
+        iterations: optimiser steps, at least 1; None: the model's own number.
+        seed: of weights and of sampling.
+        start: weights to go on from: a set or a path.
+    """
+
+    data: Path
+    runs: Path
+    weights: str = "default"
+    iterations: int | None = None
+    seed: int = 0
+    start: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.iterations is not None and self.iterations < 1:
+            raise ValueError(f"iterations: expected 1 or more, got {self.iterations}")
+
+    def path(self, model: str) -> Path:
+        """Where the weights of ``model`` go, in the folder of its run: ``RUNS/MODEL-SET/MODEL-SET.safetensors``."""
+        name = f"{model}-{self.weights}"
+        return self.runs / name / f"{name}.safetensors"
 
 
 class TrainingRun:

@@ -24,12 +24,15 @@ from steadypose.prior.models.completer.network import Completer
 from steadypose.prior.models.hmvae.network import from_6d, to_6d
 from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
 from steadypose.prior.models.torch_weights import started
-from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations
 from steadypose.prior.timing.rate import FPS
 
 Rng = np.random.Generator
+
+ITERATIONS, BATCH, LEARNING_RATE = 20_000, 1536, 8e-4
+"""Frames a step; AdamW's rate at its highest, from where it falls along a cosine."""
 
 GAPS = (5, 64)
 """Range of frames of a gap."""
@@ -64,44 +67,20 @@ _PARTS = (*_ARMS, *_LEGS, _LOWER, _LOWER, _BOTH_ARMS, [*_BOTH_ARMS, J["head"], J
 _ENDS = [J[name] for name in ("pelvis", "spine3", "head", "left_wrist", "right_wrist", "left_ankle", "right_ankle")]
 
 
-def train_completer(
-    data: Path,
-    runs: Path,
-    weights: str = "default",
-    iterations: int = 20_000,
-    batch: int = 1536,
-    learning_rate: float = 8e-4,
-    seed: int = 0,
-    start: str | None = None,
-    config: CompleterConfig | None = None,
-) -> Path:
-    """Train the completer on prepared motion and write weights, card and curves.
-
-    Args:
-        data: ``prepared.npz``.
-        runs: folder of training runs; a killed run of the same name resumes there.
-        weights: which set: ``default`` or ``research``.
-        iterations: optimiser steps.
-        batch: frames a step.
-        learning_rate: of AdamW at its highest; it falls along a cosine.
-        seed: of weights and of sampling.
-        start: weights to go on from: a set or a path.
-        config: sizes.
-
-    Returns:
-        The path of the weights.
-    """
-    name = f"completer-{weights}"
+def train_completer(options: TrainingOptions, config: CompleterConfig | None = None) -> Path:
+    """Train the completer, of these sizes, on prepared motion; the path of the weights."""
+    iterations, weights, seed = options.iterations or ITERATIONS, options.weights, options.seed
+    path = options.path("completer")
     torch.manual_seed(seed)
-    train, val = (MotionSet.load(data, weights, split) for split in ("train", "val"))
+    train, val = (MotionSet.load(options.data, weights, split) for split in ("train", "val"))
     model = Completer(config or CompleterConfig())
     model.usual.copy_(roma.rotmat_to_unitquat(roma.special_procrustes(train.rotations.mean(dim=0))))
-    origin = started(model, "completer", start)
-    optimiser = torch.optim.AdamW(model.parameters(), lr=learning_rate, weight_decay=0.01)
+    origin = started(model, "completer", options.start)
+    optimiser = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=0.01)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, learning_rate, total_steps=iterations + 1, pct_start=0.05, final_div_factor=40
+        optimiser, LEARNING_RATE, total_steps=iterations + 1, pct_start=0.05, final_div_factor=40
     )
-    run = TrainingRun(runs / name, model, schedule, iterations, evaluations=40)
+    run = TrainingRun(path.parent, model, schedule, iterations, evaluations=40)
     sampler = Sampler(train)
 
     def loss_of(count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
@@ -110,13 +89,13 @@ def train_completer(
         rows = sampler.draw(max(count // frames, 1), frames, rng)
         return loss(model, Truth.of(train, rows, rng), masks(len(rows), gap, context, rng), rng)
 
-    run.minimise(loss_of, lambda: evaluate_completer(model, val), batch, seed, clip=1.0)
-    return run.save(runs / name / f"{name}.safetensors", model, asdict(calibrate(model, val)), {
+    run.minimise(loss_of, lambda: evaluate_completer(model, val), BATCH, seed, clip=1.0)
+    return run.save(path, model, asdict(calibrate(model, val)), {
         "Model": f"a transformer of {model.config.layers} layers, {model.config.width} wide, over a window's frames",
         "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],
-        "Training": f"`steadypose train completer --weights {weights} --iterations {iterations}`: {batch} frames a "
-        f"step in windows of {GAPS[0] + CONTEXT[0]} to {GAPS[1] + CONTEXT[1]}, AdamW {learning_rate:g}, "
+        "Training": f"`steadypose train completer --weights {weights} --iterations {iterations}`: {BATCH} frames a "
+        f"step in windows of {GAPS[0] + CONTEXT[0]} to {GAPS[1] + CONTEXT[1]}, AdamW {LEARNING_RATE:g}, "
         f"seed {seed}{origin}",
     })  # fmt: skip
 

@@ -24,13 +24,16 @@ from steadypose.prior.models.contacts.features import FEATURES, contact_features
 from steadypose.prior.models.contacts.network import ContactConfig, ContactNet
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.models.torch_weights import started
-from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.dataset import MotionSet, data_told
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator
+
+ITERATIONS, BATCH, LEARNING_RATE = 3_000, 64, 4e-3
+"""Clips a step; Adam's rate at the start, which falls along a cosine."""
 
 FRAMES = 90
 """Of a clip, from its first: the start of a stream is a part of it."""
@@ -171,40 +174,18 @@ def _tensor(values: NDArray[Any]) -> Tensor:
     return torch.from_numpy(values.astype(np.float32))
 
 
-def train_contacts(
-    data: Path,
-    runs: Path,
-    weights: str = "default",
-    iterations: int = 3_000,
-    batch: int = 64,
-    learning_rate: float = 4e-3,
-    seed: int = 0,
-    start: str | None = None,
-) -> Path:
-    """Train the contact network on prepared motion and write weights, card and curves.
-
-    Args:
-        data: ``prepared.npz``, of motion at several speeds.
-        runs: folder of training runs; a killed run of the same name resumes there.
-        weights: which set: ``default`` or ``research``.
-        iterations: optimiser steps.
-        batch: clips a step.
-        learning_rate: of Adam at the start; it falls along a cosine.
-        seed: of weights and of sampling.
-        start: weights to go on from: a set or a path.
-
-    Returns:
-        The path of the weights.
-    """
-    name = f"contacts-{weights}"
-    sets = {split: MotionSet.load(data, weights, split, flat=True) for split in CLIPS}
-    train, val = (_pool(runs / name, sets[split], split, seed) for split in CLIPS)
+def train_contacts(options: TrainingOptions) -> Path:
+    """Train the contact network on prepared motion at several speeds; the path of the weights."""
+    iterations, weights, seed = options.iterations or ITERATIONS, options.weights, options.seed
+    path = options.path("contacts")
+    sets = {split: MotionSet.load(options.data, weights, split, flat=True) for split in CLIPS}
+    train, val = (_pool(path.parent, sets[split], split, seed) for split in CLIPS)
     torch.manual_seed(seed)
     model = ContactNet(ContactConfig())
-    origin = started(model, "contacts", start)
-    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=learning_rate / 100)
-    run = TrainingRun(runs / name, model, schedule, iterations, evaluations=40)
+    origin = started(model, "contacts", options.start)
+    optimiser = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=LEARNING_RATE / 100)
+    run = TrainingRun(path.parent, model, schedule, iterations, evaluations=40)
 
     def loss_of(count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         features, load, rest, counts = draw(train, rng.integers(len(train.yaw), size=count), rng)
@@ -215,14 +196,14 @@ def train_contacts(
         ]
         return losses[0] + losses[1], {"L_load": losses[0].item(), "L_rest": losses[1].item()}
 
-    run.minimise(loss_of, lambda: evaluate_contacts(model, val), batch, seed, clip=1.0)
-    return run.save(runs / name / f"{name}.safetensors", model, asdict(model.config), {
+    run.minimise(loss_of, lambda: evaluate_contacts(model, val), BATCH, seed, clip=1.0)
+    return run.save(path, model, asdict(model.config), {
         "Model": f"load and rest of {len(CONTACT_JOINTS)} joints, a recurrent network of {model.config.hidden} units",
         "Data": data_told(weights, sets["train"], sets["val"]),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train contacts --weights {weights} --iterations {iterations}`: "
-        f"{batch} clips of {FRAMES} frames a step, of {CLIPS['train']} through simulated sensors and the smoother, "
-        f"Adam {learning_rate:g}, seed {seed}{origin}",
+        f"{BATCH} clips of {FRAMES} frames a step, of {CLIPS['train']} through simulated sensors and the smoother, "
+        f"Adam {LEARNING_RATE:g}, seed {seed}{origin}",
     })  # fmt: skip
 
 

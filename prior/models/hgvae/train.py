@@ -10,7 +10,7 @@ was seen where the model would not have put it is an anomaly.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ from steadypose.prior.models.hgvae.train_completion import BATCH, BONES, SPOILT_
 from steadypose.prior.models.hgvae.train_faults import train_anomaly
 from steadypose.prior.models.hgvae.windows import STRIDES, Batch, Windows, mean_tracks
 from steadypose.prior.models.torch_weights import started
-from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES, weights_path
 from steadypose.prior.motion.corruption import add_noise, occlude, other_builds, slow_errors, spoil
 from steadypose.prior.motion.dataset import MotionSet
@@ -55,44 +55,30 @@ CLIP_ENTRY = 100.0
 """norm of the gradient (section 5), times the root of how many entries a window has: here the loss is their sum"""
 
 
-def train_hgvae(
-    data: Path,
-    runs: Path,
-    weights: str = "default",
-    model: str = "hgvae",
-    iterations: int = 9_000,
-    batch: int = 64,
-    learning_rate: float = 6e-3,
-    seed: int = 0,
-    start: str | None = None,
-) -> Path:
-    """Train HG-VAE on prepared motion and write weights, card and curves.
+def train_hgvae(options: TrainingOptions) -> Path:
+    """Train HG-VAE on prepared motion, first its completion network, last its fault network; the path of the weights.
 
-    Args:
-        data: ``prepared.npz``.
-        runs: folder of training runs; a killed run of the same name resumes there.
-        weights: which set: ``default`` or ``research``.
-        model: which of `MODELS`.
-        iterations: optimiser steps.
-        batch: windows a step.
-        learning_rate: of Adam at the start, half of it where weights are gone on from; falls to nothing along a cosine.
-        seed: of weights and of sampling.
-        start: weights to go on from: a set or a path; the fault network beside them is taken up too.
-
-    Returns:
-        The path of the weights.
+    From ``options.start`` the rate is half, and the fault network goes on from the one beside those weights.
     """
-    name = f"{model}-{weights}"
-    train = Windows(MotionSet.load(data, weights, "train"))
-    val = Windows(MotionSet.load(data, weights, "val"))
+    return _train("hgvae", options, options.iterations or 9_000, batch=64, learning_rate=6e-3)
+
+
+def train_hgvae_wide(options: TrainingOptions) -> Path:
+    """Train the paper's size: fewer and smaller steps, so that it stays within an hour on two cores."""
+    return _train("hgvae-wide", options, options.iterations or 4_000, batch=32, learning_rate=5e-4)
+
+
+def _train(model: str, options: TrainingOptions, iterations: int, batch: int, learning_rate: float) -> Path:
+    weights, seed, start, path = options.weights, options.seed, options.start, options.path(model)
+    train, val = (Windows(MotionSet.load(options.data, weights, split)) for split in ("train", "val"))
     torch.manual_seed(seed)
     network = HGVAE(MODELS[model])
     network.mean.copy_(mean_tracks(train, network.config.frames))
     origin = started(network, model, start)
     rate = learning_rate if start is None else learning_rate / 2
-    train_completion(network, train, val, runs / f"{name}-completion", iterations, seed)
-    run = fit(network, train, val, runs / name, iterations, batch, rate, seed)
-    path = run.save(runs / name / f"{name}.safetensors", network, asdict(network.config), {
+    train_completion(network, train, val, options.runs / f"{path.stem}-completion", iterations, seed)
+    run = fit(network, train, val, path.parent, iterations, batch, rate, seed)
+    run.save(path, network, asdict(network.config), {
         "Model": f"HG-VAE, '{model}' of prior/models/hgvae/train.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject",
         "Licence": LICENCES[weights],
@@ -101,20 +87,8 @@ def train_hgvae(
         f"Adam {rate:g}, seed {seed}{origin}",
     })  # fmt: skip
     faults = None if start is None else str(weights_path(start, model).with_suffix(".faults.safetensors"))
-    train_anomaly(data, runs, weights, path, -(-iterations // 3), seed, faults)
+    train_anomaly(path, -(-iterations // 3), replace(options, start=faults))
     return path
-
-
-def train_hgvae_wide(
-    data: Path,
-    runs: Path,
-    weights: str = "default",
-    iterations: int = 4_000,
-    seed: int = 0,
-    start: str | None = None,
-) -> Path:
-    """Train the paper's size: fewer and smaller steps, so that it stays within an hour on two cores."""
-    return train_hgvae(data, runs, weights, "hgvae-wide", iterations, 32, 5e-4, seed, start)
 
 
 def fit(

@@ -23,7 +23,7 @@ from steadypose.prior.models.hgvae.features import to_tracks
 from steadypose.prior.models.hgvae.network import HGVAE
 from steadypose.prior.models.hgvae.windows import STRIDES, Windows, standardise
 from steadypose.prior.models.torch_weights import load_network, started
-from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.corruption import (
     FAST,
@@ -68,27 +68,22 @@ REPEATED = 0.15
 """share of the windows in which a tracker repeats its last answer for some joints"""
 
 
-def train_anomaly(
-    data: Path, runs: Path, weights: str, path: Path, iterations: int, seed: int = 0, start: str | None = None
-) -> None:
+def train_anomaly(path: Path, iterations: int, options: TrainingOptions) -> None:
     """Train the fault network of an HG-VAE, and measure its scale on validation motion; both go beside its weights.
 
     Args:
-        data: ``prepared.npz``.
-        runs: folder of training runs.
-        weights: which set: ``default`` or ``research``.
         path: of HG-VAE's weights, ``.safetensors``.
         iterations: optimiser steps.
-        seed: of weights and of sampling.
-        start: weights of a fault network to go on from.
+        options: as HG-VAE was trained with, but to start from weights of a fault network.
     """
+    weights, seed = options.weights, options.seed
     model = _model(path)
-    train, val = (Windows(MotionSet.load(data, weights, split)) for split in ("train", "val"))
+    train, val = (Windows(MotionSet.load(options.data, weights, split)) for split in ("train", "val"))
     torch.manual_seed(seed)
     network = FaultNet(FaultNetConfig(frames=model.config.frames))
     network.mean.copy_(model.mean)
-    origin = started(network, "hgvae", start)
-    run = fit(network, model, train, val, runs / f"{path.stem}-faults", iterations, seed)
+    origin = started(network, "hgvae", options.start)
+    run = fit(network, model, train, val, options.runs / f"{path.stem}-faults", iterations, seed)
     run.save(path.with_suffix(".faults.safetensors"), network, asdict(network.config), {
         "Model": f"fault network beside {path.name}, prior/models/hgvae/faults.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, spoilt as in train_faults.py",

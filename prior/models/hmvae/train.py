@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from steadypose.prior.models.hmvae.config import HMVAEConfig
 from steadypose.prior.models.hmvae.network import HMVAE, MotionVAE, from_6d, to_6d
 from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
 from steadypose.prior.models.torch_weights import started
-from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations, remove_heading
 
@@ -50,82 +50,65 @@ NOISY, NOISE, HELD = 0.5, 0.03, 0.25
 """Of a model about the mean pose: share of windows with noise, metres along an axis of joints at most, of which half is
 an error that lasts; and share of these with a limb that stays where it was."""
 
-
-def train_hmvae(
-    data: Path,
-    runs: Path,
-    weights: str = "default",
-    iterations: int = 11_000,
-    batch: int = 64,
-    learning_rate: float = 5e-4,
-    seed: int = 0,
-    start: str | None = None,
-) -> Path:
-    """Train HM-VAE on prepared motion and write weights, card and curves.
-
-    The official schedule (250,000 steps of 8 windows at 1e-4) is folded into fewer, larger steps; the proportions
-    are kept: z_l comes in late, the rate falls twice.
-
-    Args:
-        data: ``prepared.npz``.
-        runs: folder of training runs; a killed run of the same name resumes there.
-        weights: which set: ``default`` or ``research``.
-        iterations: optimiser steps.
-        batch: windows a step.
-        learning_rate: of Adam at the start.
-        seed: of weights and of sampling.
-        start: weights to go on from: a set or a path.
-
-    Returns:
-        The path of the weights.
-    """
-    torch.manual_seed(seed)
-    train = MotionSet.load(data, weights, "train")
-    val = MotionSet.load(data, weights, "val")
-    config = HMVAEConfig()
-    model = HMVAE(config)
-    origin = started(model, "hmvae", start)
-    name = f"hmvae-{weights}"
-    run = fit(model, train, val, runs / name, iterations, batch, learning_rate, STRIDES, seed)
-    return run.save(runs / name / f"{name}.safetensors", model, asdict(config), {
-        "Model": "HM-VAE, window 8, 22 joints (prior/models/hmvae/network.py)",
-        "Data": data_told(weights, train, val),
-        "Licence": LICENCES[weights],
-        "Training": f"`steadypose train hmvae --weights {weights} --iterations {iterations}`: "
-        f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}{origin}",
-    })  # fmt: skip
-
-
-LONG = HMVAEConfig(window=64, kernel=7, strides=(2, 2, 2, 2), local_latent=12, global_latent=24, about_mean=True)
+LONG_CONFIG = HMVAEConfig(window=64, kernel=7, strides=(2, 2, 2, 2), local_latent=12, global_latent=24, about_mean=True)
 """Windows of 64 frames for `prior.offline.optimise`: the official sizes, but for a kernel of half as many frames, and
 about the mean pose."""
 
 
-def train_long_hmvae(
-    data: Path,
-    runs: Path,
-    weights: str = "default",
-    iterations: int = 20_000,
-    batch: int = 16,
-    learning_rate: float = 1e-3,
-    seed: int = 0,
-    start: str | None = None,
-) -> Path:
+@dataclass(frozen=True)
+class Hyperparameters:
+    """How a VAE of windows is trained.
+
+    Attributes:
+        iterations: optimiser steps.
+        batch: windows a step.
+        learning_rate: of Adam at the start; it falls to a third twice.
+        strides: frame rates, as frames from one to the next, each as likely as it stands there.
+        kl_weight: beta.
+        denoise: whether it sees windows through noise and occlusion, and is to give the clean ones.
+    """
+
+    iterations: int
+    batch: int
+    learning_rate: float
+    strides: Sequence[int] = STRIDES
+    kl_weight: float = KL_WEIGHT
+    denoise: bool = False
+
+
+SHORT = Hyperparameters(11_000, 64, 5e-4)
+"""The official schedule (250,000 steps of 8 windows at 1e-4) folded into fewer, larger steps; the proportions are kept:
+z_l comes in late, the rate falls twice."""
+
+LONG = Hyperparameters(20_000, 16, 1e-3, strides=(1,), kl_weight=ABOUT_MEAN_KL_WEIGHT, denoise=True)
+
+
+def train_hmvae(options: TrainingOptions) -> Path:
+    """Train HM-VAE on prepared motion; the path of the weights."""
+    return _train("hmvae", HMVAEConfig(), "window 8", SHORT, options)
+
+
+def train_long_hmvae(options: TrainingOptions) -> Path:
     """`train_hmvae` for windows of 64 frames, which completion searches: it sees noise and gives what is clean."""
-    torch.manual_seed(seed)
-    train, val = (MotionSet.load(data, weights, split) for split in ("train", "val"))
-    model = HMVAE(LONG)
-    origin = started(model, "hmvae64", start)
-    name = f"hmvae64-{weights}"
-    run = fit(
-        model, train, val, runs / name, iterations, batch, learning_rate, (1,), seed, ABOUT_MEAN_KL_WEIGHT, denoise=True
-    )
-    return run.save(runs / name / f"{name}.safetensors", model, asdict(LONG), {
-        "Model": "HM-VAE, window 64 about its mean pose, 22 joints (prior/models/hmvae/network.py)",
+    return _train("hmvae64", LONG_CONFIG, "window 64 about its mean pose", LONG, options)
+
+
+def _train(
+    name: str, config: HMVAEConfig, described: str, hyperparameters: Hyperparameters, options: TrainingOptions
+) -> Path:
+    torch.manual_seed(options.seed)
+    weights, path = options.weights, options.path(name)
+    train, val = (MotionSet.load(options.data, weights, split) for split in ("train", "val"))
+    model = HMVAE(config)
+    origin = started(model, name, options.start)
+    used = replace(hyperparameters, iterations=options.iterations or hyperparameters.iterations)
+    run = fit(model, train, val, path.parent, used, options.seed)
+    return run.save(path, model, asdict(config), {
+        "Model": f"HM-VAE, {described}, 22 joints (prior/models/hmvae/network.py)",
         "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],
-        "Training": f"`steadypose train hmvae64 --weights {weights} --iterations {iterations}`: "
-        f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}{origin}",
+        "Training": f"`steadypose train {name} --weights {weights} --iterations {used.iterations}`: "
+        f"{used.batch} windows a step, Adam {used.learning_rate:g}, seed {options.seed}{origin}",
     })  # fmt: skip
 
 
@@ -134,14 +117,8 @@ def fit(
     train: MotionSet,
     val: MotionSet,
     directory: Path,
-    iterations: int,
-    batch: int,
-    learning_rate: float,
-    strides: Sequence[int],
+    hyperparameters: Hyperparameters,
     seed: int,
-    kl_weight: float = KL_WEIGHT,
-    *,
-    denoise: bool = False,
 ) -> TrainingRun:
     """Train a VAE of windows as HM-VAE is trained, with equations 3 and 5 to 8.
 
@@ -150,18 +127,14 @@ def fit(
         train: what it learns.
         val: what it is evaluated on as it goes.
         directory: of the run's checkpoint and curves; a checkpoint there is resumed.
-        iterations: optimiser steps.
-        batch: windows a step.
-        learning_rate: of Adam at the start; it falls to a third twice.
-        strides: frame rates, as frames from one to the next, each as likely as it stands there.
+        hyperparameters: of the training.
         seed: of sampling.
-        kl_weight: beta.
-        denoise: whether it sees windows through noise and occlusion, and is to give the clean ones.
 
     Returns:
         The finished run, with its curves.
     """
-    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate, weight_decay=1e-4)
+    iterations, strides = hyperparameters.iterations, hyperparameters.strides
+    optimiser = torch.optim.Adam(model.parameters(), lr=hyperparameters.learning_rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.MultiStepLR(optimiser, [int(iterations * f) for f in (0.6, 0.85)], gamma=0.3)
     run = TrainingRun(directory, model, schedule, iterations, evaluations=48)
 
@@ -169,10 +142,10 @@ def fit(
         rows = train.sample(count, model.window, strides, rng)
         rotations, offsets = _augment(train.rotations[rows], train.offsets[rows[:, 0]])
         rotations, _ = remove_heading(rotations, model.window // 2 - 1)
-        seen = corrupt(rotations, offsets, rng) if denoise else rotations
-        return _loss(model, seen, rotations, offsets, (done - GLOBAL_FIRST) / LOCAL_WARM_UP, kl_weight)
+        seen = corrupt(rotations, offsets, rng) if hyperparameters.denoise else rotations
+        return _loss(model, seen, rotations, offsets, (done - GLOBAL_FIRST) / LOCAL_WARM_UP, hyperparameters.kl_weight)
 
-    run.minimise(loss_of, lambda: evaluate_hmvae(model, val), batch, seed)
+    run.minimise(loss_of, lambda: evaluate_hmvae(model, val), hyperparameters.batch, seed)
     return run
 
 

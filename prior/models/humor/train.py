@@ -17,12 +17,15 @@ from steadypose.prior.models.humor.network import HumorConfig, HumorNet
 from steadypose.prior.models.humor.rollout import roll_out, sample, transitions
 from steadypose.prior.models.humor.state import State, canonical, choose, features, stack, states_of
 from steadypose.prior.models.torch_weights import started
-from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations
 from steadypose.prior.timing.rate import FPS
 
 Rng = np.random.Generator
+
+ITERATIONS, BATCH, LEARNING_RATE = 6_000, 128, 7e-4
+"""Sequences a step; Adam's rate at the start, which falls along a cosine."""
 
 STEPS = 10
 """Steps of a training sequence."""
@@ -126,44 +129,21 @@ class Batch:
     contacts: Tensor
 
 
-def train_humor(
-    data: Path,
-    runs: Path,
-    weights: str = "default",
-    iterations: int = 6_000,
-    batch: int = 128,
-    learning_rate: float = 7e-4,
-    seed: int = 0,
-    start: str | None = None,
-) -> Path:
-    """Train the transition model on prepared motion and write weights, card and curves.
-
-    Args:
-        data: ``prepared.npz``.
-        runs: folder of training runs; a killed run of the same name resumes there.
-        weights: which set: ``default`` or ``research``.
-        iterations: optimiser steps.
-        batch: sequences of `STEPS` steps.
-        learning_rate: of Adam at the start; it falls along a cosine.
-        seed: of weights and of sampling.
-        start: weights to go on from: a set or a path.
-
-    Returns:
-        The path of the weights.
-    """
-    name = f"humor-{weights}"
-    train, val = (MotionSet.load(data, weights, split, flat=True) for split in ("train", "val"))
+def train_humor(options: TrainingOptions) -> Path:
+    """Train the transition model on prepared motion; the path of the weights."""
+    iterations, weights = options.iterations or ITERATIONS, options.weights
+    train, val = (MotionSet.load(options.data, weights, split, flat=True) for split in ("train", "val"))
     config = HumorConfig()
-    told = {
+    card = {
         "Model": f"transitions of HuMoR: latent of {config.latent}, layers of {config.hidden}, "
         f"{config.components} Gaussians of initial states",
         "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],
-        "Training": f"`steadypose train humor --weights {weights} --iterations {iterations}`: {batch} sequences of "
-        f"{STEPS} steps a step, Adam {learning_rate:g}, seed {seed}",
+        "Training": f"`steadypose train humor --weights {weights} --iterations {iterations}`: {BATCH} sequences of "
+        f"{STEPS} steps a step, Adam {LEARNING_RATE:g}, seed {options.seed}",
     }  # fmt: skip
     return fit_transitions(
-        config, train, val, runs / name / f"{name}.safetensors", told, iterations, batch, learning_rate, seed, start
+        config, train, val, options.path("humor"), card, iterations, BATCH, LEARNING_RATE, options.seed, options.start
     )
 
 

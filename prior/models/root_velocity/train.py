@@ -16,9 +16,12 @@ from steadypose.prior.body.skeleton import MIRROR, limbs
 from steadypose.prior.models.root_velocity.config import FRAME_S, TrajectoryConfig
 from steadypose.prior.models.root_velocity.network import RootMotion, TrajectoryNet
 from steadypose.prior.models.torch_weights import started
-from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.dataset import MotionSet, data_told, heading, yaw_rotation
+
+ITERATIONS, BATCH, LEARNING_RATE = 2_000, 64, 2e-3
+"""Windows a step; Adam's rate at the start, which falls along a cosine."""
 
 WINDOW = 48
 """Frames of a training window, 1.6 s."""
@@ -71,54 +74,32 @@ class _Windows:
     contacts: Tensor
 
 
-def train_trajectory(
-    data: Path,
-    runs: Path,
-    weights: str = "default",
-    iterations: int = 2_000,
-    batch: int = 64,
-    learning_rate: float = 2e-3,
-    seed: int = 0,
-    start: str | None = None,
-) -> Path:
-    """Train the trajectory network on prepared motion and write weights, card and curves.
-
-    Args:
-        data: ``prepared.npz``.
-        runs: folder of training runs; a killed run of the same name resumes there.
-        weights: which set: ``default`` or ``research``.
-        iterations: optimiser steps.
-        batch: windows a step.
-        learning_rate: of Adam at the start; it falls along a cosine.
-        seed: of weights and of sampling.
-        start: weights to go on from: a set or a path.
-
-    Returns:
-        The path of the weights.
-    """
+def train_trajectory(options: TrainingOptions) -> Path:
+    """Train the trajectory network on prepared motion; the path of the weights."""
+    iterations, weights, seed = options.iterations or ITERATIONS, options.weights, options.seed
+    path = options.path("trajectory")
     torch.manual_seed(seed)
-    train = MotionSet.load(data, weights, "train", flat=True)
-    val = MotionSet.load(data, weights, "val", flat=True)
+    train = MotionSet.load(options.data, weights, "train", flat=True)
+    val = MotionSet.load(options.data, weights, "val", flat=True)
     starts, chances = _chances(train)
     model = TrajectoryNet(TrajectoryConfig())
-    origin = started(model, "trajectory", start)
-    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=learning_rate / 100)
-    name = f"trajectory-{weights}"
-    run = TrainingRun(runs / name, model, schedule, iterations, evaluations=50)
+    origin = started(model, "trajectory", options.start)
+    optimiser = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=LEARNING_RATE / 100)
+    run = TrainingRun(path.parent, model, schedule, iterations, evaluations=50)
 
     def loss_of(count: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
         windows = _sample(train, starts, chances, count, rng)
         return _loss(model(windows.joints), windows)
 
-    run.minimise(loss_of, lambda: evaluate_trajectory(model, val), batch, seed)
+    run.minimise(loss_of, lambda: evaluate_trajectory(model, val), BATCH, seed)
     config = calibrate(model, val)
-    return run.save(runs / name / f"{name}.safetensors", model, asdict(config), {
+    return run.save(path, model, asdict(config), {
         "Model": f"root velocity and contacts, {config.context} frames of context, 22 joints",
         "Data": data_told(weights, train, val),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train trajectory --weights {weights} --iterations {iterations}`: "
-        f"{batch} windows a step, Adam {learning_rate:g}, seed {seed}{origin}",
+        f"{BATCH} windows a step, Adam {LEARNING_RATE:g}, seed {seed}{origin}",
         "Calibration": f"standard deviations times {config.sigma_scale}, errors last {config.correlation_s} s "
         "(horizontal, vertical)",
     })  # fmt: skip

@@ -24,52 +24,33 @@ from steadypose.prior.models.sensor_bias.features import (
     trunk_frame,
 )
 from steadypose.prior.models.sensor_bias.network import CorrectionNet, mirror_features
-from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.motion.dataset import mirror_offsets
 from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
 
+ITERATIONS, BATCH = 4_000, 256
+"""Frames a step."""
 HIDE = 0.1
 """Share of training frames with joints hidden, so that the network can do without some."""
 INPUT_NOISE = 0.03
 """Standard deviations of noise on the inputs: six people are few."""
 
 
-def train_correction(
-    data: Path,
-    runs: Path,
-    weights: str = "kinect_v2",
-    iterations: int = 4000,
-    batch: int = 256,
-    seed: int = 0,
-    subjects: Collection[str] = TRAIN_SUBJECTS,
-) -> Path:
-    """Train the Kinect's correction and write weights, card and curves.
-
-    Args:
-        data: ``ui_prmd.npz``.
-        runs: folder of training runs; a killed run of the same name resumes there.
-        weights: the sensor's name.
-        iterations: optimiser steps.
-        batch: frames a step.
-        seed: of weights and sampling.
-        subjects: whom to learn from.
-
-    Returns:
-        The path of the weights.
-    """
+def train_correction(options: TrainingOptions, subjects: Collection[str] = TRAIN_SUBJECTS) -> Path:
+    """Train the Kinect's correction on ``ui_prmd.npz``, on these subjects of it; the path of the weights."""
+    iterations, seed, path = options.iterations or ITERATIONS, options.seed, options.path("correction")
     torch.manual_seed(seed)
     # All six people: with one held back to watch, the other five teach measurably less (docs/experiments.md). The
     # length of the training was chosen that way once; `steadypose evaluate kinect_vicon` has people never seen.
-    x, y = _examples(data, subjects)
-    config = CorrectionConfig(sensor=weights)
+    x, y = _examples(options.data, subjects)
+    config = CorrectionConfig(sensor=options.weights)
     net = CorrectionNet(config)
     net.mean.copy_(x.nanmean(dim=0).nan_to_num())
     net.scale.copy_((x - net.mean).square().nanmean(dim=0).sqrt().nan_to_num().clamp(min=1e-2))
     optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=iterations)
-    name = f"correction-{weights}"
-    run = TrainingRun(runs / name, net, schedule, iterations, evaluations=40)
+    run = TrainingRun(path.parent, net, schedule, iterations, evaluations=40)
     recent = deque[float](maxlen=run.every)
 
     def loss_of(count: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
@@ -82,12 +63,12 @@ def train_correction(
         recent.append(1000 * loss.item())
         return loss, {"training mm": float(np.mean(recent))}
 
-    run.minimise(loss_of, dict, batch, seed)
-    return run.save(runs / name / f"{name}.safetensors", net, asdict(config), {
+    run.minimise(loss_of, dict, BATCH, seed)
+    return run.save(path, net, asdict(config), {
         "Model": "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses",
         "Data": f"UI-PRMD, Kinect beside Vicon: {', '.join(subjects)}",
         "Licence": "Apache-2.0; the data is in the public domain (PDDL 1.0)",
-        "Training": f"`steadypose train correction --data ui_prmd.npz`: {iterations} steps of {batch}, seed {seed}",
+        "Training": f"`steadypose train correction --data ui_prmd.npz`: {iterations} steps of {BATCH}, seed {seed}",
     })  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import torch
 
 from steadypose.nodes.commands import train as command
 from steadypose.prior.models import torch_weights
+from steadypose.prior.models.training import TrainingOptions
 
 
 @pytest.fixture
@@ -18,8 +19,8 @@ def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (folder / f"hmvae-default.{suffix}").write_text("shipped")
     (folder / "hmvae-research.safetensors").write_text("another set")
 
-    def train_hmvae(data: Path, runs: Path, **settings: object) -> Path:
-        path = runs / "hmvae-default" / "hmvae-default.safetensors"
+    def train_hmvae(options: TrainingOptions) -> Path:
+        path = options.path("hmvae")
         torch_weights.save_weights(path, torch.nn.Linear(2, 1), {}, {"Model": "small"})
         return path
 

@@ -29,6 +29,7 @@ from steadypose.prior.models.completer.inference import LiveCompleter
 from steadypose.prior.models.completer.network import Completer
 from steadypose.prior.models.completer.train import Truth, answer, masks, train_completer
 from steadypose.prior.models.torch_weights import arrays_of
+from steadypose.prior.models.training import TrainingOptions
 from steadypose.prior.motion.dataset import MotionSet
 
 SMALL = CompleterConfig(width=16, heads=2, layers=2)
@@ -162,12 +163,12 @@ def test_windows_of_training_are_of_one_person_and_keep_something() -> None:
 
 
 def test_training_learns_to_fill_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("steadypose.prior.models.completer.train.BATCH", 60)
     monkeypatch.setattr("steadypose.prior.models.completer.train.GAPS", (5, 12))
     monkeypatch.setattr("steadypose.prior.models.completer.train.evaluate_completer", lambda *_: {"val": 1.0})
     monkeypatch.setattr("steadypose.prior.models.completer.train.calibrate", lambda model, _: model.config)
     data = prepared(tmp_path / "m.npz")
-    settings_ = {"batch": 60, "config": SMALL}
-    whole = train_completer(data, tmp_path / "a", iterations=4, **settings_).read_bytes()
+    whole = train_completer(TrainingOptions(data, tmp_path / "a", iterations=4), SMALL).read_bytes()
     steps = iter(range(100))
     original = torch.optim.AdamW.step
 
@@ -178,9 +179,9 @@ def test_training_learns_to_fill_and_resumes(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(torch.optim.AdamW, "step", dies)
     with pytest.raises(KeyboardInterrupt):
-        train_completer(data, tmp_path / "b", iterations=4, **settings_)
+        train_completer(TrainingOptions(data, tmp_path / "b", iterations=4), SMALL)
     monkeypatch.setattr(torch.optim.AdamW, "step", original)
-    assert train_completer(data, tmp_path / "b", iterations=4, **settings_).read_bytes() == whole
+    assert train_completer(TrainingOptions(data, tmp_path / "b", iterations=4), SMALL).read_bytes() == whole
     motion = MotionSet.load(data, "default", "train")
     truth = Truth.of(motion, motion.all_windows(12, 40)[:2])
     assert np.isfinite(truth.seen(np.ones((2, 12, 22), bool), torch.from_numpy(USUAL)).features).all()

@@ -11,6 +11,7 @@ import torch
 from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS, J
 from steadypose.prior.models.contacts import train as training
 from steadypose.prior.models.contacts.inference import LiveContacts
+from steadypose.prior.models.training import TrainingOptions
 from steadypose.prior.motion.dataset import MotionSet
 
 FRAMES = 30
@@ -47,14 +48,15 @@ def prepared(tmp_path: Path) -> Path:
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "CLIPS", {"train": 8, "val": 4})
     monkeypatch.setattr(training, "FRAMES", FRAMES)
+    monkeypatch.setattr(training, "BATCH", 4)
 
 
 def test_it_trains_and_writes_what_loads(prepared: Path, tmp_path: Path) -> None:
-    path = training.train_contacts(prepared, tmp_path / "runs", iterations=4, batch=4)
+    path = training.train_contacts(TrainingOptions(prepared, tmp_path / "runs", iterations=4))
     live = LiveContacts.load(str(path))
     said = live(np.zeros((2, training.FEATURES), np.float32), np.zeros((2, live.hidden), np.float32))
     assert said.load.shape == said.rest.shape == (2, 8)
-    again = training.train_contacts(prepared, tmp_path / "runs", iterations=4, batch=4)  # done: nothing is left
+    again = training.train_contacts(TrainingOptions(prepared, tmp_path / "runs", iterations=4))  # done: nothing is left
     assert again.read_bytes() == path.read_bytes()
 
 

@@ -19,6 +19,7 @@ from steadypose.prior.models.hgvae.network import HGVAE, Gaussian, dct_matrix
 from steadypose.prior.models.hgvae.train import train_hgvae
 from steadypose.prior.models.layers.graph import GraphBlock, GraphLinear
 from steadypose.prior.models.torch_weights import arrays_of, load_tensors
+from steadypose.prior.models.training import TrainingOptions
 from steadypose.prior.models.weights_io import WEIGHTS
 
 SMALL = HGVAEConfig(
@@ -213,7 +214,7 @@ def test_training_writes_weights_their_card_and_their_scale(tmp_path: Path, monk
     config = replace(SMALL, frames=20)
     monkeypatch.setattr("steadypose.prior.models.hgvae.train.MODELS", {"hgvae": config})
     monkeypatch.setattr("steadypose.prior.models.hgvae.train_faults.WINDOWS", 16)
-    path = train_hgvae(prepared(tmp_path / "m.npz"), tmp_path / "runs", iterations=2, batch=4)
+    path = train_hgvae(TrainingOptions(prepared(tmp_path / "m.npz"), tmp_path / "runs", iterations=2))
     state, stored = load_tensors(str(path), "hgvae")
     HGVAE(HGVAEConfig.from_dict(stored)).load_state_dict(state)
     assert all(torch.isfinite(tensor).all() for tensor in state.values())

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,11 @@ from steadypose.prior.clean.refine import rotations_of
 from steadypose.prior.models.hmvae.config import HMVAEConfig
 from steadypose.prior.models.hmvae.inference import LiveHMVAE
 from steadypose.prior.models.hmvae.network import HMVAE, Posterior, from_6d, to_6d
-from steadypose.prior.models.hmvae.train import train_hmvae
+from steadypose.prior.models.hmvae.train import SHORT, train_hmvae
 from steadypose.prior.models.layers.skeleton_conv import SkeletonConv
 from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
 from steadypose.prior.models.torch_weights import arrays_of, load_tensors
+from steadypose.prior.models.training import TrainingOptions
 from steadypose.prior.models.weights_io import WEIGHTS, load_weights
 from steadypose.prior.motion.dataset import (
     MotionSet,
@@ -152,8 +154,9 @@ def test_a_missing_split_and_a_missing_file_are_said(tmp_path: Path) -> None:
 
 def test_training_resumes_where_it_was_killed_and_ends_the_same(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("steadypose.prior.models.weights_io.WEIGHTS", tmp_path / "weights")
+    monkeypatch.setattr("steadypose.prior.models.hmvae.train.SHORT", replace(SHORT, batch=4))
     data = prepared(tmp_path / "m.npz")
-    whole = train_hmvae(data, tmp_path / "a", iterations=6, batch=4).read_bytes()
+    whole = train_hmvae(TrainingOptions(data, tmp_path / "a", iterations=6)).read_bytes()
 
     steps = iter(range(100))
     original = torch.optim.Adam.step
@@ -165,9 +168,9 @@ def test_training_resumes_where_it_was_killed_and_ends_the_same(tmp_path: Path, 
 
     monkeypatch.setattr(torch.optim.Adam, "step", dies)
     with pytest.raises(KeyboardInterrupt):
-        train_hmvae(data, tmp_path / "b", iterations=6, batch=4)
+        train_hmvae(TrainingOptions(data, tmp_path / "b", iterations=6))
     monkeypatch.setattr(torch.optim.Adam, "step", original)
-    assert train_hmvae(data, tmp_path / "b", iterations=6, batch=4).read_bytes() == whole
+    assert train_hmvae(TrainingOptions(data, tmp_path / "b", iterations=6)).read_bytes() == whole
     assert [c["step"] for c in json.loads((tmp_path / "b/hmvae-default/curves.json").read_text())] == [1, 2, 3, 4, 5, 6]
     assert (tmp_path / "b/hmvae-default/curves.png").stat().st_size > 1000
 

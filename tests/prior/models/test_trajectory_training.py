@@ -14,6 +14,7 @@ from steadypose.prior.models.root_velocity import train as training
 from steadypose.prior.models.root_velocity.config import TrajectoryConfig
 from steadypose.prior.models.root_velocity.network import TrajectoryNet
 from steadypose.prior.models.torch_weights import load_tensors
+from steadypose.prior.models.training import TrainingOptions
 from steadypose.prior.motion.dataset import MotionSet
 
 
@@ -110,7 +111,9 @@ def test_calibration_finds_the_size_of_the_errors(prepared: Path, monkeypatch: p
 
 def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("steadypose.prior.models.weights_io.WEIGHTS", tmp_path / "weights")
-    state, config = load_tensors(str(training.train_trajectory(prepared, tmp_path / "a", iterations=4, batch=4)), "")
+    monkeypatch.setattr(training, "BATCH", 4)
+    whole = training.train_trajectory(TrainingOptions(prepared, tmp_path / "a", iterations=4))
+    state, config = load_tensors(str(whole), "")
     TrajectoryNet(TrajectoryConfig.from_dict(config)).load_state_dict(state)
     assert (tmp_path / "a/trajectory-default/trajectory-default.md").read_text().startswith("# trajectory-default")
     assert (tmp_path / "a/trajectory-default/trajectory-default.png").stat().st_size > 0
@@ -123,9 +126,10 @@ def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, 
         return loss(*args)
 
     monkeypatch.setattr(training, "_loss", killed)
+    options = TrainingOptions(prepared, tmp_path / "b", iterations=4)
     with pytest.raises(KeyboardInterrupt):
-        training.train_trajectory(prepared, tmp_path / "b", iterations=4, batch=4)
-    resumed, _ = load_tensors(str(training.train_trajectory(prepared, tmp_path / "b", iterations=4, batch=4)), "")
+        training.train_trajectory(options)
+    resumed, _ = load_tensors(str(training.train_trajectory(options)), "")
     assert next(calls) == 5
     for name, tensor in state.items():
         torch.testing.assert_close(resumed[name], tensor, rtol=0, atol=0)
