@@ -31,7 +31,7 @@ from steadypose.prior.models.mixture.motion import load_kinect, load_motion, wri
 from steadypose.prior.models.mixture.network import MixtureConfig, MixtureNet, answer
 from steadypose.prior.models.mixture.sensors import Sensed, Sensors
 from steadypose.prior.models.torch_weights import started
-from steadypose.prior.models.training import TrainingRun
+from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS
 from steadypose.prior.timing.rate import FPS
@@ -224,24 +224,17 @@ def _measure_features(network: MixtureNet, sensors: Sensors, seed: int) -> None:
     network.deviation.copy_(rows.std(dim=0).clamp(min=0.05))
 
 
-def train_mixture(
-    data: Path,
-    runs: Path,
-    *,
-    weights: str = "default",
-    seed: int = 0,
-    iterations: int = 6000,
-    start: str | None = None,
-) -> Path:
-    """Train on the recordings in the folder ``data`` that are free for products; the path of the weights.
+def train_mixture(options: TrainingOptions) -> Path:
+    """Train on the recordings in the folder ``options.data`` that are free for products; the path of the weights.
 
-    Prepared arrays, at several speeds, lie in the run's folder. From ``start``, the rate of learning is half.
+    Prepared arrays, at several speeds, lie in the run's folder. From ``options.start`` the rate is half.
     """
-    name = f"mixture-{weights}"
-    directory = runs / name
+    iterations, seed, start = options.iterations or 6000, options.seed, options.start
+    path = options.path("mixture")
+    directory = path.parent
     arrays = directory / "arrays"
     if not (arrays / "pairs.npz").is_file():
-        write_arrays(data, arrays)
+        write_arrays(options.data, arrays)
     torch.manual_seed(seed)
     pairs = load_kinect(arrays / "pairs.npz")
     sensors = Sensors(load_motion(arrays / "motion-train.npz"), pairs.of(TRAIN_SUBJECTS), FRAMES)
@@ -258,4 +251,4 @@ def train_mixture(
         "Seed": str(seed),
         "Training": f"`steadypose train mixture --iterations {iterations} --seed {seed}`{began}",
     }
-    return run.save(directory / f"{name}.safetensors", network, asdict(network.config), card)
+    return run.save(path, network, asdict(network.config), card)
