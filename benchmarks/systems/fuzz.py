@@ -29,6 +29,7 @@ from types import FunctionType
 import numpy as np
 
 from steadypose import PACKAGE
+from steadypose.benchmarks.systems.motion_files import AMC, ASF, BVH, amass
 from steadypose.msgs.codec import DecodeError, decode, encode
 from steadypose.msgs.recording import RecordingError, RecordingReader
 from steadypose.msgs.topics import POSE_RAW
@@ -97,9 +98,9 @@ def targets(folder: Path) -> dict[str, Target]:
     joints = SKELETONS["smpl22"].joints
     header = ",".join(f"{joint}_{axis}" for joint in joints for axis in "xyz")
     csv = f"# up: z\nstamp,{header}\n" + "\n".join(f"{k / 30}," + ",".join(["0.5"] * 66) for k in range(3))
-    npz, amass = io.BytesIO(), io.BytesIO()
+    npz = io.BytesIO()
     np.savez(npz, positions=np.zeros((3, 22, 3)), skeleton="smpl22", fps=30.0, confidence=np.ones((3, 22)))
-    np.savez(amass, poses=np.zeros((3, 66)), trans=np.zeros((3, 3)), mocap_framerate=30.0)
+    skeleton = read_asf(ASF)
     assert frames
 
     def decoded(content: bytes) -> object:
@@ -114,6 +115,9 @@ def targets(folder: Path) -> dict[str, Target]:
 
         return read_file
 
+    def from_text(read: Callable[[str], object]) -> Callable[[bytes], object]:
+        return lambda content: read(content.decode("ascii", "replace"))
+
     def recorded(path: Path) -> None:
         with RecordingReader(path) as recording:
             for _ in recording:
@@ -126,10 +130,10 @@ def targets(folder: Path) -> dict[str, Target]:
         "launch": Target([launch], from_file("x.toml", Launch.read), (LaunchError,)),
         "npz": Target([npz.getvalue()], from_file("x.npz", lambda path: list(NpzSource(path))), (NpzError,)),
         "csv": Target([csv.encode()], from_file("x.csv", lambda path: list(CsvSource(path))), (CsvError,)),
-        "bvh": Target([BVH], lambda content: read_bvh(content.decode("ascii", "replace")).positions(), (MotionError,)),
-        "asf": Target([ASF], lambda content: read_asf(content.decode("ascii", "replace")), (MotionError,)),
-        "amc": Target([AMC], lambda content: read_amc(content.decode("ascii", "replace"), _ASF), (MotionError,)),
-        "amass": Target([amass.getvalue()], lambda content: read_amass(io.BytesIO(content)), (MotionError,)),
+        "bvh": Target([BVH.encode()], from_text(lambda text: read_bvh(text).positions()), (MotionError,)),
+        "asf": Target([ASF.encode()], from_text(read_asf), (MotionError,)),
+        "amc": Target([AMC.encode()], from_text(lambda text: read_amc(text, skeleton)), (MotionError,)),
+        "amass": Target([amass()], lambda content: read_amass(io.BytesIO(content)), (MotionError,)),
     }
 
 
@@ -198,53 +202,6 @@ def main() -> int:
             print(json.dumps({"reader": name, **found}), flush=True)
     return 1 if failed else 0
 
-
-BVH = b"""HIERARCHY
-ROOT Hips
-{
- OFFSET 0 0 0
- CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
- JOINT Leg
- {
-  OFFSET 0 -1 0
-  CHANNELS 3 Zrotation Xrotation Yrotation
-  End Site
-  {
-   OFFSET 0 -1 0
-  }
- }
-}
-MOTION
-Frames: 2
-Frame Time: 0.0333333
-0 1 0 0 0 0 10 0 0
-0 1 0 0 0 5 20 0 0
-"""
-ASF = b""":units
- mass 1.0
- length 0.45
- angle deg
-:root
- order TX TY TZ RX RY RZ
- axis XYZ
- position 0 0 0
- orientation 0 0 0
-:bonedata
- begin
-  id 1
-  name leg
-  direction 0 -1 0
-  length 5
-  axis 0 0 20 XYZ
-  dof rx
- end
-:hierarchy
- begin
-  root leg
- end
-"""
-AMC = b":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 1 0 0 0 0\nleg 10\n2\nroot 0 1 0 0 0 5\nleg 20\n"
-_ASF = read_asf(ASF.decode())
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -8,71 +8,18 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib import format as npy
 
+from steadypose.benchmarks.systems.motion_files import AMC, ASF, BVH, amass
 from steadypose.prior import npz_size
 from steadypose.prior.motion.amc import read_amc, read_asf
 from steadypose.prior.motion.bvh import read_bvh
 from steadypose.prior.motion.clip import MotionError
 from steadypose.prior.motion.npz import read_amass
 from steadypose.prior.npz_size import check_arrays
-
-BVH = """HIERARCHY
-ROOT Hips
-{
- OFFSET 0 0 0
- CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
- JOINT Leg
- {
-  OFFSET 0 -1 0
-  CHANNELS 3 Zrotation Xrotation Yrotation
-  End Site
-  {
-   OFFSET 0 -1 0
-  }
- }
-}
-MOTION
-Frames: 2
-Frame Time: 0.0333333
-0 1 0 0 0 0 10 0 0
-0 1 0 0 0 5 20 0 0
-"""
-ASF = """:units
- mass 1.0
- length 0.45
- angle deg
-:root
- order TX TY TZ RX RY RZ
- axis XYZ
- position 0 0 0
- orientation 0 0 0
-:bonedata
- begin
-  id 1
-  name leg
-  direction 0 -1 0
-  length 5
-  axis 0 0 20 XYZ
-  dof rx
- end
-:hierarchy
- begin
-  root leg
- end
-"""
-AMC = ":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 1 0 0 0 0\nleg 10\n2\nroot 0 1 0 0 0 5\nleg 20\n"
-
-
-def amass() -> bytes:
-    file = io.BytesIO()
-    np.savez(file, poses=np.zeros((5, 66)), trans=np.zeros((5, 3)), mocap_framerate=30.0)
-    return file.getvalue()
-
 
 WORDS = [b"", b"nan", b"1e999", b"-1", b"0", b"{", b"}", b"JOINT", b"CHANNELS 99999", b"\n", b"\xff\0", b"9" * 30]
 READERS: dict[str, tuple[str | bytes, Callable]] = {
