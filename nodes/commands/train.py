@@ -7,6 +7,7 @@ from typing import Literal
 
 import torch
 
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.models.distributed import join, neighbours, writes
 from steadypose.prior.models.torch_weights import install as install_weights
 from steadypose.prior.models.training import TrainingOptions
@@ -87,7 +88,11 @@ def train(
         from steadypose.prior.models.sensor_bias.train import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")
     if start is not None and model == "correction":
-        raise ValueError("--start: a correction is trained from the beginning, in minutes; leave it out")
-    path = train_model(TrainingOptions(data, runs, name, iterations, seed, start))
+        raise LaunchError("--start: a correction is trained from the beginning, in minutes; leave it out")
+    try:
+        options = TrainingOptions(data, runs, name, iterations, seed, start)
+    except ValueError as error:
+        raise LaunchError(f"--{error}") from error
+    path = train_model(options)
     if writes():
         print(f"weights: {install_weights(path) if install else path}")

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from steadypose.nodes.commands import train as command
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.models import torch_weights
 from steadypose.prior.models.training import TrainingOptions
 
@@ -45,3 +46,10 @@ def test_installed_weights_replace_the_old_which_are_kept(shipped: Path, tmp_pat
     assert not (shipped / "hmvae-default.faults.safetensors").exists()  # belonged to the old
     assert (shipped / "hmvae-research.safetensors").read_text() == "another set"
     assert str(shipped / made.name) in capsys.readouterr().out
+
+
+def test_options_that_cannot_be_used_are_refused_by_name() -> None:
+    with pytest.raises(LaunchError, match="--iterations: expected 1 or more, got 0"):
+        command.train("correction", iterations=0)
+    with pytest.raises(LaunchError, match="--start: a correction"):
+        command.train("correction", start="default")
