@@ -21,6 +21,7 @@ from steadypose.prior.body.kinematics import LOAD_SPEED, REST_HEIGHT, label_cont
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.models.humor.network import HumorNet
 from steadypose.prior.offline.lift import starts_of_key_points
+from steadypose.prior.offline.motion import float_tensor
 from steadypose.prior.offline.observations import KeyPoints, Observed, Pinhole, SeenJoints, SurfacePoints
 from steadypose.prior.offline.solve import FitSettings, Start, fit_window
 from steadypose.prior.offline.windows import load_of
@@ -65,12 +66,12 @@ class Answer:
 def start_of(positions: Floats) -> Start:
     """Where ``steadypose fit`` starts on joints in space, of what `clean` says (T, 22, 3); the floor is known."""
     offsets = estimate_offsets(positions)
-    return Start(_t(positions[:, 0]), _t(solve_rotations(positions, offsets)), _t(offsets), 0.0, ground_known=True)
+    return Start.of(positions[:, 0], solve_rotations(positions, offsets), offsets, ground_known=True)
 
 
 def seen_joints(seen: Floats) -> list[Observed]:
     """Of (T, 22, 3) metres, NaN where hidden."""
-    return [SeenJoints(_t(seen), torch.full(seen.shape[:-1], noise_of(seen)))]
+    return [SeenJoints(float_tensor(seen), torch.full(seen.shape[:-1], noise_of(seen)))]
 
 
 def fitted(
@@ -116,7 +117,8 @@ def pictures(clips: MotionClips, clip: int, rng: np.random.Generator) -> Picture
     pixels[wrong] += WRONG_PIXELS * rng.standard_normal((int(wrong.sum()), 2))
     pixels[rng.random(truth.shape[:2]) < MISSED] = np.nan
     confidence = rng.uniform(0.5, 1.0, truth.shape[:2])
-    camera = Pinhole(_t(np.array([FOCAL, FOCAL])), _t(np.array(CENTRE)), _t(rotation), torch.zeros(3))
+    focal, centre = torch.tensor([FOCAL, FOCAL]), torch.tensor(CENTRE)
+    camera = Pinhole(focal, centre, float_tensor(rotation), torch.zeros(3))
     starts = starts_of_key_points(pixels, camera, REST_OFFSETS, -CAMERA_HEIGHT)
     stereo = Stereo()
     wall = np.full((stereo.height, stereo.width), 2.0 * AWAY)
@@ -132,8 +134,8 @@ def pictures(clips: MotionClips, clip: int, rng: np.random.Generator) -> Picture
             @ rotation.T
         )
     return Pictures(
-        truth, starts, KeyPoints(_t(pixels), _t(confidence), camera, PIXEL_SIGMA * FOCAL),
-        SurfacePoints(_t(points)),
+        truth, starts, KeyPoints(float_tensor(pixels), float_tensor(confidence), camera, PIXEL_SIGMA * FOCAL),
+        SurfacePoints(float_tensor(points)),
     )  # fmt: skip
 
 
@@ -186,7 +188,3 @@ def load_labels(clips: MotionClips) -> NDArray[np.bool_]:
 def _mm(values: Floats) -> float | None:
     known = values[np.isfinite(values)]
     return round(float(known.mean()) * 1e3, 1) if len(known) else None
-
-
-def _t(values: Floats) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values)).float()

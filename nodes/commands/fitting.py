@@ -112,28 +112,23 @@ def track_of(seen: Seen, points: Floats | None) -> Track:
         seen: the body.
         points: (T, N, 3) metres, world, of its surface, NaN where there are fewer; None where there are none.
     """
-    import torch
-
+    from steadypose.prior.offline.motion import float_tensor
     from steadypose.prior.offline.observations import Observed, SeenJoints, SurfacePoints
     from steadypose.prior.offline.solve import Start
     from steadypose.prior.offline.windows import Track
 
-    def tensor(values: Floats) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values)).float()
-
     positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
     offsets = estimate_offsets(positions)
-    start = Start(
-        tensor(positions[:, 0]), tensor(solve_rotations(positions, offsets)), tensor(offsets),
-        0.0 if seen.calibrated else lowest_floor(positions), seen.calibrated,
-    )  # fmt: skip
+    floor = 0.0 if seen.calibrated else lowest_floor(positions)
+    rotations = solve_rotations(positions, offsets)
+    start = Start.of(positions[:, 0], rotations, offsets, floor, ground_known=seen.calibrated)
     noise = noise_of(raw)
     raw = np.where(np.linalg.norm(raw - positions, axis=-1, keepdims=True) > FAR + 5.0 * noise, np.nan, raw)
     confidence = np.clip(np.stack([body.raw_confidence for body in seen.bodies]), 0.05, 1.0)
     sigma = noise / np.sqrt(confidence)
-    observed: list[Observed] = [SeenJoints(tensor(raw), tensor(sigma))]
+    observed: list[Observed] = [SeenJoints(float_tensor(raw), float_tensor(sigma))]
     if points is not None:
-        observed.append(SurfacePoints(tensor(points)))
+        observed.append(SurfacePoints(float_tensor(points)))
     return Track([start], observed)
 
 

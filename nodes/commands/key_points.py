@@ -155,22 +155,27 @@ def _on_grid(
 
 
 def track_of_key_points(recording: KeyPointRecording) -> Track:
-    """What is to be fitted, from two bodies at rest."""
+    """What is to be fitted, and the two motions to start from; the camera is at the origin of the world."""
     import torch
 
     from steadypose.prior.offline.lift import starts_of_key_points
+    from steadypose.prior.offline.motion import float_tensor
     from steadypose.prior.offline.observations import KeyPoints, Observed, Pinhole, SurfacePoints
     from steadypose.prior.offline.windows import Track
 
-    def tensor(values: Floats) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values)).float()
-
-    camera = Pinhole(tensor(recording.focal), tensor(recording.centre), tensor(recording.rotation), torch.zeros(3))
+    camera = Pinhole(
+        float_tensor(recording.focal),
+        float_tensor(recording.centre),
+        float_tensor(recording.rotation),
+        position=torch.zeros(3),
+    )
     floor = -(recording.camera_height or CAMERA_HEIGHT)
     sigma = PIXEL_SIGMA * float(recording.focal.mean())
-    observed: list[Observed] = [KeyPoints(tensor(recording.pixels), tensor(recording.confidence), camera, sigma)]
+    observed: list[Observed] = [
+        KeyPoints(float_tensor(recording.pixels), float_tensor(recording.confidence), camera, sigma)
+    ]
     if recording.points is not None:
-        observed.append(SurfacePoints(tensor(recording.points @ recording.rotation.T)))
+        observed.append(SurfacePoints(float_tensor(recording.points @ recording.rotation.T)))
     return Track(starts_of_key_points(recording.pixels, camera, REST_OFFSETS, floor), observed)
 
 

@@ -1,8 +1,8 @@
-"""The energy of a motion, as a sum of terms: each has residuals in deviations, and most a robust kernel.
+"""The energy of a motion: a sum of terms with normalised residuals, most of them under a robust kernel.
 
-A term says ``residual(motion)``, a tensor of any shape, in units of its sigma; its energy is half the sum of their
-squares, each through the kernel. That is HuMoR's energy (section 4.2, appendix C) with its weights as the deviations
-that they stand for, and the form that a Gauss-Newton solver takes too.
+A term has residuals of any shape in units of their standard deviation; its energy is half the sum of their squares,
+each through the kernel. That is HuMoR's energy (section 4.2, appendix C), its weights written as the standard
+deviations that they stand for, and the form that a Gauss-Newton solver takes too.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ class Term(Protocol):
     """A part of the energy."""
 
     def residual(self, motion: Motion) -> Tensor:
-        """Deviations, of any shape; NaN nowhere."""
+        """In standard deviations, of any shape; NaN nowhere."""
         ...
 
     def kernel(self, square: Tensor) -> Tensor:
-        """What a squared residual costs."""
+        """The cost of squared residuals, of their shape."""
         ...
 
 
 class Quadratic:
-    """A term whose residuals are normal."""
+    """A term without a robust kernel: its residuals are taken to be normal."""
 
     def kernel(self, square: Tensor) -> Tensor:
         return square
@@ -52,42 +52,42 @@ def energy(motion: Motion, terms: Sequence[Term]) -> Tensor:
 
 
 def huber(square: Tensor, scale: float) -> Tensor:
-    """Quadratic up to ``scale`` deviations, then linear: an error costs less, but none is given up (Huber 1964)."""
+    """Quadratic up to ``scale`` standard deviations, linear beyond: no residual loses its pull (Huber 1964)."""
     return torch.where(square <= scale**2, square, 2.0 * scale * square.clamp(min=scale**2).sqrt() - scale**2)
 
 
 def geman_mcclure(square: Tensor, scale: float) -> Tensor:
-    """Quadratic near 0; beyond ``scale`` deviations an error hardly costs more (Geman and McClure 1987)."""
+    """Quadratic near 0; beyond ``scale`` standard deviations it levels off (Geman and McClure 1987)."""
     return square / (1.0 + square / scale**2)
 
 
 def bisquare(square: Tensor, scale: float) -> Tensor:
-    """Quadratic near 0, constant from ``scale`` deviations on (Beaton and Tukey 1974)."""
+    """Quadratic near 0, constant from ``scale`` standard deviations on (Beaton and Tukey 1974)."""
     inside = 1.0 - (square / scale**2).clamp(max=1.0)
     return scale**2 / 3.0 * (1.0 - inside**3)
 
 
 @dataclass(frozen=True)
 class Transitions(Quadratic):
-    """E_CVAE, and what a step is off from what the decoder makes of its latent.
+    """E_CVAE, and the defect of each step: how far its next state is from the decoder's.
 
     Attributes:
         joints_sigma: metres, the decoder's own error of a step.
-        turns_sigma: of entries of rotation matrices.
-        latent_sigma: deviations: 1 takes the prior at its word.
+        rotations_sigma: the same of the entries of rotation matrices.
+        latent_sigma: standard deviations of the prior; 1 is the prior itself, more a wider one.
     """
 
     joints_sigma: float = 0.008
-    turns_sigma: float = 0.04
+    rotations_sigma: float = 0.04
     latent_sigma: float = 1.0
 
     def residual(self, motion: Motion) -> Tensor:
-        said, _ = motion.predicted
-        is_ = motion.states[1:]
+        predicted, _ = motion.predicted
+        actual = motion.states[1:]
         parts = [
             motion.variables.latents / self.latent_sigma,
-            (said.joints - is_.joints).flatten(1) / self.joints_sigma,
-            (said.rotations - is_.rotations).flatten(1) / self.turns_sigma,
+            (predicted.joints - actual.joints).flatten(1) / self.joints_sigma,
+            (predicted.rotations - actual.rotations).flatten(1) / self.rotations_sigma,
         ]
         return torch.cat(parts, dim=1)
 
@@ -97,25 +97,26 @@ class FirstState(Quadratic):
     """E_init, by the likeliest component of the mixture (a max-mixture, Olson and Agarwal 2013).
 
     Attributes:
-        sigma: deviations: 1 takes the mixture at its word.
-        always: whether all states are asked, not the first alone: a prior of poses, where there is none of motion.
+        sigma: standard deviations of the mixture; 1 is the mixture itself, more a wider one.
+        all_states: whether it holds for all states, not the first alone: a prior of poses, where there is none of
+            motion.
     """
 
     sigma: float = 1.0
-    always: bool = False
+    all_states: bool = False
 
     def residual(self, motion: Motion) -> Tensor:
-        told = motion.told if self.always else motion.told[:1]
+        inputs = motion.inputs if self.all_states else motion.inputs[:1]
         model = motion.model
-        off = (pose_features(told) - model.mixture_means.unsqueeze(1)) @ model.mixture_precisions  # (K, N, 133)
-        height = model.mixture_log_weights + model.mixture_precisions.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
-        best = (height.unsqueeze(1) - 0.5 * off.detach().square().sum(dim=-1)).argmax(dim=0)
-        return off[best, torch.arange(len(best))] / self.sigma
+        residuals = (pose_features(inputs) - model.mixture_means.unsqueeze(1)) @ model.mixture_precisions  # (K, N, 133)
+        log_peak = model.mixture_log_weights + model.mixture_precisions.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
+        best = (log_peak.unsqueeze(1) - 0.5 * residuals.detach().square().sum(dim=-1)).argmax(dim=0)
+        return residuals[best, torch.arange(len(best))] / self.sigma
 
 
 @dataclass(frozen=True)
 class Smooth(Quadratic):
-    """E_smooth, of accelerations: what joints do when nothing is known of how bodies move.
+    """E_smooth, of the joints' accelerations: a prior of motion that knows no bodies.
 
     Attributes:
         sigma: m/s² along an axis.
@@ -129,7 +130,7 @@ class Smooth(Quadratic):
 
 @dataclass(frozen=True)
 class Bones(Quadratic):
-    """E_shape: bones are about those that they started as, and alike on both sides.
+    """E_shape: bones stay about as they were initially.
 
     Attributes:
         sigma: metres along an axis.
@@ -143,10 +144,10 @@ class Bones(Quadratic):
 
 @dataclass(frozen=True)
 class Ground(Quadratic):
-    """E_gnd: the ground is about where it was believed to be.
+    """E_gnd: a normal prior of the ground, level and at a height.
 
     Attributes:
-        height: metres, of the world.
+        height: metres, world, its mean.
         height_sigma: metres.
         tilt_sigma: radians.
     """
@@ -162,12 +163,12 @@ class Ground(Quadratic):
 
 @dataclass(frozen=True)
 class Standing(Quadratic):
-    """E_env: what rests does not move, and is as high as it is when it rests; no foot goes into the ground.
+    """E_env: joints in contact do not move and are at their height of contact; no foot is below the ground.
 
-    The decoder's contacts weigh this and are not moved by it: else the cheapest way were to have none.
+    The decoder's contact probabilities weigh this, detached: else it were cheapest to have no contacts.
 
     Attributes:
-        speed_sigma: m/s of what rests.
+        speed_sigma: m/s along an axis, of a joint in contact.
         height_sigma: metres beyond `CONTACT_HEIGHT`, and below the ground.
     """
 
@@ -188,7 +189,7 @@ class Standing(Quadratic):
 
 @dataclass(frozen=True)
 class Anchored(Quadratic):
-    """The first frames are about where the window before left them.
+    """The first F frames are about where the window before left them.
 
     Attributes:
         joints: (F, 22, 3) metres, world.

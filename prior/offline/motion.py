@@ -1,4 +1,4 @@
-"""A motion as the optimisation moves it: what it varies, and what follows from that.
+"""A motion under optimisation: the variables, and what follows from them.
 
 HuMoR varies the first state and the latents of all steps, and rolls the rest out of them: ninety passes one after the
 other for an evaluation, in which an early latent moves everything after it. Here the poses of all frames are varied
@@ -10,10 +10,12 @@ are then evaluated at once, and a model that errs bends a motion less than it wo
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from steadypose.prior.models.humor.network import HumorNet
@@ -23,27 +25,32 @@ from steadypose.prior.models.humor.state import JOINT_COUNT, State, canonical, f
 SCALES: Mapping[str, float] = {
     "root": 0.02, "orientation": 0.05, "turns": 0.05, "bones": 0.01, "ground": 0.02, "latents": 1.0,
 }  # fmt: skip
-"""Metres and radians that count as 1 in the optimiser's steps."""
+"""Metres, radians and standard deviations that a step of 1 of the optimiser stands for."""
 
-FURTHEST_LATENT = 3.0
-"""deviations from what the prior expects, beyond which no latent starts"""
+MAX_LATENT = 3.0
+"""Standard deviations of the prior from its mean, beyond which no latent starts."""
+
+
+def float_tensor(values: NDArray[np.floating]) -> Tensor:
+    """The same values in single precision, as models take them; a copy where the array is not contiguous."""
+    return torch.from_numpy(np.ascontiguousarray(values)).float()
 
 
 @dataclass(frozen=True)
 class Variables:
-    """What is varied, of T frames; the poses as they start, and how far each is from there.
+    """The variables of T frames: the initial poses, which are fixed, and the offset of each from there.
 
     Attributes:
         start_root: (T, 3) metres, in the frame of the ground: z up, the floor at 0.
         start_rotations: (T, 22, 3, 3) local.
         start_offsets: (22, 3) metres, bones.
         root: (T, 3) metres.
-        orientation: (T, 3) rotation vectors of the root, from the left.
-        turns: (T, 21, 3) of the other joints.
+        orientation: (T, 3) rotation vectors of the root, applied from the left.
+        turns: (T, 21, 3) the same of the other joints.
         bones: (22, 3) metres.
         ground: (3,) metres by which the floor lies above 0 of the world, and radians by which it is turned about x and
             y there.
-        latents: (T - 2, latent) deviations from what the prior expects.
+        latents: (T - 2, latent) from the prior's mean, in its standard deviations.
     """
 
     start_root: Tensor
@@ -57,20 +64,16 @@ class Variables:
     latents: Tensor
 
     @classmethod
-    def starting(cls, root: Tensor, rotations: Tensor, offsets: Tensor, height: float, latent: int) -> Variables:
-        """From poses (T, ...) in a world whose floor is believed to lie at ``height``, with unremarkable latents."""
+    def initial(cls, root: Tensor, rotations: Tensor, offsets: Tensor, height: float, latent: int) -> Variables:
+        """Poses (T, ...) in a world whose floor lies at ``height`` metres, with latents at the prior's mean."""
         down = root.new_tensor([0.0, 0.0, height])
         zero = torch.zeros_like(root)
         turns, latents = zero.unsqueeze(1).repeat(1, JOINT_COUNT - 1, 1), zero.new_zeros(len(root) - 2, latent)
         return cls(root - down, rotations, offsets, zero, zero, turns, torch.zeros_like(offsets), down.flip(0), latents)
 
-    def varied(self, **values: Tensor) -> Variables:
-        """With other values of some."""
-        return replace(self, **values)
-
 
 class Motion:
-    """What follows from variables, each computed once, for all terms that ask.
+    """What follows from variables, each computed once, for all terms of the energy.
 
     Args:
         model: of transitions.
@@ -98,7 +101,7 @@ class Motion:
 
     @cached_property
     def _all(self) -> State:
-        # before the first frame stands another like it, so that it has a state, if one at rest
+        # a state takes two frames: the first frame is doubled, so that it has one, at rest
         root = torch.cat([self.root[:1], self.root])
         return states_of(root, torch.cat([self.rotations[:1], self.rotations]), self.offsets)
 
@@ -109,7 +112,7 @@ class Motion:
 
     @property
     def states(self) -> State:
-        """(T - 1) from the second frame on: the first has no velocity."""
+        """(T - 1) states, from the second frame on: the first has no velocity."""
         return self._all[1:]
 
     @cached_property
@@ -129,26 +132,25 @@ class Motion:
         return self.variables.ground[:1] * self.variables.ground.new_tensor([0.0, 0.0, 1.0])
 
     @cached_property
-    def _own(self) -> tuple[State, Tensor]:
-        own = canonical(self.states, self.states)
-        return own, self.model.standardised(features(own))
+    def _canonical(self) -> State:
+        return canonical(self.states, self.states)
 
-    @property
-    def told(self) -> Tensor:
-        """(T - 1, `FEATURES`) of the states in their own frames, standardised."""
-        return self._own[1]
+    @cached_property
+    def inputs(self) -> Tensor:
+        """(T - 1, `FEATURES`) standardised features of the states in their canonical frames."""
+        return self.model.standardise(features(self._canonical))
 
     @cached_property
     def predicted(self) -> tuple[State, Tensor]:
-        """The states (T - 2) that the decoder makes of each but the last, and logits of contacts (T - 2, 16)."""
-        own, told = self._own[0][:-1], self.told[:-1]
-        prior = self.model.expected(told)
+        """(T - 2) the decoder's next state of each state but the last, and logits of contacts (T - 2, 16)."""
+        inputs = self.inputs[:-1]
+        prior = self.model.prior_latent(inputs)
         latents = prior.mean + prior.sigma * self.variables.latents
-        following, logits = self.model.decoded(own, told, latents, self.offsets)
+        following, logits = self.model.decode(self._canonical[:-1], inputs, latents, self.offsets)
         return placed(following, self.states[:-1]), logits
 
     @torch.no_grad()
-    def inferred_latents(self) -> Tensor:
-        """(T - 2, latent) what the encoder says of the steps, as deviations from what the prior expects."""
+    def encoded_latents(self) -> Tensor:
+        """(T - 2, latent) the encoder's means, from the prior's, in standard deviations of the prior."""
         posterior, prior = transitions(self.model, self.states)
-        return ((posterior.mean - prior.mean) / prior.sigma).clamp(-FURTHEST_LATENT, FURTHEST_LATENT)
+        return ((posterior.mean - prior.mean) / prior.sigma).clamp(-MAX_LATENT, MAX_LATENT)

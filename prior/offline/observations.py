@@ -1,4 +1,4 @@
-"""What was seen of a body, as terms of the energy: joints, key points of a picture, points of its surface."""
+"""Observations as terms of the energy: joints in space, key points of a picture, points of a body's surface."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from steadypose.prior.offline.motion import Motion
 from steadypose.prior.sim.body import CAPSULES, REST_HEIGHT, stature
 
 ROBUST = 5.0
-"""Deviations from which on a key point or a point of the surface counts as wrong."""
+"""Standard deviations from which on a key point or a point of the surface counts as an outlier."""
 
 CLEAR = 3.0
-"""Deviations from which on a joint in space pulls no harder; it is never given up, for it may be all that there is."""
+"""Standard deviations from which on a joint in space pulls no harder; none is given up: there may be no other."""
 
 POINT_SIGMA = 0.05
-"""Metres of a depth camera's points, five metres away, and of capsules for a body: within five times that a limb finds
-its points."""
+"""Metres: error of a depth camera's points five metres away, and of capsules as a body. A limb finds its points within
+`ROBUST` times that."""
 
 
 class Observed(Term, Protocol):
-    """What was seen of T frames."""
+    """Observations of T frames."""
 
     def between(self, first: int, last: int) -> Observed:
-        """Of the frames from ``first`` up to, not with, ``last``."""
+        """Those of the frames ``first`` to ``last - 1``."""
         ...
 
     def misfit(self, motion: Motion) -> Tensor:
-        """(T, 22) what a motion leaves unexplained of each joint: metres, or pixels; NaN where nothing was seen."""
+        """(T, 22) distance of each joint from its observation: metres, or pixels; NaN where there is none."""
         ...
 
 
@@ -68,7 +68,7 @@ class SeenJoints:
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A camera that stands still.
+    """A fixed pinhole camera.
 
     Attributes:
         focal: (2,) pixels.
@@ -83,19 +83,19 @@ class Pinhole:
     position: Tensor
 
     def project(self, points: Tensor) -> Tensor:
-        """(..., 2) pixels of points (..., 3) of the world; what is behind the camera as if just before it."""
+        """(..., 2) pixels of points (..., 3) metres, world; depths are at least 0.1 m."""
         seen = (points - self.position) @ self.rotation
         return seen[..., :2] / seen[..., 2:].clamp(min=0.1) * self.focal + self.centre
 
 
 @dataclass(frozen=True)
 class KeyPoints:
-    """E_data of key points in a picture, by their confidence, with Geman's and McClure's kernel.
+    """E_data of key points in a picture, weighted by their confidence, under Geman's and McClure's kernel.
 
     Attributes:
         pixels: (T, 22, 2); NaN where not found.
         confidence: (T, 22) 0 to 1, a weight as in the paper; its square is the official code's.
-        camera: that took it.
+        camera: of the picture.
         sigma: pixels along an axis.
     """
 
@@ -130,7 +130,7 @@ _RADII = torch.tensor([radius for _, _, radius in CAPSULES])
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """E_data of points of a depth camera: how far each is from the nearest capsule round a bone.
+    """E_data of points of a depth camera: the distance of each from the nearest capsule about a bone.
 
     Attributes:
         points: (T, N, 3) metres, world; NaN where there are fewer.
@@ -148,7 +148,7 @@ class SurfacePoints:
         frames, _ = torch.nonzero(self._seen, as_tuple=True)
         points, joints = self.points[self._seen], motion.world_joints
         radii = _RADII.to(joints.dtype) * (stature(motion.offsets.detach().numpy()) / REST_HEIGHT)
-        with torch.no_grad():  # which one is nearest has no derivative
+        with torch.no_grad():  # an argmin has no derivative
             nearest = _distance(points.unsqueeze(1), joints[frames][:, _STARTS], joints[frames][:, _ENDS], radii)
             which = nearest.abs().argmin(dim=1)
         starts, ends = torch.tensor(_STARTS)[which], torch.tensor(_ENDS)[which]
@@ -161,7 +161,7 @@ class SurfacePoints:
         return SurfacePoints(self.points[first:last], self.sigma)
 
     def misfit(self, motion: Motion) -> Tensor:
-        """Metres from the surface, the median over all points of a frame, which do not say what joint they are of."""
+        """(T, 22) the median distance of a frame's points, metres, for every joint: points belong to none."""
         off = self.residual(motion) * self.sigma
         frames, _ = torch.nonzero(self._seen, as_tuple=True)
         found = torch.full((len(self.points), motion.joints.shape[1]), torch.nan)
@@ -171,7 +171,7 @@ class SurfacePoints:
 
 
 def _distance(points: Tensor, starts: Tensor, ends: Tensor, radii: Tensor) -> Tensor:
-    """(...) metres outside capsules; negative within."""
+    """(...) signed distance to capsules, metres, negative inside."""
     bone = ends - starts
     along = ((points - starts) * bone).sum(dim=-1) / bone.square().sum(dim=-1).clamp(min=1e-8)
     nearest = starts + along.clamp(0.0, 1.0).unsqueeze(-1) * bone

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from steadypose.prior.models.humor.network import HumorNet
@@ -21,35 +23,37 @@ from steadypose.prior.offline.energy import (
     Transitions,
     energy,
 )
-from steadypose.prior.offline.motion import SCALES, Motion, Variables
+from steadypose.prior.offline.motion import SCALES, Motion, Variables, float_tensor
+
+Floats = NDArray[np.float64]
 
 POSES = ("root", "orientation", "turns")
 
 ROUND = 10
-"""Steps of L-BFGS between two looks at whether it still gains."""
+"""Steps of L-BFGS between two checks for convergence."""
 
 STIFFNESS = 30.0
-"""How much more firmly motion holds than observations do: the square of about 4 cm over 7 mm."""
+"""Ratio of the curvatures of the motion terms and of the observations: about the square of 4 cm over 7 mm."""
 
-STILL = 1e-4
-"""Of the energy: a round that gains less is the last."""
+TOLERANCE = 1e-4
+"""Share of the energy: a round that gains less is the last."""
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How long each stage may take, and how far each term is believed; chosen on validation people.
+    """Steps of each stage and standard deviation of each term, chosen on validation people.
 
     Attributes:
         root_steps, pose_steps, motion_steps: of L-BFGS, of up to five evaluations each.
         smooth_sigma: m/s², of stage 2.
-        pose_sigma: deviations of the mixture as a prior of poses, in stage 2.
+        pose_sigma: of `FirstState` as a prior of all states, in stage 2.
         transitions: of stage 3.
-        first_sigma: deviations of the mixture as a prior of all states, in stage 3.
-        motion_smooth_sigma: m/s², of stage 3: what model and latents leave of a shake.
+        first_sigma: of `FirstState` as a prior of all states, in stage 3.
+        motion_smooth_sigma: m/s², of stage 3: against the jitter that the model of motion allows.
         standing: of stage 3.
         bones_sigma: metres.
         ground_height_sigma: metres, where the ground is not known.
-        ground_tilt_sigma: radians, as well.
+        ground_tilt_sigma: radians, likewise.
     """
 
     root_steps: int = 30
@@ -68,14 +72,14 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Start:
-    """Poses to start from, (T, ...), in the world.
+    """Initial poses of T frames, in the world.
 
     Attributes:
         root: (T, 3) metres.
         rotations: (T, 22, 3, 3) local.
         offsets: (22, 3) metres, bones.
-        ground: metres, where the floor is believed to lie.
-        ground_known: whether that is so: a calibrated camera, say.
+        ground: metres, height of the floor.
+        ground_known: whether that is certain, as with a calibrated camera, or the mean of a prior.
     """
 
     root: Tensor
@@ -84,14 +88,21 @@ class Start:
     ground: float = 0.0
     ground_known: bool = False
 
+    @classmethod
+    def of(
+        cls, root: Floats, rotations: Floats, offsets: Floats, ground: float = 0.0, *, ground_known: bool = False
+    ) -> Start:
+        """From arrays of the same shapes."""
+        return cls(float_tensor(root), float_tensor(rotations), float_tensor(offsets), ground, ground_known)
+
 
 @dataclass(frozen=True)
 class Fitted:
-    """What came of a window.
+    """The fit of a window.
 
     Attributes:
-        motion: the last, without gradients.
-        energies: nats at the end of each stage, of that stage's terms.
+        motion: of least energy, without gradients.
+        energies: (stages,) nats at the end of each stage, of that stage's terms.
     """
 
     motion: Motion
@@ -111,16 +122,16 @@ def fit_window(
     """Fit a window of some seconds, three frames at least.
 
     Args:
-        model: of transitions, in evaluation.
-        start: as above.
-        observed: terms of what was seen.
-        settings: as above.
-        anchor: where the window before ends.
-        stages: 2 stops at poses and smoothness: what HuMoR calls VPoser-t, without a model of motion.
+        model: of transitions, in evaluation mode.
+        start: initial poses.
+        observed: terms of the observations.
+        settings: of stages and terms.
+        anchor: the frames shared with the window before.
+        stages: how many; 2 stops before the model of motion: HuMoR's VPoser-t.
         advanced: called after each stage.
     """
     model.requires_grad_(False)
-    variables = Variables.starting(start.root, start.rotations, start.offsets, start.ground, model.config.latent)
+    variables = Variables.initial(start.root, start.rotations, start.offsets, start.ground, model.config.latent)
     known = start.ground_known
     shape: list[Term] = [Bones(settings.bones_sigma)]
     if not known:
@@ -128,10 +139,10 @@ def fit_window(
     given = [*observed, *([anchor] if anchor else [])]
     free = ("bones",) if known else ("bones", "ground")
     poses: list[Term] = [
-        *given, *shape, Smooth(settings.smooth_sigma), FirstState(settings.pose_sigma, always=True),
+        *given, *shape, Smooth(settings.smooth_sigma), FirstState(settings.pose_sigma, all_states=True),
     ]  # fmt: skip
     motions: list[Term] = [
-        *given, *shape, settings.transitions, FirstState(settings.first_sigma, always=True), settings.standing,
+        *given, *shape, settings.transitions, FirstState(settings.first_sigma, all_states=True), settings.standing,
         Smooth(settings.motion_smooth_sigma),
     ]  # fmt: skip
     plan = [
@@ -142,7 +153,7 @@ def fit_window(
     found: list[float] = []
     for number, (names, terms, steps) in enumerate(plan[:stages]):
         if number == 2:
-            variables = variables.varied(latents=Motion(model, variables).inferred_latents())
+            variables = replace(variables, latents=Motion(model, variables).encoded_latents())
         variables, value = minimise(model, variables, names, terms, steps)
         found.append(value)
         advanced()
@@ -153,21 +164,32 @@ def fit_window(
 def minimise(
     model: HumorNet, variables: Variables, names: Sequence[str], terms: Sequence[Term], steps: int
 ) -> tuple[Variables, float]:
-    """The variables of least energy near these, of which those of these names are moved; and that energy."""
-    whole = [getattr(variables, name) for name in names]
-    mixing = smoothing_root(len(variables.root)).to(variables.root.dtype)
-    moves = [torch.zeros_like(value, requires_grad=True) for value in whole]
+    """Minimise the energy by L-BFGS.
+
+    Args:
+        model: of transitions.
+        variables: to start from.
+        names: of the variables that are free; the others stay.
+        terms: of the energy.
+        steps: at most.
+
+    Returns:
+        The variables of least energy, and that energy, nats.
+    """
+    initial = [getattr(variables, name) for name in names]
+    conditioned = preconditioner(len(variables.root)).to(variables.root.dtype)
+    moves = [torch.zeros_like(value, requires_grad=True) for value in initial]
     optimiser = torch.optim.LBFGS(
         moves, max_iter=ROUND, max_eval=5 * ROUND, history_size=30, tolerance_change=1e-7, line_search_fn="strong_wolfe"
     )
 
     def moved() -> Variables:
         found = {}
-        for name, value, move in zip(names, whole, moves, strict=True):
+        for name, value, move in zip(names, initial, moves, strict=True):
             if name in POSES:
-                move = torch.einsum("ts,s...->t...", mixing, move)
+                move = torch.einsum("ts,s...->t...", conditioned, move)
             found[name] = value + SCALES[name] * move
-        return variables.varied(**found)
+        return replace(variables, **found)
 
     def closure() -> Tensor:
         optimiser.zero_grad()
@@ -178,7 +200,7 @@ def minimise(
     before = torch.inf
     for _ in range(0, steps, ROUND):
         now = float(optimiser.step(closure).detach())  # the energy before these steps
-        if before - now < STILL * abs(now):
+        if before - now < TOLERANCE * abs(now):
             break
         before = now
     with torch.no_grad():
@@ -187,12 +209,11 @@ def minimise(
 
 
 @cache
-def smoothing_root(frames: int) -> Tensor:
-    """(T, T) what the poses' moves are made of: the inverse root of 1 + `STIFFNESS` times squared second differences.
+def preconditioner(frames: int) -> Tensor:
+    """(T, T) of the poses' moves: the inverse root of 1 + `STIFFNESS` times the squared second differences.
 
-    Observations hold each frame by itself, motion holds three by their acceleration, and far more firmly, so that the
-    energy is a long narrow valley. Seen through this matrix it is about as wide as long, and takes a fraction of the
-    steps.
+    Observations constrain each frame by itself, motion terms constrain three by their acceleration, and far more
+    firmly: the energy is ill-conditioned. Through this matrix L-BFGS takes a fraction of the steps.
     """
     second = torch.eye(frames, dtype=torch.float64).diff(n=2, dim=0)
     values, vectors = torch.linalg.eigh(torch.eye(frames) + STIFFNESS * (second.mT @ second))

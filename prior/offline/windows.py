@@ -28,7 +28,7 @@ FRAMES, OVERLAP = 90, 15
 """Of a window, as in the paper; and how many of them the next one begins with."""
 
 LEAST_FRAMES = 8
-"""A body seen for less has no motion to fit."""
+"""The shortest track that is fitted."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Track:
     """One body at 30 Hz, T frames without a gap.
 
     Attributes:
-        starts: poses to start from; where there are several, each window takes those that end best.
-        observed: what was seen.
+        starts: initial poses; of several, each window keeps the fit of least energy.
+        observed: observations of all T frames.
     """
 
     starts: Sequence[Start]
@@ -49,7 +49,7 @@ class Track:
 
 @dataclass(frozen=True)
 class FittedTrack:
-    """What came of a track.
+    """The fit of a track.
 
     Attributes:
         joints: (T, 22, 3) metres, world.
@@ -57,7 +57,7 @@ class FittedTrack:
         offsets: (W, 22, 3) metres, the bones that each of W windows ended with.
         ground: (W, 3) metres of height, and radians of tilt about x and y, of each.
         load: (T, 8) probabilities that `CONTACT_JOINTS` bear load; NaN from a model that does not say.
-        misfit: (K, T, 22) what stays unexplained, by observation: metres or pixels; NaN where nothing was seen.
+        misfit: (K, T, 22) as of `Observed.misfit`, of each of K observations.
         energies: (W, S) nats after each stage.
     """
 
@@ -71,7 +71,7 @@ class FittedTrack:
 
 
 def window_bounds(frames: int) -> list[tuple[int, int]]:
-    """First frame and end of each window; the last is as long as the others, and overlaps by what that takes."""
+    """First frame and end, exclusive, of each window; the last is as long as the others and overlaps by more."""
     if frames <= FRAMES:
         return [(0, frames)]
     firsts = [*range(0, frames - FRAMES, FRAMES - OVERLAP), frames - FRAMES]
@@ -91,10 +91,10 @@ def fit_track(
 
     Args:
         model: of transitions.
-        track: as above.
+        track: starts and observations.
         settings: of each window's fit.
-        folder: where windows are stored that are done, and found again if the same is asked for.
-        stages: of `fit_window`.
+        folder: cache of fitted windows, by a digest of all that a fit depends on.
+        stages: as of `fit_window`.
         advanced: called after each window.
     """
     done: list[dict[str, Floats]] = []
@@ -143,7 +143,7 @@ def _arrays(fitted: Fitted, seen: Sequence[Observed]) -> dict[str, Floats]:
 
 @torch.no_grad()
 def load_of(motion: Motion) -> Floats:
-    """(T, 8) probabilities of load; the first two frames, which no step leads to, have those of the third."""
+    """(T, 8) probabilities of load; the first two frames, which no step ends in, have those of the third."""
     logits = motion.predicted[1][:, : len(CONTACT_JOINTS)]
     if not logits.shape[1]:
         return np.full((len(motion.joints), len(CONTACT_JOINTS)), np.nan)
@@ -155,7 +155,7 @@ def _numpy(values: Tensor) -> Floats:
 
 
 def _joined(done: Sequence[dict[str, Floats]], bounds: Sequence[tuple[int, int]]) -> FittedTrack:
-    """One motion of all windows: where two overlap, the first fades into the second."""
+    """One motion of all windows, cross-faded where two overlap."""
     whole = {name: values for name, values in done[0].items() if name in ("joints", "rotations", "load", "misfit")}
     for (_, end), (first, _), found in zip(bounds, bounds[1:], done[1:], strict=False):
         shared = end - first
@@ -167,14 +167,14 @@ def _joined(done: Sequence[dict[str, Floats]], bounds: Sequence[tuple[int, int]]
             mixed = (1 - weight) * a[-shared:] + weight * b[:shared]
             whole[name] = np.moveaxis(np.concatenate([a[:-shared], mixed, b[shared:]]), 0, axis)
         a, b = whole["rotations"], found["rotations"]
-        mixed = _between_rotations(a[-shared:], b[:shared], share)
+        mixed = _slerp(a[-shared:], b[:shared], share)
         whole["rotations"] = np.concatenate([a[:-shared], mixed, b[shared:]])
     every = {name: np.stack([found[name] for found in done]) for name in ("offsets", "ground", "energies")}
     return FittedTrack(**whole, **every)
 
 
-def _between_rotations(first: Floats, second: Floats, share: Floats) -> Floats:
-    """Of (F, 22, 3, 3), the shorter arc from the first to the second, as far as ``share`` (F,)."""
+def _slerp(first: Floats, second: Floats, share: Floats) -> Floats:
+    """Rotations (F, 22, 3, 3) from the first to the second by ``share`` (F,) of the way."""
     a = Rotation.from_matrix(first.reshape(-1, 3, 3))
     turn = (a.inv() * Rotation.from_matrix(second.reshape(-1, 3, 3))).as_rotvec()
     part = np.repeat(share, first.shape[1])[:, None] * turn
@@ -198,21 +198,21 @@ def _store(path: Path | None, found: dict[str, Any]) -> None:
 
 
 def _fingerprint(model: HumorNet, *inputs: Any) -> str:
-    """Of all that a window's fit depends on."""
+    """Digest of all that a window's fit depends on."""
     digest = hashlib.sha256()
     for value in (*model.state_dict().values(), *inputs):
-        _add(digest, value)
+        _update(digest, value)
     return digest.hexdigest()[:16]
 
 
-def _add(digest: Any, value: Any) -> None:
+def _update(digest: Any, value: Any) -> None:
     if isinstance(value, Tensor):
         digest.update(value.detach().contiguous().numpy().tobytes())
     elif is_dataclass(value):
         for field in fields(value):
-            _add(digest, getattr(value, field.name))
+            _update(digest, getattr(value, field.name))
     elif isinstance(value, list | tuple):
         for item in value:
-            _add(digest, item)
+            _update(digest, item)
     else:
         digest.update(repr(value).encode())

@@ -1,7 +1,7 @@
 """The transition model: a conditional VAE of the next state given this one (HuMoR, section 3, equations 1 to 4).
 
-Encoder and prior say of a step which latent it takes, the decoder what the latent does to the state. What this differs
-in from the paper: joints and velocities follow from root, rotations and bones (`state`), features are standardised,
+Encoder and prior are Gaussians of a step's latent, the decoder takes a state and a latent to the next state. Unlike in
+the paper, joints and velocities follow from root, rotations and bones (`state`), features are standardised,
 networks are half as wide, and contact has two labels, load and rest.
 """
 
@@ -37,7 +37,7 @@ LOG_VARIANCES = (-10.0, 6.0)
 """The official code bounds them not at all, and drops steps that are not numbers without a word."""
 
 POSE = 3 + 6 * JOINT_COUNT
-"""Outputs of a decoder that says the next pose, not the change: root, and two columns of each rotation."""
+"""Outputs of a decoder of the next pose, not of its change: root, and two columns of each rotation."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class HumorConfig:
         latent: numbers of a transition.
         hidden: width of the hidden layers.
         learned_prior: whether the prior reads the state; else it is N(0, I), as in a Motion VAE.
-        residual: whether the decoder says the change of the state; else the next pose itself.
-        contacts: whether it says contacts.
+        residual: whether the decoder's output is the change of the state; else the next pose itself.
+        contacts: whether it predicts contacts.
         components: of the mixture of initial states.
     """
 
@@ -80,22 +80,22 @@ class Gaussian:
 
     @property
     def sigma(self) -> Tensor:
-        """(..., latent) deviations."""
+        """(..., latent) standard deviations."""
         return (0.5 * self.log_variance).exp()
 
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
         """One draw of each."""
         return self.mean + self.sigma * torch.randn(self.mean.shape, generator=generator)
 
-    def divergence(self, other: Gaussian) -> Tensor:
-        """(...) nats, of this one from ``other``."""
-        spread = (self.log_variance - other.log_variance).exp()
-        off = (self.mean - other.mean).square() * (-other.log_variance).exp()
-        return 0.5 * (spread + off - 1.0 - (self.log_variance - other.log_variance)).sum(dim=-1)
+    def kl(self, other: Gaussian) -> Tensor:
+        """(...) nats, KL(self || other)."""
+        ratio = (self.log_variance - other.log_variance).exp()
+        distance = (self.mean - other.mean).square() * (-other.log_variance).exp()
+        return 0.5 * (ratio + distance - 1.0 - (self.log_variance - other.log_variance)).sum(dim=-1)
 
 
 class HumorNet(nn.Module):
-    """The three networks, and the mixture of initial states beside them (`initial`).
+    """Prior, encoder and decoder, and the mixture of initial states beside them (`initial`).
 
     Buffers:
         mean, scale: (`FEATURES`,) what features are standardised by.
@@ -124,61 +124,61 @@ class HumorNet(nn.Module):
         self.register_buffer("mixture_means", torch.zeros(config.components, known))
         self.register_buffer("mixture_precisions", torch.eye(known).expand(config.components, -1, -1).clone())
 
-    def standardised(self, told: Tensor) -> Tensor:
+    def standardise(self, inputs: Tensor) -> Tensor:
         """`features` (..., `FEATURES`) as the networks take them."""
-        return (told - self.mean) / self.scale
+        return (inputs - self.mean) / self.scale
 
-    def expected(self, told: Tensor) -> Gaussian:
-        """p(z | x): of standardised features of states (..., `FEATURES`) in their own frames."""
+    def prior_latent(self, inputs: Tensor) -> Gaussian:
+        """p(z | x), of standardised features (..., `FEATURES`) of states in their canonical frames."""
         if self.prior is None:
-            zero = told.new_zeros(*told.shape[:-1], self.config.latent)
+            zero = inputs.new_zeros(*inputs.shape[:-1], self.config.latent)
             return Gaussian(zero, zero)
-        return _gaussian(self.prior(told))
+        return _gaussian(self.prior(inputs))
 
-    def inferred(self, told: Tensor, following: Tensor) -> Gaussian:
-        """q(z | x, x'): of these and of the states that follow, in the same frames."""
-        return _gaussian(self.encoder(torch.cat([told, following], dim=-1)))
+    def posterior_latent(self, inputs: Tensor, next_inputs: Tensor) -> Gaussian:
+        """q(z | x, x'), of the same and of the next states, as seen from the canonical frames of the first."""
+        return _gaussian(self.encoder(torch.cat([inputs, next_inputs], dim=-1)))
 
-    def decoded(self, state: State, told: Tensor, latent: Tensor, offsets: Tensor) -> tuple[State, Tensor]:
-        """The state that follows on canonical states, in their frames, and logits of contacts (..., 16).
+    def decode(self, state: State, inputs: Tensor, latent: Tensor, offsets: Tensor) -> tuple[State, Tensor]:
+        """The next states, in the canonical frames of these, and logits of contacts (..., 16): load, then rest.
 
         Args:
             state: (...) canonical.
-            told: (..., `FEATURES`) their features, standardised.
+            inputs: (..., `FEATURES`) their features, standardised.
             latent: (..., latent).
             offsets: (..., 22, 3) metres, bones.
         """
-        said = self.decoder(told, latent)
+        output = self.decoder(inputs, latent)
         if self.config.residual:
-            step, logits = said[..., :CHANGE] * STEP_SCALE, said[..., CHANGE:]
+            step, logits = output[..., :CHANGE] * STEP_SCALE, output[..., CHANGE:]
             return moved_by(state, step, offsets), logits
-        pose, logits = said[..., :POSE], said[..., POSE:]
+        pose, logits = output[..., :POSE], output[..., POSE:]
         mean, scale = self.mean[:POSE], self.scale[:POSE]
         pose = pose * scale + mean
         return posed(state, pose[..., :3], _orthonormal(pose[..., 3:]), offsets), logits
 
     def step(self, state: State, latent: Tensor, offsets: Tensor) -> tuple[State, Tensor]:
-        """The states that follow on any states (...) with these latents, and logits of contacts."""
+        """The next states of any states (...) with these latents (..., latent), and logits of contacts (..., 16)."""
         own = canonical(state, state)
-        following, logits = self.decoded(own, self.standardised(features(own)), latent, offsets)
+        following, logits = self.decode(own, self.standardise(features(own)), latent, offsets)
         return placed(following, state), logits
 
 
 class Decoder(nn.Module):
-    """A perceptron that is told the latent in front of every layer, lest it does without."""
+    """A perceptron that has the latent as an input of every layer, against posterior collapse."""
 
     def __init__(self, widths: list[int], latent: int) -> None:
         super().__init__()
         self.layers = nn.ModuleList(nn.Linear(a + latent, b) for a, b in itertools.pairwise(widths))
         self.norms = nn.ModuleList(nn.GroupNorm(GROUPS, b) for b in widths[1:-1])
 
-    def forward(self, told: Tensor, latent: Tensor) -> Tensor:
-        x = told.reshape(-1, told.shape[-1])
+    def forward(self, inputs: Tensor, latent: Tensor) -> Tensor:
+        x = inputs.reshape(-1, inputs.shape[-1])
         z = latent.reshape(-1, latent.shape[-1])
         for layer, norm in zip(self.layers, self.norms, strict=False):
             x = torch.relu(norm(layer(torch.cat([x, z], dim=-1))))
         x = self.layers[-1](torch.cat([x, z], dim=-1))
-        return x.reshape(*told.shape[:-1], -1)
+        return x.reshape(*inputs.shape[:-1], -1)
 
 
 def _perceptron(widths: list[int]) -> nn.Sequential:
@@ -198,8 +198,8 @@ class _Groups(nn.GroupNorm):
         return super().forward(input.reshape(-1, input.shape[-1])).reshape(input.shape)
 
 
-def _gaussian(said: Tensor) -> Gaussian:
-    mean, log_variance = said.chunk(2, dim=-1)
+def _gaussian(output: Tensor) -> Gaussian:
+    mean, log_variance = output.chunk(2, dim=-1)
     return Gaussian(mean, log_variance.clamp(*LOG_VARIANCES))
 
 

@@ -60,7 +60,7 @@ def _rolled(
 
 
 def _drawn(model: HumorNet, state: State, generator: torch.Generator | None) -> Tensor:
-    prior = model.expected(model.standardised(features(canonical(state, state))))
+    prior = model.prior_latent(model.standardise(features(canonical(state, state))))
     return prior.mean if generator is None else prior.sample(generator)
 
 
@@ -69,6 +69,6 @@ def transitions(model: HumorNet, states: State) -> tuple[Gaussian, Gaussian]:
     dim = states.root.dim() - 2
     index = (slice(None),) * dim
     before, after = states[(*index, slice(None, -1))], states[(*index, slice(1, None))]
-    told = model.standardised(features(canonical(before, before)))
-    following = model.standardised(features(canonical(after, before)))
-    return model.inferred(told, following), model.expected(told)
+    inputs = model.standardise(features(canonical(before, before)))
+    next_inputs = model.standardise(features(canonical(after, before)))
+    return model.posterior_latent(inputs, next_inputs), model.prior_latent(inputs)

@@ -137,14 +137,14 @@ def features(state: State) -> Tensor:
     return torch.cat([state.root, columns, from_root, state.velocity.flatten(-2), state.turning], dim=-1)
 
 
-def pose_features(told: Tensor) -> Tensor:
+def pose_features(inputs: Tensor) -> Tensor:
     """Of `features` of states in their own frames, those that a mixture of initial states knows: (..., 133).
 
     Height, joints from the root, velocities and turning: where joints are and go, as in the official code, without
     the rotations, which follow from them but for twists.
     """
     of_joints = 3 + 6 * JOINT_COUNT
-    return torch.cat([told[..., 2:3], told[..., of_joints:]], dim=-1)
+    return torch.cat([inputs[..., 2:3], inputs[..., of_joints:]], dim=-1)
 
 
 def moved_by(state: State, change: Tensor, offsets: Tensor) -> State:

@@ -61,14 +61,14 @@ _STATES_OF_MIXTURE = 40_000
 
 @dataclass(frozen=True)
 class Sequences:
-    """Motion that is consistent: joints are where rotations and bones put them.
+    """Sequences of states, drawn from motion.
 
     Attributes:
-        motion: as prepared.
-        load: (N, 8) labels.
-        rest: (N, 8).
-        starts: where a sequence may start.
-        chances: of each of these.
+        motion: N frames, as prepared.
+        load: (N, 8) whether `CONTACT_JOINTS` bear load.
+        rest: (N, 8) whether they rest.
+        starts: (M,) frames at which a sequence may start.
+        chances: (M,) the probability that it does.
     """
 
     motion: MotionSet
@@ -79,7 +79,7 @@ class Sequences:
 
     @classmethod
     def of(cls, motion: MotionSet) -> Sequences:
-        """All of it."""
+        """All sequences of a motion."""
         ends = zip(motion.clip_start, motion.clip_start[1:], strict=False)
         clips = [motion.positions[a:b].numpy() for a, b in ends]
         load, rest = (
@@ -160,9 +160,23 @@ def fit_transitions(
     start: str | None = None,
     known: HumorNet | None = None,
 ) -> Path:
-    """The same for any configuration and motion: what the ablations are trained by; ``path``'s folder is the run's.
+    """Train any configuration on any motion, as the ablations are.
 
-    ``known`` is a model whose statistics of states are taken over, which take a minute.
+    Args:
+        config: sizes, and what is left out.
+        train: motion to learn.
+        val: motion of other people, evaluated on as it goes.
+        path: of the weights; its folder is the run's.
+        card: as of `TrainingRun.save`; what training started from is added to its "Training".
+        iterations: optimiser steps.
+        batch: sequences of `STEPS` steps.
+        learning_rate: of Adam at the start; it falls along a cosine.
+        seed: of weights and of sampling.
+        start: weights to go on from: a set or a path.
+        known: a model whose statistics of states are taken over: to fit them takes a minute.
+
+    Returns:
+        ``path``.
     """
     sequences, unseen = Sequences.of(train), Sequences.of(val)
     torch.manual_seed(seed)
@@ -171,7 +185,7 @@ def fit_transitions(
     if known is not None:
         model.load_state_dict(dict(known.named_buffers()), strict=False)
     elif start is None and not (path.parent / "checkpoint.pt").exists():
-        _know_states(model, sequences, seed)
+        _fit_statistics(model, sequences, seed)
     optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=learning_rate / 100)
     run = TrainingRun(path.parent, model, schedule, iterations, evaluations=40)
@@ -184,47 +198,47 @@ def fit_transitions(
 
 
 @torch.no_grad()
-def _know_states(model: HumorNet, sequences: Sequences, seed: int) -> None:
-    """Fit what is not learned by gradients: by what features are standardised, and the mixture of initial states."""
+def _fit_statistics(model: HumorNet, sequences: Sequences, seed: int) -> None:
+    """Fit what gradients do not: the mean and scale of features, and the mixture of initial states."""
     rng = np.random.default_rng(seed)
     states = sequences.draw(_STATES_OF_MIXTURE, 0, rng).states[:, 0]
-    told = features(canonical(states, states))
-    model.mean.copy_(told.mean(dim=0))
-    model.scale.copy_(told.std(dim=0).clamp(min=LEAST_SCALE))
-    fit_initial(model, model.standardised(told), seed)
+    inputs = features(canonical(states, states))
+    model.mean.copy_(inputs.mean(dim=0))
+    model.scale.copy_(inputs.std(dim=0).clamp(min=LEAST_SCALE))
+    fit_initial(model, model.standardise(inputs), seed)
 
 
 def transition_loss(model: HumorNet, batch: Batch, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
-    """Equation 7: reconstruction, divergence and regularisers, of steps from states as scheduled sampling has them.
+    """Equation 7: reconstruction, KL divergence and regularisers, of steps from states by scheduled sampling.
 
     Args:
         model: in training.
         batch: of sequences.
-        done: the share of the training.
-        rng: of which states are true.
+        done: share of the training, 0 to 1.
+        rng: of which steps start from the true state.
+
+    Returns:
+        The loss, and its terms by name.
     """
     own = float(np.clip((done - TRUE_UNTIL) / (OWN_FROM - TRUE_UNTIL), 0.0, 1.0))
     true = batch.states[:, :-1]
     before = _own_states(model, batch, own, rng) if own > 0.0 else true
     origin, target = canonical(before, before), canonical(batch.states[:, 1:], true)
-    told, following = model.standardised(features(origin)), model.standardised(features(target))
-    prior, posterior = model.expected(told), model.inferred(told, following)
-    said, logits = model.decoded(origin, told, posterior.sample(), batch.offsets.unsqueeze(1))
-    l_root = (said.root - target.root).square().mean()
-    l_rotation = (said.rotations - target.rotations).square().mean()
-    l_joint = (said.joints - target.joints).square().mean()
-    l_velocity = (said.velocity - target.velocity).square().mean()
-    l_divergence = posterior.divergence(prior).mean()
-    warmth = min(done / KL_SHARE, 1.0)
-    loss = (
-        JOINTS_WEIGHT * (l_joint + l_root) + ROTATIONS_WEIGHT * l_rotation + l_velocity
-        + KL_WEIGHT * warmth * l_divergence
-    )  # fmt: skip
-    terms = {"L_velocity": l_velocity.item(), "KL, nats": l_divergence.item()}
+    inputs, next_inputs = model.standardise(features(origin)), model.standardise(features(target))
+    prior, posterior = model.prior_latent(inputs), model.posterior_latent(inputs, next_inputs)
+    predicted, logits = model.decode(origin, inputs, posterior.sample(), batch.offsets.unsqueeze(1))
+    l_root = (predicted.root - target.root).square().mean()
+    l_rotation = (predicted.rotations - target.rotations).square().mean()
+    l_joint = (predicted.joints - target.joints).square().mean()
+    l_velocity = (predicted.velocity - target.velocity).square().mean()
+    l_kl = posterior.kl(prior).mean()
+    kl_weight = KL_WEIGHT * min(done / KL_SHARE, 1.0)
+    loss = JOINTS_WEIGHT * (l_joint + l_root) + ROTATIONS_WEIGHT * l_rotation + l_velocity + kl_weight * l_kl
+    terms = {"L_velocity": l_velocity.item(), "KL, nats": l_kl.item()}
     if model.config.contacts:
         l_contact = F.binary_cross_entropy_with_logits(logits, batch.contacts)
         resting = torch.sigmoid(logits[..., len(CONTACT_JOINTS) :])
-        still = (resting * said.velocity[..., list(CONTACT_JOINTS), :].square().sum(dim=-1)).mean()
+        still = (resting * predicted.velocity[..., list(CONTACT_JOINTS), :].square().sum(dim=-1)).mean()
         loss = loss + CONTACT_WEIGHT * l_contact + STILL_WEIGHT * still
         terms["L_contact"] = l_contact.item()
     return loss, terms
@@ -232,25 +246,25 @@ def transition_loss(model: HumorNet, batch: Batch, done: float, rng: Rng) -> tup
 
 @torch.no_grad()
 def _own_states(model: HumorNet, batch: Batch, own: float, rng: Rng) -> State:
-    """The states (B, T) that steps start from: each, by the chance ``own``, the one that the step before made."""
+    """The states (B, T) that steps start from: each with probability ``own`` the model's own, of the step before."""
     states = [batch.states[:, 0]]
     count, steps = batch.contacts.shape[:2]
     for t in range(steps - 1):
         before, true = states[-1], batch.states[:, t]
         origin = canonical(before, before)
-        told = model.standardised(features(origin))
-        following = model.standardised(features(canonical(batch.states[:, t + 1], true)))
-        made = model.step(before, model.inferred(told, following).sample(), batch.offsets)[0]
+        inputs = model.standardise(features(origin))
+        next_inputs = model.standardise(features(canonical(batch.states[:, t + 1], true)))
+        made = model.step(before, model.posterior_latent(inputs, next_inputs).sample(), batch.offsets)[0]
         states.append(choose(torch.from_numpy(rng.random(count) < own), made, batch.states[:, t + 1]))
     return stack(states, 1)
 
 
 def evaluate_humor(model: HumorNet, unseen: Sequences) -> dict[str, float]:
-    """On unseen people, seconds of motion that move: how well latents say it, and how well it is foreseen.
+    """On unseen people, over the seconds that travel farthest: errors of reconstruction and of prediction.
 
     Returns:
-        ``val told mm``, the mean error of joints at the end of a second rolled out by the posterior's means;
-        ``val foreseen mm``, after half a second, by the prior's; ``val rest F1`` of heels and toes along the former.
+        ``val reconstruction mm``, the mean error of joints at the end of a second rolled out by the posterior's means;
+        ``val prediction mm``, after half a second, by the prior's; ``val rest F1`` of heels and toes along the former.
     """
     steps = int(FPS)
     rows = unseen.motion.all_windows(steps + 2, steps)
@@ -258,15 +272,18 @@ def evaluate_humor(model: HumorNet, unseen: Sequences) -> dict[str, float]:
     batch = unseen.at(rows[np.argsort(-path.norm(dim=-1).numpy(), kind="stable")[:128]])
     posterior, _ = transitions(model, batch.states)
     first = batch.states[:, 0]
-    told = roll_out(model, first, posterior.mean, batch.offsets)
-    foreseen = sample(model, first, steps // 2, batch.offsets, None)
+    reconstructed = roll_out(model, first, posterior.mean, batch.offsets)
+    future = sample(model, first, steps // 2, batch.offsets, None)
 
-    def error(said: State, step: int) -> float:
-        return float((said.joints[:, step - 1] - batch.states.joints[:, step]).norm(dim=-1).mean()) * 1e3
+    def error(predicted: State, step: int) -> float:
+        return float((predicted.joints[:, step - 1] - batch.states.joints[:, step]).norm(dim=-1).mean()) * 1e3
 
-    found = {"val told mm": error(told.states, steps), "val foreseen mm": error(foreseen.states, steps // 2)}
+    found = {
+        "val reconstruction mm": error(reconstructed.states, steps),
+        "val prediction mm": error(future.states, steps // 2),
+    }
     if model.config.contacts:
         feet = slice(len(CONTACT_JOINTS) + 2, len(CONTACT_JOINTS) + 6)
-        said, true = told.contacts[..., feet] > 0, batch.contacts[..., feet] > 0.5
-        found["val rest F1"] = float(2 * (said & true).sum() / (said.sum() + true.sum()).clamp(min=1))
+        predicted, true = reconstructed.contacts[..., feet] > 0, batch.contacts[..., feet] > 0.5
+        found["val rest F1"] = float(2 * (predicted & true).sum() / (predicted.sum() + true.sum()).clamp(min=1))
     return found

@@ -145,8 +145,8 @@ def test_a_rollout_is_step_after_step_of_each_alone(model: HumorNet) -> None:
                 [0.0, 0.0, root[2]], own[:, :, :2].swapaxes(1, 2).ravel(), ((joints - root) @ turn)[1:].ravel(),
                 (velocity @ turn).ravel(), turning @ turn,
             ])  # fmt: skip
-            read = model.standardised(torch.from_numpy(told))
-            prior = model.expected(read[None])
+            read = model.standardise(torch.from_numpy(told))
+            prior = model.prior_latent(read[None])
             assert torch.isfinite(prior.mean).all()
             said = model.decoder(read[None], latents[body, t][None])[0, :CHANGE].detach().numpy() * 0.02
             turns = Rotation.from_rotvec(said[3:].reshape(22, 3)).as_matrix()
@@ -181,7 +181,7 @@ def test_divergence_is_that_of_torch() -> None:
     generator = torch.Generator().manual_seed(0)
     a, b = (Gaussian(*torch.randn(2, 5, 8, generator=generator)) for _ in range(2))
     normals = [torch.distributions.Normal(g.mean, g.sigma) for g in (a, b)]
-    torch.testing.assert_close(a.divergence(b), torch.distributions.kl_divergence(*normals).sum(-1))
+    torch.testing.assert_close(a.kl(b), torch.distributions.kl_divergence(*normals).sum(-1))
 
 
 def test_the_mixture_of_first_states_is_sklearns(model: HumorNet) -> None:
@@ -255,6 +255,6 @@ def test_what_ships_tells_motion_of_people_it_has_not_seen(shipped: HumorNet) ->
     posterior, prior = transitions(shipped, states)
     told = roll_out(shipped, states[:, 0], posterior.mean[:, :15], offsets).states.joints[:, -1]
     error = 1e3 * float((told - states.joints[:, 15]).norm(dim=-1).mean())
-    nats = float(posterior.divergence(prior).mean())
+    nats = float(posterior.kl(prior).mean())
     assert error == pytest.approx(TOLD_MM, rel=0.15)
     assert nats == pytest.approx(NATS, rel=0.15)

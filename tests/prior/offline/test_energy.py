@@ -48,13 +48,13 @@ def variables() -> Variables:
     """Somebody who sways above a floor that lies 10 cm low, all of it a little off from where it starts."""
     generator = torch.Generator().manual_seed(0)
     root = of([[0.1 * t, 0.0, 0.95] for t in range(FRAMES)])
-    start = Variables.starting(root, torch.eye(3).double().expand(FRAMES, 22, 3, 3), of(REST_OFFSETS), -0.1, 6)
+    start = Variables.initial(root, torch.eye(3).double().expand(FRAMES, 22, 3, 3), of(REST_OFFSETS), -0.1, 6)
 
     def off(like: Tensor, by: float) -> Tensor:
         return like + by * torch.randn(like.shape, generator=generator, dtype=torch.float64)
 
     sizes = {"root": 0.02, "orientation": 0.2, "turns": 0.2, "bones": 0.01, "ground": 0.03, "latents": 0.5}
-    return start.varied(**{name: off(getattr(start, name), size) for name, size in sizes.items()})
+    return replace(start, **{name: off(getattr(start, name), size) for name, size in sizes.items()})
 
 
 def camera() -> Pinhole:
@@ -76,7 +76,7 @@ def terms() -> dict[str, Term]:
         "surface": SurfacePoints(points, 0.05),
         "transitions": Transitions(),
         "first state": FirstState(),
-        "all states": FirstState(always=True),
+        "all states": FirstState(all_states=True),
         "smooth": Smooth(),
         "bones": Bones(),
         "ground": Ground(-0.1, 0.02, 0.05),
@@ -109,7 +109,7 @@ def test_derivatives_are_those_of_finite_differences(name: str, model: HumorNet,
 
 def test_what_stands_is_weighed_by_contacts_that_it_does_not_move(model: HumorNet, variables: Variables) -> None:
     latents = variables.latents.clone().requires_grad_()
-    value = energy(Motion(model, variables.varied(latents=latents)), [Standing()])
+    value = energy(Motion(model, replace(variables, latents=latents)), [Standing()])
     assert value > 0
     assert not value.requires_grad or torch.autograd.grad(value, latents, allow_unused=True)[0] is None
 
@@ -119,7 +119,7 @@ def test_a_foot_under_the_floor_costs_and_one_on_it_does_not(model: HumorNet) ->
 
     def depth(height: float) -> float:
         root = of([[0.0, 0.0, height - rest + REST_HEIGHT[4]]] * FRAMES)
-        start = Variables.starting(root, torch.eye(3).double().expand(FRAMES, 22, 3, 3), of(REST_OFFSETS), 0.0, 6)
+        start = Variables.initial(root, torch.eye(3).double().expand(FRAMES, 22, 3, 3), of(REST_OFFSETS), 0.0, 6)
         plain = HumorNet(HumorConfig(hidden=64, latent=6, contacts=False)).double().requires_grad_(False)
         return float(energy(Motion(plain, start), [Standing(height_sigma=0.02)]))
 
@@ -145,7 +145,7 @@ def test_hubers_kernel_goes_on_growing() -> None:
 
 def test_points_on_the_skin_cost_nothing(model: HumorNet) -> None:
     root = of([[0.0, 0.0, 1.0]] * FRAMES)
-    start = Variables.starting(root, torch.eye(3).double().expand(FRAMES, 22, 3, 3), of(REST_OFFSETS), 0.0, 6)
+    start = Variables.initial(root, torch.eye(3).double().expand(FRAMES, 22, 3, 3), of(REST_OFFSETS), 0.0, 6)
     motion = Motion(model, start)
     knee, ankle = motion.world_joints[:, J["left_knee"]], motion.world_joints[:, J["left_ankle"]]
     skin = (0.5 * (knee + ankle) + of([0.05, 0.0, 0.0])).unsqueeze(1)
@@ -154,9 +154,9 @@ def test_points_on_the_skin_cost_nothing(model: HumorNet) -> None:
 
 
 def test_the_floor_is_moved_and_tilted_with_all_that_stands_on_it(model: HumorNet, variables: Variables) -> None:
-    level = variables.varied(ground=of([0.0, 0.0, 0.0]))
-    raised = variables.varied(ground=of([0.3, 0.0, 0.0]))
+    level = replace(variables, ground=of([0.0, 0.0, 0.0]))
+    raised = replace(variables, ground=of([0.3, 0.0, 0.0]))
     lifted = Motion(model, raised).world_joints - Motion(model, level).world_joints
     torch.testing.assert_close(lifted, of([0.0, 0.0, 0.3]).expand_as(lifted))
-    tilted = Motion(model, variables.varied(ground=of([0.0, 0.1, 0.0])))
+    tilted = Motion(model, replace(variables, ground=of([0.0, 0.1, 0.0])))
     torch.testing.assert_close(tilted.world_joints @ tilted.tilt, Motion(model, level).joints)

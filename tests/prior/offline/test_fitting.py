@@ -16,7 +16,7 @@ from steadypose.prior.body.skeleton import REST_OFFSETS, limbs
 from steadypose.prior.models.humor.network import HumorConfig, HumorNet
 from steadypose.prior.models.torch_weights import load_network
 from steadypose.prior.offline import windows
-from steadypose.prior.offline.solve import STIFFNESS, FitSettings, fit_window, smoothing_root
+from steadypose.prior.offline.solve import STIFFNESS, FitSettings, fit_window, preconditioner
 from steadypose.prior.offline.windows import Track, fit_track, window_bounds
 
 NOISE = 0.03
@@ -121,7 +121,7 @@ def test_a_long_track_is_one_motion_and_done_windows_are_not_done_again(
 
 
 def test_poses_move_as_what_is_smooth_does() -> None:
-    root = smoothing_root(20)
+    root = preconditioner(20)
     second = torch.eye(20, dtype=torch.float64).diff(n=2, dim=0)
     held = torch.eye(20, dtype=torch.float64) + STIFFNESS * second.mT @ second
     torch.testing.assert_close(root @ held @ root, torch.eye(20, dtype=torch.float64))
