@@ -22,8 +22,8 @@ from steadypose.benchmarks.peers import window_vaes
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import figures, score
 from steadypose.prior.models.hmvae.config import HMVAEConfig
-from steadypose.prior.models.hmvae.network import HMVAE, MotionVAE, from_6d, to_6d
-from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
+from steadypose.prior.models.hmvae.network import HMVAE, MotionVAE
+from steadypose.prior.models.layers.torch_kinematics import forward_kinematics, from_6d, to_6d
 from steadypose.prior.models.torch_weights import load_network
 from steadypose.prior.motion.dataset import remove_heading
 

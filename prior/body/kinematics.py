@@ -131,14 +131,18 @@ def _write_quaternions(rotations, out):
 
 def rotation_matrix(quaternion: NDArray[np.floating]) -> Floats:
     """The rotation (3, 3) of a quaternion (4,), xyzw, of any length but 0."""
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotation_matrices(np.asarray(quaternion / np.linalg.norm(quaternion)))
+
+
+def rotation_matrices(q: Floats) -> Floats:
+    """Rotations (..., 3, 3) of unit quaternions (..., 4), xyzw."""
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return np.stack(rows, axis=-1).reshape(*q.shape[:-1], 3, 3)
 
 
 def rigid_alignment(source: NDArray[np.floating], target: NDArray[np.floating]) -> tuple[Floats, Floats]:

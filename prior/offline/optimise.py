@@ -15,17 +15,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from steadypose.prior.body.kinematics import rotation_matrices
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.models.completer.features import (
     anchored,
     draw_line,
-    rotation_matrices,
     rotations_of_6d,
     solved_rotations,
 )
 from steadypose.prior.models.hmvae.config import HMVAEConfig
-from steadypose.prior.models.hmvae.network import HMVAE, from_6d, to_6d
-from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
+from steadypose.prior.models.hmvae.network import HMVAE
+from steadypose.prior.models.layers.torch_kinematics import forward_kinematics, from_6d, to_6d
 from steadypose.prior.models.torch_weights import load_network
 from steadypose.prior.motion.dataset import remove_heading
 from steadypose.prior.offline.parts import PartsCompleter

@@ -1,4 +1,4 @@
-"""The sizes of the completer, as its weights tell them."""
+"""Sizes of the completer, as stored with its weights."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 JOINTS = 22
 
 BENDS = JOINTS * 6 + 3
-"""Numbers by which cubics differ from the line, of rotations' first columns and of the root."""
+"""Numbers of a frame's bend: of each rotation's first two columns, and of the root's position."""
 
 FEATURES = JOINTS * (6 + 3 + 3 + 3) + 9 + BENDS
-"""Numbers of a frame: of each joint its rotation, place, velocity, and whether and how near it is known; of the root
-its place, velocity, and the same three; and the bends."""
+"""Numbers of a frame: of each joint its rotation (6D), position, velocity, whether it is known, and how near that is
+before and after; of the root its position, velocity and the same three; and the bend."""
 
 OUTPUTS = JOINTS * 6 + 3 + JOINTS + 1
-"""What is added to the line, to each joint's 6D rotation and to the root's place, metres; and, as logits, how much of
-each joint's and the root's bend is taken."""
+"""Corrections of each joint's 6D rotation and of the root's position, metres; and logits of the gates of each joint's
+and the root's bend."""
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,12 @@ class CompleterConfig:
     """The sizes of the completer.
 
     Attributes:
-        width: numbers of a frame, in the transformer.
+        width: of the transformer's tokens, one a frame.
         heads: of each layer's attention.
         layers: how many.
-        reach: frames apart beyond which attention tells distances no more.
-        never_sigma: (22,) metres along an axis, how far off each joint is that is never known: of validation.
-        half_frames: frames from something known at which an answer is half as far off.
+        reach: frames at which relative positions are clipped.
+        never_sigma: (22,) metres along an axis, error of each joint where it is never known, of validation people.
+        half_frames: frames from the nearest in which a joint is known at which its error is half of that.
     """
 
     width: int = 128

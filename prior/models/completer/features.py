@@ -1,10 +1,9 @@
-"""What the completer reads of a window, and the line that it corrects: compiled loops, in training and live alike.
+"""Features of the completer, and the interpolation that it corrects: compiled loops, in training and live alike.
 
-Rotations and root are filled by slerp and lerp between what is known before and after, each joint for itself. What is
-known of one side only is held; what is never known is as it usually is. Beside the line is its bend: what a cubic with
-the velocities at both ends differs from it by, of which the network says how much to take. What else it corrects is
-taken less the line through its corrections (`anchored`): so they vanish where something is known and meet it without a
-step.
+The line: rotations by slerp and root by lerp between what is known before and after, joint by joint. What is known on
+one side only is held, what is never known has the mean pose. The bend: a cubic with the velocities at both ends, less
+the line; the network's output has a gate for it. The correction: the rest of that output, less the line through it
+(`anchored`), so that it vanishes where something is known and there is no step.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
-from steadypose.prior.body.kinematics import heading, quaternions, yaw_matrix
+from steadypose.prior.body.kinematics import heading, quaternions, rotation_matrices, yaw_matrix
 from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENTS, J, finite_joints
 from steadypose.prior.models.completer.config import BENDS, FEATURES
 from steadypose.prior.timing.rate import FPS
@@ -29,11 +28,11 @@ Floats32 = NDArray[np.float32]
 NEAR = 8.0
 """Frames from something known at which its nearness is a half: 1 / (1 + d / NEAR)."""
 
-SHORT_SAY, LONG_SAY, LONG_GAP = 0.2, 0.75, 30.0
-"""Shares of the network's answer that are taken in gaps of no frame and from so many frames on."""
+SHORT_SHARE, LONG_SHARE, LONG_GAP = 0.2, 0.75, 30.0
+"""Shares of the correction that are taken in gaps of 0 frames, and of `LONG_GAP` frames and more."""
 
-STEEPEST = 2.0
-"""The most that a bend may be."""
+MAX_BEND = 2.0
+"""Bound of a bend's entries: of rotation matrices, and metres."""
 
 _FASTEST = 10.0  # m/s
 _SPINE = [J["spine1"], J["spine2"]]
@@ -41,12 +40,12 @@ _LEAVES = [joint for joint, children in enumerate(CHILDREN) if not children]
 
 
 class Line(NamedTuple):
-    """Between which frames each track of B windows is drawn: 22 rotations and, last, the root's place.
+    """Interpolation of each track of B windows: 22 rotations and, last, the root's position.
 
     Attributes:
-        before: (B, T, 23) the frame known last, or next if none is before.
-        after: (B, T, 23) the frame known next, or last if none is after.
-        weight: (B, T, 23) float32, how far from the one to the other.
+        before: (B, T, 23) the last known frame; the next, if there is none before.
+        after: (B, T, 23) the next known frame; the last, if there is none after.
+        weight: (B, T, 23) float32, 0 to 1, from the one to the other.
         known: (B, T, 23) whether this frame itself is.
         ever: (B, 23) whether any is.
     """
@@ -59,17 +58,17 @@ class Line(NamedTuple):
 
 
 class Window(NamedTuple):
-    """B windows as the completer reads them; all turned and moved so that the first root known faces +x at the origin.
+    """Input of the completer for B windows, each turned and moved: the first known root faces +x at the origin.
 
     Attributes:
         features: (B, T, FEATURES) float32.
         rotations: (B, T, 22, 3, 3) local, the line's.
         root: (B, T, 3) metres, the line's.
-        bend: (B, T, 23, 6) what to add to the line's first columns, and last to the root, three numbers and no more,
-            to make cubics of them.
-        line: between what.
-        turn: (B, 3, 3) rotations back.
-        origin: (B, 3) metres, where the root first known is.
+        bend: (B, T, 23, 6) cubics less the line: of the rotations' first two columns; of the root, last, three
+            metres and three zeros.
+        line: the interpolation.
+        turn: (B, 3, 3) rotations from the window's frame to the world.
+        origin: (B, 3) metres, world, of the window's frame.
     """
 
     features: Floats32
@@ -82,15 +81,15 @@ class Window(NamedTuple):
 
 
 def solved_rotations(positions: Floats, offsets: Floats, usual: Floats) -> tuple[Floats, Bools]:
-    """Local rotations (..., 22, 3, 3), NaN where nothing tells them, and which (..., 22) are known for certain.
+    """Local rotations (..., 22, 3, 3), NaN where undetermined, and which (..., 22) are known.
 
     A rotation is known where its joint and the one below are and that of the joint above is. A chest that hangs from a
-    spine nobody saw, as of sensors that know of no spine, is known: the spine is then as it usually is.
+    spine was not seen, as with sensors without a spine, is known: the spine then has the mean pose.
 
     Args:
         positions: (..., 22, 3) metres, z up; NaN where not known.
-        offsets: (..., 22, 3) metres.
-        usual: (22, 3, 3)
+        offsets: (..., 22, 3) metres, bones.
+        usual: (22, 3, 3) local rotations of the mean pose.
     """
     known = finite_joints(positions)
     fallback = np.full((*positions.shape, 3), np.nan)
@@ -112,12 +111,12 @@ def solved_rotations(positions: Floats, offsets: Floats, usual: Floats) -> tuple
 
 
 def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
-    """Windows as the completer reads them.
+    """The completer's input of windows.
 
     Args:
         positions: (B, T, 22, 3) metres, z up; NaN where not known.
         offsets: (B, 22, 3) metres, the person's bones.
-        usual: (22, 4) quaternions, xyzw, of what is never known.
+        usual: (22, 4) quaternions, xyzw, local, of the mean pose.
     """
     count, frames = positions.shape[:2]
     known = finite_joints(positions)
@@ -152,7 +151,7 @@ def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
 
 
 def draw_line(known: Bools) -> Line:
-    """Of tracks (B, T, K) that are known in some frames."""
+    """The line of K tracks, by where each is known (B, T, K)."""
     shape = known.shape
     before, after = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
     weight = np.zeros(shape, dtype=np.float32)
@@ -160,16 +159,16 @@ def draw_line(known: Bools) -> Line:
     return Line(before, after, weight, known, np.asarray(known.any(axis=1)))
 
 
-def say(line: Line) -> Floats32:
-    """(B, T, 23, 1) how much of the network's answer is taken, in place of the cubic alone: by validation, the less the
-    shorter a gap is; all of it where something is known on one side only, or never."""
+def correction_share(line: Line) -> Floats32:
+    """(B, T, 23, 1) share of the network's output that is taken beside the cubic: by validation less in shorter gaps,
+    all of it where a track is known on one side only or never."""
     length = (line.after - line.before)[..., None].astype(np.float32)
-    between = SHORT_SAY + (LONG_SAY - SHORT_SAY) * np.minimum(length / LONG_GAP, 1.0)
+    between = SHORT_SHARE + (LONG_SHARE - SHORT_SHARE) * np.minimum(length / LONG_GAP, 1.0)
     return np.where(length > 0, between, 1.0).astype(np.float32)
 
 
 def _lerp(values: Floats, line: Line, tracks: slice) -> Floats:
-    """Values (B, T, K, d) of what is known, along the line; 0 where nothing ever is."""
+    """(B, T, K, d) values at known frames, interpolated along the line; 0 of tracks never known."""
     first = np.take_along_axis(values, line.before[..., tracks, None], axis=1)
     second = np.take_along_axis(values, line.after[..., tracks, None], axis=1)
     weight = line.weight[..., tracks, None]
@@ -177,23 +176,12 @@ def _lerp(values: Floats, line: Line, tracks: slice) -> Floats:
 
 
 def anchored(values: Floats, line: Line, tracks: slice) -> Floats:
-    """What a network says (B, T, K, d) of these tracks, less the line through what it says where they are known."""
+    """A network's output (B, T, K, d) for these tracks, less the line through its values where they are known."""
     return values - _lerp(values, line, tracks)
 
 
-def rotation_matrices(q: Floats) -> Floats:
-    """(..., 3, 3) of unit quaternions (..., 4), xyzw."""
-    x, y, z, w = np.moveaxis(q, -1, 0)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return np.stack(rows, axis=-1).reshape(*q.shape[:-1], 3, 3)
-
-
 def rotations_of_6d(x: Floats) -> Floats:
-    """(..., 3, 3) rotations whose first columns (..., 6) are nearest to ``x``, by Gram and Schmidt."""
+    """Rotations (..., 3, 3) of their first two columns (..., 6), by Gram and Schmidt (Zhou et al. 2019)."""
     first = x[..., :3] / np.linalg.norm(x[..., :3], axis=-1, keepdims=True)
     second = x[..., 3:] - (first * x[..., 3:]).sum(axis=-1, keepdims=True) * first
     second /= np.linalg.norm(second, axis=-1, keepdims=True)
@@ -244,7 +232,7 @@ def _bends(values, known, before, after, weight, out):
                     continue
                 for i in range(size):
                     p, q = values[row, a, k, i], values[row, b, k, i]
-                    way, start, end = q - p, 0.0, 0.0  # each velocity as what it would make of the way, less the way
+                    way, start, end = q - p, 0.0, 0.0  # velocities times the gap's length, less the way
                     if left:
                         start = p - values[row, a - 1, k, i]
                         if a > 1 and known[row, a - 2, k]:
@@ -260,7 +248,7 @@ def _bends(values, known, before, after, weight, out):
                     if not left:
                         start = -0.5 * end
                     bend = (s * s * s - 2 * s * s + s) * start + (s * s * s - s * s) * end
-                    out[row, t, k, i] = min(max(bend, -STEEPEST), STEEPEST)
+                    out[row, t, k, i] = min(max(bend, -MAX_BEND), MAX_BEND)
 
 
 @njit(cache=True)

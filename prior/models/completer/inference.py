@@ -1,4 +1,4 @@
-"""`Completer` without torch: one pass over windows, and what becomes of the line by it."""
+"""`Completer` without torch: one pass over windows, and the motion that it corrects."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.models.completer.config import BENDS, CompleterConfig
-from steadypose.prior.models.completer.features import anchored, read_window, rotations_of_6d, say
+from steadypose.prior.models.completer.features import anchored, correction_share, read_window, rotations_of_6d
 from steadypose.prior.models.layers.dense import Floats as Floats32
 from steadypose.prior.models.weights_io import Arrays, load_weights, part
 
@@ -20,7 +20,7 @@ class LiveCompleter:
 
     Attributes:
         config: its sizes.
-        usual: (22, 4) quaternions, xyzw, of local rotations that are never known.
+        usual: (22, 4) quaternions, xyzw, local, of the mean pose: for joints that are never known.
     """
 
     def __init__(self, config: CompleterConfig, weights: Arrays) -> None:
@@ -41,20 +41,21 @@ class LiveCompleter:
         return cls(CompleterConfig.from_dict(config), arrays)
 
     def __call__(self, positions: Floats, offsets: Floats) -> tuple[Floats, Floats]:
-        """Whole windows: local rotations (B, T, 22, 3, 3) and places of the root (B, T, 3), metres.
-
-        Where rotations and root are known, these are they.
+        """Complete windows; what is known stays.
 
         Args:
             positions: (B, T, 22, 3) metres, z up; NaN where not known.
             offsets: (B, 22, 3) metres, the person's bones.
+
+        Returns:
+            local rotations (B, T, 22, 3, 3) and positions of the root (B, T, 3), metres.
         """
         window = read_window(positions, offsets, self.usual)
-        said = self.forward(window.features).astype(np.float64)
-        turns, steps, taken = np.split(said, [BENDS - 3, BENDS], axis=-1)
-        share = say(window.line).astype(np.float64)
-        bend = window.bend * (1.0 - share / (1.0 + np.exp(taken[..., None])))
-        turns = anchored(turns.reshape(*said.shape[:2], 22, 6), window.line, slice(0, 22))
+        output = self.forward(window.features).astype(np.float64)
+        turns, steps, gates = np.split(output, [BENDS - 3, BENDS], axis=-1)
+        share = correction_share(window.line).astype(np.float64)
+        bend = window.bend * (1.0 - share / (1.0 + np.exp(gates[..., None])))
+        turns = anchored(turns.reshape(*output.shape[:2], 22, 6), window.line, slice(0, 22))
         steps = anchored(steps[:, :, None], window.line, slice(22, 23))[:, :, 0]
         turns = share[:, :, :22] * turns + bend[:, :, :22]
         steps = share[:, :, 22] * steps + bend[:, :, 22, :3]
@@ -94,6 +95,6 @@ def _norm(x: Floats32, layer: Arrays) -> Floats32:
 
 
 def _gelu(x: Floats32) -> Floats32:
-    """By tanh."""
+    """GELU, by its approximation with tanh."""
     inner = np.float32(math.sqrt(2.0 / math.pi)) * (x + np.float32(0.044715) * x * x * x)
     return np.float32(0.5) * x * (np.float32(1.0) + np.tanh(inner))

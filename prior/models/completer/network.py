@@ -3,7 +3,7 @@
 One encoder over the frames of a window, hidden and known alike, as the transformers for in-betweening have it (Duan et
 al. 2022; Qin et al. 2022, "Motion In-betweening via Two-stage Transformers"), whose answer is added to an interpolation
 (Oreshkin et al. 2023, "Motion In-betweening via Deep Delta-Interpolator"). Theirs know whole frames or nothing; here
-any joint may be known in any frame, and the network says how far to believe cubics, which theirs do without.
+any joint may be known in any frame, and the network gates cubics, which theirs do without.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from steadypose.prior.models.completer.config import BENDS, FEATURES, OUTPUTS, C
 
 
 class Completer(nn.Module):
-    """What to add to the line, before it is anchored where something is known (`features.anchored`), and how much of
-    the bend beside that."""
+    """Correction of the line, before it is anchored (`features.anchored`), and gates of the bend."""
 
     def __init__(self, config: CompleterConfig) -> None:
         super().__init__()
@@ -28,7 +27,7 @@ class Completer(nn.Module):
         self.layers = nn.ModuleList(_Layer(config) for _ in range(config.layers))
         self.norm = nn.LayerNorm(config.width)
         self.write = nn.Linear(config.width, OUTPUTS)
-        # (22, 4) quaternions, xyzw, of what is never known
+        # (22, 4) quaternions, xyzw, local, of the mean pose
         self.register_buffer("usual", torch.tensor([0.0, 0.0, 0.0, 1.0]).repeat(22, 1))
         self.usual: Tensor
         with torch.no_grad():
@@ -48,7 +47,7 @@ class Completer(nn.Module):
 
 
 class _Layer(nn.Module):
-    """Attention that knows how far apart frames are, and a perceptron of each frame; both after their norm."""
+    """Pre-norm attention with biases of relative position, and a feed-forward network."""
 
     def __init__(self, config: CompleterConfig) -> None:
         super().__init__()

@@ -19,10 +19,9 @@ from torch.nn import functional as F
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.skeleton import J, limbs
 from steadypose.prior.models.completer.config import BENDS, CompleterConfig
-from steadypose.prior.models.completer.features import Bools, Line, Window, read_window, say
+from steadypose.prior.models.completer.features import Bools, Line, Window, correction_share, read_window
 from steadypose.prior.models.completer.network import Completer
-from steadypose.prior.models.hmvae.network import from_6d, to_6d
-from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
+from steadypose.prior.models.layers.torch_kinematics import forward_kinematics, from_6d, to_6d
 from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
@@ -105,8 +104,8 @@ class Truth:
 
     Attributes:
         rotations: (B, T, 22, 3, 3) local.
-        root: (B, T, 3) metres.
-        offsets: (B, 22, 3) metres.
+        root: (B, T, 3) metres, world.
+        offsets: (B, 22, 3) metres, bones.
     """
 
     def __init__(self, rotations: Tensor, root: Tensor, offsets: Tensor) -> None:
@@ -114,7 +113,7 @@ class Truth:
 
     @classmethod
     def of(cls, motion: MotionSet, rows: NDArray[np.int64], rng: Rng | None = None) -> Truth:
-        """These frames (B, T); half mirrored and all scaled at random, with random numbers."""
+        """These frames (B, T); with ``rng``, half of the windows mirrored and all scaled at random."""
         rotations, root, offsets = motion.rotations[rows], motion.positions[rows, 0], motion.offsets[rows[:, 0]]
         if rng is not None:
             half = len(rows) // 2
@@ -128,7 +127,7 @@ class Truth:
         return cls(rotations, root, offsets)
 
     def seen(self, known: Bools, usual: Tensor, rng: Rng | None = None) -> Window:
-        """What the completer reads where these joints (B, T, 22) are known; with random numbers, some are noisy."""
+        """The completer's input where these joints (B, T, 22) are known; with ``rng``, some are noisy."""
         joints = forward_kinematics(self.rotations, self.offsets[:, None], self.root)[0].double().numpy()
         if rng is not None:
             sigma = rng.uniform(0.0, NOISE, (len(joints), 1, 1, 1)) * (rng.random((len(joints), 1, 1, 1)) < NOISY)
@@ -136,10 +135,17 @@ class Truth:
         joints[~known] = np.nan
         return read_window(joints, self.offsets.double().numpy(), usual.double().numpy())
 
+    def in_frame_of(self, window: Window) -> tuple[Tensor, Tensor]:
+        """Rotations (B, T, 22, 3, 3) and root (B, T, 3), turned and moved as the window is."""
+        turn, origin = torch.from_numpy(window.turn).float(), torch.from_numpy(window.origin).float()
+        rotations = self.rotations.clone()
+        rotations[:, :, 0] = turn.mT[:, None] @ rotations[:, :, 0]
+        return rotations, (self.root - origin[:, None]) @ turn
+
 
 class Sampler:
-    """Draws windows of motion, the faster the likelier; and of a source as many as the root of what it has, for a large
-    one of ten exercises is not most of the world."""
+    """Draws windows of motion, the faster the likelier, and each source by the square root of its size: a large one
+    of ten exercises would outweigh all others."""
 
     def __init__(self, motion: MotionSet) -> None:
         lengths = np.diff(motion.clip_start)
@@ -163,7 +169,10 @@ class Sampler:
 
 
 def masks(count: int, gap: int, context: int, rng: Rng) -> Bools:
-    """(count, gap + context, 22) which joints are known, of windows as somebody could want them completed."""
+    """(count, gap + context, 22) which joints are known, in tasks of completion.
+
+    By chance 52 % a gap, 10 % key frames, 30 % parts of the body hidden, 8 % both a gap and parts.
+    """
     frames = gap + context
     known = np.ones((count, frames, 22), dtype=bool)
     for row in known:
@@ -194,7 +203,7 @@ def masks(count: int, gap: int, context: int, rng: Rng) -> Bools:
     return known
 
 
-def _gathered(values: Tensor, line: Line, tracks: slice) -> Tensor:
+def _anchored(values: Tensor, line: Line, tracks: slice) -> Tensor:
     """`features.anchored`, with gradients."""
 
     def at(frames: NDArray[np.int64]) -> Tensor:
@@ -207,28 +216,25 @@ def _gathered(values: Tensor, line: Line, tracks: slice) -> Tensor:
 
 
 def answer(model: Completer, window: Window) -> tuple[Tensor, Tensor]:
-    """Local rotations (B, T, 22, 3, 3) and root (B, T, 3), with gradients, where `read_window` turned and put them."""
+    """Local rotations (B, T, 22, 3, 3) and root (B, T, 3), metres, in the window's frame, with gradients."""
     line = window.line
     with torch.autocast("cpu", torch.bfloat16, enabled=model.training):
-        said = model(torch.from_numpy(window.features))
-    rotations, root, taken = said.float().split([BENDS - 3, 3, 23], dim=-1)
-    share = torch.from_numpy(say(line))
-    bend = torch.from_numpy(window.bend) * (1.0 - share * torch.sigmoid(-taken)[..., None])
-    rotations = _gathered(rotations.unflatten(-1, (22, 6)), line, slice(0, 22))
-    root = _gathered(root.unflatten(-1, (1, 3)), line, slice(22, 23))[:, :, 0]
+        output = model(torch.from_numpy(window.features))
+    rotations, root, gates = output.float().split([BENDS - 3, 3, 23], dim=-1)
+    share = torch.from_numpy(correction_share(line))
+    bend = torch.from_numpy(window.bend) * (1.0 - share * torch.sigmoid(-gates)[..., None])
+    rotations = _anchored(rotations.unflatten(-1, (22, 6)), line, slice(0, 22))
+    root = _anchored(root.unflatten(-1, (1, 3)), line, slice(22, 23))[:, :, 0]
     base = torch.from_numpy(window.rotations).float()
     rotations, root = share[:, :, :22] * rotations + bend[:, :, :22], share[:, :, 22] * root + bend[:, :, 22, :3]
     return from_6d(to_6d(base) + rotations), torch.from_numpy(window.root).float() + root
 
 
 def loss(model: Completer, truth: Truth, known: Bools, rng: Rng) -> tuple[Tensor, dict[str, float]]:
-    """How far the answer is off where something was hidden; every term a mean of absolute values."""
+    """Absolute errors where something was hidden, weighted by window (`EASY`); and its terms by name."""
     window = truth.seen(known, model.usual, rng)
     rotations, root = answer(model, window)
-    turn, origin = torch.from_numpy(window.turn).float(), torch.from_numpy(window.origin).float()
-    true = truth.rotations.clone()
-    true[:, :, 0] = turn.mT[:, None] @ true[:, :, 0]
-    true_root = (truth.root - origin[:, None]) @ turn
+    true, true_root = truth.in_frame_of(window)
     joints, turned = forward_kinematics(torch.stack([rotations, true]), truth.offsets[:, None])
     hidden = torch.from_numpy(~known)
     frames = hidden.any(dim=-1)
@@ -325,10 +331,8 @@ def _errors(
     rows = rows[np.linspace(0, len(rows) - 1, windows).astype(int)]
     truth = Truth.of(motion, rows)
     window = truth.seen(np.broadcast_to(known, (windows, *known.shape)).copy(), model.usual)
-    turn, origin = torch.from_numpy(window.turn).float(), torch.from_numpy(window.origin).float()
-    true = truth.rotations.clone()
-    true[:, :, 0] = turn.mT[:, None] @ true[:, :, 0]
-    aim, _ = forward_kinematics(true, truth.offsets[:, None], (truth.root - origin[:, None]) @ turn)
+    rotations, root = truth.in_frame_of(window)
+    aim, _ = forward_kinematics(rotations, truth.offsets[:, None], root)
 
     def error(rotations: Tensor, root: Tensor) -> Tensor:
         off = (forward_kinematics(rotations, truth.offsets[:, None], root)[0] - aim).norm(dim=-1)

@@ -154,16 +154,3 @@ def _join_edges(a: Tensor, b: Tensor, channels: int) -> Tensor:
         dim=2,
     )
     return joined.reshape(batch, 2 * features, time)
-
-
-def to_6d(rotations: Tensor) -> Tensor:
-    """(..., 3, 3) rotation matrices to (..., 6): first column, then second."""
-    return rotations[..., :2].transpose(-1, -2).flatten(-2)
-
-
-def from_6d(x: Tensor) -> Tensor:
-    """(..., 6) to rotation matrices (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019)."""
-    a, b = x[..., :3], x[..., 3:]
-    first = F.normalize(a, dim=-1)
-    second = F.normalize(b - (first * b).sum(dim=-1, keepdim=True) * first, dim=-1)
-    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)

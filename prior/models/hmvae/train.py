@@ -15,8 +15,8 @@ from torch import Tensor
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.models.hmvae.config import HMVAEConfig
-from steadypose.prior.models.hmvae.network import HMVAE, MotionVAE, from_6d, to_6d
-from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
+from steadypose.prior.models.hmvae.network import HMVAE, MotionVAE
+from steadypose.prior.models.layers.torch_kinematics import forward_kinematics, from_6d, to_6d
 from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES

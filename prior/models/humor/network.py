@@ -26,6 +26,7 @@ from steadypose.prior.models.humor.state import (
     placed,
     posed,
 )  # fmt: skip
+from steadypose.prior.models.layers.torch_kinematics import from_6d
 
 GROUPS = 16
 """of the group normalisation"""
@@ -155,7 +156,7 @@ class HumorNet(nn.Module):
         pose, logits = output[..., :POSE], output[..., POSE:]
         mean, scale = self.mean[:POSE], self.scale[:POSE]
         pose = pose * scale + mean
-        return posed(state, pose[..., :3], _orthonormal(pose[..., 3:]), offsets), logits
+        return posed(state, pose[..., :3], from_6d(pose[..., 3:].unflatten(-1, (JOINT_COUNT, 6))), offsets), logits
 
     def step(self, state: State, latent: Tensor, offsets: Tensor) -> tuple[State, Tensor]:
         """The next states of any states (...) with these latents (..., latent), and logits of contacts (..., 16)."""
@@ -201,11 +202,3 @@ class _Groups(nn.GroupNorm):
 def _gaussian(output: Tensor) -> Gaussian:
     mean, log_variance = output.chunk(2, dim=-1)
     return Gaussian(mean, log_variance.clamp(*LOG_VARIANCES))
-
-
-def _orthonormal(columns: Tensor) -> Tensor:
-    """Rotations (..., 22, 3, 3) of two columns each (..., 132), by Gram and Schmidt."""
-    first, second = columns.unflatten(-1, (JOINT_COUNT, 2, 3)).unbind(dim=-2)
-    first = nn.functional.normalize(first, dim=-1)
-    second = nn.functional.normalize(second - (first * second).sum(dim=-1, keepdim=True) * first, dim=-1)
-    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)

@@ -1,4 +1,4 @@
-"""Forward kinematics with gradients, for training; without: `prior.body.kinematics`."""
+"""Forward kinematics and rotations as networks have them, with gradients; without: `prior.body.kinematics`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from steadypose.prior.body.kinematics import LEVELS
 from steadypose.prior.body.skeleton import PARENTS
@@ -34,3 +35,16 @@ def forward_kinematics(rotations: Tensor, offsets: Tensor, root: Tensor | None =
         positions.append(positions[-1][..., parents, :] + (orientation @ offsets[..., level, :, :]).squeeze(-1))
         orientations.append(orientation @ rotations[..., level, :, :])
     return torch.cat(positions, dim=-2), torch.cat(orientations, dim=-3)
+
+
+def to_6d(rotations: Tensor) -> Tensor:
+    """(..., 3, 3) rotation matrices to (..., 6): first column, then second."""
+    return rotations[..., :2].transpose(-1, -2).flatten(-2)
+
+
+def from_6d(x: Tensor) -> Tensor:
+    """(..., 6) to rotation matrices (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019)."""
+    a, b = x[..., :3], x[..., 3:]
+    first = F.normalize(a, dim=-1)
+    second = F.normalize(b - (first * b).sum(dim=-1, keepdim=True) * first, dim=-1)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)

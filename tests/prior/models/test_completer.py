@@ -16,13 +16,13 @@ from tests.helpers.bodies import random_pose, waving
 
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
+from steadypose.prior.body.kinematics import rotation_matrices
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.models.completer.config import FEATURES, CompleterConfig
 from steadypose.prior.models.completer.features import (
     anchored,
     draw_line,
     read_window,
-    rotation_matrices,
     solved_rotations,
 )
 from steadypose.prior.models.completer.inference import LiveCompleter

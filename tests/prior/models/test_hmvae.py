@@ -13,10 +13,10 @@ from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.clean.refine import rotations_of
 from steadypose.prior.models.hmvae.config import HMVAEConfig
 from steadypose.prior.models.hmvae.inference import LiveHMVAE
-from steadypose.prior.models.hmvae.network import HMVAE, Posterior, from_6d, to_6d
+from steadypose.prior.models.hmvae.network import HMVAE, Posterior
 from steadypose.prior.models.hmvae.train import SHORT, train_hmvae
 from steadypose.prior.models.layers.skeleton_conv import SkeletonConv
-from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
+from steadypose.prior.models.layers.torch_kinematics import forward_kinematics, from_6d, to_6d
 from steadypose.prior.models.torch_weights import arrays_of, load_tensors
 from steadypose.prior.models.training import TrainingOptions
 from steadypose.prior.models.weights_io import WEIGHTS, load_weights

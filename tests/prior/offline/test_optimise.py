@@ -6,13 +6,15 @@ import numpy as np
 import torch
 from tests.helpers.bodies import waving
 
+from steadypose.prior.body.kinematics import rotation_matrices
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.models.completer.config import CompleterConfig
-from steadypose.prior.models.completer.features import rotation_matrices, solved_rotations
+from steadypose.prior.models.completer.features import solved_rotations
 from steadypose.prior.models.completer.inference import LiveCompleter
 from steadypose.prior.models.completer.network import Completer
 from steadypose.prior.models.hmvae.config import HMVAEConfig
-from steadypose.prior.models.hmvae.network import HMVAE, to_6d
+from steadypose.prior.models.hmvae.network import HMVAE
+from steadypose.prior.models.layers.torch_kinematics import to_6d
 from steadypose.prior.models.torch_weights import arrays_of
 from steadypose.prior.offline import optimise
 from steadypose.prior.offline.optimise import Optimiser
