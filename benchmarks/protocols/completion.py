@@ -1,7 +1,7 @@
-"""A part of the body from the rest, that nobody sees for the whole of a window: legs, arms, all but a few joints.
+"""Parts of the body that are hidden for a whole window, from the rest: legs, arms, all but a few joints.
 
-Beside the nearest training window and what HG-VAE's completion, which the live node uses, makes of the same. Joints are
-compared about the root, which is known; windows are of 50 frames, as HG-VAE has them.
+Peers are the mean pose, the nearest training window, and HG-VAE's completion, which the live node uses. Joints are
+compared about the root, which is known; windows are of 50 frames, as HG-VAE's.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ HIDDEN: Mapping[str, list[int]] = {
         joint for joint, name in enumerate(JOINTS) if not name.endswith(("pelvis", "head", "wrist", "ankle", "spine3"))
     ],
 }
-"""What is hidden, by name."""
+"""Hidden joints, by name."""
 
 _NETWORK = "complete"
 
@@ -72,7 +72,7 @@ def run(bench: Bench) -> Result:
         )
 
     methods: dict[str, Callable[[Floats, list[int]], Floats]] = {
-        "mean pose": by(usual(completer)),
+        "mean pose": by(mean_pose(completer)),
         "nearest training window": lambda given, hidden: nearest(given, yaw, hidden),
         "HG-VAE's completion": lambda given, hidden: by_hgvae(hgvae, given, clips.offsets),
         "transformer alone": by(completer),
@@ -108,8 +108,8 @@ def run(bench: Bench) -> Result:
     return Result([_table(records, ratios, len(clips.offsets))], data)
 
 
-def usual(completer: LiveCompleter) -> Fill:
-    """What is hidden as it usually is, on bones that hang from what is known."""
+def mean_pose(completer: LiveCompleter) -> Fill:
+    """What is hidden in the mean pose, on the person's bones."""
 
     def fill(positions: Floats, offsets: Floats) -> tuple[Floats, Floats]:
         window = read_window(positions, offsets, completer.usual)
@@ -122,7 +122,7 @@ def usual(completer: LiveCompleter) -> Fill:
 
 @torch.inference_mode()
 def by_hgvae(model: HGVAE, given: Floats, offsets: Floats) -> Floats:
-    """Windows (C, T, 22, 3), NaN where hidden, completed by the network that HG-VAE begins from."""
+    """Windows (C, T, 22, 3) metres, NaN where hidden, by HG-VAE's completion network; offsets (C, 22, 3) metres."""
     sizes = body_size(offsets)
     tracks = to_tracks(given, sizes)
     hung = standardise(model, tracks.x)

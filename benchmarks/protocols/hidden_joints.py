@@ -1,7 +1,7 @@
 """Hidden joints: below 0.9 m (HuMoR's occlusion), an arm behind the trunk, and limbs away for 0.2 to 2 seconds.
 
-Seen joints carry 1 cm of noise. Each clip begins with half a second in which everything is seen: a joint that has
-never been seen is no question to ask a filter. HuMoR scores 43 points on the body's surface; these are 22 joints.
+Seen joints carry 1 cm of noise. Each clip begins with half a second in which everything is seen: a filter
+has no answer for a joint never seen. HuMoR scores 43 points on the body's surface; these are 22 joints.
 """
 
 from __future__ import annotations

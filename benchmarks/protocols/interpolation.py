@@ -2,8 +2,8 @@
 
 The protocol of LAFAN1 (Harvey et al. 2020) on our motion, with its figures: L2Q of global rotations, L2P of global
 joints by the deviation that each has in training, NPSS. LAFAN1 itself is not our data, and its figures are of other
-motion on another skeleton; what can be compared is a method's share of slerp's and lerp's. Beside the gaps, paths: of
-wrists and ankles (figure 4), and of the root (figure 5), as it is drawn, completed, and read from the body's motion.
+motion on another skeleton; what can be compared is the ratio to slerp's and lerp's. Also paths: of wrists and ankles
+(figure 4), and of the root (figure 5): interpolated, completed, and integrated from the body's motion.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ _FOOT_JOINTS = [CONTACT_JOINTS[k] for k in _FEET]
 
 
 class Truth(NamedTuple):
-    """Clips as they were; the gap is known to whoever scores.
+    """C clips of T frames, with the gap to be filled.
 
     Attributes:
         positions: (C, T, 22, 3) metres.
         rotations: (C, T, 22, 3, 3) local.
-        offsets: (C, 22, 3)
-        contacts: (C, T, 8)
-        gap: frames of it.
+        offsets: (C, 22, 3) metres, bones.
+        contacts: (C, T, 8) of `CONTACT_JOINTS`.
+        gap: its frames.
     """
 
     positions: Floats
@@ -60,7 +60,7 @@ class Truth(NamedTuple):
 
     @classmethod
     def of(cls, clips: MotionClips, gap: int) -> Truth:
-        """The first frames of clips, joints on their bones."""
+        """The first frames of clips, with joints placed by forward kinematics."""
         rows = slice(0, BEFORE + gap + AFTER)
         rotations = clips.rotations[rows].swapaxes(0, 1)
         joints = place_joints(rotations, clips.offsets[:, None]) + clips.positions[rows].swapaxes(0, 1)[:, :, :1]
@@ -69,7 +69,7 @@ class Truth(NamedTuple):
 
     @property
     def given(self) -> Floats:
-        """The joints without the gap's."""
+        """(C, T, 22, 3) metres, the joints, NaN in the gap."""
         given = self.positions.copy()
         given[:, self.gap] = np.nan
         return given
@@ -109,7 +109,7 @@ def run(bench: Bench) -> Result:
 
 
 def place_deviation(train: MotionSet, windows: int = 4000) -> Floats:
-    """(22, 3) metres: how far joints are spread over training windows, seen from where the root faces before a gap."""
+    """(22, 3) metres: standard deviations of joints over training windows, in the root's frame before a gap."""
     rows = train.all_windows(FRAMES, 7)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, windows).round().astype(int))]
     joints = train.positions[rows].double().numpy()
@@ -119,7 +119,14 @@ def place_deviation(train: MotionSet, windows: int = 4000) -> Floats:
 
 
 def measure(truth: Truth, rotations: Floats, root: Floats, deviation: Floats) -> dict[str, Any]:
-    """The figures of an answer (C, T, 22, 3, 3) and (C, T, 3) within the gap; motion is compared across its ends."""
+    """Figures of an answer in the gap; accelerations across its ends.
+
+    Args:
+        truth: C clips of T frames.
+        rotations: (C, T, 22, 3, 3) local, the answer's.
+        root: (C, T, 3) metres, the answer's.
+        deviation: (22, 3) metres, as of `place_deviation`, by which L2P is normalised.
+    """
     joints = place_joints(rotations, truth.offsets[:, None]) + root[:, :, None]
     gap = truth.gap
     around = slice(gap.start - 2, gap.stop + AFTER)
@@ -157,7 +164,7 @@ def measure(truth: Truth, rotations: Floats, root: Floats, deviation: Floats) ->
 
 
 def relate(records: list[dict[str, Any]]) -> None:
-    """To each record, its share of what slerp and lerp err, and of the truth's acceleration."""
+    """Add to each record the ratios of its errors to slerp's and lerp's, and of its acceleration to the truth's."""
     for record in records:
         line, true = (
             next(r for r in records if r["gap"] == record["gap"] and r["method"] == name)
@@ -169,7 +176,7 @@ def relate(records: list[dict[str, Any]]) -> None:
 
 
 def root_paths(clips: MotionClips, completer: LiveCompleter) -> list[dict[str, Any]]:
-    """How far the root is off in gaps: on a line, completed, and read from the motion of a body completed or true."""
+    """Errors of the root in gaps: by lerp, completed, and integrated from the motion of the completed or true body."""
     network = LiveRootVelocity.load("default")
     records = []
     for gap in GAPS:
@@ -239,7 +246,7 @@ KEY_FRAMES = (30, 15, 5)
 
 
 def draw_paths(bench: Bench, completer: LiveCompleter) -> Figure:
-    """Left wrist and right ankle about the root, from the side, of the clip that goes farthest: key frames, filled."""
+    """Left wrist and right ankle about the root, from the side, of the farthest travelling clip, by key frames."""
     clip = bench.clips(91, 24).farthest(1)
     rotations, offsets = clip.rotations[:, 0], clip.offsets[0]
     true = place_joints(rotations, offsets)

@@ -26,13 +26,12 @@ def complete(
 ) -> int:
     """Complete recorded poses: motion between key frames, and the parts of a body that nobody saw.
 
-    What is missing is what the input leaves out: joints that are NaN or of confidence 0, in any frames; and frames that
-    it does not have, between stamps more than 1/20 s apart. What is there stays as it is, so clean a noisy recording
-    first: steadypose clean IN CLEAN. OUT has a frame every 1/30 s, from the first stamp to the last, and where the
-    input has others, is interpolated between them;
-    joints that were completed have the state IMPUTED, and a standard deviation that grows with the time from the next
-    sighting. Gaps of up to two seconds are filled with motion like people's; in longer ones it is less and less theirs,
-    and after 8 s without any joint a new stretch begins.
+    Missing are joints that are NaN or of confidence 0, in any frame, and frames between stamps more than 1/20 s apart.
+    What is there stays as it is, so clean a noisy recording first: steadypose clean IN CLEAN. OUT has a frame every
+    1/30 s from the first stamp to the last, interpolated where the input has other stamps. Completed joints have the
+    state IMPUTED, and a standard deviation that grows with the time to the nearest sighting. In gaps of up to two
+    seconds the motion is like people's; in longer ones it is less so, and after 8 s without any joint a new stretch
+    begins.
 
     Where the pelvis lies at the origin all the time, as in many files of poses lifted from images, the way over the
     floor is read from the motion of the body; world_positions, or pose/world, have it.
@@ -66,7 +65,7 @@ def complete(
     from steadypose.nodes.commands.completing import complete_recording
     from steadypose.prior.models.completer.inference import LiveCompleter
     from steadypose.prior.offline.parts import PartsCompleter
-    from steadypose.prior.offline.sigma import Doubt
+    from steadypose.prior.offline.sigma import Uncertainty
 
     try:
         completer = LiveCompleter.load(weights)
@@ -84,7 +83,7 @@ def complete(
             source,
             out,
             fill,
-            Doubt(completer.config.never_sigma, completer.config.half_frames),
+            Uncertainty(completer.config.never_sigma, completer.config.half_frames),
             replace=force,
             began=lambda frames: progress.update(bar, total=frames),
             advanced=lambda frame: progress.update(bar, completed=frame),

@@ -31,7 +31,7 @@ from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, finite_joints
 from steadypose.prior.models.root_velocity.inference import LiveRootVelocity
 from steadypose.prior.offline.complete import Completed, Fill, complete
 from steadypose.prior.offline.root_path import is_root_centred, root_path
-from steadypose.prior.offline.sigma import Doubt
+from steadypose.prior.offline.sigma import Uncertainty
 from steadypose.prior.timing.resample import PERIOD_NS
 from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
 
@@ -106,7 +106,7 @@ def complete_recording(
     source: Path,
     out: Path,
     fill: Fill,
-    doubt: Doubt,
+    uncertainty: Uncertainty,
     *,
     replace: bool = False,
     began: Callable[[int], None] = lambda frames: None,
@@ -118,7 +118,7 @@ def complete_recording(
         source: a recording or file of poses.
         out: the recording to make, or .npz.
         fill: a completer.
-        doubt: how sure to be of what it gives.
+        uncertainty: how sure to be of what it gives.
         replace: whether what is at ``out`` may be replaced, if it is a recording or an .npz.
         began: called with the number of frames of all bodies together.
         advanced: called with how many of them are done.
@@ -148,7 +148,7 @@ def complete_recording(
         before += len(stretch.given)
         advanced(before)
     centred = sorted({s.body for s, _ in done if is_root_centred(s.given)})
-    clean = _clean_messages(raws, done, doubt, anchor)
+    clean = _clean_messages(raws, done, uncertainty, anchor)
     world = TrajectoryPipeline(TrajectorySettings())
     paths = _paths(done, centred)
     answers: list[tuple[str, Message]] = []
@@ -247,7 +247,7 @@ def _check_size(body: int, offsets: Floats) -> None:
 
 
 def _clean_messages(
-    raws: list[PoseRaw], done: list[tuple[Stretch, Completed]], doubt: Doubt, anchor_ns: int
+    raws: list[PoseRaw], done: list[tuple[Stretch, Completed]], uncertainty: Uncertainty, anchor_ns: int
 ) -> list[PoseClean]:
     """``pose/clean`` of every frame of the grid on which there is a body, in the frames in which these were seen."""
     bodies: dict[int, list[CleanBody]] = defaultdict(list)
@@ -259,7 +259,7 @@ def _clean_messages(
         return ordered[max(int(at), 0)]
 
     for stretch, completed in done:
-        sigma = doubt.of(stretch.given)
+        sigma = uncertainty.of(stretch.given)
         lengths = np.linalg.norm(stretch.offsets, axis=-1) * (np.array(PARENTS) >= 0)
         for row in np.flatnonzero(finite_joints(completed.positions).all(axis=1)):
             frame = stretch.first + int(row)

@@ -40,18 +40,18 @@ def fit(
 ) -> int:
     """Fit a motion to a recording, with all of it in view: what `clean` cannot do while frames come in.
 
-    Starts from what `clean` says, and moves poses, bones and floor until joints lie where they were seen, every step is
-    one that people take, and feet that stand stay where they are (HuMoR). Takes seconds for a second of a body; what
-    is done is kept, so that the same call goes on where it was stopped. Where a fit fails, what `clean` said stays,
-    flagged as an anomaly.
+    Starts from the answer of `clean`, and optimises poses, bones and floor until joints lie where they were seen, steps
+    are likely ones of people, and feet in contact stand still (HuMoR). Takes seconds for a second of a body; finished
+    windows are kept, so that the same call goes on where it was stopped. Where a fit fails, the answer of `clean`
+    stays, flagged as an anomaly.
 
     An .npz may hold, instead of positions, what one camera saw of one person: `keypoints` (T, J, 2) pixels, skeleton,
     fps or stamp_ns, `focal` and `centre` in pixels, and where known confidence (T, J), `up` (-y, a level camera, unless
     given) and `camera_height` in metres. Beside either, `points` (T, N, 3) metres of the body's surface, in the same
     frame, from a depth camera.
 
-    Beside OUT lie OUT's name with .misfit.npz, what stays unexplained of each joint and frame, with bones and ground,
-    and with .fit.png, a picture of it.
+    Beside OUT lie OUT.misfit.npz, the residual of each joint and frame, with bones and ground, and OUT.fit.png, a
+    picture of it.
 
     Args:
         source: a recording, a .csv or .npz, as for `clean`; or an .npz with key points.
@@ -97,7 +97,7 @@ def fit(
 def _fit_poses(
     source: Path, out: Path, model: Any, folder: Path, delay: int, progress: Progress
 ) -> tuple[int, list[str]]:
-    """Of joints in space, by way of the nodes' own pipelines."""
+    """Fit joints in space, from the answer of the nodes' own pipelines; the frames, and lines to print."""
     from steadypose.nodes.graph.prior_node import make_prior
     from steadypose.nodes.graph.trajectory_node import make_trajectory
     from steadypose.prior.offline.solve import FitSettings
@@ -144,7 +144,7 @@ def _line(fit: Fit) -> str:
 def _fit_picture(
     source: Path, out: Path, model: Any, folder: Path, delay: int, progress: Progress
 ) -> tuple[int, list[str]]:
-    """Of key points."""
+    """Fit key points of one camera; the frames, and lines to print."""
     from steadypose.prior.offline.solve import FitSettings
     from steadypose.prior.offline.windows import LEAST_FRAMES, window_bounds
 
@@ -164,7 +164,7 @@ def _fit_picture(
 
 
 def _points(source: Path, frames: int) -> Floats | None:
-    """(T, N, 3) metres of an .npz that has points of the surface."""
+    """(T, N, 3) metres, points of the surface, of an .npz that has them."""
     if source.suffix != ".npz":
         return None
     with np.load(source, allow_pickle=False) as file:
@@ -179,7 +179,7 @@ def _points(source: Path, frames: int) -> Floats | None:
 
 
 def _added(arrays: dict[str, NDArray[Any]], track: Any) -> dict[str, NDArray[Any]]:
-    """With what belongs to one person and the place: of several, .misfit.npz has it for each."""
+    """With bones and ground, where there is one person; of several, .misfit.npz has them for each."""
     bones = np.linalg.norm(track.offsets.mean(axis=0), axis=-1)
     return arrays | {"bone_lengths": bones, "ground_plane": ground_plane(track.ground.mean(axis=0))}
 
@@ -191,7 +191,7 @@ def _write(
     stamps: NDArray[np.int64],
     fits: Sequence[Fit],
 ) -> None:
-    """The output is there whole, or not at all."""
+    """Write the output whole, or not at all."""
     part = folder / out.name
     if out.suffix == ".npz":
         collector = NpzCollector()
@@ -215,7 +215,7 @@ def _write(
 
 
 def _explain(out: Path, fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit: str) -> None:
-    """What stays unexplained, as arrays and as a picture."""
+    """Write the residuals, as arrays and as a picture."""
     arrays: dict[str, Any] = {"joint_names": np.array(JOINTS), "unit": np.array(unit)}
     for number, (body, stamps, misfit, track) in enumerate(fits):
         arrays |= {f"{number}/body_id": np.array(body), f"{number}/stamp_ns": stamps, f"{number}/misfit": misfit}

@@ -1,4 +1,4 @@
-"""Occluded joints: where each is, of what the smoother, the completion network and its place beside the body say."""
+"""Occluded joints: each a weighted mean of the smoother's, the completion network's and the held position."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.clean.frame import Bools, Floats
-from steadypose.prior.models.occlusion.candidates import FEATURES, describe, forget, look, new_past
+from steadypose.prior.models.occlusion.candidates import FEATURES, describe, forget, new_past, observe
 from steadypose.prior.models.occlusion.inference import LiveOcclusion, Occluded, Weighed
 
 Weigher = Callable[[Occluded], Weighed]
 
 
 class OccludedJoints:
-    """Weighs the accounts of every body's occluded joints. Frames are to be given in order.
+    """Estimates every body's occluded joints. Frames are to be given in order.
 
     Attributes:
-        weigher: who weighs them; training puts one there that remembers what it was asked.
+        weigher: of the candidates; training replaces it by one that records them.
     """
 
     def __init__(self, weights: str, slots: int) -> None:
@@ -40,30 +40,32 @@ class OccludedJoints:
         completed: Floats,
         completed_sigma: Floats | None,
     ) -> tuple[Occluded, Weighed] | None:
-        """Which joints of B bodies are occluded, and where they are; None if there are none.
+        """The occluded joints of B bodies, and their estimates; None if there are none.
 
-        Of a frame that was lost whole, and of joints never seen, nothing is said.
+        A joint is occluded if another of its body was seen since: a frame that was lost whole occludes none. Joints
+        never seen are left out.
 
         Args:
-            slots: (B,) whose.
+            slots: (B,) of the bodies.
             seen: (B, 22, 3) metres, of the smoother; NaN of joints never seen.
-            sigma: (B, 22) metres, along an axis; inf of those.
-            unseen_s: (B, 22) seconds.
-            again: (B, 22) whether they are seen again, in a frame that has come already.
+            sigma: (B, 22) metres along an axis, of the smoother; inf of joints never seen.
+            unseen_s: (B, 22) seconds since each was last seen.
+            again: (B, 22) whether it is seen again within the delay.
             completed: (B, 22, 3) metres, by the completion network.
-            completed_sigma: (B, 22) metres; None where nothing is completed.
+            completed_sigma: (B, 22) metres along an axis; None where nothing is completed.
         """
         held = np.empty_like(seen)
-        _look(self._past, slots, seen, sigma, unseen_s, held)
+        _observe(self._past, slots, seen, sigma, unseen_s, held)
         if completed_sigma is None:
             return None
         occluded = (unseen_s > unseen_s.min(axis=1, keepdims=True)) & np.isfinite(
             unseen_s + sigma + completed_sigma + held[..., 0] + completed[..., 0]
         )
-        body, joint = (np.ascontiguousarray(index) for index in np.nonzero(occluded))  # else another loop for many
+        # contiguous, as one loop is compiled for each memory layout
+        body, joint = (np.ascontiguousarray(index) for index in np.nonzero(occluded))
         if not len(body):
             return None
-        candidates = np.stack([account[body, joint] for account in (seen, completed, held)], axis=1)
+        candidates = np.stack([positions[body, joint] for positions in (seen, completed, held)], axis=1)
         features = np.empty((len(body), FEATURES), dtype=np.float32)
         _describe(self._past, slots, body, joint, candidates, sigma, completed_sigma, unseen_s, again, features)
         rows = Occluded(body, joint, candidates, features)
@@ -71,9 +73,9 @@ class OccludedJoints:
 
 
 @njit(cache=True)
-def _look(past, slots, seen, sigma, unseen_s, held):
+def _observe(past, slots, seen, sigma, unseen_s, held):
     for row, slot in enumerate(slots):
-        look(past, slot, seen[row], sigma[row], unseen_s[row], held[row])
+        observe(past, slot, seen[row], sigma[row], unseen_s[row], held[row])
 
 
 @njit(cache=True)

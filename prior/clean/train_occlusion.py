@@ -1,7 +1,7 @@
 """Training of the occlusion network: ``steadypose train occlusion --data MOCAP``, resumable.
 
-Clips of true motion go through simulated sensors, lose joints, and go through the pipeline itself; what its steps say
-of the occluded joints, and how far each is off, is what the network learns from.
+Clips of true motion go through simulated sensors, lose joints, and go through the pipeline itself. The candidates and
+features of its occluded joints, with the truth, are the training data.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ ITERATIONS, BATCH, LEARNING_RATE = 3_000, 4096, 3e-3
 """Occluded joints a step; AdamW's rate at the start, which falls along a cosine."""
 
 FRAMES, CLIPS = 120, 64
-"""of a clip, and clips side by side"""
+"""Frames of a clip, and clips of a run, side by side as bodies."""
 
 RECORDED = {"train": 40, "val": 8}
-"""How many times so many clips go through the pipeline."""
+"""Runs of the pipeline for each split."""
 
 ROWS = 40_000
-"""of each, at most"""
+"""Occluded joints kept of a run, at most."""
 
 SEEN_FIRST = 8, 40
-"""Frames in which all is seen, of clips that lose what is below or on one side."""
+"""Range of the frames before anything is hidden, of clips that lose what is below or on one side."""
 
 DELAYS = (0, 0, 2, 4, 4, 8, 16)
 
 LEAST_MM, DEVIATION = 30.0, 0.02
-"""Added to what the best account is off by, before it divides; and weight of the likelihood of the errors."""
+"""Added to the best candidate's error, by which errors are divided; and weight of the likelihood."""
 
 _ARMS, _LEGS = limbs(("shoulder", "elbow", "wrist")), limbs(("knee", "ankle", "foot"))
 _OCCLUSIONS: tuple[tuple[float, list[int]], ...] = (
@@ -68,12 +68,19 @@ _OCCLUSIONS: tuple[tuple[float, list[int]], ...] = (
     (1.0, [J["left_wrist"]]),
     (1.0, [joint for name, joint in J.items() if joint > J["spine2"] or name == "spine2"]),
 )  # fmt: skip
-"""Joints that are away together, and how often."""
+"""Joints that are hidden together, with their relative frequency."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Occluded joints: (N, ...) `Occluded`'s features and joint, candidates and truth beside the first candidate."""
+    """N occluded joints.
+
+    Attributes:
+        features: (N, `FEATURES`).
+        joint: (N,) its index.
+        candidates: (N, 3, 3) metres from the first candidate.
+        truth: (N, 3) metres, likewise.
+    """
 
     features: NDArray[np.float32]
     joint: NDArray[np.int64]
@@ -82,8 +89,10 @@ class Rows:
 
 
 def occlusions(truth: Floats, rng: Rng) -> Bools:
-    """(T, C, 22) which joints of clips (T, C, 22, 3) are not seen: what is low, what is on one side, or limbs for a
-    tenth of a second to three."""
+    """(T, C, 22) which joints of clips (T, C, 22, 3) metres are hidden.
+
+    By chance 25 % of clips lose what is low, 15 % what is on one side, the others limbs for 2 to 100 frames.
+    """
     frames, clips = truth.shape[:2]
     hidden = np.zeros(truth.shape[:3], dtype=bool)
     shares = np.array([share for share, _ in _OCCLUSIONS])
@@ -110,7 +119,7 @@ def occlusions(truth: Floats, rng: Rng) -> Bools:
 
 
 class _Recorder:
-    """Stands in for the network, and remembers what it was asked of; what it answers is read by nobody."""
+    """Takes the network's place and records its inputs by frame; nothing reads its answers."""
 
     def __init__(self) -> None:
         self.frame = 0
@@ -122,7 +131,7 @@ class _Recorder:
 
 
 def record(sensors: Sensors, settings: PriorSettings, runs: int, seed: int, split: str) -> Rows:
-    """What the pipeline says of occluded joints, of so many ``runs`` of `CLIPS` clips."""
+    """Occluded joints of the pipeline, over so many ``runs`` of `CLIPS` clips."""
     found: list[tuple[Any, ...]] = []
     for run in track(range(runs), description=f"occlusions, {split}"):
         rng = np.random.default_rng((seed, run, split == "val"))
@@ -152,7 +161,7 @@ def record(sensors: Sensors, settings: PriorSettings, runs: int, seed: int, spli
 
 
 def loss_of(network: OcclusionNet, rows: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Of rows: what is to be minimised; the error of each, and of the best of its candidates, mm."""
+    """The loss of `Rows`; the error (N,) of each, and of the best of its candidates, mm."""
     weights, log_sigma = network(rows["features"], rows["joint"])
     off = 1e3 * ((weights[..., None] * rows["candidates"]).sum(dim=1) - rows["truth"])
     error = (off.square().sum(dim=-1) + 1.0).sqrt()
@@ -195,7 +204,7 @@ def train_occlusion(options: TrainingOptions) -> Path:
 
     run.minimise(loss_of_step, evaluate, BATCH, seed, clip=1.0)
     return run.save(path, model, asdict(model.config), {
-        "Model": "weights of three accounts of where an occluded joint is, and a deviation",
+        "Model": "weights of three candidates for an occluded joint's position, and its standard deviation",
         "Data": "as the mixture's, through simulated sensors, occlusions and the pipeline itself",
         "Licence": LICENCES[options.weights],
         "Training": f"`steadypose train occlusion --iterations {iterations}`: {BATCH} of {len(train['joint'])} "
@@ -204,7 +213,7 @@ def train_occlusion(options: TrainingOptions) -> Path:
 
 
 def _rows(directory: Path, untrained: OcclusionNet, split: str, seed: int) -> Rows:
-    """Of a split, recorded once: the weights of the pipeline's own network play no part in it."""
+    """Those of a split, recorded once, whatever the weights of the network under training."""
     path, weights = directory / f"rows-{split}.npz", directory / "untrained.safetensors"
     if not path.is_file():
         save_weights(weights, untrained, asdict(untrained.config), {})

@@ -1,8 +1,8 @@
 """Motion where there was none: between key frames, and of the parts of a body that nobody saw.
 
 What is known stays as it is, to the last bit. The rest comes from the completer, window by window
-(`prior.offline.views`), and is placed on the person's bones; what bones that are not quite constant leave between the
-two, a few millimetres, fades from one thing known to the next.
+(`prior.offline.views`), on the person's bones. Known joints are a few millimetres off these bones, which are not quite
+constant: the residual is interpolated from one known frame to the next.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
 Fill = Callable[[Floats, Floats], tuple[Floats, Floats]]
-"""What completes whole windows, as `LiveCompleter` does: positions (B, T, 22, 3) and bones (B, 22, 3) to local
-rotations (B, T, 22, 3, 3) and places of the root (B, T, 3)."""
+"""A completer of whole windows, such as `LiveCompleter`: positions (B, T, 22, 3), NaN where not known, and bones
+(B, 22, 3) to local rotations (B, T, 22, 3, 3) and positions of the root (B, T, 3); metres."""
 
 BENT = 0.02
-"""Metres from its bones at which a joint that is known pulls those above, which are not, so that these reach it."""
+"""Metres that a known joint is off its bones from which on the unknown joints above it are solved again to reach it."""
 
 
 @dataclass(frozen=True)
 class Completed:
-    """A body's motion, as far as it could be completed.
+    """A body's completed motion.
 
     Attributes:
-        positions: (T, 22, 3) metres, world, z up; NaN where too far from all that is known.
-        rotations: (T, 22, 3, 3) local.
+        positions: (T, 22, 3) metres, world, z up; NaN more than `LONGEST_GAP` frames before or after all that is known.
+        rotations: (T, 22, 3, 3) local; NaN likewise.
         known: (T, 22) which joints were given.
-        span: frames of the longest gap, before it was filled.
+        span: frames of the longest gap that was filled.
     """
 
     positions: Floats
@@ -55,7 +55,7 @@ def complete(
         fill: a completer.
         positions: (T, 22, 3) metres, z up, at 30 Hz; NaN where not known.
         offsets: (22, 3) metres, the person's bones.
-        advanced: called with the last frame of each window that is done.
+        advanced: called with the end of each window that is done.
 
     Raises:
         ValueError: no joint is known in any frame.
@@ -75,7 +75,7 @@ def complete(
 def _completed(
     fill: Fill, positions: Floats, offsets: Floats, advanced: Callable[[int], None]
 ) -> tuple[Floats, Floats]:
-    """Joints (T, 22, 3) and rotations (T, 22, 3, 3) of frames that are all near something known."""
+    """Joints (T, 22, 3) and rotations (T, 22, 3, 3) of frames that are all within `LONGEST_GAP` of a known one."""
     known = finite_joints(positions)
     bridged = _bridged(fill, positions, offsets)
     rotations, root = _filled(fill, bridged, offsets, advanced)
@@ -91,8 +91,7 @@ def _completed(
 
 
 def _faded(missed: Floats, known: Bools) -> Floats:
-    """How far joints (T, 22, 3) that are known were missed, for all: from one frame known to the next by lerp; a joint
-    never known is carried along by the one above."""
+    """Residuals (T, 22, 3) of known joints interpolated in time for all; a joint never known has its parent's."""
     line = draw_line(known[None])
     before, after = (np.take_along_axis(missed, rows[..., None], axis=0) for rows in (line.before[0], line.after[0]))
     weight = line.weight[0][..., None]
@@ -104,9 +103,9 @@ def _faded(missed: Floats, known: Bools) -> Floats:
 
 
 def _bridged(fill: Fill, positions: Floats, offsets: Floats) -> Floats:
-    """The same with frames put into gaps that are too long, so far apart that what is left between can be filled.
+    """Positions (T, 22, 3) with key frames put into gaps longer than `LONGEST_GAP`, so that those left are shorter.
 
-    They are found by filling the gap as if it were shorter: every so many-th frame of it and of what is around it.
+    The key frames come from the completer on every n-th frame of the gap and of what is around it.
     """
     bridged, frames = positions.copy(), len(positions)
     for gap in gaps(finite_joints(positions)):
@@ -128,7 +127,7 @@ def _bridged(fill: Fill, positions: Floats, offsets: Floats) -> Floats:
 def _filled(fill: Fill, positions: Floats, offsets: Floats, advanced: Callable[[int], None]) -> tuple[Floats, Floats]:
     """Rotations (T, 22, 3, 3) and root (T, 3) of all frames.
 
-    Where windows overlap, the sums of their rotations' first columns and of their places are taken, weighed.
+    Where windows overlap, the weighted means of their rotations' first two columns and of their roots are taken.
     """
     known = finite_joints(positions)
     frames = len(positions)

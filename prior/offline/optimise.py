@@ -1,8 +1,8 @@
 """Motion by search through HM-VAE (section 4, equations 14 and 15): latent vectors first, then the decoder too.
 
-The paper starts from random latent vectors; here they are those of the completer's answer. Mended, against the official
-code: losses are means over what is known and not diluted by what is not, the best iterate is kept and not the last, and
-the answer meets what is known without a step, where the official one overwrites key frames. It needs torch.
+The paper starts from random latent vectors; here they are those of the completer's answer. Unlike the official code,
+losses are means over what is known only, the best iterate is kept and not the last, and the answer meets what is known
+without a step, where the official one overwrites key frames. It needs torch.
 """
 
 from __future__ import annotations
@@ -43,22 +43,22 @@ JOINT_WEIGHT = 10.0
 """lambda_1 of equation 14."""
 
 STAY_WEIGHT = 1000.0
-"""lambda_2 of equation 15: of the mean square of how far each of the decoder's tensors has moved."""
+"""lambda_2 of equation 15: of the mean square change of each of the decoder's tensors."""
 
 AGREE_WEIGHT = 1.0
-"""Of the square of what windows that overlap differ by."""
+"""Of the mean square difference of windows where they overlap."""
 
 
 @dataclass(frozen=True)
 class _Known:
-    """What is known of W windows of T frames, turned as the windows are.
+    """What is known of W windows of T frames, in the windows' frames.
 
     Attributes:
-        columns: (W, T, 22, 6) of local rotations.
-        rotations: (W, T, 22, 1) 1 where known.
+        columns: (W, T, 22, 6) first two columns of local rotations.
+        rotations: (W, T, 22, 1) 1 where these are known, else 0.
         joints: (W, T, 22, 3) metres from the root.
-        places: (W, T, 22, 1) 1 where known.
-        offsets: (22, 3)
+        places: (W, T, 22, 1) 1 where these are known, else 0.
+        offsets: (22, 3) metres, bones.
     """
 
     columns: Tensor
@@ -68,7 +68,7 @@ class _Known:
     offsets: Tensor
 
     def loss(self, decoded: Tensor) -> Tensor:
-        """Equation 14 of windows (W, T, 22, 6); every term a mean over what is known."""
+        """Equation 14 for windows (W, T, 22, 6), each term a mean over what is known."""
         matrices = from_6d(decoded)
         joints, _ = forward_kinematics(matrices, self.offsets)
         count = self.rotations.sum().clamp(min=1.0)
@@ -83,8 +83,8 @@ class Optimiser:
 
     Args:
         model: whose windows are searched.
-        completer: gives the beginning, and the root.
-        seed: of random latent vectors to begin from, as in the paper, in place of those of the completer's answer.
+        completer: of the initial motion, and of the root.
+        seed: of random initial latent vectors, as in the paper; None: those of the completer's answer.
     """
 
     def __init__(self, model: HMVAE, completer: PartsCompleter, seed: int | None = None) -> None:
@@ -100,17 +100,14 @@ class Optimiser:
         return cls(load_network(HMVAE, HMVAEConfig.from_dict, weights, MODEL), completer, seed)
 
     def __call__(self, positions: Floats, offsets: Floats) -> tuple[Floats, Floats]:
-        """Whole windows: local rotations (B, T, 22, 3, 3) and places of the root (B, T, 3), metres.
-
-        The root's are the completer's. Arguments are those of `PartsCompleter`.
-        """
+        """As `PartsCompleter`: local rotations (B, T, 22, 3, 3), and the completer's root (B, T, 3), metres."""
         rotations, root = self._completer(positions, offsets)
         for window in range(len(positions)):
             rotations[window] = self._searched(positions[window], offsets[window], rotations[window])
         return rotations, root
 
     def _searched(self, positions: Floats, offsets: Floats, start: Floats) -> Floats:
-        """(T, 22, 3, 3) of one window, from the completer's answer."""
+        """Rotations (T, 22, 3, 3) of one window, from the completer's, ``start`` (T, 22, 3, 3)."""
         usual = rotation_matrices(self._completer.usual)
         solved, known = solved_rotations(positions, np.broadcast_to(offsets, positions.shape), usual)
         frames, length = len(positions), self._model.window
@@ -135,10 +132,10 @@ class Optimiser:
             some = rows[k][inside[k]]
             columns[some] += fade[inside[k], None, None] * window[inside[k]]
             total[some] += fade[inside[k]]
-        return self._met(columns / total[:, None, None], given, known)
+        return self._meeting_known(columns / total[:, None, None], given, known)
 
     def _search(self, begun: Tensor, seen: _Known, starts: NDArray[np.int64], back: Tensor) -> Tensor:
-        """The windows (W, T, 22, 6) that fit best of all that were tried."""
+        """The windows (W, T, 22, 6) of least loss over all iterations."""
         model = copy.deepcopy(self._model)  # phase two changes its decoder
         with torch.no_grad():
             posterior = model.encode(begun)
@@ -177,8 +174,8 @@ class Optimiser:
             schedule.step()
         return best
 
-    def _met(self, columns: Floats, given: Floats, known: NDArray[np.bool_]) -> Floats:
-        """Rotations (T, 22, 3, 3) of ``columns`` (T, 22, 6), moved so that they are those known where these are."""
+    def _meeting_known(self, columns: Floats, given: Floats, known: NDArray[np.bool_]) -> Floats:
+        """Rotations (T, 22, 3, 3) of ``columns`` (T, 22, 6), corrected in time so that known ones are as given."""
         line = draw_line(known[None])
         wanted = given[..., :2].swapaxes(-1, -2).reshape(columns.shape)
         off = np.where(known[..., None], wanted - columns, 0.0)[None]

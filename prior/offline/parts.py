@@ -1,5 +1,5 @@
-"""The completer with a second opinion of the parts of a body that are hidden: HG-VAE's completion, which was trained
-longer on that, but knows nothing of gaps in time.
+"""The completer blended with HG-VAE's completion where parts of a body are hidden: that was trained longer on these,
+but not on gaps in time.
 
 Where some joints of a frame are known and others not, the answer lies between the two; rotations are solved anew.
 """
@@ -21,11 +21,11 @@ from steadypose.prior.models.weights_io import load_weights, part
 Floats = NDArray[np.float64]
 
 SHARE = 0.8
-"""Of the second opinion, by validation (docs/experiments.md)."""
+"""Of HG-VAE's completion in the blend, by validation (docs/experiments.md)."""
 
 SMOOTH = 3.0
-"""Frames, standard deviation: what the opinions differ by is smoothed so much, for HG-VAE's completion shakes limbs
-that it does not see ten times as much as people move them."""
+"""Frames, standard deviation of the Gaussian that smooths the difference of the two: HG-VAE's completion gives hidden
+limbs ten times the acceleration of true ones."""
 
 _FIRM = 1e-6  # mobility of a joint that is known, beside 1 of one that is not
 
@@ -34,8 +34,8 @@ class PartsCompleter:
     """Completes windows as `LiveCompleter` does.
 
     Args:
-        completer: gives the first opinion.
-        weights: set of HG-VAE's.
+        completer: of gaps and parts.
+        weights: weight set of HG-VAE.
 
     Raises:
         FileNotFoundError: there are no such weights.
@@ -53,14 +53,11 @@ class PartsCompleter:
 
     @property
     def usual(self) -> Floats:
-        """(22, 4) quaternions, xyzw, of local rotations that are never known."""
+        """(22, 4) quaternions, xyzw, local, of the mean pose."""
         return self._completer.usual
 
     def __call__(self, positions: Floats, offsets: Floats) -> tuple[Floats, Floats]:
-        """Whole windows: local rotations (B, T, 22, 3, 3) and places of the root (B, T, 3), metres.
-
-        The arguments are those of `LiveCompleter`.
-        """
+        """As `LiveCompleter`: local rotations (B, T, 22, 3, 3) and positions of the root (B, T, 3), metres."""
         rotations, root = self._completer(positions, offsets)
         for row, (given, bones) in enumerate(zip(positions, offsets, strict=True)):
             known = finite_joints(given)
@@ -70,7 +67,7 @@ class PartsCompleter:
             first = place_joints(rotations[row], bones) + root[row][:, None]
             second = self._second(given, first, bones)
             joints = first + SHARE * gaussian_filter1d(second - first, SMOOTH, axis=0, mode="nearest")
-            # in a gap, of what is known beside it the completer alone tells
+            # in a gap, joints that are known beside it are the completer's alone
             asked = ~known & (partly[:, None] | ~known.any(axis=0))
             some = asked.any(axis=1)
             joints = np.where(known[..., None], given, np.where(asked[..., None], joints, first))[some]
@@ -79,9 +76,9 @@ class PartsCompleter:
         return rotations, root
 
     def _second(self, given: Floats, first: Floats, bones: Floats) -> Floats:
-        """(T, 22, 3) what HG-VAE's completion makes of a window (T, 22, 3), NaN where hidden.
+        """(T, 22, 3) HG-VAE's completion of a window ``given`` (T, 22, 3) metres, NaN where hidden.
 
-        In frames of which nothing is known it is told where the completer has the joints that it knows elsewhere.
+        In frames of which nothing is known, the joints known in other frames are given as in ``first`` (T, 22, 3).
         """
         known = finite_joints(given)
         blank = ~known.any(axis=1)

@@ -1,5 +1,5 @@
-"""The way of a body whose joints are known about its root only: the root velocity read from its motion, summed up
-(HM-VAE, section 3.3 and Figure 5)."""
+"""The root's path of a body whose joints are known about its root only: its velocity, read from the body's motion, is
+integrated (HM-VAE, section 3.3 and Figure 5)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from steadypose.prior.timing.rate import FPS
 Floats = NDArray[np.float64]
 
 STILL_M, MOVING_M = 1e-3, 0.03
-"""Metres: by how much less a root moves that is no more than the origin, and other joints at least."""
+"""Metres: extent of a root below which it is the origin of its coordinates, if another joint's is above the second."""
 
 _FEET = slice(2, 6)
 _EDGES = ((np.max, 1.0), (np.min, -1.0))
 
 
 def is_root_centred(positions: Floats) -> bool:
-    """Whether the pelvis of joints (T, 22, 3), NaN where unknown, lies in one place while others move about it."""
+    """Whether joints (T, 22, 3) metres, NaN where unknown, are about their pelvis: it stays while others move."""
     known = finite_joints(positions)
     if known[:, 0].sum() < FPS // 3:
         return False
@@ -33,21 +33,21 @@ def is_root_centred(positions: Floats) -> bool:
 
 
 def velocities(network: LiveRootVelocity, joints: Floats, root_rotations: Floats) -> Floats:
-    """(T, 3) m/s, world: how the root moves.
+    """(T, 3) m/s, world: velocities of the root.
 
     Args:
-        network: asked about every frame and those before it, of which the first is taken to have stood for long.
+        network: run on every frame with its context; before the first frame that is the first, repeated.
         joints: (T, 22, 3) metres from the root, z up.
-        root_rotations: (T, 3, 3)
+        root_rotations: (T, 3, 3) to the world.
     """
     turn = yaw_matrix(heading(root_rotations))
     rows = np.maximum(np.arange(len(joints))[:, None] + np.arange(1 - network.config.context, 1), 0)
-    said = network(joints[rows] @ turn[:, None])
-    return (turn @ said.velocity[..., None].astype(np.float64))[..., 0]
+    answer = network(joints[rows] @ turn[:, None])
+    return (turn @ answer.velocity[..., None].astype(np.float64))[..., 0]
 
 
 def root_path(network: LiveRootVelocity, joints: Floats, root_rotations: Floats) -> Floats:
-    """(T, 3) metres, world: where the root is that began over the origin, the lower foot always on the floor.
+    """(T, 3) metres, world: the root's path from above the origin, with the lower foot always on the floor.
 
     The arguments are those of `velocities`.
     """
@@ -59,12 +59,12 @@ def root_path(network: LiveRootVelocity, joints: Floats, root_rotations: Floats)
 
 
 def bridge(network: LiveRootVelocity, joints: Floats, root_rotations: Floats, ends: Floats) -> Floats:
-    """(K, 3) metres, world: the way through the last K frames but the first from one place to another; what the
-    velocities read miss the second by is taken back frame by frame.
+    """(K, 3) metres, world: the root's path over the last K frames between two known ends; the closing error of the
+    integrated velocities is spread evenly over the frames.
 
     Args:
         network, joints, root_rotations: of `velocities`, of T frames.
-        ends: (K, 3) metres, the first and the last row of which are known; up to the last of the T frames.
+        ends: (K, 3) metres, world, of the last K of the T frames; the first row and the last are known.
     """
     steps = velocities(network, joints, root_rotations)[-len(ends) :] * FRAME_S
     way = np.cumsum(steps, axis=0)

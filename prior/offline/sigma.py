@@ -1,4 +1,4 @@
-"""How sure to be of joints that were completed, and of those that were given."""
+"""Standard deviations of completed joints, and of those that were given."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from steadypose.prior.body.skeleton import finite_joints
 Floats = NDArray[np.float64]
 
 LEAST_SIGMA = 0.002
-"""Metres along an axis: no joint that was given is taken to be known better."""
-
+"""Metres along an axis: the least of a joint that was given."""
 
 LEAST_NEVER = 0.015
 """The same of a joint that was never given."""
 
 DRIFT, MOST_DRIFT, LONG = 0.0045, 0.14, 60.0
-"""Metres along an axis, a frame from the next in which the pelvis is known, and at most: how far a body is off in a gap
-of so many frames, and in shorter ones by as much less. Validation: root mean squares of up to 135 mm."""
+"""Drift of a body in a gap without the pelvis: metres along an axis a frame from the gap's nearer end, its maximum, and
+the frames of a gap from which on it is in full; in shorter ones it is in proportion. By validation people, where root
+mean squares reach 135 mm."""
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """Standard deviations along an axis of what the completer gives, as validation found them.
+class Uncertainty:
+    """Uncertainty of the completer's answers, as found on validation people.
 
     Attributes:
-        never: (22,) metres, of each joint that is known in no frame.
-        half: frames from something known at which it is half of that.
+        never: (22,) metres along an axis, standard deviation of each joint that is known in no frame.
+        half: frames from the nearest in which a joint is known at which it is half of that.
     """
 
     never: Sequence[float]
     half: float
 
     def of(self, given: Floats) -> Floats:
-        """(T, 22) metres, of joints (T, 22, 3) that are NaN where they were not given.
+        """(T, 22) metres along an axis, of joints (T, 22, 3) metres, NaN where not given.
 
-        A joint that was given is as uncertain as it jumps from frame to frame.
+        The noise of joints that were given is estimated from their second differences.
         """
         known = finite_joints(given)
         apart = frames_apart(known)
@@ -58,12 +58,12 @@ class Doubt:
 
 
 def frames_apart(known: NDArray[np.bool_]) -> Floats:
-    """(T, K) frames from the nearest in which each of (T, K) is known; infinite where none is."""
+    """(T, K) frames to the nearest one in which each is ``known`` (T, K); infinite where there is none."""
     return np.minimum(*frames_since_and_until(known))
 
 
 def frames_since_and_until(known: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """(T, K) frames from the last and to the next in which each of (T, K) is known; infinite where there is none."""
+    """(T, K) frames since the last and until the next one in which each is ``known`` (T, K); infinite where none."""
     at = np.arange(len(known), dtype=np.float64)[:, None]
     before = np.maximum.accumulate(np.where(known, at, -np.inf), axis=0)
     after = np.minimum.accumulate(np.where(known, at, np.inf)[::-1], axis=0)[::-1]

@@ -1,4 +1,4 @@
-"""Where a recording with holes is looked at: windows that see both ends of every gap and overlap between them."""
+"""Windows over a recording with gaps: each gap is inside a window with both its ends, and windows overlap."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
 LONGEST_GAP = 64
-"""Frames of a gap that the completer has learned to fill."""
+"""Frames of the longest gap that the completer was trained on."""
 
 AROUND = 7
-"""Frames about a gap that a window takes along, where they are known."""
+"""Frames of context that a window has on each side of a gap, where the recording has them."""
 
 LONGEST = LONGEST_GAP + 2 * AROUND
 """Frames of a window."""
@@ -27,7 +27,7 @@ class View(NamedTuple):
 
     Attributes:
         start: its first frame.
-        weight: (frames,) how much its answer counts beside those of the windows that overlap it.
+        weight: (frames,) of its answer, beside those of the windows that overlap it.
     """
 
     start: int
@@ -39,23 +39,23 @@ class View(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """Frames of which nothing is known, from ``start`` up to ``end``."""
+    """Frames ``start`` to ``end - 1``, of which nothing is known."""
 
     start: int
     end: int
 
 
 def gaps(known: Bools) -> list[Gap]:
-    """Runs of frames of which no joint (T, 22) is known."""
+    """Runs of frames in which no joint is ``known`` (T, 22)."""
     blank = np.concatenate([[False], ~known.any(axis=1), [False]]).astype(np.int8)
     return [Gap(*ends) for ends in zip(*(np.flatnonzero(np.diff(blank) == d) for d in (1, -1)), strict=True)]
 
 
 def views(known: Bools) -> list[View]:
-    """Windows over all frames of which a joint (T, 22) is not known; no gap may be longer than `LONGEST_GAP`.
+    """Windows over all frames with a joint that is not ``known`` (T, 22); no gap may be longer than `LONGEST_GAP`.
 
-    Gaps, and what lies between them if it is short, have windows of their own: only they see both ends. The rest is
-    looked at by windows that overlap by half.
+    Gaps, with what lies between them where that is short, have windows of their own, for both ends have to be inside.
+    The other frames have windows that overlap by half.
     """
     frames = len(known)
     own = np.zeros(frames)

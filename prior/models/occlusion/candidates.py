@@ -1,9 +1,9 @@
-"""Where an occluded joint may be, by three accounts, and what tells which to believe: training and live node share it.
+"""Candidates for the position of an occluded joint, and the features that weigh them: for training and live node.
 
-The smoother lets a joint coast, which is right for a foot that stands. The completion network places it as a body would
-have it, which is right for an arm that swings. And a joint may keep its place beside the nearest one that is seen,
-turned with the trunk, which is right for an arm that rests. `prior.models.occlusion.network` weighs the three by
-`FEATURES` numbers, which do not change when the body stands elsewhere or faces elsewhere.
+The smoother lets a joint coast, which is right for a foot that stands. The completion network places it from the rest
+of the body, which is right for an arm that swings. And a joint may keep its offset from the nearest joint seen, turned
+with the trunk, which is right for an arm that rests. `prior.models.occlusion.network` weighs the three by `FEATURES`
+numbers that are invariant to the body's position and heading.
 """
 
 from __future__ import annotations
@@ -21,37 +21,38 @@ from steadypose.prior.timing.rate import FPS
 Floats = NDArray[np.float64]
 
 CANDIDATES = 3
-"""Coasting, completed, held beside the body."""
+"""Coasting by the smoother, completed by the network, held beside the body."""
 
 FEATURES = 20
 """Of each occluded joint."""
 
 LEAST = 1e-3
-"""Metres: what is smaller than this is nothing, in logarithms."""
+"""Metres added to distances before their logarithm is taken."""
 LEAST_SIGMA = 1e-4
-"""metres, of deviations"""
+"""Metres, likewise, of standard deviations."""
 LEAST_SPEED = 0.02
-"""m/s"""
+"""m/s, likewise."""
 LEAST_HEIGHT = 0.01
-"""metres"""
+"""Metres, likewise, of heights above the lowest joint."""
 
 FADING = 0.4
 """Weight of the newest speed in the running mean."""
 
 NEAR = 1e-3
-"""Bones per metre: of joints as many bones away, the nearest in space."""
+"""Bones per metre: of joints as many bones away, the nearest in space is taken."""
 
 _MIRROR, _PARENT = np.asarray(MIRROR), np.maximum(PARENT, 0)
 _TRUNK = np.array([[J[f"{side}_{part}"] for side in ("left", "right")] for part in ("hip", "shoulder")])
 
 
 class Past(NamedTuple):
-    """What is kept of S bodies.
+    """State of S bodies.
 
     Attributes:
-        poses: (S, 22, 22, 3) metres, of each joint the pose, as held, of when it was last seen; NaN before.
+        poses: (S, 22, 22, 3) metres, for each joint the whole pose, as held, when it was last seen; NaN before.
         place: (S, 22, 3) metres, the joints of the last frame; NaN before.
-        speed: (S, 22) m/s, running mean; and ``speed_seen`` (S, 22), that of when the joint was last seen.
+        speed: (S, 22) m/s, running mean.
+        speed_seen: (S, 22) m/s, the same when the joint was last seen.
     """
 
     poses: Floats
@@ -61,7 +62,7 @@ class Past(NamedTuple):
 
 
 def new_past(slots: int) -> Past:
-    """Of bodies of which nothing was seen."""
+    """Of bodies of which nothing was seen so far."""
     past = Past(np.empty((slots, 22, 22, 3)), np.empty((slots, 22, 3)), np.empty((slots, 22)), np.empty((slots, 22)))
     forget(past, np.ones(slots, dtype=bool))
     return past
@@ -74,16 +75,16 @@ def forget(past: Past, slot: NDArray[np.bool_]) -> None:
 
 
 @njit(cache=True)
-def look(past, slot, positions, sigma, unseen_s, held):
-    """Take in a body's frame, and write where its occluded joints are if they keep their place beside the body.
+def observe(past, slot, positions, sigma, unseen_s, held):
+    """Update the state with a body's frame, and write its pose with occluded joints held beside those seen.
 
     Args:
         past: a `Past`.
-        slot: whose.
+        slot: of the body.
         positions: (22, 3) metres, of the smoother; NaN of joints never seen.
         sigma: (22,) metres, along an axis.
         unseen_s: (22,) seconds, 0 of a joint that is seen.
-        held: (22, 3) metres, written: joints seen as they are; NaN of joints never seen.
+        held: (22, 3) metres, written; NaN of joints never seen.
     """
     poses, joints = past.poses[slot], len(positions)
     seen = np.empty(joints, dtype=np.bool_)
@@ -109,7 +110,7 @@ def look(past, slot, positions, sigma, unseen_s, held):
 
 @njit(cache=True)
 def _hold(joint, then, positions, seen, held):
-    """Write where a joint is that keeps its place beside the nearest joint seen, as in the pose ``then`` (22, 3)."""
+    """Write a joint at its offset from the nearest joint seen in the pose ``then`` (22, 3), turned with the trunk."""
     nearest, least = -1, np.inf
     for other in range(len(seen)):
         if seen[other]:
@@ -117,7 +118,7 @@ def _hold(joint, then, positions, seen, held):
             for axis in range(3):
                 square += (then[joint, axis] - then[other, axis]) ** 2
             apart = BONES_BETWEEN[joint, other] + NEAR * math.sqrt(square)
-            if apart < least:  # never of what is not known
+            if apart < least:  # never, where `then` is NaN
                 nearest, least = other, apart
     if nearest < 0:
         for axis in range(3):
@@ -133,7 +134,7 @@ def _hold(joint, then, positions, seen, held):
 
 @njit(cache=True)
 def turned(then, now, seen):
-    """Radians about z by which hips and shoulders, those ``seen`` (22,), have turned from one pose to another."""
+    """Radians about z from pose ``then`` to ``now`` (22, 3), by the hips and shoulders that are ``seen`` (22,)."""
     a, b = np.zeros(2), np.zeros(2)
     for part in range(len(_TRUNK)):
         left, right = _TRUNK[part]
@@ -147,18 +148,18 @@ def turned(then, now, seen):
 
 @njit(cache=True)
 def describe(past, slot, joint, candidates, sigma, completed_sigma, unseen_s, again, features):
-    """Write the features (`FEATURES`,) of an occluded joint; after `look` at the same frame.
+    """Write the features (`FEATURES`,) of an occluded joint; after `observe` with the same frame.
 
     Args:
         past: a `Past`.
-        slot: whose.
-        joint: which.
+        slot: of the body.
+        joint: its index.
         candidates: (3, 3) metres, as `CANDIDATES` has them.
         sigma: (22,) metres, of the smoother.
         completed_sigma: metres, of the joint as it is completed.
         unseen_s: (22,) seconds.
-        again: whether it is seen again, in a frame that has come already.
-        features: float32, written.
+        again: whether it is seen again within the delay.
+        features: (`FEATURES`,) float32, written.
     """
     place, then = past.place[slot], past.poses[slot, joint]
     joints = len(place)
@@ -196,6 +197,6 @@ def describe(past, slot, joint, candidates, sigma, completed_sigma, unseen_s, ag
 
 @njit(cache=True)
 def _log_apart(a, b):
-    """Logarithm of the distance between two places (3,); of none, 0."""
+    """Logarithm of the distance between two positions (3,); 0 where one is NaN."""
     square = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
     return math.log(math.sqrt(square) + LEAST) if math.isfinite(square) else 0.0

@@ -1,4 +1,4 @@
-"""`OcclusionNet` as the live node asks it, without torch: row by row, so that no answer depends on the others."""
+"""`OcclusionNet` without torch, row by row, so that no answer depends on the others."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from steadypose.prior.models.weights_io import Arrays, load_weights
 
 Floats = NDArray[np.float64]
 
-OF_OTHERS = 1.1
-"""Times the deviation that the network states of people it was trained on: what people it has not seen are off, for
-0.2 s to four, 1.0 to 1.3 (validation)."""
+SIGMA_SCALE = 1.1
+"""Factor on the network's standard deviation, which holds for the people it was trained on: of others it is 1.0 to 1.3
+times too small, over occlusions of 0.2 s to 4 s (validation)."""
 
 
 class Occluded(NamedTuple):
     """N occluded joints of several bodies.
 
     Attributes:
-        body: (N,) whose.
-        joint: (N,) which.
+        body: (N,) row of the body.
+        joint: (N,) index of the joint.
         candidates: (N, 3, 3) metres, as `CANDIDATES` has them.
         features: (N, `FEATURES`) float32.
     """
@@ -36,10 +36,10 @@ class Occluded(NamedTuple):
 
 
 class Weighed(NamedTuple):
-    """Where they are.
+    """Estimates of N occluded joints.
 
     Attributes:
-        positions: (N, 3) metres.
+        positions: (N, 3) metres, in the frame of the candidates.
         sigma: (N,) metres, standard deviation along an axis.
     """
 
@@ -70,7 +70,7 @@ class LiveOcclusion:
         return cls(load_weights(weights, "occlusion")[0])
 
     def __call__(self, rows: Occluded) -> Weighed:
-        """The joints where their candidates, weighed, have them."""
+        """The weighted mean of each joint's candidates, and its standard deviation."""
         weighed = Weighed(np.empty((len(rows.joint), 3)), np.empty(len(rows.joint)))
         _weigh(rows.features, rows.joint, rows.candidates, *self._layers, weighed.positions, weighed.sigma)
         return weighed
@@ -103,4 +103,4 @@ def _weigh(features, joint, candidates, read, of_joint, think, think_bias, write
             positions[row, axis] = 0.0
             for c in range(CANDIDATES):
                 positions[row, axis] += out[c] / total * candidates[row, c, axis]
-        sigma[row] = OF_OTHERS * 1e-3 * np.exp(min(max(out[CANDIDATES], LEAST_LOG_SIGMA), MOST_LOG_SIGMA))
+        sigma[row] = SIGMA_SCALE * 1e-3 * np.exp(min(max(out[CANDIDATES], LEAST_LOG_SIGMA), MOST_LOG_SIGMA))

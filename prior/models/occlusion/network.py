@@ -1,7 +1,7 @@
-"""The network that weighs where an occluded joint may be: a mixture of three accounts, and how sure it is.
+"""The network that weighs the candidates for an occluded joint's position, and states a standard deviation.
 
-Stacked generalisation (Wolpert 1992): what to believe of several models is learned from how far each is off where it
-has to answer. The answer lies between the candidates, so that it cannot do great harm.
+Stacked generalisation (Wolpert 1992): the weights of several models are learned from their errors where they have to
+answer. A convex combination of the candidates is never farther off than the worst of them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from steadypose.prior.models.occlusion.form import LEAST_LOG_SIGMA, MOST_LOG_SIG
 JOINTS = 22
 
 FIRST_LOG_SIGMA = 4.0
-"""What training begins with, of millimetres."""
+"""Initial logarithm of the standard deviation in millimetres."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class OcclusionConfig:
 
 
 class OcclusionNet(nn.Module):
-    """Two layers, of which the first knows which joint it is."""
+    """Two hidden layers; the bias of the first is the joint's."""
 
     mean: Tensor
     deviation: Tensor

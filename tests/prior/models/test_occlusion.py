@@ -13,7 +13,7 @@ from steadypose.benchmarks.peers.beside import beside
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.occluded import OccludedJoints
 from steadypose.prior.models.occlusion.candidates import FEATURES
-from steadypose.prior.models.occlusion.inference import OF_OTHERS, LiveOcclusion, Occluded, Weighed
+from steadypose.prior.models.occlusion.inference import SIGMA_SCALE, LiveOcclusion, Occluded, Weighed
 from steadypose.prior.models.occlusion.network import OcclusionConfig, OcclusionNet
 from steadypose.prior.models.torch_weights import arrays_of
 
@@ -114,7 +114,7 @@ def test_live_form_gives_what_torch_gives_between_the_candidates() -> None:
         weights, log_sigma = network(torch.from_numpy(features), torch.from_numpy(joint))
     expected = np.einsum("nc,nca->na", weights.numpy().astype(float), rows.candidates)
     np.testing.assert_allclose(live.positions, expected, atol=1e-5)
-    np.testing.assert_allclose(live.sigma, OF_OTHERS * 1e-3 * np.exp(log_sigma.numpy()), rtol=1e-4)
+    np.testing.assert_allclose(live.sigma, SIGMA_SCALE * 1e-3 * np.exp(log_sigma.numpy()), rtol=1e-4)
     assert (live.positions <= rows.candidates.max(axis=1) + 1e-9).all()
     assert (live.positions >= rows.candidates.min(axis=1) - 1e-9).all()
 

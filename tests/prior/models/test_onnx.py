@@ -32,7 +32,7 @@ from steadypose.prior.models.mixture.bank import (
 )
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.models.occlusion.candidates import FEATURES as OCCLUSION_FEATURES
-from steadypose.prior.models.occlusion.inference import OF_OTHERS, LiveOcclusion, Occluded
+from steadypose.prior.models.occlusion.inference import SIGMA_SCALE, LiveOcclusion, Occluded
 from steadypose.prior.models.onnx.export import FORMS, export
 from steadypose.prior.models.root_velocity.inference import LiveRootVelocity
 from steadypose.prior.models.sensor_bias.features import HISTORY, features, trunk_frame
@@ -101,7 +101,7 @@ def test_occlusion() -> None:
     expected = LiveOcclusion.load("default")(rows)
     weights, sigma = answers("occlusion-default", features=features, joint=joint.astype(np.float32))
     np.testing.assert_allclose((weights[..., None] * rows.candidates).sum(axis=1), expected.positions, atol=1e-5)
-    np.testing.assert_allclose(OF_OTHERS * sigma, expected.sigma, rtol=1e-4)
+    np.testing.assert_allclose(SIGMA_SCALE * sigma, expected.sigma, rtol=1e-4)
 
 
 def test_refinement() -> None:

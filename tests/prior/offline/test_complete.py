@@ -14,7 +14,7 @@ from steadypose.prior.models.completer.inference import LiveCompleter
 from steadypose.prior.offline.complete import complete
 from steadypose.prior.offline.parts import PartsCompleter
 from steadypose.prior.offline.root_path import bridge, is_root_centred, root_path
-from steadypose.prior.offline.sigma import Doubt, frames_apart
+from steadypose.prior.offline.sigma import Uncertainty, frames_apart
 from steadypose.prior.offline.views import LONGEST, LONGEST_GAP, gaps, views
 
 LEGS = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
@@ -150,7 +150,7 @@ def test_doubt_grows_from_what_is_known() -> None:
         assert apart[t, k] == (np.abs(rows - t).min() if len(rows) else np.inf)
     given_ = waving(60)
     given_[20:40, 18], given_[:, 20] = np.nan, np.nan
-    sigma = Doubt((0.1,) * 22, 10.0).of(given_)
+    sigma = Uncertainty((0.1,) * 22, 10.0).of(given_)
     assert (np.diff(sigma[19:30, 18]) > 0).all()
     assert np.allclose(sigma[:, 20], 0.1, atol=1e-3)
     assert (sigma[:19, 18] < 0.01).all()
