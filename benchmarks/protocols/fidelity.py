@@ -119,10 +119,10 @@ def _answered(
     """All methods, peers tuned on every third clip with other noise; and what was tried."""
     stamps = np.arange(len(truth)) / FPS
     some = truth[:, ::3]
-    told = spoil(some, np.random.default_rng((number, 1)))
+    tuning_seen = spoil(some, np.random.default_rng((number, 1)))
 
     def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
-        return _errors(peer.run(told, stamps, delay, **parameters), some)
+        return _errors(peer.run(tuning_seen, stamps, delay, **parameters), some)
 
     tuned = tune(bench, evaluate, title, compared.peers, compared.delays)
     seen = spoil(truth, np.random.default_rng((number, 0)))

@@ -1,8 +1,8 @@
 """HuMoR's tables on our data: futures, noisy and hidden joints, a simulated detector, simulated depth.
 
 The figures are not comparable with the paper's, whose data are AMASS and whose body is SMPL; the order of the methods
-is. Ablations are trained alike, and briefly, so beside what ships stands the same model trained as they are. Contact is
-that of load, of eight joints; the paper's ninth, the hips, never has any.
+is. Ablations are trained alike and briefly, so the model that ships has a copy trained as briefly beside it. Contact is
+load, of eight joints; the paper's ninth, the hips, never bears any.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ DEPENDS_ON = (*CLEAN, "humor weights", "offline settings")
 
 FRAMES = 90
 DELAY = 8
+"""Frames: of the live answer that fits start from."""
 CLIPS, PICTURES, FUTURES = 4, 2, 12
-"""Clips of each table, taken evenly from all sources of the split."""
+"""Clips of Table 2, of Tables 3 and 4, and of Table 1, taken evenly from all sources of the split."""
 
 _STILL, _RAW, _TRUTH = "stands still", "as seen", "truth"
 _PER_FRAME = "per-frame fit, smoothed (stage 2)"
@@ -69,7 +70,7 @@ def run(bench: Bench) -> Result:
 
 
 def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hide: bool) -> list[dict[str, Any]]:
-    """Table 2: noise on all joints, or none and what is low hidden."""
+    """Table 2: all joints with noise; or with ``hide``, without noise, those below `HIDDEN_BELOW` hidden."""
     rng = np.random.default_rng(0)
     truth = clips.positions
     seen = truth + (0.0 if hide else NOISE) * rng.standard_normal(truth.shape)

@@ -47,7 +47,7 @@ def run(bench: Bench) -> Result:
     kinect = Kinect(bench, path, clips, taught)
     tuned = kinect.tuned(clips[:: 1 if bench.quick else TUNING_CLIPS])
     parts: dict[tuple[str, int, int], list[tuple[Scores, dict[str, Any]]]] = {}
-    told: dict[tuple[str, int], dict[str, Any]] = {}
+    deviations: dict[tuple[str, int], dict[str, Any]] = {}
     bins: dict[str, list[tuple[Floats, Floats]]] = {}
     for person in bench.progress.track(subjects, description="Kinect, left out"):
         asked = [clip for clip in clips if clip.subject == person]
@@ -63,11 +63,11 @@ def run(bench: Bench) -> Result:
             }))  # fmt: skip
             if stated is not None:
                 sigma, anomaly, flagged = (np.concatenate(part) for part in zip(*stated, strict=True))
-                told.setdefault(key, {})[person] = deviation(error, sigma, anomaly, flagged)
+                deviations.setdefault(key, {})[person] = deviation(error, sigma, anomaly, flagged)
                 bins.setdefault(f"{method.name}, delay {method.delay}", []).append((error, sigma))
     ordered = [clip for person in subjects for clip in clips if clip.subject == person]
     scored = {key: _together([s for s, _ in some]) for key, some in parts.items()}
-    records = over_seeds([_record(key, ordered, scored, parts[key], told) for key in scored])
+    records = over_seeds([_record(key, ordered, scored, parts[key], deviations) for key in scored])
     reliabilities = {
         name: reliability(np.concatenate([error for error, _ in some]), np.concatenate([sigma for _, sigma in some]))
         for name, some in bins.items()
@@ -90,7 +90,7 @@ def run(bench: Bench) -> Result:
         ),
         "kinect_reliability": figures.reliability(reliabilities, "Real Kinect: stated and found"),
     }  # fmt: skip
-    tables = [_summary(records, bench.delays), _table(records, clips, subjects), _deviation_table(told, subjects)]
+    tables = [_summary(records, bench.delays), _table(records, clips, subjects), _deviation_table(deviations, subjects)]
     return Result(tables, data, pictures)
 
 
@@ -124,7 +124,7 @@ def _record(
     clips: Sequence[Clip],
     scored: Mapping[tuple[str, int, int], Scores],
     parts: Sequence[tuple[Scores, dict[str, Any]]],
-    told: Mapping[tuple[str, int], dict[str, Any]],
+    deviations: Mapping[tuple[str, int], dict[str, Any]],
 ) -> dict[str, Any]:
     name, delay, _ = key
     people = list(dict.fromkeys(clip.subject for clip in clips))
@@ -133,8 +133,8 @@ def _record(
         "parameters": {person: extra["parameters"] for person, (_, extra) in zip(people, parts, strict=True)},
         "markers_mm": {person: extra["markers_mm"] for person, (_, extra) in zip(people, parts, strict=True)},
     }  # fmt: skip
-    if (name, delay) in told:
-        record["deviation"] = told[name, delay]
+    if (name, delay) in deviations:
+        record["deviation"] = deviations[name, delay]
         record["ratios"] = _ratios(scored[key], delay, clips, scored)
     return record
 
@@ -214,7 +214,7 @@ def _table(records: Sequence[dict[str, Any]], clips: Sequence[Clip], subjects: S
     )
 
 
-def _deviation_table(told: Mapping[tuple[str, int], dict[str, Any]], subjects: Sequence[str]) -> Table:
+def _deviation_table(deviations: Mapping[tuple[str, int], dict[str, Any]], subjects: Sequence[str]) -> Table:
     """What sigma and anomaly tell of the error, for each person, at a delay of 4."""
     keys = {
         "rank_correlation": "rank correlation", "auroc_off": "AUROC, joint off by 10 cm",
@@ -222,7 +222,7 @@ def _deviation_table(told: Mapping[tuple[str, int], dict[str, Any]], subjects: S
         "flagged_percent": "flagged, %",
     }  # fmt: skip
     rows = [
-        [f"{person}, {text}", *("–" if (v := told[name, 4][person][key]) is None else f"{v:.2f}" for key in keys)]
+        [f"{person}, {text}", *("–" if (v := deviations[name, 4][person][key]) is None else f"{v:.2f}" for key in keys)]
         for name, text in ((UNKNOWN, "sensor unknown"), (KNOWN, "sensor known"))
         for person in subjects
     ]

@@ -43,13 +43,17 @@ def run_conditions(
     tried: dict[str, Any] = {}
     for number, (name, spoil) in enumerate(conditions.items()):
         some = clips.every(TUNED_ON)
-        told = spoil(some.positions, np.random.default_rng((number, 1)))
+        tuning_seen = spoil(some.positions, np.random.default_rng((number, 1)))
 
         def evaluate(
-            peer: Peer, delay: int, parameters: Mapping[str, float], truth: Floats = some.positions, told: Floats = told
+            peer: Peer,
+            delay: int,
+            parameters: Mapping[str, float],
+            truth: Floats = some.positions,
+            tuning_seen: Floats = tuning_seen,
         ) -> dict[str, float]:
-            answer = peer.run(told, clips.stamps_s, delay, **parameters)
-            found = figures(score(answer, truth, missing(told), align=False))
+            answer = peer.run(tuning_seen, clips.stamps_s, delay, **parameters)
+            found = figures(score(answer, truth, missing(tuning_seen), align=False))
             return {key: found[key] for key in ("position_mm", "acceleration_mm")}
 
         tuned = tune(bench, evaluate, name, peers)

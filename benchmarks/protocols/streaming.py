@@ -51,11 +51,11 @@ def run(bench: Bench) -> Result:
     clips = bench.clips()
     truth_at = CubicSpline(clips.stamps_s, clips.positions)
     some = clips.every(3)
-    told = gaussian(some.positions, NOISE, np.random.default_rng(1))
+    tuning_seen = gaussian(some.positions, NOISE, np.random.default_rng(1))
 
     def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
-        answer = peer.run(told, clips.stamps_s, delay, **parameters)
-        found = figures(score(answer, some.positions, missing(told), align=False))
+        answer = peer.run(tuning_seen, clips.stamps_s, delay, **parameters)
+        found = figures(score(answer, some.positions, missing(tuning_seen), align=False))
         behind = found_delay(answer, some.positions, MOST_LAG)
         kept = {key: found[key] for key in ("position_mm", "acceleration_mm", "own_acceleration_mm")}
         return {**kept, "delay_found_ms": round((delay + behind) * 1e3 / FPS, 2)}

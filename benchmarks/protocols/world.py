@@ -49,13 +49,13 @@ def run(bench: Bench) -> Result:
     """The whole chain beside filters, then the fusion without a root."""
     clips = bench.clips(FRAMES, 400).farthest(4 if bench.quick else 24)
     some = clips.every(3)
-    told = correlated(some.positions, NOISE, np.random.default_rng(1))
+    tuning_seen = correlated(some.positions, NOISE, np.random.default_rng(1))
     seen = correlated(clips.positions, NOISE, np.random.default_rng(0))
     peers = tuple(peer for peer in FILTERS if peer.delays != (OFFLINE,))
 
     def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
-        answer = peer.run(told, clips.stamps_s, delay, **parameters)
-        found = figures(score(answer, some.positions, missing(told), align=False))
+        answer = peer.run(tuning_seen, clips.stamps_s, delay, **parameters)
+        found = figures(score(answer, some.positions, missing(tuning_seen), align=False))
         return {key: found[key] for key in ("position_mm", "acceleration_mm")}
 
     tuned = tune(bench, evaluate, "world", peers)

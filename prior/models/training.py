@@ -141,11 +141,11 @@ class TrainingRun:
             ``path``.
         """
         curves = path.with_suffix(".png")
-        told = {
+        found = {
             "Validation": ", ".join(f"{k} {v:.4g}" for k, v in self.curves[-1].items()),
             "Curves": f"`{curves.name}`",
         }
-        save_weights(path, model, config, {**card, **told})
+        save_weights(path, model, config, {**card, **found})
         draw_curves(self.curves, curves)
         return path
 

@@ -126,8 +126,8 @@ class MotionSet:
         return np.concatenate(starts)[:, None] + np.arange(window)
 
 
-def data_told(weights: str, train: MotionSet, val: MotionSet) -> str:
-    """What a card says of the data that weights were made from."""
+def describe_data(weights: str, train: MotionSet, val: MotionSet) -> str:
+    """The data that weights were trained on, for their card."""
     return (
         f"the '{weights}' set of `steadypose prepare`: {train.hours:.2f} h training, {val.hours:.2f} h validation, "
         "split by subject"

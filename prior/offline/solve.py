@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -132,33 +133,44 @@ def fit_window(
     """
     model.requires_grad_(False)
     variables = Variables.initial(start.root, start.rotations, start.offsets, start.ground, model.config.latent)
-    known = start.ground_known
-    shape: list[Term] = [Bones(settings.bones_sigma)]
-    if not known:
-        shape.append(Ground(start.ground, settings.ground_height_sigma, settings.ground_tilt_sigma))
     given = [*observed, *([anchor] if anchor else [])]
-    free = ("bones",) if known else ("bones", "ground")
-    poses: list[Term] = [
-        *given, *shape, Smooth(settings.smooth_sigma), FirstState(settings.pose_sigma, all_states=True),
-    ]  # fmt: skip
-    motions: list[Term] = [
-        *given, *shape, settings.transitions, FirstState(settings.first_sigma, all_states=True), settings.standing,
-        Smooth(settings.motion_smooth_sigma),
-    ]  # fmt: skip
-    plan = [
-        (("root", "orientation"), [*given, Smooth(settings.smooth_sigma)], settings.root_steps),
-        ((*POSES, *free), poses, settings.pose_steps),
-        ((*POSES, *free, "latents"), motions, settings.motion_steps),
-    ]
     found: list[float] = []
-    for number, (names, terms, steps) in enumerate(plan[:stages]):
-        if number == 2:
+    for stage in _stages(start, given, settings)[:stages]:
+        if "latents" in stage.free:
             variables = replace(variables, latents=Motion(model, variables).encoded_latents())
-        variables, value = minimise(model, variables, names, terms, steps)
+        variables, value = minimise(model, variables, stage.free, stage.terms, stage.steps)
         found.append(value)
         advanced()
     with torch.no_grad():
         return Fitted(Motion(model, variables), tuple(found))
+
+
+class _Stage(NamedTuple):
+    """Which variables are free, under which terms, for how many steps at most."""
+
+    free: tuple[str, ...]
+    terms: list[Term]
+    steps: int
+
+
+def _stages(start: Start, given: Sequence[Term], settings: FitSettings) -> list[_Stage]:
+    """The root's pose; all poses, by smoothness; all poses and latents, by the model of motion."""
+    shape: list[Term] = [Bones(settings.bones_sigma)]
+    body: tuple[str, ...] = (*POSES, "bones")
+    if not start.ground_known:
+        shape.append(Ground(start.ground, settings.ground_height_sigma, settings.ground_tilt_sigma))
+        body = (*body, "ground")
+    smooth = Smooth(settings.smooth_sigma)
+    poses = [*given, *shape, smooth, FirstState(settings.pose_sigma, all_states=True)]
+    motion = [
+        *given, *shape, settings.transitions, FirstState(settings.first_sigma, all_states=True), settings.standing,
+        Smooth(settings.motion_smooth_sigma),
+    ]  # fmt: skip
+    return [
+        _Stage(("root", "orientation"), [*given, smooth], settings.root_steps),
+        _Stage(body, poses, settings.pose_steps),
+        _Stage((*body, "latents"), motion, settings.motion_steps),
+    ]
 
 
 def minimise(

@@ -25,7 +25,7 @@ from steadypose.prior.models.layers.torch_kinematics import forward_kinematics, 
 from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
-from steadypose.prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations
+from steadypose.prior.motion.dataset import MotionSet, describe_data, mirror_offsets, mirror_rotations
 from steadypose.prior.timing.rate import FPS
 
 Rng = np.random.Generator
@@ -91,7 +91,7 @@ def train_completer(options: TrainingOptions, config: CompleterConfig | None = N
     run.minimise(loss_of, lambda: evaluate_completer(model, val), BATCH, seed, clip=1.0)
     return run.save(path, model, asdict(calibrate(model, val)), {
         "Model": f"a transformer of {model.config.layers} layers, {model.config.width} wide, over a window's frames",
-        "Data": data_told(weights, train, val),
+        "Data": describe_data(weights, train, val),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train completer --weights {weights} --iterations {iterations}`: {BATCH} frames a "
         f"step in windows of {GAPS[0] + CONTEXT[0]} to {GAPS[1] + CONTEXT[1]}, AdamW {LEARNING_RATE:g}, "

@@ -26,7 +26,7 @@ from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
-from steadypose.prior.motion.dataset import MotionSet, data_told
+from steadypose.prior.motion.dataset import MotionSet, describe_data
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
@@ -199,7 +199,7 @@ def train_contacts(options: TrainingOptions) -> Path:
     run.minimise(loss_of, lambda: evaluate_contacts(model, val), BATCH, seed, clip=1.0)
     return run.save(path, model, asdict(model.config), {
         "Model": f"load and rest of {len(CONTACT_JOINTS)} joints, a recurrent network of {model.config.hidden} units",
-        "Data": data_told(weights, sets["train"], sets["val"]),
+        "Data": describe_data(weights, sets["train"], sets["val"]),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train contacts --weights {weights} --iterations {iterations}`: "
         f"{BATCH} clips of {FRAMES} frames a step, of {CLIPS['train']} through simulated sensors and the smoother, "

@@ -20,7 +20,7 @@ from steadypose.prior.models.layers.torch_kinematics import forward_kinematics, 
 from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
-from steadypose.prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations, remove_heading
+from steadypose.prior.motion.dataset import MotionSet, describe_data, mirror_offsets, mirror_rotations, remove_heading
 
 JOINT_WEIGHT = 10.0
 """lambda of equation 5."""
@@ -105,7 +105,7 @@ def _train(
     run = fit(model, train, val, path.parent, used, options.seed)
     return run.save(path, model, asdict(config), {
         "Model": f"HM-VAE, {described}, 22 joints (prior/models/hmvae/network.py)",
-        "Data": data_told(weights, train, val),
+        "Data": describe_data(weights, train, val),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train {name} --weights {weights} --iterations {used.iterations}`: "
         f"{used.batch} windows a step, Adam {used.learning_rate:g}, seed {options.seed}{origin}",

@@ -19,7 +19,7 @@ from steadypose.prior.models.humor.state import State, canonical, choose, featur
 from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
-from steadypose.prior.motion.dataset import MotionSet, data_told, mirror_offsets, mirror_rotations
+from steadypose.prior.motion.dataset import MotionSet, describe_data, mirror_offsets, mirror_rotations
 from steadypose.prior.timing.rate import FPS
 
 Rng = np.random.Generator
@@ -137,7 +137,7 @@ def train_humor(options: TrainingOptions) -> Path:
     card = {
         "Model": f"transitions of HuMoR: latent of {config.latent}, layers of {config.hidden}, "
         f"{config.components} Gaussians of initial states",
-        "Data": data_told(weights, train, val),
+        "Data": describe_data(weights, train, val),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train humor --weights {weights} --iterations {iterations}`: {BATCH} sequences of "
         f"{STEPS} steps a step, Adam {LEARNING_RATE:g}, seed {options.seed}",

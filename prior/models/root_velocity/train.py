@@ -18,7 +18,7 @@ from steadypose.prior.models.root_velocity.network import RootMotion, Trajectory
 from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
-from steadypose.prior.motion.dataset import MotionSet, data_told, heading, yaw_rotation
+from steadypose.prior.motion.dataset import MotionSet, describe_data, heading, yaw_rotation
 
 ITERATIONS, BATCH, LEARNING_RATE = 2_000, 64, 2e-3
 """Windows a step; Adam's rate at the start, which falls along a cosine."""
@@ -96,7 +96,7 @@ def train_trajectory(options: TrainingOptions) -> Path:
     config = calibrate(model, val)
     return run.save(path, model, asdict(config), {
         "Model": f"root velocity and contacts, {config.context} frames of context, 22 joints",
-        "Data": data_told(weights, train, val),
+        "Data": describe_data(weights, train, val),
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train trajectory --weights {weights} --iterations {iterations}`: "
         f"{BATCH} windows a step, Adam {LEARNING_RATE:g}, seed {seed}{origin}",
