@@ -11,6 +11,7 @@ from rich.progress import Progress
 
 from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
 from steadypose.nodes.commands.cleaning import clean_recording
+from steadypose.nodes.commands.output import check_output
 from steadypose.nodes.graph.launch import apply_override, read_toml
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.body.own_layouts import add_layouts
@@ -57,10 +58,7 @@ def clean(
     if skeletons is not None:
         table["skeletons"] = read_toml(skeletons).get("skeletons", {})
         add_layouts(table["skeletons"])
-    if source.resolve() == out.resolve():
-        raise LaunchError(f"{out}: expected another path than the input's; nothing is cleaned in place")
-    if not out.resolve().parent.is_dir():
-        raise LaunchError(f"{out}: expected its folder {out.resolve().parent} to exist; make it first")
+    check_output(source, out)
     console = Console(stderr=True)
     if is_folder_of_recordings(source):
         return clean_folder(source, out, table, jobs, ray, console)

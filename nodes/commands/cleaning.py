@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from steadypose.msgs.recording import RecordingError, RecordingWriter
-from steadypose.msgs.recording_writer import recorded_parts
+from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.checks.stream import StreamCheck
+from steadypose.nodes.commands.output import check_replaceable, put_in_place, unfinished
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sinks.recorder import LogTimes
@@ -102,10 +100,7 @@ def clean_recording(
         LaunchError, RecordingError, NpzError: the input cannot be used, or the output not be made.
     """
     to_npz = out.suffix == ".npz"
-    if os.path.lexists(out):
-        if not replace:
-            raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
-        check_replaceable(out, to_npz=to_npz)
+    check_replaceable(out, replace=replace)
     add_layouts(settings.get("skeletons", {}))
     frames = open_recording(source)
     # these bring torch, which takes seconds: not before it is known that there is something to do
@@ -147,9 +142,7 @@ def clean_recording(
         if to_npz:
             arrays: dict[str, Any] = collector.arrays(np.array(stamps_ns, np.int64))
             np.savez(part, **arrays)
-        elif out.exists():
-            shutil.rmtree(out)
-        part.replace(out)
+        put_in_place(part, out)
     return Cleaned(
         frames=len(stamps_ns),
         duration_s=(max(stamps_ns) - min(stamps_ns)) / 1e9,
@@ -159,35 +152,3 @@ def clean_recording(
         problems=list(problems.values()),
         unread={cause: n for cause, n in frames.refused.items() if n},
     )
-
-
-def check_replaceable(out: Path, *, to_npz: bool) -> None:
-    """Raises:
-    LaunchError: it is nothing that this command makes, so nothing that it removes.
-    """
-    if to_npz:
-        if not out.is_file():
-            raise LaunchError(f"{out} is no file: expected an .npz to replace")
-        return
-    try:
-        recorded_parts(out)
-    except (RecordingError, OSError) as error:
-        raise LaunchError(f"{out} is no recording, and is not replaced: {error}") from error
-
-
-@contextmanager
-def unfinished(out: Path) -> Iterator[Path]:
-    """Where to write what becomes ``out``: beside it, under the same name, because a recording's file has its name."""
-    folder = out.with_name(f".{out.name}.part")
-    mark = folder / ".steadypose"
-    if mark.exists():
-        shutil.rmtree(folder)  # of a call that was killed
-    try:
-        folder.mkdir(parents=True)
-    except FileExistsError as error:
-        raise LaunchError(f"{folder} is in the way, and was not made here: expected it not to exist") from error
-    try:
-        mark.touch()
-        yield folder / out.name
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)

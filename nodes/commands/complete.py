@@ -9,6 +9,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
+from steadypose.nodes.commands.output import check_output
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
@@ -53,11 +54,7 @@ def complete(
     """
     if skeletons is not None:
         add_layouts(read_toml(skeletons).get("skeletons", {}))
-    if source.resolve() == out.resolve():
-        raise LaunchError(f"{out}: expected another path than the input's; nothing is completed in place")
-    for path in (out, picture):
-        if path is not None and not path.resolve().parent.is_dir():
-            raise LaunchError(f"{path}: expected its folder {path.resolve().parent} to exist; make it first")
+    check_output(source, out, *([picture] if picture else []))
     if picture is not None and picture.suffix not in (".png", ".svg", ".pdf"):
         raise LaunchError(f"--picture: expected a name ending in .png, .svg or .pdf, got {picture}")
     one_thread()

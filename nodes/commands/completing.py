@@ -5,8 +5,6 @@ A key frame may stand seconds from the next: so, other than `clean`, this gives 
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -16,13 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import CleanBody, JointState, Message, Pose, PoseClean, PoseRaw
-from steadypose.nodes.commands.cleaning import check_replaceable, unfinished
+from steadypose.nodes.commands.output import check_replaceable, put_in_place, unfinished, write_recording
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
-from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.recording import open_recording, with_end
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.kinematics import quaternions, rotation_matrix
@@ -126,11 +122,7 @@ def complete_recording(
     Raises:
         LaunchError, RecordingError, NpzError: the input cannot be used, or the output not be made.
     """
-    to_npz = out.suffix == ".npz"
-    if os.path.lexists(out):
-        if not replace:
-            raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
-        check_replaceable(out, to_npz=to_npz)
+    check_replaceable(out, replace=replace)
     frames = open_recording(source)
     messages = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
     raws = [message for message in messages if not message.end_of_stream]
@@ -156,7 +148,7 @@ def complete_recording(
         answers.append((POSE_CLEAN, message))
         answers += [(POSE_WORLD, answer) for answer in world.process(_moved(message, paths, anchor))]
     with unfinished(out) as part:
-        if to_npz:
+        if out.suffix == ".npz":
             collector = NpzCollector()
             for _, message in answers:
                 collector.add(message)
@@ -164,14 +156,9 @@ def complete_recording(
             arrays: dict[str, Any] = collector.arrays(stamps)
             np.savez(part, **arrays)
         else:
-            log_times = LogTimes()
-            with RecordingWriter(part) as writer:
-                every = sorted([*((POSE_RAW, m) for m in messages), *answers], key=lambda pair: pair[1].stamp_ns)
-                for topic, message in every:
-                    writer.write(topic, message, log_times.next(topic, message.stamp_ns))
-            if out.exists():
-                shutil.rmtree(out)
-        part.replace(out)
+            every = [*((POSE_RAW, message) for message in messages), *answers]
+            write_recording(part, sorted(every, key=lambda pair: pair[1].stamp_ns))
+        put_in_place(part, out)
     known = [completed.known.mean() for _, completed in done]
     return Done(
         frames=len(clean) - 1,

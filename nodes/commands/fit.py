@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
-from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.types import JOINTS, Message, PoseRaw
-from steadypose.nodes.commands.cleaning import check_replaceable, stream
+from steadypose.nodes.commands.cleaning import stream
 from steadypose.nodes.commands.fitting import Fit, bodies_seen, fit_body, ground_plane, rewritten
 from steadypose.nodes.commands.key_points import arrays_of_fit, fit_key_points, has_key_points, read_key_points
+from steadypose.nodes.commands.output import check_output, check_replaceable, put_in_place, write_recording
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
-from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.npz import NpzError
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.clean.adapt import SensorFrame
@@ -62,14 +61,8 @@ def fit(
     """
     if not source.exists():
         raise LaunchError(f"{source} does not exist: expected a recording, an .npz or a .csv")
-    if source.resolve() == out.resolve():
-        raise LaunchError(f"{out}: expected another path than the input's; nothing is fitted in place")
-    if not out.resolve().parent.is_dir():
-        raise LaunchError(f"{out}: expected its folder {out.resolve().parent} to exist; make it first")
-    if os.path.lexists(out):
-        if not force:
-            raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
-        check_replaceable(out, to_npz=out.suffix == ".npz")
+    check_output(source, out)
+    check_replaceable(out, replace=force)
     two_d = has_key_points(source)
     if two_d and out.suffix != ".npz":
         raise LaunchError(f"{out}: expected an .npz, for key points have no recording to go with; got {out.name}")
@@ -203,15 +196,10 @@ def _write(
             arrays = _added(arrays, next(iter(tracks.values())))
         np.savez(part, **arrays)
     else:
-        log_times = LogTimes()
-        if part.exists():
+        if part.exists():  # of a call that was killed
             shutil.rmtree(part)
-        with RecordingWriter(part) as writer:
-            for topic, message in messages:
-                writer.write(topic, message, log_times.next(topic, message.stamp_ns))
-        if out.exists():
-            shutil.rmtree(out)
-    part.replace(out)
+        write_recording(part, messages)
+    put_in_place(part, out)
 
 
 def _explain(out: Path, fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit: str) -> None:

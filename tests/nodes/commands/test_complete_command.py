@@ -93,7 +93,7 @@ def test_who_stands_on_the_pelvis_is_given_a_way(tmp_path: Path, capsys) -> None
 
 def test_what_cannot_be_is_said(tmp_path: Path) -> None:
     source = write(tmp_path / "in.npz", waving(20))
-    with pytest.raises(LaunchError, match="nothing is completed in place"):
+    with pytest.raises(LaunchError, match="nothing is written in place"):
         complete(source, source)
     with pytest.raises(LaunchError, match="make it first"):
         complete(source, tmp_path / "no" / "out.npz")

@@ -1,0 +1,77 @@
+"""Where the offline commands write: never over their input, and whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from steadypose.msgs.recording import RecordingError, RecordingWriter
+from steadypose.msgs.recording_writer import recorded_parts
+from steadypose.msgs.types import Message
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.recorder import LogTimes
+
+
+def check_output(source: Path, *outputs: Path) -> None:
+    """Raises:
+    LaunchError: an output is the input, or its folder does not exist.
+    """
+    for out in outputs:
+        if source.resolve() == out.resolve():
+            raise LaunchError(f"{out}: expected another path than the input's; nothing is written in place")
+        if not out.resolve().parent.is_dir():
+            raise LaunchError(f"{out}: expected its folder {out.resolve().parent} to exist; make it first")
+
+
+def check_replaceable(out: Path, *, replace: bool) -> None:
+    """Raises:
+    LaunchError: something is there that is not to be replaced, or is nothing that these commands make.
+    """
+    if not os.path.lexists(out):
+        return
+    if not replace:
+        raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
+    if out.suffix == ".npz":
+        if not out.is_file():
+            raise LaunchError(f"{out} is no file: expected an .npz to replace")
+        return
+    try:
+        recorded_parts(out)
+    except (RecordingError, OSError) as error:
+        raise LaunchError(f"{out} is no recording, and is not replaced: {error}") from error
+
+
+@contextmanager
+def unfinished(out: Path) -> Iterator[Path]:
+    """Where to write what becomes ``out``: beside it, under the same name, because a recording's file has its name."""
+    folder = out.with_name(f".{out.name}.part")
+    mark = folder / ".steadypose"
+    if mark.exists():
+        shutil.rmtree(folder)  # of a call that was killed
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError as error:
+        raise LaunchError(f"{folder} is in the way, and was not made here: expected it not to exist") from error
+    try:
+        mark.touch()
+        yield folder / out.name
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def write_recording(path: Path, messages: Iterable[tuple[str, Message]]) -> None:
+    """Write messages in this order, logged as the recorder logs them."""
+    log_times = LogTimes()
+    with RecordingWriter(path) as writer:
+        for topic, message in messages:
+            writer.write(topic, message, log_times.next(topic, message.stamp_ns))
+
+
+def put_in_place(part: Path, out: Path) -> None:
+    """Move what was written to ``part``, in the same file system, to ``out``; a recording there is replaced."""
+    if out.suffix != ".npz" and out.exists():
+        shutil.rmtree(out)
+    part.replace(out)
