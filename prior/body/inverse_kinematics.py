@@ -101,6 +101,10 @@ def solve_pose(
     return local.reshape(*shape, 3), placed.reshape(shape)
 
 
+HELD = 1e-6
+"""Mobility of a joint that is known, beside 1 of one that is not, for `fit_lengths`."""
+
+
 def fit_lengths(
     positions: NDArray[np.floating],
     offsets: NDArray[np.floating],

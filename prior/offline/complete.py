@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.body.inverse_kinematics import fit_lengths, place_joints, solve_rotations
+from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
 from steadypose.prior.body.skeleton import PARENTS, finite_joints
 from steadypose.prior.models.completer.features import draw_line, rotations_of_6d
 from steadypose.prior.offline.views import AROUND, LONGEST_GAP, gaps, views
@@ -75,7 +75,7 @@ def complete(
 def _completed(
     fill: Fill, positions: Floats, offsets: Floats, advanced: Callable[[int], None]
 ) -> tuple[Floats, Floats]:
-    """Joints (T, 22, 3) and rotations (T, 22, 3, 3) of frames that are all within `LONGEST_GAP` of a known one."""
+    """Joints (T, 22, 3) and rotations (T, 22, 3, 3) of frames that begin and end near a known one."""
     known = finite_joints(positions)
     bridged = _bridged(fill, positions, offsets)
     rotations, root = _filled(fill, bridged, offsets, advanced)
@@ -84,7 +84,7 @@ def _completed(
     joints = np.where(known[..., None], positions, placed + missed)
     bent = (~known).any(axis=1) & (np.linalg.norm(missed, axis=-1) > BENT).any(axis=1)
     if bent.any():
-        joints[bent] = fit_lengths(joints[bent], offsets, np.where(known[bent], 1e-6, 1.0))
+        joints[bent] = fit_lengths(joints[bent], offsets, np.where(known[bent], HELD, 1.0))
         joints = np.where(known[..., None], positions, joints)
         rotations[bent] = solve_rotations(joints[bent], offsets, rotations[bent])
     return joints, rotations

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from steadypose.prior.body.inverse_kinematics import fit_lengths, place_joints, solve_rotations
+from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.models.completer.inference import LiveCompleter
 from steadypose.prior.models.hgvae.completion_inference import LiveCompletion
@@ -26,8 +26,6 @@ SHARE = 0.8
 SMOOTH = 3.0
 """Frames, standard deviation of the Gaussian that smooths the difference of the two: HG-VAE's completion gives hidden
 limbs ten times the acceleration of true ones."""
-
-_FIRM = 1e-6  # mobility of a joint that is known, beside 1 of one that is not
 
 
 class PartsCompleter:
@@ -71,7 +69,7 @@ class PartsCompleter:
             asked = ~known & (partly[:, None] | ~known.any(axis=0))
             some = asked.any(axis=1)
             joints = np.where(known[..., None], given, np.where(asked[..., None], joints, first))[some]
-            joints = fit_lengths(joints, bones, np.where(asked[some], 1.0, _FIRM))
+            joints = fit_lengths(joints, bones, np.where(asked[some], 1.0, HELD))
             rotations[row, some] = solve_rotations(joints, bones, rotations[row, some])
         return rotations, root
 
