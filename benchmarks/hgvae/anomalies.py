@@ -15,12 +15,11 @@ from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.hgvae.common import Data
 from steadypose.benchmarks.hgvae.faults import FAULTS, HELD, held
 from steadypose.benchmarks.results import Table
-from steadypose.prior.models.hgvae.anomaly import RATES as QUANTILES
-from steadypose.prior.models.hgvae.anomaly import Calibration
+from steadypose.prior.models.hgvae.anomaly import Calibration, decimals
 from steadypose.prior.models.hgvae.faults import FaultNet, load_fault_net
 from steadypose.prior.models.hgvae.features import to_tracks
 from steadypose.prior.models.hgvae.network import HGVAE
-from steadypose.prior.models.hgvae.train_faults import score_windows
+from steadypose.prior.models.hgvae.train_faults import Scored, score_windows
 from steadypose.prior.models.hgvae.windows import Windows, standardise
 from steadypose.prior.motion.corruption import sensed
 from steadypose.prior.motion.dataset import MotionSet
@@ -41,7 +40,7 @@ def anomalies(bench: Bench, model: HGVAE, data: Data) -> Result:
     figure = Figure(figsize=(9.5, 5.6), layout="constrained")
     for axis, (sensor, sigma) in zip(figure.subplots(1, 2, sharey=True), SENSORS.items(), strict=True):
         clean, sizes = windows.draw(count, frames, rng)
-        quiet = score_windows(network, model, sensed(clean, sigma, rng), sizes, sigma).max(axis=1)
+        quiet = score_windows(network, model, sensed(clean, sigma, rng), sizes, sigma).odds.max(axis=1)
         plain = -_paper_score(model, sensed(clean, sigma, rng), sizes)
         other, other_sizes = windows.draw(count, frames, rng)
         for name, fault in FAULTS.items():
@@ -51,7 +50,7 @@ def anomalies(bench: Bench, model: HGVAE, data: Data) -> Result:
                 spoilt, holds = fault(other, rng)
                 seen = sensed(spoilt, sigma, rng)
             seen = seen[holds]
-            loud = score_windows(network, model, seen, other_sizes[holds], sigma).max(axis=1)
+            loud = score_windows(network, model, seen, other_sizes[holds], sigma).odds.max(axis=1)
             paper = -_paper_score(model, seen, other_sizes[holds])
             truth = np.r_[np.zeros(count), np.ones(len(loud))]
             record = {"fault": name, "sensor": sensor, "windows": len(loud),
@@ -105,18 +104,18 @@ def _false_alarms(bench: Bench, network: FaultNet, model: HGVAE, data: Data) -> 
     """Of clean windows: of each validation person by a scale of the others, and of kinds of motion never seen."""
     sigma, count = SENSORS["camera, 20 mm"], 128 if bench.quick else 4000
 
-    def scores(motion: MotionSet, windows: int) -> Floats:
+    def scored(motion: MotionSet, windows: int) -> Scored:
         rng = np.random.default_rng(13)
         positions, sizes = Windows(motion).draw(windows, model.config.frames, rng)
-        return score_windows(network, model, sensed(positions, sigma, rng), sizes, sigma).max(axis=1)
+        return score_windows(network, model, sensed(positions, sigma, rng), sizes, sigma)
 
     people = {str(person): data.val.only(data.val.subject == person) for person in np.unique(data.val.subject)}
-    found = {p: scores(m, max(round(count * m.hours / data.val.hours), 8)) for p, m in people.items()}
+    found = {p: scored(m, max(round(count * m.hours / data.val.hours), 8)).odds.max(axis=1) for p, m in people.items()}
     records: list[dict[str, Any]] = []
     for person, own in found.items():
         others = [of for other, of in found.items() if other != person] or [own]
         limits = np.quantile(np.concatenate(others), 1 - np.array(RATES))
-        records.append({"people": person, "windows": len(own)} | _above(own, limits))
+        records.append({"people": person, "windows": len(own)} | _above(own[:, None], limits))
     total = sum(r["windows"] for r in records)
     mean = {f"at_{rate:g}": sum(r["windows"] * r[f"at_{rate:g}"] for r in records) / total for rate in RATES}
     records.insert(0, {"people": "all validation people, each by a scale of the others", "windows": total} | mean)
@@ -124,14 +123,17 @@ def _false_alarms(bench: Bench, network: FaultNet, model: HGVAE, data: Data) -> 
         everything = MotionSet.load(data.prepared, "research", "val")
         known = np.isin(everything.subject, data.val.subject)
         if not known.all():
-            scale = Calibration.load("default").limits(np.zeros(1, dtype=int), np.full(1, sigma))[0]
-            limits = np.interp(-np.log10(RATES), -np.log10(QUANTILES), scale)
-            odds = scores(everything.only(~known), count)
+            odds, paces = scored(everything.only(~known), count)
+            ones = np.ones(len(paces))
+            scale = Calibration.load("default").limits(np.zeros(len(paces), dtype=int), sigma * ones, paces)
+            told = decimals(odds.max(axis=1)[:, None], scale)
             records.append(
-                {"people": "kinds of motion never seen (Bandai-Namco)", "windows": count} | _above(odds, limits)
+                {"people": "kinds of motion never seen (Bandai-Namco)", "windows": count}
+                | _above(told, -np.log10(RATES))
             )
     return records
 
 
 def _above(scores: Floats, limits: Floats) -> dict[str, float]:
+    """The share of ``scores`` (B, 1) above each of ``limits``, one for each of `RATES`."""
     return {f"at_{rate:g}": float((scores > limit).mean()) for rate, limit in zip(RATES, limits, strict=True)}

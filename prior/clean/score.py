@@ -2,7 +2,7 @@
 
 The fault network says of each joint how much more likely it is off than not; the window is as odd as its oddest joint.
 Both are told on one scale: the number of decimals of the rate at which clean motion of people whom the networks have
-not seen scores as high. An anomaly of 2 is met once in a hundred clean windows.
+not seen, as fast as this, scores as high. An anomaly of 2 is met once in a hundred clean windows.
 
 The paper scores by log p(z | x) alone (`steadypose evaluate hgvae` has both).
 """
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from steadypose.prior.clean.frame import BodyWindows, Bools, Floats, Score
-from steadypose.prior.models.hgvae.anomaly import SENSOR_SIGMAS, Calibration, decimals, joint_odds
+from steadypose.prior.models.hgvae.anomaly import SENSOR_SIGMAS, Calibration, decimals, joint_odds, pace
 from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
 from steadypose.prior.timing.rate import FPS
 
@@ -75,5 +75,5 @@ class Scorer:
         odds = self._network(tracks.x, found.mean, found.sigma, tracks.observed, sensor_sigma)
         odds = joint_odds(odds, tracks.observed, frozen)
         unseen = np.isinf(odds)
-        told = decimals(odds, self._calibration.limits(unseen.sum(axis=-1), sensor_sigma))
+        told = decimals(odds, self._calibration.limits(unseen.sum(axis=-1), sensor_sigma, pace(found.mean)))
         return told.max(axis=-1), np.where(unseen, np.nan, told)

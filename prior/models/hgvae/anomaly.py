@@ -2,7 +2,7 @@
 
 The fault network says of each joint how much more likely it is off than not; the window is as odd as its oddest joint.
 Both are told on one scale: the number of decimals of the rate at which clean motion of people whom the networks have
-not seen scores as high. An anomaly of 2 is met once in a hundred clean windows.
+not seen, as fast as this, scores as high. An anomaly of 2 is met once in a hundred clean windows.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from steadypose.prior.models.hgvae.fault_features import RECENT
 from steadypose.prior.models.weights_io import weights_path
+from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 
@@ -29,16 +30,20 @@ FROZEN_ODDS = 12.0
 SENSOR_SIGMAS = (0.003, 0.01, 0.02, 0.04)
 """Metres along an axis, errors of the sensor at which the scale was measured."""
 
+PACES, PACE_EDGES = (0.03, 0.5, 1.5), (0.274, 0.866)
+"""m/s, of `pace`: what windows of three classes move at about, and what divides these. Standing is most of any
+recording; what is fast is rare in any training, and no fault for that."""
+
 RATES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 """of clean windows that score higher than the quantiles kept"""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What clean windows score, by joints missing and error of the sensor.
+    """What clean windows score, by joints missing, error of the sensor and pace of the motion.
 
     Attributes:
-        quantiles: (M, S, R) of the window's score, at `MISSING`, `SENSOR_SIGMAS` and `RATES`.
+        quantiles: (M, S, P, R) of the window's score, at `MISSING`, `SENSOR_SIGMAS`, `PACES` and `RATES`.
     """
 
     quantiles: Floats
@@ -59,12 +64,27 @@ class Calibration:
         """Write as JSON."""
         path.write_text(json.dumps({"note": note, "quantiles": np.round(self.quantiles, 4).tolist()}) + "\n")
 
-    def limits(self, missing: NDArray[np.integer], sensor_sigma: Floats) -> Floats:
-        """(B, R) what windows score, of which so many joints are ``missing`` (B,), seen by a sensor of error
-        ``sensor_sigma`` (B,) metres along an axis: interpolated between what was measured."""
+    def limits(self, missing: NDArray[np.integer], sensor_sigma: Floats, paces: Floats) -> Floats:
+        """(B, R) what clean windows score at `RATES`, interpolated between what was measured.
+
+        Args:
+            missing: (B,) joints missing.
+            sensor_sigma: (B,) metres along an axis, error of the sensor.
+            paces: (B,) m/s, `pace`.
+        """
         by_missing = _between(np.asarray(missing, dtype=np.float64), np.array(MISSING, dtype=np.float64))
         by_sensor = _between(np.log(sensor_sigma), np.log(SENSOR_SIGMAS))
-        return np.einsum("bm,bs,msr->br", by_missing, by_sensor, self.quantiles)
+        by_pace = _between(np.log(np.maximum(paces, 1e-3)), np.log(PACES))
+        return np.einsum("bm,bs,bp,mspr->br", by_missing, by_sensor, by_pace, self.quantiles)
+
+
+def pace(mean: Floats) -> Floats:
+    """(B,) m/s, above which a quarter of the joints move, by windows' tracks (B, 66, T) as HG-VAE makes them.
+
+    Root mean square over the window. A limb at fault does not show in it, nor does a sensor's noise.
+    """
+    steps = np.diff(mean.reshape(len(mean), -1, 3, mean.shape[-1]), axis=-1) * FPS
+    return np.quantile(np.sqrt((steps**2).sum(axis=2).mean(axis=-1)), 0.75, axis=1)
 
 
 def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Floats:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +16,16 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
-from steadypose.prior.models.hgvae.anomaly import MISSING, RATES, SENSOR_SIGMAS, Calibration, joint_odds
+from steadypose.prior.models.hgvae.anomaly import (
+    MISSING,
+    PACE_EDGES,
+    PACES,
+    RATES,
+    SENSOR_SIGMAS,
+    Calibration,
+    joint_odds,
+    pace,
+)
 from steadypose.prior.models.hgvae.config import SCALE, FaultNetConfig, HGVAEConfig
 from steadypose.prior.models.hgvae.fault_features import RECENT, fault_features
 from steadypose.prior.models.hgvae.faults import FaultNet
@@ -47,8 +57,11 @@ from steadypose.prior.timing.frozen_joints import LEAST_NOISE, frozen_joints
 
 Floats = NDArray[np.float64]
 
-WINDOWS = 6000
-"""for each error and number of joints missing, of which the rarest rate leaves a handful"""
+WINDOWS = 2000
+"""for each error, number of joints missing and pace, of which the rarest rate leaves a few"""
+
+FASTER, MOST_DRAWS = (1, 2, 3), 12
+"""strides of the windows among which each pace is looked for, and how often as many are drawn: what is fast is rare"""
 
 BATCH = 64
 """windows in each step of the fault network's optimiser"""
@@ -157,16 +170,29 @@ def _reconstruct(
     return tracks.x, mean.numpy(), (0.5 * found.log_var.double()).exp().numpy() * SCALE, tracks.observed
 
 
+class Scored(NamedTuple):
+    """Windows, as `score_windows` has them.
+
+    Attributes:
+        odds: (B, 22) of `joint_odds`.
+        pace: (B,) m/s, of `pace`.
+    """
+
+    odds: Floats
+    pace: Floats
+
+
 @torch.inference_mode()
-def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Floats:
-    """(B, 22) odds, `joint_odds`, of windows (B, T, 22, 3) of bodies of sizes (B,)."""
+def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Scored:
+    """Score windows (B, T, 22, 3) of bodies of sizes (B,), by a sensor of ``sensor_sigma`` metres along an axis."""
     bias_sigma, mean, parts = sensor_sigma * np.sqrt(1.0 - FAST), network.mean.numpy(), []
     for start in range(0, len(seen), 256):
         some = slice(start, start + 256)
         reconstructed = _reconstruct(model, seen[some], sizes[some], bias_sigma)
         odds = network(torch.from_numpy(fault_features(*reconstructed, sensor_sigma, mean)))
-        parts.append(joint_odds(odds.double().numpy(), reconstructed[-1], frozen_joints(seen[some])))
-    return np.concatenate(parts)
+        joints = joint_odds(odds.double().numpy(), reconstructed[-1], frozen_joints(seen[some]))
+        parts.append(Scored(joints, pace(reconstructed[1])))
+    return Scored(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -174,14 +200,29 @@ def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, 
 
 
 def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, seed: int) -> Calibration:
-    """The scale, from ``count`` windows for each condition."""
+    """The scale, from about ``count`` windows for each condition."""
     rng = np.random.default_rng(seed)
     conditions = [(m, s) for m in range(len(MISSING)) for s in range(len(SENSOR_SIGMAS))]
-    quantiles = np.zeros((len(MISSING), len(SENSOR_SIGMAS), len(RATES)))
+    quantiles = np.zeros((len(MISSING), len(SENSOR_SIGMAS), len(PACES), len(RATES)))
     for m, s in track(conditions, "calibrating"):
-        positions, sizes = windows.draw(count, model.config.frames, rng, STRIDES)
-        sigma, fast = np.full(count, SENSOR_SIGMAS[s]), rng.uniform(0.0, 1.0, count)
+        positions, sizes = _at_paces(windows, model.config.frames, count, rng)
+        sigma, fast = np.full(len(positions), SENSOR_SIGMAS[s]), rng.uniform(0.0, 1.0, len(positions))
         seen = hide_joints(wandering(positions, sigma, rng, fast), MISSING[m], rng)
-        odds = score_windows(network, model, seen, sizes, SENSOR_SIGMAS[s])
-        quantiles[m, s] = np.quantile(odds.max(axis=1), 1 - np.array(RATES))
+        found = score_windows(network, model, seen, sizes, SENSOR_SIGMAS[s])
+        of_class = np.digitize(found.pace, PACE_EDGES)
+        for p in range(len(PACES)):
+            quantiles[m, s, p] = np.quantile(found.odds.max(axis=1)[of_class == p], 1 - np.array(RATES))
     return Calibration(quantiles)
+
+
+def _at_paces(windows: Windows, frames: int, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Windows (B, T, 22, 3), up to ``count`` of each class of `PACES`, and body sizes."""
+    kept: list[tuple[Floats, Floats]] = []
+    wanted = np.full(len(PACES), count)
+    for _ in range(MOST_DRAWS):
+        positions, sizes = windows.draw(count, frames, rng, FASTER)
+        of_class = np.digitize(pace(positions.reshape(count, frames, -1).swapaxes(1, 2)), PACE_EDGES)
+        rows = np.concatenate([np.flatnonzero(of_class == p)[:most] for p, most in enumerate(wanted)])
+        kept.append((positions[rows], sizes[rows]))
+        wanted -= np.bincount(of_class[rows], minlength=len(PACES))
+    return np.concatenate([positions for positions, _ in kept]), np.concatenate([sizes for _, sizes in kept])

@@ -13,18 +13,20 @@ from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.models.hgvae.anomaly import (
     FROZEN_ODDS,
     MISSING,
+    PACES,
     RATES,
     SENSOR_SIGMAS,
     Calibration,
     decimals,
     joint_odds,
+    pace,
 )
 from steadypose.prior.models.hgvae.config import FaultNetConfig
 from steadypose.prior.models.hgvae.fault_features import OFF_SCALE, RECENT, ROUGH_SCALE, fault_features
 from steadypose.prior.models.hgvae.faults import FaultNet, load_fault_net
 
 HEIGHTS = np.linspace(0.0, 7.0, len(RATES))
-SCALE = Calibration(np.broadcast_to(HEIGHTS, (len(MISSING), len(SENSOR_SIGMAS), len(RATES))))
+SCALE = Calibration(np.broadcast_to(HEIGHTS, (len(MISSING), len(SENSOR_SIGMAS), len(PACES), len(RATES))))
 
 
 def scored(positions: np.ndarray, **settings) -> list:
@@ -76,20 +78,29 @@ def test_a_joint_not_seen_of_late_has_no_odds_and_a_frozen_one_high_ones() -> No
 
 
 def test_the_scale_is_the_decimals_of_the_rate_among_clean_windows() -> None:
-    limits = SCALE.limits(np.zeros(1, dtype=int), np.full(1, 0.02))
+    limits = SCALE.limits(np.zeros(1, dtype=int), np.full(1, 0.02), np.ones(1))
     np.testing.assert_allclose(decimals(HEIGHTS[None], limits)[0], -np.log10(RATES), atol=1e-6)
     beyond = decimals(np.array([[7.0, 8.0, 9.0]]), limits)[0]
     assert beyond[2] - beyond[1] == pytest.approx(beyond[1] - beyond[0])
     assert (decimals(np.array([[-50.0, -np.inf]]), limits) == 0).all()
 
 
-def test_between_measured_sensors_the_scale_is_between_theirs() -> None:
+def test_between_what_was_measured_the_scale_is_between() -> None:
     quantiles = np.zeros_like(SCALE.quantiles)
-    quantiles[:, 1] = 1.0
-    between, coarser = np.sqrt(SENSOR_SIGMAS[1] * SENSOR_SIGMAS[2]), 2 * SENSOR_SIGMAS[-1]
-    limits = Calibration(quantiles).limits(np.array([0, 2]), np.array([between, coarser]))
-    np.testing.assert_allclose(limits[0], 0.5)
-    np.testing.assert_allclose(limits[1], 0.0)
+    quantiles[:, 1, 1] = 1.0
+    sensor, coarser = np.sqrt(SENSOR_SIGMAS[1] * SENSOR_SIGMAS[2]), 2 * SENSOR_SIGMAS[-1]
+    pace_between = np.sqrt(PACES[1] * PACES[2])
+    limits = Calibration(quantiles).limits(
+        np.array([0, 2, 1]), np.array([sensor, coarser, sensor]), np.array([PACES[1], PACES[1], pace_between])
+    )
+    np.testing.assert_allclose(limits, [[0.5] * len(RATES), [0.0] * len(RATES), [0.25] * len(RATES)])
+
+
+def test_the_pace_is_that_of_the_body_not_of_a_limb() -> None:
+    mean = np.zeros((2, 22, 3, 50))
+    mean[:, :, 0] = np.arange(50) / 30 * np.array([0.5, 1.5])[:, None, None]
+    mean[0, 18:, 1, ::2] += 0.3
+    np.testing.assert_allclose(pace(mean.reshape(2, 66, 50)), [0.5, 1.5])
 
 
 def test_the_weights_that_ship_find_the_wrist_of_which_the_last_answer_is_repeated() -> None:
