@@ -109,7 +109,7 @@ class CleanCore:
         if self._correct:
             gated = self._correct.update(gated)
         self._history.append(gated)
-        smoothed = self._smooth.update(gated, self._history)
+        smoothed = self._smooth.update(gated)
         windows = None
         if self._reconstruct:
             windows = self._reconstruct.update(self._history, present, person, bias_sigma)
@@ -136,7 +136,7 @@ class CleanCore:
         newest, self._newest = self._newest, None
         if newest is None:
             return []
-        held = self._smooth.flush(self._history)
+        held = self._smooth.flush()
         return [
             self._answer(self._denoised(smoothed, newest.gated, back), newest, back)
             for back, smoothed in zip(reversed(range(len(held))), held, strict=True)

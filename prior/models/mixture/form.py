@@ -17,7 +17,7 @@ CORRECTION = 2.0
 """Largest correction along an axis, in units of the noise found."""
 
 COASTING = 0.1
-"""m/s: by how much a joint's standard deviation grows at least while it is not seen."""
+"""m/s: by how much a joint's standard deviation grows at least with the time to its nearest sighting."""
 
 LEAST_LOG_SIGMA, MOST_LOG_SIGMA = -3.0, 6.0
 """Range of the logarithm of the standard deviation, in units of a millimetre."""

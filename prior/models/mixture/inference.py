@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
     EXPERTS,
-    FEATURES,
     MEASUREMENT_SIGMA,
-    PARENT,
     RAW,
     advance,
-    describe,
     forget,
     new_bank,
 )
+from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
 from steadypose.prior.models.mixture.form import COASTING, CORRECTION, LEAST_LOG_SIGMA, MOST_LOG_SIGMA, OUTPUTS, REACH
 from steadypose.prior.models.weights_io import load_weights
 from steadypose.prior.timing.fixed_lag import Smoothed
@@ -52,7 +50,7 @@ class MixtureSmoother:
         self._bank = new_bank(slots, delay)
         self._experts = np.empty((slots, 22, EXPERTS, 3))
         self._features = np.empty((slots, 22, FEATURES), dtype=np.float32)
-        self._scale = np.empty(slots)
+        self._scale, self._gap = np.empty(slots), np.empty((slots, 22))
         self._stamps: list[float] = []
         self._count = 0
 
@@ -91,13 +89,12 @@ class MixtureSmoother:
     def _answer(self, back: int) -> Smoothed:
         """The estimate of the frame ``back`` before the newest."""
         bank = self._bank
-        describe(bank, self._count, back, PARENT, self._experts, self._features, self._scale)
+        describe(bank, self._count, back, PARENT, self._experts, self._features, self._scale, self._gap)
         places, sigma = np.full((self._slots, 22, 3), np.nan), np.full((self._slots, 22), np.inf)
-        unseen = bank.unseen[:, :, (self._count - 1 - back) % (self.delay + 1)]
-        for slot in np.flatnonzero((unseen >= 0).any(axis=1)):
+        for slot in np.flatnonzero((self._gap >= 0).any(axis=1)):
             outputs = _outputs(self._features[slot], self._net, self._memory, slot)
             heading, scale = bank.heading[slot], self._scale[slot]
-            _mixed(outputs, self._experts[slot], heading, scale, unseen[slot], places[slot], sigma[slot])
+            _mixed(outputs, self._experts[slot], heading, scale, self._gap[slot], places[slot], sigma[slot])
         return Smoothed(self._stamps[-1 - back], places, sigma)
 
 
@@ -246,12 +243,12 @@ def _beside(a, b, c):
 
 
 @njit(cache=True, error_model="numpy")
-def _mixed(outputs, experts, heading, scale, unseen, places, sigma):
+def _mixed(outputs, experts, heading, scale, gap, places, sigma):
     """As `prior.models.mixture.network.answer`, of one body; of joints never seen, nothing is written."""
     cos, sin = heading
     weights, reach = np.empty(EXPERTS), np.empty(EXPERTS)
     for j in range(len(outputs)):
-        if unseen[j] < 0:
+        if gap[j] < 0:
             continue
         out = outputs[j]
         most = out[0]
@@ -281,5 +278,5 @@ def _mixed(outputs, experts, heading, scale, unseen, places, sigma):
                 places[j, axis] += weights[m] * (experts[j, m, axis] - came)
             places[j, axis] += came
         log_sigma = min(max(np.float64(out[2 * EXPERTS + 3]), LEAST_LOG_SIGMA), MOST_LOG_SIGMA)
-        coasted = COASTING / FPS * unseen[j]
+        coasted = COASTING / FPS * gap[j]
         sigma[j] = np.sqrt((1e-3 * np.exp(log_sigma)) ** 2 + coasted**2)

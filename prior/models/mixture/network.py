@@ -22,7 +22,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from steadypose.prior.models.mixture.bank import EXPERTS, FEATURES, RAW
+from steadypose.prior.models.mixture.bank import EXPERTS, RAW
+from steadypose.prior.models.mixture.features import FEATURES
 from steadypose.prior.models.mixture.form import (
     COASTING,
     CORRECTION,
@@ -150,7 +151,7 @@ def kept_of(gates: Tensor, before: Tensor) -> Tensor:
     return kept.repeat_interleave(torch.tensor([2 * EXPERTS, 3, 1]), dim=-1)
 
 
-def answer(outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, unseen: Tensor) -> tuple[Tensor, Tensor]:
+def answer(outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
     """Places (..., 22, 3) metres, and their variances along an axis (..., 22) mm².
 
     Args:
@@ -158,7 +159,7 @@ def answer(outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, uns
         experts: (..., 22, EXPERTS, 3) metres.
         heading: (..., 2) cosine and sine of where the body faces.
         scale: (...) metres, the noise found.
-        unseen: (..., 22) frames since each joint was seen.
+        gap: (..., 22) frames to the nearest sighting of each joint.
     """
     logits, reach, correction, log_sigma = outputs.split([EXPERTS, EXPERTS, 3, 1], dim=-1)
     weights = logits.softmax(dim=-1)
@@ -174,5 +175,5 @@ def answer(outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, uns
     # from the joint as it came, so that rounding does not move it
     came = experts[..., RAW, :]
     places = came + (weights[..., None] * (experts - came[..., None, :])).sum(dim=-2) + moved
-    coasted = 1e3 * COASTING / FPS * unseen
+    coasted = 1e3 * COASTING / FPS * gap
     return places, (2.0 * log_sigma[..., 0].clamp(LEAST_LOG_SIGMA, MOST_LOG_SIGMA)).exp() + coasted.square()

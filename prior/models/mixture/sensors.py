@@ -20,7 +20,7 @@ GATED = 0.18
 """Metres: what jumps farther is refused by the gate before the mixture sees it, mostly."""
 
 KINDS = ("perfect", "white", "lasting", "replayed", "mixed", "kinect", "monocular")
-SHARES = np.array([0.15, 0.28, 0.15, 0.11, 0.11, 0.11, 0.09])
+SHARES = np.array([0.13, 0.25, 0.15, 0.11, 0.11, 0.13, 0.12])
 """Sensors and how often they are drawn: none, noise from frame to frame, noise that lasts, a Kinect's errors put on
 other motion, all of these together, the real Kinect, and a network that guesses each bone's depth from one picture."""
 
@@ -174,7 +174,7 @@ class Sensors:
         return seen, truth
 
     def _spoil(self, seen: Floats, kind: NDArray[np.int64], rng: Rng) -> None:
-        """Outliers, exchanged limbs, hidden joints, in place; not of what is perfect, but hidden joints."""
+        """Outliers, exchanged limbs, lost frames, hidden joints, in place; of what is perfect, the last two alone."""
         count, frames = seen.shape[:2]
         for clip in range(count):
             noisy = KINDS[kind[clip]] != "perfect"
@@ -194,6 +194,8 @@ class Sensors:
                     seen[clip, rows, both] = seen[clip, rows][:, MIRROR[both]].swapaxes(0, 1)
                 else:
                     seen[clip, rows, pair] = np.nan
+            if rng.random() < 0.08:
+                seen[clip, rng.random(frames) < 10 ** rng.uniform(-2.0, -0.5)] = np.nan
         few = np.flatnonzero(rng.random(count) < 0.15)
         seen[np.ix_(few, np.arange(frames), np.array(_ABSENT))] = np.nan
         hidden = np.flatnonzero(rng.random(count) < 0.2)

@@ -20,13 +20,11 @@ from torch import Tensor, nn
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
     EXPERTS,
-    FEATURES,
     MEASUREMENT_SIGMA,
-    PARENT,
     advance,
-    describe,
     new_bank,
 )
+from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
 from steadypose.prior.models.mixture.motion import load_kinect, load_motion, write_arrays
 from steadypose.prior.models.mixture.network import MixtureConfig, MixtureNet, answer
 from steadypose.prior.models.mixture.sensors import Sensed, Sensors
@@ -51,18 +49,15 @@ DELAY_SHARES = np.array([0.22, 0.08, 0.12, 0.05, 0.17, 0.03, 0.04, 0.13, 0.03, 0
 LEAST_MM = 1.0
 """Added to what the best expert is off by, before it divides: a perfect input matters, but not beyond all measure."""
 
-SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.25, 0.4, 0.7, 1.5, 2.5)
+SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.25, 0.4, 0.8, 2.0, 3.0)
 """Weight of the acceleration error by delay in frames: without delay, smoothness is paid for in lag, and later not."""
 
 LEAST_SMOOTH_MM = 0.5
 """mm/frame², added to the acceleration error of the best expert."""
 
-FAST, MOST = 2.0, 3.0
+FAST, MOST = 0.5, 60.0
 """m/s at which a joint's place counts twice, and the most that one counts: joints are fast for a few frames, in which
-filters lag most and a mean over all of them does not show it."""
-
-UNSEEN = 0.15
-"""Weight of the places of joints that are not seen."""
+filters lag most and a mean over all of them does not show it. Their accelerations count less, by its root."""
 
 DEVIATION = 0.3
 """Weight of the likelihood of the errors."""
@@ -78,7 +73,7 @@ class Batch(NamedTuple):
     experts: Tensor
     heading: Tensor
     scale: Tensor
-    unseen: Tensor
+    gap: Tensor
     truth: Tensor
     counts: Tensor
 
@@ -89,18 +84,18 @@ def through_bank(sensed: Sensed, delay: int) -> Batch:
     kept = frames - delay
     features = np.empty((kept, clips, 22, FEATURES), dtype=np.float32)
     experts = np.empty((kept, clips, 22, EXPERTS, 3))
-    heading, scale, unseen = np.empty((kept, clips, 2)), np.empty((kept, clips)), np.empty((kept, clips, 22))
+    heading, scale, gap = np.empty((kept, clips, 2)), np.empty((kept, clips)), np.empty((kept, clips, 22))
     bank = new_bank(clips, delay)
     for t in range(frames):
         advance(bank, t, 1 / FPS, sensed.seen[:, t], sensed.confidence[:, t], DENSITIES, MEASUREMENT_SIGMA)
         at = t - delay
         if at >= 0:
-            describe(bank, t + 1, delay, PARENT, experts[at], features[at], scale[at])
-            heading[at], unseen[at] = bank.heading, bank.unseen[:, :, at % (delay + 1)]
+            describe(bank, t + 1, delay, PARENT, experts[at], features[at], scale[at], gap[at])
+            heading[at] = bank.heading
     middle = sensed.truth[:, :1, :1]
     middle = np.where(np.isfinite(middle), middle, 0.0)  # so that single precision is enough
     arrays = (
-        features, experts - middle.swapaxes(0, 1)[:, :, :, None], heading, scale, unseen,
+        features, experts - middle.swapaxes(0, 1)[:, :, :, None], heading, scale, gap,
         (sensed.truth - middle)[:, :kept].swapaxes(0, 1), _counts(sensed.truth)[:, :kept].swapaxes(0, 1),
     )  # fmt: skip
     return Batch(*(torch.from_numpy(a.astype(np.float32)).transpose(0, 1) for a in arrays))
@@ -109,7 +104,7 @@ def through_bank(sensed: Sensed, delay: int) -> Batch:
 def _counts(truth: NDArray[np.float64]) -> NDArray[np.float64]:
     """(C, T, 22) how much each joint's place counts, by its speed; see `FAST`."""
     speed = np.linalg.norm(np.gradient(truth, axis=1), axis=-1) * FPS
-    return np.minimum(1.0 + np.nan_to_num(speed) / FAST, MOST)
+    return np.minimum(1.0 + np.square(np.nan_to_num(speed) / FAST), MOST)
 
 
 class Errors(NamedTuple):
@@ -120,14 +115,17 @@ class Errors(NamedTuple):
 
 
 def errors(places: Tensor, truth: Tensor, weight: Tensor, counts: Tensor) -> Errors:
-    """Of places (C, T, 22, 3), weighed (C, T, 22), in position by ``counts`` too; what weighs nothing may be NaN."""
+    """Of places (C, T, 22, 3), weighed (C, T, 22), in position by ``counts`` too.
+
+    In acceleration, by the inverse of the counts' root. What weighs nothing may be NaN.
+    """
     off = torch.where(weight[..., None] > 0, places - truth, 0.0) * 1e3
     bent = off[:, 2:] - 2 * off[:, 1:-1] + off[:, :-2]
     seen = (weight[:, 2:] >= 1) & (weight[:, 1:-1] >= 1) & (weight[:, :-2] >= 1)
-    counted = weight * counts
+    counted, smooth = weight * counts, seen / counts[:, 1:-1].sqrt()
     return Errors(
         (counted * _length(off)).sum(dim=(1, 2)) / counted.sum(dim=(1, 2)).clamp(min=1),
-        (seen * _length(bent)).sum(dim=(1, 2)) / seen.sum(dim=(1, 2)).clamp(min=1),
+        (smooth * _length(bent)).sum(dim=(1, 2)) / smooth.sum(dim=(1, 2)).clamp(min=1),
     )
 
 
@@ -148,14 +146,14 @@ class Loss:
 def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
     """Of clips of one delay."""
     smooth = float(np.interp(delay, SMOOTH_DELAYS, SMOOTH))
-    outputs = network(batch.features, (batch.unseen >= 0).any(dim=-1))
+    outputs = network(batch.features, (batch.gap >= 0).any(dim=-1))
     known = batch.truth.isfinite().all(dim=-1) & batch.experts.isfinite().all(dim=(-1, -2))
     experts = torch.where(known[..., None, None], batch.experts, 0.0)
-    places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.unseen)
-    weight = known * torch.where(batch.unseen > 0, UNSEEN, 1.0)
+    places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.gap)
+    weight = known / (1.0 + batch.gap.clamp(min=0))  # where nobody can know, there is nothing to learn
     own = errors(places, batch.truth, weight, batch.counts)
     with torch.no_grad():
-        seen = known * (batch.unseen == 0).float()
+        seen = known * (batch.gap == 0).float()
         each = [errors(experts[:, :, :, m], batch.truth, seen, batch.counts) for m in range(EXPERTS)]
         position, acceleration = (torch.stack(values) for values in zip(*each, strict=True))
         best = (position + acceleration).argmin(dim=0, keepdim=True)

@@ -21,7 +21,8 @@ from steadypose.prior.models.hgvae.faults import load_fault_net
 from steadypose.prior.models.hgvae.network import HGVAE
 from steadypose.prior.models.hmvae.config import HMVAEConfig
 from steadypose.prior.models.hmvae.network import HMVAE
-from steadypose.prior.models.mixture.bank import EXPERTS, FEATURES
+from steadypose.prior.models.mixture.bank import EXPERTS
+from steadypose.prior.models.mixture.features import FEATURES
 from steadypose.prior.models.mixture.form import OUTPUTS
 from steadypose.prior.models.mixture.network import MixtureConfig, MixtureNet
 from steadypose.prior.models.occlusion.candidates import FEATURES as OCCLUSION_FEATURES
@@ -64,7 +65,7 @@ class Form:
 def _mixture() -> Form:
     network = load_network(MixtureNet, lambda config: MixtureConfig(**config), "default", "mixture")
     sizes = network.config
-    bank = {"features": (22, FEATURES), "experts": (22, EXPERTS, 3), "heading": (2,), "scale": (), "unseen": (22,)}
+    bank = {"features": (22, FEATURES), "experts": (22, EXPERTS, 3), "heading": (2,), "scale": (), "gap": (22,)}
     own, body = (22, sizes.own), (sizes.body,)
     memory = {"own": own, "own_weight": own, "body": body, "body_weight": body, "written": (22, OUTPUTS)}
     return Form(Mixture(network), {**bank, **memory}, ("positions", "sigma", *(f"{name}_next" for name in memory)))
