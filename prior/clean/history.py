@@ -21,6 +21,8 @@ class History:
     """
 
     def __init__(self, frames: int, slots: int) -> None:
+        """Of the last ``frames``, and no fewer than a gap that is bridged and its two ends."""
+        frames = max(frames, BRIDGED + 2)
         self._observed = Ring(frames, (slots, 22, 3))
         self._confidence = Ring(frames, (slots, 22), fill=0.0)
         self._positions = Ring(frames, (slots, 22, 3))

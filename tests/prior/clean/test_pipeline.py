@@ -49,6 +49,17 @@ def test_an_answer_leaves_exactly_its_delay_after_its_frame(delay: int) -> None:
         )
 
 
+@pytest.mark.parametrize("delay", [0, 1, 2, 4])
+@pytest.mark.parametrize("lost", [1, 3, 5])
+def test_without_any_network_of_windows_frames_may_be_lost(delay: int, lost: int) -> None:
+    off = {name: {"enabled": False} for name in ("denoise", "score", "impute")}
+    truth = waving(40)
+    messages = [m for k, m in enumerate(stream(truth)) if not 20 <= k < 20 + lost]
+    cleaned, _ = clean(messages, delay=delay, **off)
+    assert [c.stamp_ns for c in cleaned] == [m.stamp_ns for m in stream(truth)]
+    assert np.linalg.norm(positions(cleaned)[20 + lost :] - truth[20 + lost :], axis=-1).max() < 0.02
+
+
 def test_a_delay_longer_than_the_mixture_has_learned_is_refused() -> None:
     with pytest.raises(ValueError, match="0 to 16 frames"):
         PriorPipeline(PriorSettings(delay=17))
