@@ -59,6 +59,7 @@ class Bank(NamedTuple):
 
     Attributes:
         position: (S, J, M, K, 3) metres, of each frame given all measurements so far.
+        variance: (S, J, M, K) metres² along an axis, of that.
         with_position, with_velocity: (S, J, M, K) covariance of that with the newest position and velocity.
         velocity: (S, J, M, 3) m/s, and ``velocity_variance`` (S, J, M).
         misfit: (S, J, M) faded sums of the squared innovations, each by its variance, and ``spread`` of the logarithms
@@ -78,6 +79,7 @@ class Bank(NamedTuple):
     """
 
     position: NDArray[np.float64]
+    variance: NDArray[np.float64]
     with_position: NDArray[np.float64]
     with_velocity: NDArray[np.float64]
     velocity: NDArray[np.float64]
@@ -103,6 +105,7 @@ def new_bank(bodies: int, delay: int) -> Bank:
     experts, joints, frames = len(DENSITIES), len(PARENTS), delay + 1
     bank = Bank(
         position=np.empty((bodies, joints, experts, frames, 3)),
+        variance=np.empty((bodies, joints, experts, frames)),
         with_position=np.empty((bodies, joints, experts, frames)),
         with_velocity=np.empty((bodies, joints, experts, frames)),
         velocity=np.empty((bodies, joints, experts, 3)),
@@ -170,8 +173,9 @@ def advance(bank, count, step, positions, confidence, densities, sigma):
             if seen and known:
                 bank.sightings[s, j] = keep * bank.sightings[s, j] + 1.0
             for m in range(experts):
-                position, with_position = bank.position[s, j, m], bank.with_position[s, j, m]
-                with_velocity, velocity = bank.with_velocity[s, j, m], bank.velocity[s, j, m]
+                position, own_variance = bank.position[s, j, m], bank.variance[s, j, m]
+                with_position, with_velocity = bank.with_position[s, j, m], bank.with_velocity[s, j, m]
+                velocity = bank.velocity[s, j, m]
                 if not known:
                     if seen:
                         for k in range(frames):
@@ -179,7 +183,7 @@ def advance(bank, count, step, positions, confidence, densities, sigma):
                         for axis in range(3):
                             position[slot, axis] = positions[s, j, axis]
                             velocity[axis] = 0.0
-                        with_position[slot] = variance
+                        with_position[slot] = own_variance[slot] = variance
                         bank.velocity_variance[s, j, m] = INITIAL_SPEED**2
                     continue
                 own = bank.velocity_variance[s, j, m]
@@ -189,7 +193,7 @@ def advance(bank, count, step, positions, confidence, densities, sigma):
                     with_position[k] += step * with_velocity[k]
                 for axis in range(3):
                     position[slot, axis] = position[last, axis] + step * velocity[axis]
-                with_position[slot] = ahead
+                with_position[slot] = own_variance[slot] = ahead
                 covariance = with_velocity[slot] = covariance + step * (own + growth / 2)
                 bank.velocity_variance[s, j, m] = own = own + growth
                 if not seen:
@@ -206,6 +210,7 @@ def advance(bank, count, step, positions, confidence, densities, sigma):
                     position[k, 0] += gain * a
                     position[k, 1] += gain * b
                     position[k, 2] += gain * c
+                    own_variance[k] -= gain * with_position[k]
                     with_position[k] -= gain * ahead
                     with_velocity[k] -= gain * covariance
                 gain = covariance / total

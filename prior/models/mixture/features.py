@@ -61,7 +61,7 @@ def _log(square):
 
 
 @njit(cache=True, error_model="numpy")
-def describe(bank, count, back, parents, experts, features, scale, gap):
+def describe(bank, count, back, parents, experts, features, scale, gap, between):
     """What a frame's experts say, and the features that their weights are to be read from; running means go on.
 
     Every frame is to be described once, in order.
@@ -75,6 +75,8 @@ def describe(bank, count, back, parents, experts, features, scale, gap):
         features: (S, J, FEATURES) float32, written.
         scale: (S,) metres along an axis, the noise found; written.
         gap: (S, J) frames to the nearest sighting, before or since; 0 of a joint seen, -1 not yet seen; written.
+        between: (S, J) metres along an axis, deviation of the mean by predictions of a joint that is not seen, though
+            others of the body are, and was seen since; elsewhere 0; written.
     """
     bodies, joints, _, frames, _ = bank.position.shape
     slot = (count - 1 - back) % frames
@@ -84,11 +86,13 @@ def describe(bank, count, back, parents, experts, features, scale, gap):
         for j in range(joints):
             noise[j] = weigh_by_predictions(bank.misfit[s, j], bank.spread[s, j], bank.sightings[s, j], weights[j])
             _say(bank.position[s, j, :, slot], bank.raw[s, j, slot], weights[j], experts[s, j])
-            gap[s, j] = bank.unseen[s, j, slot]
+            gap[s, j], between[s, j] = bank.unseen[s, j, slot], 0.0
             if gap[s, j] > 0.0:
                 for since in range(1, back + 1):
                     if bank.unseen[s, j, (slot + since) % frames] == 0.0:
                         gap[s, j] = min(gap[s, j], since)
+                        scales = bank.misfit[s, j] / max(bank.sightings[s, j], 1.0)
+                        between[s, j] = _deviation(experts[s, j], weights[j], bank.variance[s, j, :, slot], scales)
                         break
             if gap[s, j] == 0.0:
                 bank.age[s, j, 0] += 1.0
@@ -102,6 +106,8 @@ def describe(bank, count, back, parents, experts, features, scale, gap):
                 total += bank.noise[s, j]
                 seen_joints += 1.0
         scale[s] = np.sqrt(total / max(seen_joints, 1.0) / 3.0) + LEAST
+        if not (gap[s] == 0.0).any():
+            between[s] = 0.0
         _face(experts[s], bank.heading[s])
         unseen = bank.unseen[s, :, slot]
         for j in range(joints):
@@ -132,6 +138,16 @@ def _say(smoothed, raw, weights, experts):
             experts[m, axis] = smoothed[m, axis]
             experts[PREDICTED, axis] += weights[m] * smoothed[m, axis]
         experts[RAW, axis] = raw[axis]
+
+
+@njit(cache=True, error_model="numpy")
+def _deviation(experts, weights, variance, scales):
+    """Of the mean by predictions, along an axis: what each smoother is off by, at the noise that its innovations show,
+    and what they differ by."""
+    total = 0.0
+    for m in range(_SMOOTHERS):
+        total += weights[m] * (scales[m] * variance[m] + _square(experts[m], experts[PREDICTED]) / 3.0)
+    return np.sqrt(total)
 
 
 @njit(cache=True)

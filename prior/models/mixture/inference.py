@@ -16,6 +16,7 @@ from steadypose.prior.models.mixture.bank import (
     DENSITIES,
     EXPERTS,
     MEASUREMENT_SIGMA,
+    PREDICTED,
     RAW,
     advance,
     forget,
@@ -50,7 +51,7 @@ class MixtureSmoother:
         self._bank = new_bank(slots, delay)
         self._experts = np.empty((slots, 22, EXPERTS, 3))
         self._features = np.empty((slots, 22, FEATURES), dtype=np.float32)
-        self._scale, self._gap = np.empty(slots), np.empty((slots, 22))
+        self._scale, self._gap, self._between = np.empty(slots), np.empty((slots, 22)), np.empty((slots, 22))
         self._stamps: list[float] = []
         self._count = 0
 
@@ -89,12 +90,13 @@ class MixtureSmoother:
     def _answer(self, back: int) -> Smoothed:
         """The estimate of the frame ``back`` before the newest."""
         bank = self._bank
-        describe(bank, self._count, back, PARENT, self._experts, self._features, self._scale, self._gap)
+        said = self._experts, self._features, self._scale, self._gap, self._between
+        describe(bank, self._count, back, PARENT, *said)
         places, sigma = np.full((self._slots, 22, 3), np.nan), np.full((self._slots, 22), np.inf)
         for slot in np.flatnonzero((self._gap >= 0).any(axis=1)):
             outputs = _outputs(self._features[slot], self._net, self._memory, slot)
-            heading, scale = bank.heading[slot], self._scale[slot]
-            _mixed(outputs, self._experts[slot], heading, scale, self._gap[slot], places[slot], sigma[slot])
+            heading, scale, gap, between = bank.heading[slot], self._scale[slot], self._gap[slot], self._between[slot]
+            _mixed(outputs, self._experts[slot], heading, scale, gap, between, places[slot], sigma[slot])
         return Smoothed(self._stamps[-1 - back], places, sigma)
 
 
@@ -243,12 +245,17 @@ def _beside(a, b, c):
 
 
 @njit(cache=True, error_model="numpy")
-def _mixed(outputs, experts, heading, scale, gap, places, sigma):
+def _mixed(outputs, experts, heading, scale, gap, between, places, sigma):
     """As `prior.models.mixture.network.answer`, of one body; of joints never seen, nothing is written."""
     cos, sin = heading
     weights, reach = np.empty(EXPERTS), np.empty(EXPERTS)
     for j in range(len(outputs)):
         if gap[j] < 0:
+            continue
+        if between[j] > 0.0:
+            for axis in range(3):
+                places[j, axis] = experts[j, PREDICTED, axis]
+            sigma[j] = between[j]
             continue
         out = outputs[j]
         most = out[0]

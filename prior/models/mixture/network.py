@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from steadypose.prior.models.mixture.bank import EXPERTS, RAW
+from steadypose.prior.models.mixture.bank import EXPERTS, PREDICTED, RAW
 from steadypose.prior.models.mixture.features import FEATURES
 from steadypose.prior.models.mixture.form import (
     COASTING,
@@ -151,8 +151,12 @@ def kept_of(gates: Tensor, before: Tensor) -> Tensor:
     return kept.repeat_interleave(torch.tensor([2 * EXPERTS, 3, 1]), dim=-1)
 
 
-def answer(outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
+def answer(
+    outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, gap: Tensor, between: Tensor
+) -> tuple[Tensor, Tensor]:
     """Places (..., 22, 3) metres, and their variances along an axis (..., 22) mm².
+
+    Between two sightings, the mean by predictions holds.
 
     Args:
         outputs: (..., 22, OUTPUTS) of the network.
@@ -160,6 +164,7 @@ def answer(outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, gap
         heading: (..., 2) cosine and sine of where the body faces.
         scale: (...) metres, the noise found.
         gap: (..., 22) frames to the nearest sighting of each joint.
+        between: (..., 22) metres, the deviation of the mean by predictions of joints between two sightings, or 0.
     """
     logits, reach, correction, log_sigma = outputs.split([EXPERTS, EXPERTS, 3, 1], dim=-1)
     weights = logits.softmax(dim=-1)
@@ -176,4 +181,9 @@ def answer(outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, gap
     came = experts[..., RAW, :]
     places = came + (weights[..., None] * (experts - came[..., None, :])).sum(dim=-2) + moved
     coasted = 1e3 * COASTING / FPS * gap
-    return places, (2.0 * log_sigma[..., 0].clamp(LEAST_LOG_SIGMA, MOST_LOG_SIGMA)).exp() + coasted.square()
+    variance = (2.0 * log_sigma[..., 0].clamp(LEAST_LOG_SIGMA, MOST_LOG_SIGMA)).exp() + coasted.square()
+    inside = between > 0.0
+    return (
+        torch.where(inside[..., None], experts[..., PREDICTED, :], places),
+        torch.where(inside, (1e3 * between).square(), variance),
+    )

@@ -74,6 +74,7 @@ class Batch(NamedTuple):
     heading: Tensor
     scale: Tensor
     gap: Tensor
+    between: Tensor
     truth: Tensor
     counts: Tensor
 
@@ -84,18 +85,19 @@ def through_bank(sensed: Sensed, delay: int) -> Batch:
     kept = frames - delay
     features = np.empty((kept, clips, 22, FEATURES), dtype=np.float32)
     experts = np.empty((kept, clips, 22, EXPERTS, 3))
-    heading, scale, gap = np.empty((kept, clips, 2)), np.empty((kept, clips)), np.empty((kept, clips, 22))
+    heading, scale = np.empty((kept, clips, 2)), np.empty((kept, clips))
+    gap, between = np.empty((2, kept, clips, 22))
     bank = new_bank(clips, delay)
     for t in range(frames):
         advance(bank, t, 1 / FPS, sensed.seen[:, t], sensed.confidence[:, t], DENSITIES, MEASUREMENT_SIGMA)
         at = t - delay
         if at >= 0:
-            describe(bank, t + 1, delay, PARENT, experts[at], features[at], scale[at], gap[at])
+            describe(bank, t + 1, delay, PARENT, experts[at], features[at], scale[at], gap[at], between[at])
             heading[at] = bank.heading
     middle = sensed.truth[:, :1, :1]
     middle = np.where(np.isfinite(middle), middle, 0.0)  # so that single precision is enough
     arrays = (
-        features, experts - middle.swapaxes(0, 1)[:, :, :, None], heading, scale, gap,
+        features, experts - middle.swapaxes(0, 1)[:, :, :, None], heading, scale, gap, between,
         (sensed.truth - middle)[:, :kept].swapaxes(0, 1), _counts(sensed.truth)[:, :kept].swapaxes(0, 1),
     )  # fmt: skip
     return Batch(*(torch.from_numpy(a.astype(np.float32)).transpose(0, 1) for a in arrays))
@@ -149,7 +151,7 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
     outputs = network(batch.features, (batch.gap >= 0).any(dim=-1))
     known = batch.truth.isfinite().all(dim=-1) & batch.experts.isfinite().all(dim=(-1, -2))
     experts = torch.where(known[..., None, None], batch.experts, 0.0)
-    places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.gap)
+    places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.gap, batch.between)
     weight = known / (1.0 + batch.gap.clamp(min=0))  # where nobody can know, there is nothing to learn
     own = errors(places, batch.truth, weight, batch.counts)
     with torch.no_grad():

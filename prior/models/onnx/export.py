@@ -65,7 +65,14 @@ class Form:
 def _mixture() -> Form:
     network = load_network(MixtureNet, lambda config: MixtureConfig(**config), "default", "mixture")
     sizes = network.config
-    bank = {"features": (22, FEATURES), "experts": (22, EXPERTS, 3), "heading": (2,), "scale": (), "gap": (22,)}
+    bank = {
+        "features": (22, FEATURES),
+        "experts": (22, EXPERTS, 3),
+        "heading": (2,),
+        "scale": (),
+        "gap": (22,),
+        "between": (22,),
+    }
     own, body = (22, sizes.own), (sizes.body,)
     memory = {"own": own, "own_weight": own, "body": body, "body_weight": body, "written": (22, OUTPUTS)}
     return Form(Mixture(network), {**bank, **memory}, ("positions", "sigma", *(f"{name}_next" for name in memory)))

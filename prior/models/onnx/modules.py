@@ -41,7 +41,7 @@ class Occlusion(nn.Module):
 class Mixture(nn.Module):
     """A frame of `MixtureSmoother`: what its bank says of it, and the memory so far, to joints, deviations and memory.
 
-    Bank: features (B, 22, FEATURES), experts (B, 22, EXPERTS, 3), heading (B, 2), scale (B,) and gap (B, 22).
+    Bank: features (B, 22, FEATURES), experts (B, 22, EXPERTS, 3), heading (B, 2), scale (B,), gap and between (B, 22).
     Memory: own, own_weight (B, 22, own), body, body_weight (B, body), written (B, 22, OUTPUTS); zeros at first.
     """
 
@@ -50,7 +50,7 @@ class Mixture(nn.Module):
         self.network = network
 
     def forward(
-        self, features: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, gap: Tensor,
+        self, features: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, gap: Tensor, between: Tensor,
         own: Tensor, own_weight: Tensor, body: Tensor, body_weight: Tensor, written: Tensor,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         own_keep, body_keep = self.network.own_memory.decay.sigmoid(), self.network.body_memory.decay.sigmoid()
@@ -69,7 +69,7 @@ class Mixture(nn.Module):
         )
         kept = kept_of(gates, before)
         written = kept * written + (1.0 - kept) * new
-        positions, variance = answer(written, experts, heading, scale, gap)
+        positions, variance = answer(written, experts, heading, scale, gap, between)
         return positions, 1e-3 * variance.sqrt(), memory[0], own_weight, memory[1], body_weight, written
 
 

@@ -69,6 +69,7 @@ def test_experts_are_fixed_lag_smoothers_and_their_mean_by_predictions(delay: in
     bank, confidence = new_bank(1, delay), np.full((1, 22), 0.8)
     textbook = [FixedLagRTS(delay, density, known_sigma) for density in DENSITIES]
     experts, features, scale = np.empty((1, 22, EXPERTS, 3)), np.empty((1, 22, FEATURES), np.float32), np.empty(1)
+    gap, between = np.empty((2, 1, 22))
     misfit, spread, count = (np.zeros((22, len(DENSITIES))) for _ in range(3))
     for t, frame in enumerate(seen):
         advance(bank, t, 1 / FPS, frame, confidence, DENSITIES, MEASUREMENT_SIGMA)
@@ -84,25 +85,31 @@ def test_experts_are_fixed_lag_smoothers_and_their_mean_by_predictions(delay: in
         expected = [smoother.update(frame, t / FPS) for smoother in textbook]
         if t < max(delay, 1):
             continue
-        describe(bank, t + 1, delay, PARENT, experts, features, scale, np.empty((1, 22)))
+        describe(bank, t + 1, delay, PARENT, experts, features, scale, gap, between)
         each = np.stack([one.positions[0] for one in expected if one is not None], axis=1)
         np.testing.assert_allclose(experts[0, :, : len(DENSITIES)], each, atol=1e-9)
         likelihood = -1.5 * (count * np.log(misfit / count) + spread)
         weights = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
         weights /= weights.sum(axis=1, keepdims=True)
-        np.testing.assert_allclose(experts[0, :, PREDICTED], (weights[..., None] * each).sum(axis=1), atol=1e-8)
+        mean = (weights[..., None] * each).sum(axis=1)
+        np.testing.assert_allclose(experts[0, :, PREDICTED], mean, atol=1e-8)
+        sigma = np.stack([one.sigma[0] for one in expected if one is not None], axis=1)
+        apart = np.square(each - mean[:, None]).mean(axis=-1)
+        deviation = np.sqrt((weights * (misfit / count * sigma**2 + apart)).sum(axis=1))
+        inside = 10 <= t - delay < 20 <= t
+        np.testing.assert_allclose(between[0], np.where(inside & (np.arange(22) == 7), deviation, 0.0), atol=1e-8)
 
 
 def test_the_gap_is_the_time_to_the_nearest_sighting() -> None:
     seen = walk(12)
     seen[:3, :, 5] = np.nan
     seen[6:9, :, 5] = np.nan
-    bank, gap, found = new_bank(1, 4), np.empty((1, 22)), []
+    bank, (gap, between), found = new_bank(1, 4), np.empty((2, 1, 22)), []
     experts, features, scale = np.empty((1, 22, EXPERTS, 3)), np.empty((1, 22, FEATURES), np.float32), np.empty(1)
     for t, frame in enumerate(seen):
         advance(bank, t, 1 / FPS, frame, np.ones((1, 22)), DENSITIES, MEASUREMENT_SIGMA)
         if t >= 4:
-            describe(bank, t + 1, 4, PARENT, experts, features, scale, gap)
+            describe(bank, t + 1, 4, PARENT, experts, features, scale, gap, between)
             found.append(int(gap[0, 5]))
     assert found == [-1, -1, -1, 0, 0, 0, 1, 2]
     assert (np.delete(gap, 5) == 0).all()
@@ -124,7 +131,7 @@ def test_live_form_gives_what_torch_gives(tmp_path: Path) -> None:
         batch = through_bank(sensed, delay)
         with torch.no_grad():
             outputs = net(batch.features, torch.ones(batch.features.shape[:2], dtype=torch.bool))
-            expected, variance = answer(outputs, batch.experts, batch.heading, batch.scale, batch.gap)
+            expected, variance = answer(outputs, batch.experts, batch.heading, batch.scale, batch.gap, batch.between)
         found = smoothed(seen, delay, str(path))[: 50 - delay]
         origin = truth[0, :, 0][:, None, None]
         np.testing.assert_allclose(places(found).swapaxes(0, 1), expected.numpy() + origin, atol=2e-5)

@@ -72,7 +72,7 @@ def test_mixture_frame_by_frame() -> None:
     motion[5:15, 0, 20] = motion[20:, 1, 7] = np.nan
     live, bank, confidence = MixtureSmoother(delay, bodies), new_bank(bodies, delay), np.ones((bodies, 22))
     features = np.empty((bodies, 22, FEATURES), dtype=np.float32)
-    experts, scale, gap = np.empty((bodies, 22, EXPERTS, 3)), np.empty(bodies), np.empty((bodies, 22))
+    experts, scale, (gap, between) = np.empty((bodies, 22, EXPERTS, 3)), np.empty(bodies), np.empty((2, bodies, 22))
     sizes = {value.name: value.shape[1:] for value in session("mixture-default").get_inputs()}
     parts = ("own", "own_weight", "body", "body_weight", "written")
     memory = {name: np.zeros((bodies, *sizes[name])) for name in parts}
@@ -81,10 +81,11 @@ def test_mixture_frame_by_frame() -> None:
         advance(bank, frame, 1 / 30, positions, confidence, DENSITIES, MEASUREMENT_SIGMA)
         if expected is None:
             continue
-        describe(bank, frame + 1, delay, PARENT, experts, features, scale, gap)
+        describe(bank, frame + 1, delay, PARENT, experts, features, scale, gap, between)
         found, sigma, *kept = answers(
             "mixture-default",
-            features=features, experts=experts, heading=bank.heading, scale=scale, gap=gap, **memory,
+            features=features, experts=experts, heading=bank.heading, scale=scale, gap=gap, between=between,
+            **memory,
         )  # fmt: skip
         memory = dict(zip(memory, kept, strict=True))
         np.testing.assert_allclose(found, expected.positions, atol=5e-6)  # metres
