@@ -200,7 +200,7 @@ def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, 
 
 
 def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, seed: int) -> Calibration:
-    """The scale, from about ``count`` windows for each condition."""
+    """The scale, from about ``count`` windows for each condition; where there is none so fast, from all."""
     rng = np.random.default_rng(seed)
     conditions = [(m, s) for m in range(len(MISSING)) for s in range(len(SENSOR_SIGMAS))]
     quantiles = np.zeros((len(MISSING), len(SENSOR_SIGMAS), len(PACES), len(RATES)))
@@ -210,8 +210,10 @@ def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, see
         seen = hide_joints(wandering(positions, sigma, rng, fast), MISSING[m], rng)
         found = score_windows(network, model, seen, sizes, SENSOR_SIGMAS[s])
         of_class = np.digitize(found.pace, PACE_EDGES)
+        odds = found.odds.max(axis=1)
         for p in range(len(PACES)):
-            quantiles[m, s, p] = np.quantile(found.odds.max(axis=1)[of_class == p], 1 - np.array(RATES))
+            own = odds[of_class == p]
+            quantiles[m, s, p] = np.quantile(own if len(own) else odds, 1 - np.array(RATES))
     return Calibration(quantiles)
 
 

@@ -36,7 +36,7 @@ PACE = 2.0
 """m/s, the unit of velocities."""
 
 MOST_NOISE = 0.3
-"""Metres: what one frame adds to the noise found, at most; of what is farther off, the gate has let a bad one through."""
+"""Metres: what one frame adds to the noise found, at most; beyond that, the gate has let a bad one through."""
 
 _CENTIMETRES = float(np.log(100.0))
 _DELAYS = (0, 1, 2, 4, 8)
