@@ -1,8 +1,7 @@
 """From joint positions to local rotations and back, on one person's bones, frame by frame.
 
-Swing comes from the directions of the bones, twist from the bend of elbows and knees. The loops are compiled by numba:
-the live node solves two poses a body thirty times a second, where an array operation a step would cost ten times the
-arithmetic. Rotations are local (child in parent's frame); the root's is its orientation in the frame of the positions.
+Swing comes from the directions of the bones, twist from the bend of elbows and knees. Rotations are local (child in
+parent's frame); the root's is its orientation in the frame of the positions.
 """
 
 from __future__ import annotations
@@ -36,6 +35,8 @@ RIGID = np.array(
     )
 )
 """(R, 2) the joints at the ends of each."""
+HELD = 1e-6
+"""Mobility of a joint that is known, beside 1 of one that is not, for `fit_lengths`."""
 _SWEEPS = 20
 
 # Where the pelvis is upright below, when it is hidden itself: the middle of two joints, best first.
@@ -99,10 +100,6 @@ def solve_pose(
     local, placed = _initial(fallback, p), np.empty_like(p)
     _solve(p, np.asarray(finite_joints(p)), bones, local, placed)
     return local.reshape(*shape, 3), placed.reshape(shape)
-
-
-HELD = 1e-6
-"""Mobility of a joint that is known, beside 1 of one that is not, for `fit_lengths`."""
 
 
 def fit_lengths(
