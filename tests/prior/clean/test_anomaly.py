@@ -8,7 +8,7 @@ from tests.helpers.bodies import stream, waving
 
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
 from steadypose.prior.clean.pipeline import PriorPipeline
-from steadypose.prior.clean.score import Scorer, ScoreSettings
+from steadypose.prior.clean.score import OwnScale, Scorer, ScoreSettings
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.models.hgvae.anomaly import (
     FROZEN_ODDS,
@@ -139,12 +139,31 @@ def test_exchanged_arms_raise_the_flag_which_goes_down_after_they_are_over() -> 
 
 def test_a_flag_is_held_until_it_has_been_quiet_for_a_while() -> None:
     stage = Scorer(ScoreSettings(false_alarms=0.01, hold=0.1), "default", 1)
-    told = iter([0.0, 2.5, 1.5, 0.9, 0.9, 0.9, 0.9, 2.5])
+    told = iter([0.0, 2.1, 1.7, 0.9, 0.9, 0.9, 0.9, 2.5])
     windows: Any = SimpleNamespace(slots=np.array([0]))
     frozen = np.zeros((1, 22), dtype=bool)
     stage._score = lambda *_: (np.array([next(told)]), np.zeros((1, 22)))  # type: ignore[method-assign]
     flags = [bool(stage.update(windows, frozen, np.full(1, 0.02)).flag[0]) for _ in range(8)]
     assert flags == [False, True, True, True, True, False, False, True]
+
+
+def test_what_a_body_scores_all_the_time_is_no_fault_and_a_fault_of_a_second_no_habit() -> None:
+    rng = np.random.default_rng(0)
+    slots = np.arange(3)
+    habit = np.array([1.0, 1.7, 10.0])  # validation's people; an unknown sensor; a wrong skeleton
+    scale, told, scales = OwnScale(3), rng.exponential(1 / np.log(10), (3000, 3)) * habit, []
+    for frame in told:
+        scales.append(scale.update(slots, frame))
+    rates = (told[300:] / np.array(scales)[300:] > 2).mean(axis=0)
+    assert rates[0] < 0.011
+    assert rates[1] < 0.6 * (told[300:, 1] > 2).mean()
+    assert rates[2] > 0.3
+    before = scale.update(slots, told[0])
+    for _ in range(30):
+        scale.update(slots, np.full(3, 50.0))
+    assert (scale.update(slots, told[0]) <= before + 0.45).all()
+    scale.forget(np.array([False, True, False]))
+    assert scale.update(slots, told[0])[1] == 1.0
 
 
 def test_switched_off_nothing_is_scored() -> None:
