@@ -19,7 +19,7 @@ from steadypose.nodes.graph.threads import one_thread
 
 def evaluate(protocol: str, *, split: str, quick: bool, mocap: Path | None, data: Path, out: Path | None) -> None:
     """Run one protocol, or all that can be run here; see ``steadypose evaluate --help``."""
-    if protocol in SENSORS and mocap is None:
+    if protocol in SENSORS and (mocap is None or not (mocap / SENSORS[protocol]).is_file()):
         raise FileNotFoundError(f"{protocol}: expected --mocap DIR, the folder that holds {SENSORS[protocol]}")
     if out is None and split == "test" and not quick:
         out = RESULTS

@@ -64,10 +64,7 @@ def complete(
     from steadypose.prior.offline.parts import PartsCompleter
     from steadypose.prior.offline.sigma import Uncertainty
 
-    try:
-        completer = LiveCompleter.load(weights)
-    except FileNotFoundError as error:
-        raise LaunchError(str(error)) from error
+    completer = LiveCompleter.load(weights)
     fill = PartsCompleter(completer)
     if optimise:
         from steadypose.prior.offline.optimise import Optimiser

@@ -23,7 +23,7 @@ from steadypose.nodes.commands.output import check_output, check_replaceable, pu
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
-from steadypose.nodes.sources.npz import NpzError
+from steadypose.nodes.sources.npz import NpzError, read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.clean.adapt import SensorFrame
 
@@ -160,15 +160,15 @@ def _points(source: Path, frames: int) -> Floats | None:
     """(T, N, 3) metres, points of the surface, of an .npz that has them."""
     if source.suffix != ".npz":
         return None
-    with np.load(source, allow_pickle=False) as file:
-        if "points" not in file:
-            return None
-        points = np.asarray(file["points"], dtype=np.float64)
-    if points.ndim != 3 or len(points) != frames or points.shape[-1] != 3:
+    points = read_arrays(source, ("points",)).get("points")
+    if points is None:
+        return None
+    if points.dtype.kind not in "fiu" or points.ndim != 3 or len(points) != frames or points.shape[-1] != 3:
         raise NpzError(
-            f"{source}: points: expected ({frames}, N, 3) metres, NaN for what is missing, got {points.shape}"
+            f"{source}: points: expected ({frames}, N, 3) metres, NaN for what is missing, got {points.dtype} "
+            f"{points.shape}"
         )
-    return points
+    return points.astype(np.float64)
 
 
 def _added(arrays: dict[str, NDArray[Any]], track: Any) -> dict[str, NDArray[Any]]:

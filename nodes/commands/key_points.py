@@ -8,6 +8,7 @@ the camera that points up (``-y``, a level camera, unless given), ``camera_heigh
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import JOINTS, JointState, Pose
 from steadypose.nodes.graph.clock import FRAME_NS
-from steadypose.nodes.sources.npz import NpzError
+from steadypose.nodes.sources.npz import NpzError, read_arrays, read_stamps
 from steadypose.prior.body.kinematics import quaternions, rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.body.skeleton import REST_OFFSETS
@@ -38,6 +39,11 @@ CAMERA_HEIGHT, CAMERA_HEIGHT_SIGMA = 1.3, 0.3
 
 LONGEST_GAP_NS = 200_000_000
 """over which key points are interpolated"""
+
+LONGEST_NS = 24 * 3600 * 10**9
+"""of a recording: one wrong stamp must not make a grid of years"""
+
+_NUMBERS = {"keypoints", "confidence", "focal", "centre", "camera_height", "points"}
 
 
 @dataclass(frozen=True)
@@ -70,10 +76,11 @@ def has_key_points(path: Path) -> bool:
     if path.suffix != ".npz" or not path.is_file():
         return False
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return "keypoints" in file and "positions" not in file
-    except (OSError, ValueError):
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (OSError, zipfile.BadZipFile):
         return False
+    return "keypoints.npy" in names and "positions.npy" not in names
 
 
 def read_key_points(path: Path) -> KeyPointRecording:
@@ -82,11 +89,15 @@ def read_key_points(path: Path) -> KeyPointRecording:
     Raises:
         NpzError: an array is missing, or has the wrong form; says what was expected.
     """
-    with np.load(path, allow_pickle=False) as file:
-        arrays: dict[str, NDArray[Any]] = dict(file)
+    arrays = read_arrays(path)
     missing = [name for name in ("skeleton", "focal", "centre") if name not in arrays]
     if missing:
         raise NpzError(f"{path}: expected {', '.join(missing)} beside keypoints; it has {', '.join(arrays)}")
+    for name in _NUMBERS & arrays.keys():
+        if arrays[name].dtype.kind not in "fiu":
+            raise NpzError(f"{path}: {name}: expected numbers, got {arrays[name].dtype}")
+    if "camera_height" in arrays and arrays["camera_height"].size != 1:
+        raise NpzError(f"{path}: camera_height: expected one number, got {arrays['camera_height']!r:.80}")
     name = str(arrays["skeleton"])
     if name not in SKELETONS:
         raise NpzError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {name!r}")
@@ -96,11 +107,12 @@ def read_key_points(path: Path) -> KeyPointRecording:
         raise NpzError(f"{path}: keypoints: expected (T, {joints}, 2) pixels for {name}, T of 2 or more, got "
                        f"{keypoints.shape}")  # fmt: skip
     confidence = np.asarray(arrays.get("confidence", np.ones(keypoints.shape[:2])), dtype=np.float64)
-    focal = np.broadcast_to(np.asarray(arrays["focal"], dtype=np.float64).ravel(), (2,))
+    focal = np.asarray(arrays["focal"], dtype=np.float64).ravel()
+    focal = focal.repeat(2) if focal.size == 1 else focal
     centre = np.asarray(arrays["centre"], dtype=np.float64).ravel()
     for what, value, fits in (
         ("confidence", confidence, confidence.shape == keypoints.shape[:2]),
-        ("focal", focal, bool((focal > 0).all())),
+        ("focal", focal, focal.shape == (2,) and bool((focal > 0).all())),
         ("centre", centre, centre.shape == (2,)),
     ):
         if not fits or not np.isfinite(value).all():
@@ -121,25 +133,23 @@ def read_key_points(path: Path) -> KeyPointRecording:
     pixels[sure <= 0] = np.nan
     count = int((stamps[-1] - stamps[0]) / FRAME_NS + 1e-3) + 1
     grid = stamps[0] + np.round(np.arange(count) * FRAME_NS).astype(np.int64)
-    nearest = np.abs(stamps[None] - grid[:, None]).argmin(axis=1)
+    after = np.clip(np.searchsorted(stamps, grid), 1, len(stamps) - 1)
+    nearest = after - (grid - stamps[after - 1] <= stamps[after] - grid)
     points = arrays.get("points")
     if points is not None and (points.ndim != 3 or points.shape[0] != len(stamps) or points.shape[2] != 3):
         raise NpzError(f"{path}: points: expected ({len(stamps)}, N, 3) metres, got {points.shape}")
     return KeyPointRecording(
         grid, *_on_grid(pixels, sure, stamps, grid, nearest), focal, centre, rotation_matrix(pose.orientation),
-        float(arrays["camera_height"]) if "camera_height" in arrays else None,
+        arrays["camera_height"].item() if "camera_height" in arrays else None,
         None if points is None else np.asarray(points, dtype=np.float64)[nearest],
     )  # fmt: skip
 
 
 def _stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:
-    if "stamp_ns" in arrays and arrays["stamp_ns"].shape == (frames,):
-        stamps = arrays["stamp_ns"].astype(np.int64)
-        if (np.diff(stamps) > 0).all():
-            return stamps
-    elif "fps" in arrays and float(arrays["fps"]) > 0:
-        return np.round(np.arange(frames) * (1e9 / float(arrays["fps"]))).astype(np.int64)
-    raise NpzError(f"{path}: expected fps, or stamp_ns ({frames},) that grow; got {', '.join(arrays)}")
+    stamps = read_stamps(path, arrays, frames)
+    if (np.diff(stamps) <= 0).any() or stamps[-1] - stamps[0] > LONGEST_NS:
+        raise NpzError(f"{path}: stamp_ns: expected stamps that grow, by {LONGEST_NS / 1e9:g} s at most in all")
+    return stamps
 
 
 def _on_grid(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 
@@ -11,6 +11,7 @@ from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.models.distributed import join, neighbours, writes
 from steadypose.prior.models.torch_weights import install as install_weights
 from steadypose.prior.models.training import TrainingOptions
+from steadypose.prior.motion.datasets import WeightSet
 
 
 def train(
@@ -52,8 +53,8 @@ def train(
             completer ('steadypose complete'), or correction (a sensor's own error).
         data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon; for
             mixture and occlusion, the folder of the recordings, which they take at several speeds.
-        weights: the set to train: 'default' takes only data free for products, 'research' all of it; a correction
-            is named after its sensor, kinect_v2.
+        weights: the set to train: 'default' takes only data free for products, 'research' all of it (there is none of
+            mixture and occlusion); a correction is named after its sensor, kinect_v2.
         runs: where checkpoints and curves go.
         iterations: optimiser steps; the model's own number, if left out. Fewer make a weaker model sooner.
         start: weights to go on from, a set or a .safetensors file: with motion of one's own and a third of the
@@ -87,6 +88,8 @@ def train(
     else:
         from steadypose.prior.models.sensor_bias.train import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")
+    if name not in (sets := _weight_sets(model)):
+        raise LaunchError(f"--weights: expected {' or '.join(sets)} for {model}, got {name}")
     if start is not None and model == "correction":
         raise LaunchError("--start: a correction is trained from the beginning, in minutes; leave it out")
     try:
@@ -96,3 +99,10 @@ def train(
     path = train_model(options)
     if writes():
         print(f"weights: {install_weights(path) if install else path}")
+
+
+def _weight_sets(model: str) -> tuple[str, ...]:
+    """The sets of weights that a model can be trained for."""
+    if model == "correction":
+        return ("kinect_v2",)
+    return ("default",) if model in ("mixture", "occlusion") else get_args(WeightSet)

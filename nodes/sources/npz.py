@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import zipfile
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,7 @@ class ArraySource:
         frames = len(positions)
         if not frames:
             raise NpzError(f"{path}: positions: expected at least one frame, got none")
-        self.stamps_ns = _stamps(path, arrays, frames)
+        self.stamps_ns = read_stamps(path, arrays, frames)
         """(T,) int64"""
         confidence = np.asarray(np.isfinite(positions).all(axis=-1), np.float32)
         if "confidence" in arrays:
@@ -107,19 +107,21 @@ class NpzSource(ArraySource):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, _load(path))
+        super().__init__(path, read_arrays(path, _ARRAYS))
 
 
-def _load(path: Path) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
+    """Those of the arrays ``names`` (None: of all) that an ``.npz`` holds.
+
+    Raises:
+        NpzError: it cannot be read, or holds what only pickle could read, which runs code.
+    """
+    if not zipfile.is_zipfile(path):
+        raise NpzError(f"{path}: cannot be read as .npz: expected a zip archive of arrays, as numpy.savez writes it")
     try:
-        if zipfile.is_zipfile(path):
-            check_arrays(path)
+        check_arrays(path)
         with np.load(path, allow_pickle=False) as file:
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise NpzError(f"{path}: expected an .npz with named arrays, got a single array")
-            return {name: file[name] for name in _ARRAYS if name in file}
-    except NpzError:
-        raise
+            return {name: file[name] for name in file if names is None or name in names}
     except Exception as error:  # of damaged bytes zipfile, zlib and numpy's parser of headers raise a dozen kinds
         raise NpzError(f"{path}: cannot be read as .npz: {error}") from error
 
@@ -158,7 +160,12 @@ def _ids(path: Path, arrays: Mapping[str, NDArray[Any]], bodies: int) -> list[in
     return ids.tolist()
 
 
-def _stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:
+def read_stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:
+    """(T,) nanoseconds of capture, from ``stamp_ns``, or counted from 0 by ``fps``.
+
+    Raises:
+        NpzError: there is neither, or not of this length, or beyond what a message can hold.
+    """
     if "stamp_ns" in arrays:
         stamps = arrays["stamp_ns"]
         fit = stamps.dtype.kind in "iu" and stamps.shape == (frames,)

@@ -17,7 +17,7 @@ from steadypose.prior.clean.person import PersonSettings
 from steadypose.prior.clean.reconstruct import ReconstructSettings
 from steadypose.prior.clean.refine import RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
-from steadypose.prior.clean.smooth import SmoothSettings
+from steadypose.prior.clean.smooth import MAX_DELAY, SmoothSettings
 from steadypose.prior.settings import build_settings, check_range
 
 JITTER_SIGMA = 0.02
@@ -58,6 +58,7 @@ class PriorSettings:
     fuse: FuseSettings = field(default_factory=FuseSettings)
 
     def __post_init__(self) -> None:
+        check_range("[prior] delay", self.delay, 0, MAX_DELAY)
         check_range("[prior] max_bodies", self.max_bodies, 1, 256)  # as many as the bench puts side by side
         check_range("[prior] timeout", self.timeout, 0.05, 60.0)
         check_range("[prior.bones] samples", self.bones.samples, 1, 1e6)

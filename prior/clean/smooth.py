@@ -8,7 +8,7 @@ from steadypose.prior.clean.frame import Bools, Gated
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.timing.fixed_lag import Smoothed
 
-MOST_DELAY = 16
+MAX_DELAY = 16
 """frames, the longest delay that the mixture was trained for"""
 
 
@@ -27,8 +27,6 @@ class Smooth:
     """The estimate of the frame ``delay_frames`` before the newest, joint by joint, from what passed the gate."""
 
     def __init__(self, settings: SmoothSettings, delay_frames: int, slots: int) -> None:
-        if not 0 <= delay_frames <= MOST_DELAY:
-            raise ValueError(f"delay: expected 0 to {MOST_DELAY} frames, got {delay_frames}")
         self._mixture = MixtureSmoother(delay_frames, slots, settings.weights)
 
     def forget(self, slot: Bools) -> None:

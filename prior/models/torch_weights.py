@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from steadypose.prior.models import weights_io
 from steadypose.prior.models.distributed import writes
-from steadypose.prior.models.weights_io import Arrays, load_weights
+from steadypose.prior.models.weights_io import Arrays, WeightsError, load_weights
 
 Config = TypeVar("Config")
 N = TypeVar("N", bound=nn.Module)
@@ -91,6 +91,7 @@ def load_network(
 
     Raises:
         FileNotFoundError: no such weights; says which there are.
+        WeightsError: the file is not one of this model's.
     """
     state, stored = load_tensors(name, model)
     loaded = network(config(stored))
@@ -103,14 +104,14 @@ def started(model: nn.Module, name: str, start: str | None) -> str:
 
     Raises:
         FileNotFoundError: no such weights.
-        ValueError: weights of another model.
+        WeightsError: weights of another model, or of another size.
     """
     if start is None:
         return ""
     try:
         model.load_state_dict(load_tensors(start, name)[0])
     except RuntimeError as error:
-        raise ValueError(f"start: expected weights of {name}, of this size, got '{start}': {error}") from error
+        raise WeightsError(f"start: expected weights of {name}, of this size, got '{start}': {error}") from error
     return f", started from the weights '{Path(start).stem}'"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,12 +11,17 @@ from typing import get_args
 import numpy as np
 import roma
 import torch
+from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 from torch import Tensor
 
 from steadypose.prior.body.skeleton import MIRROR
+from steadypose.prior.motion.clip import MotionError
 from steadypose.prior.motion.datasets import WeightSet
 from steadypose.prior.timing.rate import FPS
+
+_ARRAYS = {"clip_start", "split", "set", "rotations", "positions", "offsets", "contacts", "subject", "action",
+           "source"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -55,13 +61,13 @@ class MotionSet:
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: no clip of this split in it, or no such set.
+            MotionError: it is not what `prepare` writes, has no clip of this split, or there is no such set.
         """
         if weights not in get_args(WeightSet):
-            raise ValueError(f"weights: expected one of {', '.join(get_args(WeightSet))}, got {weights!r}")
+            raise MotionError(f"weights: expected one of {', '.join(get_args(WeightSet))}, got {weights!r}")
         if not path.is_file():
             raise FileNotFoundError(f"no prepared motion at {path}: make it with 'steadypose prepare MOCAP --out DIR'")
-        data = np.load(path)
+        data = _prepared(path, _ARRAYS | {"flat"} if flat else _ARRAYS)
         starts = data["clip_start"]
         wanted = (data["split"] == split) & ((data["set"] == "default") | (weights == "research"))
         if (weights, split) == ("default", "test"):
@@ -69,7 +75,7 @@ class MotionSet:
         if flat:
             wanted &= data["flat"]
         if not wanted.any():
-            raise ValueError(f"{path} has no clip of split '{split}' for the '{weights}' weights")
+            raise MotionError(f"{path} has no clip of split '{split}' for the '{weights}' weights")
         frames = np.concatenate([np.arange(starts[c], starts[c + 1]) for c in np.flatnonzero(wanted)])
         lengths = np.diff(starts)[wanted]
         return cls(
@@ -124,6 +130,16 @@ class MotionSet:
             np.arange(a, b - window + 1, step) for a, b in zip(self.clip_start, self.clip_start[1:], strict=False)
         ]
         return np.concatenate(starts)[:, None] + np.arange(window)
+
+
+def _prepared(path: Path, needed: set[str]) -> NpzFile:
+    """The arrays of ``prepared.npz``, not yet read; those ``needed`` are among them."""
+    data = np.load(path) if zipfile.is_zipfile(path) else None
+    if not isinstance(data, NpzFile):
+        raise MotionError(f"{path}: expected the .npz that 'steadypose prepare' writes")
+    if missing := needed - set(data.files):
+        raise MotionError(f"{path}: expected what 'steadypose prepare' writes; it lacks {', '.join(sorted(missing))}")
+    return data
 
 
 def describe_data(weights: str, train: MotionSet, val: MotionSet) -> str:

@@ -26,20 +26,23 @@ def open_npz(file: IO[bytes] | Path, *needs: str) -> Iterator[NpzFile]:
     Raises:
         MotionError: it is no .npz (or needs pickle, which can run code), or lacks an array.
     """
+    name = f"{file}: " if isinstance(file, Path) else ""
+    if not zipfile.is_zipfile(file):
+        raise MotionError(f"{name}expected an .npz archive")
     try:
-        if zipfile.is_zipfile(file):
-            check_arrays(file)
+        check_arrays(file)
         if not isinstance(file, Path):
             file.seek(0)
         archive = np.load(file)
     except Exception as error:  # of damaged bytes zipfile, zlib and numpy's parser of headers raise a dozen kinds
-        raise MotionError(f"expected an .npz archive: {error}") from error
-    if not isinstance(archive, NpzFile):
-        raise MotionError("expected an .npz archive, got a single array")
+        raise MotionError(f"{name}expected an .npz archive: {error}") from error
+    assert isinstance(archive, NpzFile), "np.load gives one for every zip archive"
     with archive:
         missing = set(needs) - set(archive.files)
         if missing:
-            raise MotionError(f"expected arrays {', '.join(sorted(missing))}; the file has {archive.files[:6]}...")
+            raise MotionError(
+                f"{name}expected arrays {', '.join(sorted(missing))}; the file has {archive.files[:6]}..."
+            )
         yield archive
 
 

@@ -16,7 +16,7 @@ from steadypose.prior.models.completer.inference import LiveCompleter
 from steadypose.prior.models.hgvae.completion_inference import LiveCompletion
 from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig
 from steadypose.prior.models.hgvae.features import body_size, from_tracks, hang_unseen, to_tracks
-from steadypose.prior.models.weights_io import load_weights, part
+from steadypose.prior.models.weights_io import WeightsError, load_weights, part
 
 Floats = NDArray[np.float64]
 
@@ -37,14 +37,16 @@ class PartsCompleter:
 
     Raises:
         FileNotFoundError: there are no such weights.
-        ValueError: they have no completion network.
+        WeightsError: they have no completion network.
     """
 
     def __init__(self, completer: LiveCompleter, weights: str = "default") -> None:
         arrays, config = load_weights(weights, "hgvae")
         sizes = HGVAEConfig.from_dict(config)
         if sizes.completion is None:
-            raise ValueError(f"weights '{weights}' of hgvae: expected some with a completion network, these have none")
+            raise WeightsError(
+                f"weights '{weights}' of hgvae: expected some with a completion network, these have none"
+            )
         self._completer, self._frames = completer, sizes.frames
         self._completion = LiveCompletion(sizes.completion, part(arrays, "completion"), 1)
         self._mean = arrays["mean"].astype(np.float64)[:, None]

@@ -66,12 +66,16 @@ def read_manifest(path: Path) -> dict[str, Stream]:
         return {name: _stream(name, entry, path.parent) for name, entry in entries.items()}
     except OSError as error:
         raise ManifestError(f"cannot read {path}: {error.strerror}") from error
-    except (KeyError, AttributeError, json.JSONDecodeError) as error:
+    except ManifestError:
+        raise
+    except (KeyError, AttributeError, TypeError, ValueError) as error:
         raise ManifestError(f"{path}: expected JSON with an object 'streams', got {error!r}") from error
 
 
 def _stream(name: str, entry: Mapping[str, Any], folder: Path) -> Stream:
     known = {f.name for f in fields(Stream)} - {"name"}
+    if not isinstance(entry, dict):
+        raise ManifestError(f"{name}: expected an object with keys {sorted(known)}, got {entry!r}")
     if unknown := set(entry) - known:
         raise ManifestError(f"{name}: unknown keys {sorted(unknown)}; there are {sorted(known)}")
     try:
@@ -88,7 +92,7 @@ def _stream(name: str, entry: Mapping[str, Any], folder: Path) -> Stream:
         )
     except KeyError as error:
         raise ManifestError(f"{name}: expected a key {error}") from error
-    except TypeError as error:
+    except (AttributeError, TypeError, ValueError) as error:
         raise ManifestError(f"{name}: {error}") from error
     if stream.script not in SCRIPTS:
         raise ManifestError(f"{name}: no script '{stream.script}'; there are {', '.join(SCRIPTS)}")
@@ -103,10 +107,19 @@ def make(stream: Stream) -> tuple[list[PoseRaw], list[PoseWorld]]:
     The truth is on the 30 Hz grid that starts at the first raw frame, as the prior's output is. A joint's state says
     whether the camera had it in view with a free line of sight (SEEN) or not (IMPUTED: whoever tells where it is
     infers it).
+
+    Raises:
+        ManifestError: the file of the noise's parameters is missing, or is none.
     """
+    try:
+        noise = NoiseModel.load(stream.noise)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ManifestError(
+            f"{stream.name}: noise: expected parameters as prior/sim/fit.py writes them: {error}"
+        ) from error
     playing, filming = (np.random.default_rng(s) for s in np.random.SeedSequence(stream.seed).spawn(2))
     people = [_cut(m, stream.seconds) for m in SCRIPTS[stream.script](playing)]
-    frames = film(people, stream.camera, NoiseModel.load(stream.noise), filming, stream.name, START_NS)
+    frames = film(people, stream.camera, noise, filming, stream.name, START_NS)
     return frames, _truth(people, stream, frames[0].stamp_ns, frames[-1].stamp_ns)
 
 

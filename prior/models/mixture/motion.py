@@ -13,7 +13,7 @@ from rich.progress import track
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J, finite_joints
-from steadypose.prior.motion.clip import Clip
+from steadypose.prior.motion.clip import Clip, MotionError
 from steadypose.prior.motion.datasets import DATA_SETS, DataSet, Split
 from steadypose.prior.motion.prepare import FPS, fill_gaps, find_faults, resample
 from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, load_pairs
@@ -77,8 +77,10 @@ def write_arrays(mocap: Path, out: Path) -> None:
     """Read the recordings under ``mocap`` that are free for products, and write ``motion-SPLIT.npz`` and ``pairs.npz``.
 
     Recordings of the test split are left out.
+
+    Raises:
+        MotionError: there are none of one split, or no pairs of Kinect and Vicon (``ui_prmd.npz``).
     """
-    out.mkdir(parents=True, exist_ok=True)
     found: dict[str, list[tuple[str, float, NDArray[np.float32]]]] = {"train": [], "val": []}
     for data in DATA_SETS:
         if data.name not in _FREE:
@@ -90,6 +92,10 @@ def write_arrays(mocap: Path, out: Path) -> None:
                 split = _split(clip, data)
                 if split in found:
                     found[split] += [(data.name, *one) for one in _at_speeds(clip, SPEEDS)]
+    for split, clips in found.items():
+        if not clips:
+            raise MotionError(f"{mocap}: expected motion capture of {', '.join(sorted(_FREE))}; none is for '{split}'")
+    out.mkdir(parents=True, exist_ok=True)
     for split, clips in found.items():
         lengths = [len(positions) for _, _, positions in clips]
         np.savez(

@@ -106,7 +106,7 @@ def test_settings_reach_the_stages(tmp_path: Path, options: tuple[str, ...]) -> 
         ({"settings": ("refine.enabeld=false",)}, "did you mean 'enabled'"),
         ({"settings": ("trajectory.contact=false",)}, "contacts"),
         ({"settings": ("delay",)}, "expected section.key=value"),
-        ({"delay": 99}, "expected 0 to 16 frames"),
+        ({"delay": 99}, "delay: expected 0 to 16"),
         ({"settings": ("smooth.weights=nothing",)}, "no weights 'nothing'"),
         ({"out": Path("in.npz")}, "another path"),
         ({"out": Path("nowhere/out.npz")}, "to exist"),

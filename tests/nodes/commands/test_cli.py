@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from steadypose.nodes.cli import COMMANDS, USAGE_ERROR, main
+from steadypose.nodes.graph.launch import bundled
+from steadypose.prior.models.weights_io import WEIGHTS
 
 
 def python(code: str) -> str:
@@ -75,6 +77,44 @@ def test_a_bad_npz_is_said_in_a_line(capsys, tmp_path: Path) -> None:
     np.savez(tmp_path / "in.npz", positions=np.zeros((3, 22)), skeleton="smpl22", fps=30)
     assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == USAGE_ERROR
     assert "for smpl22, got (3, 22)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["clean", "{idle}", "{tmp}/out", "--set", "encode.weights={tmp}/text.safetensors"], "as .safetensors"),
+        (
+            ["clean", "{idle}", "{tmp}/out", "--set", "smooth.weights={weights}/contacts-default.safetensors"],
+            "of mixture",
+        ),
+        (["clean", "{idle}", "{tmp}/out", "--delay", "99"], "expected 0 to 16"),
+        (["clean", "{tmp}/text.npz", "{tmp}/out"], "expected a zip archive"),
+        (["complete", "{idle}", "{tmp}/out", "--weights", "{weights}/contacts-default.safetensors"], "of completer"),
+        (["fit", "{tmp}/cut.npz", "{tmp}/out.npz"], "cannot be read as .npz"),
+        (["train", "hmvae", "--data", "{tmp}/text.npz"], "that 'steadypose prepare' writes"),
+        (["train", "hmvae", "--data", "{tmp}/other.npz"], "it lacks"),
+        (["train", "hmvae", "--weights", "kinect_v2"], "expected default or research for hmvae, got kinect_v2"),
+        (["train", "mixture", "--weights", "research"], "expected default for mixture, got research"),
+        (["train", "mixture", "--data", "{tmp}"], "expected motion capture of"),
+        (["train", "correction", "--data", "{tmp}/text.npz"], "text.npz: expected an .npz archive"),
+        (["simulate", "{tmp}/out", "--manifest", "{tmp}/list.json"], "expected JSON with an object 'streams'"),
+        (["simulate", "{tmp}/out", "--manifest", "{tmp}/entry.json"], "walk: expected an object with keys"),
+        (["evaluate", "kinect_vicon", "--quick", "--mocap", "{tmp}"], "the folder that holds ui_prmd.npz"),
+        (["evaluate", "fidelity", "--quick", "--data", "{tmp}/other.npz"], "it lacks"),
+    ],
+)
+def test_files_that_are_something_else_are_refused_in_a_line(
+    capsys, tmp_path: Path, arguments: list[str], expected: str
+) -> None:
+    (tmp_path / "text.npz").write_text("hello")
+    (tmp_path / "text.safetensors").write_text("hello, world")
+    np.savez(tmp_path / "other.npz", a=1)
+    (tmp_path / "cut.npz").write_bytes(b"PK\x03\x04" + bytes(60))
+    (tmp_path / "list.json").write_text("[]")
+    (tmp_path / "entry.json").write_text('{"streams": {"walk": 3}}')
+    places = {"idle": bundled("sim_data", "idle"), "tmp": tmp_path, "weights": WEIGHTS}
+    assert main([argument.format(**places) for argument in arguments]) == USAGE_ERROR
+    assert expected in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_bug_keeps_its_traceback(monkeypatch) -> None:

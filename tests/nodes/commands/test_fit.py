@@ -147,7 +147,13 @@ def test_nobody_in_it_is_said(tmp_path: Path, capsys) -> None:
         ({"keypoints": np.zeros((4, 3, 2))}, "keypoints"),
         ({"confidence": np.zeros((2, 2))}, "confidence"),
         ({"up": "x"}, "up"),
+        ({"focal": ["long"]}, "focal: expected numbers"),
+        ({"focal": [1.0, 2.0, 3.0]}, "focal"),
+        ({"camera_height": [1.0, 2.0]}, "camera_height"),
         ({"fps": 0.0}, "fps"),
+        ({"fps": 1e-9}, "fps"),
+        ({"stamp_ns": np.zeros(FRAMES, dtype=np.int64)}, "stamps that grow"),
+        ({"stamp_ns": np.arange(FRAMES) * 10**15}, "at most in all"),
         ({"points": np.zeros((3, 5, 3))}, "points"),
     ],
 )

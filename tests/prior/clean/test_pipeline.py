@@ -61,7 +61,7 @@ def test_without_any_network_of_windows_frames_may_be_lost(delay: int, lost: int
 
 
 def test_a_delay_longer_than_the_mixture_has_learned_is_refused() -> None:
-    with pytest.raises(ValueError, match="0 to 16 frames"):
+    with pytest.raises(ValueError, match="delay: expected 0 to 16"):
         PriorPipeline(PriorSettings(delay=17))
 
 

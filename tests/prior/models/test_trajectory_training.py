@@ -113,7 +113,7 @@ def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, 
     monkeypatch.setattr("steadypose.prior.models.weights_io.WEIGHTS", tmp_path / "weights")
     monkeypatch.setattr(training, "BATCH", 4)
     whole = training.train_trajectory(TrainingOptions(prepared, tmp_path / "a", iterations=4))
-    state, config = load_tensors(str(whole), "")
+    state, config = load_tensors(str(whole), "trajectory")
     TrajectoryNet(TrajectoryConfig.from_dict(config)).load_state_dict(state)
     assert (tmp_path / "a/trajectory-default/trajectory-default.md").read_text().startswith("# trajectory-default")
     assert (tmp_path / "a/trajectory-default/trajectory-default.png").stat().st_size > 0
@@ -129,7 +129,7 @@ def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, 
     options = TrainingOptions(prepared, tmp_path / "b", iterations=4)
     with pytest.raises(KeyboardInterrupt):
         training.train_trajectory(options)
-    resumed, _ = load_tensors(str(training.train_trajectory(options)), "")
+    resumed, _ = load_tensors(str(training.train_trajectory(options)), "trajectory")
     assert next(calls) == 5
     for name, tensor in state.items():
         torch.testing.assert_close(resumed[name], tensor, rtol=0, atol=0)

@@ -1,0 +1,37 @@
+"""Weights are refused by what is wrong with the file, not by where a network first stumbles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from steadypose.prior.models.weights_io import _OTHER_SIZES, _PARTS, WEIGHTS, WeightsError, load_weights
+
+
+def model_of(path: Path) -> str:
+    return "faults" if ".faults" in path.suffixes else path.stem.partition("-")[0]
+
+
+@pytest.mark.parametrize("path", sorted(WEIGHTS.glob("*.safetensors")), ids=lambda path: path.stem)
+def test_weights_that_ship_are_those_of_one_model_alone(path: Path, tmp_path: Path) -> None:
+    arrays, _ = load_weights(str(path), model_of(path))
+    assert all(array.dtype == np.float32 for array in arrays.values())
+    copy = tmp_path / f"{path.name.partition('.')[0]}.safetensors"
+    copy.write_bytes(path.read_bytes())
+    for other in {*_PARTS, *_OTHER_SIZES} - {"faults"}:
+        if other != model_of(path) and _OTHER_SIZES.get(other) != model_of(path):
+            with pytest.raises(WeightsError, match=f"expected weights of {_OTHER_SIZES.get(other, other)}"):
+                load_weights(str(copy), other)
+
+
+def test_a_damaged_file_and_one_without_configuration_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "contacts-own.safetensors"
+    path.write_bytes(b"\xff" * 100)
+    with pytest.raises(WeightsError, match="expected weights as"):
+        load_weights(str(path), "contacts")
+    save_file({"head.weight": np.zeros(1), "unit.weight": np.zeros(1)}, path)
+    with pytest.raises(WeightsError, match="no configuration"):
+        load_weights(str(path), "contacts")
