@@ -21,7 +21,7 @@ from steadypose.prior.models.hgvae.features import to_tracks
 from steadypose.prior.models.hgvae.network import HGVAE
 from steadypose.prior.models.hgvae.train_faults import Scored, score_windows
 from steadypose.prior.models.hgvae.windows import Windows, standardise
-from steadypose.prior.motion.corruption import sensed
+from steadypose.prior.motion.corruption import with_sensor_error
 from steadypose.prior.motion.dataset import MotionSet
 
 Floats = NDArray[np.float64]
@@ -40,15 +40,15 @@ def anomalies(bench: Bench, model: HGVAE, data: Data) -> Result:
     figure = Figure(figsize=(9.5, 5.6), layout="constrained")
     for axis, (sensor, sigma) in zip(figure.subplots(1, 2, sharey=True), SENSORS.items(), strict=True):
         clean, sizes = windows.draw(count, frames, rng)
-        quiet = score_windows(network, model, sensed(clean, sigma, rng), sizes, sigma).odds.max(axis=1)
-        plain = -_paper_score(model, sensed(clean, sigma, rng), sizes)
+        quiet = score_windows(network, model, with_sensor_error(clean, sigma, rng), sizes, sigma).odds.max(axis=1)
+        plain = -_paper_score(model, with_sensor_error(clean, sigma, rng), sizes)
         other, other_sizes = windows.draw(count, frames, rng)
         for name, fault in FAULTS.items():
             if name == HELD:
-                seen, holds = held(sensed(other, sigma, rng), other, rng)
+                seen, holds = held(with_sensor_error(other, sigma, rng), other, rng)
             else:
                 spoilt, holds = fault(other, rng)
-                seen = sensed(spoilt, sigma, rng)
+                seen = with_sensor_error(spoilt, sigma, rng)
             seen = seen[holds]
             loud = score_windows(network, model, seen, other_sizes[holds], sigma).odds.max(axis=1)
             paper = -_paper_score(model, seen, other_sizes[holds])
@@ -107,7 +107,7 @@ def _false_alarms(bench: Bench, network: FaultNet, model: HGVAE, data: Data) -> 
     def scored(motion: MotionSet, windows: int) -> Scored:
         rng = np.random.default_rng(13)
         positions, sizes = Windows(motion).draw(windows, model.config.frames, rng)
-        return score_windows(network, model, sensed(positions, sigma, rng), sizes, sigma)
+        return score_windows(network, model, with_sensor_error(positions, sigma, rng), sizes, sigma)
 
     people = {str(person): data.val.only(data.val.subject == person) for person in np.unique(data.val.subject)}
     found = {p: scored(m, max(round(count * m.hours / data.val.hours), 8)).odds.max(axis=1) for p, m in people.items()}

@@ -17,7 +17,7 @@ Fault = Callable[[Floats, np.random.Generator], tuple[Floats, NDArray[np.bool_]]
 HELD = "a joint frozen"
 BEGINS = 20
 """Frame in which a fault begins that lasts to the window's end."""
-LEAST_MOTION = 0.10
+MIN_MOTION = 0.10
 """Metres: a joint that would have moved less is not told from one that is frozen, by anybody."""
 
 _ARM, _LEG, *_ = limbs(("elbow", "wrist"), ("knee", "ankle", "foot"))
@@ -39,7 +39,7 @@ def exchanged(windows: Floats, rng: np.random.Generator, limb: list[int]) -> tup
     both = np.array([*limb, *MIRROR[limb]])
     out = windows.copy()
     out[:, BEGINS:, both] = windows[:, BEGINS:, MIRROR[both]]
-    return out, np.linalg.norm(out - windows, axis=-1).max(axis=(1, 2)) > LEAST_MOTION
+    return out, np.linalg.norm(out - windows, axis=-1).max(axis=(1, 2)) > MIN_MOTION
 
 
 def frozen(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
@@ -52,9 +52,9 @@ def held(seen: Floats, windows: Floats, rng: np.random.Generator) -> tuple[Float
     out = seen.copy()
     moved = np.linalg.norm(windows[:, BEGINS:] - windows[:, BEGINS - 1 : BEGINS], axis=-1)[..., _MOVERS].max(axis=1)
     for k, by in enumerate(moved):
-        joint = _MOVERS[rng.choice(np.flatnonzero(by > LEAST_MOTION))] if (by > LEAST_MOTION).any() else _MOVERS[0]
+        joint = _MOVERS[rng.choice(np.flatnonzero(by > MIN_MOTION))] if (by > MIN_MOTION).any() else _MOVERS[0]
         out[k, BEGINS:, joint] = seen[k, BEGINS - 1, joint]
-    return out, (moved > LEAST_MOTION).any(axis=1)
+    return out, (moved > MIN_MOTION).any(axis=1)
 
 
 def other_skeleton(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:

@@ -41,10 +41,10 @@ def generation(bench: Bench, data: Data) -> Result:
     windows = models.ActionWindows(motion, names)
     bench.progress.stop()
     config = models.with_actions(len(names))
-    model = models.train(config, windows, data.runs(bench) / "generation", steps, least_sigma=models.LEAST_SIGMA)
+    model = models.train(config, windows, data.runs(bench) / "generation", steps, least_sigma=models.MIN_SIGMA)
     in_levels = models.train(
         models.of_levels(), Windows(data.train), data.runs(bench) / "levels", 2 if bench.quick else 1_200,
-        least_sigma=models.LEAST_SIGMA,
+        least_sigma=models.MIN_SIGMA,
     )  # fmt: skip
     bench.progress.start()
     rng = np.random.default_rng(29)

@@ -126,7 +126,7 @@ def whole_joints(model: HGVAE, positions: Floats, sizes: Floats, hidden: Mask) -
         seen = np.where(hidden[part, None, :, None], np.nan, positions[part])
         batch = Batch.of(model, seen, positions[part], sizes[part])
         done = batch.completed(model, SLOW)
-        passed = model(done.x, done.believed).tracks.mean
+        passed = model(done.x, done.certainty).tracks.mean
         for name, x in {
             "mean": torch.zeros_like(batch.x), "guess": batch.x, "completion": done.x, "HG-VAE": passed,
         }.items():  # fmt: skip

@@ -40,7 +40,7 @@ DEPTH_RATE = 8e-3
 when an hour is over, and which one is ahead says nothing of depth."""
 
 
-LEAST_SIGMA = 0.05
+MIN_SIGMA = 0.05
 """Metres: what a model that generates need not get right. By the likelihood alone, the trunk's millimetres outweigh
 what the arms do, and neither latents nor samples tell of them."""
 
@@ -117,7 +117,7 @@ def train(
         else:
             positions, sizes = windows.draw(count, config.frames, rng)
         whole = Batch.of(model, positions, positions, sizes)
-        drawn = model(whole.x, whole.believed, spread=torch.ones(count, 1), action=action)
+        drawn = model(whole.x, whole.certainty, spread=torch.ones(count, 1), action=action)
         if least_sigma:
             log_var = drawn.tracks.log_var.clamp(min=2 * math.log(least_sigma / SCALE))
             drawn = drawn._replace(tracks=drawn.tracks._replace(log_var=log_var))

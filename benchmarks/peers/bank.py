@@ -20,7 +20,7 @@ DENSITIES = (0.05, 0.3, 1.8, 10.0, 60.0)
 """m²/s³"""
 
 _RECENT, _NOISE_FRAMES = 9, 30
-_LEAST_NOISE, _FIRST_NOISE = 1e-4, 0.01
+_MIN_NOISE, _FIRST_NOISE = 1e-4, 0.01
 """metres: below what any sensor has, and what is assumed before there are four sightings"""
 _MEDIAN_NORM = 1.538
 """Median length of a normal vector in space with a standard deviation of 1 along each axis."""
@@ -56,7 +56,7 @@ def noise_found(seen: Floats) -> Floats:
     window = np.sort(sliding_window_view(padded, _NOISE_FRAMES, axis=0), axis=-1)  # NaN last
     count = np.isfinite(window).sum(axis=-1, keepdims=True)
     median = np.take_along_axis(window, np.maximum(count - 1, 0) // 2, axis=-1)[..., 0]
-    log = np.log(np.maximum(median / _MEDIAN_NORM / _THIRD, _LEAST_NOISE))
+    log = np.log(np.maximum(median / _MEDIAN_NORM / _THIRD, _MIN_NOISE))
     known = np.isfinite(log)
     of_body = np.where(known, log, 0.0).sum(axis=-1, keepdims=True)
     of_body = np.where(

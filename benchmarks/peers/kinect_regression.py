@@ -25,9 +25,9 @@ from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 
-_FRAMES, _MOST_AHEAD = 24, 4
+_FRAMES, _MAX_AHEAD = 24, 4
 _BATCH = 128
-_LEAST_SCALE = 0.01  # metres
+_MIN_SCALE = 0.01  # metres
 _INPUT_NOISE = 0.1  # standard deviations
 _SIDES = str.maketrans("LR", "RL")
 _OTHER_SIDE = [
@@ -142,7 +142,7 @@ def temporal_convolution(
     # Both sides count, for standardised poses to be mirrored as poses are.
     poses, errors = windows[known, -1 - ahead], targets[known]
     poses, errors = torch.cat([poses, _mirrored(poses, _OTHER_SIDE)]), torch.cat([errors, _mirrored(errors, mirror)])
-    mean, scale = poses.mean(dim=0), poses.std(dim=0).clamp(min=_LEAST_SCALE)
+    mean, scale = poses.mean(dim=0), poses.std(dim=0).clamp(min=_MIN_SCALE)
     error_mean, error_scale = errors.mean(dim=0), errors.std(dim=0)
     net = TemporalConvolution()
     optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3, weight_decay=1e-2)
@@ -171,7 +171,7 @@ def temporal_convolution(
 
 def look_ahead(delay: int) -> int:
     """Frames that the convolution looks ahead at a delay; the smoother before it has the rest."""
-    return min(delay, _MOST_AHEAD)
+    return min(delay, _MAX_AHEAD)
 
 
 def _windows(clip: Smoothed, ahead: int) -> Tensor:

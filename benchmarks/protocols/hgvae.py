@@ -60,8 +60,8 @@ def _elbo(model: HGVAE, windows: Windows, count: int) -> dict[str, float]:
     for start in range(0, count, 128):
         part = slice(start, start + 128)
         whole = Batch.of(model, positions[part], positions[part], sizes[part])
-        likelihood, kl = evidence(model(whole.x, whole.believed, spread=torch.ones(len(whole.x), 1)), whole.target)
-        off = (model(whole.x, whole.believed).tracks.mean - whole.target) * SCALE * 1000
+        likelihood, kl = evidence(model(whole.x, whole.certainty, spread=torch.ones(len(whole.x), 1)), whole.target)
+        off = (model(whole.x, whole.certainty).tracks.mean - whole.target) * SCALE * 1000
         parts.append(torch.stack([likelihood, kl, off.square().mean(dim=(1, 2))], dim=1))
     likelihood, kl, square = torch.cat(parts).mean(dim=0).tolist()
     return {"log_likelihood": likelihood, "kl": kl, "elbo": likelihood - kl, "mse_mm2": square}

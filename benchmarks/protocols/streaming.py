@@ -39,7 +39,7 @@ STAMP_JITTER_S = 0.010
 BURST_S = 1.0
 RECOVERED = 1.5
 """A limb is found again when its error is within so many times what it is when nothing is hidden."""
-MOST_LAG = 12
+MAX_LAG = 12
 """Frames, looked at for the delay."""
 STREAMING_PEERS = tuple(peer for peer in PEERS if peer.delays != (OFFLINE,) and peer.run is not raw)
 """Who does not answer for a lost frame would be scored on the others alone: "hold last" is raw with an answer."""
@@ -56,7 +56,7 @@ def run(bench: Bench) -> Result:
     def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
         answer = peer.run(tuning_seen, clips.stamps_s, delay, **parameters)
         found = figures(score(answer, some.positions, missing(tuning_seen), align=False))
-        behind = found_delay(answer, some.positions, MOST_LAG)
+        behind = found_delay(answer, some.positions, MAX_LAG)
         kept = {key: found[key] for key in ("position_mm", "acceleration_mm", "own_acceleration_mm")}
         return {**kept, "delay_found_ms": round((delay + behind) * 1e3 / FPS, 2)}
 
@@ -102,7 +102,7 @@ def _record(answer: Answer, condition: str, truth_at: CubicSpline, hidden: NDArr
         **{key: found[key] for key in ("position_mm", "position_ci_mm", "acceleration_mm", "own_acceleration_mm")},
     }
     if condition == "steady":
-        behind = found_delay(positions, truth, MOST_LAG)
+        behind = found_delay(positions, truth, MAX_LAG)
         record["delay_found_ms"] = round((answer.delay + behind) * 1e3 / FPS, 2)
     if condition == "occlusion of 1 s":
         times = recovery(positions, truth, hidden)

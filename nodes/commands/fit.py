@@ -94,15 +94,15 @@ def _fit_poses(
     from steadypose.nodes.graph.prior_node import make_prior
     from steadypose.nodes.graph.trajectory_node import make_trajectory
     from steadypose.prior.offline.solve import FitSettings
-    from steadypose.prior.offline.windows import LEAST_FRAMES, window_bounds
+    from steadypose.prior.offline.windows import MIN_FRAMES, window_bounds
 
     frames = open_recording(source)
     points = _points(source, len(frames))
     messages = list(stream(frames, make_prior({"delay": delay}), make_trajectory({})))
-    bodies = bodies_seen(messages, LEAST_FRAMES)
+    bodies = bodies_seen(messages, MIN_FRAMES)
     if not bodies:
         raise LaunchError(
-            f"{source}: expected somebody who is seen for {LEAST_FRAMES} frames or more, found nobody; is the skeleton "
+            f"{source}: expected somebody who is seen for {MIN_FRAMES} frames or more, found nobody; is the skeleton "
             "right, are the units metres? `steadypose info` says what it holds"
         )
     stamps = np.array([m.stamp_ns for _, m in messages if isinstance(m, PoseRaw) and not m.end_of_stream], np.int64)
@@ -139,12 +139,12 @@ def _fit_picture(
 ) -> tuple[int, list[str]]:
     """Fit key points of one camera; the frames, and lines to print."""
     from steadypose.prior.offline.solve import FitSettings
-    from steadypose.prior.offline.windows import LEAST_FRAMES, window_bounds
+    from steadypose.prior.offline.windows import MIN_FRAMES, window_bounds
 
     recording = read_key_points(source)
     frames = len(recording.stamps_ns)
-    if frames < LEAST_FRAMES:
-        raise NpzError(f"{source}: expected {LEAST_FRAMES} frames at 30 Hz or more, got {frames}")
+    if frames < MIN_FRAMES:
+        raise NpzError(f"{source}: expected {MIN_FRAMES} frames at 30 Hz or more, got {frames}")
     bar = progress.add_task(source.name, total=len(window_bounds(frames)))
     track = fit_key_points(model, recording, FitSettings(), folder, lambda: progress.advance(bar))
     part = folder / out.name

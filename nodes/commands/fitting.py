@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-LEAST_SIGMA = 0.01
+MIN_SIGMA = 0.01
 """Metres: no sensor means the joints that our bones end in to less."""
 
 FAR = 0.1
@@ -143,7 +143,7 @@ def noise_of(raw: Floats) -> float:
     """Metres along an axis, of joints (T, 22, 3), by third differences, which motion hardly has."""
     third = np.linalg.norm(np.diff(raw, n=3, axis=0), axis=-1)
     third = third[np.isfinite(third)]
-    return max(float(np.median(third)) / _MEDIAN_NORM / float(_THIRD), LEAST_SIGMA) if len(third) else LEAST_SIGMA
+    return max(float(np.median(third)) / _MEDIAN_NORM / float(_THIRD), MIN_SIGMA) if len(third) else MIN_SIGMA
 
 
 def fit_body(

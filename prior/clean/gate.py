@@ -42,7 +42,7 @@ _EXCHANGED = tuple(np.concatenate(limbs(chain)) for chain in (("elbow", "wrist")
 _SWAP_APART = 0.15  # metres between expected and seen, mean of a limb's joints, below which no exchange is suspected
 _SWAP_BETTER = 0.4  # an exchange must bring the joints this much nearer to where they were expected
 _JUMP_NOISES = 7.0  # times the noise: one sighting in a thousand is further from where it was expected
-_LEAST_BONE, _BONE_NOISES = 0.1, 4.0  # metres, and times the noise, by which even a short bone may differ
+_MIN_BONE, _BONE_NOISES = 0.1, 4.0  # metres, and times the noise, by which even a short bone may differ
 _NOISE_MEMORY = 15  # frames
 _DISTANCE_OF_NOISE = 2.6  # median distance to the expectation of white noise of 1 along each axis, by this filter
 _OWN_MEMORY, _OWN_TIMES = 9, 3.0  # frames in which a joint shows how far from expected it comes, and times that
@@ -169,7 +169,7 @@ class Gate:
 
     def _bad_bones(self, positions: Floats, person: Person) -> Bools:
         """(S, 22) joints at the end of a bone of impossible length."""
-        least = _LEAST_BONE + _BONE_NOISES * self._jitter
+        least = _MIN_BONE + _BONE_NOISES * self._jitter
         return _of_impossible_length(positions, person.offsets, self._settings.bone, least) & person.measured[:, None]
 
 

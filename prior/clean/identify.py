@@ -190,9 +190,9 @@ class Identify:
         pose = bodies - places[:, None]
         self._pose[rows] = np.where(np.isfinite(pose), pose, self._pose[rows])
         self._seen_s[rows] = now
-        weight = np.isfinite(lengths) * np.clip(step, _LEAST_STEP_S, RECENT_S)
+        weight = np.isfinite(lengths) * np.clip(step, _MIN_STEP_S, RECENT_S)
         self._lengths_s[rows] += weight
-        share = weight / np.maximum(self._lengths_s[rows], _LEAST_STEP_S)
+        share = weight / np.maximum(self._lengths_s[rows], _MIN_STEP_S)
         self._lengths[rows] += share * (np.nan_to_num(lengths) - self._lengths[rows])
 
     def _name(self, row_of: NDArray[np.intp], places: Floats, place_score: Floats, now: float) -> None:
@@ -229,7 +229,7 @@ class Identify:
     def _become(self, row: int, person: int) -> None:
         """Recognise the body in a row as a person out of sight."""
         self._id[row] = self._id[person]
-        total = np.maximum(self._lengths_s[row] + self._lengths_s[person], _LEAST_STEP_S)
+        total = np.maximum(self._lengths_s[row] + self._lengths_s[person], _MIN_STEP_S)
         self._lengths[row] += self._lengths_s[person] / total * (self._lengths[person] - self._lengths[row])
         self._lengths_s[row] += self._lengths_s[person]
         self._forget(np.arange(self._rows) == person)
@@ -242,7 +242,7 @@ class Identify:
             self._lengths[rows] = self._lengths_s[rows] = 0.0
 
 
-_LEAST_STEP_S = 1e-3
+_MIN_STEP_S = 1e-3
 
 _ENDS = np.array([[[J[end] for end in bone] for bone in (sides[0], sides[-1])] for sides in _BONES])
 """(B, 2, 2) the joints at both ends of each bone, on either side of the body."""

@@ -11,7 +11,7 @@ from steadypose.prior.clean.history import History
 from steadypose.prior.models.hgvae.features import body_size, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
 
-LEAST_CONFIDENCE = 0.1
+MIN_CONFIDENCE = 0.1
 """of a joint that passed the gate"""
 
 
@@ -43,7 +43,7 @@ class Reconstruct:
             return None
         size = body_size(person.offsets[slots])
         tracks = to_tracks(history.positions[-self.frames :, slots].swapaxes(0, 1), size)
-        of_joints = np.clip(history.confidence[-self.frames :, slots], LEAST_CONFIDENCE, 1.0)
+        of_joints = np.clip(history.confidence[-self.frames :, slots], MIN_CONFIDENCE, 1.0)
         confidence = tracks.observed * np.repeat(of_joints.transpose(1, 2, 0), 3, axis=1)
         reconstruction = self._model.reconstruct(tracks.x, confidence, bias_sigma[slots])
         return BodyWindows(slots, tracks, confidence, size, reconstruction, self._model)

@@ -34,7 +34,7 @@ JITTER_RATIO = 4.0
 any. A Kinect v2's bones say 5.5 mm where third differences say 0.7 (medians of UI-PRMD, s01 to s06); what the gate
 measures is larger, for it includes what the body's own motion adds."""
 
-LEAST_FRAMES = 3
+MIN_FRAMES = 3
 """Frames of which a length's mean and variance are known."""
 
 UNKNOWN_VARIANCE = 1e-4
@@ -124,14 +124,14 @@ def _find(positions, sigma, offsets, expected, moments, bias, length_variance):
             noise[k] += share * (left - noise[k])
         known = 0
         for k in _BONE:
-            if frames[k] > LEAST_FRAMES:
+            if frames[k] > MIN_FRAMES:
                 lasting[known] = max(variance[k] - noise[k], 0.0)
                 known += 1
         found = 0.5 * median(lasting[:known]) if known else 0.0
         square = (PRIOR_FRAMES * expected[s] ** 2 + most * found) / (PRIOR_FRAMES + most)
         bias[s] = math.sqrt(square)
         for k in range(len(RIGID)):
-            if frames[k] <= LEAST_FRAMES:
+            if frames[k] <= MIN_FRAMES:
                 length_variance[s, k] = UNKNOWN_VARIANCE
                 continue
             own = _apart(rest, RIGID[k, 0], RIGID[k, 1])

@@ -1,4 +1,8 @@
-"""What cameras and trackers do to a window, for training: noise, hidden joints, and what they get plainly wrong."""
+"""Corruption of clean windows for training: a tracker's noise, its faults, and hidden joints.
+
+A sensor's error has two parts, as `prior.clean.frame.SensorNoise` has it: jitter, independent from frame to frame, and
+a slow error (bias), constant or slowly varying. Windows are (B, T, 22, 3) metres, and are not changed in place.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +18,11 @@ from steadypose.prior.timing.rate import FPS
 Floats = NDArray[np.float64]
 Rng = np.random.Generator
 Fault = Callable[[Floats, slice, list[int], Floats, Rng], None]
-"""Spoils a window (T, 22, 3) in place: some joints in a part of its frames; with another window, of somebody else."""
+"""Puts a tracking fault into a window (T, 22, 3), in place: into some joints, in a slice of its frames. The other
+window (T, 22, 3) is of another person, for faults that mix two bodies."""
 
 SLOW_HZ = 0.7
-"""how fast a sensor's slow error changes at most"""
+"""Largest frequency of a sensor's slow error"""
 
 _LIMBS = limbs(
     ("wrist",), ("elbow", "wrist"), ("shoulder", "elbow", "wrist"),
@@ -25,40 +30,46 @@ _LIMBS = limbs(
 )  # fmt: skip
 _LOWER = [joint for leg in limbs(("hip", "knee", "ankle", "foot")) for joint in leg]
 _ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_collar", "left_foot", "right_foot")]
-"""joints that many sensors do not have"""
+"""Joints that many sensors do not have"""
 
 
-def slow_errors(count: int, rng: Rng) -> Floats:
-    """(B,) metres along an axis: how large the errors of a sensor are that last or change slowly, in many none."""
+def draw_bias_sigma(count: int, rng: Rng) -> Floats:
+    """(B,) metres along an axis, standard deviations of slow errors to train on: 0 in 30 % of windows, up to 3 cm."""
     return 0.03 * rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.7)
 
 
-def add_noise(positions: Floats, rng: Rng, slow: Floats) -> Floats:
-    """Windows (B, T, 22, 3) with noise from frame to frame, of some joints more than of others, up to 10 cm, and with
-    errors ``slow`` (B,) that last or change slowly; see `slow_errors`. Half of those without such errors have none."""
-    count, frames, joints, _ = positions.shape
-    fast = 10 ** rng.uniform(-3.3, -1.0, (count, 1, 1, 1)) * np.exp(0.4 * rng.standard_normal((count, 1, joints, 1)))
-    fast[(slow == 0) & (rng.random(count) < 0.5)] = 0.0
-    phase = rng.uniform(0.0, 2 * np.pi, (count, 1, joints, 3))
-    turns = rng.uniform(0.0, SLOW_HZ, (count, 1, joints, 3)) * np.arange(frames)[:, None, None] / FPS
-    bias = np.sqrt(2.0) * slow[:, None, None, None] * np.cos(phase + 2 * np.pi * turns)
-    return positions + fast * rng.standard_normal((count, frames, joints, 3)) + bias
-
-
-def other_builds(positions: Floats, lengths: float, turned: float, rng: Rng) -> Floats:
-    """Windows (B, T, 22, 3) of people who are built and who hold themselves otherwise.
+def add_noise(positions: Floats, rng: Rng, bias_sigma: Floats) -> Floats:
+    """Windows with jitter of up to 10 cm, of another deviation at each joint, and with a slow error.
 
     Args:
-        positions: metres.
-        lengths: standard deviation of the logarithm of each bone's length, alike on both sides.
-        turned: radians, by how much each bone is turned about each axis, throughout the window: at most so much
-            standard deviation, in most windows less.
-        rng: of what is drawn.
+        positions: (B, T, 22, 3) metres.
+        rng: source.
+        bias_sigma: (B,) metres along an axis, of the slow error, such as `draw_bias_sigma`; half of the windows in
+            which it is 0 get no jitter either.
+    """
+    count, frames, joints, _ = positions.shape
+    jitter = 10 ** rng.uniform(-3.3, -1.0, (count, 1, 1, 1)) * np.exp(0.4 * rng.standard_normal((count, 1, joints, 1)))
+    jitter[(bias_sigma == 0) & (rng.random(count) < 0.5)] = 0.0
+    phase = rng.uniform(0.0, 2 * np.pi, (count, 1, joints, 3))
+    turns = rng.uniform(0.0, SLOW_HZ, (count, 1, joints, 3)) * np.arange(frames)[:, None, None] / FPS
+    bias = np.sqrt(2.0) * bias_sigma[:, None, None, None] * np.cos(phase + 2 * np.pi * turns)
+    return positions + jitter * rng.standard_normal((count, frames, joints, 3)) + bias
+
+
+def vary_builds(positions: Floats, length_sigma: float, turn_sigma: float, rng: Rng) -> Floats:
+    """Windows of people of other bone lengths and posture (augmentation).
+
+    Args:
+        positions: (B, T, 22, 3) metres.
+        length_sigma: standard deviation of the logarithm of each bone's scale, which both sides share.
+        turn_sigma: radians, upper bound of the standard deviation, drawn for each window, of a constant rotation of
+            each bone about each axis.
+        rng: source.
     """
     count, joints = len(positions), len(PARENTS)
-    factor = np.exp(lengths * rng.standard_normal((count, joints)))
+    factor = np.exp(length_sigma * rng.standard_normal((count, joints)))
     factor = np.sqrt(factor * factor[:, MIRROR])[..., None, None]
-    angles = turned * rng.uniform(0.0, 1.0, (count, 1, 1)) * rng.standard_normal((count, joints, 3))
+    angles = turn_sigma * rng.uniform(0.0, 1.0, (count, 1, 1)) * rng.standard_normal((count, joints, 3))
     turns = factor * Rotation.from_rotvec(angles.reshape(-1, 3)).as_matrix().reshape(count, joints, 3, 3)
     other = positions.copy()
     for joint, parent in enumerate(PARENTS[1:], start=1):
@@ -67,41 +78,43 @@ def other_builds(positions: Floats, lengths: float, turned: float, rng: Rng) -> 
     return other
 
 
-FAST = 0.5
-"""share of a sensor's variance that is noise from frame to frame, if nothing else is known"""
+JITTER_SHARE = 0.5
+"""Default share of jitter in the variance of a sensor's error; the rest is slow"""
 
 
-def sensed(positions: Floats, sigma: Floats | float, rng: Rng, fast: Floats | float = FAST) -> Floats:
-    """Windows (B, T, 22, 3) as a sensor of error ``sigma`` (metres along an axis) sees them; of its variance, ``fast``
-    is noise from frame to frame, the rest lasts."""
+def with_sensor_error(positions: Floats, sigma: Floats | float, rng: Rng) -> Floats:
+    """Windows (B, T, 22, 3) with jitter and a constant bias of each joint, together of ``sigma`` metres along an axis.
+
+    `JITTER_SHARE` of the variance is jitter.
+    """
     count, _, joints, _ = positions.shape
-    slow = np.sqrt(1.0 - fast) * rng.standard_normal((count, 1, joints, 3))
-    return positions + sigma * (slow + np.sqrt(fast) * rng.standard_normal(positions.shape))
+    bias = np.sqrt(1.0 - JITTER_SHARE) * rng.standard_normal((count, 1, joints, 3))
+    return positions + sigma * (bias + np.sqrt(JITTER_SHARE) * rng.standard_normal(positions.shape))
 
 
-def wandering(positions: Floats, sigma: Floats, rng: Rng, fast: Floats) -> Floats:
-    """Windows (B, T, 22, 3) as `sensed`, but of some joints more than of others, and what lasts wanders.
+def with_drifting_error(positions: Floats, sigma: Floats, rng: Rng, jitter_share: Floats) -> Floats:
+    """Windows with jitter and a slow error that drifts: an AR(1) process, in half of them larger at some joints.
 
     Args:
-        positions: metres.
-        sigma: (B,) metres along an axis, the sensor's error, over all joints.
-        rng: of what is drawn.
-        fast: (B,) share of its variance that is noise from frame to frame.
+        positions: (B, T, 22, 3) metres.
+        sigma: (B,) metres along an axis, RMS of the error over all joints.
+        rng: source.
+        jitter_share: (B,) share of jitter in the error's variance.
     """
     count, frames, joints, _ = positions.shape
     factor = np.exp(rng.choice([0.0, 0.5], (count, 1)) * rng.standard_normal((count, joints)))
     factor /= np.sqrt(np.square(factor).mean(axis=1, keepdims=True))
     memory = 1.0 - 10 ** rng.uniform(-3.0, -0.7, (count, 1, 1))
-    slow, new = rng.standard_normal((count, frames, joints, 3)), np.sqrt(1.0 - memory**2)
+    drift, new = rng.standard_normal((count, frames, joints, 3)), np.sqrt(1.0 - memory**2)
     for t in range(1, frames):
-        slow[:, t] = memory * slow[:, t - 1] + new * slow[:, t]
-    quick, lasts = (np.sqrt(share)[:, None, None, None] for share in (fast, 1.0 - fast))
-    noise = lasts * slow + quick * rng.standard_normal(slow.shape)
+        drift[:, t] = memory * drift[:, t - 1] + new * drift[:, t]
+    fast, slow = (np.sqrt(share)[:, None, None, None] for share in (jitter_share, 1.0 - jitter_share))
+    noise = slow * drift + fast * rng.standard_normal(drift.shape)
     return positions + sigma[:, None, None, None] * factor[:, None, :, None] * noise
 
 
-def spoil(clean: Floats, faults: Sequence[Fault], share: float, rng: Rng) -> Floats:
-    """Windows (B, T, 22, 3), a ``share`` of them with one of ``faults``, most of these to the window's end."""
+def with_faults(clean: Floats, faults: Sequence[Fault], share: float, rng: Rng) -> Floats:
+    """Windows (B, T, 22, 3), a ``share`` of them with one of ``faults``, which in 60 % lasts to the window's end."""
     spoilt = clean.copy()
     frames = clean.shape[1]
     for window in spoilt:
@@ -116,7 +129,7 @@ def spoil(clean: Floats, faults: Sequence[Fault], share: float, rng: Rng) -> Flo
 
 
 def stands_still(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
-    """Limbs that stay where they were: in the room, or beside the pelvis."""
+    """Limbs frozen where they were, in the world or relative to the pelvis."""
     before = window[part.start - 1].copy()
     if rng.random() < 0.6:
         window[part, joints] = before[joints]
@@ -125,55 +138,56 @@ def stands_still(window: Floats, part: slice, joints: list[int], other: Floats, 
 
 
 def repeats(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
-    """A tracker's last answer for some limbs, its noise and all."""
+    """Limbs for which the tracker repeats its last output, noise included."""
     window[part, joints] = window[part.start - 1, joints]
 
 
 def exchanged(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
-    """Limbs taken for the other side's."""
+    """Limbs of both sides exchanged."""
     both = [*joints, *MIRROR[joints]]
     window[part, both] = window[part][:, MIRROR[both]]
 
 
 def sides_exchanged(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
-    """Left taken for right, all over."""
+    """The whole body mirrored: left and right exchanged."""
     when = part if rng.random() < 0.5 else slice(None)
     window[when] = window[when][:, MIRROR]
 
 
-def elsewhere(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
-    """Limbs that lie 2 to 40 cm elsewhere."""
+def displaced(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
+    """Limbs displaced by a constant 2 to 40 cm."""
     window[part, joints] += rng.normal(0.0, 10 ** rng.uniform(-1.7, -0.4), 3)
 
 
-def somebody_elses(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
-    """Somebody else's limbs."""
+def of_another_person(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
+    """Limbs of another person, placed beside this one's pelvis."""
     beside = window[part, :1] - other[part, :1] + rng.normal(0.0, 10 ** rng.uniform(-2.0, -0.4), 3)
     window[part, joints] = other[part][:, joints] + beside
 
 
 def other_bones(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
-    """Bones each longer or shorter by itself: a skeleton taken for another."""
+    """Bone lengths scaled independently, throughout the window: not this person's skeleton."""
     own, factor = window.copy(), np.exp(rng.normal(0.0, rng.uniform(0.05, 0.35), len(PARENTS)))
     for joint, parent in enumerate(PARENTS[1:], start=1):
         window[:, joint] = window[:, parent] + factor[joint] * (own[:, joint] - own[:, parent])
 
 
 def noisy(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
-    """More noise, of 1 to 10 cm, on some joints or on all."""
+    """Additional jitter of 1 to 10 cm, on some joints or on all."""
     which = joints if rng.random() < 0.5 else list(range(len(PARENTS)))
     window[part, which] += rng.normal(0.0, 10 ** rng.uniform(-2.0, -1.0), (part.stop - part.start, len(which), 3))
 
 
 def jumps(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
-    """One frame in which a limb is far away."""
+    """A limb displaced by decimetres in a single frame."""
     window[rng.integers(part.start, part.stop), joints] += rng.normal(0.0, 0.2, 3)
 
 
 def occlude(positions: Floats, rng: Rng) -> Floats:
-    """Windows (B, T, 22, 3) with entries made NaN as cameras lose them: limbs, sets of joints, single ones, the past.
+    """Windows (B, T, 22, 3) with joints hidden (NaN) as cameras lose them.
 
-    The newest frame matters most, so half of the gaps reach it.
+    Hidden are limbs, the lower body, subtrees, random sets of joints, single entries, joints that a sensor does not
+    have, and all frames before a body entered. Half of the gaps reach the newest frame, which matters most.
     """
     seen = positions.copy()
     frames = positions.shape[1]
@@ -201,15 +215,15 @@ def occlude(positions: Floats, rng: Rng) -> Floats:
 
 
 def hide_joints(positions: Floats, count: int, rng: Rng) -> Floats:
-    """Windows (B, T, 22, 3), each without ``count`` joints, at random."""
+    """Windows (B, T, 22, 3) in each of which ``count`` random joints are NaN throughout."""
     hidden = rng.permuted(np.tile(np.arange(22) < count, (len(positions), 1)), axis=1)
     return np.where(hidden[:, None, :, None], np.nan, positions)
 
 
 def _below(joint: int) -> list[int]:
-    """A joint and all that hangs from it."""
-    found = [joint]
+    """A joint and all its descendants."""
+    subtree = [joint]
     for child in range(joint + 1, len(PARENTS)):
-        if PARENTS[child] in found:
-            found.append(child)
-    return found
+        if PARENTS[child] in subtree:
+            subtree.append(child)
+    return subtree

@@ -12,13 +12,13 @@ from steadypose.prior.body.skeleton import finite_joints
 
 Floats = NDArray[np.float64]
 
-LEAST_SIGMA = 0.002
+MIN_SIGMA = 0.002
 """Metres along an axis: the least of a joint that was given."""
 
-LEAST_NEVER = 0.015
+MIN_NEVER = 0.015
 """The same of a joint that was never given."""
 
-DRIFT, MOST_DRIFT, LONG = 0.0045, 0.14, 60.0
+DRIFT, MAX_DRIFT, LONG = 0.0045, 0.14, 60.0
 """Drift of a body in a gap without the pelvis: metres along an axis a frame from the gap's nearer end, its maximum, and
 the frames of a gap from which on it is in full; in shorter ones it is in proportion. By validation people, where root
 mean squares reach 135 mm."""
@@ -44,15 +44,15 @@ class Uncertainty:
         known = finite_joints(given)
         apart = frames_apart(known)
         bends = np.linalg.norm(np.diff(given, n=2, axis=0), axis=-1)
-        noise = np.full(22, LEAST_SIGMA)
+        noise = np.full(22, MIN_SIGMA)
         for joint in np.flatnonzero(np.isfinite(bends).any(axis=0)):
             # the median of a normal vector's length, of which a second difference has six times the variance
-            noise[joint] = max(np.nanmedian(bends[:, joint]) / (1.538 * np.sqrt(6.0)), LEAST_SIGMA)
+            noise[joint] = max(np.nanmedian(bends[:, joint]) / (1.538 * np.sqrt(6.0)), MIN_SIGMA)
         grown = 1.0 - self.half / (apart + self.half)
-        guessed = np.hypot(np.maximum(self.never, LEAST_NEVER) * grown, noise)
+        guessed = np.hypot(np.maximum(self.never, MIN_NEVER) * grown, noise)
         since, until = frames_since_and_until(known[:, :1])
         rootless = np.minimum(since, until) * np.minimum((since + until) / LONG, 1.0)
-        drift = np.minimum(DRIFT * np.where(np.isfinite(rootless), rootless, 0.0), MOST_DRIFT)
+        drift = np.minimum(DRIFT * np.where(np.isfinite(rootless), rootless, 0.0), MAX_DRIFT)
         guessed = np.hypot(guessed, drift)
         return np.where(known, noise, guessed)
 

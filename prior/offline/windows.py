@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 FRAMES, OVERLAP = 90, 15
 """Of a window, as in the paper; and how many of them the next one begins with."""
 
-LEAST_FRAMES = 8
+MIN_FRAMES = 8
 """The shortest track that is fitted."""
 
 

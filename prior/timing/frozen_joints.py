@@ -16,10 +16,10 @@ RECENT = 15
 SAME = 1e-6
 """Metres: a joint that has moved less from one frame to the next repeats itself."""
 
-LEAST_NOISE = 0.001
+MIN_NOISE = 0.001
 """Metres along an axis, from frame to frame: of a sensor with less, a joint that repeats itself may be at rest."""
 
-_LEAST_NEW = 5
+_MIN_NEW = 5
 """frames that were no repetition of the whole body"""
 
 
@@ -49,8 +49,8 @@ def frozen_joints(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
                 for joint in range(joints):
                     repeated[joint] += same[joint]
                     most = max(most, repeated[joint])
-        limit = 0.5 * max(new, _LEAST_NEW)
-        if most > limit and median(_noise(recent)) > LEAST_NOISE:
+        limit = 0.5 * max(new, _MIN_NEW)
+        if most > limit and median(_noise(recent)) > MIN_NOISE:
             for joint in range(joints):
                 found[b, joint] = repeated[joint] > limit
     return found

@@ -4,7 +4,7 @@ import torch
 from tests.helpers.bodies import waving
 
 from steadypose.benchmarks.hgvae import imputation, models
-from steadypose.benchmarks.hgvae.faults import BEGINS, FAULTS, LEAST_MOTION
+from steadypose.benchmarks.hgvae.faults import BEGINS, FAULTS, MIN_MOTION
 from steadypose.prior.body.skeleton import MIRROR, REST_OFFSETS, J
 from steadypose.prior.models.hgvae.features import in_frame_of, to_tracks
 from steadypose.prior.models.hgvae.network import HGVAE
@@ -44,7 +44,7 @@ def test_a_joint_counts_as_frozen_only_where_it_would_have_moved() -> None:
     assert holds.tolist() == [False, True]
     stopped = np.ptp(spoilt[1, BEGINS - 1 :], axis=0).max(axis=-1) == 0
     assert stopped.sum() == 1
-    assert np.linalg.norm(spoilt[1] - waving(50, speed=3), axis=-1)[:, stopped].max() > LEAST_MOTION
+    assert np.linalg.norm(spoilt[1] - waving(50, speed=3), axis=-1)[:, stopped].max() > MIN_MOTION
 
 
 def test_left_for_right_is_the_other_sides_joint() -> None:

@@ -39,7 +39,7 @@ GAPS = (5, 64)
 CONTEXT = (2, 14)
 """Range of frames that are known around it, before and after together."""
 
-LEAST_SPEED = 0.25
+MIN_SPEED = 0.25
 """m/s: a window is drawn as often as its joints are fast, and one that stands still as if they were this fast."""
 
 STRIDES = (1, 1, 1, 2)
@@ -152,7 +152,7 @@ class Sampler:
         speed = (motion.positions[1:] - motion.positions[:-1]).norm(dim=-1).mean(dim=1).double().numpy() * FPS
         speed = np.append(speed, 0.0)
         speed[motion.clip_start[1:] - 1] = 0.0
-        self._passed = np.concatenate([[0.0], np.cumsum(LEAST_SPEED + speed)])
+        self._passed = np.concatenate([[0.0], np.cumsum(MIN_SPEED + speed)])
         self._room = np.repeat(motion.clip_start[1:], lengths) - np.arange(lengths.sum())
         self._source = np.repeat(np.unique(motion.source, return_inverse=True)[1], lengths)
 

@@ -1,12 +1,13 @@
-"""Where the joints are that nobody saw, in one pass: the network that completes a window before HG-VAE looks at it.
+"""The completion network: fills in unobserved joints in one pass, before HG-VAE encodes a window.
 
 HG-VAE's own encoder learns this badly: a node is one coordinate of one joint, all nodes share their weights, and the
-likelihood of what was seen to the millimetre drowns what was hidden by decimetres. Here a node is a part of the
-window's time and its features are the whole body, so that a knee follows from hip, ankle and the other leg.
+likelihood of joints observed to the millimetre outweighs that of hidden ones, off by decimetres. Here a node is a patch
+of the window's time and its features are the whole body, so that a knee follows from hip, ankle and the other leg.
 
-People mostly hold still what they held still: then the line beside the joint above (`prior.models.hgvae.features`) is
-right to the millimetre, and no network is. So what the network corrects is fused with that line, each by its variance;
-the line's grows with the time from a sighting and with how much this joint of this person has moved while it was seen.
+A limb that rests mostly goes on resting: then the interpolation relative to its parent (`prior.models.hgvae.features`)
+is right to the millimetre, and no network is. So the network's correction is fused with that interpolation, each
+weighted by its inverse variance; the interpolation's variance grows with the time from a sighting and with how much
+this joint of this person has moved while it was observed.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from torch.nn import functional as F
 from steadypose.prior.models.hgvae.completion_features import (
     FIRST_LOG_VAR,
     FRAME_INPUTS,
-    HALF_BELIEVED,
+    HALF_CERTAIN_SIGMA,
     JOINTS,
     WINDOW_INPUTS,
     completion_features,
@@ -33,7 +34,7 @@ from steadypose.prior.models.layers.graph import GraphBlock, GraphLinear
 
 
 class CompletionNet(nn.Module):
-    """A better guess of what was hidden, and how far off it will be; of windows of ``frames``."""
+    """Corrections of the interpolated joints of windows of ``frames``, with their variance."""
 
     def __init__(self, frames: int, config: CompletionConfig) -> None:
         super().__init__()
@@ -45,33 +46,35 @@ class CompletionNet(nn.Module):
         self.blocks = nn.Sequential(*(GraphBlock(nodes, features) for _ in range(config.blocks)))
         self.write = GraphLinear(nodes, nodes, features, (JOINT_NODES + JOINTS) * config.patch)
         with torch.no_grad():
-            self.write.weight.mul_(0.1)  # begins near the guess
+            self.write.weight.mul_(0.1)  # begins near the interpolation
 
     def forward(self, nodes: Tensor, line_variance: Tensor) -> tuple[Tensor, Tensor]:
-        """The correction (B, 66, T) and the log-variance by joint (B, 22, T) of what it comes to, in units of `SCALE`.
+        """Correction (B, 66, T) and log-variance of the corrected joint (B, 22, T), in units of `SCALE`.
 
-        The arguments are those of `Features`.
+        Args:
+            nodes: (B, T / patch, inputs), as of `Features`.
+            line_variance: (B, 22, T) of the interpolation, `Features.line_variance`.
         """
         written = self.write(self.blocks(F.gelu(self.read(nodes.transpose(0, 1))))).transpose(0, 1)
         return self.fuse(written, line_variance)
 
     def fuse(self, written: Tensor, line_variance: Tensor) -> tuple[Tensor, Tensor]:
-        """What `forward` gives, from what the network writes (B, T / patch, 88 patch), and from the line.
+        """`forward` from the last layer's output ``written`` (B, T / patch, 88 patch).
 
-        They are fused as normal distributions are, by their product.
+        Network and interpolation are fused as normal distributions, by their product.
         """
-        found, log_var = written.split([JOINT_NODES * self.config.patch, JOINTS * self.config.patch], dim=-1)
+        correction, log_var = written.split([JOINT_NODES * self.config.patch, JOINTS * self.config.patch], dim=-1)
         log_var = (_by_track(log_var, JOINTS) + FIRST_LOG_VAR).clamp(*LOG_VAR_RANGE)
-        # of a line of infinite variance, 1; of one of none, 0, where the quotient's gradient is not a number
+        # 1 where the interpolation's variance is infinite; 0 where it is 0, at which the quotient's gradient is NaN
         gain = 1.0 / (1.0 + log_var.exp() / line_variance.clamp(min=1e-12))
         gain = torch.where(line_variance > 0, gain, 0.0)
         fused = log_var + gain.clamp(min=1e-6).log()
-        return _by_track(found, JOINT_NODES) * gain.repeat_interleave(3, dim=1), fused.clamp(*LOG_VAR_RANGE)
+        return _by_track(correction, JOINT_NODES) * gain.repeat_interleave(3, dim=1), fused.clamp(*LOG_VAR_RANGE)
 
     def complete(
         self, deviations: Tensor, observed: Tensor, bias_sigma: NDArray[np.floating] | float
     ) -> tuple[Tensor, Tensor]:
-        """Windows (B, 66, T) with a better guess of what was not observed, and its log-variance by joint (B, 22, T).
+        """Windows (B, 66, T) with unobserved entries completed, and their log-variance by joint (B, 22, T).
 
         The arguments are those of `completion_features`.
         """
@@ -80,15 +83,17 @@ class CompletionNet(nn.Module):
         return torch.where(observed > 0, deviations, deviations + correction), log_var
 
 
-def belief(observed: Tensor, log_var: Tensor) -> Tensor:
-    """(B, 66, T) how far to believe a completed window: 1 where seen; a guess as good as `HALF_BELIEVED` by half.
+def certainty_of(observed: Tensor, log_var: Tensor) -> Tensor:
+    """(B, 66, T) certainty of a completed window's entries, for HG-VAE's encoder.
+
+    s² / (s² + variance) where completed, with s = `HALF_CERTAIN_SIGMA`; 1 where observed.
 
     Args:
-        observed: (B, 66, T) more than 0 where seen.
-        log_var: (B, 22, T) of what was completed, in units of `SCALE`.
+        observed: (B, 66, T) more than 0 where observed.
+        log_var: (B, 22, T) of completed joints, in units of `SCALE`.
     """
-    guessed = torch.sigmoid(2 * math.log(HALF_BELIEVED / SCALE) - log_var)
-    return torch.where(observed > 0, 1.0, guessed.repeat_interleave(3, dim=1))
+    completed = torch.sigmoid(2 * math.log(HALF_CERTAIN_SIGMA / SCALE) - log_var)
+    return torch.where(observed > 0, 1.0, completed.repeat_interleave(3, dim=1))
 
 
 def _by_track(nodes: Tensor, tracks: int) -> Tensor:

@@ -1,8 +1,8 @@
-"""What the completion network reads of a window, in training and live: compiled loops, shared by both.
+"""Input features of the completion network, in training and live: compiled loops, shared by both.
 
-A node is a part of the window's time; its inputs are the whole body's tracks, how near each joint's sightings are, and
-how noisy and how lively this person's joints are. Beside them stands the variance of the line that the window's guess
-is (`prior.models.hgvae.features`), with which the network's answer is fused.
+A node is a patch of the window's time; its inputs are the whole body's tracks, the nearness of each joint's sightings,
+and each joint's noise and mobility. Beside them stands the variance of the interpolation that fills the window's gaps
+(`prior.models.hgvae.features`), with which the network's output is fused.
 """
 
 from __future__ import annotations
@@ -18,69 +18,68 @@ from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE
 
 NEAR = 8.0
-"""Frames from a sighting at which its nearness is a half. It falls as 1 / (1 + d / NEAR): by an exponential, an
-arm seen a second ago would pass for one never seen."""
+"""Nearness of a sighting d frames away is 1 / (1 + d / NEAR): an exponential would make an arm seen a second ago the
+same as one never seen."""
 
 LAG = 5
-"""Frames over which it is measured how much a joint moves beside the one above."""
+"""Frames over which the mobility of a joint, relative to its parent, is measured."""
 
 GROWTH = 1.5
-"""Exponent with which the variance of the line grows with the time from a sighting: 1 is a random walk's, 2 that of
-constant speed. With two more parameters it can be learned; then the sensors of training that get joints plainly wrong
-decide it, and arms that hold still are moved again."""
+"""Exponent with which the interpolation's variance grows with the time from a sighting: 1 is a random walk, 2 constant
+velocity. Learned instead, it is dominated by the training sensors' faults, and moves arms that rest."""
 
 STILL = 0.004
-"""Metres along an axis in `LAG` frames: what a joint that was never seen to move may do."""
+"""Metres along an axis in `LAG` frames: the least mobility assumed of any joint."""
 
 CENTIMETRE = 0.01 / SCALE
-"""in the network's units: the noise of joints is given in these, by its logarithm"""
+"""In units of `SCALE`; the noise of joints enters as the logarithm of its ratio to this"""
 
 BIAS_SCALE = 0.01
 BIAS_MIN = 0.002
-"""Metres along an axis: errors that last are given in the one by their logarithm, those under the other as none."""
+"""Metres along an axis: the slow error enters as the logarithm of its ratio to the first, at least the second."""
 
-HALF_BELIEVED = 0.01
-"""Metres along an axis: a guess with this standard deviation is half believed."""
+HALF_CERTAIN_SIGMA = 0.01
+"""Metres along an axis: a completed entry of this standard deviation has a certainty of one half."""
 
 FIRST_LOG_VAR = -3.0
-"""What the network's zero stands for, in units of `SCALE`: 4.5 cm."""
+"""Log-variance for which an output of 0 stands, in units of `SCALE`: a deviation of 4.5 cm."""
 
 JOINTS = JOINT_NODES // 3
 
 FRAME_INPUTS = JOINT_NODES + 2 * JOINTS
-"""Inputs a frame: tracks, and how near a joint's last and next sighting are."""
+"""Inputs a frame: tracks, and the nearness of each joint's last and next sighting."""
 
 WINDOW_INPUTS = 2 * JOINTS + 2
-"""Inputs a window: how noisy joints are, each and all, how much they move, and the sensor's error that lasts."""
+"""Inputs a window: noise of each joint and of all, mobility of each, and the sensor's slow error."""
 
 _NEVER = -1.0
 
 
 class Features(NamedTuple):
-    """Windows as the network reads them.
+    """Windows as the network reads them; variances are along an axis, in units of `SCALE`.
 
     Attributes:
         nodes: (B, T / patch, inputs) float32.
-        moved: (B, 22) float32, by how much a joint moves in `LAG` frames beside the one above, without the noise: mean
-            of the square along an axis, in units of `SCALE`.
-        noise: (B, 22) float32, variance of a sighting along an axis: from frame to frame, and what lasts.
-        apart: (B, 22, T) float32, frames from a sighting, less where it lies between two; 0 where seen, -1 of a joint
-            never seen.
+        mobility: (B, 22) float32, mean squared displacement of a joint relative to its parent in `LAG` frames, less
+            what its noise explains.
+        noise: (B, 22) float32, variance of a sighting: jitter and slow error.
+        gap: (B, 22, T) float32, frames to a sighting, 1 / (1 / last + 1 / next) between two; 0 where observed, -1 of a
+            joint never seen.
     """
 
     nodes: NDArray[np.float32]
-    moved: NDArray[np.float32]
+    mobility: NDArray[np.float32]
     noise: NDArray[np.float32]
-    apart: NDArray[np.float32]
+    gap: NDArray[np.float32]
 
     def line_variance(self) -> NDArray[np.float32]:
-        """(B, 22, T) variance along an axis, in units of `SCALE`, of the line that a hidden joint is guessed to follow.
+        """(B, 22, T) variance of the interpolation of hidden joints.
 
-        It grows with the time from a sighting and with how much this joint moves, and adds to that of the joint which
-        it hangs from. 0 where a joint is seen, infinite where it never was.
+        It grows with the time from a sighting and with the joint's mobility, and adds to its parent's. 0 where a joint
+        is observed, infinite where it never was.
         """
-        variance = np.empty_like(self.apart)
-        _line_variance(self.moved, self.noise, self.apart, variance)
+        variance = np.empty_like(self.gap)
+        _line_variance(self.mobility, self.noise, self.gap, variance)
         return variance
 
 
@@ -90,43 +89,43 @@ def completion_features(
     bias_sigma: NDArray[np.floating] | float,
     patch: int,
 ) -> Features:
-    """Windows as the completion network reads them.
+    """The completion network's input.
 
     Args:
-        deviations: (B, 66, T) tracks about the training mean in units of `SCALE`, what was not seen guessed.
-        observed: (B, 66, T) more than 0 where seen.
-        bias_sigma: (B,) metres along an axis, the errors of the sensor that last.
+        deviations: (B, 66, T) tracks less the training mean, in units of `SCALE`; interpolated where not observed.
+        observed: (B, 66, T) more than 0 where observed.
+        bias_sigma: (B,) metres along an axis, the sensor's slow error.
         patch: frames in a node.
     """
     count, _, frames = deviations.shape
     nodes = np.empty((count, frames // patch, FRAME_INPUTS * patch + WINDOW_INPUTS), dtype=np.float32)
-    moved, noise = np.empty((2, count, JOINTS), dtype=np.float32)
-    apart = np.empty((count, JOINTS, frames), dtype=np.float32)
-    _write_nodes(deviations.astype(np.float32), observed.astype(np.float32), patch, nodes, moved, noise, apart)
+    mobility, noise = np.empty((2, count, JOINTS), dtype=np.float32)
+    gap = np.empty((count, JOINTS, frames), dtype=np.float32)
+    _write_nodes(deviations.astype(np.float32), observed.astype(np.float32), patch, nodes, mobility, noise, gap)
     bias = np.reshape(np.maximum(bias_sigma, BIAS_MIN), (-1, 1))
     nodes[..., -1] = np.log(bias / BIAS_SCALE)
     noise += (bias / SCALE) ** 2
-    return Features(nodes, moved, noise, apart)
+    return Features(nodes, mobility, noise, gap)
 
 
 @njit(cache=True)
-def _line_variance(moved, noise, apart, variance):
-    count, joints, frames = apart.shape
+def _line_variance(mobility, noise, gap, variance):
+    count, joints, frames = gap.shape
     least = np.float32((STILL / SCALE) ** 2)
     held = np.empty((joints, frames), dtype=np.float32)
     for row in range(count):
         for joint in range(joints):
             parent = PARENT[joint]
             for t in range(frames):
-                far = apart[row, joint, t]
+                far = gap[row, joint, t]
                 held[joint, t] = held[parent, t] if parent > 0 else 0.0
                 if far > 0:
-                    held[joint, t] += (moved[row, joint] + least) * (far / LAG) ** GROWTH + noise[row, joint]
+                    held[joint, t] += (mobility[row, joint] + least) * (far / LAG) ** GROWTH + noise[row, joint]
                 variance[row, joint, t] = np.inf if far == _NEVER else (held[joint, t] if far > 0 else 0.0)
 
 
 @njit(cache=True)
-def _write_nodes(deviations, observed, patch, nodes, moved, noise, apart):
+def _write_nodes(deviations, observed, patch, nodes, mobility, noise, gap):
     count, tracks, frames = deviations.shape
     joints = tracks // 3
     frame = tracks + 2 * joints
@@ -142,7 +141,7 @@ def _write_nodes(deviations, observed, patch, nodes, moved, noise, apart):
                     observed[b, 3 * joint, t], observed[b, 3 * joint + 1, t], observed[b, 3 * joint + 2, t]
                 )
                 since = 0 if seen[joint, t] > 0 else min(since + 1, frames)
-                apart[b, joint, t] = since
+                gap[b, joint, t] = since
                 near = 1.0 / (1.0 + since / NEAR) if since < frames else 0.0
                 nodes[b, t // patch, (t % patch) * frame + tracks + joint] = near
             since = frames
@@ -150,20 +149,20 @@ def _write_nodes(deviations, observed, patch, nodes, moved, noise, apart):
                 since = 0 if seen[joint, t] > 0 else min(since + 1, frames)
                 near = 1.0 / (1.0 + since / NEAR) if since < frames else 0.0
                 nodes[b, t // patch, (t % patch) * frame + tracks + joints + joint] = near
-                last = apart[b, joint, t]
+                last = gap[b, joint, t]
                 if last == frames and since == frames:
-                    apart[b, joint, t] = _NEVER
+                    gap[b, joint, t] = _NEVER
                 elif last == frames or since == frames:
-                    apart[b, joint, t] = min(last, since)
+                    gap[b, joint, t] = min(last, since)
                 elif since > 0:
-                    apart[b, joint, t] = last * since / (last + since)
+                    gap[b, joint, t] = last * since / (last + since)
         _measure_noise(deviations[b], seen, nodes[b, :, patch * frame :], noise[b])
-        _measure_moved(deviations[b], seen, moved[b])
+        _measure_mobility(deviations[b], seen, mobility[b])
         for joint in range(joints):
-            liveliness = 0.5 * math.log(moved[b, joint] / CENTIMETRE**2 + 1e-3)
+            log_mobility = 0.5 * math.log(mobility[b, joint] / CENTIMETRE**2 + 1e-3)
             for node in range(nodes.shape[1]):
-                nodes[b, node, patch * frame + joints + 1 + joint] = liveliness
-            moved[b, joint] = max(moved[b, joint] - 2 * noise[b, joint], 0.0)
+                nodes[b, node, patch * frame + joints + 1 + joint] = log_mobility
+            mobility[b, joint] = max(mobility[b, joint] - 2 * noise[b, joint], 0.0)
 
 
 @njit(cache=True)
@@ -175,14 +174,14 @@ def _total(values):
 
 
 @njit(cache=True)
-def _measure_moved(deviations, seen, moved):
-    """How much each joint moves in `LAG` frames beside the one above; as all do, where that was not to be seen."""
+def _measure_mobility(deviations, seen, mobility):
+    """Mean squared displacement of each joint relative to its parent in `LAG` frames; that of all where it has none."""
     tracks, frames = deviations.shape
     joints = tracks // 3
     counts = np.zeros(joints)
     for joint in range(joints):
         above = PARENT[joint]
-        moved[joint] = 0.0
+        mobility[joint] = 0.0
         for t in range(LAG, frames):
             if seen[joint, t] > 0 and seen[joint, t - LAG] > 0:
                 counts[joint] += 1
@@ -190,15 +189,15 @@ def _measure_moved(deviations, seen, moved):
                     way = deviations[3 * joint + axis, t] - deviations[3 * joint + axis, t - LAG]
                     if above > 0:
                         way -= deviations[3 * above + axis, t] - deviations[3 * above + axis, t - LAG]
-                    moved[joint] += way * way / 3
-    together = _total(moved) / max(_total(counts), 1.0)
+                    mobility[joint] += way * way / 3
+    together = _total(mobility) / max(_total(counts), 1.0)
     for joint in range(joints):
-        moved[joint] = moved[joint] / counts[joint] if counts[joint] > 0 else together
+        mobility[joint] = mobility[joint] / counts[joint] if counts[joint] > 0 else together
 
 
 @njit(cache=True)
 def _measure_noise(deviations, seen, nodes, noise):
-    """How much each joint jumps about, by the second difference of its track, and how much all do, to every node."""
+    """Noise of each joint and of all, from the second differences of their tracks; written to every node."""
     tracks, frames = deviations.shape
     joints = tracks // 3
     squares, counts = np.zeros(joints), np.zeros(joints)

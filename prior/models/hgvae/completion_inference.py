@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from steadypose.prior.models.hgvae.completion_features import FIRST_LOG_VAR, HALF_BELIEVED, completion_features
+from steadypose.prior.models.hgvae.completion_features import FIRST_LOG_VAR, HALF_CERTAIN_SIGMA, completion_features
 from steadypose.prior.models.hgvae.config import SCALE, CompletionConfig
 from steadypose.prior.models.layers.compiled_graph import LOG_VAR_RANGE, Network, Program
 from steadypose.prior.models.weights_io import Arrays, part
@@ -33,35 +33,35 @@ class LiveCompletion:
     def complete(
         self, deviations: NDArray[np.floating], observed: NDArray[np.floating], bias_sigma: NDArray[np.floating]
     ) -> NDArray[np.float32]:
-        """Put a better guess of what was not observed into windows (B, 66, T), in place; see `CompletionNet`.
+        """Complete the unobserved entries of windows, in place; see `CompletionNet.complete`.
 
         Args:
-            deviations: (B, 66, T), changed.
-            observed: (B, 66, T) more than 0 where seen.
-            bias_sigma: (B,) metres along an axis, the errors of the sensor that last.
+            deviations: (B, 66, T) tracks less the training mean, in units of `SCALE`; changed.
+            observed: (B, 66, T) more than 0 where observed.
+            bias_sigma: (B,) metres along an axis, the sensor's slow error.
 
         Returns:
-            (B, 66, T) how far to believe each entry, as `completion.belief` has it.
+            (B, 66, T) certainty of each entry, see `completion.certainty_of`.
         """
-        believed = (observed > 0).astype(np.float32)
+        certainty = (observed > 0).astype(np.float32)
         partly = np.flatnonzero((observed == 0).any(axis=(-2, -1)))
         if not len(partly):
-            return believed
+            return certainty
         features = completion_features(deviations[partly], observed[partly], bias_sigma[partly], self._patch)
         rows = slice(0, len(partly))
         self._net.matrix(self._nodes, rows)[:] = features.nodes
         self._net.run(self._net.steps, rows)
         written = self._net.matrix(self._written, rows)
-        _fuse(written, features.line_variance(), partly, observed, deviations, believed)
-        return believed
+        _fuse(written, features.line_variance(), partly, observed, deviations, certainty)
+        return certainty
 
 
 @njit(cache=True)
-def _fuse(written, line_variance, places, observed, deviations, believed):
-    """As `CompletionNet.fuse` and `belief`: what windows at ``places`` become, and how far to believe them."""
+def _fuse(written, line_variance, places, observed, deviations, certainty):
+    """As `CompletionNet.fuse` and `certainty_of`: completes the windows at ``places``, and writes their certainty."""
     joints, frames = line_variance.shape[1:]
     patch = written.shape[2] // (4 * joints)
-    half = np.float32(2 * math.log(HALF_BELIEVED / SCALE))
+    half = np.float32(2 * math.log(HALF_CERTAIN_SIGMA / SCALE))
     for row in range(len(places)):
         place = places[row]
         for joint in range(joints):
@@ -78,4 +78,4 @@ def _fuse(written, line_variance, places, observed, deviations, believed):
                     track = 3 * joint + axis
                     if observed[place, track, t] == 0:
                         deviations[place, track, t] += gain * written[row, node, k * 3 * joints + track]
-                        believed[place, track, t] = 1.0 / (1.0 + math.exp(fused - half))
+                        certainty[place, track, t] = 1.0 / (1.0 + math.exp(fused - half))

@@ -1,4 +1,4 @@
-"""The sizes of HG-VAE and of the networks beside it, as their weights tell them; and what one node is and counts."""
+"""Sizes of HG-VAE and of the networks beside it, as stored with their weights; its nodes and their unit."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ JOINT_NODES = 66
 """22 joints, 3 coordinates: node ``3 * joint + axis``."""
 
 SCALE = 0.2
-"""Metres that the networks count as one."""
+"""Metres, the unit of the networks' inputs and outputs."""
 
 TRACK_LOG_VAR = -4.0
-"""Log-variance of tracks that HG-VAE's zero stands for: 2.7 cm"""
+"""Log-variance of tracks for which an output of 0 stands: a deviation of 2.7 cm"""
 
 
 class Level(NamedTuple):
@@ -49,7 +49,7 @@ class HGVAEConfig:
         stochastic: how many of the levels, counted from the bottom, are random; those above stay at their prior's
             mean and carry nothing (table 1: depth at equal capacity). None: all.
         actions: action classes, given one-hot beside the top latent; 0 for a model without.
-        completion: sizes of the network that guesses what was not observed; None for a model without.
+        completion: sizes of the completion network; None for a model without.
     """
 
     frames: int = 50

@@ -40,9 +40,13 @@ class LiveFaultNet:
         arrays, config = load_weights(str(path), "hgvae")
         return cls(FaultNetConfig.from_dict(config), arrays, max_batch)
 
-    def __call__(self, x: Floats, found: Floats, sigma: Floats, observed: Floats, sensor_sigma: Floats) -> Floats:
-        """(B, 22) logarithm of the odds that a joint is off; the arguments are those of `fault_features`."""
+    def __call__(
+        self, x: Floats, reconstructed: Floats, sigma: Floats, observed: Floats, sensor_sigma: Floats
+    ) -> Floats:
+        """(B, 22) log-odds that a joint is faulty; the arguments are those of `fault_features`."""
         rows = slice(0, len(x))
-        self._net.matrix(self._features, rows)[:] = fault_features(x, found, sigma, observed, sensor_sigma, self._mean)
+        self._net.matrix(self._features, rows)[:] = fault_features(
+            x, reconstructed, sigma, observed, sensor_sigma, self._mean
+        )
         self._net.run(self._net.steps, rows)
         return self._net.matrix(self._odds, rows)[..., 0].astype(np.float64)

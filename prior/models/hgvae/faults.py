@@ -1,10 +1,9 @@
-"""Which joints of a window are not where they were seen: a small graph network beside HG-VAE.
+"""The fault network: which joints of a window are not where the tracker reports them; a small graph network.
 
-How unlikely a window is under a generative model tells noise from motion, but not a hand that stands still from one
-that rests, and it takes a dance for a fault. The best test between two hypotheses is the ratio of their likelihoods
-(Neyman and Pearson), and that is what a classifier learns: this one reads what was seen, where HG-VAE would have put it
-and how sure it was, and is taught by clean motion and by motion with what trackers get wrong
-(`prior.models.hgvae.train_faults`).
+A window's likelihood under a generative model tells noise from motion, but not a frozen hand from one that rests, and
+takes a dance for a fault. The most powerful test between two hypotheses is the ratio of their likelihoods (Neyman and
+Pearson), which is what a classifier learns: this one reads the observations and HG-VAE's reconstruction with its
+deviation, and is trained on clean motion and on motion with trackers' faults (`prior.models.hgvae.train_faults`).
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from steadypose.prior.models.weights_io import weights_path
 
 
 class FaultNet(nn.Module):
-    """The logarithm of the odds that a joint is further off than its sensor explains."""
+    """Log-odds that a joint's error is larger than the sensor's noise explains."""
 
     def __init__(self, config: FaultNetConfig) -> None:
         super().__init__()
@@ -38,6 +37,6 @@ class FaultNet(nn.Module):
 
 
 def load_fault_net(weights: str) -> FaultNet:
-    """The one beside HG-VAE's weights of this name."""
+    """The fault network that belongs to HG-VAE's weights of this name."""
     path = weights_path(weights, "hgvae").with_suffix(".faults.safetensors")
     return load_network(FaultNet, FaultNetConfig.from_dict, str(path), "hgvae")

@@ -1,9 +1,9 @@
 """Windows of joints as HG-VAE reads them: tracks about a smooth path of the trunk, facing forward, of one size.
 
-The path is a low-passed mean of what is seen of the trunk, so that it neither jitters with one noisy joint nor jumps
-when one disappears. All joints but the pelvis are relative to it; the pelvis's track is relative to the path's mean,
-so that it tells where the body goes. In a gap a joint goes in a straight line beside the joint it hangs from; before
-its first and after its last sighting it stays beside it: the guess from which imputation starts.
+The path is a low-passed mean of the visible joints of the trunk, so that it neither jitters with one noisy joint nor
+jumps when one disappears. All joints but the pelvis are relative to it; the pelvis's track is relative to the path's
+mean, and so holds the locomotion. Unobserved entries are interpolated: in a gap, a joint's offset from its parent is
+interpolated linearly; before the first and after the last sighting it is held. Completion starts from this.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _TALL = np.array([J[n] for n in ("left_knee", "left_ankle", "right_knee", "right
                                  "neck")])  # fmt: skip
 _STANDARD = float(np.linalg.norm(REST_OFFSETS[_TALL], axis=-1).sum())
 _PATH_COEFFICIENTS = 8
-"""of the cosine transform of the trunk's path: in a window of 50 frames, all that is slower than 2 Hz"""
+"""Coefficients kept of the cosine transform of the trunk's path: a low pass at 2 Hz, in a window of 50 frames"""
 
 
 class Tracks(NamedTuple):
@@ -42,12 +42,17 @@ class Tracks(NamedTuple):
 
 
 def body_size(offsets: NDArray[np.floating]) -> NDArray[np.float64]:
-    """How much longer than the generic adult's the legs and spine of bones (..., 22, 3) are."""
+    """(...) total length of legs and spine, of bones (..., 22, 3), relative to the generic adult's."""
     return np.sqrt((offsets[..., _TALL, :] ** 2).sum(axis=-1)).sum(axis=-1) / _STANDARD
 
 
 def to_tracks(positions: NDArray[np.float64], size: NDArray[np.floating] | float) -> Tracks:
-    """Windows (..., T, 22, 3) metres, z up, NaN where missing, as tracks; ``size`` (...) as `body_size` gives it."""
+    """Windows as tracks.
+
+    Args:
+        positions: (..., T, 22, 3) metres, z up; NaN where missing.
+        size: (...) of the bodies, as `body_size` gives it.
+    """
     batch, frames = positions.shape[:-3], positions.shape[-3]
     windows = np.ascontiguousarray(positions, dtype=np.float64).reshape(-1, frames, 22, 3)
     sizes = np.empty(batch)
@@ -59,7 +64,7 @@ def to_tracks(positions: NDArray[np.float64], size: NDArray[np.floating] | float
 
 
 def in_frame_of(tracks: Tracks, positions: NDArray[np.float64], size: float) -> NDArray[np.float64]:
-    """(66, T) tracks of other joints (T, 22, 3) in the frame of ``tracks``: those of the truth beside what was seen."""
+    """(66, T) tracks of other positions (T, 22, 3), such as ground truth, in the frame of ``tracks``."""
     local = positions - tracks.path[:, None]
     local[:, 0] = positions[:, 0] - tracks.path.mean(axis=0)
     c, s = math.cos(tracks.yaw), math.sin(tracks.yaw)
@@ -68,12 +73,12 @@ def in_frame_of(tracks: Tracks, positions: NDArray[np.float64], size: float) -> 
 
 
 def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: NDArray[np.floating] | float) -> NDArray[np.float64]:
-    """The joints (..., K, 22, 3) metres, world, of the last K frames of windows.
+    """Joint positions (..., K, 22, 3) metres, world, of the last K frames of windows; the inverse of `to_tracks`.
 
     Args:
-        x: (..., 66, K) tracks of those frames, in the frames of
-        tracks: windows of at least so many frames, of
-        size: (...), as `body_size` gives it.
+        x: (..., 66, K) tracks of those frames.
+        tracks: the windows, of T >= K frames, in whose frames ``x`` is.
+        size: (...) of the bodies, as `body_size` gives it.
     """
     batch, frames = x.shape[:-2], x.shape[-1]
     sizes, world = np.empty(batch), np.empty((*batch, frames, 22, 3))
@@ -84,10 +89,10 @@ def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: NDArray[np.floatin
 
 
 def hang_unseen(deviations: NDArray[np.floating]) -> None:
-    """Give joints never seen the deviation from the training mean of what they hang from, in place.
+    """Fill in joints never seen, in place: each deviates from its training mean as its parent does from its own.
 
     Args:
-        deviations: (..., 66, T) tracks less the mean tracks; NaN for joints never seen.
+        deviations: (..., 66, T) tracks less the mean tracks; NaN for joints never seen in the window.
     """
     _hang_unseen(deviations.reshape(-1, 22, 3, deviations.shape[-1]))
 
@@ -189,7 +194,7 @@ def _hang_unseen(deviations):
 
 @njit(cache=True)
 def _bridge(track, above):
-    """Fill the gaps of a track (T,) in place: what it is beside ``above`` goes in a straight line, or stays."""
+    """Fill the gaps of a track (T,) in place: its offset from ``above`` is interpolated linearly, held at the ends."""
     frames = len(track)
     last = -1
     for t in range(frames + 1):
@@ -225,7 +230,7 @@ def _heading(positions):
 
 @njit(cache=True)
 def _centre(positions, yaw, size):
-    """(T, 3) where the pelvis would be, from all of the trunk that is seen; held where nothing is."""
+    """(T, 3) pelvis position implied by the visible joints of the trunk; interpolated, or held, where none is."""
     frames = len(positions)
     c, s = math.cos(yaw), math.sin(yaw)
     centre = np.zeros((frames, 3))

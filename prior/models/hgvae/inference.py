@@ -1,5 +1,5 @@
-"""HG-VAE as the live node runs it: the windows of all bodies, forward, and the gradient of a window's score by its
-latents. The same numbers as `HGVAE` with the means of its latents.
+"""HG-VAE as the live node runs it, without torch: `HGVAE` at the means of its latents, forward for the windows of all
+bodies, and the gradient of one window's score with respect to its latents.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from steadypose.prior.models.weights_io import Arrays, load_weights, part
 
 
 class Reconstruction(NamedTuple):
-    """What the model makes of windows.
+    """p(x | z) of windows.
 
     Attributes:
-        mean: (..., 66, T) metres of a standard body, the tracks that the model would put there.
+        mean: (..., 66, T) metres of a body of standard size, tracks.
         sigma: (..., 66, T) metres, standard deviation.
     """
 
@@ -29,18 +29,18 @@ class Reconstruction(NamedTuple):
 
 
 class LiveHGVAE:
-    """A trained `HGVAE` with the means of its latents, which may be moved.
+    """A trained `HGVAE` at the means of its latents, to which offsets may be added.
 
     Args:
         config: its sizes; without actions.
         weights: its state dict, which is copied.
-        sensor_sigma: metres, standard deviation of an observation, by which the score weighs it.
+        sensor_sigma: metres along an axis, standard deviation of an observation in the score's likelihood.
         max_batch: windows at once.
 
     Attributes:
         frames: T, of a window.
-        latents: how many numbers all latents of a window are.
-        scratch_row: the row in which `decode` leaves the window that it decoded last.
+        latents: n, total dimension of a window's latents.
+        scratch_row: the row that holds the window last decoded by `decode`.
     """
 
     def __init__(self, config: HGVAEConfig, weights: Arrays, sensor_sigma: float, max_batch: int) -> None:
@@ -54,7 +54,7 @@ class LiveHGVAE:
         weight = np.concatenate([dct.T @ read["weight"][:kept], read["weight"][kept:]])
         graph = p.gelu(p.linear(self._x, weight, read["bias"], read["adjacency"]))
         p.block(graph, part(weights, "read_block"), onto=graph)
-        # Of a level's joined features, what the encoder has to say: the stream's half of the product comes later.
+        # the encoder's half of each level's `join`; the decoder adds the stream's half
         features, seen = config.features, []
         levels = [part(weights, f"down.{k}") for k in range(len(config.levels))]
         for k, level in enumerate(reversed(levels)):
@@ -65,10 +65,10 @@ class LiveHGVAE:
         nothing, one = np.zeros((1, features), dtype=np.float32), np.zeros((JOINT_NODES, 1), dtype=np.float32)
         stream = p.linear(p.matrix(1, 1), nothing, weights["start"], one)
         self._moves, self._terms = [], []
-        for k, (level, found) in enumerate(zip(levels, reversed(seen), strict=True)):
+        for k, (level, encoded) in enumerate(zip(levels, reversed(seen), strict=True)):
             nodes, latent = config.levels[k]
             above = p.layer(stream, part(level, "contract"))
-            joined = p.linear(above, level["join.weight"].T[:features], nothing, plus=found)
+            joined = p.linear(above, level["join.weight"].T[:features], nothing, plus=encoded)
             p.block(joined, part(level, "posterior_block"), onto=joined)
             mean = p.linear(joined, level["posterior_head.weight"].T[:, :latent], level["posterior_head.bias"][:latent])
             if k == 0:
@@ -92,7 +92,7 @@ class LiveHGVAE:
         self.scratch_row, self._encoded = max_batch, self._net.places[encoder_matrices][0]
         self._encoder, self._decoder = self._net.steps[:encoder_steps], self._net.steps[encoder_steps:]
         self._sensor_variance = np.float32((sensor_sigma / SCALE) ** 2)
-        self._trust = np.zeros((max_batch + 1, JOINT_NODES, config.frames), dtype=np.float32)
+        self._confidence = np.zeros((max_batch + 1, JOINT_NODES, config.frames), dtype=np.float32)
         self._term_places = [self._net.places[number][0] for number in self._terms]
         self.latents = sum(end - begin for begin, end, _ in (self._net.places[number] for number in self._moves))
 
@@ -107,34 +107,35 @@ class LiveHGVAE:
         return cls(HGVAEConfig.from_dict(config), arrays, sensor_sigma, max_batch)
 
     def reconstruct(
-        self, x: NDArray[np.float64], observed: NDArray[np.float64], bias_sigma: NDArray[np.float64]
+        self, x: NDArray[np.float64], confidence: NDArray[np.float64], bias_sigma: NDArray[np.float64]
     ) -> Reconstruction:
-        """Encode and decode windows. The model stands at them until the next; a window's row is its place here.
+        """Encode and decode windows. Their activations stay, by row, for `decode`, `score` and `gradient`.
 
         Args:
-            x: (B, 66, T) metres of a standard body; see `prior.models.hgvae.features`. NaN for a joint never seen.
-            observed: (B, 66, T) how far to believe each entry: 0 where there was none, at most 1.
-            bias_sigma: (B,) metres along an axis, the errors of the sensor that last.
+            x: (B, 66, T) metres of a body of standard size, `Tracks.x`; NaN for a joint never seen.
+            confidence: (B, 66, T) of each observation, 0 to 1, its weight in the score's likelihood; 0 where there is
+                none.
+            bias_sigma: (B,) metres along an axis, the sensor's slow error.
         """
         rows = slice(0, len(x))
         deviations = (x - self._mean) / SCALE
         hang_unseen(deviations)
-        believed = observed > 0
+        certainty = confidence > 0
         if self._completion:
-            believed = self._completion.complete(deviations, observed, bias_sigma)
+            certainty = self._completion.complete(deviations, confidence, bias_sigma)
         seen = self._net.matrix(self._x, rows)
-        seen[..., : self.frames], seen[..., self.frames :] = deviations, believed
-        self._trust[rows] = observed
+        seen[..., : self.frames], seen[..., self.frames :] = deviations, certainty
+        self._confidence[rows] = confidence
         for number in self._moves:
             self._net.matrix(number, rows)[:] = 0.0
         self._net.run(self._encoder, rows)
         return self._decode(rows)
 
     def decode(self, row: int, moved: NDArray[np.float64]) -> Reconstruction:
-        """Decode a window anew in the row `scratch_row`, its latents (n,) moved from where the encoder puts them."""
+        """Decode the window of a row with offsets ``moved`` (n,) added to its latents' means, into `scratch_row`."""
         rows, begin = slice(self.scratch_row, self.scratch_row + 1), 0
         self._net.values[rows, : self._encoded] = self._net.values[row, : self._encoded]
-        self._trust[rows] = self._trust[row]
+        self._confidence[rows] = self._confidence[row]
         for number in self._moves:
             matrix = self._net.matrix(number, rows)
             matrix[:] = moved[begin : begin + matrix.size].reshape(matrix.shape)
@@ -142,15 +143,15 @@ class LiveHGVAE:
         return Reconstruction(*(part[0] for part in self._decode(rows)))
 
     def score(self, row: int) -> float:
-        """Nats, of a window as last decoded: sum over all levels of log p(z | above), the score of section 7, and of
-        what was observed, weighted, log p(x | z)."""
+        """Nats, of a window as last decoded: the score of section 7, the sum over all levels of log p(z | above), plus
+        log p(x | z) of its observations, weighted by confidence."""
         off, log_var = self._off_and_log_var(row)
         variance = np.exp(np.clip(log_var, *LOG_VAR_RANGE)) + self._sensor_variance
-        likelihood = -0.5 * self._trust[row] * (np.log(2 * np.pi * variance) + off * off / variance)
+        likelihood = -0.5 * self._confidence[row] * (np.log(2 * np.pi * variance) + off * off / variance)
         return float(likelihood.sum(dtype=np.float64)) + sum(float(self._net.values[row, k]) for k in self._term_places)
 
     def gradient(self, row: int) -> NDArray[np.float64]:
-        """(n,) gradient of the score of a window, as last decoded, by how far the latents were moved."""
+        """(n,) gradient of a window's score, as last decoded, with respect to the latents' offsets."""
         self._net.gradients[:] = 0.0
         self._net.gradients[self._term_places] = 1.0
         off, log_var = self._off_and_log_var(row)
@@ -159,14 +160,14 @@ class LiveHGVAE:
         off /= variance
         inside = (log_var > LOG_VAR_RANGE[0]) & (log_var < LOG_VAR_RANGE[1])
         by_written = self._net.gradient(self._written)
-        by_written[:, : self.frames] = self._trust[row] * off
-        by_written[:, self.frames :] = 0.5 * self._trust[row] * inside * own * (off * off - 1 / variance)
+        by_written[:, : self.frames] = self._confidence[row] * off
+        by_written[:, self.frames :] = 0.5 * self._confidence[row] * inside * own * (off * off - 1 / variance)
         self._net.run_back(self._decoder, row)
         return np.concatenate([self._net.gradient(number).ravel() for number in self._moves]).astype(np.float64)
 
     def _off_and_log_var(self, row: int) -> tuple[Floats, Floats]:
-        """How far the tracks of a window are from where the model puts them, (66, T) in units of `SCALE`, and the
-        log-variance that it states, not clamped."""
+        """Residual of a window's tracks against the reconstruction, in units of `SCALE`, and its log-variance, not
+        clamped, both (66, T)."""
         rows = slice(row, row + 1)
         written = self._net.matrix(self._written, rows)[0]
         off = self._net.matrix(self._x, rows)[0, :, : self.frames] - written[:, : self.frames]

@@ -3,12 +3,12 @@ Variational Autoencoding for Generative Modelling of Human Motion", sections 4 a
 
 A node is one coordinate's track of one joint. Its features are the track's cosine transform; graph convolutions with
 learned adjacency mix nodes, contract them to fewer on the way up and expand them on the way down. The decoder keeps a
-deterministic stream of all nodes, to which every stochastic level, from the single top node down to one latent for
-each track, adds what it knows.
+deterministic stream of all nodes, to which every stochastic level adds its latent, from the single top node down to one
+latent for each track.
 
-Beyond the paper: the encoder is told how far to believe each entry, and those not observed are guessed by a network of
-their own (`prior.models.hgvae.completion`), so that one pass already completes a window; and the cosine transform may
-be cut off at its lower coefficients, which makes the live model small.
+Beyond the paper: the encoder also reads the certainty of each entry, and entries that were not observed are filled in
+by the completion network (`prior.models.hgvae.completion`), so that one pass completes a window; and the cosine
+transform may be truncated to its lowest coefficients, which makes the live model small.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from steadypose.prior.models.hgvae.completion import CompletionNet, belief
+from steadypose.prior.models.hgvae.completion import CompletionNet, certainty_of
 from steadypose.prior.models.hgvae.config import JOINT_NODES, TRACK_LOG_VAR, HGVAEConfig, Level
 from steadypose.prior.models.layers.compiled_graph import LOG_VAR_RANGE
 from steadypose.prior.models.layers.graph import GraphBlock, GraphLinear
 
-FAINT, SURE = 0.25, -4.0
-"""How a model begins: the factor on what a level adds to the stream, and the log-variance of the posteriors"""
+INITIAL_LATENT_GAIN, INITIAL_POSTERIOR_LOG_VAR = 0.25, -4.0
+"""Initialisation: the factor on what a level adds to the stream, and the bias of the posteriors' log-variance"""
 
 
 def dct_matrix(frames: int) -> Tensor:
@@ -55,7 +55,7 @@ class Gaussian(NamedTuple):
         return self.mean + spread * torch.randn_like(self.mean) * (0.5 * self.log_var).exp()
 
     def log_density(self, value: Tensor) -> Tensor:
-        """Of every entry of ``value``, natural logarithm."""
+        """Log-density (nats) of every entry of ``value``."""
         return -0.5 * (self.log_var + math.log(2 * math.pi) + (value - self.mean).square() * (-self.log_var).exp())
 
     def kl(self, other: Gaussian) -> Tensor:
@@ -65,8 +65,8 @@ class Gaussian(NamedTuple):
         return 0.5 * (ratio + shift - 1 - self.log_var + other.log_var)
 
 
-class Pass(NamedTuple):
-    """What one pass through the model gives.
+class HGVAEOutput(NamedTuple):
+    """What one pass through the model returns.
 
     Attributes:
         tracks: p(x | z), mean and log-variance (B, N, T), in units of `SCALE`.
@@ -119,40 +119,40 @@ class HGVAE(nn.Module):
 
     @torch.no_grad()
     def completed(self, x: Tensor, observed: Tensor, bias_sigma: NDArray[np.floating] | float) -> tuple[Tensor, Tensor]:
-        """(B, N, T) windows with a better guess of what was not observed, and how far to believe each entry.
+        """(B, N, T) windows whose unobserved entries are completed, and the certainty (B, N, T) of each entry.
 
         Args:
-            x: (B, N, T) tracks; what was not observed holds a guess.
+            x: (B, N, T) tracks; unobserved entries hold the interpolation of `features.to_tracks`.
             observed: (B, N, T) 1 where observed, else 0.
-            bias_sigma: (B,) metres along an axis, the errors of the sensor that last.
+            bias_sigma: (B,) metres along an axis, the sensor's slow error.
         """
         if self.completion is None:
             return x, observed
         completed, log_var = self.completion.complete(x, observed, bias_sigma)
-        return completed, belief(observed, log_var)
+        return completed, certainty_of(observed, log_var)
 
     def forward(
-        self, x: Tensor, believed: Tensor, *, spread: Tensor | None = None, action: Tensor | None = None
-    ) -> Pass:
+        self, x: Tensor, certainty: Tensor, *, spread: Tensor | None = None, action: Tensor | None = None
+    ) -> HGVAEOutput:
         """Encode and decode windows.
 
         Args:
-            x: (B, N, T) tracks; what was not observed holds a guess.
-            believed: (B, N, T) how far to believe each entry: 1 where observed, 0 where nothing is known of it.
+            x: (B, N, T) tracks, complete.
+            certainty: (B, N, T) of each entry, 0 to 1: 1 where observed; see `completion.certainty_of`.
             spread: (B, 1) the share of the posterior's standard deviation with which latents are drawn: 1 to draw
                 them, 0 or None to take the means.
             action: (B, actions) one-hot, for a model with actions.
         """
-        read = torch.cat([x @ self.dct.T, believed], dim=-1).transpose(0, 1)
+        read = torch.cat([x @ self.dct.T, certainty], dim=-1).transpose(0, 1)
         graph = self.read_block(F.gelu(self.read(read)))
-        found: list[Tensor] = []
+        encoded: list[Tensor] = []
         for up, block in zip(self.up, self.encoder, strict=True):
             graph = block(up(graph))
-            found.append(graph)
+            encoded.append(graph)
         stream = self.start[:, None].expand(-1, x.shape[0], -1)
         kl, log_prior, top = [], [], None
         off = len(self.down) - (len(self.down) if self.config.stochastic is None else self.config.stochastic)
-        for k, (level, seen) in enumerate(zip(self.decoder_levels, reversed(found), strict=True)):
+        for k, (level, seen) in enumerate(zip(self.decoder_levels, reversed(encoded), strict=True)):
             prior = level.prior(stream)
             if k < off:
                 stream = level.add(stream, prior.mean, action)
@@ -168,7 +168,7 @@ class HGVAE(nn.Module):
         tracks = self._decode(stream)
         if top is None:
             top = x.new_zeros(x.shape[0], self.config.levels[0].latent)
-        return Pass(tracks, torch.stack(kl, dim=1), torch.stack(log_prior, dim=1), top)
+        return HGVAEOutput(tracks, torch.stack(kl, dim=1), torch.stack(log_prior, dim=1), top)
 
     def generate(
         self, count: int, *, random_levels: int | None = None, top: Tensor | None = None, action: Tensor | None = None
@@ -210,24 +210,24 @@ class DecoderLevel(nn.Module):
             self.prior_head = nn.Linear(features, 2 * level.latent)
         self.expand = GraphLinear(level.nodes, nodes, level.latent + extra, features)
         self.block = GraphBlock(nodes, features)
-        with torch.no_grad():  # latents begin as faint and as sure: the noise of many levels would bury what each tells
-            self.expand.weight.mul_(FAINT)
-            self.posterior_head.bias[level.latent :] += SURE
+        with torch.no_grad():  # little noise at first: sampled at every level, it would bury the signal
+            self.expand.weight.mul_(INITIAL_LATENT_GAIN)
+            self.posterior_head.bias[level.latent :] += INITIAL_POSTERIOR_LOG_VAR
 
     def prior(self, stream: Tensor) -> Gaussian:
-        """p(z | what stands above); N(0, I) at the top."""
+        """p(z | levels above); N(0, I) at the top."""
         if self.top:
             zero = stream.new_zeros(self.level.nodes, stream.shape[1], self.level.latent)
             return Gaussian(zero, zero)
         return _heads(self.prior_head(self.prior_block(self.contract(stream))))
 
     def posterior(self, stream: Tensor, seen: Tensor) -> Gaussian:
-        """q(z | what stands above, x)."""
+        """q(z | levels above, x)."""
         joined = self.join(torch.cat([self.contract(stream), seen], dim=-1))
         return _heads(self.posterior_head(self.posterior_block(joined)))
 
     def add(self, stream: Tensor, z: Tensor, action: Tensor | None) -> Tensor:
-        """The stream with this level's latent in it."""
+        """The stream with this level's latent added."""
         if self.extra:
             if action is None:
                 raise ValueError(f"expected an action, one-hot (B, {self.extra})")

@@ -1,10 +1,10 @@
 """Training of HG-VAE (section 5): the evidence lower bound, and completion of windows seen in part.
 
-Half of each batch is the paper's: clean windows, every entry observed, latents drawn, KL warmed up. The other half
-teaches the encoder what a camera does: entries are hidden, and guessed by the completion network, which is trained
-first (`prior.models.hgvae.train_completion`); the rest is noisy or plainly wrong; and the likelihood of the true
-window, at the means of the latents, is all that counts. One pass then completes a window and says how sure it is; what
-was seen where the model would not have put it is an anomaly.
+Half of each batch is the paper's: clean windows, every entry observed, latents sampled, KL warmed up. The other half
+simulates a camera: entries are hidden, and completed by the completion network, which is trained first
+(`prior.models.hgvae.train_completion`); observed entries are noisy or faulty; and the loss is the negative
+log-likelihood of the clean window at the posterior means. One pass then denoises and completes a window, with a
+standard deviation.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, CompletionConfig, HGVAEConfig, Level
-from steadypose.prior.models.hgvae.network import HGVAE, Pass
-from steadypose.prior.models.hgvae.train_completion import BATCH, BONES, SPOILT_BY, TURNED, train_completion
+from steadypose.prior.models.hgvae.network import HGVAE, HGVAEOutput
+from steadypose.prior.models.hgvae.train_completion import BATCH, BONE_SIGMA, FAULTS, TURN_SIGMA, train_completion
 from steadypose.prior.models.hgvae.train_faults import train_anomaly
 from steadypose.prior.models.hgvae.windows import STRIDES, Batch, Windows, mean_tracks
 from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES, weights_path
-from steadypose.prior.motion.corruption import add_noise, occlude, other_builds, slow_errors, spoil
+from steadypose.prior.motion.corruption import add_noise, draw_bias_sigma, occlude, vary_builds, with_faults
 from steadypose.prior.motion.dataset import MotionSet
 
 Floats = NDArray[np.float64]
@@ -45,20 +45,23 @@ MODELS: dict[str, HGVAEConfig] = {
         completion=CompletionConfig(),
     ),
 }
-"""``hgvae`` fits a robot's budget; ``hgvae-wide`` has the paper's size, for recordings."""
+"""``hgvae`` runs live on a robot's CPU; ``hgvae-wide`` has the paper's size, for recordings."""
 
 KL_START = 0.001
 """beta at the start (section 5)"""
 WARM_UP = 0.2
 """Share of the training over which beta rises to 1 (the paper: 200 of 5,000 epochs, of a much longer training)."""
 CLIP_ENTRY = 100.0
-"""norm of the gradient (section 5), times the root of how many entries a window has: here the loss is their sum"""
+"""Maximum norm of the gradient (section 5) per root of the entries of a window: the loss is summed over these"""
 
 
 def train_hgvae(options: TrainingOptions) -> Path:
-    """Train HG-VAE on prepared motion, first its completion network, last its fault network; the path of the weights.
+    """Train HG-VAE on prepared motion, after its completion network and before its fault network.
 
-    From ``options.start`` the rate is half, and the fault network goes on from the one beside those weights.
+    From ``options.start`` the learning rate is half, and the fault network goes on from the one beside those weights.
+
+    Returns:
+        The path of the weights.
     """
     return _train("hgvae", options, options.iterations or 9_000, batch=64, learning_rate=6e-3)
 
@@ -94,7 +97,7 @@ def _train(model: str, options: TrainingOptions, iterations: int, batch: int, le
 def fit(
     model: HGVAE, train: Windows, val: Windows, directory: Path, iterations: int, batch: int, rate: float, seed: int
 ) -> TrainingRun:
-    """Train ``model``, all but what completes windows; see `train_hgvae`."""
+    """Train ``model``, all but its completion network, with the loss of the module's docstring."""
     learned = [p for name, p in model.named_parameters() if not name.startswith("completion.")]
     optimiser = torch.optim.Adam(learned, lr=rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
@@ -105,16 +108,15 @@ def fit(
         positions, sizes = train.draw(count, frames, rng, STRIDES)
         half = count // 2
         whole = Batch.of(model, positions[:half], positions[:half], sizes[:half])
-        slow = slow_errors(count - half, rng)
-        clean = other_builds(positions[half:], BONES, TURNED, rng)
-        seen = occlude(spoil(add_noise(clean, rng, slow), SPOILT_BY, 0.5, rng), rng)
-        both = whole.beside(Batch.of(model, seen, clean, sizes[half:]).completed(model, slow))
-        drawn = model(both.x, both.believed, spread=(torch.arange(count) < half).float()[:, None])
+        bias_sigma = draw_bias_sigma(count - half, rng)
+        clean = vary_builds(positions[half:], BONE_SIGMA, TURN_SIGMA, rng)
+        seen = occlude(with_faults(add_noise(clean, rng, bias_sigma), FAULTS, 0.5, rng), rng)
+        both = whole.joined(Batch.of(model, seen, clean, sizes[half:]).completed(model, bias_sigma))
+        drawn = model(both.x, both.certainty, spread=(torch.arange(count) < half).float()[:, None])
         density = drawn.tracks.log_density(both.target) * both.counts
         stated = (0.5 * drawn.tracks.log_var[half:]).exp().detach()
-        density[half:] = density[half:] * (
-            stated / stated.mean()
-        )  # as in `prior.models.hgvae.train_completion`, and for its reason
+        # weighted by the stated deviation: see `prior.models.hgvae.train_completion`
+        density[half:] = density[half:] * (stated / stated.mean())
         likelihood = density.flatten(1).sum(dim=1)
         kl = drawn.kl[:half].sum() / count
         beta = min(KL_START + (1 - KL_START) * done / WARM_UP, 1.0)
@@ -126,7 +128,7 @@ def fit(
     return run
 
 
-def evidence(drawn: Pass, target: Tensor) -> tuple[Tensor, Tensor]:
+def evidence(drawn: HGVAEOutput, target: Tensor) -> tuple[Tensor, Tensor]:
     """The two terms of equation 1, nats a window (B,): log p(x | z), x in metres, and the KL divergence."""
     entries = target[0].numel()
     return drawn.tracks.log_density(target).flatten(1).sum(dim=1) - entries * math.log(SCALE), drawn.kl.sum(dim=1)
@@ -134,28 +136,29 @@ def evidence(drawn: Pass, target: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def evaluate_hgvae(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, float]:
-    """On unseen people: the evidence lower bound, how far reconstruction is off, and completion against a line.
+    """On unseen people: evidence lower bound, reconstruction error, and error of completed entries.
 
     Returns:
         ``ELBO`` and its ``log p(x|z)``, nats an entry; ``val mm``, the mean joint error of whole windows; ``hidden
-        mm``, that of entries hidden as in training, and ``guess mm``, that of the completion it started from.
+        mm``, that of joints hidden as in training, and ``guess mm``, that of the completion network alone; ``hidden
+        found/stated``, RMS error over stated deviation of the former.
     """
     rng = np.random.default_rng(1)
     positions, sizes = val.draw(windows, model.config.frames, rng)
     whole = Batch.of(model, positions, positions, sizes)
-    likelihood, kl = evidence(model(whole.x, whole.believed, spread=torch.ones(windows, 1)), whole.target)
-    found = model(whole.x, whole.believed)
-    slow = slow_errors(windows, rng)
-    partial = Batch.of(model, occlude(add_noise(positions, rng, slow), rng), positions, sizes)
-    partial = partial.completed(model, slow)
-    completed = model(partial.x, partial.believed)
+    likelihood, kl = evidence(model(whole.x, whole.certainty, spread=torch.ones(windows, 1)), whole.target)
+    whole_output = model(whole.x, whole.certainty)
+    bias_sigma = draw_bias_sigma(windows, rng)
+    partial = Batch.of(model, occlude(add_noise(positions, rng, bias_sigma), rng), positions, sizes)
+    partial = partial.completed(model, bias_sigma)
+    completed = model(partial.x, partial.certainty)
     hidden = (partial.observed[:, ::3] == 0) & (partial.counts > 0)
     z = (completed.tracks.mean - partial.target).square() * (-completed.tracks.log_var).exp()
     entries = whole.x[0].numel()
     return {
         "ELBO": ((likelihood - kl).mean() / entries).item(),
         "log p(x|z)": (likelihood.mean() / entries).item(),
-        "val mm": _joint_error(found.tracks.mean, whole.target).mean().item(),
+        "val mm": _joint_error(whole_output.tracks.mean, whole.target).mean().item(),
         "hidden mm": _joint_error(completed.tracks.mean, partial.target)[hidden].mean().item(),
         "guess mm": _joint_error(partial.x, partial.target)[hidden].mean().item(),
         "hidden found/stated": z.unflatten(1, (-1, 3)).mean(dim=2)[hidden].mean().sqrt().item(),

@@ -36,24 +36,24 @@ from steadypose.prior.models.torch_weights import load_network, started
 from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
 from steadypose.prior.motion.corruption import (
-    FAST,
-    elsewhere,
+    JITTER_SHARE,
+    displaced,
     exchanged,
     hide_joints,
     jumps,
     noisy,
     occlude,
+    of_another_person,
     other_bones,
-    other_builds,
     repeats,
     sides_exchanged,
-    somebody_elses,
-    spoil,
     stands_still,
-    wandering,
+    vary_builds,
+    with_drifting_error,
+    with_faults,
 )
 from steadypose.prior.motion.dataset import MotionSet
-from steadypose.prior.timing.frozen_joints import LEAST_NOISE, frozen_joints
+from steadypose.prior.timing.frozen_joints import MIN_NOISE, frozen_joints
 
 Floats = NDArray[np.float64]
 
@@ -70,9 +70,9 @@ LEAST_FAULT = 0.015
 """Metres along an axis, over the frames that are scored: a joint less off than that, or than the sensor's own error, is
 no fault worth the name, and one less off than a fifth of it is none."""
 
-FAULTS = (stands_still, exchanged, sides_exchanged, elsewhere, somebody_elses, other_bones, noisy, jumps)
+FAULTS = (stands_still, exchanged, sides_exchanged, displaced, of_another_person, other_bones, noisy, jumps)
 BONES, TURNED = 0.05, 0.1
-"""By how much each bone of a window is longer or shorter, and turned, radians (`other_builds`): how
+"""By how much each bone of a window is longer or shorter, and turned, radians (`vary_builds`): how
 somebody is built or holds a limb is no fault."""
 
 SPOILT = 0.6
@@ -134,15 +134,15 @@ def fit(
 def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np.random.Generator) -> Tensor:
     """Binary cross-entropy over the joints seen of which it is clear whether they are off."""
     clean, sizes = windows.draw(count, model.config.frames, rng, STRIDES)
-    clean = other_builds(clean, BONES, TURNED, rng)
+    clean = vary_builds(clean, BONES, TURNED, rng)
     sigma = np.exp(rng.uniform(np.log(SENSOR_SIGMAS[0]), np.log(SENSOR_SIGMAS[-1]), count))
-    spoilt = spoil(clean, FAULTS, SPOILT, rng)
+    spoilt = with_faults(clean, FAULTS, SPOILT, rng)
     fast = rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.8)  # some sensors smooth what they say
-    answered = wandering(spoilt, sigma, rng, fast)
-    seen = spoil(answered, (repeats,), REPEATED, rng)
+    answered = with_drifting_error(spoilt, sigma, rng, fast)
+    seen = with_faults(answered, (repeats,), REPEATED, rng)
     astray = np.sqrt(((spoilt - clean + seen - answered)[:, -RECENT:] ** 2).mean(axis=(1, 3)))
     repeated = (seen != answered)[:, -RECENT:].any(axis=-1).mean(axis=1)
-    lost = (repeated > 0.5) & (sigma * np.sqrt(fast) > LEAST_NOISE)[:, None]
+    lost = (repeated > 0.5) & (sigma * np.sqrt(fast) > MIN_NOISE)[:, None]
     lacking = rng.random(count)
     for k in np.flatnonzero(lacking < 0.7):
         alone, few = seen[k : k + 1], lacking[k] < 0.4
@@ -185,7 +185,7 @@ class Scored(NamedTuple):
 @torch.inference_mode()
 def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Scored:
     """Score windows (B, T, 22, 3) of bodies of sizes (B,), by a sensor of ``sensor_sigma`` metres along an axis."""
-    bias_sigma, mean, parts = sensor_sigma * np.sqrt(1.0 - FAST), network.mean.numpy(), []
+    bias_sigma, mean, parts = sensor_sigma * np.sqrt(1.0 - JITTER_SHARE), network.mean.numpy(), []
     for start in range(0, len(seen), 256):
         some = slice(start, start + 256)
         reconstructed = _reconstruct(model, seen[some], sizes[some], bias_sigma)
@@ -207,7 +207,7 @@ def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, see
     for m, s in track(conditions, "calibrating"):
         positions, sizes = _at_paces(windows, model.config.frames, count, rng)
         sigma, fast = np.full(len(positions), SENSOR_SIGMAS[s]), rng.uniform(0.0, 1.0, len(positions))
-        seen = hide_joints(wandering(positions, sigma, rng, fast), MISSING[m], rng)
+        seen = hide_joints(with_drifting_error(positions, sigma, rng, fast), MISSING[m], rng)
         found = score_windows(network, model, seen, sizes, SENSOR_SIGMAS[s])
         of_class = np.digitize(found.pace, PACE_EDGES)
         odds = found.odds.max(axis=1)

@@ -11,7 +11,7 @@ from torch import Tensor
 from steadypose.prior.models.humor.network import HumorNet
 from steadypose.prior.models.humor.state import pose_features
 
-LEAST_VARIANCE = 1e-3
+MIN_VARIANCE = 1e-3
 """Of standardised features: added to each, as the joints of a body on bones are fewer than their coordinates."""
 
 _ITERATIONS = 100
@@ -28,7 +28,7 @@ def fit_initial(model: HumorNet, inputs: Tensor, seed: int) -> None:
     from sklearn.mixture import GaussianMixture  # of the extra `train`, and slow to import
 
     mixture = GaussianMixture(
-        model.config.components, reg_covar=LEAST_VARIANCE, max_iter=_ITERATIONS, random_state=seed
+        model.config.components, reg_covar=MIN_VARIANCE, max_iter=_ITERATIONS, random_state=seed
     ).fit(pose_features(inputs).double().numpy())
     model.mixture_log_weights.copy_(torch.from_numpy(np.log(np.asarray(mixture.weights_))))
     model.mixture_means.copy_(torch.from_numpy(mixture.means_))

@@ -24,7 +24,7 @@ FEATURES = 3 + 6 * JOINT_COUNT + 3 * (JOINT_COUNT - 1) + 3 * JOINT_COUNT + 3
 CHANGE = 3 + 3 * JOINT_COUNT
 """Numbers of a step: how far the root moves, and rotation vectors of all joints."""
 
-_LEAST_LEVEL = 1e-4
+_MIN_LEVEL = 1e-4
 """Of the horizontal part of the body's left axis: one who lies exactly on a side faces nowhere."""
 
 
@@ -92,7 +92,7 @@ def facing(orientation: Tensor) -> Tensor:
     derivative where the body faces along the axis already.
     """
     x, y = orientation[..., 0, 1], orientation[..., 1, 1]
-    length = (x.square() + y.square()).clamp(min=_LEAST_LEVEL**2).sqrt()
+    length = (x.square() + y.square()).clamp(min=_MIN_LEVEL**2).sqrt()
     cos, sin = y / length, -x / length
     zero = torch.zeros_like(cos)
     rows = [cos, -sin, zero, sin, cos, zero, zero, zero, torch.ones_like(cos)]

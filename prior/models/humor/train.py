@@ -33,7 +33,7 @@ STEPS = 10
 SCALES = (0.9, 1.1)
 """Range of factors on people's sizes."""
 
-LEAST_SPEED = 0.1
+MIN_SPEED = 0.1
 """m/s: a sequence is drawn as often as its feet are fast, and one that stands as if they were this fast."""
 
 KL_WEIGHT, KL_SHARE = 4e-4, 0.25
@@ -52,7 +52,7 @@ TRUE_UNTIL, OWN_FROM = 0.15, 0.35
 """Scheduled sampling: shares of the training before which each step starts from the true state, and after which each
 starts from what the step before made; between, from either by chance."""
 
-LEAST_SCALE = 0.02
+MIN_SCALE = 0.02
 """of a feature's deviation: some do not vary, such as where in its own frame a root stands"""
 
 _MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
@@ -89,7 +89,7 @@ class Sequences:
         rows = motion.all_windows(STEPS + 2, 1)
         feet = motion.positions[:, [J["left_ankle"], J["right_ankle"]]]
         moved = np.concatenate([[0.0], feet.diff(dim=0).norm(dim=-1).mean(dim=1).double().cumsum(0).numpy()])
-        chances = LEAST_SPEED + (moved[rows[:, -1]] - moved[rows[:, 0]]) * FPS / (STEPS + 1)
+        chances = MIN_SPEED + (moved[rows[:, -1]] - moved[rows[:, 0]]) * FPS / (STEPS + 1)
         return cls(motion, load, rest, rows[:, 0], chances / chances.sum())
 
     def draw(self, count: int, steps: int, rng: Rng) -> Batch:
@@ -204,7 +204,7 @@ def _fit_statistics(model: HumorNet, sequences: Sequences, seed: int) -> None:
     states = sequences.draw(_STATES_OF_MIXTURE, 0, rng).states[:, 0]
     inputs = features(canonical(states, states))
     model.mean.copy_(inputs.mean(dim=0))
-    model.scale.copy_(inputs.std(dim=0).clamp(min=LEAST_SCALE))
+    model.scale.copy_(inputs.std(dim=0).clamp(min=MIN_SCALE))
     fit_initial(model, model.standardise(inputs), seed)
 
 

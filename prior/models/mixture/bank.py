@@ -37,7 +37,7 @@ RAW = EXPERTS - 1
 MEMORY = 9
 """Sightings over which a prediction's likelihood fades: 5 to 15 differ by 3 % at most (validation)."""
 
-LEAST_SCALE = 1e-4
+MIN_SCALE = 1e-4
 """Added, per sighting remembered, to the squared innovations: a hundredth of the measurement's deviation."""
 
 SLOW = 18
@@ -203,7 +203,7 @@ def advance(bank, count, step, positions, confidence, densities, sigma):
                 b = positions[s, j, 1] - position[slot, 1]
                 c = positions[s, j, 2] - position[slot, 2]
                 square = (a * a + b * b + c * c) / (3.0 * total)
-                bank.misfit[s, j, m] = keep * bank.misfit[s, j, m] + square + LEAST_SCALE
+                bank.misfit[s, j, m] = keep * bank.misfit[s, j, m] + square + MIN_SCALE
                 bank.spread[s, j, m] = keep * bank.spread[s, j, m] + np.log(total)
                 for k in range(frames):
                     gain = with_position[k] / total

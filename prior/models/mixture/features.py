@@ -35,7 +35,7 @@ QUICK, LONG = 3, 30
 PACE = 2.0
 """m/s, the unit of velocities."""
 
-MOST_NOISE = 0.3
+MAX_NOISE = 0.3
 """Metres: what one frame adds to the noise found, at most; beyond that, the gate has let a bad one through."""
 
 _CENTIMETRES = float(np.log(100.0))
@@ -103,7 +103,7 @@ def describe(bank, count, back, parents, experts, features, scale, gap, between)
                     square = _square(experts[s, j, m], experts[s, j, _looser(m)])
                     for k, memory in enumerate((QUICK, SLOW)):
                         bank.apart[s, j, m, k] += (square - bank.apart[s, j, m, k]) / min(bank.age[s, j, 0], memory)
-                square = min(_square(experts[s, j, LOOSE], experts[s, j, RAW]), MOST_NOISE**2)
+                square = min(_square(experts[s, j, LOOSE], experts[s, j, RAW]), MAX_NOISE**2)
                 bank.noise[s, j] += (square - bank.noise[s, j]) / min(bank.age[s, j, 0], SLOW)
             if bank.age[s, j, 0] > 0.0:
                 total += bank.noise[s, j]

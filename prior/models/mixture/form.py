@@ -19,5 +19,5 @@ CORRECTION = 2.0
 COASTING = 0.1
 """m/s: by how much a joint's standard deviation grows at least with the time to its nearest sighting."""
 
-LEAST_LOG_SIGMA, MOST_LOG_SIGMA = -3.0, 6.0
+MIN_LOG_SIGMA, MAX_LOG_SIGMA = -3.0, 6.0
 """Range of the logarithm of the standard deviation, in units of a millimetre."""

@@ -23,7 +23,7 @@ from steadypose.prior.models.mixture.bank import (
     new_bank,
 )
 from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
-from steadypose.prior.models.mixture.form import COASTING, CORRECTION, LEAST_LOG_SIGMA, MOST_LOG_SIGMA, OUTPUTS, REACH
+from steadypose.prior.models.mixture.form import COASTING, CORRECTION, MAX_LOG_SIGMA, MIN_LOG_SIGMA, OUTPUTS, REACH
 from steadypose.prior.models.weights_io import load_weights
 from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS
@@ -284,6 +284,6 @@ def _mixed(outputs, experts, heading, scale, gap, between, places, sigma):
             for m in range(RAW):
                 places[j, axis] += weights[m] * (experts[j, m, axis] - came)
             places[j, axis] += came
-        log_sigma = min(max(np.float64(out[2 * EXPERTS + 3]), LEAST_LOG_SIGMA), MOST_LOG_SIGMA)
+        log_sigma = min(max(np.float64(out[2 * EXPERTS + 3]), MIN_LOG_SIGMA), MAX_LOG_SIGMA)
         coasted = COASTING / FPS * gap[j]
         sigma[j] = np.sqrt((1e-3 * np.exp(log_sigma)) ** 2 + coasted**2)

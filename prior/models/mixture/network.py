@@ -28,8 +28,8 @@ from steadypose.prior.models.mixture.form import (
     COASTING,
     CORRECTION,
     GATES,
-    LEAST_LOG_SIGMA,
-    MOST_LOG_SIGMA,
+    MAX_LOG_SIGMA,
+    MIN_LOG_SIGMA,
     OUTPUTS,
     REACH,
 )
@@ -181,7 +181,7 @@ def answer(
     came = experts[..., RAW, :]
     places = came + (weights[..., None] * (experts - came[..., None, :])).sum(dim=-2) + moved
     coasted = 1e3 * COASTING / FPS * gap
-    variance = (2.0 * log_sigma[..., 0].clamp(LEAST_LOG_SIGMA, MOST_LOG_SIGMA)).exp() + coasted.square()
+    variance = (2.0 * log_sigma[..., 0].clamp(MIN_LOG_SIGMA, MAX_LOG_SIGMA)).exp() + coasted.square()
     inside = between > 0.0
     return (
         torch.where(inside[..., None], experts[..., PREDICTED, :], places),

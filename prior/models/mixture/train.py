@@ -46,13 +46,13 @@ CLIPS, DELAYS_A_STEP = 16, 2
 DELAYS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16])
 DELAY_SHARES = np.array([0.22, 0.08, 0.12, 0.05, 0.17, 0.03, 0.04, 0.13, 0.03, 0.03, 0.10])
 
-LEAST_MM = 1.0
+MIN_MM = 1.0
 """Added to what the best expert is off by, before it divides: a perfect input matters, but not beyond all measure."""
 
 SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.25, 0.4, 0.8, 2.0, 3.0)
 """Weight of the acceleration error by delay in frames: without delay, smoothness is paid for in lag, and later not."""
 
-LEAST_SMOOTH_MM = 0.5
+MIN_SMOOTH_MM = 0.5
 """mm/frame², added to the acceleration error of the best expert."""
 
 FAST, MOST = 0.5, 60.0
@@ -160,7 +160,7 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
         position, acceleration = (torch.stack(values) for values in zip(*each, strict=True))
         best = (position + acceleration).argmin(dim=0, keepdim=True)
         position, acceleration = position.gather(0, best)[0], acceleration.gather(0, best)[0]
-    relative = own.position / (position + LEAST_MM) + smooth * own.acceleration / (acceleration + LEAST_SMOOTH_MM)
+    relative = own.position / (position + MIN_MM) + smooth * own.acceleration / (acceleration + MIN_SMOOTH_MM)
     square = torch.where(known[..., None], places - batch.truth, 0.0).square().mean(dim=-1).detach() * 1e6
     density = 0.5 * (variance.log() + square / variance)
     likelihood = (density * known).sum(dim=(1, 2)) / known.sum(dim=(1, 2)).clamp(min=1)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from steadypose.prior.models.contacts.network import ContactNet
-from steadypose.prior.models.hgvae.completion import belief
+from steadypose.prior.models.hgvae.completion import certainty_of
 from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.faults import FaultNet
 from steadypose.prior.models.hgvae.network import HGVAE
@@ -95,13 +95,13 @@ class Reconstruction(nn.Module):
         origin, completion = self.network.mean[:, None], self.network.completion
         deviations = hang_unseen((tracks - origin) / SCALE)
         seen = confidence > 0
-        believed = seen.float()
+        certainty = seen.float()
         if completion is not None:
             features = completion_features(deviations, confidence, bias_sigma, completion.config.patch)
             correction, log_var = completion(*features)
             deviations = torch.where(seen, deviations, deviations + correction)
-            believed = belief(confidence, log_var)
-        found = self.network(deviations, believed).tracks
+            certainty = certainty_of(confidence, log_var)
+        found = self.network(deviations, certainty).tracks
         return found.mean * SCALE + origin, (0.5 * found.log_var).exp() * SCALE
 
 

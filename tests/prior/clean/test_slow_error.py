@@ -6,7 +6,7 @@ from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import RIGID, place_joints
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.clean.slow_error import LEAST_FRAMES, UNKNOWN_VARIANCE, SlowError, SlowErrorEstimator
+from steadypose.prior.clean.slow_error import MIN_FRAMES, UNKNOWN_VARIANCE, SlowError, SlowErrorEstimator
 from steadypose.prior.timing.fixed_lag import Smoothed
 
 BONES = np.tile(REST_OFFSETS, (1, 1, 1))
@@ -47,7 +47,7 @@ def test_before_anything_is_seen_it_is_what_was_expected_but_not_of_a_sensor_wit
     nothing = np.full((1, 22, 3), np.nan)
     assert found(nothing, 0.01, jitter=0.02).bias_sigma[0] == pytest.approx(0.02)
     assert found(nothing, 0.01, jitter=0.0).bias_sigma[0] == 0.0
-    assert (found(waving(LEAST_FRAMES), 0.01, 0.02).length_variance == UNKNOWN_VARIANCE).all()
+    assert (found(waving(MIN_FRAMES), 0.01, 0.02).length_variance == UNKNOWN_VARIANCE).all()
 
 
 def test_a_rig_with_other_bones_is_not_at_fault() -> None:

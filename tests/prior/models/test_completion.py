@@ -7,11 +7,11 @@ import torch
 from tests.prior.models.test_hgvae import SMALL, awake
 
 from steadypose.prior.body.skeleton import PARENTS, J
-from steadypose.prior.models.hgvae.completion import CompletionNet, belief
+from steadypose.prior.models.hgvae.completion import CompletionNet, certainty_of
 from steadypose.prior.models.hgvae.completion_features import (
     FIRST_LOG_VAR,
     GROWTH,
-    HALF_BELIEVED,
+    HALF_CERTAIN_SIGMA,
     LAG,
     NEAR,
     STILL,
@@ -35,17 +35,17 @@ def windows(frames: int = 12) -> tuple[np.ndarray, np.ndarray]:
     return deviations, observed
 
 
-def test_how_far_apart_from_sightings_a_joint_is() -> None:
+def test_the_gap_to_the_nearest_sightings() -> None:
     deviations, observed = windows()
     observed[0, 0, 7] = 0  # a coordinate alone: the joint was not seen whole
-    apart = completion_features(deviations, observed, 0.0, patch=4).apart
-    assert apart[0, 0, 7] == 0.5
-    gap = np.arange(1, 6)
-    np.testing.assert_allclose(apart[1, WRIST, 4:9], gap * (6 - gap) / 6, rtol=1e-6)
-    assert (apart[2, WRIST] == -1).all()
-    assert np.count_nonzero(apart) == 1 + 5 + 12
+    gap = completion_features(deviations, observed, 0.0, patch=4).gap
+    assert gap[0, 0, 7] == 0.5
+    steps = np.arange(1, 6)
+    np.testing.assert_allclose(gap[1, WRIST, 4:9], steps * (6 - steps) / 6, rtol=1e-6)
+    assert (gap[2, WRIST] == -1).all()
+    assert np.count_nonzero(gap) == 1 + 5 + 12
     observed[1, TRACKS, 9:] = 0
-    assert completion_features(deviations, observed, 0.0, patch=4).apart[1, WRIST].tolist() == [
+    assert completion_features(deviations, observed, 0.0, patch=4).gap[1, WRIST].tolist() == [
         0,
         0,
         0,
@@ -71,12 +71,12 @@ def test_how_much_a_joint_moves_is_told_beside_the_one_above_and_without_the_noi
     )
     assert features.noise[1, J["head"]] > features.noise[1, WRIST] > (0.01 / SCALE) ** 2  # of the gap, nothing is told
     hips = [J["left_hip"], J["right_hip"], J["spine1"]]  # beside the pelvis's path, which is not the pelvis's track
-    assert (np.delete(features.moved[1], [0, WRIST, *hips]) < 1e-9).all()
+    assert (np.delete(features.mobility[1], [0, WRIST, *hips]) < 1e-9).all()
     elbow = PARENTS[WRIST]
     way = deviations[2, 3 * elbow : 3 * elbow + 3] - deviations[2, 3 * PARENTS[elbow] : 3 * PARENTS[elbow] + 3]
     moved = ((way[:, LAG:] - way[:, :-LAG]) ** 2).mean() - 2 * (features.noise[2, elbow] - (0.01 / SCALE) ** 2)
-    assert features.moved[2, elbow] == pytest.approx(moved, rel=1e-3)
-    assert features.moved[2, WRIST] > 0  # never seen: as all do
+    assert features.mobility[2, elbow] == pytest.approx(moved, rel=1e-3)
+    assert features.mobility[2, WRIST] > 0  # never seen: as all do
 
 
 def test_the_longer_ago_and_the_more_it_moves_the_less_the_line_counts() -> None:
@@ -85,10 +85,10 @@ def test_the_longer_ago_and_the_more_it_moves_the_less_the_line_counts() -> None
     written[..., : 66 * 4] = 1.0
 
     def leaning(moved: float, noise: float = 0.0, above: float = 0.0) -> np.ndarray:
-        apart = torch.zeros(1, 22, 12)
-        apart[0, WRIST], apart[0, PARENTS[WRIST]] = torch.arange(12), above
+        gap = torch.zeros(1, 22, 12)
+        gap[0, WRIST], gap[0, PARENTS[WRIST]] = torch.arange(12), above
         with torch.inference_mode():
-            correction, log_var = network.fuse(written, line_variance(apart, moved, noise))
+            correction, log_var = network.fuse(written, line_variance(gap, moved, noise))
         assert log_var[0, WRIST, 1:].diff().min() > 0
         return correction[0, 3 * WRIST].numpy()
 
@@ -110,10 +110,10 @@ def line_variance(apart: torch.Tensor, moved: float, noise: float) -> torch.Tens
 
 
 def test_a_guess_is_believed_by_how_good_it_is() -> None:
-    observed, log_var = torch.zeros(1, 66, 4), torch.full((1, 22, 4), 2 * np.log(HALF_BELIEVED / SCALE))
+    observed, log_var = torch.zeros(1, 66, 4), torch.full((1, 22, 4), 2 * np.log(HALF_CERTAIN_SIGMA / SCALE))
     observed[:, :3] = 1
     log_var[:, 2] += np.log(3.0)
-    found = belief(observed, log_var)
+    found = certainty_of(observed, log_var)
     assert (found[:, :3] == 1).all()
     np.testing.assert_allclose(found[:, 3:6], 0.5)
     np.testing.assert_allclose(found[:, 6:9], 0.25)
@@ -134,13 +134,13 @@ def test_only_what_was_not_seen_moves() -> None:
     model = awake()
     deviations, observed = windows()
     observed[0, 3, 5] = 0  # one coordinate of a joint
-    completed, believed = model.completed(
+    completed, certainty = model.completed(
         torch.from_numpy(deviations).float(), torch.from_numpy(observed).float(), 0.01
     )
     moved = np.abs(completed.numpy() - deviations) > 1e-6
     assert not moved[observed == 1].any()
     assert moved[observed == 0].all()
-    assert ((believed == 1).numpy() == (observed == 1)).all()
+    assert ((certainty == 1).numpy() == (observed == 1)).all()
 
 
 def test_noise_is_told_by_joint_where_it_was_seen_and_of_all_where_it_was_not() -> None:

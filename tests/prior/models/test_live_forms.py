@@ -40,13 +40,13 @@ def test_completion(seed: int) -> None:
     observed[1, 30:36] = 0.0  # joints never seen
     observed[2, :, 5:] = 0.0
     torched = torch.from_numpy(deviations), torch.from_numpy(observed).float()
-    expected, expected_belief = model.completed(*torched, 0.01)
+    expected, expected_certainty = model.completed(*torched, 0.01)
     completed = deviations.copy()
     assert model.config.completion is not None
     live = LiveCompletion(model.config.completion, arrays_of(model.completion), max_batch=5)
-    believed = live.complete(completed, observed, np.full(len(completed), 0.01))
+    certainty = live.complete(completed, observed, np.full(len(completed), 0.01))
     np.testing.assert_allclose(completed, expected.numpy(), atol=2e-6)
-    np.testing.assert_allclose(believed, expected_belief.numpy(), atol=2e-6)
+    np.testing.assert_allclose(certainty, expected_certainty.numpy(), atol=2e-6)
     assert (completed[0] == deviations[0]).all()
 
 

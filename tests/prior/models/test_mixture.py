@@ -14,9 +14,9 @@ from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
     EXPERTS,
-    LEAST_SCALE,
     MEASUREMENT_SIGMA,
     MEMORY,
+    MIN_SCALE,
     PREDICTED,
     advance,
     new_bank,
@@ -79,7 +79,7 @@ def test_experts_are_fixed_lag_smoothers_and_their_mean_by_predictions(delay: in
                 continue
             now = np.isfinite(frame[0]).all(axis=1)
             variance = ahead.sigma[0] ** 2 + known_sigma**2
-            square = np.square(frame[0] - ahead.positions[0]).sum(axis=1) / 3 / variance + LEAST_SCALE
+            square = np.square(frame[0] - ahead.positions[0]).sum(axis=1) / 3 / variance + MIN_SCALE
             for total, new in ((misfit, square), (spread, np.log(variance)), (count, 1.0)):
                 total[:, m] = np.where(now, (1 - 1 / MEMORY) * total[:, m] + new, total[:, m])
         expected = [smoother.update(frame, t / FPS) for smoother in textbook]

@@ -6,13 +6,13 @@ from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
 from steadypose.prior.models.hgvae.train_faults import FAULTS
 from steadypose.prior.motion.corruption import (
     add_noise,
+    draw_bias_sigma,
     exchanged,
     hide_joints,
     occlude,
-    other_builds,
-    sensed,
-    slow_errors,
-    spoil,
+    vary_builds,
+    with_faults,
+    with_sensor_error,
 )
 
 WINDOWS = np.stack([waving(50, speed=1.0 + 0.05 * k) for k in range(40)])
@@ -22,10 +22,10 @@ def test_the_truth_is_left_alone() -> None:
     rng, kept = np.random.default_rng(0), WINDOWS.copy()
     for spoilt in (
         occlude(WINDOWS, rng),
-        add_noise(WINDOWS, rng, slow_errors(40, rng)),
-        other_builds(WINDOWS, 0.05, 0.2, rng),
-        spoil(WINDOWS, FAULTS, 1.0, rng),
-        sensed(WINDOWS, 0.01, rng),
+        add_noise(WINDOWS, rng, draw_bias_sigma(40, rng)),
+        vary_builds(WINDOWS, 0.05, 0.2, rng),
+        with_faults(WINDOWS, FAULTS, 1.0, rng),
+        with_sensor_error(WINDOWS, 0.01, rng),
         hide_joints(WINDOWS, 3, rng),
     ):
         assert spoilt.shape == WINDOWS.shape
@@ -34,7 +34,7 @@ def test_the_truth_is_left_alone() -> None:
 
 
 def test_other_bones_are_as_long_on_both_sides_and_in_every_frame() -> None:
-    other = other_builds(WINDOWS, 0.1, 0.2, np.random.default_rng(0))
+    other = vary_builds(WINDOWS, 0.1, 0.2, np.random.default_rng(0))
     factor = bone_lengths(other)[..., 1:] / bone_lengths(WINDOWS)[..., 1:]
     assert 0.05 < np.log(factor).std() < 0.15
     np.testing.assert_allclose(factor, factor[:, :1].repeat(50, axis=1))
@@ -43,7 +43,7 @@ def test_other_bones_are_as_long_on_both_sides_and_in_every_frame() -> None:
 
 def test_other_people_hold_each_bone_at_an_angle_of_its_own_throughout() -> None:
     still = WINDOWS[:, :1].repeat(50, axis=1)
-    other = other_builds(still, 0.0, 0.2, np.random.default_rng(0))
+    other = vary_builds(still, 0.0, 0.2, np.random.default_rng(0))
     np.testing.assert_allclose(other, other[:, :1].repeat(50, axis=1), atol=1e-12)
     bones, turned = (windows[:, 0, 1:] - windows[:, 0, list(PARENTS[1:])] for windows in (still, other))
     cosine = (bones * turned).sum(axis=-1) / np.linalg.norm(bones, axis=-1) / np.linalg.norm(turned, axis=-1)
@@ -57,7 +57,7 @@ def test_errors_that_last_are_as_large_as_told() -> None:
     slow = np.repeat([0.0, 0.03], 20)
     off = np.abs((add_noise(WINDOWS, rng, slow) - WINDOWS).mean(axis=1))
     assert off[20:].mean() > 3 * off[:20].mean()
-    assert 0.5 < (slow_errors(4000, rng) > 0).mean() < 0.8
+    assert 0.5 < (draw_bias_sigma(4000, rng) > 0).mean() < 0.8
 
 
 def bone_lengths(windows: np.ndarray) -> np.ndarray:
@@ -76,7 +76,7 @@ def test_as_many_joints_are_hidden_as_asked_and_all_the_time() -> None:
 
 
 def test_a_sensor_errs_by_what_is_said_half_of_it_for_good() -> None:
-    off = sensed(WINDOWS, 0.02, np.random.default_rng(0)) - WINDOWS
+    off = with_sensor_error(WINDOWS, 0.02, np.random.default_rng(0)) - WINDOWS
     assert off.std() == pytest.approx(0.02, rel=0.05)
     assert off.mean(axis=1).std() == pytest.approx(0.02 * np.sqrt(0.5 + 0.5 / 50), rel=0.05)
 
@@ -105,6 +105,6 @@ def test_exchanged_limbs_are_each_others() -> None:
 
 
 def test_the_share_asked_for_is_spoilt() -> None:
-    spoilt = spoil(np.tile(WINDOWS, (10, 1, 1, 1)), FAULTS, 0.6, np.random.default_rng(0))
+    spoilt = with_faults(np.tile(WINDOWS, (10, 1, 1, 1)), FAULTS, 0.6, np.random.default_rng(0))
     off = np.linalg.norm(spoilt - np.tile(WINDOWS, (10, 1, 1, 1)), axis=-1) > 0
     assert off.any(axis=(1, 2)).mean() == pytest.approx(0.6, abs=0.1)
