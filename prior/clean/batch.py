@@ -1,13 +1,12 @@
 """Many streams through one prior, in batches: a frame of all of them goes through each stage together.
 
 Bodies of several cameras share the stages' slots as bodies of one camera do; what differs is the clock. Each stream has
-its own, and its frames come at times of their own. So each is put on one grid that all share, and a grid time is worked
-on when every stream has come to it, or has had its time: who is later than that goes without for that frame, and holds
-up nobody.
+its own, and its frames are stamped by it. So each is resampled to one grid that all share, and a grid time is processed
+when every stream has reached it or `PATIENCE_NS` is over; a stream that is later misses that frame, and holds up no
+other.
 
-From a stream's clock to the server's: a message arrives after its capture by the difference of the clocks and what the
-way takes, which is never less than the network's least. The smallest difference seen is kept, and let go of slowly, so
-that it follows clocks that drift.
+The offset from a stream's clock to the server's is the minimum of arrival less capture stamp: clock difference plus the
+least latency of the network. The minimum decays slowly (`DRIFT`), so that it follows clocks that drift.
 """
 
 from __future__ import annotations
@@ -40,27 +39,26 @@ from steadypose.prior.clean.slots import Slots
 from steadypose.prior.timing.resample import PERIOD_NS, Resampler
 
 PATIENCE_NS = 2 * PERIOD_NS
-"""How long a frame waits for those of the other streams: a period, because they come at any time in it, and as much
-again for the network."""
+"""How long a frame waits for the other streams: a period, as their phases differ, and another for the network."""
 DRIFT = 200e-6
-"""By how much two clocks may run apart: twice what two bad quartzes do."""
+"""Relative drift allowed between two clocks: twice that of two poor quartz oscillators."""
 LATE_IN_A_ROW = 15
-"""Frames of a stream, half a second; then its clock was set or its way has become longer, and it starts anew."""
+"""Late frames in a row (half a second) after which a stream starts anew: its clock was set, or its latency grew."""
 
 
 @dataclass
 class _Stream:
-    """What is kept of one stream; times are the server's.
+    """State of one stream; times are on the server's clock.
 
     Attributes:
         resampler: to the shared grid; its slots are the batch's.
-        identify: who tells its bodies apart, if it does not itself.
+        identify: assigns ids to its bodies; None if the source does.
         offset_ns: from its clock to the server's.
         last: its newest message.
-        time_ns: of that message's capture.
-        heard_ns: when it came.
-        first_ns, newest_ns: the first and the newest grid time that it has given joints for; none yet if negative.
-        sensor_pose: where the sensor stands, as far as it is believed.
+        sensor_pose: outlier rejection of its sensor's pose.
+        time_ns: capture of the newest message.
+        heard_ns: arrival of the newest message.
+        first_ns, newest_ns: the first and the newest grid time with joints of this stream; negative before the first.
         late: how many of its frames in a row came too late.
     """
 
@@ -77,14 +75,14 @@ class _Stream:
 
 
 class StreamBatch:
-    """The prior for many streams, told apart by ``source``.
+    """The prior for many streams, distinguished by their messages' ``source``.
 
     Args:
-        settings: of the prior; ``max_bodies`` is of all streams together.
+        settings: of the prior; ``max_bodies`` is the limit of all streams together.
         max_streams: further ones are refused.
 
     Attributes:
-        counters: what was refused or dropped so far, by cause.
+        counters: messages, bodies and joints refused or dropped so far, by cause.
         delay_frames: frames at 30 Hz between a frame and its answer.
     """
 
@@ -106,11 +104,11 @@ class StreamBatch:
         return len(self._streams)
 
     def process_at(self, raw: PoseRaw, now_ns: int, *, hurry: bool = False) -> list[PoseClean]:
-        """Take a message of any stream, and give the frames that are then complete, of all streams, oldest first.
+        """Take a message of any stream, and give the frames of all streams that are then complete, oldest first.
 
         Args:
             raw: the message.
-            now_ns: when it came, on the server's clock.
+            now_ns: its arrival, on the server's clock.
             hurry: as of `PriorPipeline.process`.
         """
         cleaned: list[PoseClean] = []
@@ -128,7 +126,7 @@ class StreamBatch:
                 stream.heard_ns = now_ns
         else:
             layout = layout_of(raw, self.counters)
-            if layout is not None and self._is_believed(raw):
+            if layout is not None and self._is_pose_accepted(raw):
                 self._take(raw, layout, now_ns)
         cleaned += self._advance(now_ns, hurry)
         if self._streams and all(stream.last.end_of_stream for stream in self._streams.values()):
@@ -137,11 +135,11 @@ class StreamBatch:
 
     @property
     def sensor_noise(self) -> SensorNoise | None:
-        """What the sensor was last found to be off by, the median over bodies; None before there was one."""
+        """The latest estimate of the sensors' error, the median over bodies; None before the first body."""
         return self._core.sensor_noise
 
     def flush(self) -> list[PoseClean]:
-        """Give the frames that the delay still holds, and forget all streams."""
+        """The frames that the delay still holds, oldest first; all streams are then forgotten."""
         cleaned = [part for frame in self._core.flush() for part in self._split(frame)]
         for name, stream in list(self._streams.items()):
             if stream.last.end_of_stream:
@@ -152,18 +150,18 @@ class StreamBatch:
         self._done_ns = None
         return cleaned
 
-    def _is_believed(self, raw: PoseRaw) -> bool:
-        """Whether the sensor stands where it may; one that was put elsewhere begins anew."""
+    def _is_pose_accepted(self, raw: PoseRaw) -> bool:
+        """Whether the message's sensor pose is accepted; a stream whose sensor was moved starts anew."""
         stream = self._streams.get(raw.source)
         if stream is None or raw.stamp_ns <= stream.last.stamp_ns:
             return True
         verdict = stream.sensor_pose.judge(raw.sensor_pose, raw.stamp_ns)
-        if verdict is Verdict.DOUBTED:
+        if verdict is Verdict.SUSPECT:
             self.counters["sensor_pose_jumped"] += 1
         elif verdict is Verdict.MOVED:
             self.counters["sensor_moved"] += 1
             self._forget(raw.source)
-        return verdict is not Verdict.DOUBTED
+        return verdict is not Verdict.SUSPECT
 
     def _take(self, raw: PoseRaw, layout: Skeleton, now_ns: int) -> None:
         """Put a stream's message on the grid."""
@@ -221,7 +219,7 @@ class StreamBatch:
         return self._slots.arrange(zip(keys, found.values(), strict=True))
 
     def _advance(self, now_ns: int, hurry: bool) -> list[PoseClean]:
-        """Work on the grid times for which nobody is waited for any more."""
+        """Process the grid times that wait for no further stream."""
         cleaned: list[PoseClean] = []
         while self._waiting:
             tick_ns = min(self._waiting) if self._done_ns is None else self._done_ns + PERIOD_NS
@@ -256,7 +254,7 @@ class StreamBatch:
         return merged
 
     def _split(self, frame: CleanFrame) -> list[PoseClean]:
-        """The answer for all streams, as one message for each stream that was there."""
+        """A frame of all streams, as one message for each stream that was present."""
         stamp_ns = self._origin_ns + round(frame.estimate.stamp_s * 1e9)
         cleaned = []
         answered: set[int] = set()

@@ -1,4 +1,4 @@
-"""The correct stage: a known sensor's systematic error is taken out of what it shows."""
+"""The correct stage: subtracts a known sensor's systematic error from the observed joints."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from steadypose.prior.timing.fixed_lag import FixedLagRTS
 from steadypose.prior.timing.ring import Ring
 
 FADE = 0.9
-"""A frame's worth of a correction that can no longer be computed, because the trunk is hidden."""
+"""Decay per frame of the last correction while none can be computed, because the trunk is hidden."""
 
 
 @dataclass(frozen=True)
 class CorrectSettings:
-    """Which sensor to correct.
+    """Settings of the correct stage.
 
     Attributes:
         sensor: ``kinect_v2``, or empty for a sensor whose error is not known. A property of the sensor, not of its
-            skeleton: another camera that speaks the same joints errs in other ways.
+            joint layout: another camera with the same joints has other errors.
     """
 
     sensor: str = ""
 
 
 class Correct:
-    """Adds to each joint seen what `CorrectionNet` says is missing; it adds no delay."""
+    """Adds `CorrectionNet`'s correction to each observed joint, without delay."""
 
     def __init__(self, settings: CorrectSettings, slots: int) -> None:
         self._net = LiveCorrection.load(settings.sensor, slots)

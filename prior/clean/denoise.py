@@ -1,9 +1,10 @@
-"""The denoise stage: joints seen through noise go where HG-VAE has them, as far as the noise found says.
+"""The denoise stage: the smoother's estimate of observed joints, fused with HG-VAE's reconstruction.
 
-HG-VAE was taught to tell a window from its noise, and knows what a filter does not: which motions of one joint go with
-those of the others. Behind the mixture it takes 13 % off the error in 4 cm of noise after four frames (24.5 to 21.4 mm,
-validation motion at 1 to 2.5 times its speed: docs/experiments.md); where noise is millimetres it has no say. What both
-are off by is mostly the same noise, so the best mean of them is not that of independent estimates.
+HG-VAE is trained to denoise windows, and uses what a filter of one joint cannot: the correlation between joints. Behind
+the mixture it reduces the error in 4 cm of noise, after four frames, by 13 % (24.5 to 21.4 mm, validation motion at 1
+to 2.5 times its speed: docs/experiments.md); where the noise is millimetres it has next to no weight. The errors of
+both estimates are correlated, as most of their noise is the same, so the weights are not those of independent
+estimates.
 """
 
 from __future__ import annotations
@@ -22,90 +23,99 @@ from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS
 
 MODEL_SIGMA = 0.005
-"""Metres along an axis: what HG-VAE is off by at least, apart from noise."""
+"""Metres along an axis: lower bound of HG-VAE's own error, apart from the sensor's noise."""
 
 NOISE_LEFT = 0.59
-"""Of the variance that noise gives to the smoother's answer, what it gives to HG-VAE's."""
+"""Variance that the sensor's noise causes in HG-VAE's reconstruction, relative to that in the smoother's estimate."""
 
 MEMORY = 15
-"""Frames over which HG-VAE earns its belief."""
+"""Frames of the running mean of the squared distance between the two estimates, from which HG-VAE's own error
+follows."""
 
 SUDDEN = 3.0
-"""Times the mean of its squared distance to what was smoothed, above which this very frame's counts."""
+"""A squared distance of the current frame above this multiple of the running mean replaces it (divided by the
+multiple)."""
 
 LATE_S, LATE_NEWEST_S = 0.01, 0.03
-"""Seconds by which HG-VAE is behind a joint: of a frame that others have followed for `SETTLED`, and of the newest. A
-joint at 3 m/s it has 3 or 9 cm from where it is; of one that has just begun, what it was off by of late says little."""
+"""Seconds by which HG-VAE lags behind a moving joint: of a frame `SETTLED` frames before the newest or older, and of
+the newest. At 3 m/s that is 3 or 9 cm; of a motion that has just begun, the running mean does not show it yet."""
 
 SETTLED = 4
 
 RENEWAL = 0.5
-"""How far a frame's answer goes to that of the next window: windows one frame apart disagree, which would be jitter."""
+"""Weight of the newest window in the running mean of a frame's reconstructions: successive windows disagree, which
+would be jitter."""
 
 _BESIDE_PELVIS = np.array([*HIPS, J["spine1"]])
 
 
 @dataclass(frozen=True)
 class DenoiseSettings:
-    """Whether to.
+    """Settings of the denoise stage.
 
     Attributes:
-        enabled: off, joints seen are where the smoother has them.
+        enabled: off, observed joints stay as smoothed.
     """
 
     enabled: bool = True
 
 
 class Denoise:
-    """Moves the smoother's estimate of the joints seen towards what HG-VAE makes of them.
+    """Moves the smoother's estimate of observed joints towards HG-VAE's reconstruction.
 
     Args:
         delay_frames: between the newest frame and the one that is answered.
-        slots: bodies at most.
+        slots: maximum number of bodies.
     """
 
     def __init__(self, delay_frames: int, slots: int) -> None:
         self._apart = np.zeros((slots, 22))  # m², mean square of the distance between the two along an axis
         self._frames = np.zeros((slots, 22))
-        self._found = np.full((delay_frames + 1, slots, 22, 3), np.nan)
+        self._reconstructed = np.full((delay_frames + 1, slots, 22, 3), np.nan)
         self._before = np.full((slots, 22, 3), np.nan)
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
-        self._found[:, slot] = np.nan
+        self._reconstructed[:, slot] = np.nan
         self._before[slot] = np.nan
         self._apart[slot] = self._frames[slot] = 0.0
 
     def update(self, windows: BodyWindows | None, history: History) -> None:
-        """Take in what HG-VAE makes of the newest windows."""
-        self._found[:-1], self._found[-1] = self._found[1:], np.nan
+        """Take in HG-VAE's reconstruction of the newest windows; None if no body is present."""
+        self._reconstructed[:-1], self._reconstructed[-1] = self._reconstructed[1:], np.nan
         if windows is None:
             return
         slots, tracks = windows.slots, windows.tracks
-        latest = from_tracks(windows.reconstruction.mean[..., -len(self._found) :], tracks, windows.size)
+        latest = from_tracks(windows.reconstruction.mean[..., -len(self._reconstructed) :], tracks, windows.size)
         _place_pelvis(latest, history.positions[:, slots].swapaxes(0, 1))
         latest = latest.swapaxes(0, 1)
-        before = self._found[:, slots]
-        # a window that ends in the dark tells less of what went before than the last one that did not
+        before = self._reconstructed[:, slots]
+        # a window that ends without any sighting is worse for earlier frames than the last one that had some
         seen = np.asarray(np.isfinite(history.positions[-1, slots, :, 0]).any(axis=1))
         renewed = np.where(seen[:, None, None], before + RENEWAL * (latest - before), before)
-        self._found[:, slots] = np.where(np.isnan(before), latest, renewed)
+        self._reconstructed[:, slots] = np.where(np.isnan(before), latest, renewed)
 
     def denoised(self, smoothed: Smoothed, history: History, jitter: Floats, back: int) -> Smoothed:
-        """The smoother's estimate of the frame ``back`` before the newest, denoised; frames are to be given in order.
+        """The smoother's estimate of the frame ``back`` before the newest, denoised. Frames must come in order.
 
-        The weights are those of least variance for two estimates of which the second holds the share `NOISE_LEFT` of
-        the first one's noise and an error of its own. That error is what its distance to the first one shows beyond
-        noise, in this joint and of late (innovations, as in adaptive Kalman filters: Mehra 1970): motion that HG-VAE
-        has never seen takes its belief away; and it is the later, the faster the joint. Noise is what jumps from frame
-        to frame, ``jitter`` (S,) metres as of now: of an error that lasts, HG-VAE keeps all.
+        The weights are those of least variance for two estimates of which the second has the share `NOISE_LEFT` of the
+        first one's noise, and an error of its own. That error is estimated for each joint from the running mean of the
+        squared distance between the two, less what noise explains (innovation-based adaptation, as in adaptive Kalman
+        filters: Mehra 1970), so that motion unlike HG-VAE's training data loses its weight; and from the joint's speed,
+        by HG-VAE's lag. Only jitter counts as noise: a slow error, HG-VAE reproduces.
+
+        Args:
+            smoothed: (S, 22) joints and their standard deviations.
+            history: of the observations.
+            jitter: (S,) metres along an axis, as of the newest frame.
+            back: frames between the newest and this one.
         """
-        found = self._found[-1 - back]
+        reconstructed = self._reconstructed[-1 - back]
         seen = np.isfinite(history.positions[-1 - back][..., 0])
-        # in a frame that was lost whole, the answer must not jump to the smoother's
+        # also in a frame without any sighting: else the estimate would jump to the smoother's
         seen |= ~seen.any(axis=1, keepdims=True)
-        known = seen & np.isfinite(found[..., 0] + smoothed.sigma)
-        moved = np.where(known[..., None], found - smoothed.positions, 0.0)
+        known = seen & np.isfinite(reconstructed[..., 0] + smoothed.sigma)
+        moved = np.where(known[..., None], reconstructed - smoothed.positions, 0.0)
         square = np.square(moved).mean(axis=-1)
         self._frames += known
         self._apart += known * (square - self._apart) / np.clip(self._frames, 1, MEMORY)
@@ -123,19 +133,19 @@ class Denoise:
 
 
 @njit(cache=True)
-def _place_pelvis(found, seen):
-    """Move the pelvis to where it lay beside hips and spine, in place.
+def _place_pelvis(reconstructed, seen):
+    """Replace the reconstructed pelvis, in place, by hips and spine less their mean observed offset from it.
 
-    The other joints' tracks are told about the trunk's path, the pelvis's about that path's mean, so no joint tells
-    HG-VAE of the pelvis's noise: it leaves more of it than of any other's.
+    The tracks of other joints are relative to the trunk's path, the pelvis's is relative to that path's mean, so no
+    other joint informs HG-VAE of the pelvis's noise, and it removes less of it than of any other joint's.
 
     Args:
-        found: (B, K, 22, 3) metres, of the newest frames.
-        seen: (B, T, 22, 3) metres, NaN where not.
+        reconstructed: (B, K, 22, 3) metres, of the newest frames.
+        seen: (B, T, 22, 3) metres, observed; NaN where not.
     """
     joints = len(_BESIDE_PELVIS)
     lies, counts = np.empty((joints, 3)), np.empty(joints)
-    for row in range(len(found)):
+    for row in range(len(reconstructed)):
         among = 0
         for k in range(joints):
             joint, counts[k] = _BESIDE_PELVIS[k], 0.0
@@ -151,10 +161,10 @@ def _place_pelvis(found, seen):
                 among += 1
         if among == 0:
             continue
-        for t in range(found.shape[1]):
+        for t in range(reconstructed.shape[1]):
             for axis in range(3):
                 place = 0.0
                 for k in range(joints):
                     if counts[k] > 0:
-                        place += (found[row, t, _BESIDE_PELVIS[k], axis] + lies[k, axis] / counts[k]) / among
-                found[row, t, 0, axis] = place
+                        place += (reconstructed[row, t, _BESIDE_PELVIS[k], axis] + lies[k, axis] / counts[k]) / among
+                reconstructed[row, t, 0, axis] = place

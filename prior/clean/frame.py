@@ -1,6 +1,6 @@
-"""The values that the steps of the pipeline hand to each other: frozen, made once, and read by whoever comes later.
+"""The values that the stages of the pipeline pass to each other, frozen.
 
-S bodies stand in as many slots, in world-aligned coordinates (z up), metres and seconds.
+S slots hold one body each; coordinates are world-aligned (z up), in metres and seconds.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """What a sensor's joints are off by, standard deviations along an axis.
+    """A sensor's error, as standard deviations along an axis.
 
     Attributes:
-        jitter_sigma: metres, from frame to frame, of a joint seen with full confidence.
-        bias_sigma: metres, slowly: what no filter averages out.
+        jitter_sigma: metres, independent from frame to frame, of a joint of full confidence.
+        bias_sigma: metres, the slow error (bias): constant or slowly varying, so that no filter averages it out.
     """
 
     jitter_sigma: float
@@ -39,14 +39,14 @@ class SensorNoise:
 
 @dataclass(frozen=True)
 class Observation:
-    """What came of one moment of the grid.
+    """The input of one time step of the 30 Hz grid.
 
     Attributes:
-        stamp_s: the moment, seconds since the stream began.
+        stamp_s: seconds since the stream began.
         positions: (S, 22, 3) canonical joints; NaN where unobserved.
         confidence: (S, 22) in 0..1.
-        present: (S,) which slots hold a body, seen in this frame or a while ago.
-        sensor_position: (3,) where the sensor stands.
+        present: (S,) which slots hold a body, seen in this frame or within the timeout.
+        sensor_position: (3,) of the sensor.
     """
 
     stamp_s: float
@@ -58,13 +58,13 @@ class Observation:
 
 @dataclass(frozen=True)
 class Gated:
-    """An observation without what cannot be.
+    """An observation after outlier rejection.
 
     Attributes:
-        observation: of which this is left.
+        observation: the input.
         positions: (S, 22, 3) metres; NaN where unobserved or refused.
-        jitter: (S,) metres along an axis, how much each body's joints are found to jump about from frame to frame.
-        frozen: (S, 22) joints of which the sensor repeats its last answer.
+        jitter: (S,) metres along an axis, estimated for each body.
+        frozen: (S, 22) joints for which the tracker repeats its last output.
     """
 
     observation: Observation
@@ -75,15 +75,15 @@ class Gated:
 
 @dataclass(frozen=True)
 class BodyWindows:
-    """The windows of the bodies present, seen and as HG-VAE would have them.
+    """The windows of the bodies present, observed and reconstructed by HG-VAE.
 
     Attributes:
-        slots: (B,) whose windows these are.
-        tracks: what was seen, each in its body's frame.
-        confidence: (B, 66, T) of each entry; 0 where it was not seen.
+        slots: (B,) of the bodies.
+        tracks: the observed windows, each in its body's frame.
+        confidence: (B, 66, T) of each entry; 0 where not observed.
         size: (B,) of the bodies, as `body_size` gives it.
-        reconstruction: (B, 66, T) mean and standard deviation, what the model makes of them.
-        model: which still stands at these windows.
+        reconstruction: (B, 66, T) mean and standard deviation.
+        model: which keeps these windows' activations, by row, for `decode`, `score` and `gradient`.
     """
 
     slots: NDArray[np.intp]
@@ -96,12 +96,13 @@ class BodyWindows:
 
 @dataclass(frozen=True)
 class Person:
-    """Every body's bones.
+    """The bones of every body.
 
     Attributes:
         offsets: (S, 22, 3) metres, each joint in its parent's frame.
-        length_variance: (S, 22) metres^2, of each bone, still to be learned away; 0 of a generic adult's.
-        measured: (S,) whether these are the person's own, not yet those of a generic adult.
+        length_variance: (S, 22) metres^2, of each bone's length that further measurements will reduce; 0 for the
+            generic adult's.
+        measured: (S,) whether these are the person's own bones, or still a generic adult's.
     """
 
     offsets: Floats
@@ -110,18 +111,18 @@ class Person:
 
     @classmethod
     def generic(cls, slots: int) -> Person:
-        """A generic adult's."""
+        """A generic adult in every slot."""
         return cls(np.tile(REST_OFFSETS, (slots, 1, 1)), np.zeros((slots, 22)), np.zeros(slots, dtype=bool))
 
 
 @dataclass(frozen=True)
 class Score:
-    """Whether what was seen can be trusted.
+    """Anomaly of the observations (`prior.clean.score`).
 
     Attributes:
-        anomaly: (S,) how unlike human motion the last half second is (`prior.clean.score`); NaN if not scored.
-        flag: (S,) whether it is too much so.
-        joint_anomaly: (S, 22) the same joint by joint; NaN where not seen.
+        anomaly: (S,) of the last half second; NaN if not scored.
+        flag: (S,) whether the anomaly is above its threshold, with hysteresis.
+        joint_anomaly: (S, 22) on the same scale; NaN where not seen.
     """
 
     anomaly: Floats
@@ -130,15 +131,15 @@ class Score:
 
     @classmethod
     def unscored(cls, slots: int) -> Score:
-        """Of those of whom nothing is known."""
+        """NaN and no flag, in every slot."""
         return cls(np.full(slots, np.nan), np.zeros(slots, dtype=bool), np.full((slots, 22), np.nan))
 
 
 class Imputed(NamedTuple):
-    """The last frames of every body as HG-VAE completes them, the newest last.
+    """The last K frames of every body as completed by HG-VAE, the newest last.
 
     Attributes:
-        positions: (K, S, 22, 3) metres; NaN for a body of which nothing is hidden.
+        positions: (K, S, 22, 3) metres; NaN for a body without hidden joints.
         sigma: (K, S, 22) metres, standard deviation along an axis.
     """
 
@@ -148,13 +149,13 @@ class Imputed(NamedTuple):
 
 @dataclass(frozen=True)
 class Estimate:
-    """The prior's answer for one moment and every slot.
+    """The estimate of one time step, for every slot.
 
     Attributes:
-        stamp_s: the moment, seconds.
-        positions: (S, 22, 3) metres; NaN for a body of which nothing is known.
-        rotations: (S, 22, 3, 3) local.
-        offsets: (S, 22, 3) metres, the bones on which these rotations have these positions.
+        stamp_s: seconds since the stream began.
+        positions: (S, 22, 3) metres; NaN for a body without an estimate.
+        rotations: (S, 22, 3, 3) local, solved for these positions.
+        offsets: (S, 22, 3) metres, the person's bones.
         sigma: (S, 22) metres, standard deviation along an axis.
         state: (S, 22) `JointState`.
     """
@@ -169,13 +170,13 @@ class Estimate:
 
 @dataclass(frozen=True)
 class CleanFrame:
-    """All that is said of one moment.
+    """The output of one time step.
 
     Attributes:
-        estimate: where the joints are.
-        score: as of the newest frame.
-        observed: (S, 22, 3) metres, the joints that came in of that moment; NaN where unobserved.
-        confidence: (S, 22) of those.
+        estimate: of the joints.
+        score: as of the newest frame, ``delay`` later.
+        observed: (S, 22, 3) metres, the input of that time step; NaN where unobserved.
+        confidence: (S, 22) of the input.
     """
 
     estimate: Estimate

@@ -1,4 +1,4 @@
-"""The last frames of every body: what the windows of the models and the frames still to be answered are taken from."""
+"""The last frames of every body: source of the models' windows, and of the frames still to be answered."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.prior.timing.ring import Ring
 
 BRIDGED = 3
-"""Frames: when so many at most were lost whole, joints went in a straight line. The models know limbs that are hidden,
-not bodies that flicker, and would pass the flicker on."""
+"""Frames: gaps of the whole body up to this long are interpolated linearly. The models are trained on hidden limbs, not
+on flickering bodies, and would pass the flicker on."""
 
 
 class History:
-    """The last frames of S bodies, the newest last. The pipeline appends; everybody else reads.
+    """The last frames of S bodies, the newest last. The pipeline appends; all stages read.
 
-    A body that is seen again after a frame or three without any of its joints went in a straight line meanwhile: its
-    `positions` of those frames are filled in, once, when it comes back. `unseen_s` still says that they were not seen.
+    When a body reappears after up to `BRIDGED` frames without any joint, its `positions` in those frames are filled in
+    by linear interpolation; `unseen_s` still counts them as unseen.
     """
 
     def __init__(self, frames: int, slots: int) -> None:
-        """Of the last ``frames``, and no fewer than a gap that is bridged and its two ends."""
+        """Holds the last ``frames``, and at least the longest gap that is bridged with its two ends."""
         frames = max(frames, BRIDGED + 2)
         self._observed = Ring(frames, (slots, 22, 3))
         self._confidence = Ring(frames, (slots, 22), fill=0.0)
@@ -31,7 +31,7 @@ class History:
 
     @property
     def observed(self) -> Floats:
-        """(T, S, 22, 3) metres, the joints that came in; NaN where unobserved."""
+        """(T, S, 22, 3) metres, the input; NaN where unobserved."""
         return self._observed.all
 
     @property
@@ -46,7 +46,7 @@ class History:
 
     @property
     def unseen_s(self) -> Floats:
-        """(T, S, 22) seconds for which a joint had not been seen by then; 0 where it was, inf where it never was."""
+        """(T, S, 22) seconds since each joint was last seen, at each frame; 0 if then, inf if never."""
         return self._unseen_s.all
 
     def seen_since(self, back: int) -> Bools:
@@ -69,7 +69,7 @@ class History:
         self._lost[slot] = 0
 
     def _bridge(self, seen: Bools) -> None:
-        """Fill in the frames in which nothing was seen of the bodies that are ``seen`` (S,) again."""
+        """Interpolate the gap of bodies that are ``seen`` (S,) again."""
         for slot in np.flatnonzero(seen & (self._lost > 0) & (self._lost <= BRIDGED)).tolist():
             lost = int(self._lost[slot])
             before, now = self.positions[-2 - lost][slot], self._positions.newest[slot]

@@ -1,4 +1,4 @@
-"""Stable ids: which body of this frame is whose, from where it was expected and how long its bones are.
+"""Stable ids: multi-person tracking by position and bone lengths.
 
 For sources that number the bodies of each frame anew (detectors), or give a person who was hidden a new number.
 Multi-target tracking by a sequence of best assignments; scores are log-likelihood ratios of "the same person" against
@@ -23,12 +23,12 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class IdentifySettings:
-    """Who tells bodies apart.
+    """Settings of the identify stage.
 
     Attributes:
-        enabled: whether ids are made here and the source's ignored; off, the source's are passed on.
-        birth: seconds for which a body nobody knows must be seen before it gets an id.
-        death: seconds without a sighting after which a person is forgotten, and comes back as somebody new.
+        enabled: whether ids are assigned here and the source's ignored; off, the source's are passed on.
+        birth: seconds for which an unknown body must be seen before it gets an id.
+        death: seconds without a sighting after which a person is forgotten, and gets a new id on return.
     """
 
     enabled: bool = False
@@ -36,7 +36,7 @@ class IdentifySettings:
     death: float = 5.0
 
     def __post_init__(self) -> None:
-        # who is forgotten sooner than a body is followed from frame to frame is never told apart
+        # a track that is dropped before it may be matched by position alone could never be continued
         for name, least in (("birth", 0.0), ("death", RECENT_S)):
             if not least <= getattr(self, name) < 60.0:
                 raise ValueError(
@@ -45,32 +45,32 @@ class IdentifySettings:
 
 
 RECENT_S = 0.25
-"""A body seen within so long goes on from frame to frame; unseen for longer, it must be recognised."""
+"""A body seen within this time is matched by position from frame to frame; after longer, it must be recognised."""
 ACCELERATION = 1.0
-"""m²/s³, how freely a body in sight accelerates."""
+"""m²/s³, density of the white acceleration noise of a visible body."""
 SPEED, SPEED_MEMORY_S = 0.6, 1.0
-"""m/s and seconds: out of sight, the velocity of a body is an Ornstein-Uhlenbeck process, which forgets which way one
-walked, so that who stops behind a pillar is not expected in the next room."""
+"""m/s and seconds: standard deviation and correlation time of the velocity of a body out of sight, an
+Ornstein-Uhlenbeck process: a person who stops behind a pillar must not be expected in the next room."""
 PLACE_SIGMA, HEIGHT_SIGMA = 0.1, 0.3
-"""Metres along an axis: how well one frame tells where a body is; the most by which its height changes unseen."""
+"""Metres: deviation of a body's position in one frame, along an axis; upper bound of that of its height, unseen."""
 NEWCOMERS = 0.01
-"""Newcomers in a m³ (of a room of 20 m², a tenth) for one person that comes back into sight there."""
+"""Density of new people per m³, relative to one person who reappears (a tenth in a room of 20 m²)."""
 LENGTH_SIGMA, LENGTH_MEMORY_S = 0.05, 1.0
-"""Metres by which a bone is seen too long or short, and the seconds for which that error lasts."""
+"""Standard deviation (metres) and correlation time (seconds) of the error of an observed bone length."""
 LENGTH_SPREAD = 0.1
-"""Of a bone's length, its standard deviation between people."""
+"""Standard deviation of a bone's length between people, relative to its length."""
 LENGTH_DOUBT = 3.0
-"""The most that one bone says against a person: that it was seen wrong is never less likely than that."""
+"""Lower bound (negative) of one bone's log-likelihood ratio: an outlier is never less likely than this."""
 CERTAIN_SCORE = 3.0
-"""A score this much above all others (20 to 1) needs no more frames."""
+"""Margin of the best score over all others (20 to 1) at which a body is recognised without waiting for `birth`."""
 APART = 0.25
-"""Metres: two bodies nearer than this to each other are one, seen twice."""
+"""Metres: two bodies nearer than this to each other are one, detected twice."""
 MIN_CONFIDENCE = 0.3
-"""Of a bone's joints, for its length to count."""
+"""Least confidence of a bone's joints for its length to count."""
 MIN_JOINTS = 6
-"""Joints that must be seen for a body to be taken for one."""
+"""Least number of visible joints of a detection."""
 
-_FREE, _NAMELESS = 0, -1
+_FREE, _TENTATIVE = 0, -1
 """In place of an id: ids are 1 and up."""
 
 _BONES: tuple[tuple[tuple[str, str], ...], ...] = (
@@ -84,16 +84,16 @@ _BONES: tuple[tuple[tuple[str, str], ...], ...] = (
 
 
 class Identify:
-    """Gives each body of a frame its id.
+    """Assigns an id to each body of a frame.
 
-    A row holds a person, or a body seen too shortly to be one. Frames follow each other through a constant-velocity
-    Kalman filter of each body's place: bodies seen a moment ago are matched first, by place. What is left becomes a
-    row without a name, which after ``birth`` seconds, or as soon as there is no doubt, is recognised as a person out
-    of sight or becomes a new one: several frames tell bones better than one.
+    A row holds a track: a person, or a tentative track that has no id yet. A constant-velocity Kalman filter predicts
+    each track's position; bodies are first matched to tracks seen within `RECENT_S`, by position. What remains starts
+    tentative tracks, which after ``birth`` seconds, or as soon as the score is decisive, are recognised as a person out
+    of sight or become a new one: bone lengths from several frames are better than from one.
 
     Args:
         settings: of this stage.
-        rows: people followed at once: seen, out of sight, and not yet named.
+        rows: tracks kept at once: visible, out of sight, and tentative.
         counters: gets ``too_many_bodies``.
     """
 
@@ -103,7 +103,7 @@ class Identify:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everybody; no id is given a second time."""
+        """Forget all tracks; no id is used a second time."""
         rows = self._rows
         self._origin_ns = self._last_ns = -1
         self._filter = FixedLagRTS(0, ACCELERATION, PLACE_SIGMA)
@@ -134,22 +134,22 @@ class Identify:
             self._counters["too_many_bodies"] += count - self._rows
         bodies, confidence = bodies[: self._rows], confidence[: self._rows]
         unseen_s = now - self._seen_s
-        self._forget((unseen_s > self._settings.death) | ((self._id == _NAMELESS) & (unseen_s > RECENT_S)))
+        self._forget((unseen_s > self._settings.death) | ((self._id == _TENTATIVE) & (unseen_s > RECENT_S)))
         row_of, places, score = self._follow(bodies, now)
-        self._take_up(bodies, row_of, places, now)
+        self._start_tracks(bodies, row_of, places, now)
         seen = np.flatnonzero(row_of >= 0)
         lengths = _bone_lengths(bodies, confidence)
-        self._see(row_of[seen], bodies[seen], places[seen], lengths[seen], now, step)
-        self._name(row_of, places, score, now)
+        self._update_tracks(row_of[seen], bodies[seen], places[seen], lengths[seen], now, step)
+        self._assign_ids(row_of, places, score, now)
         return [int(self._id[row]) if row >= 0 and self._id[row] > 0 else None for row in row_of] + [None] * (
             count - len(row_of)
         )
 
     def _follow(self, bodies: Floats, now: float) -> tuple[NDArray[np.intp], Floats, Floats]:
-        """Match bodies to rows seen a moment ago.
+        """Match bodies to tracks seen within `RECENT_S`.
 
         Returns:
-            (N,) the row of each body or -1, (N, 3) its place in metres, and (rows, N) the score of all by place.
+            (N,) row of each body or -1, (N, 3) its position in metres, and (rows, N) score of all pairs by position.
         """
         row_of, places = np.full(len(bodies), -1), np.full((len(bodies), 3), np.nan)
         score = np.full((self._rows, len(bodies)), -np.inf)
@@ -157,7 +157,7 @@ class Identify:
         rows = np.flatnonzero(self._id != _FREE)
         if expected is None or not len(rows) or not len(bodies):
             return row_of, places, score
-        # A body is where it moves the joints of its last pose to, in the middle.
+        # a body's position: the median displacement of its joints from the pose last seen
         place = _median(bodies[None] - self._pose[rows, None])
         unseen_s = now - self._seen_s[rows]
         there, sigma = _out_of_sight(self._place[rows], expected.positions[rows], expected.sigma[rows], unseen_s)
@@ -167,8 +167,8 @@ class Identify:
             row_of[body], places[body] = rows[recent[k]], place[recent[k], body]
         return row_of, places, score
 
-    def _take_up(self, bodies: Floats, row_of: NDArray[np.intp], places: Floats, now: float) -> None:
-        """Give bodies that nobody expected a row, in place, as long as there are any."""
+    def _start_tracks(self, bodies: Floats, row_of: NDArray[np.intp], places: Floats, now: float) -> None:
+        """Start tentative tracks for unmatched bodies, in place, as long as rows are free."""
         free = iter(np.flatnonzero(self._id == _FREE))
         for body in np.flatnonzero((row_of < 0) & (finite_joints(bodies).sum(axis=1) >= MIN_JOINTS)):
             row = next(free, None)
@@ -176,12 +176,12 @@ class Identify:
                 self._counters["too_many_bodies"] += 1
                 return
             row_of[body], places[body] = row, _middle(bodies[body])
-            self._id[row], self._first_s[row] = _NAMELESS, now
+            self._id[row], self._first_s[row] = _TENTATIVE, now
 
-    def _see(
+    def _update_tracks(
         self, rows: NDArray[np.intp], bodies: Floats, places: Floats, lengths: Floats, now: float, step: float
     ) -> None:
-        """Let rows see their bodies at these places, with bones of these lengths (N, B)."""
+        """Update tracks by their bodies, at these positions, with bones of these lengths (N, B)."""
         measured = np.full((self._rows, 3), np.nan)
         measured[rows] = places
         estimate = self._filter.update(measured, now)
@@ -195,39 +195,39 @@ class Identify:
         share = weight / np.maximum(self._lengths_s[rows], _MIN_STEP_S)
         self._lengths[rows] += share * (np.nan_to_num(lengths) - self._lengths[rows])
 
-    def _name(self, row_of: NDArray[np.intp], places: Floats, place_score: Floats, now: float) -> None:
-        """Recognise bodies without a name as people out of sight, or call them new."""
+    def _assign_ids(self, row_of: NDArray[np.intp], places: Floats, place_score: Floats, now: float) -> None:
+        """Recognise tentative tracks as people out of sight, or give them new ids."""
         seen = np.flatnonzero(row_of >= 0)
-        nameless = seen[self._id[row_of[seen]] == _NAMELESS]
-        if not len(nameless):
+        tentative = seen[self._id[row_of[seen]] == _TENTATIVE]
+        if not len(tentative):
             return
-        old_enough = now - self._first_s[row_of[nameless]] >= self._settings.birth
+        old_enough = now - self._first_s[row_of[tentative]] >= self._settings.birth
         away = np.setdiff1d(np.flatnonzero(self._id > 0), row_of)
-        score = place_score[np.ix_(away, nameless)].T + self._length_score(row_of[nameless], away)
+        score = place_score[np.ix_(away, tentative)].T + self._length_score(row_of[tentative], away)
         waiting = ~old_enough
         for k, person in _best(score):
             others = np.r_[0.0, np.delete(score[k], person), np.delete(score[:, person], k)]
             if old_enough[k] or score[k, person] - others.max() > CERTAIN_SCORE:
-                self._become(int(row_of[nameless[k]]), int(away[person]))
+                self._recognise(int(row_of[tentative[k]]), int(away[person]))
             waiting[k] = True
         for k in np.flatnonzero(~waiting):
             named = seen[self._id[row_of[seen]] > 0]
-            if (np.linalg.norm(places[named] - places[nameless[k]], axis=1) > APART).all():
-                self._id[row_of[nameless[k]]] = self._next_id
+            if (np.linalg.norm(places[named] - places[tentative[k]], axis=1) > APART).all():
+                self._id[row_of[tentative[k]]] = self._next_id
                 self._next_id += 1
 
     def _length_score(self, rows: NDArray[np.intp], people: NDArray[np.intp]) -> Floats:
-        """(rows, people) log-likelihood ratio of having the same bones by chance or by being the same."""
-        doubt = [LENGTH_SIGMA**2 / np.maximum(self._lengths_s[who] / LENGTH_MEMORY_S, 1.0) for who in (rows, people)]
+        """(rows, people) log-likelihood ratio of the bone lengths, being the same person against being another."""
+        variance = [LENGTH_SIGMA**2 / np.maximum(self._lengths_s[who] / LENGTH_MEMORY_S, 1.0) for who in (rows, people)]
         both = (self._lengths_s[rows, None] > 0) & (self._lengths_s[people] > 0)
         apart = self._lengths[rows, None] - self._lengths[people]
-        same = doubt[0][:, None] + doubt[1]
+        same = variance[0][:, None] + variance[1]
         other = same + 2 * (LENGTH_SPREAD * _GENERIC_LENGTHS) ** 2
         ratio = 0.5 * (np.log(other / same) - apart**2 * (1 / same - 1 / other))
         return np.where(both, np.maximum(ratio, -LENGTH_DOUBT), 0.0).sum(axis=-1)
 
-    def _become(self, row: int, person: int) -> None:
-        """Recognise the body in a row as a person out of sight."""
+    def _recognise(self, row: int, person: int) -> None:
+        """Give the track in a row the id and bones of a person out of sight."""
         self._id[row] = self._id[person]
         total = np.maximum(self._lengths_s[row] + self._lengths_s[person], _MIN_STEP_S)
         self._lengths[row] += self._lengths_s[person] / total * (self._lengths[person] - self._lengths[row])
@@ -260,7 +260,7 @@ def _bone_lengths(bodies: Floats, confidence: Floats) -> Floats:
 
 
 def _middle(body: Floats) -> Floats:
-    """(3,) metres, the middle of a body's trunk, or of all of it (22, 3) where no joint of the trunk is seen."""
+    """(3,) metres, median of the joints of a body's trunk, or of all joints (22, 3) where none of the trunk is seen."""
     trunk = _median(body[list(TRUNK_LANDMARKS)])
     return trunk if np.isfinite(trunk).all() else _median(body)
 
@@ -274,22 +274,27 @@ def _median(points: Floats) -> Floats:
 
 
 def _out_of_sight(last: Floats, coasting: Floats, sigma: Floats, unseen_s: Floats) -> tuple[Floats, Floats]:
-    """Where bodies (R, 3) are that were at ``last`` ``unseen_s`` ago and move on straight to ``coasting`` +- ``sigma``.
+    """Prediction of bodies out of sight: an Ornstein-Uhlenbeck velocity in place of a constant one.
+
+    Args:
+        last: (R, 3) metres, last position seen.
+        coasting: (R, 3) metres, predicted at constant velocity, with ``sigma`` (R,) along an axis.
+        unseen_s: (R,) seconds since.
 
     Returns:
         (R, 3) metres, and the standard deviation along an axis (R,).
     """
     age = np.maximum(unseen_s / SPEED_MEMORY_S, 1e-6)
     forgotten = 1.0 - np.exp(-age)
-    strayed = SPEED * SPEED_MEMORY_S * np.sqrt(2.0 * (age - forgotten))
-    return last + (forgotten / age)[:, None] * (coasting - last), np.minimum(sigma, np.hypot(PLACE_SIGMA, strayed))
+    spread = SPEED * SPEED_MEMORY_S * np.sqrt(2.0 * (age - forgotten))
+    return last + (forgotten / age)[:, None] * (coasting - last), np.minimum(sigma, np.hypot(PLACE_SIGMA, spread))
 
 
 def _place_score(away: Floats, sigma: Floats) -> Floats:
-    """Log-likelihood ratio of bodies (..., 3) metres from where a person was expected being that person."""
+    """Log-likelihood ratio of bodies (..., 3) metres from a person's predicted position being that person."""
     horizontal, vertical = sigma**2 + PLACE_SIGMA**2, np.minimum(sigma, HEIGHT_SIGMA) ** 2 + PLACE_SIGMA**2
-    surprise = (away[..., :2] ** 2).sum(axis=-1) / horizontal + away[..., 2] ** 2 / vertical
-    score = -0.5 * (surprise + np.log((2 * np.pi) ** 3 * horizontal**2 * vertical)) - np.log(NEWCOMERS)
+    distance_squared = (away[..., :2] ** 2).sum(axis=-1) / horizontal + away[..., 2] ** 2 / vertical
+    score = -0.5 * (distance_squared + np.log((2 * np.pi) ** 3 * horizontal**2 * vertical)) - np.log(NEWCOMERS)
     return np.where(np.isfinite(score), score, -np.inf)
 
 

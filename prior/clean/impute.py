@@ -1,14 +1,13 @@
-"""The impute stage: where the joints are that nobody saw, as HG-VAE completes the window.
+"""The impute stage: hidden joints, as HG-VAE completes the window.
 
-The encoder, given the completion network's guess and told which entries were observed, completes a window in one pass.
-From there the latents may climb log p(z) + log p(x | z) of the entries observed, each weighted by its confidence, and
-what they decode to is the answer. The climb goes on from frame to frame: how far the latents were moved is kept as the
-window slides. Since the completion network is there, a step a frame brings limbs hidden for 0.5 to 1 s nearer to the
-truth by 5 to 6 %, and takes a third of a frame's time again (docs/experiments.md): none is taken unless asked for.
+Completion network and encoder complete a window in one pass. From there, optionally, gradient ascent on the latents
+maximises log p(z) + log p(x | z) of the observed entries, each weighted by its confidence, and the decoded window is
+the result. The ascent is warm-started: the latents' offsets are kept as the window slides. With the completion network,
+one step a frame reduces the error of limbs hidden for 0.5 to 1 s by 5 to 6 % and takes a third of a frame's time more
+(docs/experiments.md), so by default none is taken.
 
-The paper moves the missing entries themselves, up log p(z | x). That drifts away from the truth with every step
-(`steadypose evaluate hgvae`): the posterior is surest of windows that the encoder finds easy, not of those that are
-right.
+The paper instead ascends log p(z | x) in the missing entries themselves. That drifts from the truth with every step
+(`steadypose evaluate hgvae`): the posterior is narrowest for windows that are easy to encode, not for correct ones.
 """
 
 from __future__ import annotations
@@ -25,34 +24,32 @@ from steadypose.prior.models.hgvae.features import Tracks, from_tracks
 from steadypose.prior.models.hgvae.inference import Reconstruction
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.99
-"""of Adam's moments"""
+"""of Adam's first and second moments"""
 
 CARRY_FRAMES = 20.0
-"""Frames over which what the model was off at the edge of a gap fades inside it."""
+"""Frames over which the model's residual at the edge of a gap, added inside it, decays (1/e)."""
 
 EDGE_FRAMES = 3
-"""Frames beside a gap over which what the model is off is averaged, where a single one would carry its noise into the
-gap: where joints jump about by more than"""
 EDGE_NOISE = 0.005
-"""metres. Without noise the last frame knows best."""
+"""The residual at the edge of a gap is the mean over this many frames where the jitter is larger than this (metres), so
+that one frame's noise is not carried into the gap; otherwise that of the last frame."""
 
-SIGMA_FOUND = 1.2
-"""Times the standard deviation that the model states: what limbs hidden for 0.3 to 2 s are off on validation motion."""
+SIGMA_SCALE = 1.2
+"""Ratio of error to HG-VAE's stated deviation, for limbs hidden for 0.3 to 2 s in validation motion."""
 
 
-CLIMBING = 4
-"""One slot in so many climbs in one frame; if more bodies are to, each has its turn, so that eight fit into a camera's
-period."""
+SLOTS_PER_ASCENT = 4
+"""Of so many slots, one ascends in a frame; further bodies take turns, so that eight fit into a camera's period."""
 
 
 @dataclass(frozen=True)
 class ImputeSettings:
-    """How far to climb.
+    """Settings of the impute stage.
 
     Attributes:
-        enabled: whether to impute at all; off, hidden joints follow the refinement model.
-        steps: gradient steps a frame, 1.6 ms each; 0 takes what one pass through the encoder gives.
-        rate: of a step, in units of the latents, as Adam has it.
+        enabled: whether to impute at all; off, hidden joints keep their last local rotations.
+        steps: gradient steps a frame, 1.6 ms each; 0 takes the encoder's pass alone.
+        rate: Adam's step size, in units of the latents.
     """
 
     enabled: bool = True
@@ -72,10 +69,10 @@ class LatentAscent:
         self._count = 0
 
     def complete(self, windows: BodyWindows, row: int, steps: int) -> Reconstruction:
-        """What the model makes of the window in this row: of the points visited, the one of highest score.
+        """The reconstruction of the window in this row: of the points evaluated, the one of highest score.
 
-        Each of ``steps`` looks at a point and takes a step from it; where the last one leads is seen in the next frame.
-        Without a step, what the ascent had gained when it was last looked at is added to the new start.
+        Each of ``steps`` evaluates a point and steps from it; the point after the last step is evaluated in the next
+        frame. Without a step, the change of the last evaluated ascent is added to the encoder's reconstruction.
         """
         model, start = windows.model, Reconstruction(*(part[row] for part in windows.reconstruction))
         best, best_at = start, np.zeros_like(self._moved)
@@ -86,10 +83,10 @@ class LatentAscent:
             at = row
             if step or self._moved.any():
                 at = model.scratch_row
-                look, score = model.decode(row, self._moved), model.score(at)
+                decoded, score = model.decode(row, self._moved), model.score(at)
                 if score > best_score:
-                    best, best_at, best_score = look, self._moved, score
-                elif step == 0:  # where the ascent had come to is worth less than a new start
+                    best, best_at, best_score = decoded, self._moved, score
+                elif step == 0:  # the kept offsets score worse than the encoder's means: start anew
                     self._moved, at = best_at, row
             self._step(model.gradient(at))
         self._gained = best.mean - start.mean
@@ -105,7 +102,7 @@ class LatentAscent:
 
 
 class Impute:
-    """Every body's joints of the last frames, as the model completes its window."""
+    """Completes the last frames of every body with hidden joints."""
 
     def __init__(self, settings: ImputeSettings, delay_frames: int, slots: int, counters: Counter[str]) -> None:
         if settings.steps < 0 or settings.rate <= 0:
@@ -121,29 +118,29 @@ class Impute:
             self._ascents[k] = None
 
     def _turn(self, slot: int) -> bool:
-        """Whether it is this body's turn to climb: of many, so many in each frame."""
-        climbing = [k for k, ascent in enumerate(self._ascents) if ascent or k == slot]
-        turns = -(-len(climbing) // max(1, len(self._ascents) // CLIMBING))
-        return (climbing.index(slot) + self._updates) % turns == 0
+        """Whether it is this body's turn to ascend; see `SLOTS_PER_ASCENT`."""
+        ascending = [k for k, ascent in enumerate(self._ascents) if ascent or k == slot]
+        turns = -(-len(ascending) // max(1, len(self._ascents) // SLOTS_PER_ASCENT))
+        return (ascending.index(slot) + self._updates) % turns == 0
 
     def update(self, windows: BodyWindows | None, jitter: Floats, *, hurry: bool) -> Imputed | None:
-        """Complete the windows of those of whom something is hidden in the frames that are still to be answered.
+        """Complete the windows of bodies with joints hidden in the frames that are still to be answered.
 
         Args:
-            windows: the newest; nobody is there if None.
-            jitter: (S,) metres, of each body's joints.
-            hurry: whether to do without the ascent: a live node that falls behind says so.
+            windows: the newest; None if no body is present.
+            jitter: (S,) metres along an axis, of each body.
+            hurry: whether to skip the ascent, for a live node that falls behind.
         """
         self._updates += 1
         frames, slots = self._frames, len(self._ascents)
         if windows is None:
             self._ascents = [None] * slots
             return None
-        tracks, found = windows.tracks, windows.reconstruction
+        tracks, reconstruction = windows.tracks, windows.reconstruction
         seen = np.asarray(tracks.observed[..., -frames:].all(axis=-1))
-        # A joint never seen in the window is one that the sensor does not have: that takes no climb.
+        # a joint never seen in the window is one that the sensor does not have: no ascent for it
         lost = np.asarray((tracks.observed.any(axis=-1) & ~seen).any(axis=-1))
-        mean = found.mean.copy()
+        mean = reconstruction.mean.copy()
         for row, slot in enumerate(windows.slots):
             if seen[row].all():
                 self._ascents[slot] = None
@@ -161,16 +158,21 @@ class Impute:
         completed = completed_tracks(tracks, mean[hidden], jitter[of])[..., -frames:]
         imputed = Imputed(np.full((frames, slots, 22, 3), np.nan), np.full((frames, slots, 22), np.inf))
         imputed.positions[:, of] = from_tracks(completed, tracks, size).swapaxes(0, 1)
-        # at the start: where the ascent ends, the model is surer than it is right
-        variance = (found.sigma[hidden, :, -frames:] ** 2).reshape(-1, 22, 3, frames).mean(axis=2)
-        sigma = SIGMA_FOUND * size[:, None, None] * np.sqrt(variance)
+        # of the encoder's pass: after an ascent the stated deviation is too small
+        variance = (reconstruction.sigma[hidden, :, -frames:] ** 2).reshape(-1, 22, 3, frames).mean(axis=2)
+        sigma = SIGMA_SCALE * size[:, None, None] * np.sqrt(variance)
         imputed.sigma[:, of] = sigma.transpose(2, 0, 1)
         return imputed
 
 
 def completed_tracks(tracks: Tracks, mean: Floats, noise: Floats | float = 0.0) -> Floats:
-    """(..., 66, T) metres: what was seen, and what the model makes of the rest, ``mean``, without a jump at the edge of
-    a gap; ``noise`` (...) metres, how much the joints seen jump about."""
+    """(..., 66, T) metres: observed entries, and the reconstruction elsewhere, continuous at the edges of gaps.
+
+    Args:
+        tracks: observed windows (..., 66, T).
+        mean: (..., 66, T) metres, their reconstruction.
+        noise: (...) metres along an axis, jitter of the observed joints.
+    """
     frames = mean.shape[-1]
     off, observed = (part.reshape(-1, frames) for part in (tracks.x - mean, tracks.observed))
     edges = np.empty(mean.shape[:-1], dtype=np.int64)
@@ -180,9 +182,9 @@ def completed_tracks(tracks: Tracks, mean: Floats, noise: Floats | float = 0.0) 
 
 @njit(cache=True)
 def _carried(off, observed, fade, edge):
-    """(N, T) what the model was off where observed, carried from either side into the gaps, where it fades.
+    """(N, T) the model's residuals where observed, extrapolated from either side into the gaps, where they decay.
 
-    ``edge`` (N,): over how many frames beside a gap the mean is taken.
+    ``edge`` (N,): frames beside a gap over which the residual is averaged.
     """
     nodes, frames = off.shape
     carried = np.zeros((nodes, frames))
@@ -206,7 +208,7 @@ def _carried(off, observed, fade, edge):
 
 @njit(cache=True)
 def _beside_gap(off, observed, last, following, edge):
-    """What the model was off just before and just after a gap, from ``last`` to ``following``; 0 beyond the window."""
+    """The model's residual just before and just after a gap, from ``last`` to ``following``; 0 beyond the window."""
     earlier = later = 0.0
     count = 0
     for t in range(last, max(last - edge, -1), -1):

@@ -1,4 +1,5 @@
-"""This person's bones: what was measured, weighed against human proportions, frozen once sure."""
+"""The bones stage: this person's bone lengths, measured for the first ten seconds, with human proportions as a
+prior."""
 
 from __future__ import annotations
 
@@ -14,12 +15,12 @@ from steadypose.prior.timing.fixed_lag import Smoothed
 
 @dataclass(frozen=True)
 class PersonSettings:
-    """How long to measure.
+    """Settings of the bones stage.
 
     Attributes:
-        enabled: whether to measure at all; off, everybody has a generic adult's bones.
-        samples: frames to measure before the estimate is frozen.
-        every: frames between two of them, so that their errors are not the same one.
+        enabled: whether to measure at all; off, every body has a generic adult's bones.
+        samples: frames sampled before the estimate is frozen.
+        every: frames between two samples, so that their errors are less correlated.
     """
 
     enabled: bool = True
@@ -27,19 +28,19 @@ class PersonSettings:
     every: int = 5
 
 
-_ENOUGH_JOINTS = 8
-_RENEWAL = 1.5
-_RENEWED = 8  # one in so many slots, at most, in one frame
-_MEASURING_SIGMA = 0.05  # metres: a joint whose place is known less well, hidden for a while, measures no bone
-_APPROACH = 0.1  # of the way to a renewed estimate, a frame: bones that jump would shake the whole limb
-_ENOUGH_SAMPLES = 4
+_MIN_JOINTS = 8  # with a standard deviation below _MAX_SIGMA, for a frame to be sampled
+_MAX_SIGMA = 0.05  # metres along an axis, of a joint that counts for bone lengths
+_GROWTH = 1.5  # the estimate is renewed when the number of samples has grown by this factor
+_SLOTS_PER_RENEWAL = 8  # of so many slots, one is renewed in a frame
+_APPROACH = 0.1  # share of the way to a renewed estimate, per frame: a jump of the bones would shake the whole limb
+_MIN_SAMPLES = 4  # for the bones to count as measured
 
 
 class PersonEstimator:
-    """Everybody's bones: `estimate_bones` over frames sampled from the person's first ten seconds.
+    """The bones of every body: `estimate_bones` over frames sampled from its first ten seconds.
 
-    The estimate is renewed each time there are half as many samples more, so that it costs little and soon stands
-    still, and is approached smoothly. `Person.length_variance` says how far lengths are still to be learned.
+    The estimate is renewed whenever the number of samples has grown by half, so that it costs little and settles, and
+    is approached smoothly.
 
     Attributes:
         current: the bones as of the last frame.
@@ -77,10 +78,10 @@ class PersonEstimator:
         """
         if not self._settings.enabled or smoothed is None:
             return self.current
-        # Smoothed, for noise makes bones longer.
-        known = smoothed.sigma < _MEASURING_SIGMA
+        # smoothed positions: noise lengthens bones
+        known = smoothed.sigma < _MAX_SIGMA
         positions = np.where(known[..., None], smoothed.positions, np.nan)
-        enough = known.sum(axis=1) >= _ENOUGH_JOINTS
+        enough = known.sum(axis=1) >= _MIN_JOINTS
         self._wait -= 1
         due = present & enough & (self._wait < 0) & (self._count < self._settings.samples)
         for slot in np.flatnonzero(due):
@@ -88,19 +89,19 @@ class PersonEstimator:
             self._count[slot] += 1
             self._wait[slot] = self._settings.every - 1
         full = self._count == self._settings.samples
-        renew = (self._count >= _RENEWAL * self._used) | (full & (self._count > self._used))
-        # People who came together would all be due in the same frame: after the first estimate, a few at a time.
+        renew = (self._count >= _GROWTH * self._used) | (full & (self._count > self._used))
+        # people who came together are due in the same frame: after the first estimate, only a few at a time
         stale = np.flatnonzero(renew & (self._count > 0) & present & enough)
-        first, again = stale[self._used[stale] == 0], stale[self._used[stale] > 0]
+        first, later = stale[self._used[stale] == 0], stale[self._used[stale] > 0]
         offsets, variance = self.current.offsets.copy(), self.current.length_variance.copy()
         measured = self.current.measured.copy()
-        for slot in [*first, *again[: max(1, len(self._count) // _RENEWED)]]:
+        for slot in [*first, *later[: max(1, len(self._count) // _SLOTS_PER_RENEWAL)]]:
             count = self._used[slot] = self._count[slot]
             noise = float(np.median(smoothed.sigma[slot, known[slot]]))
             self._target[slot], self._target_variance[slot] = estimate_bones(
                 self._samples[slot, :count], float(bias_sigma[slot]), noise, self._settings.samples
             )
-            measured[slot] = count >= _ENOUGH_SAMPLES
+            measured[slot] = count >= _MIN_SAMPLES
             if count == 1:
                 offsets[slot], variance[slot] = self._target[slot], self._target_variance[slot]
         begun = self._used > 0

@@ -1,4 +1,4 @@
-"""The prior over a stream: ``pose/raw`` messages in, the ``pose/clean`` messages that they complete out."""
+"""The prior over one stream: from ``pose/raw`` messages to ``pose/clean`` messages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class PriorPipeline:
     """The prior over one stream. The same messages give the same answers, bit for bit.
 
     Attributes:
-        counters: what was refused or dropped so far, by cause.
+        counters: messages, bodies and joints refused or dropped so far, by cause.
         delay_frames: frames at 30 Hz between a frame and its answer.
     """
 
@@ -77,7 +77,7 @@ class PriorPipeline:
                 self.counters["stamp_jumped_back" if step <= 0 else "stream_gap"] += 1
                 flushed = self.flush()
         verdict = self._sensor_pose.judge(raw.sensor_pose, raw.stamp_ns)
-        if verdict is Verdict.DOUBTED:
+        if verdict is Verdict.SUSPECT:
             self.counters["sensor_pose_jumped"] += 1
             return flushed
         if verdict is Verdict.MOVED:
@@ -93,11 +93,11 @@ class PriorPipeline:
 
     @property
     def sensor_noise(self) -> SensorNoise | None:
-        """What the sensor was last found to be off by, the median over bodies; None before there was one."""
+        """The latest estimate of the sensor's error, the median over bodies; None before the first body."""
         return self._core.sensor_noise
 
     def flush(self) -> list[PoseClean]:
-        """Give the frames that the delay still holds, and forget the stream."""
+        """The frames that the delay still holds, oldest first; the stream is then forgotten."""
         last = self._last
         cleaned = [] if last is None else [self._message(frame, last) for frame in self._core.flush()]
         self._drop(np.ones_like(self._slots.present))

@@ -1,4 +1,4 @@
-"""Refinement: encode a window, decode it, keep one frame, slide by one (HM-VAE, equations 10 to 13)."""
+"""The refine stage: local rotations from joint positions and, if enabled, refined by HM-VAE (equations 10 to 13)."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from steadypose.prior.timing.ring import Ring
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """Whether, and with which weights, to refine.
+    """Settings of the refine stage.
 
     Attributes:
-        enabled: whether to; off, as it ships, the solved rotations pass as they are and no model is loaded. Joints seen
-            stay where smoothing has them and hidden ones where HG-VAE completes them, so that on or off nothing moved
-            by 0.1 mm on validation people (docs/experiments.md); it matters where `impute` or `fuse` is off.
+        enabled: whether to refine; off, the default, the solved rotations pass unchanged and no model is loaded. With
+            `impute` and `fuse` on, observed joints stay as smoothed and hidden ones as completed, so that refinement
+            changes nothing by 0.1 mm (validation people, docs/experiments.md).
         weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
     """
 
@@ -32,13 +32,12 @@ class RefineSettings:
 
 
 class Refine:
-    """Local rotations of the last frames: solved from the joints seen and, if enabled, refined by HM-VAE.
+    """Local rotations of the last frames: solved from the observed joints and, if enabled, refined by HM-VAE.
 
-    A window N_1 … N_T goes through the posterior's mean and the decoder, and its frame ``T - 1 - delay`` (counted
-    from 0) is kept by the fusion that follows. With the default delay T / 2 that is index T / 2 - 1, the paper's
-    M_{T/2} of equation 12. Smaller delays keep later frames of the same windows, down to 0, the newest; with larger
-    ones, which other stages may ask for, a frame keeps what it was as the centre. At the start of a stream, windows
-    are filled up with the first frame.
+    A window N_1 … N_T is encoded to the posterior's mean and decoded, and the fuse stage takes its frame
+    ``T - 1 - delay`` (counted from 0). With the default delay T / 2 that is index T / 2 - 1, the paper's M_{T/2} of
+    equation 12. Smaller delays take later frames of the same windows, down to the newest; with larger ones a frame is
+    kept as it was decoded at the centre. At the start of a stream, windows are padded with the first frame.
     """
 
     def __init__(self, settings: RefineSettings, delay_frames: int, slots: int) -> None:
@@ -54,15 +53,15 @@ class Refine:
         self._decoded[:, slot] = np.eye(3)
 
     def update(self, gated: Gated, person: Person) -> Floats:
-        """(K, S, 22, 3, 3) local rotations of the last frames on these bones; what is not seen keeps what it had."""
+        """(K, S, 22, 3, 3) local rotations of the last frames on these bones; unobserved joints keep their last."""
         slots = np.flatnonzero(gated.observation.present)
         self._solve(gated.positions, person.offsets, slots)
-        kept = self._window // 2 + 1  # from the centre on; before it, a frame stays as it was decoded
+        kept = self._window // 2 + 1  # from the centre on; earlier frames stay as decoded at the centre
         self._decoded[:-1] = self._decoded[1:]
         frames = self._solved.all[:, slots]
         _repeat_first(frames)
         if self._reconstruct and len(slots):
-            # The body faces +x in the centre frame, as in training; only the root's rotation knows.
+            # the heading of the centre frame is removed, as in training; it is in the root's rotation alone
             back = yaw_matrix(heading(frames[self._window // 2 - 1, :, 0]))
             x = np.empty((len(slots), self._window, 22, 6), dtype=np.float32)
             _facing_forward(frames, back, x)

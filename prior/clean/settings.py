@@ -21,7 +21,7 @@ from steadypose.prior.clean.smooth import MAX_DELAY, SmoothSettings
 from steadypose.prior.settings import build_settings, check_range
 
 JITTER_SIGMA = 0.02
-"""Metres along an axis, of a joint seen with full confidence: what networks are told before noise is found."""
+"""Metres along an axis, of a joint of full confidence: the jitter assumed by HG-VAE's score (`LiveHGVAE.score`)."""
 
 
 @dataclass(frozen=True)
@@ -29,15 +29,14 @@ class PriorSettings:
     """Settings of the prior: ``[prior]`` of a launch file.
 
     Attributes:
-        delay: frames at 30 Hz to wait for before answering, 0 to 16 (4, the default, is half of HM-VAE's window: the
-            paper's centre-frame refinement).
-        max_bodies: bodies followed at once.
+        delay: look-ahead, frames at 30 Hz between a frame and its answer, 0 to 16 (the default, 4, is half of HM-VAE's
+            window: the paper's centre-frame refinement).
+        max_bodies: bodies tracked at once.
         timeout: seconds without a sighting after which a body is dropped, and without a frame after which the
             stream starts anew.
-        bias_sigma: metres along an axis, the sensor's slow error, which no filter averages out, as far as it is to be
-            expected before the stream shows what it is, and what a fault has to exceed. Depth cameras have 2 cm or
-            more.
-        identify: who tells bodies apart: the source (the default), or the prior.
+        bias_sigma: metres along an axis, expected standard deviation of the sensor's slow error: the prior of its
+            estimate from the stream, and the least that a fault has to exceed. Depth cameras have 2 cm or more.
+        identify: whether ids are the source's (the default) or assigned by the prior.
         gate, correct, smooth, encode, denoise, bones, score, impute, refine, fuse: settings of the stages.
     """
 
@@ -71,7 +70,7 @@ class PriorSettings:
 
     @property
     def noise(self) -> SensorNoise:
-        """What the sensor is off by."""
+        """The sensor's error, as far as it is known before the stream."""
         return SensorNoise(JITTER_SIGMA, self.bias_sigma)
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Which slot holds whose body: who comes in takes a free one, who is not seen for a while leaves it."""
+"""Assignment of bodies to slots: a new body takes a free slot, one not seen for a while leaves it."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from steadypose.prior.clean.adapt import Sighting
 from steadypose.prior.clean.frame import Bools, Floats
 
 MIN_JOINTS = 6
-"""Canonical joints that must be seen for a body to be taken up."""
+"""Least number of visible canonical joints of a new body."""
 
 
 Key = TypeVar("Key", bound=Hashable)
 
 
 class Slots(Generic[Key]):
-    """The bodies followed at once.
+    """The bodies tracked at once.
 
     Args:
-        count: at most so many.
+        count: of slots.
         timeout_s: seconds without a sighting after which a body is dropped.
         counters: gets ``body_too_little_seen`` and ``too_many_bodies``.
 
     Attributes:
-        keys: (S,) what each slot's body is called; None of a free slot.
-        present: (S,) which slots hold a body that has been on the grid.
+        keys: (S,) key of each slot's body; None of a free slot.
+        present: (S,) which slots hold a body that has been seen at a grid time.
     """
 
     def __init__(self, count: int, timeout_s: float, counters: Counter[str]) -> None:
@@ -39,7 +39,8 @@ class Slots(Generic[Key]):
         self._last_seen_ns = np.zeros(count, dtype=np.int64)  # 0: not on the grid yet
 
     def arrange(self, sightings: Iterable[tuple[Key | None, Sighting]]) -> Sighting:
-        """Joints (S, 22, 3) and confidence (S, 22) by slot, of bodies by key; None is a body that nobody follows."""
+        """Sort bodies into slots by key (None: a body without one, which is left out): joints and confidence by
+        slot."""
         positions, confidence = np.full((len(self.keys), 22, 3), np.nan), np.zeros((len(self.keys), 22))
         for key, seen in sightings:
             if key is None:
@@ -50,7 +51,7 @@ class Slots(Generic[Key]):
         return Sighting(positions, confidence)
 
     def advance(self, stamp_ns: int, positions: Floats) -> Bools:
-        """Go on to this time of the grid, with these joints (S, 22, 3); give the slots whose bodies have timed out."""
+        """Advance to a grid time, with its joints (S, 22, 3); returns the slots (S,) whose bodies have timed out."""
         taken = np.array([key is not None for key in self.keys])
         seen = np.asarray(finite_joints(positions).any(axis=1))
         self.present = self.present & taken | seen
@@ -59,13 +60,13 @@ class Slots(Generic[Key]):
         return taken & (stamp_ns - self._last_seen_ns > self._timeout_ns)
 
     def free(self, slot: Bools) -> None:
-        """Let these slots (S,) be taken by others."""
+        """Free these slots (S,)."""
         self.present = self.present & ~slot
         for k in np.flatnonzero(slot):
             self.keys[k] = None
 
     def _slot(self, key: Key, joints_seen: int) -> int | None:
-        """The slot of a body, a free one if it is new and enough of it is seen."""
+        """The slot of a body; a free one if it is new and enough of it is visible."""
         if key in self.keys:
             return self.keys.index(key)
         if joints_seen < MIN_JOINTS:

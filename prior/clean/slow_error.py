@@ -1,11 +1,11 @@
-"""The sensor's slow error, found from bones: no filter averages it out, but it makes a person's bones change length.
+"""Estimate of the sensor's slow error (bias) from bones: no filter averages it out, but it varies their lengths.
 
-The length of a rigid part of the body varies by the noise that the smoother leaves, which it states, and by the
-sensor's slow error: what is left of the variance, halved since a bone has two ends, is that error's variance. Where the
-mean length differs from the person's bone, or one part varies by more than the others do, the sensor's idea of a joint
-differs from the skeleton's: that part's length is uncertain. It says how far this person's bones are to be measured
-rather than taken from human proportions, and how firmly they hold hidden joints. Moving seen joints onto the bones by
-it was tried: 0.2 % of a Kinect's error, for 0.6 mm of a perfect input's.
+The observed length of a rigid segment varies by the noise that the smoother leaves, whose variance it states, and by
+the sensor's slow error: the rest of the variance, halved because a bone has two ends, is that error's variance. Where
+the mean length differs from the person's bone, or one segment varies by more than the others, the sensor's definition
+of a joint differs from the skeleton's, and that segment's length is uncertain. The estimates weigh measured bones
+against human proportions (`prior.body.bone_lengths`), and say how firmly bones hold hidden joints. Moving observed
+joints onto the bones by them was tried: it gains 0.2 % of a Kinect's error, and costs 0.6 mm on a perfect input.
 """
 
 from __future__ import annotations
@@ -24,37 +24,38 @@ from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS
 
 MEMORY = round(3.0 * FPS)
-"""Frames of the running moments: long beside an error that lasts for half a second, short beside a change of sensor."""
+"""Frames of the running moments: long against an error's correlation time of half a second, short against a change of
+sensor."""
 
 PRIOR_FRAMES = round(0.5 * FPS)
-"""Frames that what is expected of the sensor counts for."""
+"""Frames for which the expected slow error counts, as a prior."""
 
 JITTER_RATIO = 4.0
-"""Times its jitter that a sensor's slow error is expected to be at most, so that nothing is expected of one without
-any. A Kinect v2's bones say 5.5 mm where third differences say 0.7 (medians of UI-PRMD, s01 to s06); what the gate
-measures is larger, for it includes what the body's own motion adds."""
+"""Upper bound of the expected slow error, as a multiple of the jitter, so that none is expected of a perfect sensor. Of
+a Kinect v2, bones give a slow error of 5.5 mm where third differences give a jitter of 0.7 mm (medians of UI-PRMD, s01
+to s06); the gate's estimate of the jitter is larger, as it includes part of the body's motion."""
 
 MIN_FRAMES = 3
-"""Frames of which a length's mean and variance are known."""
+"""A length's mean and variance are used only after more frames than this."""
 
 UNKNOWN_VARIANCE = 1e-4
-"""m², of a length seen for fewer frames: a centimetre."""
+"""m², length variance of a segment seen for no more frames: (1 cm)²."""
 
-INDEPENDENT = 5.0
-"""Frames after which what the smoother leaves of the noise is another."""
+CORRELATION_FRAMES = 5.0
+"""Correlation time of the noise that the smoother leaves, in frames."""
 
-SURE = 0.05
-"""Metres along an axis: a joint whose place is known less well measures no length."""
+MAX_SIGMA = 0.05
+"""Metres along an axis: joints of a larger standard deviation do not count for lengths."""
 
 _BONE = np.array([k for k, (end, start) in enumerate(RIGID) if start == PARENT[end]])
 
 
 class SlowError(NamedTuple):
-    """What was found of the sensor's slow error.
+    """The sensor's slow error, and what it does to lengths.
 
     Attributes:
-        bias_sigma: (S,) metres along an axis, by body.
-        length_variance: (S, R) m², of each of `RIGID`: by how much the length seen is not that of the person's bones.
+        bias_sigma: (S,) metres along an axis, estimated from each body.
+        length_variance: (S, R) m², of each segment of `RIGID`: of its observed length about the person's bone.
     """
 
     bias_sigma: Floats
@@ -62,14 +63,14 @@ class SlowError(NamedTuple):
 
 
 class SlowErrorEstimator:
-    """Keeps, for each body, running moments of the lengths of all that is rigid.
+    """Keeps, for each body, running moments of the lengths of the segments of `RIGID`.
 
     Args:
-        bias_sigma: metres along an axis, the slow error to be expected at most, before it is found.
+        bias_sigma: metres along an axis, the expected slow error, at most.
         slots: bodies.
 
     Attributes:
-        bias_sigma: (S,) metres along an axis, as last found.
+        bias_sigma: (S,) metres along an axis, the latest estimate.
     """
 
     def __init__(self, bias_sigma: float, slots: int) -> None:
@@ -78,7 +79,7 @@ class SlowErrorEstimator:
         self._moments = np.zeros((4, slots, len(RIGID)))  # frames, mean, variance, variance by noise
 
     def forget(self, slot: Bools) -> None:
-        """Start these slots afresh."""
+        """Forget the bodies in these slots (S,)."""
         self._moments[:, slot] = 0.0
         self.bias_sigma = np.where(slot, self._expected, self.bias_sigma)
 
@@ -88,7 +89,7 @@ class SlowErrorEstimator:
         Args:
             smoothed: (S, 22) joints and their standard deviations.
             offsets: (S, 22, 3) metres, the bones in use.
-            jitter: (S,) metres along an axis, the noise from frame to frame.
+            jitter: (S,) metres along an axis.
         """
         expected = np.minimum(self._expected, JITTER_RATIO * jitter)
         bias, length = expected.copy(), np.full((len(offsets), len(RIGID)), UNKNOWN_VARIANCE)
@@ -113,7 +114,7 @@ def _find(positions, sigma, offsets, expected, moments, bias, length_variance):
             left = sigma[s, a] ** 2 + sigma[s, b] ** 2
             length = _apart(positions[s], a, b)
             most = max(most, frames[k])
-            if not (left < 2 * SURE**2 and math.isfinite(length)):
+            if not (left < 2 * MAX_SIGMA**2 and math.isfinite(length)):
                 continue
             frames[k] += 1
             most = max(most, frames[k])
@@ -135,7 +136,7 @@ def _find(positions, sigma, offsets, expected, moments, bias, length_variance):
                 length_variance[s, k] = UNKNOWN_VARIANCE
                 continue
             own = _apart(rest, RIGID[k, 0], RIGID[k, 1])
-            apart = (mean[k] - own) ** 2 - noise[k] / max(frames[k] / INDEPENDENT, 1.0)
+            apart = (mean[k] - own) ** 2 - noise[k] / max(frames[k] / CORRELATION_FRAMES, 1.0)
             length_variance[s, k] = max(apart, 0.0) + max(variance[k] - noise[k] - 2.0 * square, 0.0)
 
 

@@ -14,7 +14,7 @@ MAX_DELAY = 16
 
 @dataclass(frozen=True)
 class SmoothSettings:
-    """Which mixture; there is nothing to tell it of the sensor or of the motion.
+    """Settings of the smooth stage: there are no noise parameters to tune.
 
     Attributes:
         weights: weight set (``default``), or a path to a ``.safetensors`` file.
@@ -34,7 +34,7 @@ class Smooth:
         self._mixture.forget(slot)
 
     def update(self, gated: Gated) -> Smoothed | None:
-        """Take the newest frame in; None while there is no frame so long ago."""
+        """Take in the newest frame; the estimate of the one ``delay_frames`` before, or None while there is none."""
         return self._mixture.update(gated.positions, gated.observation.stamp_s, gated.observation.confidence)
 
     def flush(self) -> list[Smoothed]:

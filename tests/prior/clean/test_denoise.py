@@ -64,7 +64,7 @@ def test_the_weight_is_that_of_least_variance() -> None:
     """Of estimates with noise n and own + sqrt(NOISE_LEFT) n', correlated as the better of the two demands."""
     stage, history, jitter = Denoise(delay_frames=0, slots=1), History(4, 1), np.array([0.04])
     history.append(gated(np.zeros((1, 22, 3))))
-    stage._found[:] = 1e-4
+    stage._reconstructed[:] = 1e-4
     smoothed = Smoothed(0.0, np.zeros((1, 22, 3)), np.full((1, 22), 0.012))
     share = stage.denoised(smoothed, history, jitter, 0).positions[0, 0, 0] / 1e-4
     first, second, both = 0.012**2, NOISE_LEFT * 0.012**2 + MODEL_SIGMA**2, NOISE_LEFT * 0.012**2
@@ -79,7 +79,7 @@ def test_motion_that_the_model_does_not_know_takes_its_belief_away_and_lasting_e
 
     def moved(apart: float, jitter: float) -> list[float]:
         stage = Denoise(delay_frames=0, slots=1)
-        stage._found[:] = apart
+        stage._reconstructed[:] = apart
         found = [stage.denoised(smoothed, history, np.array([jitter]), 0).positions[0, 0, 0] for _ in range(20)]
         return [place / apart for place in found]
 
@@ -94,7 +94,7 @@ def test_hidden_joints_and_bodies_that_left_are_not_touched() -> None:
     seen = np.zeros((2, 22, 3))
     seen[0, J["left_wrist"]] = np.nan
     history.append(gated(seen))
-    stage._found[:] = 1.0
+    stage._reconstructed[:] = 1.0
     stage.forget(np.array([False, True]))
     smoothed = Smoothed(0.0, np.zeros((2, 22, 3)), np.full((2, 22), 0.012))
     moved = stage.denoised(smoothed, history, jitter, 0).positions[..., 0]
