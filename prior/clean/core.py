@@ -105,7 +105,7 @@ class CleanCore:
         """
         # of the frame before: all that is fed back
         person, bias_sigma, present = self._person.current, self._slow_error.bias_sigma, observation.present
-        gated = self._gate.update(observation, person)
+        gated = self._gate.update(observation)
         if self._correct:
             gated = self._correct.update(gated)
         self._history.append(gated)

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from steadypose.prior.body.skeleton import CHILDREN, MIRROR, PARENT, limbs
-from steadypose.prior.clean.frame import Bools, Floats, Gated, Observation, Person
+from steadypose.prior.body.skeleton import MIRROR, limbs
+from steadypose.prior.clean.bone_outliers import BoneOutliers
+from steadypose.prior.clean.frame import Bools, Floats, Gated, Observation
 from steadypose.prior.compiled import median
 from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
 from steadypose.prior.timing.frozen_joints import RECENT, frozen_joints
@@ -25,14 +26,12 @@ class GateSettings:
     Attributes:
         enabled: whether to refuse anything; off, all that is seen passes.
         jump: metres a joint may be from where it was expected, beyond three standard deviations of that.
-        bone: fraction by which a bone may differ from this person's.
         patience: seconds after which a joint refused (or limbs exchanged) throughout is accepted after all.
         min_confidence: joints below are unobserved.
     """
 
     enabled: bool = True
     jump: float = 0.18
-    bone: float = 1.0
     patience: float = 0.3
     min_confidence: float = 0.1
 
@@ -42,7 +41,6 @@ _EXCHANGED = tuple(np.concatenate(limbs(chain)) for chain in (("elbow", "wrist")
 _SWAP_APART = 0.15  # metres between expected and seen, mean of a limb's joints, below which no exchange is suspected
 _SWAP_BETTER = 0.4  # an exchange must bring the joints this much nearer to where they were expected
 _JUMP_NOISES = 7.0  # times the noise: one sighting in a thousand is further from where it was expected
-_MIN_BONE, _BONE_NOISES = 0.1, 4.0  # metres, and times the noise, by which even a short bone may differ
 _NOISE_MEMORY = 15  # frames
 _DISTANCE_OF_NOISE = 2.6  # median distance to the expectation of white noise of 1 along each axis, by this filter
 _OWN_MEMORY, _OWN_TIMES = 9, 3.0  # frames in which a joint shows how far from expected it comes, and times that
@@ -61,6 +59,7 @@ class Gate:
         self._settings = settings
         self._counters = counters
         self._filter = FixedLagRTS(0, acceleration_density=8.0, measurement_sigma=0.015)
+        self._bones = BoneOutliers(slots)
         self._observed = Ring(RECENT + 1, (slots, 22, 3))
         self._jitter = np.zeros(slots)
         self._own = np.zeros((slots, 22))
@@ -74,6 +73,7 @@ class Gate:
         if slot.all():
             self._filter.reset()  # a new stream: its stamps may be earlier
         self._filter.forget(np.repeat(slot[:, None], 22, axis=1))
+        self._bones.forget(slot)
         self._observed.clear(slot)
         self._jitter[slot] = 0.0
         self._own[slot] = 0.0
@@ -82,8 +82,8 @@ class Gate:
         self._refused[slot] = 0
         self._swapped[slot] = 0
 
-    def update(self, observation: Observation, person: Person) -> Gated:
-        """What can be of the newest frame, by the bones that these people were found to have before it."""
+    def update(self, observation: Observation) -> Gated:
+        """What can be of the newest frame."""
         s = self._settings
         self._observed.push(observation.positions)
         positions = observation.positions.copy()
@@ -99,12 +99,12 @@ class Gate:
             distance = _apart(positions, expected.positions)
             self._measure_jitter(distance)
             if s.enabled:
-                self._judge(positions, person, expected, distance)
+                self._judge(positions, expected, distance)
         self._lost = np.where(np.isfinite(observation.positions[..., 0]), 0, self._lost + 1)
         self._filter.update(positions, observation.stamp_s)
         return Gated(observation, positions, self._jitter.copy(), frozen)
 
-    def _judge(self, positions: Floats, person: Person, expected: Smoothed, distance: Floats) -> None:
+    def _judge(self, positions: Floats, expected: Smoothed, distance: Floats) -> None:
         """Put exchanged limbs back, and make NaN what is refused, in place."""
         s = self._settings
         known = np.isfinite(expected.positions[..., 0])
@@ -121,12 +121,11 @@ class Gate:
         everywhere = jumped.sum(axis=1) > _BODY_JUMP * np.maximum((seen & known).sum(axis=1), 1)
         self._expect_anew(everywhere[:, None] & jumped)
         jumped &= ~everywhere[:, None]
-        refused = jumped | (self._bad_bones(positions, person) & ~everywhere[:, None])
-        self._refused = np.where(refused, self._refused + 1, 0)
+        self._refused = np.where(jumped, self._refused + 1, 0)
         overruled = self._refused > s.patience * FPS
         self._expect_anew(overruled)
-        refused &= ~overruled
         self._refused[overruled] = 0
+        refused = jumped & ~overruled | self._bones.update(positions)
         if refused.any():
             self._counters["joints_refused"] += int(refused.sum())
             positions[refused] = np.nan
@@ -167,14 +166,6 @@ class Gate:
                 rows = np.flatnonzero(exchanged)[:, None]
                 positions[rows, pair] = positions[rows, MIRROR[pair]]
 
-    def _bad_bones(self, positions: Floats, person: Person) -> Bools:
-        """(S, 22) joints at the end of a bone of impossible length."""
-        least = _MIN_BONE + _BONE_NOISES * self._jitter
-        return _of_impossible_length(positions, person.offsets, self._settings.bone, least) & person.measured[:, None]
-
-
-_LEAF = np.array([not children for children in CHILDREN])
-
 
 @njit(cache=True)
 def _apart(a, b):
@@ -202,23 +193,3 @@ def _middle(distance):
         if count:
             middle[row] = median(known[:count])
     return middle
-
-
-@njit(cache=True)
-def _of_impossible_length(positions, offsets, share, least):
-    """(S, 22) joints at the end of a bone that differs from the person's own by more than ``share`` of it, and more
-    than ``least`` (S,)."""
-    bad = np.zeros(positions.shape[:2], dtype=np.bool_)
-    for row in range(len(positions)):
-        for joint in range(1, positions.shape[1]):
-            length, own = 0.0, 0.0
-            for axis in range(3):
-                length += (positions[row, joint, axis] - positions[row, PARENT[joint], axis]) ** 2
-                own += offsets[row, joint, axis] ** 2
-            off = abs(math.sqrt(length) - math.sqrt(own))
-            bad[row, joint] = off > max(share * math.sqrt(own), least[row])
-        for joint in range(1, positions.shape[1]):
-            # A bad bone does not say which end is wrong: where the next bone is bad too, it is the joint between.
-            if _LEAF[joint] and bad[row, PARENT[joint]]:
-                bad[row, joint] = False
-    return bad
