@@ -1,9 +1,9 @@
-"""Bones of impossible length: a limb's joint that lies where this body's bones, as seen so far, cannot put it.
+"""Outliers among a limb's joints, by the lengths of its bones.
 
-What a sensor says of a bone's length has an error of its own, by bone and by person: a network that guesses depth
-makes bones shorter and longer all the time, a marker system never. So each bone is judged by its own running mean and
-deviation. A collapsed wrist, or a limb thrown aside, is found however slowly the body moves, where a test for jumps
-alone would take it for motion.
+The error of a measured length depends on the sensor, the bone and the person: a network that estimates depth from one
+picture varies bones all the time, a marker system hardly. So each bone is compared with its own running mean and
+standard deviation. A wrist that collapses onto the elbow is found at any speed of the body; a test for jumps alone
+takes it for motion.
 """
 
 from __future__ import annotations
@@ -16,20 +16,21 @@ from numba import njit
 from steadypose.prior.body.skeleton import CHILDREN, PARENT, limbs
 from steadypose.prior.clean.frame import Bools, Floats
 
-SHARE, LEAST, DEVIATIONS = 0.5, 0.10, 6.0
-"""A length differs from the mean by more than this share of it, so many metres, and so many standard deviations."""
+MIN_SHARE, MIN_DIFFERENCE, DEVIATIONS = 0.5, 0.1, 6.0
+"""An impossible length differs from the mean by more than this share of it, these metres and these standard
+deviations (chosen on validation, docs/experiments.md)."""
 
-LEAST_DEVIATION = 0.01
+MIN_DEVIATION = 0.01
 """metres"""
 
 MEMORY, FIRST = 45, 15
 """Frames of the running mean and deviation; and sightings before which nothing is judged."""
 
 WINSORISED = 2.0
-"""Standard deviations beyond which a length counts as so much: an outlier does not excuse itself, but bones that stay
-as they are, of another person or after a start that went wrong, are the new mean within a few seconds."""
+"""Standard deviations at which differences are clipped before they update mean and deviation: an outlier changes them
+little, but a new length that lasts is accepted within two seconds."""
 
-MOST = 0.5
+MAX_OUTLIERS = 0.5
 """Share of the limbs' bones seen beyond which it is another body, which is measured anew."""
 
 _LIMB_JOINTS = np.sort(np.concatenate(limbs(("shoulder", "elbow", "wrist"), ("knee", "ankle", "foot"))))
@@ -37,7 +38,7 @@ _CHILD = np.array([children[0] if len(children) == 1 else -1 for children in CHI
 
 
 class BoneOutliers:
-    """Joints of limbs at the end of a bone of impossible length, of ``slots`` bodies."""
+    """Finds the outliers among the limbs' joints of ``slots`` bodies."""
 
     def __init__(self, slots: int) -> None:
         self._mean = np.zeros((slots, 22))
@@ -50,10 +51,16 @@ class BoneOutliers:
             values[slot] = 0.0
 
     def update(self, positions: Floats) -> Bools:
-        """(S, 22) the joints of positions (S, 22, 3) metres that are not to be believed; their lengths are taken in.
+        """Judge a frame's bones, and update their means and deviations.
 
-        Of a bad bone, the joint farther from the trunk is wrong, and all beyond it; if the next bone is bad too, it
-        alone.
+        An impossible bone makes outliers of its outer joint and of all joints beyond; of the outer joint alone if the
+        next bone is impossible too.
+
+        Args:
+            positions: (S, 22, 3) metres, NaN where unobserved.
+
+        Returns:
+            (S, 22) which joints are outliers.
         """
         bad = np.zeros(positions.shape[:2], dtype=np.bool_)
         _judge(positions, self._mean, self._variance, self._sightings, bad)
@@ -63,7 +70,7 @@ class BoneOutliers:
 @njit(cache=True)
 def _judge(positions, mean, variance, sightings, bad):
     for row in range(len(positions)):
-        seen, found = 0, 0
+        seen, outliers = 0, 0
         for joint in _LIMB_JOINTS:
             square = 0.0
             for axis in range(3):
@@ -75,14 +82,14 @@ def _judge(positions, mean, variance, sightings, bad):
             count = sightings[row, joint]
             if count > FIRST:
                 seen += 1
-                deviation = max(math.sqrt(variance[row, joint]), LEAST_DEVIATION)
-                bad[row, joint] = abs(off) > max(SHARE * mean[row, joint], LEAST, DEVIATIONS * deviation)
-                found += bad[row, joint]
+                deviation = max(math.sqrt(variance[row, joint]), MIN_DEVIATION)
+                bad[row, joint] = abs(off) > max(MIN_SHARE * mean[row, joint], MIN_DIFFERENCE, DEVIATIONS * deviation)
+                outliers += bad[row, joint]
                 off = min(max(off, -WINSORISED * deviation), WINSORISED * deviation)
             mean[row, joint] += off / min(count, MEMORY)
             if count > 1:
                 variance[row, joint] += (off * off - variance[row, joint]) / min(count, MEMORY)
-        if found > MOST * seen:
+        if outliers > MAX_OUTLIERS * seen:
             bad[row] = False
             sightings[row] = 0.0
             continue
@@ -91,7 +98,7 @@ def _judge(positions, mean, variance, sightings, bad):
 
 @njit(cache=True)
 def _attribute(bad):
-    """From the joints at the end of a bad bone (22,) to those that are wrong, in place."""
+    """Turn ``bad`` (22,) from joints at the outer end of an impossible bone into outliers, in place."""
     of_bone = bad.copy()
     for joint in _LIMB_JOINTS:  # from the trunk outwards
         if not of_bone[joint]:

@@ -51,8 +51,8 @@ _BODY_JUMP = 0.5  # if more of the joints jump at once, the body did (a new trac
 class Gate:
     """Refuses what cannot be: a refused joint becomes unobserved, exchanged limbs are put back.
 
-    Expectation comes from a constant-velocity Kalman filter fed with what passed. Nothing is refused for longer
-    than ``patience``: then the sensor is right and the expectation wrong.
+    Expectation comes from a constant-velocity Kalman filter fed with what passed. No jump is refused for longer than
+    ``patience``: then the sensor is right and the expectation wrong. Bones are judged by `BoneOutliers`.
     """
 
     def __init__(self, settings: GateSettings, slots: int, counters: Counter[str]) -> None:
@@ -83,7 +83,7 @@ class Gate:
         self._swapped[slot] = 0
 
     def update(self, observation: Observation) -> Gated:
-        """What can be of the newest frame."""
+        """The newest frame without what is refused."""
         s = self._settings
         self._observed.push(observation.positions)
         positions = observation.positions.copy()
