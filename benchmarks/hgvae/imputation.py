@@ -36,7 +36,7 @@ BURSTS_S = (0.1, 0.3, 0.5, 1.0)
 PAPER_RATE = 0.01
 """Metres: Adam's rate for the entries, by its best result on windows of training."""
 
-SENSOR_SIGMA, SLOW = 0.003, 0.0
+SENSOR_SIGMA, BIAS_SIGMA = 0.003, 0.0
 """Metres: the windows are clean."""
 
 
@@ -92,7 +92,7 @@ def impute_all(
         guess[b] = _guess(positions[b], sizes[b], clean[b], observed[b], line[b])
     live = LiveHGVAE(model.config, arrays_of(model), SENSOR_SIGMA, 1)
     hung = standardise(model, guess)
-    completed, _ = model.completed(hung, torch.from_numpy(observed).float(), SLOW)
+    completed, _ = model.completed(hung, torch.from_numpy(observed).float(), BIAS_SIGMA)
     guess_m, completed_m = (x.double().numpy() * SCALE + mean for x in (hung, completed))
     found = {"mean": np.where(masks, mean, truth), "hold": hold, "line": line, "guess": guess_m}
     if model.completion:
@@ -100,7 +100,7 @@ def impute_all(
     passes: dict[str, list[Floats]] = {}
     for t, x, seen, size in zip(clean, guess, observed.astype(float), sizes, strict=True):
         tracks = t._replace(x=x, observed=seen)
-        reconstruction = live.reconstruct(x[None], seen[None], np.array([SLOW]))
+        reconstruction = live.reconstruct(x[None], seen[None], np.array([BIAS_SIGMA]))
         batch = Tracks(*(np.asarray(part)[None] for part in tracks))
         windows = BodyWindows(np.zeros(1, dtype=np.intp), batch, seen[None], np.array([size]), reconstruction, live)
         passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(tracks, reconstruction.mean[0]))
@@ -125,7 +125,7 @@ def whole_joints(model: HGVAE, positions: Floats, sizes: Floats, hidden: Mask) -
         part = slice(first, first + 256)
         seen = np.where(hidden[part, None, :, None], np.nan, positions[part])
         batch = Batch.of(model, seen, positions[part], sizes[part])
-        done = batch.completed(model, SLOW)
+        done = batch.completed(model, BIAS_SIGMA)
         passed = model(done.x, done.certainty).tracks.mean
         for name, x in {
             "mean": torch.zeros_like(batch.x), "guess": batch.x, "completion": done.x, "HG-VAE": passed,

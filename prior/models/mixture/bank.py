@@ -1,14 +1,14 @@
 """The experts of the mixture: a bank of fixed-lag smoothers.
 
-Every joint is followed by constant-velocity Kalman filters that differ in the density of their process noise, each with
-the smoother of its last frames (see `FixedLagRTS`, of which these are many side by side). A stiff one
-averages noise away and lags behind what is quick; a loose one follows all, noise too.
+Every joint is tracked by constant-velocity Kalman filters that differ in the density of their process noise, each with
+the fixed-lag smoother of its last frames (see `FixedLagRTS`, of which these are many side by side). One of small
+density averages noise away and lags behind fast motion; one of large density follows everything, noise included.
 
-Their mean, weighed by how well each predicted of late, is multiple-model estimation in its static form (Bar-Shalom, Li
-and Kirubarajan 2001, section 11.6), with a memory that fades. The measurement noise is not told: of each filter it is
-what its innovations say (concentrated likelihood), so that only the ratio of process to noise tells the filters apart.
-That mean is one more expert; how much each is believed is for a network to say (`prior.models.mixture.network`), which
-reads `prior.models.mixture.features`. Training and the live node run this very code.
+Their mean, weighted by each filter's likelihood, is the static multiple-model estimate (Bar-Shalom, Li and Kirubarajan
+2001, section 11.6), with exponential forgetting. The measurement noise is unknown: for each filter it is the most
+likely one given the innovations (concentrated likelihood), so that only the ratio of process to measurement noise
+distinguishes the filters. That mean is one more expert; the experts' weights are computed by
+`prior.models.mixture.network`, from `prior.models.mixture.features`. Training and the live node share this code.
 """
 
 from __future__ import annotations
@@ -28,29 +28,31 @@ MEASUREMENT_SIGMA = 0.02
 """Metres along an axis, at full confidence. Only its ratio to the density matters."""
 
 EXPERTS = len(DENSITIES) + 2
-"""The smoothers; their mean, weighed by predictions; and the joint as it came: where it was last, if it is not seen."""
+"""Number of experts: the smoothers; the multiple-model estimate; the raw joint, held at its last position while
+unseen."""
 
-PREDICTED = len(DENSITIES)
+MULTIPLE_MODEL = len(DENSITIES)
 RAW = EXPERTS - 1
-"""where the last two stand"""
+"""Indices of the last two"""
 
 MEMORY = 9
-"""Sightings over which a prediction's likelihood fades: 5 to 15 differ by 3 % at most (validation)."""
+"""Time constant of the likelihoods' exponential forgetting, in sightings: 5 to 15 differ by 3 % at most
+(validation)."""
 
 MIN_SCALE = 1e-4
-"""Added, per sighting remembered, to the squared innovations: a hundredth of the measurement's deviation."""
+"""Added to every normalised squared innovation: a floor of the noise at a hundredth of `MEASUREMENT_SIGMA`."""
 
-SLOW = 18
-"""Frames of the running means."""
+MEAN_FRAMES = 18
+"""Frames of the running means of distances and differences."""
 
-LEAST = 3e-4
-"""Metres: what is smaller than this is nothing, in logarithms."""
+LOG_FLOOR = 3e-4
+"""Metres, floor of lengths in logarithms."""
 
 INITIAL_SPEED = 1.0
-"""m/s, standard deviation of a new joint's velocity."""
+"""m/s along an axis, standard deviation of a new joint's velocity."""
 
 LAGS = ((1, 1), (2, 1), (3, 1), (2, 3))
-"""Order and spacing in frames of the differences of what came, whose sizes tell noise from motion."""
+"""Order and spacing (frames) of the differences of raw positions, whose sizes distinguish noise from motion."""
 _HISTORY = 7
 
 
@@ -60,22 +62,23 @@ class Bank(NamedTuple):
     Attributes:
         position: (S, J, M, K, 3) metres, of each frame given all measurements so far.
         variance: (S, J, M, K) metres² along an axis, of that.
-        with_position, with_velocity: (S, J, M, K) covariance of that with the newest position and velocity.
+        with_position, with_velocity: (S, J, M, K) covariance of each frame's position with the newest position and
+            velocity.
         velocity: (S, J, M, 3) m/s, and ``velocity_variance`` (S, J, M).
-        misfit: (S, J, M) faded sums of the squared innovations, each by its variance, and ``spread`` of the logarithms
-            of these variances.
-        sightings: (S, J) that these are sums of, faded.
-        raw: (S, J, K, 3) metres, what came, or came last; NaN before.
-        unseen: (S, J, K) frames for which the joint had not been seen by then, -1 before it was first seen.
+        squared_innovations: (S, J, M) sums, with forgetting, of the squared innovations normalised by their variance.
+        log_variances: (S, J, M) sums, with forgetting, of the logarithms of the innovations' variance.
+        sightings: (S, J) number of terms of these sums, with forgetting.
+        raw: (S, J, K, 3) metres, the raw position, or the last one; NaN before the first.
+        unseen: (S, J, K) frames since the joint was last seen; -1 before the first sighting.
         confidence: (S, J, K).
-        recent: (S, J, 7, 3) metres, what came in the last frames, NaN where unseen.
-        apart: (S, J, M, 2) metres², running means of the squared distances between neighbouring experts.
-        noise: (S, J) metres², that of the loose expert to what came.
-        sizes: (S, J, 4) running means of the logarithms of differences of what came.
-        length: (S, J, 2) metres and metres², running mean of each bone's length, and of its deviation squared.
-        place: (S, J, 3) metres, the pose of the last frame described; NaN before.
-        age: (S, J, 3) how many frames the running means are of: experts, differences, bones.
-        heading: (S, 2) cosine and sine of where the body faces.
+        recent: (S, J, 7, 3) metres, raw positions of the last frames; NaN where unseen.
+        distances: (S, J, M, 2) metres², running means of the squared distances between neighbouring experts.
+        noise: (S, J) metres², running mean of the squared distance of the raw joint to `features.NOISE_EXPERT`.
+        sizes: (S, J, 4) running means of the logarithms of the differences of `LAGS`.
+        length: (S, J, 2) metres and metres², running mean and variance of the length of each joint's bone.
+        place: (S, J, 3) metres, the pose in the frame last described; NaN before.
+        age: (S, J, 3) frames that the running means of experts, differences and bones contain.
+        heading: (S, 2) cosine and sine of the body's heading.
     """
 
     position: NDArray[np.float64]
@@ -84,14 +87,14 @@ class Bank(NamedTuple):
     with_velocity: NDArray[np.float64]
     velocity: NDArray[np.float64]
     velocity_variance: NDArray[np.float64]
-    misfit: NDArray[np.float64]
-    spread: NDArray[np.float64]
+    squared_innovations: NDArray[np.float64]
+    log_variances: NDArray[np.float64]
     sightings: NDArray[np.float64]
     raw: NDArray[np.float64]
     unseen: NDArray[np.float64]
     confidence: NDArray[np.float64]
     recent: NDArray[np.float64]
-    apart: NDArray[np.float64]
+    distances: NDArray[np.float64]
     noise: NDArray[np.float64]
     sizes: NDArray[np.float64]
     length: NDArray[np.float64]
@@ -101,7 +104,7 @@ class Bank(NamedTuple):
 
 
 def new_bank(bodies: int, delay: int) -> Bank:
-    """A bank that has seen nothing, for ``bodies`` slots and a delay in frames."""
+    """An empty bank for ``bodies`` slots and a delay in frames."""
     experts, joints, frames = len(DENSITIES), len(PARENTS), delay + 1
     bank = Bank(
         position=np.empty((bodies, joints, experts, frames, 3)),
@@ -110,14 +113,14 @@ def new_bank(bodies: int, delay: int) -> Bank:
         with_velocity=np.empty((bodies, joints, experts, frames)),
         velocity=np.empty((bodies, joints, experts, 3)),
         velocity_variance=np.empty((bodies, joints, experts)),
-        misfit=np.empty((bodies, joints, experts)),
-        spread=np.empty((bodies, joints, experts)),
+        squared_innovations=np.empty((bodies, joints, experts)),
+        log_variances=np.empty((bodies, joints, experts)),
         sightings=np.empty((bodies, joints)),
         raw=np.empty((bodies, joints, frames, 3)),
         unseen=np.empty((bodies, joints, frames)),
         confidence=np.empty((bodies, joints, frames)),
         recent=np.empty((bodies, joints, _HISTORY, 3)),
-        apart=np.empty((bodies, joints, experts, 2)),
+        distances=np.empty((bodies, joints, experts, 2)),
         noise=np.empty((bodies, joints)),
         sizes=np.empty((bodies, joints, len(LAGS))),
         length=np.empty((bodies, joints, 2)),
@@ -130,7 +133,7 @@ def new_bank(bodies: int, delay: int) -> Bank:
 
 
 def forget(bank: Bank, slot: NDArray[np.bool_]) -> None:
-    """Start these slots (S,) afresh."""
+    """Forget the bodies in these slots (S,)."""
     for values in bank:
         values[slot] = 0.0
     for values in (bank.position, bank.raw, bank.recent, bank.place):
@@ -141,7 +144,7 @@ def forget(bank: Bank, slot: NDArray[np.bool_]) -> None:
 
 @njit(cache=True, error_model="numpy")
 def advance(bank, count, step, positions, confidence, densities, sigma):
-    """Take a frame in.
+    """Take in a frame: predict and update all filters and smoothers.
 
     Args:
         bank: a `Bank`.
@@ -203,8 +206,8 @@ def advance(bank, count, step, positions, confidence, densities, sigma):
                 b = positions[s, j, 1] - position[slot, 1]
                 c = positions[s, j, 2] - position[slot, 2]
                 square = (a * a + b * b + c * c) / (3.0 * total)
-                bank.misfit[s, j, m] = keep * bank.misfit[s, j, m] + square + MIN_SCALE
-                bank.spread[s, j, m] = keep * bank.spread[s, j, m] + np.log(total)
+                bank.squared_innovations[s, j, m] = keep * bank.squared_innovations[s, j, m] + square + MIN_SCALE
+                bank.log_variances[s, j, m] = keep * bank.log_variances[s, j, m] + np.log(total)
                 for k in range(frames):
                     gain = with_position[k] / total
                     position[k, 0] += gain * a
@@ -222,37 +225,42 @@ def advance(bank, count, step, positions, confidence, densities, sigma):
 
 @njit(cache=True, error_model="numpy")
 def _measure_differences(recent, sizes, age):
-    """Running means of the logarithms of the sizes of `LAGS`' differences of what came (7, 3)."""
+    """Update the running means of the logarithms of `LAGS`' differences of raw positions (7, 3)."""
     n = _HISTORY - 1
-    found = np.zeros(4)
+    squares = np.zeros(4)
     for axis in range(3):
         a, b, c, d = recent[n, axis], recent[n - 1, axis], recent[n - 2, axis], recent[n - 3, axis]
-        found[0] += (a - b) ** 2
-        found[1] += (a - 2 * b + c) ** 2
-        found[2] += (a - 3 * b + 3 * c - d) ** 2
-        found[3] += (a - 2 * d + recent[n - 6, axis]) ** 2
-    if np.isfinite(found[2]):
+        squares[0] += (a - b) ** 2
+        squares[1] += (a - 2 * b + c) ** 2
+        squares[2] += (a - 3 * b + 3 * c - d) ** 2
+        squares[3] += (a - 2 * d + recent[n - 6, axis]) ** 2
+    if np.isfinite(squares[2]):
         age[1] += 1.0
         for k in range(4):
-            if np.isfinite(found[k]):
-                value = 0.5 * np.log(found[k] + LEAST**2)
-                sizes[k] += (value - sizes[k]) / min(age[1], SLOW)
+            if np.isfinite(squares[k]):
+                value = 0.5 * np.log(squares[k] + LOG_FLOOR**2)
+                sizes[k] += (value - sizes[k]) / min(age[1], MEAN_FRAMES)
             elif age[1] < 4:
-                sizes[k] = 0.5 * np.log(found[1] + LEAST**2)
+                sizes[k] = 0.5 * np.log(squares[1] + LOG_FLOOR**2)
 
 
 @njit(cache=True, error_model="numpy")
-def weigh_by_predictions(misfit, spread, sightings, weights):
-    """Write the weights (M,) of a joint's smoothers; give the variance of the noise found, in those of `advance`.
+def multiple_model_weights(squared_innovations, log_variances, sightings, weights):
+    """Write the smoothers' weights in the multiple-model estimate of one joint: their normalised likelihoods.
 
     Args:
-        misfit, spread: (M,) and ``sightings``: as a `Bank` has them, of one joint.
+        squared_innovations: (M,), as of `Bank`.
+        log_variances: (M,), as of `Bank`.
+        sightings: as of `Bank`.
         weights: (M,), written; they sum to 1.
+
+    Returns:
+        The estimated variance of the measurement noise, in units of `MEASUREMENT_SIGMA` squared.
     """
     most, noise = -np.inf, 0.0
     for m in range(len(weights)):
-        scale = misfit[m] / sightings if sightings > 0.0 else 1.0
-        weights[m] = -1.5 * (sightings * np.log(scale) + spread[m])
+        scale = squared_innovations[m] / sightings if sightings > 0.0 else 1.0
+        weights[m] = -1.5 * (sightings * np.log(scale) + log_variances[m])
         most = max(most, weights[m])
     total = 0.0
     for m in range(len(weights)):
@@ -260,5 +268,5 @@ def weigh_by_predictions(misfit, spread, sightings, weights):
         total += weights[m]
     for m in range(len(weights)):
         weights[m] /= total
-        noise += weights[m] * (misfit[m] / sightings if sightings > 0.0 else 1.0)
+        noise += weights[m] * (squared_innovations[m] / sightings if sightings > 0.0 else 1.0)
     return noise

@@ -1,7 +1,7 @@
-"""What the network of the mixture reads of a frame: `FEATURES` numbers of every joint.
+"""Input features of the mixture's network: `FEATURES` numbers for each joint and frame.
 
-They do not change when the body stands elsewhere or faces elsewhere: they are lengths, and vectors in the frame
-of the body's heading.
+They are invariant under translation and rotation about the vertical: lengths, and vectors in the frame of the body's
+heading.
 """
 
 from __future__ import annotations
@@ -13,30 +13,27 @@ from steadypose.prior.body.skeleton import PARENTS, J
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
     LAGS,
-    LEAST,
+    LOG_FLOOR,
+    MEAN_FRAMES,
     MEASUREMENT_SIGMA,
-    PREDICTED,
+    MULTIPLE_MODEL,
     RAW,
-    SLOW,
-    weigh_by_predictions,
+    multiple_model_weights,
 )
 from steadypose.prior.timing.rate import FPS
 
-MIDDLE = 3
-"""The expert from which a body's pose is read,"""
-LOOSE = 4
-"""the one whose distance to what came measures the noise,"""
-STEADY = 2
-"""and the one that tells where the body faces."""
+POSE_EXPERT, NOISE_EXPERT, HEADING_EXPERT = 3, 4, 2
+"""Indices of the smoothers from which the body's pose is read, from whose residuals the noise is estimated, and from
+which the heading is read."""
 
-QUICK, LONG = 3, 30
-"""Frames of the running means, beside `SLOW`."""
+SHORT_MEAN_FRAMES, BONE_MEAN_FRAMES = 3, 30
+"""Frames of the short running mean of distances, and of that of bone lengths; see `MEAN_FRAMES`."""
 
-PACE = 2.0
-"""m/s, the unit of velocities."""
+SPEED_UNIT = 2.0
+"""m/s, unit of velocities."""
 
 MAX_NOISE = 0.3
-"""Metres: what one frame adds to the noise found, at most; beyond that, the gate has let a bad one through."""
+"""Metres: a residual enters the noise estimate clipped at this, for frames with outliers that passed the gate."""
 
 _CENTIMETRES = float(np.log(100.0))
 _DELAYS = (0, 1, 2, 4, 8)
@@ -47,39 +44,37 @@ _VECTORS = 3 * _SMOOTHERS
 _SIZES = 2 * _VECTORS
 _BONE = _SIZES + len(LAGS)
 _POSE = _BONE + 6
-_PREDICTED = _POSE + 6
-_SIGHTING = _PREDICTED + 6
+_MULTIPLE_MODEL = _POSE + 6
+_SIGHTING = _MULTIPLE_MODEL + 6
 _DELAY = _SIGHTING + 6
-"""Where these begin: logarithms of the distance between neighbouring experts (the smoothers, stiff to loose, and the
-joint as it came), three of each; vectors between these; sizes of differences; bone; pose; what predictions say;
-sighting; delay."""
+"""Offsets of the groups of features: log-distances between neighbouring experts (the smoothers by density, then the raw
+joint), three each; vectors between these; sizes of differences; bone; pose; multiple-model estimate; sighting;
+delay."""
 FEATURES = _DELAY + len(_DELAYS) + 1
-"""Of each joint."""
+"""Features of each joint."""
 
 
 @njit(cache=True, error_model="numpy")
 def _log(square):
-    """How large a square of metres is, in powers of e of a centimetre, its root."""
-    return 0.5 * np.log(square + LEAST**2) + _CENTIMETRES
+    """Natural logarithm of the root of a square (m²), in centimetres."""
+    return 0.5 * np.log(square + LOG_FLOOR**2) + _CENTIMETRES
 
 
 @njit(cache=True, error_model="numpy")
 def describe(bank, count, back, parents, experts, features, scale, gap, between):
-    """What a frame's experts say, and the features that their weights are to be read from; running means go on.
-
-    Every frame is to be described once, in order.
+    """Write the experts and features of a frame, and update the running means. Frames must come once, in order.
 
     Args:
         bank: a `Bank`.
         count: frames taken in, the newest included.
-        back: how many frames before the newest.
-        parents: of the joints, the root's being 0.
+        back: frames between the newest and this one.
+        parents: (J,) of the joints, the root's being 0.
         experts: (S, J, EXPERTS, 3) metres, written; NaN of a joint not yet seen.
         features: (S, J, FEATURES) float32, written.
-        scale: (S,) metres along an axis, the noise found; written.
-        gap: (S, J) frames to the nearest sighting, before or since; 0 of a joint seen, -1 not yet seen; written.
-        between: (S, J) metres along an axis, deviation of the mean by predictions of a joint that is not seen, though
-            others of the body are, and was seen since; elsewhere 0; written.
+        scale: (S,) metres along an axis, estimated noise of the body's joints; written.
+        gap: (S, J) frames to the nearest sighting, before or after; 0 if seen in this frame, -1 if not yet; written.
+        between: (S, J) metres along an axis, standard deviation of the multiple-model estimate of a joint in a gap
+            between two sightings, in a frame in which other joints of the body are seen; otherwise 0; written.
     """
     bodies, joints, _, frames, _ = bank.position.shape
     slot = (count - 1 - back) % frames
@@ -87,39 +82,43 @@ def describe(bank, count, back, parents, experts, features, scale, gap, between)
     for s in range(bodies):
         total, seen_joints = 0.0, 0.0
         for j in range(joints):
-            noise[j] = weigh_by_predictions(bank.misfit[s, j], bank.spread[s, j], bank.sightings[s, j], weights[j])
-            _say(bank.position[s, j, :, slot], bank.raw[s, j, slot], weights[j], experts[s, j])
+            noise[j] = multiple_model_weights(
+                bank.squared_innovations[s, j], bank.log_variances[s, j], bank.sightings[s, j], weights[j]
+            )
+            _write_experts(bank.position[s, j, :, slot], bank.raw[s, j, slot], weights[j], experts[s, j])
             gap[s, j], between[s, j] = bank.unseen[s, j, slot], 0.0
             if gap[s, j] > 0.0:
                 for since in range(1, back + 1):
                     if bank.unseen[s, j, (slot + since) % frames] == 0.0:
                         gap[s, j] = min(gap[s, j], since)
-                        scales = bank.misfit[s, j] / max(bank.sightings[s, j], 1.0)
+                        scales = bank.squared_innovations[s, j] / max(bank.sightings[s, j], 1.0)
                         between[s, j] = _deviation(experts[s, j], weights[j], bank.variance[s, j, :, slot], scales)
                         break
             if gap[s, j] == 0.0:
                 bank.age[s, j, 0] += 1.0
                 for m in range(_SMOOTHERS):
-                    square = _square(experts[s, j, m], experts[s, j, _looser(m)])
-                    for k, memory in enumerate((QUICK, SLOW)):
-                        bank.apart[s, j, m, k] += (square - bank.apart[s, j, m, k]) / min(bank.age[s, j, 0], memory)
-                square = min(_square(experts[s, j, LOOSE], experts[s, j, RAW]), MAX_NOISE**2)
-                bank.noise[s, j] += (square - bank.noise[s, j]) / min(bank.age[s, j, 0], SLOW)
+                    square = _square(experts[s, j, m], experts[s, j, _neighbour(m)])
+                    for k, memory in enumerate((SHORT_MEAN_FRAMES, MEAN_FRAMES)):
+                        bank.distances[s, j, m, k] += (square - bank.distances[s, j, m, k]) / min(
+                            bank.age[s, j, 0], memory
+                        )
+                square = min(_square(experts[s, j, NOISE_EXPERT], experts[s, j, RAW]), MAX_NOISE**2)
+                bank.noise[s, j] += (square - bank.noise[s, j]) / min(bank.age[s, j, 0], MEAN_FRAMES)
             if bank.age[s, j, 0] > 0.0:
                 total += bank.noise[s, j]
                 seen_joints += 1.0
-        scale[s] = np.sqrt(total / max(seen_joints, 1.0) / 3.0) + LEAST
+        scale[s] = np.sqrt(total / max(seen_joints, 1.0) / 3.0) + LOG_FLOOR
         if not (gap[s] == 0.0).any():
             between[s] = 0.0
-        _face(experts[s], bank.heading[s])
+        _update_heading(experts[s], bank.heading[s])
         unseen = bank.unseen[s, :, slot]
         for j in range(joints):
             confidence, age = bank.confidence[s, j, slot], bank.age[s, j]
             _describe_sighting(unseen[j], gap[s, j], confidence, age[0], back, scale[s], features[s, j])
             if unseen[j] >= 0.0:
                 heading = bank.heading[s]
-                _describe_experts(experts[s, j], bank.apart[s, j], heading, scale[s], features[s, j])
-                _describe_predictions(experts[s, j], weights[j], noise[j], heading, scale[s], features[s, j])
+                _describe_experts(experts[s, j], bank.distances[s, j], heading, scale[s], features[s, j])
+                _describe_multiple_model(experts[s, j], weights[j], noise[j], heading, scale[s], features[s, j])
                 if age[1] > 0.0:
                     for k in range(len(LAGS)):
                         features[s, j, _SIZES + k] = bank.sizes[s, j, k] + _CENTIMETRES
@@ -128,50 +127,51 @@ def describe(bank, count, back, parents, experts, features, scale, gap, between)
                 _describe_pose(j, unseen[0], experts[s], bank.place[s, j], heading, features[s, j])
         for j in range(joints):
             for axis in range(3):
-                bank.place[s, j, axis] = experts[s, j, MIDDLE, axis]
+                bank.place[s, j, axis] = experts[s, j, POSE_EXPERT, axis]
 
 
 @njit(cache=True, error_model="numpy")
-def _say(smoothed, raw, weights, experts):
-    """Write a joint's experts (EXPERTS, 3), from its smoothers' places (M, 3), their weights, and the joint as it
-    came."""
+def _write_experts(smoothed, raw, weights, experts):
+    """Write a joint's experts (EXPERTS, 3), from its smoothers' positions (M, 3), their weights and the raw
+    position."""
     for axis in range(3):
-        experts[PREDICTED, axis] = 0.0
+        experts[MULTIPLE_MODEL, axis] = 0.0
         for m in range(_SMOOTHERS):
             experts[m, axis] = smoothed[m, axis]
-            experts[PREDICTED, axis] += weights[m] * smoothed[m, axis]
+            experts[MULTIPLE_MODEL, axis] += weights[m] * smoothed[m, axis]
         experts[RAW, axis] = raw[axis]
 
 
 @njit(cache=True, error_model="numpy")
 def _deviation(experts, weights, variance, scales):
-    """Of the mean by predictions, along an axis: what each smoother is off by, at the noise that its innovations show,
-    and what they differ by."""
+    """Standard deviation of the multiple-model estimate, along an axis: of a mixture of normal distributions, the
+    weighted mean of the smoothers' variances, scaled by their innovations, and of their squared distances from the
+    mean."""
     total = 0.0
     for m in range(_SMOOTHERS):
-        total += weights[m] * (scales[m] * variance[m] + _square(experts[m], experts[PREDICTED]) / 3.0)
+        total += weights[m] * (scales[m] * variance[m] + _square(experts[m], experts[MULTIPLE_MODEL]) / 3.0)
     return np.sqrt(total)
 
 
 @njit(cache=True)
-def _looser(m):
-    """The next expert of those that are neighbours."""
+def _neighbour(m):
+    """The expert next to smoother ``m``: the one of the next larger density, or the raw joint."""
     return m + 1 if m + 1 < _SMOOTHERS else RAW
 
 
 @njit(cache=True, error_model="numpy")
 def _square(a, b):
-    """Of the distance between two places (3,)."""
+    """Squared distance between two positions (3,)."""
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
 
 
 @njit(cache=True, error_model="numpy")
-def _face(experts, heading):
-    """Where the body faces, from hips and shoulders, what is known of them."""
+def _update_heading(experts, heading):
+    """Update the heading from hips and shoulders, as far as they are known."""
     x, y = 0.0, 0.0
     for left, right in ((_LEFT_HIP, _RIGHT_HIP), (_LEFT_SHOULDER, _RIGHT_SHOULDER)):
-        a = experts[left, STEADY, 0] - experts[right, STEADY, 0]
-        b = experts[left, STEADY, 1] - experts[right, STEADY, 1]
+        a = experts[left, HEADING_EXPERT, 0] - experts[right, HEADING_EXPERT, 0]
+        b = experts[left, HEADING_EXPERT, 1] - experts[right, HEADING_EXPERT, 1]
         if np.isfinite(a) and np.isfinite(b):
             x += a
             y += b
@@ -181,19 +181,20 @@ def _face(experts, heading):
 
 
 @njit(cache=True, error_model="numpy")
-def _turned(heading, x, y, z, unit, features, at):
-    """Write a vector in the body's frame, in ``unit``, large ones compressed."""
+def _write_vector(heading, x, y, z, unit, features, at):
+    """Write a vector in the body's frame, as asinh of multiples of ``unit``."""
     features[at] = np.arcsinh((heading[0] * x + heading[1] * y) / unit)
     features[at + 1] = np.arcsinh((heading[0] * y - heading[1] * x) / unit)
     features[at + 2] = np.arcsinh(z / unit)
 
 
-# Each writes its part of a joint's features. None is handed the bank: its 19 arrays take a second more to compile.
+# Each function writes one group of a joint's features. None takes the whole bank: compiling its 19 arrays takes a
+# second.
 
 
 @njit(cache=True, error_model="numpy")
 def _describe_sighting(unseen, gap, confidence, age, back, scale, features):
-    """How the joint was seen, and the delay; the rest is 0 for a joint never seen."""
+    """Sighting and delay; all else is set to 0."""
     for k in range(FEATURES):
         features[k] = 0.0
     for k, delay in enumerate(_DELAYS):
@@ -210,63 +211,64 @@ def _describe_sighting(unseen, gap, confidence, age, back, scale, features):
 
 
 @njit(cache=True, error_model="numpy")
-def _describe_experts(own, apart, heading, scale, features):
-    """How far neighbouring experts (M + 1, 3) are from each other, now and of late, and which way."""
+def _describe_experts(own, distances, heading, scale, features):
+    """Distances between neighbouring experts (M + 1, 3), now and their running means, and the vectors between them."""
     for m in range(_SMOOTHERS):
-        looser = own[_looser(m)]
+        looser = own[_neighbour(m)]
         features[3 * m] = _log(_square(own[m], looser))
-        features[3 * m + 1], features[3 * m + 2] = _log(apart[m, 0]), _log(apart[m, 1])
+        features[3 * m + 1], features[3 * m + 2] = _log(distances[m, 0]), _log(distances[m, 1])
         x, y, z = own[m, 0] - looser[0], own[m, 1] - looser[1], own[m, 2] - looser[2]
-        _turned(heading, x, y, z, scale, features, _VECTORS + 3 * m)
+        _write_vector(heading, x, y, z, scale, features, _VECTORS + 3 * m)
 
 
 @njit(cache=True, error_model="numpy")
-def _describe_predictions(own, weights, noise, heading, scale, features):
-    """Where the mean by predictions is beside the middle expert, how stiff it is, and the noise that it found."""
-    features[_PREDICTED] = _log(_square(own[PREDICTED], own[MIDDLE]))
-    features[_PREDICTED + 1] = 0.5 * np.log(noise + 1e-4) + np.log(MEASUREMENT_SIGMA / 0.01)
-    features[_PREDICTED + 2] = 0.0
+def _describe_multiple_model(own, weights, noise, heading, scale, features):
+    """Multiple-model estimate: relative to `POSE_EXPERT`, its mean log-density, and the noise that it estimates."""
+    features[_MULTIPLE_MODEL] = _log(_square(own[MULTIPLE_MODEL], own[POSE_EXPERT]))
+    features[_MULTIPLE_MODEL + 1] = 0.5 * np.log(noise + 1e-4) + np.log(MEASUREMENT_SIGMA / 0.01)
+    features[_MULTIPLE_MODEL + 2] = 0.0
     for m in range(_SMOOTHERS):
-        features[_PREDICTED + 2] += weights[m] * _LOG_DENSITIES[m]
-    x, y, z = own[PREDICTED, 0] - own[MIDDLE, 0], own[PREDICTED, 1] - own[MIDDLE, 1], own[PREDICTED, 2] - own[MIDDLE, 2]
-    _turned(heading, x, y, z, scale, features, _PREDICTED + 3)
+        features[_MULTIPLE_MODEL + 2] += weights[m] * _LOG_DENSITIES[m]
+    mean, middle = own[MULTIPLE_MODEL], own[POSE_EXPERT]
+    x, y, z = mean[0] - middle[0], mean[1] - middle[1], mean[2] - middle[2]
+    _write_vector(heading, x, y, z, scale, features, _MULTIPLE_MODEL + 3)
 
 
 @njit(cache=True, error_model="numpy")
 def _describe_pose(j, unseen_root, experts, place, heading, features):
-    """Where the joint is beside the root, and how it has moved since the last frame."""
-    x, y, z = experts[j, MIDDLE, 0], experts[j, MIDDLE, 1], experts[j, MIDDLE, 2]
+    """Position relative to the root, and displacement since the last frame."""
+    x, y, z = experts[j, POSE_EXPERT, 0], experts[j, POSE_EXPERT, 1], experts[j, POSE_EXPERT, 2]
     if unseen_root >= 0.0:
-        a, b, c = experts[0, MIDDLE, 0], experts[0, MIDDLE, 1], experts[0, MIDDLE, 2]
-        _turned(heading, x - a, y - b, z - c, 0.5, features, _POSE)
+        a, b, c = experts[0, POSE_EXPERT, 0], experts[0, POSE_EXPERT, 1], experts[0, POSE_EXPERT, 2]
+        _write_vector(heading, x - a, y - b, z - c, 0.5, features, _POSE)
     if np.isfinite(place[0]):
-        _turned(heading, x - place[0], y - place[1], z - place[2], PACE / FPS, features, _POSE + 3)
+        _write_vector(heading, x - place[0], y - place[1], z - place[2], SPEED_UNIT / FPS, features, _POSE + 3)
 
 
 @njit(cache=True, error_model="numpy")
 def _describe_bone(j, parent, unseen, length, age, experts, heading, scale, features):
-    """The bone to a joint: how its length varies, and by how much, and where to, it is too long now."""
+    """The bone to the joint's parent: variance of its length, and its current deviation from the mean length."""
     if parent == j or unseen[parent] < 0.0:
         return
     came, middle = 0.0, 0.0
     for axis in range(3):
         came += (experts[j, RAW, axis] - experts[parent, RAW, axis]) ** 2
-        middle += (experts[j, MIDDLE, axis] - experts[parent, MIDDLE, axis]) ** 2
+        middle += (experts[j, POSE_EXPERT, axis] - experts[parent, POSE_EXPERT, axis]) ** 2
     came, middle = np.sqrt(came), np.sqrt(middle)
     if unseen[j] == 0.0 and unseen[parent] == 0.0:
         age[2] += 1.0
-        length[0] += (came - length[0]) / min(age[2], LONG)
-        length[1] += ((came - length[0]) ** 2 - length[1]) / min(age[2], LONG)
+        length[0] += (came - length[0]) / min(age[2], BONE_MEAN_FRAMES)
+        length[1] += ((came - length[0]) ** 2 - length[1]) / min(age[2], BONE_MEAN_FRAMES)
     if age[2] == 0.0:
         return
     features[_BONE] = _log(length[1])
     features[_BONE + 1] = np.arcsinh((came - length[0]) / scale)
     features[_BONE + 2] = np.arcsinh((middle - length[0]) / scale)
     long = (middle - length[0]) / max(middle, 1e-3)
-    x = experts[j, MIDDLE, 0] - experts[parent, MIDDLE, 0]
-    y = experts[j, MIDDLE, 1] - experts[parent, MIDDLE, 1]
-    z = experts[j, MIDDLE, 2] - experts[parent, MIDDLE, 2]
-    _turned(heading, long * x, long * y, long * z, scale, features, _BONE + 3)
+    x = experts[j, POSE_EXPERT, 0] - experts[parent, POSE_EXPERT, 0]
+    y = experts[j, POSE_EXPERT, 1] - experts[parent, POSE_EXPERT, 1]
+    z = experts[j, POSE_EXPERT, 2] - experts[parent, POSE_EXPERT, 2]
+    _write_vector(heading, long * x, long * y, long * z, scale, features, _BONE + 3)
 
 
 PARENT = np.maximum(np.array(PARENTS), 0)

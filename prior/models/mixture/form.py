@@ -1,23 +1,23 @@
-"""What the network writes of a joint, and how it is read: training and the live node share these."""
+"""Layout and bounds of the network's output, shared by training and the live node."""
 
 from __future__ import annotations
 
 from steadypose.prior.models.mixture.bank import EXPERTS
 
 OUTPUTS = 2 * EXPERTS + 4
-"""Of each joint: logarithms of weights, reaches, correction, logarithm of the standard deviation."""
+"""Outputs of each joint: logits of the weights w, then b, the correction r (3), and the log standard deviation."""
 
 GATES = 3
-"""Of each joint: how far weights and reaches, the correction, and the deviation lean on the last frame's."""
+"""Gates of each joint, weights of the last frame's output: of w and b, of r, and of the deviation."""
 
 REACH = 1.0
-"""Weight by which the mixture may leave the experts' convex hull, at most, of each expert."""
+"""Bound of each b: how far the estimate may leave the experts' convex hull."""
 
 CORRECTION = 2.0
-"""Largest correction along an axis, in units of the noise found."""
+"""Bound of the correction along an axis, in units of the estimated noise."""
 
 COASTING = 0.1
-"""m/s: by how much a joint's standard deviation grows at least with the time to its nearest sighting."""
+"""m/s: least growth of a joint's standard deviation with the time to its nearest sighting."""
 
 MIN_LOG_SIGMA, MAX_LOG_SIGMA = -3.0, 6.0
-"""Range of the logarithm of the standard deviation, in units of a millimetre."""
+"""Range of the natural logarithm of the standard deviation in millimetres."""

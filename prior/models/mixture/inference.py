@@ -16,7 +16,7 @@ from steadypose.prior.models.mixture.bank import (
     DENSITIES,
     EXPERTS,
     MEASUREMENT_SIGMA,
-    PREDICTED,
+    MULTIPLE_MODEL,
     RAW,
     advance,
     forget,
@@ -32,14 +32,14 @@ Floats = NDArray[np.float32]
 
 
 class MixtureSmoother:
-    """Smooths the joints of several bodies, each frame answered ``delay`` frames later.
+    """Fixed-lag smoother of the joints of several bodies: `MixtureNet` over a `Bank`.
 
     Attributes:
         delay: frames.
     """
 
     def __init__(self, delay: int, slots: int, weights: str = "default") -> None:
-        """``weights``: a name, as of `load_weights`."""
+        """``weights``: a weight set or a path, as of `load_weights`."""
         if delay < 0:
             raise ValueError(f"mixture: expected a delay of 0 frames or more, got {delay}")
         self.delay = delay
@@ -58,7 +58,7 @@ class MixtureSmoother:
     def update(
         self, positions: NDArray[np.float64], stamp_s: float, confidence: NDArray[np.float64] | None = None
     ) -> Smoothed | None:
-        """Take a frame; give the estimate of the frame ``delay`` before it, or None while there is none.
+        """Take in a frame; the estimate of the frame ``delay`` before it, or None while there is none.
 
         Args:
             positions: (S, 22, 3) metres, world-aligned with z up, NaN where unseen.
@@ -68,21 +68,21 @@ class MixtureSmoother:
         if self._stamps and stamp_s <= self._stamps[-1]:
             raise ValueError(f"mixture: expected a stamp after {self._stamps[-1]} s, got {stamp_s} s")
         step = stamp_s - self._stamps[-1] if self._stamps else 1 / FPS
-        trust = np.ones((self._slots, 22)) if confidence is None else confidence
-        advance(self._bank, self._count, step, positions, trust, DENSITIES, MEASUREMENT_SIGMA)
+        certainty = np.ones((self._slots, 22)) if confidence is None else confidence
+        advance(self._bank, self._count, step, positions, certainty, DENSITIES, MEASUREMENT_SIGMA)
         self._count += 1
         self._stamps = [*self._stamps[-self.delay :], stamp_s] if self.delay else [stamp_s]
         return self._answer(self.delay) if self._count > self.delay else None
 
     def flush(self) -> list[Smoothed]:
-        """Give the estimates still held, oldest first, and start afresh."""
+        """The estimates that the delay still holds, oldest first; everything is then forgotten."""
         held = [self._answer(back) for back in reversed(range(min(self.delay, self._count)))]
         self.forget(np.ones(self._slots, dtype=bool))
         self._stamps, self._count = [], 0
         return held
 
     def forget(self, slot: NDArray[np.bool_]) -> None:
-        """Start these slots (S,) afresh; estimates still held of them are lost."""
+        """Forget the bodies in these slots (S,), with the estimates that the delay still holds."""
         forget(self._bank, slot)
         for values in self._memory:
             values[slot] = 0.0
@@ -90,8 +90,8 @@ class MixtureSmoother:
     def _answer(self, back: int) -> Smoothed:
         """The estimate of the frame ``back`` before the newest."""
         bank = self._bank
-        said = self._experts, self._features, self._scale, self._gap, self._between
-        describe(bank, self._count, back, PARENT, *said)
+        described = self._experts, self._features, self._scale, self._gap, self._between
+        describe(bank, self._count, back, PARENT, *described)
         places, sigma = np.full((self._slots, 22, 3), np.nan), np.full((self._slots, 22), np.inf)
         for slot in np.flatnonzero((self._gap >= 0).any(axis=1)):
             outputs = _outputs(self._features[slot], self._net, self._memory, slot)
@@ -101,8 +101,7 @@ class MixtureSmoother:
 
 
 class _Network(NamedTuple):
-    """A trained `MixtureNet`: weights (in, out) and biases (rows, out), float32; those that are added to the same are
-    added up."""
+    """A trained `MixtureNet`: weights (in, out) and biases (rows, out), float32; biases added to one sum are merged."""
 
     mean: Floats
     per_deviation: Floats
@@ -127,8 +126,8 @@ class _Network(NamedTuple):
 
 
 class _Memory(NamedTuple):
-    """What the network remembers of S bodies: sums with fading weights, and the weights' sums, of joints' features
-    (S, 22, own) and of bodies' (S, body); and what it wrote last (S, 22, OUTPUTS)."""
+    """Recurrent state of S bodies: sums of `Memory` and their weights, of joints' features (S, 22, own) and of bodies'
+    (S, body); and the last outputs (S, 22, OUTPUTS)."""
 
     own: Floats
     own_weight: Floats
@@ -163,14 +162,14 @@ def _network(name: str) -> _Network:
 
 @njit(cache=True, error_model="numpy")
 def _outputs(features, net, memory, slot):
-    """(22, OUTPUTS) of one body's features (22, FEATURES), as `prior.models.mixture.network.MixtureNet` has them."""
+    """`MixtureNet` for one body and frame: (22, OUTPUTS) from features (22, FEATURES)."""
     joints, zero, one = len(features), np.float32(0), np.float32(1)
     started = memory.body_weight[slot, 0] > zero
-    told = np.empty_like(features)
+    normalised = np.empty_like(features)
     for j in range(joints):
         for k in range(FEATURES):
-            told[j, k] = (features[j, k] - net.mean[k]) * net.per_deviation[k]
-    own = np.dot(told, net.read)
+            normalised[j, k] = (features[j, k] - net.mean[k]) * net.per_deviation[k]
+    own = np.dot(normalised, net.read)
     _rectify(own, net.joint, own)
     own_before = np.empty_like(own)
     _remember(own, net.own_decay, memory.own[slot], memory.own_weight[slot], own_before)
@@ -186,7 +185,7 @@ def _outputs(features, net, memory, slot):
     _add(summand, body)
     context = np.dot(body, net.tell).reshape(joints, -1)
     _add(net.tell_bias, context)
-    mixed = np.dot(_beside(told, own_before, context), net.mix)
+    mixed = np.dot(_concatenated(normalised, own_before, context), net.mix)
     _rectify(mixed, net.joint_mix, mixed)
     deeper = np.dot(mixed, net.deepen)
     _rectify(deeper, net.deepen_bias, deeper)
@@ -221,7 +220,7 @@ def _add(values, out):
 
 @njit(cache=True, error_model="numpy")
 def _remember(values, decay, total, weight, mean):
-    """Fade the sums (N, F) of values and of their weights, take ``values`` in, and write the mean."""
+    """One step of `Memory`: update the sums (N, F) of values and of their weights, and write the mean."""
     one = np.float32(1)
     for i in range(len(values)):
         for k in range(values.shape[1]):
@@ -231,7 +230,7 @@ def _remember(values, decay, total, weight, mean):
 
 
 @njit(cache=True)
-def _beside(a, b, c):
+def _concatenated(a, b, c):
     """(N, A + B + C) of (N, A), (N, B) and (N, C)."""
     out = np.empty((len(a), a.shape[1] + b.shape[1] + c.shape[1]), dtype=np.float32)
     for i in range(len(a)):
@@ -246,7 +245,7 @@ def _beside(a, b, c):
 
 @njit(cache=True, error_model="numpy")
 def _mixed(outputs, experts, heading, scale, gap, between, places, sigma):
-    """As `prior.models.mixture.network.answer`, of one body; of joints never seen, nothing is written."""
+    """`prior.models.mixture.network.answer` for one body; joints never seen are not written."""
     cos, sin = heading
     weights, reach = np.empty(EXPERTS), np.empty(EXPERTS)
     for j in range(len(outputs)):
@@ -254,7 +253,7 @@ def _mixed(outputs, experts, heading, scale, gap, between, places, sigma):
             continue
         if between[j] > 0.0:
             for axis in range(3):
-                places[j, axis] = experts[j, PREDICTED, axis]
+                places[j, axis] = experts[j, MULTIPLE_MODEL, axis]
             sigma[j] = between[j]
             continue
         out = outputs[j]

@@ -21,7 +21,8 @@ from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS, load_pairs
 Floats = NDArray[np.float64]
 
 SPEEDS = (1.0, 1.4, 1.9, 2.5)
-"""How many times faster than it was recorded training motion is played: people of the test move faster than these."""
+"""Factors by which training motion is sped up: people of the test split move faster than those recorded for
+training."""
 
 _FREE = ("CMU (AMC)", "CMU (BVH)", "CMU (expmap)", "CMU (dance)", "ReActIdle", "UI-PRMD (Vicon)")
 _TRUNK = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
@@ -50,11 +51,11 @@ class Motion:
 
 @dataclass(frozen=True)
 class Pairs:
-    """A real Kinect and what it should have seen, in a row, at 30 Hz.
+    """Recordings of a real Kinect and its ground truth, concatenated, at 30 Hz.
 
     Attributes:
         seen: (N, 22, 3) float32 metres, z up; NaN where the Kinect has no such joint.
-        truth: (N, 22, 3) of the Vicon, in the Kinect's idea of a joint; NaN where not known.
+        truth: (N, 22, 3) metres, of the Vicon, by the Kinect's definition of the joints; NaN where not known.
         start: (C + 1,) of each recording.
         subject: (C,).
     """
@@ -109,8 +110,8 @@ def write_arrays(mocap: Path, out: Path) -> None:
 
 
 def _split(clip: Clip, data: DataSet) -> Split:
-    """As `prior.motion.datasets` has it, but that a person belongs to one split alone: CMU's 02 validates whole, and
-    the clips whose subjects are not known, and may be trained on elsewhere, train."""
+    """The split of `prior.motion.datasets`, except that a person must be in one split only: all of CMU's 02 is for
+    validation, and clips of unknown subjects, which other splits may contain, are for training."""
     if data.name == "CMU (AMC)":
         return "val" if clip.subject == "02" else "train"
     return "train" if data.name == "CMU (expmap)" else data.split(clip)
@@ -129,7 +130,7 @@ def load_kinect(path: Path) -> Pairs:
 
 
 def _at_speeds(clip: Clip, speeds: tuple[float, ...]) -> Iterator[tuple[float, NDArray[np.float32]]]:
-    """The sound parts of a recording, at each speed, at 30 Hz: played faster, then resampled."""
+    """The parts of a recording without faults, sped up and resampled to 30 Hz."""
     clip = clip.canonical()
     if clip.seconds < 1.0:
         return
@@ -172,13 +173,15 @@ def _write_pairs(path: Path, out: Path) -> None:
             seen.append(kinect.astype(np.float32))
             truth.append((pair.vicon + np.einsum("tab,jb->tja", frame, offset)).astype(np.float32))
             names.append(subject)
+    part = out.with_suffix(".part.npz")
     np.savez(
-        out,
+        part,
         seen=np.concatenate(seen),
         truth=np.concatenate(truth),
         start=np.concatenate([[0], np.cumsum([len(s) for s in seen])]),
         subject=np.array(names),
     )
+    part.replace(out)  # whole or not at all: its presence says that all arrays are written
 
 
 def trunk_frame(positions: Floats) -> Floats:

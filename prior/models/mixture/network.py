@@ -1,16 +1,16 @@
-"""The network of the mixture: from what a bank of filters says of every joint to the weights it gives them.
+"""The network of the mixture: weights of a bank of filters, for every joint, from features of the whole body.
 
-Mixture of experts (Jacobs et al. 1991) over linear filters. Each joint's features are read by weights that all joints
-share, the body's are read together, and each joint's answer is written from both. The answer is
+A mixture of experts (Jacobs et al. 1991) over linear filters. A layer shared by all joints encodes each joint's
+features, a second one the whole body's, and each joint's output is computed from both. The estimate is
 
     sum of w_m x_m  +  (1 - w_raw) (sum of b_m x_m + scale r),   w >= 0, sum of w = 1, sum of b = 0, b and r bounded
 
-``x`` being the experts' places. The second part lets the mixture reach ahead of filters that lag, and correct a joint
-by what the whole body tells, by an amount that is bounded by the noise found; where a joint is believed as it came, it
-vanishes: a perfect input stays what it is.
+``x`` being the experts' positions. The second term extrapolates beyond filters that lag, and corrects a joint from the
+context of the whole body, by an amount bounded by the estimated noise ``scale``; it vanishes where the raw joint has
+all the weight, so that a perfect input stays unchanged.
 
-What is written for a joint may lean on what was written for it a frame before, by gates that are written with it (as in
-gated recurrent units, Cho et al. 2014): weights that jump about would be noise of their own.
+Outputs are smoothed over time by gates that the network computes (as in gated recurrent units, Cho et al. 2014):
+weights that fluctuate would add noise of their own.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from steadypose.prior.models.mixture.bank import EXPERTS, PREDICTED, RAW
+from steadypose.prior.models.mixture.bank import EXPERTS, MULTIPLE_MODEL, RAW
 from steadypose.prior.models.mixture.features import FEATURES
 from steadypose.prior.models.mixture.form import (
     COASTING,
@@ -38,18 +38,18 @@ from steadypose.prior.timing.rate import FPS
 JOINTS = 22
 
 FIRST_GATE = -4.0
-"""What training begins with: as good as no leaning."""
+"""Initial bias of the gates: next to no weight on the previous output."""
 
 
 @dataclass(frozen=True)
 class MixtureConfig:
-    """Sizes.
+    """Layer widths.
 
     Attributes:
-        own: features that are read of each joint.
+        own: features of each joint.
         body: features of the whole body.
-        told: features of the body that each joint is told.
-        head: features from which a joint's answer is written.
+        told: features of the body passed to each joint.
+        head: features of the layers that compute a joint's output.
     """
 
     own: int = 32
@@ -59,9 +59,9 @@ class MixtureConfig:
 
 
 class Memory(nn.Module):
-    """Running means of features, each with a memory of its own: a diagonal linear recurrence, which cannot run away.
+    """Running means of features, each with a learned time constant: a diagonal linear recurrence, which is stable.
 
-    From the first frame on they are means: what they start from has no weight.
+    They are normalised from the first frame on: the initial state has no weight.
     """
 
     def __init__(self, features: int) -> None:
@@ -79,7 +79,7 @@ class Memory(nn.Module):
 
 
 def _faded(kept: Tensor, added: Tensor) -> Tensor:
-    """Sums (C, T, ...) over the frames up to each, of which ``kept`` (C, T, ...) is left from one to the next."""
+    """The recurrence y[t] = kept[t] y[t - 1] + added[t], of (C, T, ...) from y[-1] = 0."""
     total, out = torch.zeros_like(added[:, 0]), []
     for keep, new in zip(kept.unbind(1), added.unbind(1), strict=True):
         total = torch.addcmul(new, keep, total)
@@ -88,7 +88,7 @@ def _faded(kept: Tensor, added: Tensor) -> Tensor:
 
 
 class MixtureNet(nn.Module):
-    """Weights, corrections and deviations of the joints of a body, from their features, frame after frame."""
+    """From features of the joints of a body, frame by frame, to weights, corrections and standard deviations."""
 
     def __init__(self, config: MixtureConfig) -> None:
         super().__init__()
@@ -115,8 +115,8 @@ class MixtureNet(nn.Module):
     deviation: Tensor
 
     def forward(self, features: Tensor, present: Tensor) -> Tensor:
-        """(C, T, 22, FEATURES) from a clip's first frame on, and whether there is a body (C, T), to
-        (C, T, 22, OUTPUTS)."""
+        """(C, T, 22, OUTPUTS) from features (C, T, 22, FEATURES), from a clip's first frame on, and whether a body is
+        ``present`` (C, T)."""
         written, gates = self.layers(
             features, lambda own: self.own_memory(own, present), lambda body: self.body_memory(body, present)
         )
@@ -126,27 +126,27 @@ class MixtureNet(nn.Module):
     def layers(
         self, features: Tensor, own_memory: Callable[[Tensor], Tensor], body_memory: Callable[[Tensor], Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """What is newly written (..., 22, OUTPUTS), and its gates (..., 22, GATES).
+        """New outputs (..., 22, OUTPUTS) before gating, and their gates (..., 22, GATES).
 
         Args:
             features: (..., 22, FEATURES).
             own_memory: from joints' features (..., 22, own) to their means so far.
             body_memory: from bodies' features (..., body) to theirs.
         """
-        told = (features - self.mean) / self.deviation
-        own = F.relu(self.read(told) + self.joint)
+        normalised = (features - self.mean) / self.deviation
+        own = F.relu(self.read(normalised) + self.joint)
         before = own_memory(own)
         body = F.relu(self.gather(own.flatten(-2)))
         body = body + F.relu(self.remember(body_memory(body)))
         body = body + F.relu(self.think(body))
         context = self.tell(body).unflatten(-1, (JOINTS, self.config.told))
-        mixed = F.relu(self.mix(torch.cat([told, before, context], dim=-1)) + self.joint_mix)
+        mixed = F.relu(self.mix(torch.cat([normalised, before, context], dim=-1)) + self.joint_mix)
         written, gates = self.write(mixed + F.relu(self.deepen(mixed))).split([OUTPUTS, GATES], dim=-1)
         return written, gates
 
 
 def kept_of(gates: Tensor, before: Tensor) -> Tensor:
-    """How much of each output (..., 22, OUTPUTS) stays as it was a frame before; 0 where there was none ``before``."""
+    """Weight (..., 22, OUTPUTS) of the previous frame's outputs; 0 where there is no frame ``before``."""
     kept = torch.where(before, torch.sigmoid(gates), 0.0)
     return kept.repeat_interleave(torch.tensor([2 * EXPERTS, 3, 1]), dim=-1)
 
@@ -154,17 +154,18 @@ def kept_of(gates: Tensor, before: Tensor) -> Tensor:
 def answer(
     outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, gap: Tensor, between: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Places (..., 22, 3) metres, and their variances along an axis (..., 22) mm².
+    """Positions (..., 22, 3) metres, and their variances along an axis (..., 22) mm².
 
-    Between two sightings, the mean by predictions holds.
+    In a gap between two sightings, the multiple-model estimate is used.
 
     Args:
         outputs: (..., 22, OUTPUTS) of the network.
-        experts: (..., 22, EXPERTS, 3) metres.
-        heading: (..., 2) cosine and sine of where the body faces.
-        scale: (...) metres, the noise found.
+        experts: (..., 22, EXPERTS, 3) metres; this and the following as `features.describe` writes them.
+        heading: (..., 2) cosine and sine of the body's heading.
+        scale: (...) metres along an axis, estimated noise.
         gap: (..., 22) frames to the nearest sighting of each joint.
-        between: (..., 22) metres, the deviation of the mean by predictions of joints between two sightings, or 0.
+        between: (..., 22) metres along an axis, deviation of the multiple-model estimate in gaps between two
+            sightings; otherwise 0.
     """
     logits, reach, correction, log_sigma = outputs.split([EXPERTS, EXPERTS, 3, 1], dim=-1)
     weights = logits.softmax(dim=-1)
@@ -184,6 +185,6 @@ def answer(
     variance = (2.0 * log_sigma[..., 0].clamp(MIN_LOG_SIGMA, MAX_LOG_SIGMA)).exp() + coasted.square()
     inside = between > 0.0
     return (
-        torch.where(inside[..., None], experts[..., PREDICTED, :], places),
+        torch.where(inside[..., None], experts[..., MULTIPLE_MODEL, :], places),
         torch.where(inside, (1e3 * between).square(), variance),
     )

@@ -1,4 +1,4 @@
-"""Simulated sensors: what cameras make of true joints, from nothing at all to 8 cm, for the training of the mixture."""
+"""Simulated sensors for the training of the mixture: errors from none to 8 cm."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Floats = NDArray[np.float64]
 Rng = np.random.Generator
 
 GATED = 0.18
-"""Metres: what jumps farther is refused by the gate before the mixture sees it, mostly."""
+"""Metres: 90 % of larger jumps are removed, as the gate would before the mixture."""
 
-KINDS = ("perfect", "white", "lasting", "replayed", "mixed", "kinect", "monocular")
+KINDS = ("perfect", "white", "coloured", "replayed", "mixed", "kinect", "monocular")
 SHARES = np.array([0.13, 0.25, 0.15, 0.11, 0.11, 0.13, 0.12])
-"""Sensors and how often they are drawn: none, noise from frame to frame, noise that lasts, a Kinect's errors put on
-other motion, all of these together, the real Kinect, and a network that guesses each bone's depth from one picture."""
+"""Kinds of sensors and their shares: no error, white noise, AR(1) noise, a real Kinect's errors added to other motion,
+all of these together, the real Kinect's recordings, and a monocular network, which errs in the depth of each bone."""
 
 _SWINGS = (
     ("elbow", ("wrist",)),
@@ -31,7 +31,7 @@ _SWINGS = (
     ("hip", ("knee", "ankle", "foot")),
 )
 _ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_collar", "left_foot", "right_foot")]
-"""joints that many sensors do not have"""
+"""Joints that many sensors do not have"""
 _HIPS = [J["left_hip"], J["right_hip"]]
 _LIMBS = [
     [J[f"{side}_{n}"] for n in names]
@@ -42,12 +42,12 @@ _LIMBS = [
 
 @dataclass(frozen=True)
 class Sensed:
-    """Clips as a sensor sees them.
+    """Clips as observed by simulated sensors.
 
     Attributes:
         seen: (C, T, 22, 3) metres, NaN where not seen.
         truth: (C, T, 22, 3) metres, NaN where not known.
-        confidence: (C, T, 22) 0 to 1, as the sensor states it: with some, what is less sure is noisier.
+        confidence: (C, T, 22) 0 to 1, as the sensor states it; in 70 % of clips the noise is inversely proportional.
         kind: (C,) index into `KINDS`.
     """
 
@@ -58,14 +58,14 @@ class Sensed:
 
 
 class Sensors:
-    """Draws clips of true motion and of what sensors see of it."""
+    """Draws clips of motion and simulates sensors on them."""
 
     def __init__(self, motion: Motion, pairs: Pairs, frames: int) -> None:
         """``frames`` of each clip; ``pairs`` of the training subjects."""
         self._motion, self._pairs, self._frames = motion, pairs, frames
         sources = sorted(set(motion.source))
         room = np.maximum(np.diff(motion.start) - frames, 0).astype(float)
-        # every source the same, by a softer measure than its length: dance is short and fast
+        # sources are weighted by their length to the power of 0.4: dance is short and fast
         weight = np.zeros(len(room))
         for source in sources:
             own = motion.source == source
@@ -86,10 +86,10 @@ class Sensors:
                 seen[clip], truth[clip] = self._real(rng)
             else:
                 noise = self._noise(KINDS[kind[clip]], truth[clip], rng)
-                told = rng.random() < 0.7
-                seen[clip] = truth[clip] + (noise * (0.8 / confidence[clip, ..., None]) if told else noise)
-        self._spoil(seen, kind, rng)
-        # as monocular networks have it: beside the hips
+                informative = rng.random() < 0.7  # whether the confidence goes with the noise
+                seen[clip] = truth[clip] + (noise * (0.8 / confidence[clip, ..., None]) if informative else noise)
+        self._add_outliers(seen, kind, rng)
+        # relative to the hips, as monocular networks give joints
         about = np.flatnonzero(rng.random(count) < np.where(kind == KINDS.index("monocular"), 0.8, 0.05))
         for places in (seen, truth):
             places[about] -= places[about][:, :, _HIPS].mean(axis=2, keepdims=True)
@@ -111,9 +111,10 @@ class Sensors:
         return truth
 
     def _residual(self, rng: Rng) -> Floats:
-        """(T, 22, 3) errors of the real Kinect, turned about the vertical; of joints it lacks, those of their parents.
+        """(T, 22, 3) metres, errors of the real Kinect, rotated about the vertical; joints that it lacks take their
+        parent's.
 
-        Clips are shorter than what is asked for: they are played forwards and backwards.
+        Recordings that are shorter than a clip are played forwards and backwards.
         """
         start = self._pairs.start
         clip = rng.choice(len(self._pair_weight), p=self._pair_weight)
@@ -132,19 +133,19 @@ class Sensors:
         return rng.uniform(0.6, 1.4) * error @ Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix().T
 
     def _noise(self, kind: str, truth: Floats, rng: Rng) -> Floats:
-        """(T, 22, 3) metres."""
+        """(T, 22, 3) metres, the error of a sensor of this kind."""
         shape = truth.shape
         if kind == "perfect":
             return 10 ** rng.uniform(-4, -3) * rng.standard_normal(shape) if rng.random() < 0.15 else np.zeros(shape)
         if kind == "monocular":
-            return _guessed_depth(truth, rng)
+            return _monocular_errors(truth, rng)
         by_joint = np.exp(rng.choice([0.0, 0.5]) * rng.standard_normal((1, 22, 1)))
         noise = np.zeros(shape)
         if kind in ("white", "mixed"):
-            most = -1.05 if kind == "white" else -1.5
-            noise += 10 ** rng.uniform(-2.8, most) * by_joint * rng.standard_normal(shape)
-        if kind in ("lasting", "mixed"):
-            noise += 10 ** rng.uniform(-2.4, -1.2) * by_joint * _lasting(shape, rng.uniform(0.5, 0.97), rng)
+            upper = -1.05 if kind == "white" else -1.5
+            noise += 10 ** rng.uniform(-2.8, upper) * by_joint * rng.standard_normal(shape)
+        if kind in ("coloured", "mixed"):
+            noise += 10 ** rng.uniform(-2.4, -1.2) * by_joint * _coloured(shape, rng.uniform(0.5, 0.97), rng)
         if kind == "replayed" or (kind == "mixed" and rng.random() < 0.3):
             noise += self._residual(rng)
         if kind != "replayed" and rng.random() < 0.25:
@@ -159,7 +160,7 @@ class Sensors:
         return noise
 
     def _real(self, rng: Rng) -> tuple[Floats, Floats]:
-        """A clip of the real Kinect; where it is shorter than what is asked for, nothing is known of the rest."""
+        """A clip of the real Kinect and its truth; NaN after the end of a shorter recording."""
         start = self._pairs.start
         clip = rng.choice(len(self._pair_weight), p=self._pair_weight)
         first = start[clip] + int(rng.random() * max(start[clip + 1] - start[clip] - self._frames, 0))
@@ -173,8 +174,8 @@ class Sensors:
             seen, truth = (x[:, MIRROR] * (1.0, -1.0, 1.0) for x in (seen, truth))
         return seen, truth
 
-    def _spoil(self, seen: Floats, kind: NDArray[np.int64], rng: Rng) -> None:
-        """Outliers, exchanged limbs, lost frames, hidden joints, in place; of what is perfect, the last two alone."""
+    def _add_outliers(self, seen: Floats, kind: NDArray[np.int64], rng: Rng) -> None:
+        """Outliers, exchanged limbs, lost frames and hidden joints, in place; of perfect sensors only the last two."""
         count, frames = seen.shape[:2]
         for clip in range(count):
             noisy = KINDS[kind[clip]] != "perfect"
@@ -203,21 +204,22 @@ class Sensors:
             seen[hidden] = occlude(seen[hidden], rng)
 
 
-def sound(pairs: Pairs, most: float = 0.05) -> NDArray[np.bool_]:
-    """(C,) recordings in which Kinect and Vicon agree to ``most`` metres in the median: elsewhere, either is lost."""
+def sound(pairs: Pairs, threshold: float = 0.05) -> NDArray[np.bool_]:
+    """(C,) recordings in which Kinect and Vicon differ by less than ``threshold`` metres in the median: in others, one
+    of them lost the person."""
     error = np.linalg.norm(pairs.seen - pairs.truth, axis=-1)
-    return np.array([np.nanmedian(error[a:b]) < most for a, b in zip(pairs.start, pairs.start[1:], strict=False)])
+    return np.array([np.nanmedian(error[a:b]) < threshold for a, b in zip(pairs.start, pairs.start[1:], strict=False)])
 
 
 def _confidences(count: int, frames: int, rng: Rng) -> Floats:
-    """(C, T, 22) of sensors of which most are always sure; of others, joints differ and change slowly."""
+    """(C, T, 22) stated confidences: 1 in 70 % of clips, in others different for each joint and slowly varying."""
     time = 2 * np.pi * rng.uniform(0.0, 0.5, (count, 1, 22)) * np.arange(frames)[:, None] / FPS
     middle = rng.uniform(0.3, 1.0, (count, 1, 22))
     unsure = np.clip(middle + 0.2 * np.cos(time + rng.uniform(0, 2 * np.pi, (count, 1, 22))), 0.1, 1.0)
     return np.where((rng.random(count) < 0.3)[:, None, None], unsure, 1.0)
 
 
-def _lasting(shape: tuple[int, ...], memory: float, rng: Rng) -> Floats:
+def _coloured(shape: tuple[int, ...], memory: float, rng: Rng) -> Floats:
     """Stationary AR(1) noise of unit variance, ``memory`` its correlation from a frame to the next."""
     noise = rng.standard_normal(shape)
     for t in range(1, len(noise)):
@@ -225,19 +227,19 @@ def _lasting(shape: tuple[int, ...], memory: float, rng: Rng) -> Floats:
     return noise
 
 
-def _guessed_depth(truth: Floats, rng: Rng) -> Floats:
-    """(T, 22, 3) errors of a network that sees a picture: bones' depths are wrong, for a while or by a jump, and down
-    the chain they add up; across, joints are off by little."""
+def _monocular_errors(truth: Floats, rng: Rng) -> Floats:
+    """(T, 22, 3) metres, errors of a monocular network: the depth of each bone errs, by coloured noise and by jumps,
+    and errors add up along the kinematic chain; across the line of sight they are small."""
     frames = len(truth)
     view = rng.standard_normal(3) * (1.0, 1.0, 0.2)
     view /= np.linalg.norm(view)
-    depth = 10 ** rng.uniform(-1.6, -0.5) * _lasting((frames, 22), rng.uniform(0.6, 0.97), rng)
+    depth = 10 ** rng.uniform(-1.6, -0.5) * _coloured((frames, 22), rng.uniform(0.6, 0.97), rng)
     jumps = rng.random((frames, 22)) < 10 ** rng.uniform(-3.0, -1.3)
-    guesses = np.cumsum(jumps, axis=0, dtype=np.int64)  # which of them holds
+    guesses = np.cumsum(jumps, axis=0, dtype=np.int64)  # the current level, by index
     levels = rng.standard_normal((guesses.max() + 1, 22)) * rng.uniform(0.0, 0.3)
     depth += np.take_along_axis(levels, guesses, axis=0)
     across = 10 ** rng.uniform(-2.8, -1.8)
-    noise = across * _lasting(truth.shape, rng.uniform(0.0, 0.8), rng)
+    noise = across * _coloured(truth.shape, rng.uniform(0.0, 0.8), rng)
     for joint in range(1, 22):
         bone = np.linalg.norm(truth[:, joint] - truth[:, PARENTS[joint]], axis=-1)
         apart = (bone * depth[:, joint])[:, None] * view
@@ -246,7 +248,7 @@ def _guessed_depth(truth: Floats, rng: Rng) -> Floats:
 
 
 def _swing(truth: Floats, rng: Rng) -> None:
-    """A limb that waves, in place: 0.5 to 4.5 Hz, by up to 0.7 rad."""
+    """Make a limb swing, in place: 0.5 to 4.5 Hz, amplitude up to 0.7 rad."""
     centre, moved = _SWINGS[rng.integers(len(_SWINGS))]
     side = rng.choice(["left", "right"])
     pivot, joints = J[f"{side}_{centre}"], [J[f"{side}_{n}"] for n in moved]

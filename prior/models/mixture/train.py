@@ -1,8 +1,8 @@
 """Training of the mixture: ``steadypose train mixture --data MOCAP``, resumable.
 
-Clips of true motion go through simulated sensors and the bank that the live node runs; the loss is what the bench
-counts, position error (mm) and acceleration error (mm/frame²), of each clip by that of the expert that is best for that
-very clip: so no kind of sensor or motion is given up for another. The standard deviation is trained by its likelihood.
+Clips of true motion pass through simulated sensors and the live node's own bank. The loss is the benchmark's position
+error (mm) and acceleration error (mm/frame²), of each clip relative to those of the best single expert for that clip,
+so that no kind of sensor or motion dominates. The standard deviation is trained by its likelihood.
 """
 
 from __future__ import annotations
@@ -35,39 +35,39 @@ from steadypose.prior.motion.ui_prmd import TRAIN_SUBJECTS
 from steadypose.prior.timing.rate import FPS
 
 RATE = 2e-3
-"""Of learning, at first."""
+"""Initial learning rate."""
 
 FRAMES = 90
-"""of a clip, from its first: the start of a stream is a part of it"""
+"""Frames of a clip, which begins as a stream begins"""
 
 CLIPS, DELAYS_A_STEP = 16, 2
-"""clips of each delay, and delays, of a step"""
+"""Clips of each delay, and delays, in an optimiser step"""
 
 DELAYS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16])
 DELAY_SHARES = np.array([0.22, 0.08, 0.12, 0.05, 0.17, 0.03, 0.04, 0.13, 0.03, 0.03, 0.10])
 
 MIN_MM = 1.0
-"""Added to what the best expert is off by, before it divides: a perfect input matters, but not beyond all measure."""
+"""Added to the best expert's position error in the denominator, so that a perfect input does not dominate."""
 
 SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.25, 0.4, 0.8, 2.0, 3.0)
-"""Weight of the acceleration error by delay in frames: without delay, smoothness is paid for in lag, and later not."""
+"""Weight of the acceleration error, by delay in frames: without delay, smoothness costs lag."""
 
 MIN_SMOOTH_MM = 0.5
-"""mm/frame², added to the acceleration error of the best expert."""
+"""mm/frame², the same of the acceleration error."""
 
-FAST, MOST = 0.5, 60.0
-"""m/s at which a joint's place counts twice, and the most that one counts: joints are fast for a few frames, in which
-filters lag most and a mean over all of them does not show it. Their accelerations count less, by its root."""
+SPEED_WEIGHT, MAX_SPEED_WEIGHT = 0.5, 60.0
+"""Weight of a joint's position error: 1 + (speed / SPEED_WEIGHT m/s)², at most MAX_SPEED_WEIGHT. Joints are fast in few
+frames, in which filters lag most. Acceleration errors are weighted by the inverse of its root."""
 
 DEVIATION = 0.3
-"""Weight of the likelihood of the errors."""
+"""Weight of the negative log-likelihood in the loss."""
 
 AVERAGE = 0.999
-"""Memory of the running mean of the weights, which is what ships."""
+"""Decay of the exponential moving average of the weights, which is what is saved."""
 
 
 class Batch(NamedTuple):
-    """Described clips, (C, T, ...): what `answer` takes, the truth, and how much a joint counts by its speed."""
+    """Clips (C, T, ...): arguments of `answer`, ground truth, and weights ``counts`` of the position errors."""
 
     features: Tensor
     experts: Tensor
@@ -80,7 +80,7 @@ class Batch(NamedTuple):
 
 
 def through_bank(sensed: Sensed, delay: int) -> Batch:
-    """Clips as the live node describes them, one after the other; the frames that ``delay`` leaves."""
+    """Clips with features as the live node computes them; the last ``delay`` frames are left out."""
     clips, frames = sensed.seen.shape[:2]
     kept = frames - delay
     features = np.empty((kept, clips, 22, FEATURES), dtype=np.float32)
@@ -104,22 +104,26 @@ def through_bank(sensed: Sensed, delay: int) -> Batch:
 
 
 def _counts(truth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(C, T, 22) how much each joint's place counts, by its speed; see `FAST`."""
+    """(C, T, 22) weight of each joint's position error, by its true speed; see `SPEED_WEIGHT`."""
     speed = np.linalg.norm(np.gradient(truth, axis=1), axis=-1) * FPS
-    return np.minimum(1.0 + np.square(np.nan_to_num(speed) / FAST), MOST)
+    return np.minimum(1.0 + np.square(np.nan_to_num(speed) / SPEED_WEIGHT), MAX_SPEED_WEIGHT)
 
 
 class Errors(NamedTuple):
-    """Of each clip, (C,) or (C, experts)."""
+    """Errors of each clip, (C,) or (C, experts)."""
 
     position: Tensor  # mm
     acceleration: Tensor  # mm/frame²
 
 
 def errors(places: Tensor, truth: Tensor, weight: Tensor, counts: Tensor) -> Errors:
-    """Of places (C, T, 22, 3), weighed (C, T, 22), in position by ``counts`` too.
+    """Weighted mean errors of each clip.
 
-    In acceleration, by the inverse of the counts' root. What weighs nothing may be NaN.
+    Args:
+        places: (C, T, 22, 3) metres, estimates; may be NaN where the weight is 0.
+        truth: (C, T, 22, 3) metres.
+        weight: (C, T, 22) of all errors.
+        counts: (C, T, 22) further weight of position errors; acceleration errors are divided by its root.
     """
     off = torch.where(weight[..., None] > 0, places - truth, 0.0) * 1e3
     bent = off[:, 2:] - 2 * off[:, 1:-1] + off[:, :-2]
@@ -137,7 +141,7 @@ def _length(vectors: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Loss:
-    """What a batch costs: to be minimised; and what it is made of, each clip's."""
+    """The loss of a batch, and its terms for each clip."""
 
     total: Tensor
     relative: Tensor
@@ -146,13 +150,13 @@ class Loss:
 
 
 def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
-    """Of clips of one delay."""
+    """The loss of clips of one delay."""
     smooth = float(np.interp(delay, SMOOTH_DELAYS, SMOOTH))
     outputs = network(batch.features, (batch.gap >= 0).any(dim=-1))
     known = batch.truth.isfinite().all(dim=-1) & batch.experts.isfinite().all(dim=(-1, -2))
     experts = torch.where(known[..., None, None], batch.experts, 0.0)
     places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.gap, batch.between)
-    weight = known / (1.0 + batch.gap.clamp(min=0))  # where nobody can know, there is nothing to learn
+    weight = known / (1.0 + batch.gap.clamp(min=0))  # far from any sighting nothing can be learned
     own = errors(places, batch.truth, weight, batch.counts)
     with torch.no_grad():
         seen = known * (batch.gap == 0).float()
@@ -178,7 +182,8 @@ def train(
     rate: float = 2e-3,
     fresh: bool = True,
 ) -> TrainingRun:
-    """Train, and leave the mean of the last weights in ``network``; which, unless ``fresh``, is trained already."""
+    """Train ``network`` (unless ``fresh``, from its present weights), and load the moving average of its weights into
+    it."""
     mean = MixtureNet(network.config)
     optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.LambdaLR(
@@ -217,7 +222,7 @@ def train(
 
 
 def _measure_features(network: MixtureNet, sensors: Sensors, seed: int) -> None:
-    """Mean and standard deviation of the features, over training."""
+    """Set the mean and standard deviation by which features are normalised."""
     rng = np.random.default_rng((seed, 7))
     rows = torch.cat([through_bank(sensors.draw(32, rng), int(d)).features.reshape(-1, FEATURES) for d in DELAYS])
     network.mean.copy_(rows.mean(dim=0))

@@ -49,14 +49,14 @@ def completion_features(deviations: Tensor, observed: Tensor, bias_sigma: Tensor
     seen = observed.unflatten(1, (JOINTS, 3)).amin(dim=2) > 0
     since, until = _frames_from_sightings(seen)
     variance, of_noise = _noise(deviations, seen)
-    moved, of_moved = _moved(deviations, seen)
+    mobility, of_mobility = _mobility(deviations, seen)
     bias = bias_sigma.clamp(min=BIAS_MIN)[:, None]
-    of_window = torch.cat([of_noise, of_moved, (bias / BIAS_SCALE).log()], dim=1)
+    of_window = torch.cat([of_noise, of_mobility, (bias / BIAS_SCALE).log()], dim=1)
     of_frames = torch.cat([deviations, _nearness(since), _nearness(until)], dim=1).transpose(1, 2)
     nodes = of_frames.unflatten(1, (frames // patch, patch)).flatten(2)
     nodes = torch.cat([nodes, of_window[:, None].expand(-1, frames // patch, -1)], dim=2)
-    moved = (moved - 2 * variance).clamp(min=0.0)
-    return nodes, _line_variance(moved, variance + (bias / SCALE).square(), since, until)
+    mobility = (mobility - 2 * variance).clamp(min=0.0)
+    return nodes, _line_variance(mobility, variance + (bias / SCALE).square(), since, until)
 
 
 def _frames_from_sightings(seen: Tensor) -> tuple[Tensor, Tensor]:
@@ -74,19 +74,19 @@ def _nearness(frames: Tensor) -> Tensor:
 
 
 def _noise(deviations: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-    """The variance of a sighting from frame to frame (B, 22), and what the nodes are told of it (B, 23)."""
+    """Jitter variance of a sighting (B, 22), and its features (B, 23)."""
     shaken = deviations[..., :-2] - 2 * deviations[..., 1:-1] + deviations[..., 2:]
     shown = (seen[..., :-2] & seen[..., 1:-1] & seen[..., 2:]).float()
     squares = (shaken.square().unflatten(1, (JOINTS, 3)).sum(dim=2) * shown).sum(dim=-1)
     counts = shown.sum(dim=-1)
     together = squares.sum(dim=1, keepdim=True) / counts.sum(dim=1, keepdim=True).clamp(min=1.0)
     square = torch.where(counts > 3, squares / counts.clamp(min=1.0), together)
-    told = 0.25 * (torch.cat([square, together], dim=1) / CENTIMETRE**2 + 1e-3).log()
-    return square / 18, told
+    features = 0.25 * (torch.cat([square, together], dim=1) / CENTIMETRE**2 + 1e-3).log()
+    return square / 18, features
 
 
-def _moved(deviations: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-    """How much joints move in `LAG` frames beside the one above (B, 22), and what the nodes are told of it."""
+def _mobility(deviations: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+    """Mobility of joints (B, 22), with their noise, and its features (B, 22)."""
     beside = torch.eye(JOINTS)
     for joint, parent in enumerate(PARENTS):
         if parent > 0:
@@ -96,22 +96,22 @@ def _moved(deviations: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
     shown = (seen[..., LAG:] & seen[..., :-LAG]).float()
     squares, counts = (way.square().mean(dim=2) * shown).sum(dim=-1), shown.sum(dim=-1)
     together = squares.sum(dim=1, keepdim=True) / counts.sum(dim=1, keepdim=True).clamp(min=1.0)
-    moved = torch.where(counts > 0, squares / counts.clamp(min=1.0), together)
-    return moved, 0.5 * (moved / CENTIMETRE**2 + 1e-3).log()
+    mobility = torch.where(counts > 0, squares / counts.clamp(min=1.0), together)
+    return mobility, 0.5 * (mobility / CENTIMETRE**2 + 1e-3).log()
 
 
-def _line_variance(moved: Tensor, noise: Tensor, since: Tensor, until: Tensor) -> Tensor:
+def _line_variance(mobility: Tensor, noise: Tensor, since: Tensor, until: Tensor) -> Tensor:
     frames = since.shape[2]
     alone = (since == frames) | (until == frames)
-    apart = torch.where(alone, torch.minimum(since, until), since * until / (since + until).clamp(min=1.0))
-    grown = (moved + (STILL / SCALE) ** 2)[..., None] * (apart / LAG) ** GROWTH + noise[..., None]
-    hangs = torch.eye(JOINTS)  # on which joints each hangs, itself among them
+    gap = torch.where(alone, torch.minimum(since, until), since * until / (since + until).clamp(min=1.0))
+    grown = (mobility + (STILL / SCALE) ** 2)[..., None] * (gap / LAG) ** GROWTH + noise[..., None]
+    chain = torch.eye(JOINTS)  # each joint's ancestors, itself included
     for joint, parent in enumerate(PARENTS):
         if parent > 0:
-            hangs[joint] += hangs[parent]
+            chain[joint] += chain[parent]
     never = (since == frames) & (until == frames)
-    hidden = (apart > 0) & ~never
-    held = hangs @ torch.where(hidden, grown, 0.0)
+    hidden = (gap > 0) & ~never
+    held = chain @ torch.where(hidden, grown, 0.0)
     return torch.where(never, torch.inf, torch.where(hidden, held, 0.0))
 
 

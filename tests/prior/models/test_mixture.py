@@ -17,7 +17,7 @@ from steadypose.prior.models.mixture.bank import (
     MEASUREMENT_SIGMA,
     MEMORY,
     MIN_SCALE,
-    PREDICTED,
+    MULTIPLE_MODEL,
     advance,
     new_bank,
 )
@@ -92,7 +92,7 @@ def test_experts_are_fixed_lag_smoothers_and_their_mean_by_predictions(delay: in
         weights = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
         weights /= weights.sum(axis=1, keepdims=True)
         mean = (weights[..., None] * each).sum(axis=1)
-        np.testing.assert_allclose(experts[0, :, PREDICTED], mean, atol=1e-8)
+        np.testing.assert_allclose(experts[0, :, MULTIPLE_MODEL], mean, atol=1e-8)
         sigma = np.stack([one.sigma[0] for one in expected if one is not None], axis=1)
         apart = np.square(each - mean[:, None]).mean(axis=-1)
         deviation = np.sqrt((weights * (misfit / count * sigma**2 + apart)).sum(axis=1))
