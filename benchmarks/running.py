@@ -7,13 +7,14 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_WORLD
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Message
-from steadypose.nodes.graph.clock import SystemClock
+from steadypose.nodes.graph.clock import POLL_S, SystemClock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.supervisor import Supervisor
 from steadypose.nodes.graph.topology import POSE_NODES
@@ -24,12 +25,26 @@ SILENCE_S = 30.0
 """no message for so long is a node that hangs"""
 
 
+class Running(NamedTuple):
+    """Nodes at work.
+
+    Attributes:
+        messages: what they publish, ``pose/world`` and ``diagnostics``, with its topic, as it comes; ends when a node
+            fails, or all fall silent.
+        supervisor: of their processes.
+        clock: theirs.
+    """
+
+    messages: Iterator[tuple[str, Message]]
+    supervisor: Supervisor
+    clock: SystemClock
+
+
 @contextmanager
 def running(
     recording: Path, *, lossless: bool, rate: float = 1.0, loop: bool = False, record: Path | None = None
-) -> Iterator[tuple[Iterator[tuple[str, Message]], SystemClock]]:
-    """The node processes at work on a recording, with a recorder where there is a place to ``record`` to; gives what
-    they publish, ``pose/world`` and ``diagnostics``."""
+) -> Iterator[Running]:
+    """The node processes at work on a recording, with a recorder where there is a place to ``record`` to."""
     nodes = [*POSE_NODES, "recorder"] if record else [*POSE_NODES]
     console = Console(stderr=True)
     clock = SystemClock()
@@ -52,14 +67,19 @@ def running(
             Subscriber(endpoints, [POSE_WORLD, DIAGNOSTICS]) as subscriber,
             Supervisor(nodes, arguments, clock, lambda line: console.print(line, markup=False)) as supervisor,
         ):
-            yield _received(subscriber, supervisor), clock
+            yield Running(_received(subscriber, supervisor), supervisor, clock)
 
 
 def _received(subscriber: Subscriber, supervisor: Supervisor) -> Iterator[tuple[str, Message]]:
-    waited_s = START_S
-    while not supervisor.failed and (received := subscriber.receive(waited_s)):
-        waited_s = SILENCE_S
-        if isinstance(message := received[1], Diagnostics) and message.node in supervisor.children:
-            supervisor.children[message.node].heard()
+    left_s = START_S
+    while not supervisor.failed and left_s > 0:
+        received = subscriber.receive(POLL_S)
+        if received is None:
+            left_s -= POLL_S
+        else:
+            left_s = SILENCE_S
+            if isinstance(message := received[1], Diagnostics) and message.node in supervisor.children:
+                supervisor.children[message.node].heard()
         supervisor.poll()
-        yield received
+        if received:
+            yield received

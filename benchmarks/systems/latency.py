@@ -113,7 +113,7 @@ def live(recording: Path, warm_up_s: float, seconds: float, progress: Progress, 
     news: dict[str, Diagnostics] = {}
     sent_from = -1
     bar = progress.add_task(title, total=seconds)
-    with running(recording, lossless=False) as (messages, clock):
+    with running(recording, lossless=False) as (messages, _, clock):
         for topic, message in messages:
             now = clock.now_ns()
             if isinstance(message, Diagnostics):

@@ -45,7 +45,7 @@ def memory(recording: Path, hours: float, progress: Progress) -> dict[str, Any]:
     bar = progress.add_task(f"memory over {hours:g} h of stream", total=hours)
     with (
         tempfile.TemporaryDirectory(prefix="steadypose-") as folder,
-        running(recording, lossless=True, rate=0, loop=True, record=Path(folder, "soak")) as (messages, _),
+        running(recording, lossless=True, rate=0, loop=True, record=Path(folder, "soak")) as (messages, _, _),
     ):
         for _, message in messages:
             if not isinstance(message, Diagnostics) or message.stamp_ns == 0:

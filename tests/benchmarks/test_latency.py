@@ -6,6 +6,7 @@ import pytest
 
 from steadypose.benchmarks.systems.latency import SPACING, crowd, percentiles
 from steadypose.benchmarks.systems.memory import growth
+from steadypose.benchmarks.systems.restart import longest_gap
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
 
 
@@ -52,3 +53,7 @@ def test_growth_is_the_slope_after_the_start() -> None:
 
 def test_percentiles() -> None:
     assert percentiles(range(101)) == {"p50": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
+
+
+def test_the_outage_is_the_longest_time_between_two_messages() -> None:
+    assert longest_gap([10.0, 10.033, 11.7, 11.733]) == 1.667
