@@ -1,1 +1,1 @@
-"""What is known of human motion: skeletons, kinematics, the models and what is done with them."""
+"""The prior of human motion: skeletons, kinematics, models, and the pipelines that use them. No sockets, no clocks."""

@@ -1,4 +1,4 @@
-"""How large the arrays of an ``.npz`` are, looked at before any is read: two megabytes may become five thousand."""
+"""Size limit of the arrays of an ``.npz``, checked by their headers: two megabytes may unpack to five thousand."""
 
 from __future__ import annotations
 

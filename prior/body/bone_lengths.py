@@ -1,4 +1,4 @@
-"""A person's bones from their poses: robust medians of a recording, or, live, weighed against human proportions."""
+"""A person's bones from their poses: robust medians of a recording or, live, with human proportions as a prior."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ LIMB_SPREAD, TRUNK_SPREAD = 0.05, 0.12
 people measured by motion capture; more in trunk, head and feet, where sensors mean different places by one name."""
 
 TRUNK_PLACE_SPREAD = 0.05
-"""Metres along each axis, by which sensors differ in where hips, neck and shoulders leave the trunk."""
+"""Metres along each axis: deviation between sensors in the places of hips, neck and shoulders on the trunk."""
 
 LENGTH_BIASES = 3.0
-"""Times the sensor's bias: how wrong a single sample of a bone is at least, most of it an error that its neighbours
-share."""
+"""Least error of a single sample of a bone, as a multiple of the sensor's slow error; most of it is shared by
+successive samples."""
 
 LIKE_SAMPLES = 12
-"""So many samples in a row, two seconds, err alike and tell as much as one."""
+"""Correlation time of the samples' errors, in samples (two seconds): so many count as one independent sample."""
 
 _COLLAR_TO_SHOULDER = SHOULDERS[0] - COLLARS[0]
 

@@ -36,7 +36,7 @@ RIGID = np.array(
 )
 """(R, 2) the joints at the ends of each."""
 HELD = 1e-6
-"""Mobility of a joint that is known, beside 1 of one that is not, for `fit_lengths`."""
+"""Mobility of an observed joint in `fit_lengths`, relative to 1 of an unobserved one."""
 _SWEEPS = 20
 
 # Where the pelvis is upright below, when it is hidden itself: the middle of two joints, best first.

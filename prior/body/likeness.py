@@ -1,7 +1,7 @@
-"""How like a body joints are: whose order, unit, upright axis and handedness would make them one.
+"""How well joints fit a human body, and under which layout, unit, up axis and handedness they would fit better.
 
-For what comes from outside under a name that may be wrong. Nothing here changes a pose; it finds the words for what is
-wrong with one. Lengths are compared as logarithms, so that a unit is a shift of all of them.
+For input from outside whose declared layout may be wrong. Nothing here changes a pose; it diagnoses what is wrong with
+one. Lengths are compared as logarithms, so that a wrong unit is a common offset.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | 
 
 
 def likenesses(positions: NDArray[np.floating]) -> list[Likeness]:
-    """The layouts of as many joints as came, those in which they are most like a body first."""
+    """The layouts of this number of joints, best fit first."""
     fitting = [s for s in SKELETONS.values() if len(s.joints) == positions.shape[1]]
     found = [like for skeleton in fitting if (like := likeness(skeleton, positions))]
     return sorted(found, key=lambda like: like.error)
@@ -102,12 +102,12 @@ def likenesses(positions: NDArray[np.floating]) -> list[Likeness]:
 
 @dataclass(frozen=True)
 class Stance:
-    """How bodies stand in their frame.
+    """Up axis and handedness of bodies in their frame.
 
     Attributes:
         up: (3,) unit vector from their feet to their heads, in the frame of the joints.
         handed: -1 to 1: whether toes, noses and knees point where left and right say is forward. A mirrored body
-            is near -1; NaN where nothing told.
+            is near -1; NaN if no joint shows it.
     """
 
     up: Floats
@@ -115,14 +115,14 @@ class Stance:
 
 
 def stance(skeleton: Skeleton, positions: NDArray[np.floating]) -> Stance | None:
-    """How bodies stand.
+    """Estimate the up axis and handedness of a stream.
 
     Args:
         skeleton: the layout, of J joints.
         positions: (T, J, 3) any unit, NaN where missing.
 
     Returns:
-        None where it cannot be told, or changes.
+        None if they cannot be estimated, or change.
     """
     positions = positions.astype(np.float64)
     joints, _ = to_canonical(skeleton, positions)

@@ -94,7 +94,7 @@ TRUNK = (J["pelvis"], *HIPS, J["spine1"], J["spine2"], J["spine3"], J["neck"], *
 """Joints that lie about alike to each other in every pose."""
 
 TRUNK_LANDMARKS = (J["pelvis"], *HIPS, J["spine3"], J["neck"], *SHOULDERS)
-"""Those of them that sensors tell apart from their neighbours."""
+"""Those of them that sensors distinguish from their neighbours."""
 
 LIMB_ENDS = frozenset(j for j, name in enumerate(JOINTS) if name.endswith(("knee", "ankle", "elbow", "wrist")))
 """Joints at the lower end of the four bones of the arms and the four of the legs."""

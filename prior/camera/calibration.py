@@ -51,7 +51,7 @@ FLOOR_TILT = np.radians(10.0)
 
 
 class CalibrationError(ValueError):
-    """What was given does not calibrate. The text says what was expected, what came, and what to do."""
+    """The input does not determine the calibration. The text says what was expected, what was found, and what to do."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Board:
 
     @cached_property
     def pattern(self) -> cv2.aruco.CharucoBoard:
-        """The board as OpenCV has it; 4x4 markers, the largest that are recognised from afar."""
+        """The board as an OpenCV object; 4x4 markers, as these are recognised from farthest."""
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker * self.square, dictionary)
 
@@ -109,14 +109,14 @@ class Corners:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A lens, as OpenCV has it.
+    """Intrinsics of a camera, in OpenCV's convention.
 
     Attributes:
         size: pixels, width and height of the pictures.
         focal: (fx, fy) pixels.
         centre: (cx, cy) pixels.
         distortion: k1, k2, p1, p2, k3 of the Brown-Conrady model; empty for none.
-        error_px: root mean square of what the calibration left unexplained.
+        error_px: root mean square reprojection error.
     """
 
     size: tuple[int, int]
@@ -213,12 +213,12 @@ def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsic
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a camera stands.
+    """Extrinsics of a camera.
 
     Attributes:
         pose: of its optical frame in the world.
-        error_px: how far most corners, four in five, at most are from where they should be.
-        sigma_m, sigma_rad: how sure the place and the orientation are: standard deviations, along the worst axis.
+        error_px: the 80th percentile of the corners' reprojection error.
+        sigma_m, sigma_rad: standard deviations of position and orientation, along the worst axis.
     """
 
     pose: Pose
@@ -228,7 +228,7 @@ class Placement:
 
 
 def camera_pose(views: Sequence[Corners], lens: Intrinsics) -> Placement:
-    """Where a camera stands, from pictures of a board that lies flat on the floor; neither moves.
+    """Extrinsics of a camera from pictures of a board that lies flat on the floor; neither moves.
 
     Raises:
         CalibrationError: no picture, or the corners do not fit one place.
@@ -306,7 +306,7 @@ def points_of_depth(depth: NDArray[np.integer], lens: Intrinsics) -> Floats:
 
 
 def floor_pose(points: Floats, up: Floats, seed: int = 0) -> tuple[Pose, float]:
-    """Where a camera stands that sees the floor: above the world's origin, looking along +y.
+    """Extrinsics of a camera that sees the floor: above the world's origin, looking along +y.
 
     The floor is the lowest of the large planes that are about level.
 

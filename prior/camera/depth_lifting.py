@@ -33,7 +33,7 @@ from steadypose.prior.body.layouts import COCO17
 Floats = NDArray[np.float64]
 
 MIN_CONFIDENCE = 0.3
-"""of a key point; below it a detector guesses"""
+"""of a key point that is used; below it, detectors guess"""
 
 _K = {name: index for index, name in enumerate(COCO17.joints)}
 _JOINTS = len(COCO17.joints)
@@ -50,7 +50,7 @@ _TO_CENTRE = np.array([_THICKNESS.get(name.split("_")[-1], 0.0) for name in COCO
 # The trunk at the hips, cut level: an ellipse of these half axes in metres.
 _HALF_DEPTH, _HALF_BREADTH = 0.12, 0.18
 # Hips and shoulders, joint to joint, for a trunk (middle of the shoulders to middle of the hips) of length 1, and
-# the trunk's usual length in metres and those that are believed.
+# the trunk's usual length in metres and the range that is accepted.
 _HIP_WIDTH, _SHOULDER_WIDTH = 0.35, 0.70
 _TRUNK_LENGTH, _TRUNK_LENGTHS = 0.51, (0.42, 0.60)
 _MAX_TURN_COSINE = np.cos(np.radians(50))
@@ -62,7 +62,7 @@ _SEEN_WIDTH = 0.65
 _TURN_EVIDENCE = 0.10
 """metres by which one side's arm and leg are nearer, when there is no doubt which side that is"""
 _FAR_SIDE_THRESHOLD = 0.5
-"""of 1, from when on the far side is taken for known"""
+"""of 1, evidence above which the far side is taken as known"""
 _FAR_LIMBS = np.array([0.05, 0.05, -0.03, -0.03])
 """metres behind the middle of the hips where the far arm (elbow, wrist) and leg (knee, ankle) are, at least"""
 _CONFIDENCE_EVIDENCE = 0.05
@@ -71,7 +71,7 @@ _CONFIDENCE_EVIDENCE = 0.05
 _TRUNK_REACH, _HEAD_REACH = 0.40, 0.50
 """metres: from the trunk's depth to a shoulder or a hip; from the middle of the shoulders to the face"""
 _ARM, _LEG = (0.45, 0.40), (0.60, 0.60)
-"""metres: the longest bones that are believed"""
+"""metres: the longest bones that are accepted"""
 _LIMBS = [
     ([_K[f"{side}_{joint}"] for joint in joints], lengths)
     for side in ("left", "right")
@@ -101,7 +101,7 @@ _TRUNK_BAND = 0.25
 def lift(
     keypoints: Floats, confidence: Floats, depth: NDArray[Any], intrinsics: Floats
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Give the key points of the bodies in an image their depth.
+    """Lift the key points of the bodies in an image to 3D.
 
     Args:
         keypoints: (B, 17, 2) pixels of the depth image, x right and y down; NaN where missing.
@@ -188,7 +188,7 @@ def _lift_body(pixels: Floats, confidence: Floats, view: _View) -> Floats:
         positions[list(_HIPS)] = hips.middle
 
     def follow(joints: Sequence[int], lengths: Sequence[float], origin: Floats) -> None:
-        """Place the joints of a chain, each in reach of the last one seen."""
+        """Place the joints of a chain, each within reach of the last one found."""
         reach = 0.0
         for joint, length in zip(joints, lengths, strict=True):
             reach += length
@@ -276,9 +276,9 @@ class _Hips:
 
 
 def _trunk_depth(pixels: Floats, view: _View) -> float:
-    """Metres to the trunk's skin: the surface that fills most of the lines between shoulders and hips.
+    """Depth of the trunk's skin, metres: the surface that covers most of the lines between shoulders and hips.
 
-    Where fewer than two of them are known, the key points that are stand for the trunk.
+    With fewer than two of these, all key points are used instead.
     """
     known = [joint for joint in _TRUNK if np.isfinite(pixels[joint]).all()]
     ends = list(combinations(known, 2)) or [(joint, joint) for joint in range(_JOINTS)]

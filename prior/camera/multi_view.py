@@ -44,7 +44,7 @@ MAX_BODIES = 16
 
 @dataclass(frozen=True)
 class Sightings:
-    """The bodies that one camera sees at one moment.
+    """The bodies in one frame of one camera.
 
     Attributes:
         stamp_ns: capture.
@@ -80,7 +80,7 @@ class Merge:
         self._late = 0
 
     def update(self, raw: PoseRaw) -> list[PoseRaw]:
-        """Take what a camera saw; give the merged messages it completes, oldest first."""
+        """Take a camera's message; returns the merged messages that it completes, oldest first."""
         seen = self._sightings(raw)
         if seen is None:
             return []

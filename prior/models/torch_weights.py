@@ -49,9 +49,9 @@ def load_tensors(name: str, model: str) -> tuple[dict[str, Tensor], dict[str, An
 
 
 def install(path: Path) -> Path:
-    """Put weights where nodes look for them by their set's name, with all that lies beside them under their name.
+    """Copy weights, and the files that belong to them, to where nodes look for a weight set.
 
-    What they replace moves to the folder ``previous`` there.
+    Files that they replace move to the folder ``previous`` there.
 
     Args:
         path: ``MODEL-SET.safetensors`` in the folder of a training run.

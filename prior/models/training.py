@@ -20,21 +20,21 @@ from steadypose.prior.models.distributed import average_gradients, from_first, p
 from steadypose.prior.models.torch_weights import save_weights
 
 Loss = Callable[[int, float, np.random.Generator], tuple[Tensor, dict[str, float]]]
-"""Of a random batch: how many samples to draw, the share of the training that is done, in [0, 1), and random numbers to
-draw them by, which torchrun's processes do not share; to what is to be minimised, and the terms to plot."""
+"""The loss of a random batch, and terms to plot; called with the number of samples, the progress of the training in
+[0, 1), and a random generator, which differs between torchrun's processes."""
 
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """What the training of every model takes, as ``steadypose train`` has it.
+    """Options of ``steadypose train``, common to all models.
 
     Attributes:
-        data: ``prepared.npz``; where a model learns from something else, that.
+        data: ``prepared.npz``, or what a model is trained on instead.
         runs: folder of training runs; a killed run of the same name resumes there.
-        weights: which set: ``default`` or ``research``; of a sensor's correction, the sensor's name.
-        iterations: optimiser steps, at least 1; None: the model's own number.
-        seed: of weights and of sampling.
-        start: weights to go on from: a set or a path.
+        weights: the weight set, ``default`` or ``research``; for a sensor's correction, the sensor's name.
+        iterations: optimiser steps, at least 1; None for the model's default.
+        seed: of initial weights and of sampling.
+        start: weights to start from: a set or a path.
     """
 
     data: Path
@@ -55,18 +55,18 @@ class TrainingOptions:
 
 
 class TrainingRun:
-    """A training that survives being killed: its state lies in ``directory/checkpoint.pt``.
+    """A training that can be resumed: its state is in ``directory/checkpoint.pt``.
 
     Under torchrun, all processes start from the state of the first, which alone writes and evaluates; each draws its
     share of a batch, and gradients are averaged before the optimiser steps.
 
     Args:
         directory: where checkpoints, ``curves.json`` and ``curves.png`` go; a checkpoint there is resumed.
-        model: all that is learned or follows from it: averaged weights, say, that a post-step hook of the optimiser
-            keeps up, in an `nn.ModuleDict` beside the network.
-        schedule: of the learning rate, one step for each of its optimiser's.
-        iterations: how many steps the whole training has.
-        evaluations: how many evaluations and checkpoints.
+        model: all that the checkpoint must hold: the network, or an `nn.ModuleDict` of it and, say, averaged weights
+            that a post-step hook of the optimiser updates.
+        schedule: of the learning rate, stepped after each optimiser step.
+        iterations: steps of the whole training.
+        evaluations: number of evaluations and checkpoints.
     """
 
     def __init__(
@@ -95,14 +95,14 @@ class TrainingRun:
     def minimise(
         self, loss: Loss, evaluate: Callable[[], dict[str, float]], batch: int, seed: int, clip: float = math.inf
     ) -> None:
-        """Do the steps that are left; evaluate, checkpoint and draw every so often and at the end.
+        """Run the remaining steps, with evaluations, checkpoints and curves at intervals and at the end.
 
         Args:
             loss: called with the model in training mode.
             evaluate: quantities to plot beside the loss' terms; called in evaluation mode, without gradients.
             batch: samples a step, of all processes together.
             seed: of the batches.
-            clip: the most that the gradient's norm may be.
+            clip: maximum norm of the gradient.
         """
         parameters = [parameter for group in self._optimiser.param_groups for parameter in group["params"]]
         columns = (
@@ -129,13 +129,13 @@ class TrainingRun:
         self._model.eval()
 
     def save(self, path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, str]) -> Path:
-        """Write what came of the training: the model, its card, its curves.
+        """Write the trained model, its card and its curves.
 
         Args:
-            path: ``MODEL-SET.safetensors``; where nodes read weights it comes by `torch_weights.install`.
+            path: ``MODEL-SET.safetensors`` in the run's folder; `torch_weights.install` puts it where nodes read it.
             model: trained.
             config: what rebuilds it.
-            card: heading to content: what it is, its data, licence and training; how well it did is added here.
+            card: heading to content: model, data, licence and training; the last evaluation is added here.
 
         Returns:
             ``path``.

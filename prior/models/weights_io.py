@@ -37,7 +37,7 @@ _PARTS = {
     "occlusion": "deviation joint mean read think write",
     "trajectory": "blocks head",
 }
-"""Of each model, the top-level names of its state dict, by which a file of another model is told."""
+"""Top-level names of each model's state dict, by which a file of another model is recognised."""
 
 _OPTIONAL_PARTS = {"hgvae": {"completion"}, "humor": {"prior"}}
 _OTHER_SIZES = {"hmvae64": "hmvae", "hgvae-wide": "hgvae"}

@@ -32,7 +32,7 @@ CMU_LICENCE = "CMU mocap: free, no resale"
 """Free for all uses, products included; the data itself may not be resold; acknowledge NSF EIA-0196217."""
 
 CMU_FPS = 120.0
-"""Frames a second of CMU's AMC files, which do not tell it themselves."""
+"""Frames a second of CMU's AMC files, which do not state it."""
 
 REST_POSE_SPEED = 30.0
 """m/s. No body does this: a first frame that is left faster is a rest pose that a converter has put in front."""
@@ -81,7 +81,7 @@ class DataSet:
         files: a pattern (regex) of the names of the files or folders that hold it.
         weights: ``default`` if models trained on it may go into products, else ``research``.
         read: reads a file or folder.
-        split: tells of a clip whether it trains, validates or tests.
+        split: assigns a clip to training, validation or test.
     """
 
     name: str

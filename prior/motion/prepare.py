@@ -24,7 +24,7 @@ FPS = 30.0
 """Frames a second of everything that is trained on."""
 
 CUTOFF = 12.0
-"""Hz. 30 frames a second show motion up to 15 Hz; what is faster would come out as slower, and is taken out first."""
+"""Hz, cut-off of the low pass before resampling to 30 Hz, against aliasing."""
 
 FAST_ENOUGH = 50.0
 """Frames a second of recordings that can be played faster and still show at 30 Hz what the body did."""
@@ -57,8 +57,8 @@ class Prepared:
     Attributes:
         clip: its joints canonical, at 30 Hz, z up, floor at z = 0.
         weights: the set of weights it may train.
-        split: whether it trains, validates or tests.
-        speed: at how many times its speed it is played.
+        split: training, validation or test.
+        speed: factor by which it is sped up.
         offsets: (22, 3) metres, its subject's bones.
         rotations: (T, 22, 4) local, xyzw.
         contacts: (T, 8).
@@ -94,8 +94,8 @@ def prepare_clip(clip: Clip, weights: WeightSet, split: Split, speed: float = 1.
     Args:
         clip: as read, or `at_speed`.
         weights: the set of weights it may train.
-        split: what it is used for.
-        speed: at which it is played, for the accelerations that a body may have.
+        split: training, validation or test.
+        speed: factor by which it is sped up, which raises the limit of accelerations.
     """
     clip = clip.canonical()
     if clip.seconds < MIN_SECONDS:
@@ -202,7 +202,7 @@ def floor_height(positions: NDArray[np.float64]) -> float:
 
 
 def stays_on_floor(positions: NDArray[np.float64]) -> bool:
-    """Whether a recording at 30 Hz, floor at 0, has hardly a moment in which the lower toe stands still above it."""
+    """Whether, in a recording at 30 Hz with its floor at 0, the lower toe hardly ever rests above it."""
     toes, speed = _toes(positions)
     lower = toes[..., 2].argmin(axis=1)[:, None]
     height = np.take_along_axis(toes[..., 2], lower, axis=1)

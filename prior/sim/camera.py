@@ -1,9 +1,8 @@
 """A depth camera with a body tracker, filming simulated people.
 
-Each joint's line of sight is followed through the flesh of all bodies (capsules). What is hidden is guessed or
-lost; what lies near a silhouette now and then takes the depth of what is behind or in front. Everything else that
-is wrong comes from the `noise` model; its quick part grows with the distance, along the ray with its square, as
-disparity has it, across it in proportion.
+Each joint's line of sight is traced through the bodies (capsules). A hidden joint is guessed or lost; one near a
+silhouette sometimes takes the depth of what is behind or in front of it. All other errors come from the `noise` model;
+their quick part grows with the distance: along the ray with its square, as stereo does, across it in proportion.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ FRAME_ID = "camera_optical_frame"
 
 @dataclass(frozen=True)
 class Camera:
-    """Where a camera is and how it films.
+    """A camera: its pose, field of view, timing and tracker.
 
     Attributes:
         position: metres, world.
@@ -52,10 +51,10 @@ class Camera:
         near: metres in front of the camera within which it sees no depth.
         background: metres along the line of sight to the wall behind the people.
         fps: frames a second, nominally.
-        stamp_jitter: seconds, standard deviation of the frames' times about an even rhythm.
+        stamp_jitter: seconds, standard deviation of the frames' times about equal intervals.
         drop_rate: share of frames that never arrive.
         skeleton: the joints its tracker gives.
-        calibrated: whether its place in the world is told; if not, only which way is up.
+        calibrated: whether its pose in the world is known; if not, only the direction of gravity.
     """
 
     position: tuple[float, float, float]
@@ -112,12 +111,12 @@ class Camera:
 
 @dataclass(frozen=True)
 class Sight:
-    """What stands between a camera and joints (T, J).
+    """Occlusion of joints (T, J) from a camera.
 
     Attributes:
-        hidden: 0 free, 1 behind flesh, between at its edge.
-        in_front: metres of depth at which the hiding flesh lies; infinite where none does.
-        beside: metres of depth of the nearest other flesh that the ray all but touches; infinite where none does.
+        hidden: 0 visible, 1 behind a body, between at its edge.
+        in_front: metres, depth of the occluding surface; infinite where there is none.
+        beside: metres, depth of the nearest other surface that the ray nearly touches; infinite where there is none.
     """
 
     hidden: Floats
@@ -191,12 +190,12 @@ _FORGET_AFTER = 0.8  # seconds out of view after which it comes back under a new
 def film(
     people: Sequence[Motion], camera: Camera, noise: NoiseModel, rng: np.random.Generator, source: str, start_ns: int
 ) -> list[PoseRaw]:
-    """What the camera's tracker reports of people, frame by frame.
+    """The camera's tracker output, frame by frame.
 
     Args:
         people: motions that last equally long.
         camera: the camera.
-        noise: how its tracker errs.
+        noise: of its tracker.
         rng: source.
         source: the name of the stream.
         start_ns: stamp of second 0 of the motions.
@@ -239,7 +238,7 @@ def _track(
     truth = on_body.positions(person.positions, person.orientations, stature(person.offsets) / REST_HEIGHT)
     view = sight(truth, people, eye)
     hidden = as_tracked(view.hidden, on_body)
-    points = _exchanged(truth, on_body, swapped(dt, (), rng, _temptation(person, eye)))
+    points = _exchanged(truth, on_body, swapped(dt, (), rng, _swap_rate_factor(person, eye)))
 
     reach = np.linalg.norm(points - eye, axis=-1)
     drawn = draw_errors(travelled(person.positions), dt, rng, noise)
@@ -283,8 +282,8 @@ def as_tracked(hidden: Floats, on_body: Mount) -> Floats:
     return np.where(trunk, np.minimum(hidden, hidden[:, trunk].mean(axis=1, keepdims=True)), hidden)
 
 
-def _temptation(person: Motion, eye: Floats) -> Floats:
-    """(T,) 1 for a body that faces the camera, 10 for one that turns its side or back to it: sides then look alike."""
+def _swap_rate_factor(person: Motion, eye: Floats) -> Floats:
+    """(T,) factor of `SWAP_RATE`: 1 for a body that faces the camera, 10 for one seen from its side or back."""
     away = person.root - eye
     away /= np.linalg.norm(away, axis=-1, keepdims=True)
     facing = -(person.orientations[:, 0, :, 0] * away).sum(axis=-1)
@@ -300,7 +299,7 @@ def _exchanged(truth: Floats, on_body: Mount, when: dict[str, NDArray[np.bool_]]
 
 
 def _bursts(dt: Floats, rate: Floats, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """(T, J) on and off: bursts begin ``rate`` (T, J) times a second and last `_BLEED_DURATION` on average."""
+    """(T, J) bursts that begin ``rate`` (T, J) times a second, of mean duration `_BLEED_DURATION`."""
     begin = rng.random(rate.shape) < 1 - np.exp(-rate * dt[:, None])
     end = rng.random(rate.shape) < 1 - np.exp(-dt[:, None] / _BLEED_DURATION)
     on = np.zeros(rate.shape, dtype=bool)

@@ -1,8 +1,8 @@
-"""What a stereo depth camera sees of simulated people: their flesh, the room behind it, and how stereo errs.
+"""A stereo depth camera: renders simulated people in a room, with the errors of stereo matching.
 
-Errors are made on disparity, as a stereo matcher makes them, and grow with the distance as disparity has it: noise
-that neighbours share, steps of a fraction of a pixel, edges that bleed (the matcher's window spans both sides), what
-only one of the two cameras sees, and holes where nothing could be matched.
+Errors are simulated on disparity, so that they grow with the square of the distance: spatially correlated noise,
+quantisation to a fraction of a pixel, bleeding edges (the matcher's window spans both sides), half-occlusion (pixels
+that only one of the two cameras sees), and holes without a match.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class Stereo:
         focal: pixels.
         baseline: metres between the two cameras.
         noise: pixels of disparity, standard deviation.
-        step: pixels of disparity, the least it can tell.
-        window: pixels that the matcher compares at once.
-        holes: share of the image in which nothing is matched.
+        step: pixels of disparity, quantisation.
+        window: pixels, side of the matcher's window.
+        holes: share of the image without a match.
     """
 
     width: int = 640

@@ -1,8 +1,7 @@
 """Fit the noise model to a real Kinect: UI-PRMD, training subjects only.
 
-The statistics of its errors are matched by simulation: noise is drawn for the same motions, goes through the same
-alignment, and each parameter is scaled by the ratio of its own statistic in real to that in simulated errors, until
-they agree.
+Parameters are fitted by simulation: errors are drawn for the same motions and aligned in the same way, and each
+parameter is scaled by the ratio of its statistic in real errors to that in simulated ones, until they agree.
 
     python -m steadypose.prior.sim.fit PATH/TO/ui_prmd.npz
 """
@@ -113,7 +112,8 @@ def _discrepancy(real: Statistics, simulated: Statistics) -> float:
 
 
 def fit(clips: Sequence[Clip], report: Callable[[str], None]) -> NoiseModel:
-    """The model whose simulated errors look most like the real ones; ``report`` is told of each iteration."""
+    """The model whose simulated errors have statistics nearest to the real ones; ``report`` is called in each
+    iteration."""
     some = clips[::_EVERY]
     real = statistics(some)
     model = _initial(real)
@@ -129,7 +129,7 @@ def fit(clips: Sequence[Clip], report: Callable[[str], None]) -> NoiseModel:
 
 
 def draw(real: Sequence[Clip], simulated: Sequence[Clip], path: Path) -> None:
-    """Real beside simulated errors: how large, how they change from frame to frame, how long they last."""
+    """Plot real and simulated errors: their distribution, that of their changes, and their autocorrelation."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""Where the body goes on the ground, and where and when its feet step.
+"""Locomotion: the path of the pelvis, and where and when the feet step.
 
 A plan moves the pelvis over the floor; the feet follow from it. Time is counted in strides (the *phase*): the left
 foot swings from 0.05 to 0.45 of each stride and the right from 0.55 to 0.95, so that stance lasts 60 % and both

@@ -79,10 +79,10 @@ class Motion:
 
 @dataclass(frozen=True)
 class ArmAction:
-    """Something an arm does beside hanging and swinging.
+    """An action of an arm, blended with its swing.
 
     Attributes:
-        weight: (T,) 0 hangs and swings, 1 does this.
+        weight: (T,) 0 for the swing, 1 for this action.
         wrist: (T, 3) metres or (3,), in ``frame``.
         pole: (T, 3) or (3,), in the chest's frame: where the elbow points.
         frame: "world"; "pelvis": heading frame of the pelvis, origin at the pelvis; "shoulder": the chest's frame,

@@ -1,14 +1,16 @@
-"""How a depth camera's body tracker errs, as a random process with parameters fitted to a real Kinect.
+"""The errors of a depth camera's body tracker, as a random process with parameters fitted to a real Kinect.
 
-What `prior.sim.fit` finds on UI-PRMD, and what the model therefore says, of each joint:
+For each joint, as `prior.sim.fit` finds on UI-PRMD:
 
-- an **offset** that stays for a session, and a **bias** that wanders with the *distance the joint travels*, not
-  with time: a still joint keeps its error, whatever the frame rate;
-- **fast** noise that grows with the joint's speed and whose size itself swings over an order of magnitude
-  (log-normally, over half a second): the tails are heavy because the scale varies;
-- **jumps**: the joint sits elsewhere for a frame or for seconds (a wrong surface, the other limb), then returns;
+- an **offset**, constant for a session, and a **bias** that drifts with the *distance the joint travels*, not with
+time:
+  a still joint keeps its error, whatever the frame rate;
+- **fast** noise that grows with the joint's speed and whose scale varies over an order of magnitude (log-normally, with
+a
+  correlation time of half a second), which makes its tails heavy;
+- **jumps**: the joint is displaced for a frame or for seconds (a wrong surface, the other limb), then returns;
 - **swaps** of left and right limbs for short bursts;
-- a part of all this that all joints of the body share.
+- a share of all this that all joints of the body have in common.
 
 Errors are drawn in the frame of the camera's ray to the joint: along it, to its right, and up.
 """
@@ -40,16 +42,17 @@ SWAP_GROUPS: Mapping[str, tuple[int, ...]] = {
 
 SWAP_RATE: Mapping[str, float] = {"arms": 0.005, "legs": 0.01}
 SWAP_DURATION = 0.15
-"""Swaps a second and their seconds, assumed: UI-PRMD's people face the camera, with one swapped frame in 47 minutes."""
+"""Swaps a second, and their mean duration in seconds; assumed, as UI-PRMD's people face the camera and have one swapped
+frame in 47 minutes."""
 
 SPREAD_SPEED = 0.2
-"""m/s between a joint at rest and one in motion, as far as the spread of its fast noise goes."""
+"""m/s at which the spread of the fast noise is midway between that of a joint at rest and in motion."""
 
 FASTEST = 1.0
-"""m/s: the recordings that the noise is fitted to hold too little that is faster, so noise grows no further."""
+"""m/s above which the noise grows no further: the recordings hold too little faster motion to fit it."""
 
 LONGEST_JUMP = 1.2
-"""Metres: farther off a tracker would not call it the same body."""
+"""Metres: a joint farther off would not be assigned to the body."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +61,11 @@ class NoiseModel:
 
     Attributes:
         offset: (22, 3) metres, standard deviation of the session's offset.
-        bias: (22, 3) metres, standard deviation of the wandering bias (median of its log-normal spread).
+        bias: (22, 3) metres, standard deviation of the drifting bias (median of its log-normal spread).
         bias_length: metres of travel after which the bias is forgotten (1/e).
         bias_inertia: seconds that the bias lags behind, so that a fast joint does not shake with it.
-        session_spread: standard deviation of the log of how bad a joint is in a session: offset, bias and fast noise
-            go with it, and the rate of jumps with its square.
+        session_spread: standard deviation of the log of a joint's error scale in a session: offset, bias and fast noise
+            are proportional to it, the rate of jumps to its square.
         fast: (22, 3) metres, standard deviation of the fast noise at 0.3 m/s (median over its spread).
         fast_memory: seconds, correlation time of the fast noise.
         speed_floor: m/s below which speed no longer matters.
@@ -114,7 +117,7 @@ class NoiseModel:
         return cls(**arrays)
 
     def save(self, path: Path, about: Mapping[str, object]) -> None:
-        """Write the parameters beside what is to be said ``about`` them (provenance, figures)."""
+        """Write the parameters, after entries ``about`` them (provenance, figures)."""
 
         def plain(value: object) -> object:
             if isinstance(value, np.ndarray):
@@ -127,13 +130,13 @@ class NoiseModel:
 
 @dataclass(frozen=True)
 class Errors:
-    """A draw of the process.
+    """A sample of the process.
 
     Attributes:
         steady: (..., T, 22, 3) metres along the ray, to its right, up: offset and bias.
-        quick: the same of fast noise and jumps, which grow with the distance from the camera.
-        scale: (..., T, 22) metres, how large an error a tracker could know of: its fast noise's scale, half of a
-            jump, a tenth of what is steadily wrong.
+        quick: (..., T, 22, 3) metres, fast noise and jumps, which grow with the distance from the camera.
+        scale: (..., T, 22) metres, the error that a tracker could know of: the fast noise's scale, half of a jump, a
+            tenth of the steady error.
     """
 
     steady: Floats
@@ -142,7 +145,7 @@ class Errors:
 
 
 def draw_errors(travel: Floats, dt: Floats, rng: np.random.Generator, model: NoiseModel) -> Errors:
-    """Draw the errors of a tracker (but for swaps), from stationary beginnings.
+    """Sample the errors of a tracker, except for swaps, from the stationary distribution.
 
     Args:
         travel: (..., T, 22) metres each joint moved since the frame before.
@@ -210,7 +213,7 @@ def stationary(dt: Floats, memory: float, shape: tuple[int, int], rng: np.random
 
 
 def _jumps(shape: tuple[int, ...], dt: Floats, rate: Floats, rng: np.random.Generator, model: NoiseModel) -> Floats:
-    """Displacements (..., T, 22, 3) that last a while, ``rate`` (..., 22) times a second; zero most of the time."""
+    """Displacements (..., T, 22, 3) metres that begin ``rate`` (..., 22) times a second; 0 in between."""
     frames = shape[-3]
     state = (*shape[:-3], shape[-2])
     mean_duration = model.jump_short_share * model.jump_short + (1 - model.jump_short_share) * model.jump_long
@@ -250,15 +253,15 @@ def travelled(positions: Floats) -> Floats:
 
 
 def swapped(
-    dt: Floats, batch: tuple[int, ...], rng: np.random.Generator, temptation: Floats | float = 1.0
+    dt: Floats, batch: tuple[int, ...], rng: np.random.Generator, rate_factor: Floats | float = 1.0
 ) -> dict[str, NDArray[np.bool_]]:
     """When left and right are exchanged: (T, *batch) for each of `SWAP_GROUPS`.
 
-    ``temptation`` (T, *batch) multiplies `SWAP_RATE`, as for a body seen from its side.
+    ``rate_factor`` (T, *batch) multiplies `SWAP_RATE`, for a body seen from its side.
     """
     result: dict[str, NDArray[np.bool_]] = {}
     for group in SWAP_GROUPS:
-        rate = np.broadcast_to(SWAP_RATE[group] * np.asarray(temptation), (len(dt), *batch))
+        rate = np.broadcast_to(SWAP_RATE[group] * np.asarray(rate_factor), (len(dt), *batch))
         active = np.empty((len(dt), *batch), dtype=bool)
         on = rng.random(batch) < rate[0] * SWAP_DURATION
         for t in range(len(dt)):
@@ -281,20 +284,19 @@ def exchange_sides(positions: Floats, when: Mapping[str, NDArray[np.bool_]]) -> 
 
 
 def confidence_of(scale: Floats, rng: np.random.Generator) -> Floats:
-    """What a tracker says of itself: falls with the error it knows of, a half at 4 cm, with noise of its own.
+    """Confidence that a tracker states: decreasing with ``scale`` (see `Errors`), 0.5 at 4 cm, with noise of its own.
 
-    UI-PRMD keeps no confidences, so this is modelled on what trackers are like, not fitted: informative, and
-    sometimes wrong.
+    UI-PRMD has no confidences, so this is assumed, not fitted: informative, and sometimes wrong.
     """
     logit = 1.6 * np.log(0.04 / np.maximum(scale, 1e-4)) + 0.8 * rng.standard_normal(scale.shape)
     return 1.0 / (1.0 + np.exp(-logit))
 
 
 def corrupt(positions: Floats, rng: np.random.Generator, model: NoiseModel, fps: float = 30.0) -> tuple[Floats, Floats]:
-    """What a tracker would make of motion, without a scene: for training, thousands of windows a second.
+    """Tracked motion without a scene, for training: thousands of windows a second.
 
-    Each window is seen by a camera somewhere around it at the person's height. Nothing is lost and nothing hides
-    behind anything: that needs a `camera`.
+    Each window is seen by a camera at a random azimuth and at the person's height. Occlusion is not simulated: that
+    needs a `camera`.
 
     Args:
         positions: (..., T, 22, 3) metres, z up.

@@ -1,4 +1,4 @@
-"""The scenes: what people do, in our own words. Each gives the motions of one scene from a seed.
+"""The scenes: each function returns the motions of all people of one scene, from a seed.
 
 The stage is the world's floor. The camera stands near the origin and looks along +x, so a person who faces it
 has a yaw of pi, and stands 2 to 4 m away.

@@ -1,4 +1,4 @@
-"""The recordings of ``sim_data/``: a manifest says of each what is played, filmed how, and from which seed."""
+"""The recordings of ``sim_data/``, made from a manifest: script, camera, noise and seed of each."""
 
 from __future__ import annotations
 
@@ -102,11 +102,10 @@ def _stream(name: str, entry: Mapping[str, Any], folder: Path) -> Stream:
 
 
 def make(stream: Stream) -> tuple[list[PoseRaw], list[PoseWorld]]:
-    """Play, film, and write down the truth: frames for ``pose/raw`` and ``pose/truth``.
+    """Simulate and film a stream: frames for ``pose/raw`` and ``pose/truth``.
 
     The truth is on the 30 Hz grid that starts at the first raw frame, as the prior's output is. A joint's state says
-    whether the camera had it in view with a free line of sight (SEEN) or not (IMPUTED: whoever tells where it is
-    infers it).
+    whether the camera had it in view with a free line of sight (SEEN) or not (IMPUTED).
 
     Raises:
         ManifestError: the file of the noise's parameters is missing, or is none.

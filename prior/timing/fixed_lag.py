@@ -1,4 +1,4 @@
-"""Streaming textbook smoothers: what a user has for free, and what the prior's fuse stage is built on.
+"""Streaming filters from the literature: One-Euro, and a fixed-lag Kalman smoother.
 
 Both take one frame at a time, work on any number of joints at once (arrays of shape (..., 3)), use the real
 time between frames, and read a joint with a non-finite coordinate as missing. Nothing here looks at a clock.
@@ -26,7 +26,7 @@ class OneEuroFilter:
     """Low-pass filter whose cut-off rises with speed (Casiez, Roussel and Vogel, CHI 2012).
 
     The speed is the norm of the joint's filtered velocity, so the result does not depend on how the axes lie.
-    A missing joint holds its last estimate; the next measurement of it is weighed by the time since its last.
+    A missing joint holds its last estimate; the next measurement of it is weighted by the time since its last.
     """
 
     def __init__(self, min_cutoff_hz: float, beta: float, velocity_cutoff_hz: float = 1.0) -> None:
@@ -95,7 +95,7 @@ class FixedLagRTS:
         initial_speed: float = 1.0,
     ) -> None:
         """`delay`: frames of look-ahead. `acceleration_density`: power spectral density of the acceleration in
-        m^2/s^3, one for all joints or one each. `measurement_sigma`: metres, where `update` is not told."""
+        m^2/s^3, one for all joints or one each. `measurement_sigma`: metres, where `update` is given none."""
         if delay < 0:
             raise ValueError(f"fixed-lag smoother: expected a delay of 0 frames or more, got {delay}")
         self.delay = delay
@@ -208,7 +208,7 @@ def _ahead(step, density, variance, covariance, velocity_variance):
 
 @njit(cache=True)
 def _predict(slot, last, step, density, position, variance, with_position, with_velocity, velocity, velocity_variance):
-    """Put the frame ``step`` seconds after the last into ``slot``, before it is measured."""
+    """Predict the frame ``step`` seconds after the last into ``slot``."""
     for joint in range(len(density)):
         growth, known, covariance = density[joint] * step, velocity_variance[joint], with_velocity[last, joint]
         ahead = _ahead(step, density[joint], with_position[last, joint], covariance, known)

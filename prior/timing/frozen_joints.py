@@ -1,4 +1,4 @@
-"""Frozen joints: those of which a tracker repeats its last answer."""
+"""Frozen joints: those for which a tracker repeats its last output."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _MIN_NEW = 5
 
 @njit(cache=True)
 def frozen_joints(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(B, 22) joints that a tracker has lost and of which it repeats the last answer.
+    """(B, 22) joints that a tracker has lost and for which it repeats its last output.
 
-    They do so in most of the frames in which the body is not repeated whole, and other joints shake.
+    These repeat in most of the frames in which the body as a whole does not, while other joints jitter.
 
     Args:
         positions: (B, T, 22, 3) metres as the sensor gave them, NaN where it did not; the last frames count.

@@ -17,8 +17,8 @@ LOOK_AHEAD_NS = 10_000_000
 class Resampler:
     """Interpolates every slot's joints to grid times ``anchor + n / 30 s``, as frames come in.
 
-    Between two sightings of a joint positions are interpolated linearly and the lesser confidence holds. A grid
-    time is given out as soon as a frame is no more than 10 ms older: a stream of 30 Hz whose stamps jitter by a
+    Between two sightings of a joint its position is interpolated linearly, with the lesser confidence. A grid
+    frame is returned as soon as a frame is no more than 10 ms older: a stream of 30 Hz whose stamps jitter by a
     few milliseconds then costs no extra frame of delay.
 
     Args:

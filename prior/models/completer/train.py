@@ -1,7 +1,7 @@
 """Training of the completer: ``steadypose train completer``.
 
-Windows of true motion lose what somebody could want completed: all between two ends, frames between key frames, parts
-of the body, and these together; and some keep a little noise where they are known.
+Windows of true motion lose what `complete` is asked for: all frames between two ends, frames between key frames, parts
+of the body, and combinations of these; the known joints of some have a little noise.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CONTEXT = (2, 14)
 """Range of frames that are known around it, before and after together."""
 
 MIN_SPEED = 0.25
-"""m/s: a window is drawn as often as its joints are fast, and one that stands still as if they were this fast."""
+"""m/s, added to the joints' speed, to which the probability of drawing a window is proportional."""
 
 STRIDES = (1, 1, 1, 2)
 """Frame rates, as frames from one to the next."""
@@ -49,14 +49,14 @@ SCALES = (0.85, 1.15)
 """Range of factors on people's sizes."""
 
 NOISY, NOISE = 0.3, 0.015
-"""Share of windows whose known joints are noisy, and by how much at most: standard deviation along an axis, metres."""
+"""Share of windows whose known joints are noisy, and its largest standard deviation, metres along an axis."""
 
 POSE_WEIGHT, PATH_WEIGHT, ROTATION_WEIGHT, VELOCITY_WEIGHT = 4.0, 4.0, 1.0, 10.0
 """Of joints about the root and the root itself, metres; global rotation matrices; metres a frame of joints."""
 
 EASY = 0.05
-"""Metres, the error of the line that makes a window count half as much as one of which the line is right: in each, it
-is the share of the line's error that counts, and not most of all in those who jump."""
+"""Metres: a window's loss is divided by this plus the interpolation's error, so that the relative error counts and fast
+motion does not dominate."""
 
 _ARMS = limbs(("elbow", "wrist"), ("shoulder", "elbow", "wrist"))
 _LEGS = limbs(("knee", "ankle", "foot"), ("ankle", "foot"))
@@ -299,9 +299,9 @@ HIDDEN_PARTS = (
 
 @torch.no_grad()
 def calibrate(model: Completer, motion: MotionSet, windows: int = 128) -> CompleterConfig:
-    """The model's configuration with how far off validation finds its answers along an axis, root mean squares.
+    """The configuration with the model's RMS errors along an axis, measured on validation motion.
 
-    The frames are those with which the error in a gap grows from its ends most like the errors found.
+    The time constant, in frames, is the one that best fits the growth of the error from the ends of a gap.
     """
     never = np.full(22, np.nan)
     for part in (*HIDDEN_PARTS, [J["pelvis"]], [J["spine3"]]):

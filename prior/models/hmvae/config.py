@@ -1,4 +1,4 @@
-"""The sizes of an HM-VAE, as its weights tell them."""
+"""Sizes of an HM-VAE, as stored with its weights."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CHANNELS = (ROTATION_FEATURES, 12, 24, 48, 96)
 
 @dataclass(frozen=True)
 class HMVAEConfig:
-    """The sizes of an HM-VAE.
+    """Sizes of an HM-VAE.
 
     Attributes:
         window: frames T.
@@ -22,8 +22,8 @@ class HMVAEConfig:
         strides: of the four encoder blocks (official: 1, 2, 2, 1 for T = 8; 2, 2, 2, 2 for T = 64).
         local_latent: dimensions of z_l an edge (official: 6; 12).
         global_latent: dimensions of z_g an edge (official: 6; 24).
-        about_mean: whether the decoder tells how a window differs from its mean pose, which is observed, and not, as
-            the paper's, the pose itself. Most of what that one errs is the same over the window.
+        about_mean: whether the decoder gives the deviation of a window from its mean pose, which is observed, rather
+            than, as the paper's, the pose itself, whose error is mostly constant over the window.
     """
 
     window: int = 8

@@ -69,7 +69,7 @@ class MotionVAE(nn.Module, ABC):
         """Windows (B, T, 22, 6), less `around`, of z_l (B, edges, d) and z_g (B, edges, d)."""
 
     def around(self, x: Tensor) -> Tensor:
-        """What of windows x (B, T, 22, 6) the decoder does not tell: added to what it says."""
+        """The part of windows x (B, T, 22, 6) that is added to the decoder's output: their mean pose, or 0."""
         return x.new_zeros(())
 
     def reconstruct(self, x: Tensor) -> Tensor:

@@ -43,12 +43,12 @@ TILT_SD = math.radians(3.0)
 _LIMBS = limbs(("elbow", "wrist"), ("knee", "ankle", "foot"))
 
 ABOUT_MEAN_KL_WEIGHT = 0.0003
-"""beta of a model about the mean pose. What is left to tell is millimetres: at the paper's beta a bit of it costs more
-than the decimetre that it tells is worth, and the latents stay empty."""
+"""beta of a model about the mean pose, whose deviations are small: at the paper's beta the KL divergence outweighs what
+the latents gain, and they collapse to the prior."""
 
 NOISY, NOISE, HELD = 0.5, 0.03, 0.25
-"""Of a model about the mean pose: share of windows with noise, metres along an axis of joints at most, of which half is
-an error that lasts; and share of these with a limb that stays where it was."""
+"""For a model about the mean pose: share of windows with noise; its largest deviation, metres along an axis, half of
+the variance being slow; and share of these windows with a frozen limb."""
 
 LONG_CONFIG = HMVAEConfig(window=64, kernel=7, strides=(2, 2, 2, 2), local_latent=12, global_latent=24, about_mean=True)
 """Windows of 64 frames for `prior.offline.optimise`: the official sizes, but for a kernel of half as many frames, and
@@ -63,9 +63,9 @@ class Hyperparameters:
         iterations: optimiser steps.
         batch: windows a step.
         learning_rate: of Adam at the start; it falls to a third twice.
-        strides: frame rates, as frames from one to the next, each as likely as it stands there.
+        strides: frame strides of windows, drawn with equal probability for each entry.
         kl_weight: beta.
-        denoise: whether it sees windows through noise and occlusion, and is to give the clean ones.
+        denoise: whether its input is corrupted by noise and occlusion, the target being the clean window.
     """
 
     iterations: int
@@ -89,7 +89,8 @@ def train_hmvae(options: TrainingOptions) -> Path:
 
 
 def train_long_hmvae(options: TrainingOptions) -> Path:
-    """`train_hmvae` for windows of 64 frames, which completion searches: it sees noise and gives what is clean."""
+    """Train the denoising HM-VAE over windows of 64 frames that `complete --optimise` searches; the path of the
+    weights."""
     return _train("hmvae64", LONG_CONFIG, "window 64 about its mean pose", LONG, options)
 
 

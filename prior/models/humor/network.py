@@ -32,7 +32,7 @@ GROUPS = 16
 """of the group normalisation"""
 
 STEP_SCALE = 0.02
-"""Metres and radians: what a decoder's output of 1 stands for, about a deviation of what a frame changes."""
+"""Metres and radians, unit of the decoder's output: about the standard deviation of the change in one frame."""
 
 LOG_VARIANCES = (-10.0, 6.0)
 """The official code bounds them not at all, and drops steps that are not numbers without a word."""

@@ -1,4 +1,4 @@
-"""The state of a moving body, and the canonical frame that each of its steps is seen in (HuMoR, section 3 and B.1).
+"""The state of a moving body, and the canonical frame of each transition (HuMoR, section 3 and B.1).
 
 HuMoR's state holds SMPL's root, joint rotations and joints, and the velocities of all. Here joints are those that the
 rotations and this person's bones give, and velocities are differences to the step before, so that no two parts of a
@@ -100,7 +100,7 @@ def facing(orientation: Tensor) -> Tensor:
 
 
 def canonical(state: State, origin: State) -> State:
-    """``state`` as seen from where ``origin`` stands on the floor and faces."""
+    """``state`` in the canonical frame of ``origin``: its position on the floor, and its heading."""
     turn = facing(origin.rotations[..., 0, :, :])
     return _turned(_moved(state, -origin.root), turn.mT)
 
@@ -138,10 +138,10 @@ def features(state: State) -> Tensor:
 
 
 def pose_features(inputs: Tensor) -> Tensor:
-    """Of `features` of states in their own frames, those that a mixture of initial states knows: (..., 133).
+    """(..., 133) the `features` that the mixture of initial states is fitted to, of states in their own frames.
 
-    Height, joints from the root, velocities and turning: where joints are and go, as in the official code, without
-    the rotations, which follow from them but for twists.
+    Height, joints relative to the root, velocities and angular velocity, as in the official code, without the
+    rotations, which follow from the joints except for twists.
     """
     of_joints = 3 + 6 * JOINT_COUNT
     return torch.cat([inputs[..., 2:3], inputs[..., of_joints:]], dim=-1)

@@ -34,16 +34,17 @@ SCALES = (0.9, 1.1)
 """Range of factors on people's sizes."""
 
 MIN_SPEED = 0.1
-"""m/s: a sequence is drawn as often as its feet are fast, and one that stands as if they were this fast."""
+"""m/s, added to the speed of the feet, to which the probability of drawing a sequence is proportional."""
 
 KL_WEIGHT, KL_SHARE = 4e-4, 0.25
 """As the official code: nats are summed over the latent, all other terms are means. The share of the training in which
 it grows from 0."""
 
 JOINTS_WEIGHT, ROTATIONS_WEIGHT = 100.0, 10.0
-"""Of square metres and of square entries of rotation matrices, beside 1 of (m/s)². A velocity that is a difference
-weighs 900 times its joint: with 1, as in the paper, whose decoder says velocities by themselves, a rollout that is off
-would take half a minute to come back to where it should be; so it takes a third of a second."""
+"""Weights of squared joint errors (m²) and of squared entries of rotation matrices, relative to 1 of velocities
+((m/s)²). Velocities are differences here, 30 times an error of a joint: with the paper's weights of 1, whose decoder
+predicts velocities separately, a rollout would need half a minute to recover from an error; so it needs a third of a
+second."""
 
 CONTACT_WEIGHT, STILL_WEIGHT = 0.01, 0.01
 """Of the contacts' cross-entropy, and of the square velocity of what rests."""
@@ -53,7 +54,7 @@ TRUE_UNTIL, OWN_FROM = 0.15, 0.35
 starts from what the step before made; between, from either by chance."""
 
 MIN_SCALE = 0.02
-"""of a feature's deviation: some do not vary, such as where in its own frame a root stands"""
+"""Lower bound of a feature's standard deviation: some are constant, such as the root's place in its own frame"""
 
 _MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
 _STATES_OF_MIXTURE = 40_000

@@ -1,11 +1,11 @@
 """Networks of graph layers as live nodes run them: a few kinds of steps on matrices, forwards and backwards.
 
 Networks of this size are all overhead in torch: 250 small operations and their gradients take ten times as long as
-their arithmetic. Here one is written down once (`Program`) as a list of steps, which compiled loops run (`Network`).
+their arithmetic. Here one is recorded once (`Program`) as a list of steps, which compiled loops run (`Network`).
 
-Each step is done for one window after the other: a window's matrices of 66 nodes fit into the processor's first cache,
-where their products take half as long a window as those of eight side by side, and a step's weights are still at hand
-for the next window. So what is found for a window does not depend on the others, bit for bit.
+Each step runs for one window after the other: a window's matrices of 66 nodes fit into the L1 cache, where products
+take half as long per window as those of eight windows side by side, and a step's weights are still cached for the next
+window. So a window's results do not depend on the others, bit for bit.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ _LINE = 16
 
 
 class Program:
-    """A network written down: steps, the shapes of the matrices they work on, and all weights in one row.
+    """A network as a list of steps, with the shapes of their matrices, and all weights in one array.
 
-    Steps may write over a matrix. No gradient needs what it held: only what goes into `gelu` and `density` is asked for
-    again, and that is never written over.
+    Steps may overwrite a matrix: the backward pass reads only the inputs of `gelu` and `density`, which are never
+    overwritten.
     """
 
     def __init__(self) -> None:
@@ -115,7 +115,7 @@ class Program:
         return graph
 
     def gelu(self, of: int) -> int:
-        """Of a matrix, by itself."""
+        """GELU of a matrix, into a matrix of its own."""
         return self._step(_GELU, self.matrix(*self.shapes[of]), of, self._store(np.ones(1, dtype=np.float32)), _NONE)
 
     def sum(self, of: int, other: int) -> int:

@@ -1,4 +1,4 @@
-"""The edges of a skeleton as a graph: who is near whom, and which merge in pooling (HM-VAE, section 3.1).
+"""The edges of a skeleton as a graph: their neighbourhoods, and which merge in pooling (HM-VAE, section 3.1).
 
 An edge is the bone that ends in a joint and carries that joint's features; the root has a virtual edge of its own.
 Neighbourhoods and pooling pairs are derived from the skeleton's graph.

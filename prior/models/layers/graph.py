@@ -39,8 +39,8 @@ class GraphLinear(nn.Module):
 class GraphBlock(nn.Module):
     """Two graph convolutional layers beside a residual connection (equation 5).
 
-    The learned weight, 0 at first, stands on the layers' branch, as Bachlechner et al. (2020) have it and as the
-    official code does; the paper's formula puts it on the residual.
+    The learned weight, initially 0, multiplies the layers' branch, as in Bachlechner et al. (2020) and the official
+    code; the paper's formula puts it on the residual.
     """
 
     def __init__(self, nodes: int, features: int) -> None:

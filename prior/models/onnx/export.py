@@ -49,11 +49,11 @@ SMALL = 64
 
 @dataclass(frozen=True)
 class Form:
-    """A network and how its file is called from outside.
+    """A network, and the inputs and outputs of its ONNX file.
 
     Attributes:
         module: what is exported, in evaluation.
-        inputs: name to shape, without the first axis, which is of any size in all of them.
+        inputs: name to shape, without the first axis, the batch, which is of any size.
         outputs: names.
     """
 

@@ -1,4 +1,4 @@
-"""Each network of the prior as its ONNX file has it: from what a sensor shows to what the live form answers."""
+"""The networks of the prior as exported to ONNX: features included, with the outputs of the live forms."""
 
 from __future__ import annotations
 

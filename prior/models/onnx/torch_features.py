@@ -1,7 +1,7 @@
-"""What the networks read, as torch operations that ONNX knows: the compiled loops of the live node, without loops.
+"""The networks' input features as torch operations that ONNX supports: the live node's compiled loops, vectorised.
 
-Each function gives the same numbers as the one in `prior.models` that it names; the tests hold them together. Beside
-the network they make an ONNX file that takes what a sensor shows, so that nothing of this need be written in C++.
+Each function gives the same numbers as the one in `prior.models` that it names; the tests hold them together. Exported
+with the network, they make an ONNX file that takes joint positions, so that no features need be computed in C++.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ def completion_features(deviations: Tensor, observed: Tensor, bias_sigma: Tensor
     """The nodes (B, T / patch, inputs) and the line's variance (B, 22, T) of `hgvae.completion_features`.
 
     Args:
-        deviations: (B, 66, T) tracks about the training mean in units of `SCALE`, what was not seen guessed.
-        observed: (B, 66, T) more than 0 where seen.
-        bias_sigma: (B,) metres along an axis, the errors of the sensor that last.
+        deviations: (B, 66, T) tracks less the training mean, in units of `SCALE`; interpolated where not observed.
+        observed: (B, 66, T) more than 0 where observed.
+        bias_sigma: (B,) metres along an axis, the sensor's slow error.
         patch: frames in a node.
     """
     frames = deviations.shape[2]
@@ -124,7 +124,7 @@ def fault_features(
         tracks: (B, 66, T) metres, as they were seen.
         mean: (B, 66, T) metres, where HG-VAE would put them.
         sigma: (B, 66, T) metres, how sure it is.
-        observed: (B, 66, T) more than 0 where seen.
+        observed: (B, 66, T) more than 0 where observed.
         sensor_sigma: (B,) metres along an axis.
         origin: (66,) metres, of the network.
     """

@@ -25,11 +25,11 @@ FEATURES = 3 * VECTORS + 2 + 22
 
 @dataclass(frozen=True)
 class CorrectionConfig:
-    """The sizes of a correction network.
+    """Sizes of a correction network.
 
     Attributes:
         hidden: width of its two hidden layers.
-        sensor: which sensor's error it knows.
+        sensor: whose error it corrects.
     """
 
     hidden: int = 256
@@ -55,7 +55,7 @@ def _unit(v: Floats) -> Floats:
 
 
 def features(history: Floats, camera: Floats) -> Floats:
-    """What the network sees of each frame.
+    """The network's input.
 
     Args:
         history: (H, B, 22, 3) metres, z up, smoothed causally; row k is the frame `HISTORY[k]` frames ago, NaN where
@@ -82,7 +82,7 @@ def features(history: Floats, camera: Floats) -> Floats:
 def recall(frames: NDArray[np.float64]) -> NDArray[np.float64]:
     """(H, B, 22, 3) of the frames `HISTORY` ago among ``frames`` (T, B, 22, 3), the newest last.
 
-    A body younger than that is remembered as it was first seen.
+    Before a body's first frame, its first frame is repeated.
     """
     seen = np.isfinite(frames[..., 0]).any(axis=-1)
     first = np.where(seen.any(axis=0), seen.argmax(axis=0), len(frames) - 1)

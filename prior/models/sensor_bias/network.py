@@ -1,8 +1,8 @@
 """A sensor's systematic error, as a function of the pose that it shows.
 
-A smoother removes what changes from frame to frame; most of a depth camera's error does not: it depends on the pose,
-on what hides what, and on the direction of view, and stays while these do. This network learns it from recordings of
-the sensor beside a reference, and says, frame by frame, where the joints really were.
+A smoother removes jitter; most of a depth camera's error is slow: it depends on the pose, on self-occlusion and on the
+direction of view, and stays while these do. This network learns it from recordings of the sensor with a reference, and
+gives, frame by frame, the correction of each joint.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ def test_windows_may_come_in_any_batch_and_as_short_as_one_frame() -> None:
 
 def test_swaps_exchange_whole_limbs_for_a_moment() -> None:
     positions = np.random.default_rng(0).normal(size=(900, 22, 3))
-    when = swapped(np.full(900, 1 / 30), (), np.random.default_rng(1), temptation=20.0)
+    when = swapped(np.full(900, 1 / 30), (), np.random.default_rng(1), rate_factor=20.0)
     seen = exchange_sides(positions, when)
     for group, joints in SWAP_GROUPS.items():
         active = when[group]
