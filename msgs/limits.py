@@ -1,4 +1,4 @@
-"""How much a message may hold, looked at before any of it is decoded."""
+"""Limits of a message's size, checked before any of it is decoded."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """One MCAP file, read chunk by chunk, so that what is damaged costs what is damaged and nothing else.
 
-The index at the end of a file is believed if its checksum holds. Otherwise, as after the writer was killed, the file
-is gone through from its beginning; where bytes are no record, the search goes on at the next that look like a chunk. A
+The index at the end of a file is used if its checksum is right. Otherwise, as after the writer was killed, the file is
+scanned from its beginning; where bytes are no record, the scan goes on at the next that look like a chunk. A
 chunk whose checksum does not hold is left out and counted; all others are read. What a chunk may become when it is
 decompressed has a limit, so that a small file cannot fill the memory.
 """
@@ -270,7 +270,7 @@ class McapFile:
                 elif inner == Opcode.CHANNEL:
                     channels |= {(found := _parse(Channel, data)).id: found}
                 elif inner == Opcode.SCHEMA:
-                    schemas |= {(told := _parse(Schema, data)).id: told}
+                    schemas |= {(schema := _parse(Schema, data)).id: schema}
             # what a checksum covers goes before what none does
             self.channels |= channels
             self.schemas |= schemas
@@ -279,7 +279,7 @@ class McapFile:
         elif opcode == Opcode.CHANNEL:
             self.channels.setdefault((found := _parse(Channel, body)).id, found)
         elif opcode == Opcode.SCHEMA:
-            self.schemas.setdefault((told := _parse(Schema, body)).id, told)
+            self.schemas.setdefault((schema := _parse(Schema, body)).id, schema)
         elif opcode == Opcode.HEADER:
             _parse(Header, body)
         elif opcode == Opcode.MESSAGE_INDEX:

@@ -230,8 +230,8 @@ class Subscriber:
         """Count who was not let in, and connect again where ZeroMQ has given up, as it does after too large a frame."""
         self._looked = now
         while self._monitor.poll(0):
-            told, at = self._monitor.recv_multipart()
-            event, _ = _EVENT.unpack(told)
+            description, at = self._monitor.recv_multipart()
+            event, _ = _EVENT.unpack(description)
             endpoint = at.decode(errors="replace")
             if event & _HANDSHAKES:
                 self._refuse("handshake")

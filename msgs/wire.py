@@ -33,7 +33,7 @@ class Listener(NamedTuple):
 
     name: str
     instance: int
-    """drawn at random, so that one that starts again is told from the one before, uint32"""
+    """drawn at random at start, so that a restarted publisher is recognised as a new one, uint32"""
     reliable: tuple[str, ...] = ()
     """topics of which it must miss nothing"""
 

@@ -1,4 +1,4 @@
-"""The ``steadypose`` command: one line of help for each subcommand here, everything else where it is done.
+"""The ``steadypose`` command: dispatch to subcommands, with one line of help for each.
 
 A subcommand is a typed function with a docstring, in a module of its own that is imported when it is chosen, so that
 `steadypose --help`, or a subcommand that needs no torch, never waits for one that does.
@@ -47,7 +47,7 @@ COMMANDS = {
         "steadypose.nodes.commands.calibrate.command:calibrate",
         "a camera's lens and place in the world, into its launch file",
     ),
-    "doctor": ("steadypose.nodes.commands.doctor:doctor", "what is missing on this machine, and how to get it"),
+    "doctor": ("steadypose.nodes.commands.doctor.command:doctor", "what is missing on this machine, and how to get it"),
     "keys": ("steadypose.nodes.commands.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),
 }
 

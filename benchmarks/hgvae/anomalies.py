@@ -126,10 +126,10 @@ def _false_alarms(bench: Bench, network: FaultNet, model: HGVAE, data: Data) -> 
             odds, paces = scored(everything.only(~known), count)
             ones = np.ones(len(paces))
             scale = Calibration.load("default").limits(np.zeros(len(paces), dtype=int), sigma * ones, paces)
-            told = decimals(odds.max(axis=1)[:, None], scale)
+            anomaly = decimals(odds.max(axis=1)[:, None], scale)
             records.append(
                 {"people": "kinds of motion never seen (Bandai-Namco)", "windows": count}
-                | _above(told, -np.log10(RATES))
+                | _above(anomaly, -np.log10(RATES))
             )
     return records
 

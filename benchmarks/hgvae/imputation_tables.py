@@ -102,8 +102,8 @@ def whole_joints(bench: Bench, found: dict[str, HGVAE], data: Data) -> Result:
                     hidden[:, 1:] = rng.permuted(np.tile(np.arange(21) < count, (len(rows), 1)), axis=1)
                 for method, errors in imputation.whole_joints(model, positions, sizes, hidden).items():
                     for who in np.unique(person):
-                        told = method, str(who)
-                        sums[told] = sums.get(told, 0.0) + float(errors[person == who].sum())
+                        key = method, str(who)
+                        sums[key] = sums.get(key, 0.0) + float(errors[person == who].sum())
             entries = 3 * frames * count * draws
             for method, who in sums:
                 entry = {"weights": NAMES[name], "joints": count, "method": method, "person": who}

@@ -154,10 +154,10 @@ class Kinect:
         """`run_ours` over everybody's clips the first time, remembered after that."""
         if (name, delay, clips[0].name) not in self._answers:
             positions, stated = run_ours(self.clips, settings, delay)
-            for clip, own, told in zip(self.clips, positions, stated, strict=True):
-                self._answers[name, delay, clip.name] = own, told
+            for clip, own, sigma in zip(self.clips, positions, stated, strict=True):
+                self._answers[name, delay, clip.name] = own, sigma
         found = [self._answers[name, delay, clip.name] for clip in clips]
-        return [own for own, _ in found], [told for _, told in found]
+        return [own for own, _ in found], [sigma for _, sigma in found]
 
 
 def best_without(left_out: str, search: Tuned, peer: Peer) -> dict[str, float]:

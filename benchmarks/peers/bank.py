@@ -41,8 +41,8 @@ def bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
     found = [smooth(seen, stamps_s, delay, 2, density, sigma) for density in DENSITIES]
     past = np.cumsum([f.log_likelihood for f in found], axis=1)
     past[:, _RECENT:] -= past[:, :-_RECENT].copy()
-    told = past[:, np.minimum(np.arange(frames) + delay, frames - 1)]
-    weights = np.exp(told - told.max(axis=0))
+    log_likelihood = past[:, np.minimum(np.arange(frames) + delay, frames - 1)]
+    weights = np.exp(log_likelihood - log_likelihood.max(axis=0))
     weights /= weights.sum(axis=0)
     mixed = sum(w[..., None] * f.positions for w, f in zip(weights, found, strict=True))
     return np.asarray(mixed).reshape(frames, *joints, 3)

@@ -10,15 +10,15 @@ from steadypose.msgs.types import PoseClean, PoseRaw
 from steadypose.nodes.checks.problem import Problem, warning
 
 ENOUGH = 20
-"""bodies between two looks, to judge by"""
-MOST = 0.7
+"""bodies between two checks, at least, for a judgement"""
+MAX_SHARE = 0.7
 """of the joints refused, or of the poses flagged"""
-LOOKS = 3
-"""in a row that find nearly all flagged: a fault that is over within two seconds is the flag's own to tell"""
+CHECKS = 3
+"""checks in a row with nearly all bodies flagged: a shorter fault is what the flag itself reports"""
 
 
 class Answers:
-    """Counts what goes in and comes out between two looks.
+    """Counts the pipeline's input and output between two checks.
 
     Args:
         counters: of the pipeline.
@@ -39,11 +39,11 @@ class Answers:
         self._flagged += sum(body.anomaly_flag for body in clean.bodies)
 
     def problems(self) -> list[Problem]:
-        """What was wrong with the answers since the last look."""
+        """Problems with the output since the last check."""
         refused_ever = self._counters["joints_refused"]
         refused, self._refused_before = refused_ever - self._refused_before, refused_ever
         found = []
-        if self._in >= ENOUGH and refused > MOST * self._joints:
+        if self._in >= ENOUGH and refused > MAX_SHARE * self._joints:
             found.append(
                 warning(
                     "nearly_all_refused",
@@ -52,9 +52,9 @@ class Answers:
                     "arrival, take those of capture",
                 )
             )
-        nearly_all = self._out >= ENOUGH and self._flagged > MOST * self._out
+        nearly_all = self._out >= ENOUGH and self._flagged > MAX_SHARE * self._out
         self._flagged_looks = self._flagged_looks + 1 if nearly_all else 0
-        if self._flagged_looks >= LOOKS:
+        if self._flagged_looks >= CHECKS:
             found.append(
                 warning(
                     "nearly_all_flagged",

@@ -22,7 +22,7 @@ SIZES = (0.5, 1.4)
 UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281, "kilometres": 0.001}
 ADULT_M = 1.72
 UPRIGHT, ALONG = 0.5, 0.85
-"""cosines: with the vertical, of somebody who bends; with an axis, of somebody who stands along it"""
+"""cosines: of the angle to the vertical below which a body may be bending; to an axis above which it stands along it"""
 MIRRORED = -0.2
 """handedness: trackers of the field stay above 0.2"""
 FASTEST = 8.0

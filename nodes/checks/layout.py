@@ -72,7 +72,7 @@ def _wrong_count(messages: Sequence[PoseRaw], skeleton: Skeleton, count: int) ->
 
 
 def _best(messages: Sequence[PoseRaw]) -> tuple[str, int] | None:
-    """The layout in which what came is a body, and its number of joints."""
+    """The layout under which the joints fit a body best, and its number of joints."""
     counts = Counter(len(body.positions) for body in bodies(messages))
     if not counts:
         return None

@@ -1,4 +1,4 @@
-"""A problem with a stream, as it is told in `diagnostics`, on the console and by `steadypose doctor --live`."""
+"""A problem with a stream, as reported in `diagnostics`, on the console and by `steadypose doctor --live`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ PREFIX = "problem."
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong.
+    """A problem.
 
     Attributes:
-        level: ERROR where nothing useful can come out, WARN where what comes out is worse than it need be.
+        level: ERROR if no useful output is possible, WARN if the output is worse than it could be.
         cause: in a word; docs/troubleshooting.md has one entry for each.
-        text: what came, what was expected, and what to do.
+        text: what was received, what was expected, and what to do.
     """
 
     level: Level

@@ -13,7 +13,7 @@ SECOND_NS = 1_000_000_000
 ENOUGH = 10
 """messages to judge by"""
 RATES_HZ = (4.0, 300.0)
-"""what trackers give"""
+"""usual frame rates of trackers"""
 SLOW_HZ = 9.0
 """below that, half of what moves is gone between two frames"""
 UNITS = {"seconds": 1e9, "milliseconds": 1e6, "microseconds": 1e3, "ticks of 100 ns": 100.0}
@@ -65,7 +65,7 @@ def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem
 
 
 def _unit(stamps: np.ndarray) -> Problem | None:
-    """What is said where stamps are not nanoseconds."""
+    """The problem with stamps that are not nanoseconds."""
     newest, rising = int(stamps[-1]), np.diff(stamps)
     if not stamps.any():
         return error(

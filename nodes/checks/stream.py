@@ -23,11 +23,11 @@ NOBODY = 60
 
 
 class StreamCheck:
-    """Looks at a stream and says what is wrong with it.
+    """Checks a stream of ``pose/raw`` for misuse.
 
     Args:
-        max_bodies: that the prior follows at once.
-        identified: whether the prior finds ids itself.
+        max_bodies: bodies that the prior tracks at once.
+        identified: whether the prior assigns ids itself.
     """
 
     def __init__(self, max_bodies: int, *, identified: bool = False) -> None:
@@ -92,7 +92,7 @@ class StreamChecks:
 
     Args:
         max_bodies, identified: as of `StreamCheck`.
-        streams: how many to tell apart.
+        streams: number of sources.
     """
 
     def __init__(self, max_bodies: int, *, identified: bool, streams: int) -> None:

@@ -1,4 +1,4 @@
-"""The last second of a stream, as the checks look at it."""
+"""The last second of a stream, which the checks examine."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Arrival:
 
 
 class Window:
-    """The messages of the last moments, by when they came."""
+    """The messages of the last second, with their times of arrival."""
 
     def __init__(self) -> None:
         self._arrivals: deque[Arrival] = deque(maxlen=LONGEST)
@@ -56,7 +56,7 @@ def bodies(messages: Sequence[PoseRaw]) -> Iterator[RawBody]:
 
 
 def tracks(messages: Sequence[PoseRaw], joints: int) -> NDArray[np.float64]:
-    """(N, J, 3) the joints of all bodies of as many joints as the layout has; what is not finite is NaN."""
+    """(N, J, 3) the joints of all bodies that have as many as the layout; NaN where not finite."""
     found = [body.positions for body in bodies(messages) if len(body.positions) == joints]
     stacked = np.array(found, np.float64).reshape(-1, joints, 3)
     return np.where(np.isfinite(stacked).all(axis=-1, keepdims=True), stacked, np.nan)

@@ -56,13 +56,13 @@ def stream(
 
 @dataclass(frozen=True)
 class Cleaned:
-    """What cleaning one recording came to.
+    """Summary of the cleaning of one recording.
 
     Attributes:
         frames: of the input.
         duration_s: from its first stamp to its last.
-        spent_s: what it took.
-        poses: of bodies, given in answer; none if no body was recognised.
+        spent_s: computing time.
+        poses: number of poses in the output; 0 if no body was recognised.
         refused: what was refused or dropped, by cause.
         problems: what is wrong with the input, each as it was first found.
         unread: what of it the input holds and could not be read, because it is damaged.

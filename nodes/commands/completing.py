@@ -34,7 +34,7 @@ from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettin
 Floats = NDArray[np.float64]
 
 APART_NS = 8_000_000_000
-"""Nobody knows what somebody did who was not seen for longer than this."""
+"""A longer gap without any sighting of a body is not filled: a new stretch begins."""
 
 BETWEEN_NS = PERIOD_NS * 3 // 2
 """Joints seen so far apart, at most, are joined by a line; between others motion is filled in."""
@@ -75,7 +75,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Done:
-    """What completing one recording came to.
+    """Summary of the completion of one recording.
 
     Attributes:
         frames: given out.
@@ -114,7 +114,7 @@ def complete_recording(
         source: a recording or file of poses.
         out: the recording to make, or .npz.
         fill: a completer.
-        uncertainty: how sure to be of what it gives.
+        uncertainty: standard deviations of its output.
         replace: whether what is at ``out`` may be replaced, if it is a recording or an .npz.
         began: called with the number of frames of all bodies together.
         advanced: called with how many of them are done.

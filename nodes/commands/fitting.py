@@ -1,4 +1,4 @@
-"""How one recording is fitted offline: what the nodes make of it is where test-time optimisation begins."""
+"""Offline fit of one recording: test-time optimisation, initialised by the nodes' output."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def fit_body(
 
 
 def rewritten(messages: Sequence[tuple[str, Message]], fits: Sequence[Fit]) -> list[tuple[str, Message]]:
-    """The messages of a cleaned stream with what was fitted in place of what the nodes said."""
+    """The messages of a cleaned stream, with poses replaced by the fitted ones."""
     clean: dict[tuple[int, int], CleanBody] = {}
     world: dict[tuple[int, int], tuple[Fit, int]] = {}
     planes: dict[int, Floats] = {}

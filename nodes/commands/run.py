@@ -32,7 +32,7 @@ from steadypose.nodes.sinks.recorder import RecorderSettings
 
 LINE_NS = 5_000_000_000
 """between lines where there is no terminal for a table"""
-TELL_NS = 1_000_000_000
+REPORT_NS = 1_000_000_000
 """between two times the health file is written"""
 REPLAY = "replay"
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
@@ -114,7 +114,7 @@ class _Run:
         self._without: list[str] = []
         self._progress_ns = clock.monotonic_ns()
         self._printed_ns = clock.monotonic_ns()
-        self._told_ns = 0
+        self._reported_ns = 0
         self._ready = False
 
     def watch(self) -> int:
@@ -140,7 +140,7 @@ class _Run:
                         received = subscriber.receive(0)
                     supervisor.poll()
                     self._show(supervisor, live)
-                    self._tell(supervisor)
+                    self._report(supervisor)
                     status = self._exit_status(supervisor)
             except KeyboardInterrupt:
                 status = 0
@@ -155,11 +155,11 @@ class _Run:
             return 1
         return status
 
-    def _tell(self, supervisor: Supervisor) -> None:
+    def _report(self, supervisor: Supervisor) -> None:
         """Say how things are to who is no person: once a second, a file and systemd."""
-        if self._clock.monotonic_ns() - self._told_ns < TELL_NS:
+        if self._clock.monotonic_ns() - self._reported_ns < REPORT_NS:
             return
-        self._told_ns = self._clock.monotonic_ns()
+        self._reported_ns = self._clock.monotonic_ns()
         write_health(self._launch.transport.ipc_directory, sorted(self._required), supervisor, self._diagnostics)
         if not self._ready and all(name in self._diagnostics for name in self._required):
             self._ready = True
@@ -178,15 +178,15 @@ class _Run:
         if last is None or _counts(last) != _counts(diagnostics):
             self._progress_ns = self._clock.monotonic_ns()
         self._diagnostics[diagnostics.node] = diagnostics
-        self._tell_problems(diagnostics)
+        self._print_problems(diagnostics)
 
-    def _tell_problems(self, diagnostics: Diagnostics) -> None:
+    def _print_problems(self, diagnostics: Diagnostics) -> None:
         """Print what is newly wrong, and what no longer is."""
         problems = from_values(diagnostics.values)
-        told = self._problems.get(diagnostics.node, set())
-        for cause in sorted(problems.keys() - told):
+        known = self._problems.get(diagnostics.node, set())
+        for cause in sorted(problems.keys() - known):
             self._print(f"{diagnostics.node}: {diagnostics.level.name}: {problems[cause]} [{cause}]")
-        for cause in sorted(told - problems.keys()):
+        for cause in sorted(known - problems.keys()):
             self._print(f"{diagnostics.node}: no longer: {cause}")
         self._problems[diagnostics.node] = set(problems)
 

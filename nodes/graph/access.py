@@ -68,7 +68,7 @@ class TransportSettings:
         return Path(self.directory) if self.directory else local_directory()
 
     def make_ipc_directory(self) -> Path:
-        """Make it, for nobody but this user.
+        """Make the directory of the sockets, accessible to this user only.
 
         Raises:
             TransportError: it is there, and others may write to it.

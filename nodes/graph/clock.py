@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 FRAME_NS = 1_000_000_000 / FPS
 """of the grid the models run on"""
 POLL_S = 0.1
-"""the longest a node waits for anything before it looks whether it should stop"""
+"""the longest that a node waits for anything before it checks whether to stop"""
 
 
 class Clock(Protocol):

@@ -1,7 +1,7 @@
-"""``health.json``: how a run is doing, for whoever watches a machine without a screen.
+"""``health.json``: the state of a run, for monitoring a machine without a screen.
 
-It lies beside the sockets and is written anew every second, whole or not at all. Its own age is the first thing to look
-at: a file older than a few seconds means that nobody writes it any more.
+It lies in the directory of the sockets and is rewritten atomically once a second. Check its age first: a file older
+than a few seconds is no longer written.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ def write_health(
     supervisor: Supervisor,
     diagnostics: Mapping[str, Diagnostics],
 ) -> None:
-    """Write what holds now. A disk that is full is no reason to stop.
+    """Write the file. A full disk, like any other OSError, is ignored.
 
     Args:
         directory: of the sockets.
-        required: nodes without which there are no poses.
+        required: nodes that ``ok`` demands to be running.
         supervisor: of the run.
-        diagnostics: the last ones of each node.
+        diagnostics: the latest of each node, by its name.
     """
     nodes = {name: _node(name, supervisor, diagnostics.get(name)) for name in supervisor.children}
     health = {
@@ -51,19 +51,19 @@ def write_health(
 def _node(name: str, supervisor: Supervisor, latest: Diagnostics | None) -> dict[str, Any]:
     child = supervisor.children[name]
     known = child.state == "running" and latest is not None
-    told: dict[str, Any] = {"state": child.state, "restarts": child.restarts, "silent_s": round(child.silent_s, 1)}
+    status: dict[str, Any] = {"state": child.state, "restarts": child.restarts, "silent_s": round(child.silent_s, 1)}
     if known and latest:
         values, stream = latest.values, NODES[name].stream
-        told |= {
+        status |= {
             "state": values.get("state", child.state).partition(" ")[0],
             "level": Level(latest.level).name,
             "message": latest.message,
             "memory_mb": float(values.get("memory_mb", 0)),
         }
         if stream and f"rate.{stream}" in values:
-            told["rate_hz"] = float(values[f"rate.{stream}"])
+            status["rate_hz"] = float(values[f"rate.{stream}"])
         if "latency_ms.p99" in values:
-            told["latency_p99_ms"] = float(values["latency_ms.p99"])
+            status["latency_p99_ms"] = float(values["latency_ms.p99"])
     elif child.state == "running":
-        told["state"] = "starting"
-    return told
+        status["state"] = "starting"
+    return status

@@ -1,4 +1,4 @@
-"""The queue of a node: what came and is not yet worked on."""
+"""The queue of a node: messages received and not yet processed."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ READ_AHEAD = 64
 
 
 class Inbox:
-    """What came and is not yet worked on.
+    """Messages received and not yet processed.
 
-    Where it comes from several subscribers, as from the kiosks of a server, each has a queue of its own, and they take
-    turns: one that floods the node loses its own messages, and nobody else's.
+    With several subscribers, as for the kiosks of a server, each has a queue of its own, and they take turns: one that
+    floods the node loses only its own messages.
 
     Args:
         subscribers: where it comes from.
@@ -42,7 +42,7 @@ class Inbox:
         return sum(len(queue.waiting) for queue in self._queues)
 
     def next(self, timeout_s: float) -> tuple[str, Message] | None:
-        """The oldest message kept of whoever's turn it is, or None if none comes in time."""
+        """The oldest message of the queue whose turn it is, or None if none comes in time."""
         if len(self._queues) == 1:
             self._queues[0].fill(timeout_s)
         else:

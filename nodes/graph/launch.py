@@ -33,7 +33,7 @@ Settings = TypeVar("Settings")
 
 @dataclass(frozen=True)
 class _EveryLaunch:
-    """What a launch file says beside the sections of its nodes."""
+    """The settings of a launch file that are common to all nodes."""
 
     nodes: list[str] = field(default_factory=lambda: list(POSE_NODES))
     transport: TransportSettings = field(default_factory=TransportSettings)
@@ -47,7 +47,7 @@ class Launch(_EveryLaunch):
     """A launch file as read, with the overrides of the command line applied."""
 
     sections: Mapping[str, Any] = field(default_factory=dict)
-    """those sections of nodes that the file has; `settings` and `table` give them, or the defaults"""
+    """the sections of nodes that the file has; see `settings` and `table`"""
 
     def __post_init__(self) -> None:
         for node in self.nodes:

@@ -1,4 +1,4 @@
-"""What every node is: a process that takes messages, publishes messages, and reports once a second how it is doing.
+"""Base of all nodes: a process that takes messages, publishes messages, and reports its state once a second.
 
 **When a node falls behind.** A recording can wait: with ``lossless`` a full node holds up the one before it, back to
 the source, so that every frame arrives and a replay repeats. A camera cannot: otherwise a node keeps the newest
@@ -78,7 +78,7 @@ class Node(ABC):
         return {}
 
     def problems(self) -> list[Problem]:
-        """What this node found wrong with its stream since it was last asked."""
+        """Problems with this node's stream since the last call."""
         return []
 
     @property
@@ -148,7 +148,7 @@ class Node(ABC):
             self.report()
 
     def _addresses(self) -> Iterator[list[str]]:
-        """Of the publishers to hear; each kiosk by itself, so that none takes the share of another."""
+        """Addresses of the publishers to subscribe to; one subscriber for each kiosk, so that none starves another."""
         nodes, kiosks = NODES[self.name].subscribes, self.launch.server.kiosks
         if "pose_input" in nodes:
             yield from ([address] for address in kiosks)
@@ -225,12 +225,12 @@ class Node(ABC):
         return True
 
     def note_end(self, topic: str) -> None:
-        """A stream has ended; whoever waits for that should not have to wait a second."""
+        """Report at once that a stream has ended, not only with the next second's diagnostics."""
         self.health.ended.add(topic)
         self.report()
 
     def report_if_due(self) -> None:
-        """Publish `diagnostics` if the last were a second ago."""
+        """Publish `diagnostics` if the last are a second old."""
         if self.health.due:
             self.report()
 
@@ -257,7 +257,7 @@ class Node(ABC):
         return self.health.report(self.name, received, self.status(), [*self._wire_problems(), *self.problems()])
 
     def _wire_problems(self) -> Iterator[Problem]:
-        """What came and is no message, since this was last asked."""
+        """Problems with received bytes that are no messages, since the last call."""
         if self._inbox is None:
             return
         refused = sum((subscriber.refused for subscriber in self._subscribers), Counter[str]())

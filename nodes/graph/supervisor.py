@@ -14,17 +14,17 @@ from steadypose.nodes.graph.node import SUPERVISOR
 from steadypose.nodes.graph.topology import NODES
 
 BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""before each restart in a row; the last one repeats for as long as it takes"""
+"""pauses before successive restarts; the last one repeats"""
 STEADY_S = 10.0
-"""a node that ran for so long begins with the first pause again"""
+"""after running for so long, a node's next restart waits for the first pause again"""
 TRIES = 6
 """of a node that was not heard once: then it has failed"""
 STARTING_S = 600.0
 """until a node must be heard; the first start on a small machine compiles for minutes"""
 STALE_S = 3.0
-"""silence of a node, which reports once a second, from which on nothing that it said before holds"""
+"""silence of a node, which reports once a second, after which its last report no longer counts"""
 HUNG_S = 10.0
-"""silence after which it is killed, and started again"""
+"""silence after which a node is killed and restarted"""
 STOP_S = 5.0
 """between SIGTERM and SIGKILL"""
 USAGE_ERROR = 2
@@ -44,9 +44,9 @@ class Child:
     """One node's process.
 
     Attributes:
-        state: ``running``, ``stale`` (it runs, and is not heard), ``crashed`` (and about to start again), ``ended``, or
+        state: ``running``, ``stale`` (runs, but does not report), ``crashed`` (waiting for its restart), ``ended``, or
             ``failed``.
-        restarts: how often it was started again.
+        restarts: their number.
     """
 
     def __init__(self, name: str, command: Sequence[str], clock: Clock, log: Callable[[str], None]) -> None:
@@ -72,7 +72,7 @@ class Child:
         return (self._clock.monotonic_ns() - self._heard_ns) / 1e9
 
     def heard(self) -> None:
-        """It said something."""
+        """Note a report of the node."""
         if self.state in ("running", "stale"):
             self._heard_ns = self._clock.monotonic_ns()
             self._was_heard = True
@@ -84,7 +84,7 @@ class Child:
             self._heard_ns = self._clock.monotonic_ns()
 
     def poll(self) -> None:
-        """See whether the process is still there, and start it again when that is due."""
+        """Check the process, and restart it when that is due."""
         now = self._clock.monotonic_ns()
         if self.state == "crashed" and now >= self._due_ns:
             self.restarts += 1
@@ -183,7 +183,7 @@ class Supervisor:
         }
 
     def poll(self) -> None:
-        """See after all nodes; to be called several times a second, after what they said was taken."""
+        """Check all nodes; to be called several times a second, after their reports are read."""
         before, self._polled_ns = self._polled_ns, self._clock.monotonic_ns()
         away = self._polled_ns - before > STALE_S * 1e9
         for child in self.children.values():

@@ -1,4 +1,4 @@
-"""What a process tells systemd of itself, where systemd asked: that it is ready, and that it is alive."""
+"""Notifications to systemd, if it started this process: ready, alive, stopping (sd_notify)."""
 
 from __future__ import annotations
 

@@ -18,15 +18,15 @@ class Connection(Protocol):
     """A node in a ROS domain. Not thread-safe."""
 
     def publisher(self, topic: str, kind: str, *, latched: bool = False) -> Publish:
-        """What publishes messages on a topic, reliably.
+        """A reliable publisher of messages on a topic.
 
         Args:
             topic: such as ``tf``; without a leading slash.
             kind: such as ``tf2_msgs/msg/TFMessage``.
-            latched: whether who joins late gets the last message (TRANSIENT_LOCAL).
+            latched: whether late subscribers get the last message (TRANSIENT_LOCAL).
 
         Raises:
-            LaunchError: the type is not to be had.
+            LaunchError: the type is not available.
         """
         ...
 
@@ -37,7 +37,7 @@ class Connection(Protocol):
         ...
 
     def spin(self, timeout_s: float) -> None:
-        """Wait until something comes, for so long at most, and give it to whom it concerns."""
+        """Wait for messages, for so long at most, and pass them to their callbacks."""
         ...
 
     def drop(self, publish: Publish) -> None:

@@ -57,7 +57,7 @@ def deserialise(cdr: bytes, name: str) -> Any:
 
 
 def type_hash(name: str) -> str:
-    """REP-2011's hash of a type, by which ROS 2 tells versions of it apart."""
+    """REP-2011's hash of a type, by which ROS 2 distinguishes its versions."""
     return ros_types().hash_rihs01(name)
 
 

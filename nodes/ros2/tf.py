@@ -1,4 +1,4 @@
-"""Transforms between named frames over time, as tf2 keeps them: looked up by stamp, interpolated, along the tree."""
+"""A buffer of transforms between frames, as tf2's: looked up by stamp, interpolated, along the tree."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TransformError(LookupError):
 
 
 class TransformBuffer:
-    """What was heard on ``/tf`` and ``/tf_static``."""
+    """The transforms received on ``/tf`` and ``/tf_static``."""
 
     def __init__(self) -> None:
         self._parents: dict[str, str] = {}
@@ -31,10 +31,10 @@ class TransformBuffer:
         self._static: set[str] = set()
 
     def add(self, message: Any, *, static: bool) -> None:
-        """Take a ``tf2_msgs/TFMessage``; what is no pose in it is left out."""
-        for told in message.transforms:
-            child, parent = told.child_frame_id.lstrip("/"), told.header.frame_id.lstrip("/")
-            at, turned = told.transform.translation, told.transform.rotation
+        """Take a ``tf2_msgs/TFMessage``; transforms that are no pose are ignored."""
+        for transform in message.transforms:
+            child, parent = transform.child_frame_id.lstrip("/"), transform.header.frame_id.lstrip("/")
+            at, turned = transform.transform.translation, transform.transform.rotation
             place = np.array([at.x, at.y, at.z])
             quaternion = np.array([turned.x, turned.y, turned.z, turned.w])
             sound = np.isfinite(place).all() and abs(np.linalg.norm(quaternion) - 1.0) < 0.01
@@ -45,7 +45,7 @@ class TransformBuffer:
             self._parents[child] = parent
             (self._static.add if static else self._static.discard)(child)
             moments = self._moments.setdefault(child, deque())
-            moment = stamp_ns(told.header), place, quaternion
+            moment = stamp_ns(transform.header), place, quaternion
             if static or not moments:
                 self._moments[child] = deque([moment])
             elif moment[0] > moments[-1][0]:
@@ -56,32 +56,32 @@ class TransformBuffer:
                 moments.popleft()
 
     def lookup(self, target: str, source: str, at_ns: int) -> tuple[Floats, Floats]:
-        """Where a frame is in another at a moment.
+        """The pose of a frame in another at a time.
 
         Returns:
             position (3,) metres and quaternion (4,) xyzw of ``source`` in ``target``.
 
         Raises:
-            TransformError: there is no way between the frames, or not at that moment.
+            TransformError: the frames are not connected, or not at that time.
         """
-        up, down = self._way(source), self._way(target)
+        up, down = self._path(source), self._path(target)
         shared = next((frame for frame in up if frame in down), None)
         if shared is None:
             known = ", ".join(sorted({*self._parents, *self._parents.values()})) or "none"
             raise TransformError(
-                f"no way from {source!r} to {target!r} in TF: expected one tree; frames heard of: {known}"
+                f"no path from {source!r} to {target!r} in TF: expected one tree; frames heard of: {known}"
             )
         place, turned = self._chain(up[: up.index(shared)], at_ns)
         other, back = self._chain(down[: down.index(shared)], at_ns)
         inverse = back.inv()
         return inverse.apply(place - other), (inverse * turned).as_quat()
 
-    def _way(self, frame: str) -> list[str]:
+    def _path(self, frame: str) -> list[str]:
         """From a frame up to the root of its tree."""
-        way = [frame]
-        while (parent := self._parents.get(way[-1])) is not None and parent not in way:
-            way.append(parent)
-        return way
+        path = [frame]
+        while (parent := self._parents.get(path[-1])) is not None and parent not in path:
+            path.append(parent)
+        return path
 
     def _chain(self, frames: list[str], at_ns: int) -> tuple[Floats, Rotation]:
         place, turned = np.zeros(3), Rotation.identity()

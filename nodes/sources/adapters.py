@@ -1,7 +1,7 @@
-"""What other trackers give, as ``pose/raw``: ``from_...`` for each.
+"""Adapters: the output of other trackers as ``pose/raw``, one function ``from_...`` for each.
 
-Nothing of theirs is imported: an object with the right attributes will do. Each function says which axis of its frame
-points up; where the camera is calibrated, set ``sensor_pose`` and ``calibrated`` of the answer.
+Their packages are not imported: any object with the right attributes will do. Each function documents which axis of its
+frame points up; for a calibrated camera, set ``sensor_pose`` and ``calibrated`` of the result.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def from_azure_kinect(markers: Any, source: str = "azure_kinect") -> PoseRaw | N
     """``MarkerArray`` of the Azure Kinect ROS driver (``body_tracking_data``), in the depth camera's optical frame.
 
     Returns:
-        None for an array without markers, which has no stamp either: nobody is there.
+        None for an array without markers, which has no stamp either.
     """
     found: dict[int, Floats] = {}
     for marker in markers.markers:

@@ -17,13 +17,13 @@ from steadypose.nodes.sources.source import LiveSource, SourceContext
 logger = logging.getLogger(__name__)
 
 PAUSES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
-"""before each attempt in a row to open the camera again; the last one repeats"""
+"""pauses before successive attempts to open the camera; the last one repeats"""
 
 STREAMING = "streaming"
 
 
 class CameraError(RuntimeError):
-    """A camera that cannot be used now; it may be, later. The text says what is wrong."""
+    """A camera that cannot be used at present. The text says what is wrong."""
 
 
 class Connection(Protocol):
@@ -54,7 +54,7 @@ def count_failure(counts: Counter[str], camera: str, error: Exception) -> None:
 
 
 class CameraSource(LiveSource):
-    """The skeletons of a camera. When it is gone, or not there yet, it is looked for at growing intervals, for ever."""
+    """The skeletons of a camera. While it is disconnected, it is tried again at growing intervals, indefinitely."""
 
     def __init__(self, context: SourceContext) -> None:
         super().__init__()

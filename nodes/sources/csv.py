@@ -1,4 +1,4 @@
-"""Poses as CSV: what a spreadsheet, or a tracker's own export, can hold.
+"""Poses as CSV.
 
 A header and one row for each frame, or, with several bodies, for each body in it:
 
@@ -7,7 +7,7 @@ A header and one row for each frame, or, with several bodies, for each body in i
 
 ``stamp`` is in seconds, of capture; positions in metres, empty or ``nan`` where missing. Joints have the names of a
 skeleton (`prior.body.layouts`), in any order; those without columns are unobserved. Further columns:
-``JOINT_confidence``, 0 to 1, and ``body``, a whole number that tells bodies of the same stamp apart. Lines before the
+``JOINT_confidence``, 0 to 1, and ``body``, an integer id of each body of a stamp. Lines before the
 header may say ``# skeleton: NAME``, where the joints' names fit several, and ``# up: z`` (the default), ``y`` or
 ``-y``.
 """
@@ -34,7 +34,7 @@ LATEST_S = 2.0**31
 
 
 class CsvError(ValueError):
-    """A CSV that does not hold poses. The text says what was expected, what came, and what to do."""
+    """A CSV that does not hold poses. The text says what was expected, what was found, and what to do."""
 
 
 class CsvSource:

@@ -29,7 +29,7 @@ _ARRAYS = ("positions", "skeleton", "stamp_ns", "fps", "confidence", "up", "body
 
 
 class NpzError(ValueError):
-    """An ``.npz`` that does not hold poses. The text says what was expected, what came, and what to do."""
+    """An ``.npz`` that does not hold poses. The text says what was expected, what was found, and what to do."""
 
 
 class ArraySource:

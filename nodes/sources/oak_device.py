@@ -36,13 +36,13 @@ MODELS = {
 DEPTH_SIZE = (640, 400)
 DEPTH_FPS = 30.0
 SYNC_THRESHOLD = timedelta(seconds=0.5 / DEPTH_FPS)
-"""between colour and depth that are paired, at most: their sensors are not triggered together"""
+"""maximum difference of the stamps of paired colour and depth images: their sensors are not synchronised"""
 IMU_HZ = 100
 MAX_BODIES = 8
 QUEUE = 4
 """frames kept when the node is late; then the oldest is dropped"""
 TIMEOUT_S = 5.0
-"""without a frame, after which a camera is closed and opened again"""
+"""time without a frame after which the camera is closed and opened again"""
 STARTUP_TIMEOUT_S = 30.0
 """the same before its first frame"""
 

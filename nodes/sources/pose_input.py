@@ -26,7 +26,7 @@ LOOP_PAUSE_NS = 1_000_000_000
 class PoseInputNode(Node):
     """Publishes ``pose/raw``, and ``pose/truth`` where the source has it; ends when the source does.
 
-    One that plays a recording and was killed goes on where it was, so that stamps never go back.
+    When it is restarted while it plays a recording, it resumes where it was, so that stamps never go back.
     """
 
     name = "pose_input"
@@ -109,7 +109,7 @@ class PoseInputNode(Node):
         return camera | refused | (self.timeline.values() if self.timeline else {})
 
     def _with_pose(self, message: Message) -> Message:
-        """The message with the pose that its camera was calibrated to, unless it knows its own."""
+        """The message with the calibrated pose of its camera, unless it has one of its own."""
         if self._pose and isinstance(message, PoseRaw) and not message.calibrated:
             return dataclasses.replace(message, sensor_pose=self._pose, calibrated=True)
         return message

@@ -1,7 +1,7 @@
-"""How far a recording was played, so that an input node that was killed goes on where it was.
+"""Progress of a playback, so that a restarted input node resumes where it was.
 
-A few bytes in a file beside the sockets, written with each message: what a process wrote is there though it is
-killed. They count only for nodes of the same supervisor; whoever starts anew begins at the beginning.
+A few bytes in a file in the directory of the sockets, written with each message, which survive the process. They are
+valid for nodes of the same supervisor only; a new run begins at the beginning.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ProgressFile:
 
     Args:
         path: of the file.
-        supervisor: process id of who starts this node again; 0: nobody does, and nothing is kept.
+        supervisor: process id of the node's supervisor; 0 if there is none, and no progress is kept.
     """
 
     def __init__(self, path: Path, supervisor: int) -> None:

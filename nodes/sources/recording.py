@@ -55,7 +55,7 @@ def open_recording(path: str | Path) -> RecordedSource:
 
     Raises:
         LaunchError: there is nothing at the path.
-        RecordingError, NpzError, CsvError: what is there holds no skeletons. All are ValueErrors that say what to do.
+        RecordingError, NpzError, CsvError: the file holds no skeletons. All are ValueErrors that say what to do.
     """
     if not str(path):
         raise LaunchError("[input] recording: expected a recording, .npz or .csv to play, got none; give --input")
@@ -67,7 +67,7 @@ def open_recording(path: str | Path) -> RecordedSource:
 
 
 def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:
-    """The messages, and after the last the mark that the stream ends there."""
+    """The messages, followed by the end-of-stream mark."""
     last: PoseRaw | None = None
     for topic, message in messages:
         yield topic, message

@@ -29,7 +29,7 @@ class SourceDeclaration:
     """One source of skeletons."""
 
     opens: Callable[[Any, SourceContext], RecordedSource | LiveSource]
-    """with its settings; a camera is looked for when its frames are asked for"""
+    """makes the source from its settings; a camera is opened only when its frames are requested"""
     extra: str
     """of `graph.extras.EXTRAS`, that it needs; empty: none"""
 
@@ -50,7 +50,7 @@ class InputSettings:
     rate: float = 1.0
     """times real time; 0 is as fast as the subscribers take it"""
     loop: bool = False
-    """start again at the end, with stamps that go on rising"""
+    """repeat the recording endlessly, with stamps that keep increasing"""
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     tf: TfSettings = field(default_factory=TfSettings)
 

@@ -27,7 +27,7 @@ class Ros2Settings:
 
     topic: str = "/body_tracking_data"
     type: str = "MarkerArray"
-    """MarkerArray, as the driver of the Azure Kinect has it; or PoseArray, the joints of one body after the other"""
+    """MarkerArray, as of the Azure Kinect's driver; or PoseArray, the joints of one body after the other"""
     skeleton: str = "smpl22"
     """of a PoseArray: the joints and their order"""
     up: str = "z"

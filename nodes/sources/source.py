@@ -1,4 +1,4 @@
-"""What a source of skeletons is: recorded, or live."""
+"""Interfaces of sources of skeletons: recorded and live."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from steadypose.nodes.sources.calibration import CalibrationSettings
 
 
 class RecordedSource(Protocol):
-    """Skeletons in the order they came, each with its topic: ``pose/raw``, and ``pose/truth`` where it is known."""
+    """Skeletons in order, each with its topic: ``pose/raw``, and ``pose/truth`` if the recording has it."""
 
     refused: Counter[str]
-    """what could not be read, by cause"""
+    """messages that could not be read, by cause"""
 
     def __len__(self) -> int:
         """The number of frames, those that cannot be read among them."""
@@ -29,28 +29,28 @@ class RecordedSource(Protocol):
 
 
 class LiveSource(ABC):
-    """Skeletons that come when they come, stamped with the wall time of their capture."""
+    """Skeletons in real time, stamped with the wall time of their capture."""
 
     def __init__(self) -> None:
         self.refused: Counter[str] = Counter()
-        """what went wrong, by cause"""
+        """frames dropped or refused, by cause"""
 
     @abstractmethod
     def frames(self) -> Generator[PoseRaw | None, None, None]:
-        """Skeletons without end; None where a moment passed without one, so that the caller can look up."""
+        """Skeletons, endlessly; None after a short time without one, so that the caller can check whether to stop."""
 
     @abstractmethod
     def status(self) -> dict[str, str]:
-        """What `diagnostics` should say of it."""
+        """Values for `diagnostics`."""
 
     def problems(self) -> list[Problem]:
-        """What is wrong with it now."""
+        """Present problems with the source."""
         return []
 
 
 @dataclass(frozen=True)
 class SourceContext:
-    """What a source gets beside its own settings."""
+    """What a source is given in addition to its own settings."""
 
     clock: Clock
     """of the input node"""

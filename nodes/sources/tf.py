@@ -1,4 +1,4 @@
-"""Where a live source's sensor stands, looked up in ROS 2's TF by the stamp of each message: ``[input.tf]``."""
+"""The pose of a live source's sensor, looked up in ROS 2's TF by the stamp of each message: ``[input.tf]``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class TfSettings:
     """``[input.tf]``: the sensor's pose from TF, also of a robot that moves."""
 
     fixed_frame: str = ""
-    """a frame that stands still and has z up, such as odom or map; empty: TF is not asked"""
+    """a fixed frame with z up, such as odom or map; empty: TF is not used"""
     sensor_frame: str = ""
     """the frame of the joints; empty: what the source's messages name"""
     timeout: float = 0.2

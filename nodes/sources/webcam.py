@@ -1,4 +1,4 @@
-"""Any camera the system knows, with MediaPipe's pose landmarker: no depth, so distances rest on the body's size.
+"""Any camera of the system, with MediaPipe's pose landmarker: without depth, distances follow from the body's size.
 
 MediaPipe is an optional extra, and its model a file of its own (docs/sources.md says where from). What runs with
 OpenCV and MediaPipe is in `nodes.sources.webcam_device`.
@@ -35,11 +35,11 @@ class WebcamSettings:
     camera: int = 0
     """its number: 0 is /dev/video0"""
     video: str = path_setting()
-    """a film to look at in its place; a relative path starts at the launch file"""
+    """a video to read instead; a relative path starts at the launch file"""
     model: str = path_setting()
     """MediaPipe's pose landmarker, a .task file; a relative path starts at the launch file"""
     bodies: int = 1
-    """number of bodies to look for"""
+    """maximum number of bodies to detect"""
     field_of_view: float = 1.05
     """radians, of the image's width, where the lens is not calibrated: scales how far away bodies seem"""
 

@@ -24,15 +24,15 @@ Landmarker = Callable[[NDArray[Any], int], Any]
 
 
 class Lens:
-    """Undistorts a webcam's pictures, and says their intrinsics then: as calibrated, or a guess.
+    """Undistorts a webcam's pictures, with intrinsics as calibrated, or guessed from the field of view.
 
     Args:
         size: width and height of the pictures.
-        field_of_view: radians; what is guessed from where nothing is calibrated.
-        calibration: as it was made; for pictures of another size it is scaled.
+        field_of_view: radians; used without a calibration.
+        calibration: of the camera; scaled to pictures of another size.
 
     Raises:
-        LaunchError: it is of pictures of another shape.
+        LaunchError: the calibration is for another aspect ratio.
     """
 
     def __init__(self, size: tuple[int, int], field_of_view: float, calibration: CalibrationSettings) -> None:
@@ -95,7 +95,7 @@ class PoseFinder:
 
 
 class Webcam:
-    """A webcam that is open, and the landmarker that looks at its pictures."""
+    """An open webcam, and the landmarker for its pictures."""
 
     def __init__(self, capture: cv2.VideoCapture, finder: PoseFinder, name: str, clock: Clock) -> None:
         self.name = name

@@ -1,4 +1,4 @@
-"""A film in the place of a webcam: the same landmarker and lens, at the stamps of its pictures."""
+"""A video in place of a webcam: the same landmarker and lens, with the stamps of its pictures."""
 
 from __future__ import annotations
 
@@ -50,9 +50,12 @@ class VideoSource:
             with self._make_landmarker(self._settings) as landmarker:
                 finder = PoseFinder(name, landmarker, self._settings, self._calibration)
                 while film.grab():
-                    told_ns = round(film.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-                    # of some containers nothing is told but the rate
-                    stamp_ns = told_ns if told_ns > stamp_ns else stamp_ns + (self._period_ns if stamp_ns >= 0 else 1)
+                    reported_ns = round(film.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+                    # some containers state the frame rate alone
+                    if reported_ns > stamp_ns:
+                        stamp_ns = reported_ns
+                    else:
+                        stamp_ns += self._period_ns if stamp_ns >= 0 else 1
                     good, image = film.retrieve()
                     if good and (frame := finder.find(image, stamp_ns)) is not None:
                         yield POSE_RAW, frame

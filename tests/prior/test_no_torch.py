@@ -22,7 +22,7 @@ class NoTorch(MetaPathFinder):
 
 sys.meta_path.insert(0, NoTorch())
 import steadypose.nodes.commands.completing
-import steadypose.nodes.commands.doctor
+import steadypose.nodes.commands.doctor.command
 import steadypose.nodes.commands.plot
 import steadypose.nodes.commands.run
 import steadypose.nodes.commands.simulate

@@ -34,7 +34,7 @@ Address = Annotated[tuple[str, ...], tyro.conf.arg(name="endpoint", metavar="ADD
 
 
 class InspectError(ValueError):
-    """What was asked for is not there. The text says what is."""
+    """No such topic or recording. The text says what there is."""
 
 
 def messages_of(

@@ -1,4 +1,4 @@
-"""How far bodies are from the truth, where a recording has it."""
+"""Errors against the ground truth of a recording, if it has one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class TrackError(NamedTuple):
 
 
 def errors_of(history: History, body: int) -> dict[str, TrackError]:
-    """How far a body's joints are from the truth on each topic, where the recording has it."""
+    """Errors of a body's joints on each topic."""
     truth = [person for person in history.tracks.get(POSE_TRUTH, {}).values() if len(person.time) > 1]
     found = {}
     for topic in (POSE_RAW, POSE_CLEAN, POSE_WORLD):

@@ -83,7 +83,7 @@ def busiest_joints(clean: Track) -> list[int]:
 
 
 def corrections(clean: Track) -> NDArray[np.float64]:
-    """(T, 22) metres between what went in and what came out; NaN where nothing went in."""
+    """(T, 22) metres between input and output; NaN where there was no input."""
     return np.linalg.norm(clean.positions - clean.raw, axis=2)
 
 

@@ -103,9 +103,9 @@ class BodyTopics:
         if last is not None:
             self._moving.add(frame)
         self._sensor[frame] = pose
-        told = messages.tf_message([messages.sensor_transform(clean, self._settings.world_frame)])
+        message = messages.tf_message([messages.sensor_transform(clean, self._settings.world_frame)])
         moves = frame in self._moving
-        self._send("tf" if moves else "tf_static", "tf2_msgs/msg/TFMessage", told, latched=not moves)
+        self._send("tf" if moves else "tf_static", "tf2_msgs/msg/TFMessage", message, latched=not moves)
 
     def _send(self, topic: str, kind: str, message: Any, *, latched: bool = False) -> None:
         self._output.send(topic, kind, serialise(message, kind), latched=latched)

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.commands import doctor_live
+from steadypose.nodes.commands.doctor import live
 from steadypose.nodes.graph.clock import SystemClock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
@@ -40,7 +40,7 @@ class Tracker(Node):
 def file(make_launch: Callable[..., Launch], tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     path = tmp_path / "launch.toml"
     path.write_text(f'[transport]\ndirectory = "{folder}"\nlossless = false\n')
-    monkeypatch.setattr(doctor_live, "LISTEN_NS", 800_000_000)
+    monkeypatch.setattr(live, "LISTEN_NS", 800_000_000)
     return str(path)
 
 
@@ -49,7 +49,7 @@ def heard(file: str, frames: list[PoseRaw]) -> tuple[int, str]:
     node = Tracker(Launch.read(file), SystemClock())
     node.frames = tuple(frames)
     with running(node):
-        return doctor_live.listen(file, console), console.export_text()
+        return live.listen(file, console), console.export_text()
 
 
 def test_a_good_tracker(file: str) -> None:
@@ -65,5 +65,5 @@ def test_a_bad_tracker(file: str) -> None:
 
 def test_no_tracker(file: str) -> None:
     console = Console(record=True, width=200)
-    assert doctor_live.listen(file, console) == 1
+    assert live.listen(file, console) == 1
     assert "start the tracker" in console.export_text()

@@ -61,7 +61,7 @@ def test_between_two_stamps_it_is_interpolated_and_beyond_them_unknown() -> None
     for at_ns, words in ((999, "older than the oldest"), (1201, "newer than the newest")):
         with pytest.raises(TransformError, match=words):
             buffer.lookup("odom", "base", at_ns)
-    with pytest.raises(TransformError, match=r"no way from 'camera' to 'odom'.*frames heard of: base, odom"):
+    with pytest.raises(TransformError, match=r"no path from 'camera' to 'odom'.*frames heard of: base, odom"):
         buffer.lookup("odom", "camera", 1100)
 
 
@@ -146,7 +146,7 @@ def test_one_that_waits_in_vain_is_dropped_and_told(clock: VirtualClock, monkeyp
     assert next(frames) is None
     assert source.refused["without a transform"] == 1
     (problem,) = source.problems()
-    assert "no way from 'camera' to 'odom'" in problem.text
+    assert "no path from 'camera' to 'odom'" in problem.text
     assert "ROS_DOMAIN_ID" in problem.text
 
 

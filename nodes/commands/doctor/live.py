@@ -37,7 +37,7 @@ def listen(launch_file: str, console: Console, clock: Clock | None = None) -> in
     settings = PriorSettings.from_dict(launch.table("prior"))
     check = StreamCheck(settings.max_bodies, identified=settings.identify.enabled)
     addresses = launch.addresses("pose_input")
-    told: dict[str, str] = {}
+    reported: dict[str, str] = {}
     frames: list[PoseRaw] = []
     with (
         Subscriber(addresses, POSE_RAW, keys=keys, clear_text=transport.clear_text) as tracker,
@@ -56,7 +56,7 @@ def listen(launch_file: str, console: Console, clock: Clock | None = None) -> in
                 frames.append(raw)
             while received := nodes.receive(0):
                 if isinstance(news := received[1], Diagnostics):
-                    told |= {cause: f"{news.node}: {text}" for cause, text in from_values(news.values).items()}
+                    reported |= {cause: f"{news.node}: {text}" for cause, text in from_values(news.values).items()}
         refused = sum(tracker.refused.values())
     # a replay's stamps are long past, and so is what a tracker's may be: neither says that they should be of now
     problems = check.problems(clock.now_ns(), live=False)
@@ -64,7 +64,7 @@ def listen(launch_file: str, console: Console, clock: Clock | None = None) -> in
         problems.append(_silence(addresses, refused))
     for problem in problems:
         console.print(f"{problem.level.name} {problem.cause}: {problem.text}", markup=False, soft_wrap=True)
-    for cause, text in told.items():
+    for cause, text in reported.items():
         if cause not in {problem.cause for problem in problems}:
             console.print(f"{cause}: {text}", markup=False, soft_wrap=True)
     if frames:
@@ -75,7 +75,7 @@ def listen(launch_file: str, console: Console, clock: Clock | None = None) -> in
             f"{len(frames)} messages, {rate:.1f} Hz, of {newest.source!r}: skeleton {newest.skeleton!r}, up to "
             f"{bodies} bodies, frame {newest.frame_id!r}, {'calibrated' if newest.calibrated else 'not calibrated'}"
         )
-    if problems or told:
+    if problems or reported:
         return 1
     console.print("nothing is wrong with it")
     return 0

@@ -1,0 +1,146 @@
+"""What the nodes need: messages between processes, the models' weights, the bundled streams."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from steadypose.msgs.addresses import TransportError, make_private
+from steadypose.nodes.commands.doctor.finding import Finding, Verdict, restored
+
+# what is checked is imported in its check: if it is missing, the other checks still run
+if TYPE_CHECKING:
+    from steadypose.msgs.types import PoseRaw
+
+MODELS = ("mixture", "hgvae", "occlusion", "trajectory", "contacts")
+FRAMES, WARM_UP = 100, 20
+FRAME_NS = 1_000_000_000 / 30
+TARGET_MS, BUDGET_MS = 10.0, 1000 / 30
+LONGEST_IPC_PATH = 107  # bytes of a unix socket's path that the system takes
+
+
+def check_messages() -> Iterator[Finding]:
+    """The directory of the ipc sockets, and a message there and back."""
+    from steadypose.nodes.graph.access import TransportSettings
+
+    directory = TransportSettings().ipc_directory
+    longest = len(os.fsencode(directory / "trajectory"))
+    if longest > LONGEST_IPC_PATH:
+        fix = "set XDG_RUNTIME_DIR, or [transport] directory in the launch file, to a shorter path"
+        yield Finding("messages", Verdict.BAD, f"{directory} is too long a path for sockets", fix)
+        return
+    try:
+        make_private(directory)
+        with tempfile.TemporaryDirectory(dir=directory, prefix="") as folder:
+            took_ms = _round_trip(f"ipc://{folder}/s") * 1e3
+    except TransportError as error:
+        yield Finding("messages", Verdict.BAD, str(error))
+        return
+    except OSError as error:
+        fix = f"sudo chown {os.getuid()} {directory}; or set [transport] directory in the launch file"
+        yield Finding("messages", Verdict.BAD, f"cannot write to {directory}: {error.strerror}", fix)
+        return
+    yield Finding("messages", Verdict.GOOD, f"{took_ms:.1f} ms through {directory}")
+
+
+def _round_trip(endpoint: str) -> float:
+    """Seconds that a message takes from a publisher to a subscriber."""
+    from steadypose.msgs.topics import POSE_RAW
+    from steadypose.msgs.transport import Publisher, Subscriber
+
+    name = "doctor"
+    with Publisher(endpoint) as publisher, Subscriber(endpoint, POSE_RAW, name=name) as subscriber:
+        if not publisher.wait_for_subscribers({name}, timeout_s=5.0):
+            raise TimeoutError(f"no connection over {endpoint} within 5 s")
+        started = time.perf_counter()
+        publisher.publish(POSE_RAW, _standing(0))
+        if subscriber.receive(5.0) is None:
+            raise TimeoutError(f"no message over {endpoint} within 5 s")
+        return time.perf_counter() - started
+
+
+def check_models() -> Iterator[Finding]:
+    """The weights that the nodes load, and what a frame costs with them."""
+    from steadypose.prior.models.weights_io import load_weights
+
+    whole = True
+    for model in MODELS:
+        try:
+            state, _ = load_weights("default", model)
+        except (OSError, ValueError, KeyError) as error:
+            whole = False
+            fix = f"{restored('prior/weights')}, or steadypose train {model}"
+            yield Finding(f"weights of {model}", Verdict.BAD, str(error).split(". ")[0], fix)
+        else:
+            numbers = sum(array.size for array in state.values())
+            yield Finding(f"weights of {model}", Verdict.GOOD, f"default, {numbers / 1e6:.2f} million numbers")
+    if whole:
+        yield _self_test()
+
+
+def _self_test() -> Finding:
+    """A body that stands for a hundred frames, through the prior."""
+    import numpy as np
+
+    from steadypose.nodes.graph.threads import one_thread
+    from steadypose.prior.clean.pipeline import PriorPipeline
+    from steadypose.prior.clean.settings import PriorSettings
+
+    one_thread()
+    pipeline = PriorPipeline(PriorSettings())
+    spent_ms, bodies = [], []
+    for frame in range(FRAMES):
+        raw = _standing(frame)
+        started = time.perf_counter()
+        for clean in pipeline.process(raw):
+            bodies += clean.bodies
+        spent_ms.append((time.perf_counter() - started) * 1e3)
+    p50, p99 = np.percentile(spent_ms[WARM_UP:], (50, 99))
+    found = f"{p50:.1f} ms a frame, p99 {p99:.1f} ms, of {BUDGET_MS:.0f}"
+    if not bodies or not all(np.isfinite(body.positions).all() for body in bodies):
+        return Finding("prior", Verdict.BAD, "gave no pose for a body that stands still", restored("prior"))
+    if p99 > BUDGET_MS:
+        return Finding("prior", Verdict.NOTE, found, "too slow for 30 Hz at the moment: free the processor")
+    if p99 > TARGET_MS:
+        return Finding("prior", Verdict.NOTE, found, f"keeps up, but slower than the {TARGET_MS:g} ms of a free core")
+    return Finding("prior", Verdict.GOOD, found)
+
+
+def _standing(frame: int) -> PoseRaw:
+    """A body in a T-pose, two metres in front of the world's origin, that sways a little."""
+    import numpy as np
+
+    from steadypose.msgs.types import Pose, PoseRaw, RawBody
+    from steadypose.prior.body.layouts import CANONICAL
+    from steadypose.prior.body.skeleton import REST_POSITIONS
+
+    positions = REST_POSITIONS + [2.0, 0.02 * np.sin(frame / 10), 0.95]
+    body = RawBody(0, positions, np.ones(len(positions)))
+    stamp_ns = round(frame * FRAME_NS)
+    return PoseRaw(stamp_ns, "world", "doctor", CANONICAL.name, Pose.identity(), True, [body])
+
+
+def check_streams() -> Iterator[Finding]:
+    """What the default launch file plays."""
+    from steadypose.msgs.recording import RecordingReader
+    from steadypose.nodes.graph.launch import Launch, bundled
+    from steadypose.nodes.sources.recording import open_recording
+    from steadypose.nodes.sources.registry import InputSettings
+
+    fix = f"{restored('sim_data launch')}, or play your own: steadypose run --input RECORDING"
+    recording = Path(Launch.read("replay").settings(InputSettings).recording).resolve()
+    try:
+        open_recording(recording)
+    except (OSError, ValueError) as error:
+        yield Finding("bundled streams", Verdict.BAD, str(error), fix)
+        return
+    streams = sorted({file.parent for file in bundled("sim_data").rglob("*.mcap")})
+    seconds = 0.0
+    for stream in streams:
+        with RecordingReader(stream) as reader:
+            seconds += reader.duration_s
+    yield Finding("bundled streams", Verdict.GOOD, f"{len(streams)}, {seconds:.0f} s together")
