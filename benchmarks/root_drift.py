@@ -100,7 +100,7 @@ class Errors:
     seen_skate: list[float] = field(default_factory=list)
     hidden_skate: list[float] = field(default_factory=list)
     hidden_position: dict[int, list[float]] = field(default_factory=lambda: {h: [] for h in HORIZONS})
-    hidden_surprise: list[float] = field(default_factory=list)
+    hidden_nees: dict[int, list[float]] = field(default_factory=lambda: {h: [] for h in HORIZONS})
     hidden_path: list[float] = field(default_factory=list)
 
     def add(self, clip: Clip, positions: Floats, velocity: Floats, sigma: Floats) -> None:
@@ -119,9 +119,10 @@ class Errors:
         self.hidden_skate += list(speed[stands & inside[:, None]])
         for start in range(SEEN_FRAMES, len(hidden) - HIDDEN_FRAMES, SEEN_FRAMES + HIDDEN_FRAMES):
             for h in HORIZONS:
-                self.hidden_position[h].append(float(np.linalg.norm(off[start + h - 1, :2])))
+                at = start + h - 1
+                self.hidden_position[h].append(float(np.linalg.norm(off[at, :2])))
+                self.hidden_nees[h].append(float(np.mean((off[at, :2] / sigma[at, :2]) ** 2)))
             end = start + HIDDEN_FRAMES - 1
-            self.hidden_surprise.append(float(np.mean((off[end, :2] / sigma[end, :2]) ** 2)))
             self.hidden_path.append(float(np.linalg.norm(np.diff(truth[start : end + 1, :2], axis=0), axis=1).sum()))
 
     def summary(self) -> dict[str, float]:
@@ -137,7 +138,10 @@ class Errors:
             "hidden: m per 10 m walked": float(10 * last[walked].sum() / path[walked].sum())
             if walked.any()
             else np.nan,
-            "hidden: squared error over variance": float(np.mean(self.hidden_surprise)),
+            **{
+                f"hidden {h * FRAME_S:g} s: squared error over variance": float(np.mean(e))
+                for h, e in self.hidden_nees.items()
+            },
         }
 
 

@@ -41,6 +41,8 @@ class BodyNoise:
         acceleration_at_speed: what each m/s of its speed adds to that, 1/√s.
         rest, load, swing: densities of the random walk of a foot that rests, of one that rolls under load, and of one
             in the air, metres over √s.
+        slip_at_speed: s/m, by how much more each m/s of the root's speed lets feet at rest and under load walk: they
+            roll, slide, and are taken to stand when they do not.
         sensor_rate: 1/s, w of the sensor's errors of what is at rest.
         sensor_memory_m: metres of travel by which a moving root's is forgotten as well, as a camera's error is.
         network_memory_s: (3,) or a number, the time constant of the network's error, a Gauss-Markov process.
@@ -48,11 +50,12 @@ class BodyNoise:
     """
 
     acceleration: float = 3.0
-    acceleration_at_speed: float = 3.0
-    rest: float = 0.015
-    load: float = 0.13
-    swing: float = 1.0
-    sensor_rate: float = 8.0
+    acceleration_at_speed: float = 1.0
+    rest: float = 0.006
+    load: float = 0.2
+    swing: float = 4.0
+    slip_at_speed: float = 0.5
+    sensor_rate: float = 12.0
     sensor_memory_m: float = 0.03
     network_memory_s: ArrayLike = 0.15
     first_speed: float = 1.0
@@ -136,8 +139,10 @@ class BodyFilter:
         """Move on by ``dt`` seconds, above 0; (feet,) probabilities that each foot bears load, and that it rests."""
         noise = self._noise
         speed = math.hypot(*self._x[_VELOCITY, :2])  # not the height, which the floor has a say in
+        slip = math.log(1.0 + noise.slip_at_speed * speed)
         rolls = np.maximum(load - rest, 0.0)
-        walk = rest * math.log(noise.rest) + rolls * math.log(noise.load) + (1 - rest - rolls) * math.log(noise.swing)
+        walk = rest * (math.log(noise.rest) + slip) + rolls * (math.log(noise.load) + slip)
+        walk += (1.0 - rest - rolls) * math.log(noise.swing)
         rates = np.full(1 + len(load), noise.sensor_rate)
         rates[0] += speed / noise.sensor_memory_m
         density = (noise.acceleration + noise.acceleration_at_speed * speed) ** 2

@@ -24,6 +24,7 @@ from steadypose.prior.world.contact_reader import Glimpse
 from steadypose.prior.world.ground import Ground
 from steadypose.prior.world.legs import fit_legs, turn_legs
 from steadypose.prior.world.sighting import Sighting
+from steadypose.prior.world.standing import StandingFeet
 
 Floats = NDArray[np.float64]
 Sigma = TypeVar("Sigma", float, NDArray[np.float64])
@@ -117,6 +118,7 @@ class BodyTrack:
         self._window_ns = stamp_ns
         self._noise = noise
         self._filter = self._start(sighting, np.zeros(3))
+        self._standing, self._feet = StandingFeet(len(FEET)), np.full((len(FEET), 3), np.nan)
         self._dt = 0.0
         self._jumps = 0
         self._before = sighting
@@ -210,6 +212,8 @@ class BodyTrack:
         in_the_world = self._observe_root(sighting)
         self._observe_feet(sighting, in_the_world)
         self._meet_ground(sighting, rest, ground)
+        estimates = np.where(self._filter.placed[:, None], self._filter.feet, np.nan)
+        self._feet = self._standing.update(estimates, self._filter.feet_sigma, rest, self._dt)
         if sighting.root is not None and not sighting.root_seen:
             self._shift = self._filter.position - sighting.root
         else:
@@ -285,7 +289,7 @@ class BodyTrack:
         moved = sighting.positions + self._shift
         placed = self._filter.placed
         feet = np.array(FEET)[placed]
-        moved[feet], sigma[feet] = self._filter.feet[placed], self._filter.feet_sigma[placed]
+        moved[feet], sigma[feet] = self._feet[placed], self._filter.feet_sigma[placed]
         moved[0], sigma[0] = place, math.sqrt(float(np.mean(spread**2)))
         positions = fit_legs(moved, sigma, sighting.body.bone_lengths)
         rotations = sighting.body.rotations.astype(np.float64)

@@ -50,7 +50,8 @@ class Textbook:
         q = [a * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(2) - root @ root.T, 1 - kept**2]
         for bears, r in zip(load, rest, strict=True):
             rolls = max(bears - r, 0.0)
-            walk = n.rest ** (2 * r) * n.load ** (2 * rolls) * n.swing ** (2 * (1 - r - rolls)) * dt
+            slip = 1 + n.slip_at_speed * speed
+            walk = (slip * n.rest) ** (2 * r) * (slip * n.load) ** (2 * rolls) * n.swing ** (2 * (1 - r - rolls)) * dt
             q += [walk, np.eye(2) - foot @ foot.T]
         self.x, self.p = f @ self.x, f @ self.p @ f.T + diagonal(*q)
 

@@ -1,0 +1,55 @@
+"""Feet that stand are published still, and never far from where they are estimated."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from steadypose.prior.world.standing import EASE_S, DEADBAND, StandingFeet
+
+DT = 1 / 30
+SIGMA = np.full(2, 0.01)
+RESTS, SWINGS = np.ones(2), np.zeros(2)
+
+
+def test_a_foot_that_stands_does_not_follow_what_it_is_uncertain_by():
+    feet, places = StandingFeet(2), np.zeros((2, 3))
+    published = [
+        feet.update(places + [0.3 * DEADBAND * SIGMA[0] * np.sin(step), 0.0, 0.0], SIGMA, RESTS, DT) for step in range(30)
+    ]
+    np.testing.assert_allclose(published, np.broadcast_to(published[0], (30, 2, 3)), atol=1e-12)
+
+
+def test_it_is_dragged_along_by_an_estimate_that_goes_on_moving():
+    feet = StandingFeet(2)
+    for step in range(30):
+        place = np.array([[0.01 * step, 0.0, 0.0]] * 2)
+        published = feet.update(place, SIGMA, RESTS, DT)
+    np.testing.assert_allclose(place[:, 0] - published[:, 0], DEADBAND * SIGMA, atol=1e-12)
+
+
+def test_a_foot_that_has_lifted_comes_to_its_estimate_smoothly():
+    feet = StandingFeet(2)
+    feet.update(np.zeros((2, 3)), SIGMA, RESTS, DT)
+    place = np.array([[0.004, 0.0, 0.0]] * 2)
+    feet.update(place, SIGMA, RESTS, DT)
+    off = np.array([np.linalg.norm(feet.update(place, SIGMA, SWINGS, DT) - place, axis=1).max() for _ in range(30)])
+    np.testing.assert_allclose(off, 0.004 * np.exp(-DT / EASE_S * np.arange(1, 31)), atol=1e-12)
+
+
+def test_a_foot_of_no_known_place_has_none_and_stands_anew():
+    feet, nowhere = StandingFeet(2), np.full((2, 3), np.nan)
+    feet.update(np.zeros((2, 3)), SIGMA, RESTS, DT)
+    assert np.isnan(feet.update(nowhere, SIGMA, RESTS, DT)).all()
+    np.testing.assert_array_equal(feet.update(np.ones((2, 3)), SIGMA, RESTS, DT), np.ones((2, 3)))
+
+
+@settings(max_examples=50)
+@given(seed=st.integers(0, 10_000))
+def test_it_is_never_further_off_than_the_deadband(seed: int):
+    rng, feet = np.random.default_rng(seed), StandingFeet(2)
+    for _ in range(20):
+        places, sigma = rng.normal(0.0, 0.02, (2, 3)), rng.uniform(0.0, 0.02, 2)
+        published = feet.update(places, sigma, rng.random(2), DT)
+        assert (np.linalg.norm(published - places, axis=1) <= DEADBAND * sigma + 1e-12).all()
