@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from steadypose.prior.world.standing import EASE_S, DEADBAND, StandingFeet
+from steadypose.prior.world.standing import DEADBAND, EASE_S, StandingFeet
 
 DT = 1 / 30
 SIGMA = np.full(2, 0.01)
@@ -15,18 +15,17 @@ RESTS, SWINGS = np.ones(2), np.zeros(2)
 
 def test_a_foot_that_stands_does_not_follow_what_it_is_uncertain_by():
     feet, places = StandingFeet(2), np.zeros((2, 3))
-    published = [
-        feet.update(places + [0.3 * DEADBAND * SIGMA[0] * np.sin(step), 0.0, 0.0], SIGMA, RESTS, DT) for step in range(30)
-    ]
+    wander = 0.3 * DEADBAND * SIGMA[0] * np.sin(np.arange(30))
+    published = [feet.update(places + [x, 0.0, 0.0], SIGMA, RESTS, DT) for x in wander]
     np.testing.assert_allclose(published, np.broadcast_to(published[0], (30, 2, 3)), atol=1e-12)
 
 
 def test_it_is_dragged_along_by_an_estimate_that_goes_on_moving():
     feet = StandingFeet(2)
-    for step in range(30):
-        place = np.array([[0.01 * step, 0.0, 0.0]] * 2)
-        published = feet.update(place, SIGMA, RESTS, DT)
-    np.testing.assert_allclose(place[:, 0] - published[:, 0], DEADBAND * SIGMA, atol=1e-12)
+    estimates = np.zeros((30, 2, 3))
+    estimates[..., 0] = 0.01 * np.arange(30)[:, None]
+    published = [feet.update(places, SIGMA, RESTS, DT) for places in estimates]
+    np.testing.assert_allclose(estimates[-1, :, 0] - published[-1][:, 0], DEADBAND * SIGMA, atol=1e-12)
 
 
 def test_a_foot_that_has_lifted_comes_to_its_estimate_smoothly():
