@@ -1,1 +1,1 @@
-"""What is measured, against which peers, and the last results: ``python -m steadypose.benchmarks.NAME --help``."""
+"""Benchmarks: protocols, peers, and the last results: ``python -m steadypose.benchmarks.NAME --help``."""

@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 DELAYS = (0, 2, 4, 8)
 """Frames at 30 Hz at which methods are compared."""
 SEEDS = (0, 1, 2)
-"""Of networks trained here, and of what is drawn at random."""
+"""Seeds of networks trained here, and of random sampling."""
 
 
 @dataclass(frozen=True)

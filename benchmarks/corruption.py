@@ -1,4 +1,5 @@
-"""How protocols spoil true joints: noise, and joints hidden. Every function takes and gives (T, C, J, 3) metres.
+"""Corruption of true joints for the protocols: noise and hidden joints. Every function takes and gives (T, C, J, 3)
+metres.
 
 A hidden joint is NaN. The functions draw from the generator that they are given and change nothing in place.
 """
@@ -38,8 +39,8 @@ def along_sight(truth: Floats, sigma: float, rng: np.random.Generator, ratio: fl
 
 
 def correlated(truth: Floats, sigma: float, rng: np.random.Generator, memory: float = 0.9) -> Floats:
-    """Stationary AR(1) noise of ``sigma`` metres, with correlation ``memory`` from a frame to the next: what a depth
-    camera's errors look like, and what no low-pass filter can tell from motion."""
+    """Stationary AR(1) noise of ``sigma`` metres, with correlation ``memory`` from a frame to the next: like a depth
+    camera's errors, which no low-pass filter separates from motion."""
     noise = rng.normal(0.0, sigma, truth.shape)
     for t in range(1, len(noise)):
         noise[t] = memory * noise[t - 1] + np.sqrt(1 - memory**2) * noise[t]
@@ -95,8 +96,8 @@ def arm_behind(truth: Floats, radius: float = 0.16) -> Mask:
 
 
 def bursts(shape: tuple[int, int, int], frames: int, first: int, rng: np.random.Generator) -> Mask:
-    """(T, C, J) one limb of every clip away for ``frames`` frames, at some time from frame ``first`` on and so that
-    a third of a second is left to find it again."""
+    """(T, C, J) one limb of every clip hidden for ``frames`` frames, at a random time from frame ``first`` on, at least
+    a third of a second before the end."""
     hidden = np.zeros(shape, dtype=bool)
     starts = rng.integers(first, shape[0] - frames - 10, endpoint=True, size=shape[1])
     limbs = rng.integers(len(LIMBS), size=shape[1])

@@ -29,7 +29,7 @@ def describe() -> dict[str, str | int | float]:
 
 
 def uncommitted() -> list[str]:
-    """Files that differ from the commit, results and documents aside: those do not change what is measured."""
+    """Files that differ from the commit, except results and documents, which do not change what is measured."""
     changed = _git("diff", "--name-only", "HEAD", "--", ".", ":!benchmarks/results", ":!docs", ":!*.md")
     return [] if changed == "unknown" else changed.split()
 

@@ -73,7 +73,7 @@ def found_delay(estimate: Floats, truth: Floats, most: int) -> float:
     Correlated are all coordinates together; between frames, a parabola through the best three.
 
     Args:
-        most: frames, the longest lag looked at; as many of lead are looked at too.
+        most: frames, the largest lag, and lead, that is considered.
     """
     a, b = (np.diff(x.reshape(len(x), -1), axis=0) for x in (estimate, truth))
     whole = np.isfinite(a).all(axis=0)

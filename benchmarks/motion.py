@@ -1,4 +1,4 @@
-"""The true motion that protocols spoil and score: validation clips of prepared motion, or simulated people."""
+"""Ground-truth motion of the protocols: validation clips of prepared motion, or simulated people."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def simulated_clips(frames: int, most: int, seed: int) -> MotionClips:
 
 
 def _people(seed: int) -> Iterator[Motion]:
-    """Everybody of every scene, again and again with other bodies and paths."""
+    """All people of all scenes, repeated with other bodies and paths."""
     rng = np.random.default_rng(seed)
     while True:
         for script in SCRIPTS.values():

@@ -43,14 +43,14 @@ SLOTS_A_CLIP = 4
 
 @dataclass(frozen=True)
 class Cleaned:
-    """What ``pose/clean`` said.
+    """The content of ``pose/clean``.
 
     Attributes:
         stamps_s: (T',) seconds, of the prior's own 30 Hz grid.
-        positions: (T', C, 22, 3) metres; NaN where there was no answer.
+        positions: (T', C, 22, 3) metres; NaN where there was no estimate.
         sigma: (T', C, 22) metres, the standard deviation stated, along an axis.
-        anomaly: (T', C) score, NaN where there was no answer.
-        flagged: (T', C) whether it was called an anomaly.
+        anomaly: (T', C) score, NaN where there was no estimate.
+        flagged: (T', C) whether it was flagged as an anomaly.
     """
 
     stamps_s: Floats
@@ -71,7 +71,7 @@ def available(settings: PriorSettings, delay: int) -> bool:
 
 
 def run(settings: PriorSettings, seen: Floats, stamps_s: Floats, delay: int, skeleton: str = "smpl22") -> Cleaned:
-    """Clips through ``PriorPipeline``.
+    """Clean clips with ``PriorPipeline``.
 
     Args:
         settings: the variant; its delay is overridden.

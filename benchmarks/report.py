@@ -1,6 +1,6 @@
 """Writes the tables of the last results into the README, between markers.
 
-Where a line reads ``<!-- results:NAME -->``, what stands up to ``<!-- /results -->`` is replaced by table NAME of
+Where a line reads ``<!-- results:NAME -->``, the text up to ``<!-- /results -->`` is replaced by table NAME of
 ``benchmarks/results/*.json``. A table that was measured with other weights or settings than those that ship is refused.
 """
 

@@ -26,7 +26,7 @@ class Table:
         title: what is measured, with units.
         columns: headers.
         rows: cells, ready to print.
-        note: what a reader must know to read it right.
+        note: conditions that a reader must know.
     """
 
     name: str

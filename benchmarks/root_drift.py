@@ -64,7 +64,7 @@ def _lasting_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
 
 
 def observe(clip: Clip, rng: np.random.Generator) -> list[PoseClean]:
-    """What a prior might say of a clip: with noise, and without the trunk where `Clip.hidden`.
+    """A clip as a prior's output: with noise, and without the trunk where `Clip.hidden`.
 
     There the root stays where it was last seen, with an infinite standard deviation, and the rest of the body with
     it: only the body's own motion is known, which is the task of HM-VAE's section 3.3.

@@ -13,11 +13,11 @@ Parameters = dict[str, float]
 
 @dataclass(frozen=True)
 class Tuned:
-    """What a search found.
+    """Result of a parameter search.
 
     Attributes:
         parameters: of the least loss.
-        tried: every point, with the figures that `loss` was told of it.
+        tried: every point, with its figures.
     """
 
     parameters: Parameters

@@ -1,4 +1,4 @@
-"""What the tables of HG-VAE share: motion, names of models, and where what is trained for them is kept."""
+"""Shared by HG-VAE's tables: motion, names of models, and the folder of models trained for them."""
 
 from __future__ import annotations
 

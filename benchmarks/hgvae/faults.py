@@ -1,4 +1,4 @@
-"""What HG-VAE's score must tell from clean motion: noise, exchanged and frozen joints, and what is no fault at all."""
+"""Test cases of the anomaly score: tracking faults, and transformations of motion that are no faults."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from steadypose.prior.body.skeleton import MIRROR, PARENTS, limbs
 
 Floats = NDArray[np.float64]
 Fault = Callable[[Floats, np.random.Generator], tuple[Floats, NDArray[np.bool_]]]
-"""From clean windows (B, T, 22, 3) to spoilt ones, and which of them (B,) hold the fault at all."""
+"""From clean windows (B, T, 22, 3) to corrupted ones, and which of them (B,) contain the fault."""
 
 HELD = "a joint frozen"
 BEGINS = 20
-"""Frame in which a fault begins that lasts to the window's end."""
+"""Frame in which a fault begins; it lasts to the window's end."""
 MIN_MOTION = 0.10
-"""Metres: a joint that would have moved less is not told from one that is frozen, by anybody."""
+"""Metres: a joint that would have moved less is indistinguishable from a frozen one."""
 
 _ARM, _LEG, *_ = limbs(("elbow", "wrist"), ("knee", "ankle", "foot"))
 _MOVERS = np.concatenate(limbs(("elbow", "wrist", "knee", "ankle")))
@@ -34,7 +34,7 @@ def noise(windows: Floats, rng: np.random.Generator, sigma: float) -> tuple[Floa
 
 
 def exchanged(windows: Floats, rng: np.random.Generator, limb: list[int]) -> tuple[Floats, NDArray[np.bool_]]:
-    """A limb and the other side's are taken for each other, from `BEGINS` on; only where they are apart."""
+    """Limbs of both sides exchanged from `BEGINS` on; a fault only where they are apart."""
     del rng
     both = np.array([*limb, *MIRROR[limb]])
     out = windows.copy()
@@ -43,12 +43,12 @@ def exchanged(windows: Floats, rng: np.random.Generator, limb: list[int]) -> tup
 
 
 def frozen(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """One of the joints that move stays where it was in the frame before `BEGINS`."""
+    """One moving joint frozen at its position in the frame before `BEGINS`."""
     return held(windows, windows, rng)
 
 
 def held(seen: Floats, windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """The same of what a sensor saw of ``windows``: of one joint that moves, it repeats its last answer."""
+    """`frozen` on noisy observations ``seen`` of ``windows``: the tracker repeats its last output."""
     out = seen.copy()
     moved = np.linalg.norm(windows[:, BEGINS:] - windows[:, BEGINS - 1 : BEGINS], axis=-1)[..., _MOVERS].max(axis=1)
     for k, by in enumerate(moved):
@@ -58,7 +58,7 @@ def held(seen: Floats, windows: Floats, rng: np.random.Generator) -> tuple[Float
 
 
 def other_skeleton(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """Bones 0.6 to 1.6 times as long, each by itself: a skeleton taken for another."""
+    """Bone lengths scaled independently by 0.6 to 1.6: not this person's skeleton."""
     out = windows.copy()
     factor = np.exp(rng.uniform(np.log(0.6), np.log(1.6), (len(windows), 22)))
     for joint, parent in enumerate(PARENTS[1:], start=1):
@@ -69,7 +69,7 @@ def other_skeleton(windows: Floats, rng: np.random.Generator) -> tuple[Floats, N
 
 
 def other_persons_limb(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """From `BEGINS` on, an arm is that of somebody else, half a metre away."""
+    """From `BEGINS` on, an arm of another person, half a metre away."""
     out = windows.copy()
     other = windows[rng.permutation(len(windows))]
     beside = windows[:, BEGINS:, :1] - other[:, BEGINS:, :1] + rng.normal(0.0, 0.3, (len(windows), 1, 1, 3))
@@ -84,13 +84,13 @@ def relabelled(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArr
 
 
 def mirrored(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """As in a mirror: somebody else's motion, and no fault."""
+    """Mirrored: no fault."""
     del rng
     return windows[:, :, MIRROR] * np.array([1.0, -1.0, 1.0]), _all(windows)
 
 
 def reversed_in_time(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """Backwards: most of what people do can be done backwards too."""
+    """Played backwards: mostly no fault."""
     del rng
     return windows[:, ::-1].copy(), _all(windows)
 

@@ -98,7 +98,7 @@ def _encodable(
 
 
 def _features(model: HGVAE, x: torch.Tensor) -> Floats:
-    """Lowest cosines of every track but the pelvis's, for telling actions apart."""
+    """Lowest cosines of every track except the pelvis's, for classifying actions."""
     return (x[:, 3:] @ model.dct[:8].T).flatten(1).numpy()
 
 

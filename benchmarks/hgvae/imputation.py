@@ -1,9 +1,9 @@
-"""The occlusion sweep (figure 4) and what imputation is worth to a motion predictor (figure 5).
+"""The occlusion sweep (figure 4), and the effect of imputation on a motion predictor (figure 5).
 
-Entries are hidden one by one, joint by joint, or a limb for a while; every method gets the same windows. "mean" is the
-training mean of each track, "hold" the last sighting, "line" a straight line in time, "guess" the line beside the
-joint above, "completion" what the network makes of it, from which HG-VAE starts. The paper climbs log p(z | x) by the
-missing entries; we climb by the latents.
+Single entries, whole joints, or a limb for a time are hidden; every method gets the same windows. "mean" is the
+training mean of each track, "hold" the last sighting, "line" linear interpolation in time, "guess" interpolation
+relative to the parent, "completion" the completion network's output, from which HG-VAE starts. The paper ascends log
+p(z | x) in the missing entries; here the ascent is in the latents.
 """
 
 from __future__ import annotations
@@ -177,7 +177,8 @@ def _line(track: Floats, observed: Mask, mean: Floats) -> Floats:
 
 
 def _guess(window: Floats, size: float, clean: Tracks, observed: Mask, line: Floats) -> Floats:
-    """What `to_tracks` makes of whole joints hidden, in the frame of the clean window; of single entries, the line."""
+    """The interpolation of `to_tracks` for hidden joints, in the frame of the clean window; linear for single
+    entries."""
     joints = observed.reshape(22, 3, -1)
     if (joints != joints[:, :1]).any():
         return line
@@ -188,7 +189,7 @@ def _guess(window: Floats, size: float, clean: Tracks, observed: Mask, line: Flo
 
 
 class Predictor(nn.Module):
-    """A small predictor of the half second that follows a window: what each track adds to its last entry."""
+    """A small predictor of the half second after a window: the displacement of each track from its last entry."""
 
     FUTURE = 15
 

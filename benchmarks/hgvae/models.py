@@ -41,17 +41,17 @@ when an hour is over, and which one is ahead says nothing of depth."""
 
 
 MIN_SIGMA = 0.05
-"""Metres: what a model that generates need not get right. By the likelihood alone, the trunk's millimetres outweigh
-what the arms do, and neither latents nor samples tell of them."""
+"""Metres, lower bound of the standard deviation of generative models: without it, the trunk's millimetres outweigh the
+arms' motion in the likelihood, and neither latents nor samples represent it."""
 
 
 def of_levels() -> HGVAEConfig:
-    """Four levels of which the finest has few latents: the others are used, and what is drawn from all is a body."""
+    """Four levels, the finest with few latents, so that the others are used and samples of all are plausible bodies."""
     return HGVAEConfig(features=48, levels=(Level(1, 48), Level(8, 24), Level(24, 24), Level(JOINT_NODES, 2)))
 
 
 def with_actions(count: int) -> HGVAEConfig:
-    """One level, with a one-hot of the action beside its latent: of several, the top one is hardly used."""
+    """One level, with the action as one-hot beside its latent: with several, the top one is hardly used."""
     return HGVAEConfig(features=48, levels=(Level(1, 96),), actions=count)
 
 
@@ -96,7 +96,7 @@ def train(
     least_sigma: float = 0.0,
     rate: float = 1e-3,
 ) -> HGVAE:
-    """By the evidence lower bound alone, as the paper; a run of the same name in ``directory`` is taken up again.
+    """By the evidence lower bound alone, as the paper; a run of the same name in ``directory`` is resumed.
 
     ``least_sigma``, metres, is the least standard deviation that the likelihood takes the model to state; ``rate`` is
     Adam's at the start.
@@ -131,9 +131,9 @@ def train(
 
 
 def draw_tops(top: NDArray[np.float64], actions: NDArray[np.intp], wanted: NDArray[np.intp], seed: int) -> Tensor:
-    """Top latents for the actions ``wanted``, each drawn from the Gaussian of what windows of that action have.
+    """Top latents sampled for the actions ``wanted``, each from a Gaussian fitted to those of windows of that action.
 
-    N(0, I), the prior, is far wider than where windows are (ex-post density estimation, Ghosh et al. 2020).
+    The prior N(0, I) is far wider than the aggregate posterior (ex-post density estimation, Ghosh et al. 2020).
 
     Args:
         top: (B, latent) posterior means of real windows, whose

@@ -1,4 +1,4 @@
-"""Motion from observations (Tables 2 to 4): what is seen, by whom it is fitted, and how that is scored."""
+"""Motion from observations (Tables 2 to 4): inputs, methods and scores."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ UNKNOWN, KNOWN = "steadypose", "steadypose, sensor known"
 
 
 class Stated(NamedTuple):
-    """What ours says of a clip beside the joints' places."""
+    """Our output for a clip, besides positions."""
 
     sigma: Floats  # (T, 13) metres
     anomaly: Floats  # (T,)
@@ -66,7 +66,7 @@ def run_filter(clips: Sequence[Clip], run: Callable[[Floats, Floats], Floats]) -
 
 
 def run_ours(clips: Sequence[Clip], settings: PriorSettings, delay: int) -> tuple[list[Floats], list[Stated]]:
-    """What ``steadypose clean --delay K`` makes of each clip.
+    """Each clip, cleaned as by ``steadypose clean --delay K``.
 
     The command gives the same numbers for each clip alone, but for its last few frames, where a shorter clip ends by
     absence and not with the stream (0.05 mm of a clip's mean, up to 4 mm in its last frame).
@@ -84,13 +84,13 @@ def run_ours(clips: Sequence[Clip], settings: PriorSettings, delay: int) -> tupl
 
 @dataclass
 class Kinect:
-    """The methods, for one person left out after the other; what does not depend on who that is, is done once.
+    """The methods, with each person left out in turn; what does not depend on the person is computed once.
 
     Attributes:
         bench: where this runs.
         data: ``ui_prmd.npz``.
-        clips: of everybody.
-        taught: of everybody, those that peers learn from.
+        clips: of all people.
+        taught: of all people, the clips that peers learn from.
     """
 
     bench: Bench
@@ -100,7 +100,7 @@ class Kinect:
     _answers: dict[tuple[str, int, str], tuple[Floats, Stated]] = field(default_factory=dict)
 
     def tuned(self, on: Sequence[Clip]) -> dict[tuple[str, int], Tuned]:
-        """One search for each filter and delay on clips of everybody, with the figures of each subject in it."""
+        """One parameter search for each filter and delay on the clips of all people, with figures for each subject."""
         groups = {subject: [c for c in on if c.subject == subject] for subject in dict.fromkeys(c.subject for c in on)}
 
         def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
@@ -151,7 +151,7 @@ class Kinect:
     def _once(
         self, clips: Sequence[Clip], name: str, settings: PriorSettings, delay: int
     ) -> tuple[list[Floats], list[Stated]]:
-        """`run_ours` over everybody's clips the first time, remembered after that."""
+        """`run_ours` over the clips of all people, cached."""
         if (name, delay, clips[0].name) not in self._answers:
             positions, stated = run_ours(self.clips, settings, delay)
             for clip, own, sigma in zip(self.clips, positions, stated, strict=True):

@@ -23,9 +23,9 @@ from steadypose.benchmarks.metrics import (
 from steadypose.prior.body.kinematics import rigid_alignment
 
 OFF = 0.10
-"""Metres: a joint that its standard deviation should have told of."""
+"""Metres: an error that the stated standard deviation should indicate."""
 WORST = 0.1
-"""Share of the frames that the anomaly should have told of."""
+"""Share of frames, the worst by mean error, that the anomaly should indicate."""
 
 
 @dataclass(frozen=True)
@@ -114,13 +114,13 @@ def summary(clips: Sequence[Clip], scores: Scores) -> dict[str, Any]:
 
 
 def deviation(error: Floats, sigma: Floats, anomaly: Floats, flagged: NDArray[np.bool_]) -> dict[str, float | None]:
-    """Whether what is stated tells of the error.
+    """How well stated deviation and anomaly predict the error.
 
     Args:
         error: (N, 13) metres, NaN where Vicon has nothing.
         sigma: (N, 13) metres, stated.
         anomaly: (N,) score of each frame.
-        flagged: (N,) whether it is called an anomaly.
+        flagged: (N,) whether a frame is flagged as an anomaly.
 
     Returns:
         the rank correlation of sigma with the error; areas under the ROC curve of sigma for joints off by more than

@@ -1,9 +1,8 @@
-"""A peer without a setting: a bank of constant-velocity fixed-lag smoothers, weighed by how well each predicts.
+"""A peer without parameters to tune: the static multiple-model estimate of constant-velocity fixed-lag smoothers.
 
-Multiple-model estimation in its static form (Bar-Shalom, Li and Kirubarajan 2001, section 11.6): each joint's weight of
-a smoother is the likelihood of its innovations over the last 0.3 s. The measurement noise is found from third
-differences, which motion hardly has: their median over the last second, half of it (in logarithm) shared by the joints
-of a body.
+(Bar-Shalom, Li and Kirubarajan 2001, section 11.6.) For each joint, a smoother's weight is the likelihood of its
+innovations over the last 0.3 s. The measurement noise is estimated from third differences, in which motion is small:
+their median over the last second, half of it (in logarithm) shared by the joints of a body.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ DENSITIES = (0.05, 0.3, 1.8, 10.0, 60.0)
 
 _RECENT, _NOISE_FRAMES = 9, 30
 _MIN_NOISE, _FIRST_NOISE = 1e-4, 0.01
-"""metres: below what any sensor has, and what is assumed before there are four sightings"""
+"""metres, lower bound of the estimated noise, and its value before there are four sightings"""
 _MEDIAN_NORM = 1.538
 """Median length of a normal vector in space with a standard deviation of 1 along each axis."""
 _THIRD = np.sqrt(20.0)
@@ -49,7 +48,7 @@ def bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
 
 
 def noise_found(seen: Floats) -> Floats:
-    """(T, ..., J) metres along an axis, from what came up to each frame."""
+    """(T, ..., J) metres along an axis, noise estimated from the input up to each frame."""
     third = np.full(seen.shape[:-1], np.nan)
     third[3:] = np.linalg.norm(np.diff(seen, n=3, axis=0), axis=-1)
     padded = np.concatenate([np.full((_NOISE_FRAMES - 1, *third.shape[1:]), np.nan), third])

@@ -13,13 +13,13 @@ _ACROSS = tuple((J[f"left_{part}"], J[f"right_{part}"]) for part in ("hip", "sho
 
 
 def beside(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """As it came; a hidden joint where it was when last seen, beside the nearest that is seen: the fewest bones away,
-    and of several the nearest in space. Where none is seen, all stay; a joint never seen has no answer.
+    """The input; a hidden joint keeps its last offset, turned with the trunk, from the nearest visible joint: the one
+    fewest bones away and, of several, nearest in space. With no visible joint, all are held; a joint never seen is NaN.
 
     Args:
         seen: (T, C, 22, 3) metres, z up, canonical joints, NaN where missing.
         stamps_s: (T,) seconds.
-        delay: frames, of which no use is made.
+        delay: frames; not used.
     """
     answers = seen.copy()
     clips, joints = seen.shape[1:3]

@@ -1,4 +1,4 @@
-"""What a user has for free: the methods that steadypose is compared with.
+"""Filters that are freely available, as peers.
 
 A peer takes clips side by side, (T, ..., 3) metres with NaN where a joint is missing, and their stamps, and gives each
 frame's answer as it stands ``delay`` frames later; at the end of a clip, with the frames there are. All use the real
@@ -58,13 +58,13 @@ def raw(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
 
 
 def hold_last(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """As it came; a missing joint where it last was."""
+    """The input; a missing joint is held at its last position."""
     return np.take_along_axis(seen, _last_seen(seen)[..., None], axis=0)
 
 
 def interpolate(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """As it came; a missing joint on the line between its neighbours in time, if the later one is at most ``delay``
-    frames away, and else where it last was."""
+    """The input; a missing joint is interpolated linearly if its next sighting is at most ``delay`` frames away, and
+    otherwise held."""
     frames = np.arange(len(seen)).reshape(-1, *[1] * (seen.ndim - 2))
     gone = missing(seen)
     last = _last_seen(seen)

@@ -1,6 +1,6 @@
-"""The peers of completion: what fills a gap, or a hidden part of a body, without a network.
+"""Peers of completion: fill gaps, or hidden parts of a body, without a network.
 
-Each gives local rotations and the root of whole windows, as `prior.offline.complete.Fill` has it.
+Each returns local rotations and the root of whole windows, as `prior.offline.complete.Fill`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def zero_velocity(positions: Floats, rotations: Floats, offsets: Floats) -> tupl
 
 
 def held_rows(positions: Floats) -> NDArray[np.intp]:
-    """(T,) for each frame the last that is known, of clips with the same gap."""
+    """(T,) index of the last known frame at each frame, for clips with the same gap."""
     known = np.isfinite(positions[0, :, 0, 0])
     return np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))
 
@@ -61,9 +61,9 @@ def cubic_spline(positions: Floats, rotations: Floats, offsets: Floats) -> tuple
 
 
 class NearestWindow:
-    """What training people did in the window that is nearest in what is known, put between the ends that are known.
+    """The training window nearest in the known joints, fitted between the known ends.
 
-    How that window differs from slerp and lerp between its own ends is added to those between these.
+    Its deviation from slerp and lerp between its own ends is added to slerp and lerp between these.
     """
 
     def __init__(self, motion: MotionSet, step: int = 5) -> None:
@@ -128,7 +128,7 @@ class NearestPose:
 
         Args:
             positions: metres, NaN where hidden.
-            truth_yaw: (C,) radians, where bodies look in the first frame.
+            truth_yaw: (C,) radians, heading in the first frame.
             hidden: joints.
         """
         seen = np.setdiff1d(np.arange(22), hidden)

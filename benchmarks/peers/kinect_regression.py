@@ -1,8 +1,8 @@
-"""Peers that learn a Kinect's error from recordings beside a reference, in seconds: what a motion prior must beat.
+"""Peers that learn a Kinect's error from recordings with a reference, trained in seconds.
 
-Both read poses in the frame of the trunk, smoothed by a constant-velocity Kalman filter, and say what to add to the 13
-scored joints of that smoother's answer: a ridge regression on one frame (66 inputs), and a temporal convolution over
-24 frames, up to 4 of them ahead, with 64 channels.
+Both read poses in the frame of the trunk, smoothed by a constant-velocity Kalman filter, and predict a correction of
+the 13 scored joints of that smoother: a ridge regression on one frame (66 inputs), and a temporal convolution over 24
+frames, up to 4 of them ahead, with 64 channels.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Smoothed:
     """A clip, smoothed.
 
     Attributes:
-        inputs: (T, 66) metres, joints in the trunk's frame, from the middle of the hips; smoothed with whatever part
-            of the delay is not looked ahead by the regression itself.
+        inputs: (T, 66) metres, joints in the trunk's frame, from the middle of the hips; smoothed with the part
+            of the delay that the regression does not look ahead itself.
         answer: (T, 13, 3) metres, the scored joints, smoothed with the whole delay.
         trunk: (T, 3, 3) the trunk's frame in that of the answer.
     """

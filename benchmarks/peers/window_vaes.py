@@ -67,7 +67,7 @@ class MVAE(HMVAE):
 
 
 class TCNVAE(MotionVAE):
-    """TCN-VAE: four temporal convolutions over all joints at once and back; nothing knows of bones.
+    """TCN-VAE: four temporal convolutions over all joints at once and back; no bones.
 
     So wide that it has as many parameters as HM-VAE has in use, within a hundredth.
     """

@@ -1,10 +1,9 @@
 """Which feet bear load, against force plates: OpenCap's validation subjects, who walk, jump and squat.
 
-Skin markers of ankle and toe, 100 frames a second, split into three streams of 30 Hz, stand for the joints; nothing
-else of the body is known, so the network has to do with feet alone. A foot bears load where its plate says more than
-30 N. Noise is independent from frame to frame (HuMoR's 4 cm), and goes through the smoother that ships. Nothing was
-trained on these recordings; the rule that labels load, on which the network was trained with other people, has its
-0.7 m/s from them.
+Skin markers of ankle and toe, 100 frames a second, split into three streams of 30 Hz, serve as joints; no other
+joint is known to the network. A foot bears load where its plate measures more than 30 N. Noise is independent from
+frame to frame (HuMoR's 4 cm), and goes through the smoother that ships. Nothing was trained on these recordings; the
+rule that labels load, on which the network was trained with other people, has its 0.7 m/s from them.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ class Trial(NamedTuple):
         kind: of `KINDS`.
         joints: (T, 22, 3) metres, floor at 0; NaN but of ankles and toes.
         loaded: (T, 2) whether the left and the right foot bear load.
-        valid: (T, 2) where the plates tell.
+        valid: (T, 2) where the plates measure.
     """
 
     kind: str

@@ -1,8 +1,7 @@
-"""Fidelity: what cleaning does to motion, by how fast a joint moves, how noisy it is, and how long one waits.
+"""Fidelity: error of cleaned motion by the true speed of a joint, its noise, and the delay.
 
-A perfect input is to come out as it went in. Bodies stand 3 m before a camera at the origin; noise is independent, the
-same in every direction or three times as large along the line of sight. Errors are sorted by the true speed of the
-joint. Swings of a forearm and of a leg show what is left of a motion of one frequency.
+A perfect input must stay unchanged. Bodies stand 3 m before a camera at the origin; noise is white and isotropic, or
+three times as large along the line of sight. Swings of a forearm and of a leg measure the gain at single frequencies.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ SWINGS = {
 
 
 def conditions(quick: bool) -> dict[str, Callable[[Floats, np.random.Generator], Floats]]:
-    """By name, what is done to (T, C, 22, 3) joints before a camera at the origin."""
+    """By name, corruptions of joints (T, C, 22, 3) before a camera at the origin."""
     levels = (0.0, 0.01) if quick else NOISES_M
     same = {_noise_name(level): partial(_independent, level) for level in levels}
     more = {f"{_noise_name(level)}, depth x3": partial(_deep, level) for level in levels if level}

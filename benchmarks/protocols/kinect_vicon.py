@@ -215,7 +215,7 @@ def _table(records: Sequence[dict[str, Any]], clips: Sequence[Clip], subjects: S
 
 
 def _deviation_table(deviations: Mapping[tuple[str, int], dict[str, Any]], subjects: Sequence[str]) -> Table:
-    """What sigma and anomaly tell of the error, for each person, at a delay of 4."""
+    """How well sigma and anomaly predict the error, for each person, at a delay of 4."""
     keys = {
         "rank_correlation": "rank correlation", "auroc_off": "AUROC, joint off by 10 cm",
         "auroc_worst": "AUROC, worst tenth of frames", "found_by_stated": "found by stated",

@@ -60,7 +60,7 @@ def read_streams(path: Path) -> list[Stream]:
 def error_of(answer: Floats, stream: Stream) -> dict[str, float]:
     """Errors of (T, 22, 3), mm and mm/frame², relative to the hips' middle and turned as a whole onto the truth.
 
-    Of what lasts all along, the constant offset of each joint, one part is how joints are defined: it is taken out.
+    The constant offset of each joint, which is partly a matter of its definition, is subtracted.
     """
     both = np.isfinite(answer).all(axis=-1).any(axis=0) & np.isfinite(stream.truth).all(axis=-1).any(axis=0)
     own, wanted = ((x - x[:, HIPS].mean(axis=1, keepdims=True))[:, both] for x in (answer, stream.truth))

@@ -1,7 +1,7 @@
 """Noisy joints: HuMoR's protocol (90 frames, 4 cm), swept over levels, and noise of the kinds that sensors make.
 
 HuMoR adds independent noise to every joint (Rempe et al. 2021, section 5.2). Independent noise flatters low-pass
-filters: the other conditions have noise that lasts, spikes, and limbs exchanged.
+filters: the other conditions have correlated noise, spikes, and exchanged limbs.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""A stream as it comes: the delay that is really found, jitter beside it, recovery, lost frames, jittering stamps.
+"""Streaming: effective delay, jitter, recovery of hidden limbs, lost frames, jittering stamps.
 
-Joints carry 2 cm of independent noise. A method is tuned once, on the steady stream, and meets every other condition
-with that. Lost frames are asked for like any other: who gets no frame must still say where the body is. Stamps that
-jitter are true: the body was where the truth is at that time, and an answer is compared with the truth at its own
-stamp. Compute times are those of `benchmarks.systems.latency`.
+Joints have 2 cm of white noise. A method is tuned once, on the steady stream, for all conditions. Lost frames are
+scored like all others. Jittering stamps are correct: an estimate is compared with the truth at its own stamp. Compute
+times are those of `benchmarks.systems.latency`.
 """
 
 from __future__ import annotations
@@ -38,11 +37,11 @@ LOSSES = (0.01, 0.05, 0.10)
 STAMP_JITTER_S = 0.010
 BURST_S = 1.0
 RECOVERED = 1.5
-"""A limb is found again when its error is within so many times what it is when nothing is hidden."""
+"""A limb has recovered when its error is within this multiple of its error while nothing is hidden."""
 MAX_LAG = 12
-"""Frames, looked at for the delay."""
+"""Frames, the largest delay considered."""
 STREAMING_PEERS = tuple(peer for peer in PEERS if peer.delays != (OFFLINE,) and peer.run is not raw)
-"""Who does not answer for a lost frame would be scored on the others alone: "hold last" is raw with an answer."""
+"""A method without an estimate for lost frames would be scored on the others alone: "hold last" is raw, held."""
 CONDITIONS = ("steady", *(f"{share:.0%} lost" for share in LOSSES), "stamps ±10 ms", "occlusion of 1 s")
 
 
@@ -73,7 +72,7 @@ def run(bench: Bench) -> Result:
 
 
 def observe(clips: MotionClips, condition: str, truth_at: CubicSpline) -> tuple[Floats, Floats]:
-    """Stamps (T,) and what is seen at them (T, C, 22, 3)."""
+    """Stamps (T,) and observations (T, C, 22, 3)."""
     rng = np.random.default_rng(CONDITIONS.index(condition))
     frames, count = clips.positions.shape[:2]
     stamps = clips.stamps_s.copy()

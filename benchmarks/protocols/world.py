@@ -1,9 +1,8 @@
-"""The body in the world: how far its root drifts when it cannot be seen, and whether standing feet stand.
+"""The body in the world: root error and foot skating, and drift of a root that is hidden.
 
-Two questions. Seen through noise that lasts (2 cm), the floor known, where is the body, and do its feet skate? Each
-foot counts for itself: a measure that asks for both to be still at once (RoHM's) forgives any walk. And when the
-trunk is hidden for two seconds at a time, how far has the root gone astray, by 10 m of path
-(`benchmarks.root_drift`)?
+First: in correlated noise (2 cm), with a known floor, the error of the root, and the skating of each foot by itself (a
+measure that requires both to be still, as RoHM's, ignores walking). Second: with the trunk hidden for two seconds at a
+time, the drift of the root per 10 m of path (`benchmarks.root_drift`).
 """
 
 from __future__ import annotations

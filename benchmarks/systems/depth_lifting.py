@@ -46,14 +46,14 @@ _BODY = [index for index, name in enumerate(COCO17.joints) if not name.endswith(
 
 @dataclass(frozen=True)
 class Picture:
-    """A person as a detector and a depth camera give them, and as they are.
+    """A person's key points and depth image, with the ground truth.
 
     Attributes:
         keypoints: (17, 2) pixels, exact.
         confidence: (17,).
         depth: (H, W) millimetres.
         truth: (17, 3) metres, optical frame.
-        seen: (17,) whether the joint is hidden by nothing but its own flesh.
+        seen: (17,) whether nothing but the joint's own limb occludes it.
     """
 
     keypoints: Floats
@@ -121,7 +121,7 @@ def ours(keypoints: Floats, confidence: Floats, depth: NDArray[np.uint16], intri
 
 
 def median(keypoints: Floats, confidence: Floats, depth: NDArray[np.uint16], intrinsics: Floats) -> Floats:
-    """What most do: the median depth of a small square around each key point that is sure enough."""
+    """The common method: the median depth of a small square around each key point of sufficient confidence."""
     positions = np.full((len(keypoints), 3), np.nan)
     for joint, (x, y) in enumerate(np.rint(keypoints).astype(int)):
         around = depth[max(y - 3, 0) : max(y + 4, 0), max(x - 3, 0) : max(x + 4, 0)]

@@ -1,12 +1,11 @@
-"""``python -m steadypose.benchmarks.systems.fuzz``: what readers make of anything but what they expect.
+"""``python -m steadypose.benchmarks.systems.fuzz``: readers on malformed input.
 
     python -m steadypose.benchmarks.systems.fuzz --seconds 600
     python -m steadypose.benchmarks.systems.fuzz --seconds 60 --only codec recording
 
-Inputs are whole ones, damaged: bits flipped, bytes taken out, doubled and exchanged, numbers replaced by those that
-numbers should not be; so most get past the first check. Each must be read, or refused with the reader's own error,
-within `SLOW_S`, and the process must not grow. Where atheris is installed, ``--guided`` lets it look for new ways
-through the code.
+Inputs are whole ones, damaged: bits flipped, bytes taken out, doubled and exchanged, numbers replaced by extreme ones;
+so most get past the first check. Each must be read, or refused with the reader's own error, within `SLOW_S`, and the
+process must not grow. Where atheris is installed, ``--guided`` lets it look for new ways through the code.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ SLOW_S = 5.0
 """that a reader may take for an input of some kilobytes"""
 NUMBERS = (b"nan", b"inf", b"-1", b"0", b"1e999", b"1e-320", b"9" * 40, b"0x1", b"", b"{", b"}", b'"', b"\n", b"\0")
 SETTLED = 1000
-"""inputs after which memory is first looked at: caches are full by then"""
+"""inputs after which memory is first measured: caches are full by then"""
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def targets(folder: Path) -> dict[str, Target]:
 
 
 def fuzz(name: str, target: Target, seconds: float, random_: random.Random) -> dict[str, object]:
-    """Damage and read for so long; what came of it."""
+    """Damage and read inputs for this long; returns the outcome."""
     ended, counts = time.monotonic() + seconds, Counter[str]()
     slowest, settled_mb, bad = 0.0, 0.0, []
     while (now := time.monotonic()) < ended:
@@ -164,7 +163,7 @@ def _most_mb() -> float:
 
 
 def guided(name: str, target: Target, seconds: float) -> None:
-    """Let atheris look for inputs, by what code they reach; it ends the process."""
+    """Coverage-guided fuzzing with atheris, which ends the process."""
     import atheris  # pyright: ignore[reportMissingImports, reportMissingModuleSource]
 
     def one(content: bytes) -> None:

@@ -120,7 +120,7 @@ def _nobody() -> dict[str, Any]:
 
 
 def _people(raw: list[PoseRaw], truth: list[PoseWorld]) -> dict[int, int]:
-    """Who each id of the source is: the tracker of a simulated camera mistakes nobody for another."""
+    """The person of each id of the source: the tracker of a simulated camera makes no mistakes."""
     roots = {body.id: np.array([m.bodies[k].root_position for m in truth]) for k, body in enumerate(truth[0].bodies)}
     stamps = np.array([m.stamp_ns for m in truth])
     away: dict[int, Counter[int]] = {}
@@ -162,7 +162,7 @@ def nearest() -> Method:
 
 
 def identified(settings: IdentifySettings) -> Method:
-    """What this project makes of it."""
+    """Ids by `prior.clean.identify`."""
     stage = Identify(settings, ROWS, Counter())
     return lambda frame: stage.update(frame.stamp_ns, frame.bodies, frame.confidence)
 

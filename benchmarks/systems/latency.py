@@ -1,4 +1,4 @@
-"""What it costs in time: compute a frame, from capture to ``pose/world``, and frames dropped.
+"""Latency: computing time per frame, time from capture to ``pose/world``, and frames dropped.
 
 The input is a recorded stream, set to exactly 30 Hz and played to and fro so that nobody jumps; a crowd is copies of
 its body, side by side. Compute is measured in this process, pinned to one core, one thread. The rest is measured on

@@ -1,4 +1,4 @@
-"""What lasts: the memory and pace of every node while hours of stream are replayed as fast as they go."""
+"""Endurance: memory and speed of every node while hours of a stream are replayed as fast as possible."""
 
 from __future__ import annotations
 

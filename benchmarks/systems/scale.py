@@ -1,4 +1,4 @@
-"""What one core carries: streams a core of a server, and hours of recordings cleaned an hour.
+"""Throughput: streams per core of a server, and hours of recordings cleaned per hour.
 
 A server's kiosks are copies of one recorded body, each with a clock of its own and captured at another time of the
 frame's period. Times are the thread's processor time, which other processes of the machine do not lengthen.
