@@ -1,9 +1,8 @@
 """What every `pose/clean` and `pose/world` promises, as a check; the nodes publish no body that breaks it.
 
 Where a joint's state is not UNKNOWN, its position, its deviation and its rotation are numbers. Rotations have norm 1,
-known or not. The root of a body in the world, its velocity and covariance are numbers, and the covariance is symmetric and positive
-semi-definite.
-Stamps of a source rise, until its stream ends or begins anew.
+known or not. The root of a body in the world, its velocity and covariance are numbers, and the covariance is symmetric
+and positive semi-definite. Stamps of a source increase, until its stream ends or begins anew.
 """
 
 from __future__ import annotations
