@@ -124,19 +124,25 @@ def deviation(error: Floats, sigma: Floats, anomaly: Floats, flagged: NDArray[np
 
     Returns:
         the rank correlation of sigma with the error; areas under the ROC curve of sigma for joints off by more than
-        10 cm, and of the anomaly for the worst tenth of the frames by mean error (None where there is no such joint);
-        error found by deviation stated; the share flagged.
+        10 cm, and for the worst tenth of the frames by mean error, of the root mean square of sigma over the joints
+        and of the anomaly (None where there is no such joint); error found by deviation stated; the share flagged.
     """
     known = np.isfinite(error) & np.isfinite(sigma)
     off = error[known] > OFF
-    frames = np.isfinite(anomaly) & np.isfinite(error).any(axis=1)
+    frames = np.isfinite(anomaly) & known.any(axis=1)
     mean = np.nanmean(error[frames], axis=1)
     worst = mean > np.quantile(mean, 1 - WORST)
+    squared = np.where(known, sigma, np.nan)[frames] ** 2
     return {
         "rank_correlation": round(float(np.corrcoef(rankdata(sigma[known]), rankdata(error[known]))[0, 1]), 3),
-        "auroc_off": round(float(roc_auc_score(off, sigma[known])), 3) if 0 < off.sum() < len(off) else None,
+        "auroc_off": _auroc(off, sigma[known]),
         "off_percent": round(100 * float(off.mean()), 2),
-        "auroc_worst": round(float(roc_auc_score(worst, anomaly[frames])), 3) if 0 < worst.sum() < len(worst) else None,
+        "auroc_worst": _auroc(worst, np.sqrt(np.nanmean(squared, axis=1))),
+        "auroc_worst_anomaly": _auroc(worst, anomaly[frames]),
         "found_by_stated": round(sigma_ratio(error, sigma), 3),
         "flagged_percent": round(100 * float(flagged.mean()), 2),
     }
+
+
+def _auroc(wrong: NDArray[np.bool_], score: Floats) -> float | None:
+    return round(float(roc_auc_score(wrong, score)), 3) if 0 < wrong.sum() < len(wrong) else None

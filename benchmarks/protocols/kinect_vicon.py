@@ -218,8 +218,8 @@ def _deviation_table(deviations: Mapping[tuple[str, int], dict[str, Any]], subje
     """How well sigma and anomaly predict the error, for each person, at a delay of 4."""
     keys = {
         "rank_correlation": "rank correlation", "auroc_off": "AUROC, joint off by 10 cm",
-        "auroc_worst": "AUROC, worst tenth of frames", "found_by_stated": "found by stated",
-        "flagged_percent": "flagged, %",
+        "auroc_worst": "AUROC, worst tenth of frames", "auroc_worst_anomaly": "of the anomaly",
+        "found_by_stated": "found by stated", "flagged_percent": "flagged, %",
     }  # fmt: skip
     rows = [
         [f"{person}, {text}", *("–" if (v := deviations[name, 4][person][key]) is None else f"{v:.2f}" for key in keys)]
@@ -228,5 +228,6 @@ def _deviation_table(deviations: Mapping[tuple[str, int], dict[str, Any]], subje
     ]
     return Table(
         "kinect_vicon-deviation", "Real Kinect: what the stated deviation and the anomaly tell of the error, delay 4",
-        ["person left out", *keys.values()], rows, "Deviation of a joint, anomaly of a frame; 0.5 is chance.",
+        ["person left out", *keys.values()], rows,
+        "Deviation of a joint, its root mean square over a frame's joints, and the frame's anomaly; 0.5 is chance.",
     )  # fmt: skip

@@ -95,9 +95,11 @@ def test_what_is_stated_is_held_against_the_error() -> None:
     error = np.abs(rng.normal(0, 1, sigma.shape)) * sigma * np.sqrt(3)
     error[:5, 0] = np.nan
     honest = deviation(error, sigma, np.nanmean(error, axis=1), np.arange(400) < 4)
-    expected = {"rank_correlation": 0.5, "auroc_off": 0.85, "auroc_worst": 1.0, "found_by_stated": 1.0}
+    expected = {"rank_correlation": 0.5, "auroc_off": 0.85, "auroc_worst_anomaly": 1.0, "found_by_stated": 1.0}
     assert honest == {**honest, **{key: pytest.approx(value, abs=0.15) for key, value in expected.items()}}
     assert honest["flagged_percent"] == 1.0
+    tenfold = np.where(np.arange(400) < 40, 10.0, 1.0)[:, None]
+    assert deviation(tenfold * error, tenfold * sigma, np.zeros(400), np.zeros(400, dtype=bool))["auroc_worst"] > 0.99
     blind = deviation(error, rng.permuted(sigma), rng.normal(size=400), np.zeros(400, dtype=bool))
     assert blind["rank_correlation"] == pytest.approx(0.0, abs=0.1)
     assert blind["auroc_off"] == pytest.approx(0.5, abs=0.1)
