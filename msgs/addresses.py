@@ -63,7 +63,7 @@ def refuse_used(path: Path) -> None:
 
 def check_private(directory: Path) -> None:
     """Raises:
-    TransportError: others own the directory, or may write to it, and so could publish in somebody's name.
+    TransportError: others own the directory, or may write to it, and so could publish in this user's name.
     """
     try:
         status = directory.lstat()
@@ -87,10 +87,10 @@ def check_private(directory: Path) -> None:
 
 
 def make_private(directory: Path) -> None:
-    """Make a directory for sockets, for nobody but this user, unless it is there.
+    """Make a directory for sockets, accessible to this user only, unless it exists.
 
     Raises:
-        TransportError: it is there, and is not to be trusted, or cannot be made.
+        TransportError: it exists with other owners or permissions, or cannot be made.
     """
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import CleanBody, JointState, Pose, WorldBody
+from steadypose.msgs.types import CleanBody, JointState, WorldBody
 
 NORM_TOLERANCE = 1e-3
 """how far from 1 the norm of a quaternion may be"""
@@ -40,11 +40,6 @@ def broken(body: CleanBody | WorldBody) -> str | None:
     if np.linalg.eigvalsh(body.covariance)[0] < -1e-6 * scale:
         return "the covariance has a negative variance"
     return None
-
-
-def is_pose(pose: Pose) -> bool:
-    """Whether a pose is one: finite, with a quaternion of norm 1."""
-    return bool(np.isfinite(pose.position).all()) and bool(are_unit(pose.orientation).all())
 
 
 def are_unit(quaternions: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -49,8 +49,8 @@ _DOMAIN = "steadypose"
 class Publisher:
     """Publishes messages at an address. A context manager.
 
-    `publish` waits for nobody but the subscribers that were named `reliable` when the publisher was made and that ask
-    for it: any other that does not read loses what exceeds `SEND_HIGH_WATER`, and sees so from the sequence numbers.
+    `publish` waits only for subscribers that are named in `reliable` and request it; any other that does not read loses
+    what exceeds `SEND_HIGH_WATER`, and detects that by the sequence numbers.
 
     Attributes:
         endpoint: as bound: a port given as `*` is a number here.
@@ -68,7 +68,7 @@ class Publisher:
         """Bind `endpoint`: `ipc://` and a path, or `tcp://` and an address of this machine and a port.
 
         Args:
-            keys: whose holders may subscribe; the list is looked at again while this runs.
+            keys: whose holders may subscribe; the list is reread while this runs.
             reliable: names of the subscribers to wait for.
             clear_text: whether an address that others can reach may do without keys.
 
@@ -137,7 +137,7 @@ class Publisher:
             timeout_s: how long to wait for a reliable subscriber that is behind.
 
         Returns:
-            whether it was sent; False only if it was waited for in vain, and then nobody got it.
+            whether it was sent; False if a reliable subscriber stayed behind, and then no subscriber got it.
 
         Raises:
             ValueError: if the message is not of the topic's type, encodes to more than `MAX_FRAME` bytes, or holds more
@@ -180,14 +180,14 @@ class Publisher:
         return True
 
     def check(self) -> None:
-        """See that nobody listens who may not; to be called about once a second.
+        """Enforce the list of keys; to be called about once a second.
 
-        A key that was taken off the list since the last call ends every connection, and so do more subscriptions than
-        `_note_new` could keep out; who may comes back.
+        If a key was removed since the last call, or a flood of subscriptions got past `_note_new`, all connections are
+        closed; permitted subscribers reconnect.
 
         Raises:
-            RuntimeError: keys are not checked any more, so that nobody new is let in: make another publisher.
-            TransportError: somebody else took the address meanwhile.
+            RuntimeError: keys are no longer checked, and no new subscriber is accepted: make another publisher.
+            TransportError: the address was taken by another process meanwhile.
         """
         if self._authenticator and not self._authenticator.is_alive():
             raise RuntimeError("the thread that checks keys has ended; nobody is let in any more")
@@ -197,7 +197,7 @@ class Publisher:
             self._begin_anew(_CUT)
 
     def _begin_anew(self, cause: str) -> None:
-        """Disconnect everybody; who may comes back."""
+        """Disconnect all subscribers; permitted ones reconnect."""
         self.refused[cause] += 1
         self._socket.close(0)
         self._listeners.clear()

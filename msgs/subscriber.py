@@ -227,7 +227,7 @@ class Subscriber:
         self.refused[cause] += 1
 
     def _note_connections(self, now: float) -> None:
-        """Count who was not let in, and connect again where ZeroMQ has given up, as it does after too large a frame."""
+        """Count refused connections, and reconnect where ZeroMQ has given up, as it does after too large a frame."""
         self._looked = now
         while self._monitor.poll(0):
             description, at = self._monitor.recv_multipart()

@@ -4,8 +4,8 @@ A publisher binds, subscribers connect, in any order; either may go and come bac
 The publisher draws its number when it starts and counts its messages per topic, so that a subscriber knows what it
 missed. Sockets are not thread-safe: use each in the thread that made it.
 
-Queues are bounded everywhere, and whom a publisher waits for is said at the publisher, by name. Any other subscriber
-may be slow, stopped or hostile: it loses messages, and holds up nobody.
+Queues are bounded everywhere, and a publisher waits only for the subscribers that it names. Any other may be slow,
+stopped or hostile: it loses messages, and delays no other.
 """
 
 from steadypose.msgs.addresses import TransportError, local_address, local_directory

@@ -14,7 +14,7 @@ from steadypose.prior.models.humor.network import HumorNet
 from steadypose.prior.models.humor.rollout import Rollout, sample
 from steadypose.prior.models.humor.state import State, states_of
 
-SAMPLES, SECONDS, LONG_S = 50, 2.0, 5.0
+SAMPLES, LONG_S = 50, 5.0
 """As in the paper."""
 
 SPARED = 4

@@ -25,13 +25,13 @@ def complete(
     picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     force: bool = False,
 ) -> int:
-    """Complete recorded poses: motion between key frames, and the parts of a body that nobody saw.
+    """Complete recorded poses: motion between key frames, and unobserved parts of a body.
 
     Missing are joints that are NaN or of confidence 0, in any frame, and frames between stamps more than 1/20 s apart.
-    What is there stays as it is, so clean a noisy recording first: steadypose clean IN CLEAN. OUT has a frame every
+    Known joints stay unchanged, so clean a noisy recording first: steadypose clean IN CLEAN. OUT has a frame every
     1/30 s from the first stamp to the last, interpolated where the input has other stamps. Completed joints have the
     state IMPUTED, and a standard deviation that grows with the time to the nearest sighting. In gaps of up to two
-    seconds the motion is like people's; in longer ones it is less so, and after 8 s without any joint a new stretch
+    seconds the motion is plausible; in longer ones it becomes less so, and after 8 s without any joint a new stretch
     begins.
 
     Where the pelvis lies at the origin all the time, as in many files of poses lifted from images, the way over the

@@ -56,7 +56,7 @@ def fit(
         source: a recording, a .csv or .npz, as for `clean`; or an .npz with key points.
         out: the recording to make, or .npz with one row for each row of the input; of key points, .npz at 30 Hz.
         weights: of the model of transitions: 'default', or a .safetensors file.
-        delay: frames that `clean` waits for, from whose answer the fit starts.
+        delay: of `clean`, which initialises the fit, frames at 30 Hz; without effect on key points.
         force: replace what is at OUT, if it is a recording or an .npz.
     """
     if not source.exists():
@@ -78,7 +78,10 @@ def fit(
     folder = out.with_name(f".{out.name}.fit")
     folder.mkdir(exist_ok=True)
     with Progress(console=console, disable=not console.is_terminal) as progress:
-        frames, lines = (_fit_picture if two_d else _fit_poses)(source, out, model, folder, delay, progress)
+        if two_d:
+            frames, lines = _fit_picture(source, out, model, folder, progress)
+        else:
+            frames, lines = _fit_poses(source, out, model, folder, delay, progress)
     shutil.rmtree(folder)
     spent = time.perf_counter() - started
     console.print(f"{out}: {frames} frames, fitted in {spent:.1f} s", highlight=False, soft_wrap=True)
@@ -90,7 +93,7 @@ def fit(
 def _fit_poses(
     source: Path, out: Path, model: Any, folder: Path, delay: int, progress: Progress
 ) -> tuple[int, list[str]]:
-    """Fit joints in space, from the answer of the nodes' own pipelines; the frames, and lines to print."""
+    """Fit 3D joints, initialised by the nodes' own pipelines; returns the number of frames, and lines to print."""
     from steadypose.nodes.graph.prior_node import make_prior
     from steadypose.nodes.graph.trajectory_node import make_trajectory
     from steadypose.prior.offline.solve import FitSettings
@@ -134,10 +137,8 @@ def _line(fit: Fit) -> str:
     return f"{who}: floor at {fit.track.ground[:, 0].mean():.3f} m{far}"
 
 
-def _fit_picture(
-    source: Path, out: Path, model: Any, folder: Path, delay: int, progress: Progress
-) -> tuple[int, list[str]]:
-    """Fit key points of one camera; the frames, and lines to print."""
+def _fit_picture(source: Path, out: Path, model: Any, folder: Path, progress: Progress) -> tuple[int, list[str]]:
+    """Fit key points of one camera; returns the number of frames, and lines to print."""
     from steadypose.prior.offline.solve import FitSettings
     from steadypose.prior.offline.windows import MIN_FRAMES, window_bounds
 

@@ -29,7 +29,8 @@ class TransportSettings:
     lifespan_s: float = 1.0
     """not lossless: age of a message, from its sending on, from which a node drops it instead of taking it for new"""
     clear_text: bool = False
-    """whether to publish to, and listen to, other machines without keys: everybody on the way can see and make poses"""
+    """whether to publish and subscribe to other machines without keys: others on the network can read and forge
+    poses"""
 
     def __post_init__(self) -> None:
         for node, address in self.endpoints.items():

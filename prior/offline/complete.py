@@ -1,6 +1,6 @@
-"""Motion where there was none: between key frames, and of the parts of a body that nobody saw.
+"""Completion of a recording: motion between key frames, and unobserved parts of a body.
 
-What is known stays as it is, to the last bit. The rest comes from the completer, window by window
+Known joints stay unchanged, to the last bit. The rest comes from the completer, window by window
 (`prior.offline.views`), on the person's bones. Known joints are a few millimetres off these bones, which are not quite
 constant: the residual is interpolated from one known frame to the next.
 """

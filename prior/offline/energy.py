@@ -7,7 +7,7 @@ deviations that they stand for, and the form that a Gauss-Newton solver takes to
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -18,9 +18,6 @@ from steadypose.prior.body.kinematics import CONTACT_HEIGHT, CONTACT_JOINTS, RES
 from steadypose.prior.models.humor.state import pose_features
 from steadypose.prior.offline.motion import Motion
 from steadypose.prior.timing.rate import FPS
-
-Kernel = Callable[[Tensor], Tensor]
-"""Of squared residuals."""
 
 _CONTACTS = list(CONTACT_JOINTS)
 _FEET = slice(2, 6)

@@ -19,7 +19,7 @@ from steadypose.nodes.sinks.ros2.settings import Ros2BridgeSettings
 from steadypose.nodes.sinks.ros2.topics import BodyTopics
 
 HOST = "127.0.0.1"
-"""people are nobody else's business: to look from another machine, ssh -L 8765:localhost:8765 robot"""
+"""this machine only, as poses are personal data: from another machine, use ssh -L 8765:localhost:8765 robot"""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ JOINT_SIZE, BONE_WIDTH, TEXT_SIZE = 0.05, 0.02, 0.12
 SPHERE_LIST, LINE_LIST, TEXT_VIEW_FACING, ARROW = 7, 5, 9, 0
 """of ``visualization_msgs/Marker``"""
 UNKNOWN_VARIANCE = 1e6
-"""of what an odometry must have and nobody measured: in m², rad² and so on"""
+"""variance of components of an odometry that are not measured, in m², rad² etc."""
 
 
 def _colour(r: float, g: float, b: float, a: float = 1.0) -> Any:

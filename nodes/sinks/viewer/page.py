@@ -1,4 +1,4 @@
-"""Rerun's page, passed on with a rule that a browser obeys: call nobody but this server."""
+"""Serves Rerun's page with a Content-Security-Policy that restricts its connections to this server."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ KEPT = ("Content-Type", "Content-Length", "Content-Encoding", "Cache-Control", "
 
 
 def policy(data_url: str) -> str:
-    """The Content-Security-Policy of a page that draws what comes from ``data_url``, and calls nobody else."""
+    """The Content-Security-Policy of a page that connects to ``data_url`` only."""
     return (
         "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob: data:; "
         f"connect-src 'self' blob: data: {data_url}; frame-src 'none'; form-action 'none'; base-uri 'self'"

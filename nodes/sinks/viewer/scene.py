@@ -50,7 +50,7 @@ FOLLOW_SHARE = 0.1
 FOLLOW_STEP = 0.1
 """metres a message that the eye moves at most, whatever a joint does"""
 BELOW_TRUNK = 0.25
-"""metres from the middle of the trunk down to the middle of somebody who stands"""
+"""metres from the middle of the trunk down to the middle of a standing body"""
 BACK_JUMP_NS = 1_000_000_000
 """a stamp so far behind the last one is a stream that starts again"""
 

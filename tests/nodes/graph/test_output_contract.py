@@ -13,7 +13,7 @@ from conftest import raw, walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from steadypose.msgs.contract import broken, is_pose
+from steadypose.msgs.contract import are_unit, broken
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import JointState, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.commands.cleaning import stream
@@ -48,7 +48,8 @@ def check_promises(messages: list[Message]) -> None:
         if isinstance(message, PoseClean | PoseWorld):
             assert [broken(body) for body in message.bodies if broken(body)] == []
         if isinstance(message, PoseClean) and message.bodies:
-            assert is_pose(message.sensor_pose)
+            assert np.isfinite(message.sensor_pose.position).all()
+            assert are_unit(message.sensor_pose.orientation).all()
 
 
 def with_pose(position: float, orientation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)) -> Spoil:

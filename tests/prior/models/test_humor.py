@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, heading, yaw_matrix
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.models.humor.initial import fit_initial, initial_log_density
+from steadypose.prior.models.humor.initial import fit_initial
 from steadypose.prior.models.humor.network import Gaussian, HumorConfig, HumorNet
 from steadypose.prior.models.humor.rollout import roll_out, sample, transitions
 from steadypose.prior.models.humor.state import (
@@ -182,6 +183,17 @@ def test_divergence_is_that_of_torch() -> None:
     a, b = (Gaussian(*torch.randn(2, 5, 8, generator=generator)) for _ in range(2))
     normals = [torch.distributions.Normal(g.mean, g.sigma) for g in (a, b)]
     torch.testing.assert_close(a.kl(b), torch.distributions.kl_divergence(*normals).sum(-1))
+
+
+def initial_log_density(model: HumorNet, inputs: torch.Tensor) -> torch.Tensor:
+    """(...) nats, of standardised features (..., `FEATURES`) of states in their canonical frames."""
+    known = pose_features(inputs)
+    factors = model.mixture_precisions
+    off = ((known.reshape(-1, known.shape[-1]) - model.mixture_means.unsqueeze(1)) @ factors).square().sum(dim=-1)
+    log_root = factors.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
+    width = known.shape[-1]
+    each = (model.mixture_log_weights + log_root - 0.5 * width * math.log(math.tau)).unsqueeze(1) - 0.5 * off
+    return torch.logsumexp(each, dim=0).reshape(inputs.shape[:-1])
 
 
 def test_the_mixture_of_first_states_is_sklearns(model: HumorNet) -> None:
