@@ -1,4 +1,4 @@
-"""The steps from what was seen of a moment to what is said of it, for all bodies together, one slot a body."""
+"""The stages of the prior in order, for one time step of all bodies together, one slot a body."""
 
 from __future__ import annotations
 
@@ -37,21 +37,22 @@ from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS
 
 SPOILED_S = 0.5
-"""Seconds that a body may be seen without an answer: then its state holds what is no number, and is given up."""
+"""Seconds that a body may be seen without a publishable estimate, before its state, which then contains NaN, is
+reset."""
 
 
 @dataclass(frozen=True)
 class _Newest:
-    """What the newest frame has brought, for it and for those that are still to be answered.
+    """Results of the newest frame, for it and for those still to be answered.
 
     Attributes:
         gated: the frame.
-        present: (S,) who is there.
+        present: (S,) which slots hold a body.
         person: their bones.
-        slow_error: of the sensor, as found by then.
+        slow_error: of the sensor, as estimated by then.
         rotations: (K, S, 22, 3, 3) local, of the last frames.
-        score: as of now.
-        imputed: the last frames, completed; None without that step.
+        score: of the newest frame.
+        imputed: the last frames, completed; None without that stage.
     """
 
     gated: Gated
@@ -64,17 +65,17 @@ class _Newest:
 
 
 class CleanCore:
-    """Observations in, clean frames out, ``settings.delay`` later. Each step keeps its own state, by slot.
+    """From observations to clean frames, ``settings.delay`` later. Each stage keeps its own state, by slot.
 
     Nothing here reads a clock or draws a random number: the same input gives the same output, bit for bit.
 
     Args:
         settings: of the prior.
-        counters: gets what was refused or skipped, by cause.
+        counters: gets numbers of joints and frames refused or skipped, by cause.
 
     Attributes:
-        fuse: the last step.
-        sensor_noise: what the sensor was last found to be off by, the median over the bodies present.
+        fuse: the last stage.
+        sensor_noise: latest estimate of the sensor's error, the median over the bodies present.
     """
 
     def __init__(self, settings: PriorSettings, counters: Counter[str]) -> None:
@@ -99,7 +100,7 @@ class CleanCore:
         self.sensor_noise: SensorNoise | None = None
 
     def step(self, observation: Observation, *, hurry: bool = False) -> CleanFrame | None:
-        """Take in a frame of the grid, and give what is said of the one ``delay`` before, once there is one.
+        """Take in a frame of the grid; returns the output for the one ``delay`` before, or None while there is none.
 
         In a hurry, hidden joints are imputed without gradient ascent: for a live node that falls behind.
         """
@@ -120,19 +121,19 @@ class CleanCore:
         person = self._person.update(denoised, slow_error.bias_sigma, present)
         score = Score.unscored(self._slots)
         if self._score:
-            # bones do not show all of a sensor's slow error: less than is to be expected makes no fault of it
-            slow = np.maximum(slow_error.bias_sigma, self._bias_sigma)
-            score = self._score.update(windows, gated.frozen, np.hypot(gated.jitter, slow))
+            # bones do not show all of a sensor's slow error: at least the expected one is assumed, lest it be a fault
+            bias = np.maximum(slow_error.bias_sigma, self._bias_sigma)
+            score = self._score.update(windows, gated.frozen, np.hypot(gated.jitter, bias))
         imputed = self._impute.update(windows, gated.jitter, hurry=hurry) if self._impute else None
         rotations = self._refine.update(gated, person)
         if present.any():
-            found = gated.jitter[present], slow_error.bias_sigma[present]
-            self.sensor_noise = SensorNoise(*(float(np.median(sigma)) for sigma in found))
+            sigmas = gated.jitter[present], slow_error.bias_sigma[present]
+            self.sensor_noise = SensorNoise(*(float(np.median(sigma)) for sigma in sigmas))
         self._newest = newest = _Newest(gated, present, person, slow_error, rotations, score, imputed)
         return None if denoised is None else self._answer(denoised, newest, self._delay)
 
     def flush(self) -> list[CleanFrame]:
-        """What is said of the frames that the delay still holds, oldest first."""
+        """The output for the frames that the delay still holds, oldest first."""
         newest, self._newest = self._newest, None
         if newest is None:
             return []
@@ -155,11 +156,11 @@ class CleanCore:
             self._newest = dataclasses.replace(self._newest, present=self._newest.present & ~slot)
 
     def note_answered(self, frame: CleanFrame, answered: Collection[int]) -> None:
-        """Begin anew with bodies that are seen and of which, for long, nothing could be said.
+        """Reset bodies that have been seen for `SPOILED_S` without a publishable estimate.
 
         Args:
-            frame: as given.
-            answered: the slots of those of which it was fit to be published.
+            frame: as returned by `step`.
+            answered: slots of the bodies that were published.
         """
         silent: Bools = np.asarray(np.isfinite(frame.observed).any(axis=(1, 2)))
         silent[list(answered)] = False
@@ -171,11 +172,11 @@ class CleanCore:
             self.forget(spoiled)
 
     def _denoised(self, smoothed: Smoothed, gated: Gated, back: int) -> Smoothed:
-        """The smoother's estimate of the frame ``back`` before the newest, denoised, if that is wanted."""
+        """The smoother's estimate of the frame ``back`` before the newest, denoised if that stage is on."""
         return self._denoise.denoised(smoothed, self._history, gated.jitter, back) if self._denoise else smoothed
 
     def _answer(self, denoised: Smoothed, newest: _Newest, back: int) -> CleanFrame:
-        """What is said of the frame ``back`` before the newest."""
+        """The output for the frame ``back`` before the newest."""
         at, imputed = -1 - back, newest.imputed
         estimate = self.fuse.fuse(
             denoised,

@@ -1,4 +1,4 @@
-"""The gate: jumps, impossible bone lengths, exchanged limbs and frozen joints, before they reach a network."""
+"""The gate stage: rejects jumps, impossible bone lengths, exchanged limbs and frozen joints."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class GateSettings:
     """Thresholds of the gate.
 
     Attributes:
-        enabled: whether to refuse anything; off, all that is seen passes.
-        jump: metres a joint may be from where it was expected, beyond three standard deviations of that.
-        patience: seconds after which a joint refused (or limbs exchanged) throughout is accepted after all.
-        min_confidence: joints below are unobserved.
+        enabled: off, all observed joints pass.
+        jump: metres that a joint may be from its prediction, in addition to three standard deviations of it.
+        patience: seconds after which a joint that is refused (or a limb that is exchanged) throughout is accepted.
+        min_confidence: joints below it are unobserved.
     """
 
     enabled: bool = True
@@ -36,23 +36,23 @@ class GateSettings:
     min_confidence: float = 0.1
 
 
-# Limbs that detectors exchange: whole arms and whole legs, on both sides.
+# limbs that detectors exchange: whole arms and whole legs, on both sides
 _EXCHANGED = tuple(np.concatenate(limbs(chain)) for chain in (("elbow", "wrist"), ("knee", "ankle", "foot")))
-_SWAP_APART = 0.15  # metres between expected and seen, mean of a limb's joints, below which no exchange is suspected
-_SWAP_BETTER = 0.4  # an exchange must bring the joints this much nearer to where they were expected
-_JUMP_NOISES = 7.0  # times the noise: one sighting in a thousand is further from where it was expected
-_NOISE_MEMORY = 15  # frames
-_DISTANCE_OF_NOISE = 2.6  # median distance to the expectation of white noise of 1 along each axis, by this filter
-_OWN_MEMORY, _OWN_TIMES = 9, 3.0  # frames in which a joint shows how far from expected it comes, and times that
-_SETS_OFF = 4.0  # m/s that a joint at rest may reach while it is not seen
-_BODY_JUMP = 0.5  # if more of the joints jump at once, the body did (a new track, a gap), not the joints
+_SWAP_APART = 0.15  # metres between prediction and observation, mean of a limb's joints, for an exchange to be tested
+_SWAP_BETTER = 0.4  # an exchange must reduce that distance to this share
+_JUMP_FACTOR = 7.0  # times the jitter: one sighting in a thousand is further from its prediction
+_JITTER_FRAMES = 15  # of the running mean of the jitter
+_UNIT_DISTANCE = 2.6  # median distance to this filter's prediction, of white noise of 1 along each axis
+_MEAN_FRAMES, _MEAN_FACTOR = 9, 3.0  # of a joint's running mean distance to its prediction; and multiple of it
+_HIDDEN_SPEED = 4.0  # m/s that a joint at rest may reach while it is hidden
+_BODY_JUMP = 0.5  # if a larger share of the joints jumps at once, the body did (a new track, a gap), not the joints
 
 
 class Gate:
-    """Refuses what cannot be: a refused joint becomes unobserved, exchanged limbs are put back.
+    """Outlier rejection: a refused joint becomes unobserved, exchanged limbs are put back.
 
-    Expectation comes from a constant-velocity Kalman filter fed with what passed. No jump is refused for longer than
-    ``patience``: then the sensor is right and the expectation wrong. Bones are judged by `BoneOutliers`.
+    Predictions are those of a constant-velocity Kalman filter, updated with what passes. No jump is refused for longer
+    than ``patience``: then the prediction is wrong, not the sensor. Bone lengths are tested by `BoneOutliers`.
     """
 
     def __init__(self, settings: GateSettings, slots: int, counters: Counter[str]) -> None:
@@ -62,7 +62,7 @@ class Gate:
         self._bones = BoneOutliers(slots)
         self._observed = Ring(RECENT + 1, (slots, 22, 3))
         self._jitter = np.zeros(slots)
-        self._own = np.zeros((slots, 22))
+        self._mean_distance = np.zeros((slots, 22))
         self._frames = np.zeros(slots, dtype=np.int64)
         self._lost = np.zeros((slots, 22))
         self._refused = np.zeros((slots, 22))
@@ -76,14 +76,14 @@ class Gate:
         self._bones.forget(slot)
         self._observed.clear(slot)
         self._jitter[slot] = 0.0
-        self._own[slot] = 0.0
+        self._mean_distance[slot] = 0.0
         self._frames[slot] = 0
         self._lost[slot] = 0
         self._refused[slot] = 0
         self._swapped[slot] = 0
 
     def update(self, observation: Observation) -> Gated:
-        """The newest frame without what is refused."""
+        """The newest frame, without refused joints."""
         s = self._settings
         self._observed.push(observation.positions)
         positions = observation.positions.copy()
@@ -99,31 +99,31 @@ class Gate:
             distance = _apart(positions, expected.positions)
             self._measure_jitter(distance)
             if s.enabled:
-                self._judge(positions, expected, distance)
+                self._reject(positions, expected, distance)
         self._lost = np.where(np.isfinite(observation.positions[..., 0]), 0, self._lost + 1)
         self._filter.update(positions, observation.stamp_s)
         return Gated(observation, positions, self._jitter.copy(), frozen)
 
-    def _judge(self, positions: Floats, expected: Smoothed, distance: Floats) -> None:
-        """Put exchanged limbs back, and make NaN what is refused, in place."""
+    def _reject(self, positions: Floats, expected: Smoothed, distance: Floats) -> None:
+        """Put exchanged limbs back, and set refused joints to NaN, in place."""
         s = self._settings
         known = np.isfinite(expected.positions[..., 0])
         if (distance > _SWAP_APART).any() or self._swapped.any():
             self._exchange(positions, expected.positions, known)
             distance = _apart(positions, expected.positions)
         seen = np.isfinite(positions[..., 0])
-        # a limb thrown about comes far from where it was expected all the time, a joint that jumps once
-        least = np.maximum(np.maximum(s.jump, _JUMP_NOISES * self._jitter)[:, None], _OWN_TIMES * self._own)
-        self._own += np.where(seen & known, distance - self._own, 0.0) / _OWN_MEMORY
-        # one that comes back may have turned round, or set off, while it was away
-        speed = np.maximum(2 * np.linalg.norm(self._filter.velocity, axis=-1), _SETS_OFF)
+        # a limb in violent motion is far from its prediction all the time, a joint that jumps only once
+        least = np.maximum(np.maximum(s.jump, _JUMP_FACTOR * self._jitter)[:, None], _MEAN_FACTOR * self._mean_distance)
+        self._mean_distance += np.where(seen & known, distance - self._mean_distance, 0.0) / _MEAN_FRAMES
+        # a joint may have changed its velocity while it was hidden
+        speed = np.maximum(2 * np.linalg.norm(self._filter.velocity, axis=-1), _HIDDEN_SPEED)
         jumped = seen & known & (distance > least + speed * self._lost / FPS + 3 * expected.sigma)
         everywhere = jumped.sum(axis=1) > _BODY_JUMP * np.maximum((seen & known).sum(axis=1), 1)
-        self._expect_anew(everywhere[:, None] & jumped)
+        self._restart(everywhere[:, None] & jumped)
         jumped &= ~everywhere[:, None]
         self._refused = np.where(jumped, self._refused + 1, 0)
         overruled = self._refused > s.patience * FPS
-        self._expect_anew(overruled)
+        self._restart(overruled)
         self._refused[overruled] = 0
         refused = jumped & ~overruled | self._bones.update(positions)
         if refused.any():
@@ -131,22 +131,22 @@ class Gate:
             positions[refused] = np.nan
 
     def _measure_jitter(self, distance: Floats) -> None:
-        """Go on measuring the jitter, from how far (S, 22) the middle one of a body's joints comes from where expected.
+        """Update the jitter from the median of a body's distances (S, 22) between joints and predictions.
 
-        The middle one, so that a limb thrown about, or a joint that jumps, says nothing about the sensor. Noise that
-        lasts over frames is not seen here; it belongs to the sensor's bias.
+        The median, so that a limb in violent motion, or a joint that jumps, does not count. Noise that is correlated
+        over frames does not show here; it belongs to the slow error.
         """
-        jitter = _middle(distance) / _DISTANCE_OF_NOISE
+        jitter = _median_by_row(distance) / _UNIT_DISTANCE
         for slot in np.flatnonzero(np.isfinite(jitter)):
             self._frames[slot] += 1
-            self._jitter[slot] += (jitter[slot] - self._jitter[slot]) / min(self._frames[slot], _NOISE_MEMORY)
+            self._jitter[slot] += (jitter[slot] - self._jitter[slot]) / min(self._frames[slot], _JITTER_FRAMES)
 
-    def _expect_anew(self, joints: Bools) -> None:
+    def _restart(self, joints: Bools) -> None:
         if joints.any():
             self._filter.forget(joints)
 
     def _exchange(self, positions: Floats, expected: Floats, known: Bools) -> None:
-        """Put exchanged limbs back: both sides are nearer to where the other was expected."""
+        """Put exchanged limbs back: those of which both sides are nearer to the other's prediction."""
         for k, pair in enumerate(_EXCHANGED):
             keep = _apart(positions[:, pair], expected[:, pair]).mean(axis=1)
             swap = _apart(positions[:, MIRROR[pair]], expected[:, pair]).mean(axis=1)
@@ -159,7 +159,7 @@ class Gate:
                 self._swapped[overruled, k] = 0
                 forget = np.zeros(known.shape, dtype=bool)
                 forget[np.ix_(overruled, pair)] = True
-                self._expect_anew(forget)
+                self._restart(forget)
                 expected[forget] = np.nan
             if exchanged.any():
                 self._counters["limbs_exchanged"] += int(exchanged.sum())
@@ -181,8 +181,8 @@ def _apart(a, b):
 
 
 @njit(cache=True)
-def _middle(distance):
-    """(S,) the median of what is finite of each row, NaN where nothing is."""
+def _median_by_row(distance):
+    """(S,) median of the finite values of each row; NaN where there is none."""
     middle, known = np.full(len(distance), np.nan), np.empty(distance.shape[1])
     for row in range(len(distance)):
         count = 0
