@@ -141,8 +141,8 @@ def _summary(records: list[dict[str, Any]], hidden: Mapping[str, Mapping[str, fl
         columns=["method", "joints, mm", "acceleration error, mm/frame²", "standing feet, m/s",
                  "trunk hidden 1 s: root, cm", "2 s: root, cm", "m per 10 m walked"],
         rows=rows,
-        note=f"Delay {DELAY}. Standing feet: mean speed while in contact in truth. Trunk hidden: horizontal error of the "
-        "root; filters go on at constant velocity.",
+        note=f"Delay {DELAY}. Standing feet: mean speed while in contact in truth. Trunk hidden: horizontal error of "
+        "the root; filters go on at constant velocity.",
     )  # fmt: skip
 
 
