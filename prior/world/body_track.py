@@ -199,7 +199,8 @@ class BodyTrack:
             for foot in range(len(FEET)):
                 filter_.lose(foot)
         held = hold and sighting.root is not None
-        believed = sighting.seen[list(FEET)] & (filter_.feet_off < FOOT_SURPRISE) & held
+        told = sighting.seen[list(FEET)] | sighting.root_seen  # what nobody saw may stand, but must not hold the root
+        believed = told & (filter_.feet_off < FOOT_SURPRISE) & held
         load, rest = (believed * said[_FOOT_CONTACTS].astype(np.float64) for said in (contacts.load, contacts.rest))
         if self._dt > 0.0:
             filter_.predict(self._dt, load, rest)
