@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from functools import cache
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from onnx import numpy_helper
 from tests.helpers.bodies import waving
 
+from steadypose.benchmarks.machine import ROOT
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.models.contacts.features import contact_features
 from steadypose.prior.models.contacts.inference import LiveContacts
@@ -192,3 +194,23 @@ def test_a_file_is_small_named_and_of_no_machine(name: str) -> None:
     for value in (*session(name).get_inputs(), *session(name).get_outputs()):
         assert value.shape[0] == "bodies"
         assert all(isinstance(size, int) for size in value.shape[1:])
+
+
+def test_the_page_states_every_input_and_output_with_its_shape() -> None:
+    page = (ROOT / "docs" / "other_languages.md").read_text()
+    stated: dict[str, dict[str, str]] = {}
+    file = ""
+    row = re.compile(r"^\| ?(\w*) \| ((?:`\w+`(?:, )?)+) \| ((?:\(.*?\)(?:, )?)+) \|", re.MULTILINE)
+    for name, names, shapes in row.findall(page):
+        file = name or file
+        each = re.findall(r"\(.*?\)", shapes)
+        values = re.findall(r"`(\w+)`", names)
+        stated.setdefault(file, {}).update(zip(values, each * (len(values) // len(each)), strict=True))
+    held: dict[str, dict[str, str]] = {}
+    for path in WEIGHTS.glob("*.onnx"):
+        graph = onnx.load(path).graph
+        held["faults" if ".faults" in path.name else path.name.partition("-")[0]] = {
+            value.name: f"({', '.join(['B', *(str(d.dim_value) for d in value.type.tensor_type.shape.dim[1:])])})"
+            for value in [*graph.input, *graph.output]
+        }
+    assert stated == held
