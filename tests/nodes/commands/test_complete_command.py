@@ -99,7 +99,7 @@ def test_what_cannot_be_is_said(tmp_path: Path) -> None:
         complete(source, tmp_path / "no" / "out.npz")
     with pytest.raises(LaunchError, match=r"ending in \.png"):
         complete(source, tmp_path / "out.npz", picture=tmp_path / "a.txt")
-    with pytest.raises(LaunchError, match="no weights 'nobody'"):
+    with pytest.raises(FileNotFoundError, match="no weights 'nobody'"):
         complete(source, tmp_path / "out.npz", weights="nobody")
     with pytest.raises(FileNotFoundError, match="steadypose train hmvae64"):
         complete(source, tmp_path / "out.npz", optimise=True)
