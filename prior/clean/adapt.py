@@ -20,7 +20,7 @@ MAX_DISTANCE = 30.0
 """Metres from the sensor beyond which a joint is no sighting."""
 MAX_PLACE = 10_000.0
 """Metres from the world's origin beyond which no sensor stands: joints lose their millimetres."""
-LARGEST, LEAST_BONES = 2.5, 4
+MAX_SIZE, MIN_BONES = 2.5, 4
 """Of a body of which so many bones are seen, and in the middle are so many times the mean person's: nobody is."""
 UNIT_TOLERANCE = 0.01
 """How far from 1 the norm of a sensor pose's quaternion may be."""
@@ -142,7 +142,7 @@ def _is_too_large(positions: Floats) -> bool:
     """Whether joints (22, 3) are nobody's: one such frame would be learned from for seconds."""
     lengths = np.linalg.norm(positions[1:] - positions[PARENT[1:]], axis=1)
     seen = np.isfinite(lengths)
-    return bool(seen.sum() >= LEAST_BONES and np.median(lengths[seen] / _REST_LENGTHS[seen]) > LARGEST)
+    return bool(seen.sum() >= MIN_BONES and np.median(lengths[seen] / _REST_LENGTHS[seen]) > MAX_SIZE)
 
 
 def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int]) -> dict[int, CleanBody]:

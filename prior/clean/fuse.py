@@ -1,4 +1,4 @@
-"""Fusion: the observation smoothed, the prior's opinion, this person's bones, and how sure the result is."""
+"""The fuse stage: smoothed joints, the prior's estimate of the hidden ones, this person's bones, and the deviations."""
 
 from __future__ import annotations
 
@@ -21,15 +21,14 @@ from steadypose.prior.timing.fixed_lag import Smoothed
 
 @dataclass(frozen=True)
 class FuseSettings:
-    """How much to believe whom. Lengths are standard deviations along one axis.
+    """Settings of the fuse stage. Lengths are standard deviations along one axis.
 
     Attributes:
-        enabled: whether to; off, the body stands as the refinement model decoded it, where its pelvis was seen.
+        enabled: whether to fuse; off, the body stands as the refinement model decoded it, where its pelvis was seen.
         prior_sigma: metres, of a joint placed by the refinement model, when its body is well seen.
         prior_drift: m/s, how fast that grows for a joint that is not seen.
         fade: seconds after which a joint not seen is unknown.
-        weights: set of the weights of the network that weighs where an occluded joint may be, or a path to a
-            ``.safetensors`` file.
+        weights: weight set of the occlusion network, or a path to a ``.safetensors`` file.
     """
 
     enabled: bool = True
@@ -40,14 +39,14 @@ class FuseSettings:
 
 
 _NEAR = 1 / (1 + BONES_BETWEEN) ** 2
-"""(22, 22) how much one joint's error tells of another's"""
+"""(22, 22) weight of one joint's error in the correction of another, by the bones between them"""
 
-_LEAST_VARIANCE = 1e-10
+_MIN_VARIANCE = 1e-10
 """m^2: a hundredth of a millimetre"""
 
 
 class Precision(NamedTuple):
-    """How far to believe whom of a joint's place: the inverse of the variance along an axis, 1/m^2, (S, 22).
+    """Inverse variances of each joint's position along an axis, 1/m^2, (S, 22).
 
     Attributes:
         seen: the smoother.
@@ -59,14 +58,14 @@ class Precision(NamedTuple):
 
 
 class Fuse:
-    """Joins the joints seen with what the prior says of the hidden ones.
+    """Fuses observed joints with the prior's estimates of the hidden ones.
 
-    A joint that is seen stays where smoothing and denoising have it. Of hidden joints, the accounts of smoother and
-    completion and their place beside the body are weighed (`OccludedJoints`); without a completion, they hang from
-    those seen in the rotations decoded. The person's bones hold, as far as their lengths are known.
+    An observed joint keeps its smoothed and denoised position. A hidden one is the weighted mean of the smoother's, the
+    completed and the held position (`OccludedJoints`); without a completion, it follows from the observed ones by the
+    decoded rotations. Bone lengths are constrained as far as they are known.
 
     Attributes:
-        occluded: who weighs the accounts of hidden joints; None if nothing is to be fused.
+        occluded: estimates the hidden joints; None if nothing is to be fused.
     """
 
     def __init__(self, settings: FuseSettings, slots: int) -> None:
@@ -86,47 +85,47 @@ class Fuse:
         rotations: Floats,
         imputed: Imputed | None,
         unseen_s: Floats,
-        again: Bools,
+        seen_later: Bools,
         present: Bools,
     ) -> Estimate:
         """The estimate of one frame; frames are to be given in order.
 
         Args:
-            smoothed: what smoother and denoising make of the joints seen.
-            person: on whose bones.
-            slow_error: of the sensor, as found so far.
+            smoothed: the joints, smoothed and denoised.
+            person: whose bones.
+            slow_error: of the sensor, as estimated so far.
             rotations: (S, 22, 3, 3) local, of the body as far as it is not seen.
             imputed: (S, 22, 3) and (S, 22), that frame as HG-VAE completes it; None without it.
             unseen_s: (S, 22) seconds for which each joint had not been seen by then.
-            again: (S, 22) whether it was seen in one of the frames since.
-            present: (S,) who is there.
+            seen_later: (S, 22) whether each was seen in one of the frames since.
+            present: (S,) which slots hold a body.
         """
         s = self._settings
         slots, count = np.flatnonzero(present), len(present)
         offsets, decoded, bias = person.offsets[slots], rotations[slots], slow_error.bias_sigma[slots]
         seen, deviation, unseen = smoothed.positions[slots], smoothed.sigma[slots], unseen_s[slots]
-        held_s = _least_below(unseen)
+        held_s = _unseen_of_subtree(unseen)
         precision = Precision(*_weigh(deviation, held_s, bias, s.prior_sigma, s.prior_drift, s.fade))
         body, fitted = place_joints(decoded, offsets), decoded
-        well = _lay_over(body, seen, precision)
+        well = _align(body, seen, precision)
         if self.occluded:
-            # What is not seen hangs from what is, in the prior's rotations.
+            # Hidden joints follow from the observed ones by the prior's rotations.
             hung = solve_pose(well, offsets, decoded)[1]
             body = np.where(np.isfinite(well[:, :1, :1]), hung, body)
             completed_sigma = None
             if imputed is not None:
                 completed, completed_sigma = imputed.positions[slots], imputed.sigma[slots]
                 _complete(body, completed, seen, unseen, precision.seen)
-            weighed = self.occluded.update(slots, seen, deviation, unseen, again[slots], body, completed_sigma)
+            weighed = self.occluded.update(slots, seen, deviation, unseen, seen_later[slots], body, completed_sigma)
             if weighed is not None:
                 (whose, joint, *_), (positions, sigma) = weighed
                 body[whose, joint] = positions
                 precision.seen[whose, joint], precision.prior[whose, joint] = 0.0, 1.0 / np.square(sigma)
             # of a frame that was lost whole, the smoother knows more
             here = (unseen <= unseen.min(axis=1, keepdims=True)) & np.isfinite(deviation)
-            variance = _join(body, seen, here, precision)
+            variance = _merge(body, seen, here, precision)
             length_variance = slow_error.length_variance[slots] + _of_rigid(person.length_variance[slots])
-            body = fit_lengths(body, offsets, np.where(here, _LEAST_VARIANCE, variance), length_variance)
+            body = fit_lengths(body, offsets, np.where(here, _MIN_VARIANCE, variance), length_variance)
             fitted = solve_pose(body, offsets, decoded)[0]
         placed = np.isfinite(deviation).any(axis=1)
         state, sigma = _states(unseen, held_s, s.fade), _stated(unseen, deviation, precision)
@@ -164,7 +163,7 @@ def _states(unseen_s: Floats, held_s: Floats, fade: float) -> NDArray[np.uint8]:
 
 
 @njit(cache=True)
-def _least_below(unseen_s):
+def _unseen_of_subtree(unseen_s):
     """(S, 22) for how long neither a joint nor any below it was seen: a joint between two seen is held by them."""
     least = unseen_s.copy()
     for row in range(len(least)):
@@ -176,13 +175,13 @@ def _least_below(unseen_s):
 
 @njit(cache=True)
 def _inverse(variance):
-    """Of what is 0, that of `_LEAST_VARIANCE`: settings may say that a sensor or the prior is never wrong."""
-    return 1.0 / max(variance, _LEAST_VARIANCE)
+    """Of what is 0, that of `_MIN_VARIANCE`: settings may say that a sensor or the prior is never wrong."""
+    return 1.0 / max(variance, _MIN_VARIANCE)
 
 
 @njit(cache=True)
 def _weigh(deviation, held_s, bias_sigma, prior_sigma, prior_drift, fade):
-    """How far to believe the smoother, of ``deviation`` (S, 22), and the prior: the parts of `Precision`."""
+    """Inverse variances of the smoother, of ``deviation`` (S, 22), and of the prior: the parts of `Precision`."""
     seen, prior = np.empty_like(deviation), np.empty_like(deviation)
     for row in range(len(deviation)):
         for joint in range(deviation.shape[1]):
@@ -193,11 +192,11 @@ def _weigh(deviation, held_s, bias_sigma, prior_sigma, prior_drift, fade):
 
 
 @njit(cache=True)
-def _lay_over(body, seen, precision):
-    """Moves the body, as a whole, to where it is nearest to all joints seen, not only to the pelvis.
+def _align(body, seen, precision):
+    """Translate each body, in place, to the weighted least squares fit to all observed joints, not to the pelvis alone.
 
     Returns:
-        (S, 22, 3) the joints that the smoother knows better than the prior; NaN of the others.
+        (S, 22, 3) the joints of which the smoother is more precise than the prior; NaN of the others.
     """
     well = np.full_like(seen, np.nan)
     for row in range(len(body)):
@@ -219,10 +218,10 @@ def _lay_over(body, seen, precision):
 
 @njit(cache=True)
 def _complete(body, completed, seen, unseen_s, precision):
-    """Puts hidden joints where HG-VAE completes them, each moved as the seen ones near it are off there.
+    """Set hidden joints to HG-VAE's completion, corrected by its mean error at the observed joints near them.
 
-    A joint that the sensor does not have hangs: what is imputed of it shakes the joints seen beside it. Of a frame that
-    was lost whole, the smoother knows more.
+    Joints that the sensor does not have are left out: their imputed positions would shake the observed ones beside
+    them. So are frames that were lost whole, of which the smoother knows more.
     """
     joints = body.shape[1]
     for row in range(len(body)):
@@ -244,9 +243,9 @@ def _complete(body, completed, seen, unseen_s, precision):
 
 
 @njit(cache=True)
-def _join(body, seen, here, precision):
-    """Puts joints ``here`` (S, 22) where they were seen, others at the mean of smoother and body, of which it gives the
-    variance (S, 22)."""
+def _merge(body, seen, here, precision):
+    """Set joints ``here`` (S, 22) to the smoother's position, others to the mean of smoother and body; returns the
+    variance (S, 22) of that mean."""
     variance = 1.0 / (precision.seen + precision.prior)
     for row in range(len(body)):
         for joint in range(body.shape[1]):
@@ -259,8 +258,8 @@ def _join(body, seen, here, precision):
 
 @njit(cache=True)
 def _stated(unseen_s, deviation, precision):
-    """(S, 22) standard deviations. Of a joint not seen, smoother and prior know the same past: what one says does not
-    make the other surer."""
+    """(S, 22) standard deviations. Of a hidden joint, smoother and prior know the same past, so that their errors are
+    dependent: the smaller deviation of the two is stated."""
     sigma = np.empty_like(unseen_s)
     for row in range(len(sigma)):
         for joint in range(sigma.shape[1]):

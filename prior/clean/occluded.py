@@ -36,7 +36,7 @@ class OccludedJoints:
         seen: Floats,
         sigma: Floats,
         unseen_s: Floats,
-        again: Bools,
+        seen_later: Bools,
         completed: Floats,
         completed_sigma: Floats | None,
     ) -> tuple[Occluded, Weighed] | None:
@@ -50,7 +50,7 @@ class OccludedJoints:
             seen: (B, 22, 3) metres, of the smoother; NaN of joints never seen.
             sigma: (B, 22) metres along an axis, of the smoother; inf of joints never seen.
             unseen_s: (B, 22) seconds since each was last seen.
-            again: (B, 22) whether it is seen again within the delay.
+            seen_later: (B, 22) whether each is seen again within the delay.
             completed: (B, 22, 3) metres, by the completion network.
             completed_sigma: (B, 22) metres along an axis; None where nothing is completed.
         """
@@ -67,7 +67,7 @@ class OccludedJoints:
             return None
         candidates = np.stack([positions[body, joint] for positions in (seen, completed, held)], axis=1)
         features = np.empty((len(body), FEATURES), dtype=np.float32)
-        _describe(self._past, slots, body, joint, candidates, sigma, completed_sigma, unseen_s, again, features)
+        _describe(self._past, slots, body, joint, candidates, sigma, completed_sigma, unseen_s, seen_later, features)
         rows = Occluded(body, joint, candidates, features)
         return rows, self.weigher(rows)
 
@@ -79,9 +79,17 @@ def _observe(past, slots, seen, sigma, unseen_s, held):
 
 
 @njit(cache=True)
-def _describe(past, slots, body, joint, candidates, sigma, completed_sigma, unseen_s, again, features):
+def _describe(past, slots, body, joint, candidates, sigma, completed_sigma, unseen_s, seen_later, features):
     for row in range(len(body)):
         b, j = body[row], joint[row]
         describe(
-            past, slots[b], j, candidates[row], sigma[b], completed_sigma[b, j], unseen_s[b], again[b, j], features[row]
+            past,
+            slots[b],
+            j,
+            candidates[row],
+            sigma[b],
+            completed_sigma[b, j],
+            unseen_s[b],
+            seen_later[b, j],
+            features[row],
         )

@@ -1,11 +1,11 @@
-"""The score stage: whether what was seen of a body can be trusted, and which joints cannot.
+"""The score stage: whether the observations of a body can be trusted, and which joints cannot.
 
-The fault network says of each joint how much more likely it is off than not; the window is as odd as its oddest joint.
-Both are told on one scale: the number of decimals of the rate at which clean motion of people whom the networks have
-not seen, as fast as this, scores as high. An anomaly of 2 is met once in a hundred clean windows.
+The fault network gives each joint's log odds of being at fault; a window's score is the highest of its joints'. Both
+are expressed as an anomaly: -log10 of the rate at which clean windows of people unseen in training, of the same pace,
+score at least as high. An anomaly of 2 occurs in one of a hundred clean windows.
 
-A sensor or a person unlike those of validation scores higher all the time, and is not wrong all the time. So each body
-has a scale of its own, from its last ten seconds (`OwnScale`), by which its anomaly is divided.
+Sensors and people unlike those of validation score higher throughout, without being at fault throughout. So each body's
+anomaly is divided by a scale estimated from its own last ten seconds (`OwnScale`).
 
 The paper scores by log p(z | x) alone (`steadypose evaluate hgvae` has both).
 """
@@ -23,24 +23,25 @@ from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
 from steadypose.prior.timing.rate import FPS
 
 MEAN_ANOMALY = 0.54
-"""Mean anomaly that needs no scale. Were the scale of validation right for everybody, it would be 1 / ln 10 = 0.43."""
+"""Mean anomaly at which the scale is 1. Of a body that follows validation's distribution it would be 1 / ln 10 = 0.43;
+chosen on validation (docs/experiments.md)."""
 
-MOST_COUNTED = 2.0
-"""What one frame counts in the mean at most: a fault of a second is not to be taken for the sensor's habit."""
+MAX_COUNTED = 2.0
+"""At which a frame's anomaly is clipped in the mean, so that a fault of a second hardly changes it."""
 
-MOST_SCALE = 2.0
-"""A body that would need more than this is odd, not strange to us: a wrong skeleton, say."""
+MAX_SCALE = 2.0
+"""The largest scale: a body that would need more, such as one with a wrong skeleton, is to be flagged."""
 
 OWN_FRAMES, FIRST_FRAMES = 300, 30
-"""Memory of the mean; and how many frames `MEAN_ANOMALY` counts for when a body is new."""
+"""Frames of the running mean; and for how many `MEAN_ANOMALY` counts when a body is new."""
 
 RELEASED = 0.8
-"""Share of the flag's height under which the anomaly has to stay for the flag to go down."""
+"""Fraction of the flag's threshold below which the anomaly has to stay for the flag to be cleared."""
 
 
 @dataclass(frozen=True)
 class ScoreSettings:
-    """When to raise the flag.
+    """Settings of the score stage.
 
     Attributes:
         enabled: whether to score at all; off, the anomaly is NaN and the flag down.
@@ -54,10 +55,10 @@ class ScoreSettings:
 
 
 class OwnScale:
-    """How many times as high as validation's people each body scores when nothing is wrong: 1 to `MOST_SCALE`.
+    """The scale of each body's anomaly: how many times as high as validation's it is on average, 1 to `MAX_SCALE`.
 
-    Its anomaly over validation's would have an exponential distribution; a mean so many times as large stands for
-    quantiles as many times as high.
+    If the calibration holds, an anomaly is distributed exponentially, so that a mean k times as large stands for
+    quantiles k times as large.
     """
 
     def __init__(self, slots: int) -> None:
@@ -69,10 +70,10 @@ class OwnScale:
         self._mean[slot], self._frames[slot] = MEAN_ANOMALY, FIRST_FRAMES
 
     def update(self, slots: NDArray[np.intp], anomaly: Floats) -> Floats:
-        """(B,) scales of the bodies in ``slots`` (B,) before this frame, whose ``anomaly`` (B,) is taken in."""
-        scale = np.clip(self._mean[slots] / MEAN_ANOMALY, 1.0, MOST_SCALE)
+        """(B,) scales of the bodies in ``slots`` (B,) as of the frame before; then the means take ``anomaly`` (B,) in."""
+        scale = np.clip(self._mean[slots] / MEAN_ANOMALY, 1.0, MAX_SCALE)
         self._frames[slots] = np.minimum(self._frames[slots] + 1, OWN_FRAMES)
-        self._mean[slots] += (np.minimum(anomaly, MOST_COUNTED) - self._mean[slots]) / self._frames[slots]
+        self._mean[slots] += (np.minimum(anomaly, MAX_COUNTED) - self._mean[slots]) / self._frames[slots]
         return scale
 
 
@@ -99,8 +100,7 @@ class Scorer:
     def update(self, windows: BodyWindows | None, frozen: Bools, sensor_sigma: Floats) -> Score:
         """The score of the newest frame, in which the joints ``frozen`` (S, 22) repeat themselves.
 
-        ``sensor_sigma`` (S,) metres along an axis is the error found of what is seen of each body: one that is met all
-        the time is no fault.
+        ``sensor_sigma`` (S,) metres along an axis is the estimated error of each body's observations.
         """
         anomaly, joint_anomaly = np.full(len(frozen), np.nan), np.full(frozen.shape, np.nan)
         if windows is not None:
@@ -117,9 +117,9 @@ class Scorer:
     def _score(self, windows: BodyWindows, frozen: Bools, sensor_sigma: Floats) -> tuple[Floats, Floats]:
         """The anomaly of each window (B,), on the scale of validation's people, and of its joints (B, 22)."""
         tracks, found = windows.tracks, windows.reconstruction
-        sensor_sigma = np.clip(sensor_sigma, SENSOR_SIGMAS[0], SENSOR_SIGMAS[-1])  # of which the network was told
+        sensor_sigma = np.clip(sensor_sigma, SENSOR_SIGMAS[0], SENSOR_SIGMAS[-1])  # the range it was trained on
         odds = self._network(tracks.x, found.mean, found.sigma, tracks.observed, sensor_sigma)
         odds = joint_odds(odds, tracks.observed, frozen)
         unseen = np.isinf(odds)
-        told = decimals(odds, self._calibration.limits(unseen.sum(axis=-1), sensor_sigma, pace(found.mean)))
-        return told.max(axis=-1), np.where(unseen, np.nan, told)
+        anomaly = decimals(odds, self._calibration.limits(unseen.sum(axis=-1), sensor_sigma, pace(found.mean)))
+        return anomaly.max(axis=-1), np.where(unseen, np.nan, anomaly)

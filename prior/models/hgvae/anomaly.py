@@ -1,8 +1,8 @@
-"""The scale on which windows and joints are told to be odd.
+"""The scale of the anomaly score.
 
-The fault network says of each joint how much more likely it is off than not; the window is as odd as its oddest joint.
-Both are told on one scale: the number of decimals of the rate at which clean motion of people whom the networks have
-not seen, as fast as this, scores as high. An anomaly of 2 is met once in a hundred clean windows.
+The fault network gives each joint's log odds of being at fault; a window's score is the highest of its joints'. Both
+are expressed as an anomaly: -log10 of the rate at which clean windows of people unseen in training, of the same pace,
+score at least as high. An anomaly of 2 occurs in one of a hundred clean windows.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ MISSING = (0, 4, 8, 14)
 """Joints missing at which the scale was measured; between them it is interpolated."""
 
 FROZEN_ODDS = 12.0
-"""of a joint of which the last answer is repeated while the others shake, logarithm"""
+"""log odds of a joint whose last position the sensor repeats while the others jitter"""
 
 SENSOR_SIGMAS = (0.003, 0.01, 0.02, 0.04)
 """Metres along an axis, errors of the sensor at which the scale was measured."""
 
 PACES, PACE_EDGES = (0.03, 0.5, 1.5), (0.274, 0.866)
-"""m/s, of `pace`: what windows of three classes move at about, and what divides these. Standing is most of any
-recording; what is fast is rare in any training, and no fault for that."""
+"""m/s, of `pace`: typical values of three classes of windows, and the edges between these. Most windows of a recording
+are of people who stand; fast motion is rare in training and would score high for that alone."""
 
 RATES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
-"""of clean windows that score higher than the quantiles kept"""
+"""of clean windows that score higher than the stored quantiles"""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What clean windows score, by joints missing, error of the sensor and pace of the motion.
+    """Scores of clean windows, by missing joints, sensor error and pace.
 
     Attributes:
         quantiles: (M, S, P, R) of the window's score, at `MISSING`, `SENSOR_SIGMAS`, `PACES` and `RATES`.
@@ -72,28 +72,28 @@ class Calibration:
             sensor_sigma: (B,) metres along an axis, error of the sensor.
             paces: (B,) m/s, `pace`.
         """
-        by_missing = _between(np.asarray(missing, dtype=np.float64), np.array(MISSING, dtype=np.float64))
-        by_sensor = _between(np.log(sensor_sigma), np.log(SENSOR_SIGMAS))
-        by_pace = _between(np.log(np.maximum(paces, 1e-3)), np.log(PACES))
+        by_missing = _interpolation_weights(np.asarray(missing, dtype=np.float64), np.array(MISSING, dtype=np.float64))
+        by_sensor = _interpolation_weights(np.log(sensor_sigma), np.log(SENSOR_SIGMAS))
+        by_pace = _interpolation_weights(np.log(np.maximum(paces, 1e-3)), np.log(PACES))
         return np.einsum("bm,bs,bp,mspr->br", by_missing, by_sensor, by_pace, self.quantiles)
 
 
 def pace(mean: Floats) -> Floats:
-    """(B,) m/s, above which a quarter of the joints move, by windows' tracks (B, 66, T) as HG-VAE makes them.
+    """(B,) m/s, the upper quartile of the joints' RMS speeds in tracks (B, 66, T) as HG-VAE reconstructs them.
 
-    Root mean square over the window. A limb at fault does not show in it, nor does a sensor's noise.
+    Neither a single limb at fault nor the sensor's noise changes it much.
     """
     steps = np.diff(mean.reshape(len(mean), -1, 3, mean.shape[-1]), axis=-1) * FPS
     return np.quantile(np.sqrt((steps**2).sum(axis=2).mean(axis=-1)), 0.75, axis=1)
 
 
 def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Floats:
-    """(B, 22) what a fault network says, -inf of joints not seen in the frames that are scored.
+    """(B, 22) log odds of a fault network; -inf for joints not seen in the scored frames.
 
     Args:
         odds: (B, 22) of `FaultNet`.
         observed: (B, 66, T) more than 0 where seen.
-        frozen: (B, 22) joints of which the sensor repeats its last answer.
+        frozen: (B, 22) joints whose last position the sensor repeats.
     """
     seen = (observed[:, ::3, -RECENT:] > 0).any(axis=-1)
     return np.where(seen, np.where(frozen, np.maximum(odds, FROZEN_ODDS), odds), -np.inf)
@@ -106,19 +106,19 @@ def decimals(score: Floats, limits: Floats) -> Floats:
         score: (B, K) of windows or of their joints.
         limits: (B, R) of `Calibration.limits`.
     """
-    told = np.empty(score.shape)
-    _decimals(score, limits, -np.log10(RATES), told)
-    return told
+    anomaly = np.empty(score.shape)
+    _decimals(score, limits, -np.log10(RATES), anomaly)
+    return anomaly
 
 
-def _between(value: Floats, knots: Floats) -> Floats:
+def _interpolation_weights(value: Floats, knots: Floats) -> Floats:
     """(B, K) weights of the two of ``knots`` on either side of each value (B,); the ends go on."""
     place = np.interp(value, knots, np.arange(len(knots)))
     return np.maximum(1 - np.abs(place[:, None] - np.arange(len(knots))), 0.0)
 
 
 @njit(cache=True)
-def _decimals(score, quantiles, heights, told):
+def _decimals(score, quantiles, heights, anomaly):
     for row in range(len(score)):
         limits = quantiles[row]
         for k in range(score.shape[1]):
@@ -128,4 +128,4 @@ def _decimals(score, quantiles, heights, told):
             low = min(max(below - 1, 0), len(limits) - 2)
             # beyond the rarest rate measured, the tail goes on as it went between the last two
             rising = (heights[low + 1] - heights[low]) / max(limits[low + 1] - limits[low], 1e-6)
-            told[row, k] = max(heights[low] + rising * (score[row, k] - limits[low]), 0.0)
+            anomaly[row, k] = max(heights[low] + rising * (score[row, k] - limits[low]), 0.0)

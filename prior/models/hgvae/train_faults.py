@@ -71,11 +71,11 @@ LEAST_FAULT = 0.015
 no fault worth the name, and one less off than a fifth of it is none."""
 
 FAULTS = (stands_still, exchanged, sides_exchanged, displaced, of_another_person, other_bones, noisy, jumps)
-BONES, TURNED = 0.05, 0.1
+BONE_SIGMA, TURN_SIGMA = 0.05, 0.1
 """By how much each bone of a window is longer or shorter, and turned, radians (`vary_builds`): how
 somebody is built or holds a limb is no fault."""
 
-SPOILT = 0.6
+FAULT_SHARE = 0.6
 """share of the windows that has a fault"""
 REPEATED = 0.15
 """share of the windows in which a tracker repeats its last answer for some joints"""
@@ -134,9 +134,9 @@ def fit(
 def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np.random.Generator) -> Tensor:
     """Binary cross-entropy over the joints seen of which it is clear whether they are off."""
     clean, sizes = windows.draw(count, model.config.frames, rng, STRIDES)
-    clean = vary_builds(clean, BONES, TURNED, rng)
+    clean = vary_builds(clean, BONE_SIGMA, TURN_SIGMA, rng)
     sigma = np.exp(rng.uniform(np.log(SENSOR_SIGMAS[0]), np.log(SENSOR_SIGMAS[-1]), count))
-    spoilt = with_faults(clean, FAULTS, SPOILT, rng)
+    spoilt = with_faults(clean, FAULTS, FAULT_SHARE, rng)
     fast = rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.8)  # some sensors smooth what they say
     answered = with_drifting_error(spoilt, sigma, rng, fast)
     seen = with_faults(answered, (repeats,), REPEATED, rng)

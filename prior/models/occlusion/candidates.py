@@ -26,13 +26,13 @@ CANDIDATES = 3
 FEATURES = 20
 """Of each occluded joint."""
 
-LEAST = 1e-3
+MIN_DISTANCE = 1e-3
 """Metres added to distances before their logarithm is taken."""
-LEAST_SIGMA = 1e-4
+MIN_SIGMA = 1e-4
 """Metres, likewise, of standard deviations."""
-LEAST_SPEED = 0.02
+MIN_SPEED = 0.02
 """m/s, likewise."""
-LEAST_HEIGHT = 0.01
+MIN_HEIGHT = 0.01
 """Metres, likewise, of heights above the lowest joint."""
 
 FADING = 0.4
@@ -147,7 +147,7 @@ def turned(then, now, seen):
 
 
 @njit(cache=True)
-def describe(past, slot, joint, candidates, sigma, completed_sigma, unseen_s, again, features):
+def describe(past, slot, joint, candidates, sigma, completed_sigma, unseen_s, seen_later, features):
     """Write the features (`FEATURES`,) of an occluded joint; after `observe` with the same frame.
 
     Args:
@@ -158,7 +158,7 @@ def describe(past, slot, joint, candidates, sigma, completed_sigma, unseen_s, ag
         sigma: (22,) metres, of the smoother.
         completed_sigma: metres, of the joint as it is completed.
         unseen_s: (22,) seconds.
-        again: whether it is seen again within the delay.
+        seen_later: whether it is seen again within the delay.
         features: (`FEATURES`,) float32, written.
     """
     place, then = past.place[slot], past.poses[slot, joint]
@@ -175,23 +175,23 @@ def describe(past, slot, joint, candidates, sigma, completed_sigma, unseen_s, ag
             lowest = then[other, 2]
     speed, noise = speed / max(count, 1), noise / max(count, 1)
     features[0] = math.log(unseen_s[joint] * FPS)
-    features[1] = 1.0 if again else 0.0
-    features[2] = math.log(sigma[joint] + LEAST_SIGMA)
-    features[3] = math.log(completed_sigma + LEAST_SIGMA)
+    features[1] = 1.0 if seen_later else 0.0
+    features[2] = math.log(sigma[joint] + MIN_SIGMA)
+    features[3] = math.log(completed_sigma + MIN_SIGMA)
     features[4] = _log_apart(candidates[0], candidates[1])
     features[5] = _log_apart(candidates[0], candidates[2])
     features[6] = _log_apart(candidates[1], candidates[2])
     features[7] = _log_apart(then[0], place[0])
     features[8] = abs(turned(then, place, known))
-    features[9] = math.log(speed + LEAST_SPEED)
-    features[10] = math.log(past.speed_seen[slot, joint] + LEAST_SPEED)
+    features[9] = math.log(speed + MIN_SPEED)
+    features[10] = math.log(past.speed_seen[slot, joint] + MIN_SPEED)
     features[11] = 1.0 - count / joints
     features[12] = 1.0 if unseen_s[_PARENT[joint]] > 0.0 else 0.0
     features[13] = 1.0 if unseen_s[_MIRROR[joint]] > 0.0 else 0.0
-    features[14] = math.log(noise + LEAST_SIGMA)
+    features[14] = math.log(noise + MIN_SIGMA)
     for candidate in range(CANDIDATES):
         features[15 + candidate] = _log_apart(candidates[candidate], then[joint])
-    features[18] = math.log(max(then[joint, 2] - lowest, 0.0) + LEAST_HEIGHT)
+    features[18] = math.log(max(then[joint, 2] - lowest, 0.0) + MIN_HEIGHT)
     features[19] = 0.0 if not math.isfinite(then[0, 2] + place[0, 2]) else place[0, 2] - then[0, 2]
 
 
@@ -199,4 +199,4 @@ def describe(past, slot, joint, candidates, sigma, completed_sigma, unseen_s, ag
 def _log_apart(a, b):
     """Logarithm of the distance between two positions (3,); 0 where one is NaN."""
     square = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
-    return math.log(math.sqrt(square) + LEAST) if math.isfinite(square) else 0.0
+    return math.log(math.sqrt(square) + MIN_DISTANCE) if math.isfinite(square) else 0.0
