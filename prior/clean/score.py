@@ -70,7 +70,7 @@ class OwnScale:
         self._mean[slot], self._frames[slot] = MEAN_ANOMALY, FIRST_FRAMES
 
     def update(self, slots: NDArray[np.intp], anomaly: Floats) -> Floats:
-        """(B,) scales of the bodies in ``slots`` (B,) as of the frame before; then the means take ``anomaly`` (B,) in."""
+        """(B,) scales of the bodies ``slots`` (B,) as of the frame before; then ``anomaly`` (B,) enters the means."""
         scale = np.clip(self._mean[slots] / MEAN_ANOMALY, 1.0, MAX_SCALE)
         self._frames[slots] = np.minimum(self._frames[slots] + 1, OWN_FRAMES)
         self._mean[slots] += (np.minimum(anomaly, MAX_COUNTED) - self._mean[slots]) / self._frames[slots]
