@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import MIRROR, limbs
 from steadypose.prior.clean.bone_outliers import BoneOutliers
@@ -38,6 +39,8 @@ class GateSettings:
 
 # limbs that detectors exchange: whole arms and whole legs, on both sides
 _EXCHANGED = tuple(np.concatenate(limbs(chain)) for chain in (("elbow", "wrist"), ("knee", "ankle", "foot")))
+# Shoulders or hips, which detectors exchange with them, or not.
+_BASES = tuple(np.concatenate(limbs((joint,))) for joint in ("shoulder", "hip"))
 _SWAP_APART = 0.15  # metres between prediction and observation, mean of a limb's joints, for an exchange to be tested
 _SWAP_BETTER = 0.4  # an exchange must reduce that distance to this share
 _JUMP_FACTOR = 7.0  # times the jitter: one sighting in a thousand is further from its prediction
@@ -125,7 +128,9 @@ class Gate:
         overruled = self._refused > s.patience * FPS
         self._restart(overruled)
         self._refused[overruled] = 0
-        refused = jumped & ~overruled | self._bones.update(positions)
+        refused = jumped & ~overruled
+        # of the bone between a joint that jumped and one that did not, the one that did not is right
+        refused |= self._bones.update(np.where(refused[..., None], np.nan, positions))
         if refused.any():
             self._counters["joints_refused"] += int(refused.sum())
             positions[refused] = np.nan
@@ -148,8 +153,7 @@ class Gate:
     def _exchange(self, positions: Floats, expected: Floats, known: Bools) -> None:
         """Put exchanged limbs back: those of which both sides are nearer to the other's prediction."""
         for k, pair in enumerate(_EXCHANGED):
-            keep = _apart(positions[:, pair], expected[:, pair]).mean(axis=1)
-            swap = _apart(positions[:, MIRROR[pair]], expected[:, pair]).mean(axis=1)
+            keep, swap = _kept_and_exchanged(positions, expected, pair)
             with np.errstate(invalid="ignore"):  # a limb with a joint unseen compares as False
                 exchanged = (keep > _SWAP_APART) & (swap < _SWAP_BETTER * keep) & known[:, pair].all(axis=1)
             self._swapped[:, k] = np.where(exchanged, self._swapped[:, k] + 1, 0)
@@ -163,8 +167,23 @@ class Gate:
                 expected[forget] = np.nan
             if exchanged.any():
                 self._counters["limbs_exchanged"] += int(exchanged.sum())
-                rows = np.flatnonzero(exchanged)[:, None]
-                positions[rows, pair] = positions[rows, MIRROR[pair]]
+                _put_back(positions, exchanged, pair)
+                keep, swap = _kept_and_exchanged(positions, expected, _BASES[k])
+                _put_back(positions, exchanged & (swap < keep), _BASES[k])
+
+
+def _kept_and_exchanged(positions: Floats, expected: Floats, pair: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """(S,) metres, mean distances of the joints ``pair`` of both sides to their predictions: as they are, exchanged."""
+    return (
+        _apart(positions[:, pair], expected[:, pair]).mean(axis=1),
+        _apart(positions[:, MIRROR[pair]], expected[:, pair]).mean(axis=1),
+    )
+
+
+def _put_back(positions: Floats, exchanged: Bools, pair: NDArray[np.intp]) -> None:
+    """Exchange the joints ``pair`` of both sides of the bodies ``exchanged`` (S,), in place."""
+    rows = np.flatnonzero(exchanged)[:, None]
+    positions[rows, pair] = positions[rows, MIRROR[pair]]
 
 
 @njit(cache=True)

@@ -73,6 +73,16 @@ def test_exchanged_legs_are_put_back() -> None:
     assert np.allclose(passed, positions)
 
 
+def test_shoulders_that_are_exchanged_with_the_arms_are_put_back_too() -> None:
+    positions = noisy()
+    arms = [J[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist") for side in ("left", "right")]
+    spoilt = positions.copy()
+    spoilt[50:53, arms] = positions[50:53][:, MIRROR[arms]]
+    passed, counters = run(spoilt)
+    assert np.array_equal(passed, positions)
+    assert counters == {"limbs_exchanged": 3}
+
+
 def test_a_whole_body_that_jumps_is_another_matter_than_its_joints() -> None:
     positions = noisy()
     positions[50:] += [1.0, 0, 0]
