@@ -73,7 +73,7 @@ class OwnScale:
         """(B,) scales of the bodies ``slots`` (B,) as of the frame before; then ``anomaly`` (B,) enters the means."""
         scale = np.clip(self._mean[slots] / MEAN_ANOMALY, 1.0, MAX_SCALE)
         self._frames[slots] = np.minimum(self._frames[slots] + 1, OWN_FRAMES)
-        self._mean[slots] += (np.minimum(anomaly, MAX_COUNTED) - self._mean[slots]) / self._frames[slots]
+        self._mean[slots] += (np.fmin(anomaly, MAX_COUNTED) - self._mean[slots]) / self._frames[slots]
         return scale
 
 
