@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-import scipy.linalg  # noqa: F401  (loads the BLAS that compiled loops use, so that it is limited too)
+import sys
+from importlib.machinery import PathFinder
+from importlib.util import module_from_spec
+from pathlib import Path
+
+import scipy
 from threadpoolctl import threadpool_limits
+
+_BLAS = "scipy.linalg.cython_blas"
 
 
 def one_thread() -> None:
@@ -13,3 +20,15 @@ def one_thread() -> None:
     three times as much of the processors.
     """
     threadpool_limits(1)
+
+
+def _load_blas() -> None:
+    """Load the BLAS that compiled loops call, and of scipy nothing else: the rest of its ``linalg`` takes 12 MB."""
+    spec = PathFinder.find_spec(_BLAS, [str(Path(path, "linalg")) for path in scipy.__path__])
+    assert spec is not None and spec.loader is not None, f"scipy comes with {_BLAS}"
+    sys.modules[_BLAS] = module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+
+if _BLAS not in sys.modules:
+    _load_blas()  # as this is imported, before any loop: numba would load all of it, and `one_thread` comes after

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from steadypose.nodes.ros2.definitions import stamp_ns
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 CACHE_NS = 10_000_000_000
 """for how long transforms are kept, as tf2 does"""
 Floats = NDArray[np.float64]
+_IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 Moment = tuple[int, Floats, Floats]
 """stamp, translation (3,) metres and quaternion (4,) xyzw, from the child's frame to the parent's"""
 
@@ -84,7 +87,7 @@ class TransformBuffer:
         return path
 
     def _chain(self, frames: list[str], at_ns: int) -> tuple[Floats, Rotation]:
-        place, turned = np.zeros(3), Rotation.identity()
+        place, turned = np.zeros(3), _rotation(_IDENTITY)
         for frame in frames:
             step, turn = self._at(frame, at_ns)
             place, turned = step + turn.apply(place), turn * turned
@@ -93,7 +96,7 @@ class TransformBuffer:
     def _at(self, frame: str, at_ns: int) -> tuple[Floats, Rotation]:
         moments = self._moments[frame]
         if frame in self._static:
-            return moments[-1][1], Rotation.from_quat(moments[-1][2])
+            return moments[-1][1], _rotation(moments[-1][2])
         first, last = moments[0][0], moments[-1][0]
         if not first <= at_ns <= last:
             early = "older than the oldest" if at_ns < first else "newer than the newest"
@@ -102,8 +105,14 @@ class TransformBuffer:
         after = next(index for index, moment in enumerate(moments) if moment[0] >= at_ns)
         b = moments[after]
         if b[0] == at_ns:
-            return b[1], Rotation.from_quat(b[2])
+            return b[1], _rotation(b[2])
         a = moments[after - 1]
         share = (at_ns - a[0]) / (b[0] - a[0])
-        turned = Slerp([0.0, 1.0], Rotation.from_quat(np.stack([a[2], b[2]])))(share)
-        return a[1] + share * (b[1] - a[1]), turned
+        start = _rotation(a[2])
+        return a[1] + share * (b[1] - a[1]), start * (start.inv() * _rotation(b[2])) ** share
+
+
+def _rotation(quaternion: Floats) -> Rotation:
+    from scipy.spatial.transform import Rotation  # 16 MB: not for those nodes that only read a launch file
+
+    return Rotation.from_quat(quaternion)

@@ -129,6 +129,18 @@ def _write_quaternions(rotations, out):
             q[axis] /= length
 
 
+def quaternion_product(p: NDArray[np.floating], q: NDArray[np.floating]) -> Floats:
+    """Rotation by ``q`` and then by ``p``: quaternions (..., 4), xyzw."""
+    (a, b, c, d), (x, y, z, w) = np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)
+    found = [
+        d * x + w * a + b * z - c * y,
+        d * y + w * b + c * x - a * z,
+        d * z + w * c + a * y - b * x,
+        d * w - a * x - b * y - c * z,
+    ]
+    return np.stack(found, axis=-1)
+
+
 def rotation_matrix(quaternion: NDArray[np.floating]) -> Floats:
     """The rotation (3, 3) of a quaternion (4,), xyzw, of any length but 0."""
     return rotation_matrices(np.asarray(quaternion / np.linalg.norm(quaternion)))

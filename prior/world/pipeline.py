@@ -25,7 +25,7 @@ from steadypose.prior.world.body_filter import BodyNoise
 from steadypose.prior.world.body_track import BodyTrack, Motion
 from steadypose.prior.world.contact_reader import ContactReader
 from steadypose.prior.world.ground import Ground
-from steadypose.prior.world.sighting import Sighting, rotation, sightings
+from steadypose.prior.world.sighting import Sighting, sightings, unit_quaternion
 
 Floats = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ class TrajectoryPipeline:
         if clean.end_of_stream:
             scene = self._scenes.pop(clean.source, None) or _Scene(clean.calibrated)
             return [_message(clean, scene.ground, [])]
-        turn, place = rotation(clean.sensor_pose.orientation), clean.sensor_pose.position
+        turn, place = unit_quaternion(clean.sensor_pose.orientation), clean.sensor_pose.position
         if turn is None or not np.isfinite(place).all():
             self.counters["sensor pose is not a pose"] += 1
             return []

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import CleanBody, JointState
+from steadypose.prior.body.kinematics import quaternion_product, rotation_matrix
 from steadypose.prior.body.skeleton import HIPS, J
 
 Floats = NDArray[np.float64]
@@ -58,12 +58,13 @@ class Sighting:
         return math.isfinite(self.root_sigma)
 
 
-def sightings(bodies: Sequence[CleanBody], sensor: Rotation, place: Floats) -> list[Sighting]:
-    """What the bodies of a message are, as seen by a sensor with this orientation and place (3,) in the world."""
+def sightings(bodies: Sequence[CleanBody], sensor: Floats, place: Floats) -> list[Sighting]:
+    """What the bodies of a message are, as seen by a sensor with this orientation (4,), a unit quaternion xyzw, and
+    place (3,) in the world."""
     if not bodies:
         return []
     positions = np.array([body.positions for body in bodies], dtype=np.float64)
-    positions = np.where(np.isfinite(positions), positions, np.nan) @ sensor.as_matrix().T + place
+    positions = np.where(np.isfinite(positions), positions, np.nan) @ rotation_matrix(sensor).T + place
     state = np.array([body.state for body in bodies])
     known = np.isfinite(positions).all(axis=-1) & (state != JointState.UNKNOWN)
     known &= ~(np.linalg.norm(positions - positions[:, :1], axis=-1) > REACH_M)
@@ -89,18 +90,19 @@ def sightings(bodies: Sequence[CleanBody], sensor: Rotation, place: Floats) -> l
     ]
 
 
-def _orientations(quaternions: Floats, sensor: Rotation) -> tuple[Floats, NDArray[np.bool_]]:
+def _orientations(quaternions: Floats, sensor: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Quaternions (N, 4) of any length turned from the sensor's frame to the world, and which of them are rotations."""
     with np.errstate(invalid="ignore"):
         turns = np.linalg.norm(quaternions, axis=1) >= _LEAST_NORM
         turns &= np.isfinite(quaternions).all(axis=1)
     quaternions[~turns] = [0.0, 0.0, 0.0, 1.0]
-    return (sensor * Rotation.from_quat(quaternions)).as_quat(), turns
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return quaternion_product(sensor, quaternions), turns
 
 
-def rotation(quaternion: NDArray[np.floating]) -> Rotation | None:
-    """The rotation of a quaternion (4,) xyzw of any length; None if it is none."""
+def unit_quaternion(quaternion: NDArray[np.floating]) -> Floats | None:
+    """A quaternion (4,) of any length at length 1; None if it is no rotation."""
     q = np.asarray(quaternion, dtype=np.float64)
-    if not np.isfinite(q).all() or np.linalg.norm(q) < _LEAST_NORM:
+    if not np.isfinite(q).all() or (length := np.linalg.norm(q)) < _LEAST_NORM:
         return None
-    return Rotation.from_quat(q)
+    return q / length
