@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 import signal
-from typing import Annotated
-
-import tyro
+from collections.abc import Sequence
 
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError, nearest
+from steadypose.nodes.graph.startup import startup
 from steadypose.nodes.graph.topology import NODES, load
 
 
-def node(
-    name: str,
-    launch: str = "replay",
-    settings: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="SECTION.KEY=VALUE")] = (),
-) -> None:
-    """Run one node of a launch file until it is stopped, with SIGTERM or Ctrl-C.
-
-    Args:
-        name: pose_input, prior, trajectory, ros2_bridge, foxglove, recorder or viewer.
-        launch: a launch file, or the name of one of the project's own.
-        settings: any setting of the launch file, over what it says. May be given again.
-    """
-    if name not in NODES:
-        raise LaunchError(f"no node {name!r}{nearest(name, NODES)}; there are {', '.join(NODES)}")
+def node(arguments: Sequence[str]) -> None:
+    """Run one node of a launch file until it is stopped, with SIGTERM or Ctrl-C."""
+    parser = argparse.ArgumentParser(prog="steadypose node", description=node.__doc__, allow_abbrev=False)
+    parser.add_argument("name", help=", ".join(NODES))
+    parser.add_argument("--launch", default="replay", help="a launch file, or the name of one of the project's own")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="any setting of the launch file, over what it says; may be given again",
+    )
+    given = parser.parse_args(arguments)
+    if given.name not in NODES:
+        raise LaunchError(f"no node {given.name!r}{nearest(given.name, NODES)}; there are {', '.join(NODES)}")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    process = load(NODES[name].node)(Launch.read(launch, settings))
+    with startup():
+        process = load(NODES[given.name].node)(Launch.read(given.launch, given.set))
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: process.stop())
     process.run()

@@ -85,13 +85,14 @@ class Child:
 
     def poll(self) -> None:
         """Check the process, and restart it when that is due."""
-        now = self._clock.monotonic_ns()
-        if self.state == "crashed" and now >= self._due_ns:
+        if self.state in ("running", "stale"):
+            self._check()
+        if self.state == "crashed" and self._clock.monotonic_ns() >= self._due_ns:
             self.restarts += 1
             self._start()
-            return
-        if self.state not in ("running", "stale"):
-            return
+
+    def _check(self) -> None:
+        now = self._clock.monotonic_ns()
         if (status := self._process.poll()) is not None:
             self._note_exit(status)
         elif self.silent_s > HUNG_S or (self._heard_ns is None and now - self._started_ns > STARTING_S * 1e9):

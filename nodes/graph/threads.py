@@ -25,7 +25,8 @@ def one_thread() -> None:
 def _load_blas() -> None:
     """Load the BLAS that compiled loops call, and of scipy nothing else: the rest of its ``linalg`` takes 12 MB."""
     spec = PathFinder.find_spec(_BLAS, [str(Path(path, "linalg")) for path in scipy.__path__])
-    assert spec is not None and spec.loader is not None, f"scipy comes with {_BLAS}"
+    if spec is None or spec.loader is None:
+        raise ImportError(f"this scipy ({scipy.__version__}) has no {_BLAS}", name=_BLAS)
     sys.modules[_BLAS] = module = module_from_spec(spec)
     spec.loader.exec_module(module)
 

@@ -15,7 +15,6 @@ from steadypose.nodes.graph.settings import LaunchError, nearest, path_setting
 from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.merge import MergeSettings, MergeSource
 from steadypose.nodes.sources.oak import OakSettings, OakSource
-from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source
 from steadypose.nodes.sources.source import LiveSource, RecordedSource, SourceContext
 from steadypose.nodes.sources.tf import TfSettings, TfSource
@@ -41,6 +40,12 @@ def _declare(
     return {_SOURCE: SourceDeclaration(opens, extra)}
 
 
+def _open_recording(path: str, _: SourceContext) -> RecordedSource:
+    from steadypose.nodes.sources.recording import open_recording  # 3 MB, which nodes that play none do without
+
+    return open_recording(path)
+
+
 @dataclass(frozen=True)
 class InputSettings:
     """``[input]``: where skeletons come from."""
@@ -54,7 +59,7 @@ class InputSettings:
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     tf: TfSettings = field(default_factory=TfSettings)
 
-    recording: str = path_setting(_declare(lambda path, _: open_recording(path)))
+    recording: str = path_setting(_declare(_open_recording))
     """rosbag2 directory, .mcap, .npz or .csv to play; a relative path starts at the launch file"""
     oak: OakSettings = field(default_factory=OakSettings, metadata=_declare(OakSource, extra="oak"))
     webcam: WebcamSettings = field(default_factory=WebcamSettings, metadata=_declare(open_webcam, extra="webcam"))

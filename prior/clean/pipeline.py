@@ -148,13 +148,13 @@ def load_loops(settings: PriorSettings) -> None:
     should wait."""
     pipeline = PriorPipeline(settings)
     pose = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
-    for frame in range(40):
+    for frame in range(settings.delay + 5):
         positions = (REST_POSITIONS + 0.001 * frame).astype(np.float32)
-        if frame == 20:
+        if frame == 2:
             positions[J["left_wrist"]] += 0.5
-        if frame > 30:
+        if frame > 2:
             positions[J["right_wrist"]] = np.nan
         bodies = [RawBody(0, positions, np.ones(22, dtype=np.float32))]
-        if frame > 35:  # arrays of two bodies lie otherwise in memory, which is another loop
+        if frame > 3:  # arrays of two bodies lie otherwise in memory, which is another loop
             bodies.append(RawBody(1, positions + np.float32(1.0), np.ones(22, dtype=np.float32)))
         pipeline.process(PoseRaw(round(frame * 1e9 / FPS), "", "", CANONICAL.name, pose, False, bodies))

@@ -1,0 +1,43 @@
+"""What a node's start takes of time and memory, and gives back."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_DONTNEED = 4
+"""``MADV_DONTNEED`` of madvise(2)"""
+
+
+@contextmanager
+def startup() -> Iterator[None]:
+    """Start within this: imports and loading make half a million objects that stay, and leave memory free.
+
+    The garbage collector looks for none among them: not now, for a tenth of the time, nor ever, for 50 ms each time.
+    """
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
+    if sys.platform == "linux":
+        _give_back()
+
+
+def _give_back() -> None:
+    """Give back to the system what malloc has free, and the code of LLVM: who has loaded the loops compiles none.
+
+    If one is compiled after all, its pages come back from the file.
+    """
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "malloc_trim"):
+        libc.malloc_trim(0)
+    with open("/proc/self/maps", encoding="utf-8") as maps:
+        for line in maps:
+            if " r-xp " in line and "llvmlite" in line:
+                begin, end = (int(address, 16) for address in line.split()[0].split("-"))
+                libc.madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), _DONTNEED)

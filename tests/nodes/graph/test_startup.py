@@ -1,0 +1,27 @@
+"""What the start of a node takes, and leaves behind."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+SPARED = ("asyncio", "scipy.linalg", "scipy.sparse", "scipy.spatial", "torch", "tyro", "rich", "mcap")
+SCRIPT = """
+import gc, sys
+from steadypose.nodes.commands import node
+from steadypose.nodes.graph.node import Node
+
+def run(self):
+    print(gc.isenabled(), gc.get_freeze_count() > 100_000, *(m for m in sys.argv[2:] if m in sys.modules))
+
+Node.run = run
+node.node([sys.argv[1]])
+"""
+
+
+@pytest.mark.parametrize("name", ["prior", "trajectory"])
+def test_a_node_loads_nothing_that_its_work_does_without_and_counts_no_garbage_of_its_start(name: str) -> None:
+    command = [sys.executable, "-c", SCRIPT, name, *SPARED]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "True True\n"
