@@ -61,8 +61,9 @@ class Fuse:
     """Fuses observed joints with the prior's estimates of the hidden ones.
 
     An observed joint keeps its smoothed and denoised position. A hidden one is the weighted mean of the smoother's, the
-    completed and the held position (`OccludedJoints`); without a completion, it follows from the observed ones by the
-    decoded rotations. Bone lengths are constrained as far as they are known.
+    completed and the held position (`OccludedJoints`); without a completion, or between joints that are seen where the
+    sensor does not have it, it follows from the observed ones by the decoded rotations. Bone lengths are constrained as
+    far as they are known.
 
     Attributes:
         occluded: estimates the hidden joints; None if nothing is to be fused.
@@ -114,8 +115,9 @@ class Fuse:
             body = np.where(np.isfinite(well[:, :1, :1]), hung, body)
             completed_sigma = None
             if imputed is not None:
-                completed, completed_sigma = imputed.positions[slots], imputed.sigma[slots]
-                _complete(body, completed, seen, unseen, precision.seen)
+                hidden = _completable(unseen, imputed.positions[slots])
+                _complete(body, imputed.positions[slots], seen, unseen, hidden, precision.seen)
+                completed_sigma = np.where(hidden, imputed.sigma[slots], np.inf)
             weighed = self.occluded.update(slots, seen, deviation, unseen, seen_later[slots], body, completed_sigma)
             if weighed is not None:
                 (whose, joint, *_), (positions, sigma) = weighed
@@ -217,18 +219,42 @@ def _align(body, seen, precision):
 
 
 @njit(cache=True)
-def _complete(body, completed, seen, unseen_s, precision):
-    """Set hidden joints to HG-VAE's completion, corrected by its mean error at the observed joints near them.
+def _completable(unseen_s, completed):
+    """(S, 22) which joints are hidden and completed.
 
-    Joints that the sensor does not have are left out: their imputed positions would shake the observed ones beside
-    them. So are frames that were lost whole, of which the smoother knows more.
+    Joints that the sensor does not have are left out where they lie between two that it has, which tell their place
+    better. So are frames that were lost whole, of which the smoother knows more.
     """
+    hidden = np.zeros(unseen_s.shape, dtype=np.bool_)
+    below = np.empty(unseen_s.shape[1], dtype=np.int64)
+    for row in range(len(unseen_s)):
+        newest, total = unseen_s[row].min(), 0
+        below[:] = 0
+        for joint in range(len(below) - 1, -1, -1):
+            known = unseen_s[row, joint] < np.inf
+            below[joint] += known
+            total += known
+            if joint > 0:
+                below[PARENT[joint]] += below[joint]
+        for joint in range(len(below)):
+            unseen = unseen_s[row, joint]
+            if not unseen > newest or math.isnan(completed[row, joint, 0]):
+                continue
+            branches = 1 if below[joint] < total else 0
+            for other in range(1, len(below)):
+                branches += PARENT[other] == joint and below[other] > 0
+            hidden[row, joint] = unseen < np.inf or branches < 2
+    return hidden
+
+
+@njit(cache=True)
+def _complete(body, completed, seen, unseen_s, hidden, precision):
+    """Set ``hidden`` joints (S, 22) to HG-VAE's completion, corrected by its mean error at the observed joints near
+    them."""
     joints = body.shape[1]
     for row in range(len(body)):
-        hidden_s = unseen_s[row].min()
         for joint in range(joints):
-            unseen = unseen_s[row, joint]
-            if not (hidden_s < unseen < np.inf) or math.isnan(completed[row, joint, 0]):
+            if not hidden[row, joint]:
                 continue
             total, off = 0.0, np.zeros(3)
             for other in range(joints):

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.clean.frame import Bools, Floats
-from steadypose.prior.models.occlusion.candidates import FEATURES, describe, forget, new_past, observe
+from steadypose.prior.models.occlusion.candidates import FEATURES, average, describe, forget, new_past, observe
 from steadypose.prior.models.occlusion.inference import LiveOcclusion, Occluded, Weighed
 
 Weigher = Callable[[Occluded], Weighed]
@@ -42,8 +42,8 @@ class OccludedJoints:
     ) -> tuple[Occluded, Weighed] | None:
         """The occluded joints of B bodies, and their estimates; None if there are none.
 
-        A joint is occluded if another of its body was seen since: a frame that was lost whole occludes none. Joints
-        never seen are left out.
+        A joint is occluded if another of its body was seen since: a frame that was lost whole occludes none. One that
+        was never seen is where the completion has placed it on average of late, carried along with the body.
 
         Args:
             slots: (B,) of the bodies.
@@ -52,15 +52,18 @@ class OccludedJoints:
             unseen_s: (B, 22) seconds since each was last seen.
             seen_later: (B, 22) whether each is seen again within the delay.
             completed: (B, 22, 3) metres, by the completion network.
-            completed_sigma: (B, 22) metres along an axis; None where nothing is completed.
+            completed_sigma: (B, 22) metres along an axis, inf of joints that are not completed; None without it.
         """
         held = np.empty_like(seen)
         _observe(self._past, slots, seen, sigma, unseen_s, held)
         if completed_sigma is None:
             return None
-        occluded = (unseen_s > unseen_s.min(axis=1, keepdims=True)) & np.isfinite(
-            unseen_s + sigma + completed_sigma + held[..., 0] + completed[..., 0]
-        )
+        known = np.isfinite(completed_sigma + completed[..., 0])
+        never = known & np.isinf(unseen_s)
+        if never.any():
+            _average(self._past, slots, never, completed, held)
+            seen, completed = (np.where(never[..., None], held, positions) for positions in (seen, completed))
+        occluded = known & (unseen_s > unseen_s.min(axis=1, keepdims=True)) & np.isfinite(held[..., 0])
         # contiguous, as one loop is compiled for each memory layout
         body, joint = (np.ascontiguousarray(index) for index in np.nonzero(occluded))
         if not len(body):
@@ -76,6 +79,12 @@ class OccludedJoints:
 def _observe(past, slots, seen, sigma, unseen_s, held):
     for row, slot in enumerate(slots):
         observe(past, slot, seen[row], sigma[row], unseen_s[row], held[row])
+
+
+@njit(cache=True)
+def _average(past, slots, never, completed, held):
+    for row, slot in enumerate(slots):
+        average(past, slot, never[row], completed[row], held[row])
 
 
 @njit(cache=True)

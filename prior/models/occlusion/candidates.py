@@ -38,6 +38,13 @@ MIN_HEIGHT = 0.01
 FADING = 0.4
 """Weight of the newest speed in the running mean."""
 
+AVERAGING = 0.1
+"""Weight of the newest completion in the running mean of where a joint that was never seen is."""
+
+LONGEST_S, MOST_SIGMA = 10.0, 1.0
+"""Seconds for which a joint counts as not seen, and metres of the smoother's deviation, at most: also of joints that
+were never seen."""
+
 NEAR = 1e-3
 """Bones per metre: of joints as many bones away, the nearest in space is taken."""
 
@@ -49,7 +56,8 @@ class Past(NamedTuple):
     """State of S bodies.
 
     Attributes:
-        poses: (S, 22, 22, 3) metres, for each joint the whole pose, as held, when it was last seen; NaN before.
+        poses: (S, 22, 22, 3) metres, for each joint the whole pose, as held, when it was last seen; of one never seen,
+            that of the last frame; NaN before.
         place: (S, 22, 3) metres, the joints of the last frame; NaN before.
         speed: (S, 22) m/s, running mean.
         speed_seen: (S, 22) m/s, the same when the joint was last seen.
@@ -103,6 +111,31 @@ def observe(past, slot, positions, sigma, unseen_s, held):
             _hold(joint, poses[joint], positions, seen, held)
     for joint in range(joints):
         if seen[joint]:
+            for other in range(joints):
+                for axis in range(3):
+                    poses[joint, other, axis] = held[other, axis]
+
+
+@njit(cache=True)
+def average(past, slot, never, completed, held):
+    """Update the running mean of where joints that were never seen are completed beside the others.
+
+    Args:
+        past: a `Past`, of which their poses are those of the frame before.
+        slot: of the body.
+        never: (22,) whether to.
+        completed: (22, 3) metres.
+        held: (22, 3) metres, as `observe` wrote it; of these joints, overwritten by the mean.
+    """
+    poses, joints = past.poses[slot], len(never)
+    for joint in range(joints):
+        if never[joint]:
+            for axis in range(3):
+                before = held[joint, axis]
+                step = completed[joint, axis] - before
+                held[joint, axis] = before + AVERAGING * step if math.isfinite(step) else completed[joint, axis]
+    for joint in range(joints):
+        if never[joint]:
             for other in range(joints):
                 for axis in range(3):
                     poses[joint, other, axis] = held[other, axis]
@@ -174,9 +207,9 @@ def describe(past, slot, joint, candidates, sigma, completed_sigma, unseen_s, se
         if then[other, 2] < lowest:
             lowest = then[other, 2]
     speed, noise = speed / max(count, 1), noise / max(count, 1)
-    features[0] = math.log(unseen_s[joint] * FPS)
+    features[0] = math.log(min(unseen_s[joint], LONGEST_S) * FPS)
     features[1] = 1.0 if seen_later else 0.0
-    features[2] = math.log(sigma[joint] + MIN_SIGMA)
+    features[2] = math.log(min(sigma[joint], MOST_SIGMA) + MIN_SIGMA)
     features[3] = math.log(completed_sigma + MIN_SIGMA)
     features[4] = _log_apart(candidates[0], candidates[1])
     features[5] = _log_apart(candidates[0], candidates[2])
