@@ -12,6 +12,10 @@ MAX_GAP_NS = 150_000_000
 """A joint not seen for longer than this is missing in between, not interpolated."""
 LOOK_AHEAD_NS = 10_000_000
 """A frame this much older than its grid time is carried forward to it, rather than waiting for the next frame."""
+LOOK_AHEAD_PERIODS = 0.35
+"""The same in periods of the stream, for fast ones: extrapolated by a whole period, noise has five times its variance."""
+PERIOD_GAIN = 0.1
+"""Weight of the newest in the running mean of a stream's periods."""
 
 
 class Resampler:
@@ -34,7 +38,8 @@ class Resampler:
         """Start a new grid at the next frame."""
         self._anchor: int | None = None
         self._ticks = 0
-        self._stamp = np.full(2, -1, dtype=np.int64)
+        self._newest_ns: int | None = None
+        self._period_ns = float(PERIOD_NS)
         self._seen_ns = np.full((2, self._slots, 22), np.iinfo(np.int64).min // 2)
         self._positions = np.full((2, self._slots, 22, 3), np.nan)
         self._confidence = np.zeros((2, self._slots, 22))
@@ -59,6 +64,10 @@ class Resampler:
         if self._anchor is None:
             first = -(-(stamp_ns - LOOK_AHEAD_NS) // PERIOD_NS) * PERIOD_NS  # rounded up
             self._anchor = first if self._aligned else stamp_ns
+        if self._newest_ns is not None:
+            self._period_ns += PERIOD_GAIN * (min(stamp_ns - self._newest_ns, PERIOD_NS) - self._period_ns)
+        self._newest_ns = stamp_ns
+        look_ahead_ns = min(LOOK_AHEAD_NS, round(LOOK_AHEAD_PERIODS * self._period_ns))
         seen = np.isfinite(positions[..., 0])
         # Row 1 is each joint's last sighting, row 0 the one before.
         for store, value in (
@@ -69,7 +78,7 @@ class Resampler:
             store[0][seen] = store[1][seen]
             store[1][seen] = value[seen]
         frames = []
-        while (tick := self._anchor + self._ticks * PERIOD_NS) <= stamp_ns + LOOK_AHEAD_NS:
+        while (tick := self._anchor + self._ticks * PERIOD_NS) <= stamp_ns + look_ahead_ns:
             frames.append((tick, *self._at(tick, stamp_ns)))
             self._ticks += 1
         return frames

@@ -41,6 +41,15 @@ def test_a_steady_camera_waits_for_nothing() -> None:
         assert [f[0] for f in frames] == [k * PERIOD_NS]
 
 
+@pytest.mark.parametrize("hz", [30, 50, 60, 90, 100, 120, 200])
+def test_a_fast_camera_is_not_extrapolated_far(hz: int) -> None:
+    resampler, rng = Resampler(1), np.random.default_rng(0)
+    noise = [rng.standard_normal((1, 22, 3)) for _ in range(10 * hz)]
+    frames = [f for k, n in enumerate(noise) for f in resampler.update(round(k * 1e9 / hz), n, np.ones((1, 22)))]
+    left = float(np.std([positions for _, positions, _ in frames]))
+    assert left < 1.15, "noise is not amplified; extrapolated by a whole period, it would be by 2.2"
+
+
 def test_a_joint_hidden_for_long_is_missing_in_between_and_a_short_gap_is_bridged() -> None:
     for gap, bridged in ((3, True), (12, False)):
         resampler = Resampler(SLOTS)
