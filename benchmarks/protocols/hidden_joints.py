@@ -1,7 +1,8 @@
-"""Hidden joints: below 0.9 m (HuMoR's occlusion), an arm behind the trunk, and limbs away for 0.2 to 2 seconds.
+"""Hidden joints: below 0.9 m (HuMoR's occlusion), an arm behind the trunk, limbs away for 0.2 to 2 seconds, and never
+seen.
 
-Seen joints carry 1 cm of noise. Each clip begins with half a second in which everything is seen: a filter
-has no answer for a joint never seen. HuMoR scores 43 points on the body's surface; these are 22 joints.
+Seen joints carry 1 cm of noise. But for joints never seen, for which a filter has no answer, each clip begins with half
+a second in which everything is seen. HuMoR scores 43 points on the body's surface; these are 22 joints.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from steadypose.benchmarks.protocols.spoiled import HOW, Condition, calibration_
 from steadypose.benchmarks.provenance import VARIANTS
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import pivot
+from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
@@ -35,6 +37,10 @@ SEEN_FIRST = 15
 """Frames."""
 BURSTS_S = (0.2, 0.5, 1.0, 2.0)
 
+_LEGS = [joint for leg in limbs(("knee", "ankle", "foot")) for joint in leg]
+_ARM = limbs(("shoulder", "elbow", "wrist"))[0]
+"""What of a body is never seen: behind a counter, or out of the picture."""
+
 
 def _masked(
     truth: Floats, rng: np.random.Generator, mask: Callable[[Floats, np.random.Generator], NDArray[np.bool_]]
@@ -42,6 +48,12 @@ def _masked(
     hidden = mask(truth, rng)
     hidden[:SEEN_FIRST] = False
     return hide(gaussian(truth, NOISE, rng), hidden)
+
+
+def _without(truth: Floats, rng: np.random.Generator, joints: Sequence[int]) -> Floats:
+    seen = gaussian(truth, NOISE, rng)
+    seen[:, :, list(joints)] = np.nan
+    return seen
 
 
 def _burst(truth: Floats, rng: np.random.Generator, seconds: float) -> NDArray[np.bool_]:
@@ -53,6 +65,8 @@ CONDITIONS: dict[str, Condition] = {
     "below 0.9 m": partial(_masked, mask=lambda truth, _: below(truth)),
     "arm behind": partial(_masked, mask=lambda truth, _: arm_behind(truth)),
     **{f"{s:g} s": partial(_masked, mask=partial(_burst, seconds=s)) for s in BURSTS_S},
+    "legs never": partial(_without, joints=_LEGS),
+    "arm never": partial(_without, joints=_ARM),
 }
 
 
@@ -65,7 +79,7 @@ def run(bench: Bench) -> Result:
     note = (
         f"{clips.positions.shape[1]} clips of {len(clips.positions)} frames, 22 joints, 1 cm of noise on those seen; "
         f"the first {SEEN_FIRST} frames of a clip are seen in full. A duration: one lower arm or leg is away for so "
-        f"long. {HOW}"
+        f"long. Never: knees and all below them, or an arm, in no frame of a clip. {HOW}"
     )
     groups = (("hidden", "hidden joints"), ("seen", "seen joints"))
     tables: list[Table] = [_summary_table(records, note)]
@@ -109,6 +123,6 @@ def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
                 else:
                     mine = [r for r in mine if r["method"] == name and r["delay"] in (delay, 0)][-1:]
                 found = [r["hidden_mm"] for r in mine if "hidden_mm" in r]  # raw has no answer
-                cells.append(f"{min(found):.0f}")
+                cells.append(f"{min(found):.0f}" if found else "–")
             rows.append([f"delay {delay}: {name}", *cells])
     return Table("hidden_joints-summary", "Hidden joints: their error, mm", ["method", *conditions], rows, note)

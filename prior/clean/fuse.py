@@ -27,7 +27,7 @@ class FuseSettings:
         enabled: whether to fuse; off, the body stands as the refinement model decoded it, where its pelvis was seen.
         prior_sigma: metres, of a joint placed by the refinement model, when its body is well seen.
         prior_drift: m/s, how fast that grows for a joint that is not seen.
-        fade: seconds after which a joint not seen is unknown.
+        fade: seconds after which a joint that is neither seen nor completed within `MOST_SIGMA` is unknown.
         weights: weight set of the occlusion network, or a path to a ``.safetensors`` file.
     """
 
@@ -37,6 +37,10 @@ class FuseSettings:
     fade: float = 3.0
     weights: str = "default"
 
+
+MOST_SIGMA = 0.25
+"""Metres along an axis: a completed joint is known while its standard deviation is at most this, however long it was
+not seen."""
 
 _NEAR = 1 / (1 + BONES_BETWEEN) ** 2
 """(22, 22) weight of one joint's error in the correction of another, by the bones between them"""
@@ -107,6 +111,7 @@ class Fuse:
         seen, deviation, unseen = smoothed.positions[slots], smoothed.sigma[slots], unseen_s[slots]
         held_s = _unseen_of_subtree(unseen)
         precision = Precision(*_weigh(deviation, held_s, bias, s.prior_sigma, s.prior_drift, s.fade))
+        known = held_s <= s.fade
         body, fitted = place_joints(decoded, offsets), decoded
         well = _align(body, seen, precision)
         if self.occluded:
@@ -118,11 +123,12 @@ class Fuse:
                 hidden = _completable(unseen, imputed.positions[slots])
                 _complete(body, imputed.positions[slots], seen, unseen, hidden, precision.seen)
                 completed_sigma = np.where(hidden, imputed.sigma[slots], np.inf)
-            weighed = self.occluded.update(slots, seen, deviation, unseen, seen_later[slots], body, completed_sigma)
-            if weighed is not None:
-                (whose, joint, *_), (positions, sigma) = weighed
-                body[whose, joint] = positions
-                precision.seen[whose, joint], precision.prior[whose, joint] = 0.0, 1.0 / np.square(sigma)
+            occluded = self.occluded.update(slots, seen, deviation, unseen, seen_later[slots], body, completed_sigma)
+            if occluded is not None:
+                row, joint = occluded.index.T
+                body[row, joint] = occluded.positions
+                precision.seen[row, joint], precision.prior[row, joint] = 0.0, 1.0 / np.square(occluded.sigma)
+                known[row, joint] |= occluded.sigma <= MOST_SIGMA
             # of a frame that was lost whole, the smoother knows more
             here = (unseen <= unseen.min(axis=1, keepdims=True)) & np.isfinite(deviation)
             variance = _merge(body, seen, here, precision)
@@ -130,7 +136,7 @@ class Fuse:
             body = fit_lengths(body, offsets, np.where(here, _MIN_VARIANCE, variance), length_variance)
             fitted = solve_pose(body, offsets, decoded)[0]
         placed = np.isfinite(deviation).any(axis=1)
-        state, sigma = _states(unseen, held_s, s.fade), _stated(unseen, deviation, precision)
+        state, sigma = _states(unseen, known), _stated(unseen, deviation, precision)
         return Estimate(
             stamp_s=smoothed.stamp_s,
             positions=_scatter(count, slots[placed], body[placed], np.nan),
@@ -154,8 +160,8 @@ def _scatter(slots: int, rows: NDArray[np.intp], values: NDArray[Any], fill: flo
     return full
 
 
-def _states(unseen_s: Floats, held_s: Floats, fade: float) -> NDArray[np.uint8]:
-    hidden = np.where(held_s <= fade, JointState.IMPUTED, JointState.UNKNOWN)
+def _states(unseen_s: Floats, known: Bools) -> NDArray[np.uint8]:
+    hidden = np.where(known, JointState.IMPUTED, JointState.UNKNOWN)
     return np.where(unseen_s == 0.0, JointState.REFINED, hidden).astype(np.uint8)
 
 

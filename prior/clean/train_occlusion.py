@@ -38,7 +38,7 @@ Rng = np.random.Generator
 ITERATIONS, BATCH, LEARNING_RATE = 3_000, 4096, 3e-3
 """Occluded joints a step; AdamW's rate at the start, which falls along a cosine."""
 
-FRAMES, CLIPS = 240, 32
+FRAMES, CLIPS = 120, 64
 """Frames of a clip, and clips of a run, side by side as bodies."""
 
 RECORDED = {"train": 40, "val": 8}
@@ -49,12 +49,6 @@ ROWS = 40_000
 
 SEEN_FIRST = 8, 40
 """Range of the frames before anything is hidden, of clips that lose what is below or on one side."""
-
-NEVER_SEEN = 0.3
-"""Share of clips in which some joints are hidden from the first frame on."""
-
-LENGTHS = 2, 200
-"""Range of the frames for which limbs are hidden, uniform in the logarithm."""
 
 DELAYS = (0, 0, 2, 4, 4, 8, 16)
 
@@ -97,14 +91,13 @@ class Rows:
 def occlusions(truth: Floats, rng: Rng) -> Bools:
     """(T, C, 22) which joints of clips (T, C, 22, 3) metres are hidden.
 
-    By chance 25 % of clips lose what is low, 15 % what is on one side, the others limbs for `LENGTHS` frames; in
-    `NEVER_SEEN` of them, joints of the same kind are hidden from the first frame on.
+    By chance 25 % of clips lose what is low, 15 % what is on one side, the others limbs for 2 to 100 frames.
     """
     frames, clips = truth.shape[:2]
     hidden = np.zeros(truth.shape[:3], dtype=bool)
     shares = np.array([share for share, _ in _OCCLUSIONS])
     for clip in range(clips):
-        place, kind, never = np.nan_to_num(truth[:, clip]), rng.random(), rng.random() < NEVER_SEEN
+        place, kind = np.nan_to_num(truth[:, clip]), rng.random()
         if kind < 0.4:
             if kind < 0.25:
                 height = place[..., 2] - place[..., 2].min()
@@ -114,14 +107,11 @@ def occlusions(truth: Floats, rng: Rng) -> Bools:
                 middle = across[:, :1] if rng.random() < 0.5 else across[:, 0].mean()
                 gone = across > middle + rng.uniform(-0.1, 0.25)
             hidden[:, clip] = gone
-            if not never:
-                hidden[: int(rng.integers(*SEEN_FIRST)), clip] = False
+            hidden[: int(rng.integers(*SEEN_FIRST)), clip] = False
             continue
-        if never:
-            hidden[:, clip, _OCCLUSIONS[rng.choice(len(_OCCLUSIONS), p=shares / shares.sum())][1]] = True
         at = int(rng.integers(10, 40))
         while at < frames:
-            length = int(np.exp(rng.uniform(*np.log(LENGTHS))))
+            length = int(np.exp(rng.uniform(np.log(2), np.log(100))))
             for which in rng.choice(len(_OCCLUSIONS), 1 + (rng.random() < 0.25), p=shares / shares.sum()):
                 hidden[at : at + length, clip, _OCCLUSIONS[which][1]] = True
             at += length + int(rng.integers(8, 40))

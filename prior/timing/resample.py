@@ -13,7 +13,7 @@ MAX_GAP_NS = 150_000_000
 LOOK_AHEAD_NS = 10_000_000
 """A frame this much older than its grid time is carried forward to it, rather than waiting for the next frame."""
 LOOK_AHEAD_PERIODS = 0.35
-"""The same in periods of the stream, for fast ones: extrapolated by a whole period, noise has five times its variance."""
+"""The same in periods of the stream, for fast ones: extrapolated by a whole period, noise has 5 times its variance."""
 PERIOD_GAIN = 0.1
 """Weight of the newest in the running mean of a stream's periods."""
 

@@ -166,15 +166,29 @@ def test_a_hidden_arm_is_imputed_near_the_truth_and_says_it_is_less_sure() -> No
     assert error.mean() < 0.15
 
 
-def test_a_joint_hidden_for_seconds_is_unknown() -> None:
+def test_a_joint_hidden_for_seconds_is_known_as_long_as_it_is_completed() -> None:
     seen = waving(150)
     seen[30:, J["left_wrist"]] = np.nan
+    for imputes, at_last in ((True, JointState.IMPUTED), (False, JointState.UNKNOWN)):
+        cleaned, _ = clean(stream(seen), impute={"enabled": imputes})
+        assert cleaned[60].bodies[0].state[J["left_wrist"]] == JointState.IMPUTED
+        assert cleaned[149].bodies[0].state[J["left_wrist"]] == at_last
+
+
+def test_legs_that_were_never_seen_are_where_a_standing_body_has_them() -> None:
+    truth, legs = waving(60), [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
+    seen = truth.copy()
+    seen[:, legs] = np.nan
     cleaned, _ = clean(stream(seen))
-    assert cleaned[60].bodies[0].state[J["left_wrist"]] == JointState.IMPUTED
-    assert cleaned[149].bodies[0].state[J["left_wrist"]] == JointState.UNKNOWN
+    body = cleaned[50].bodies[0]
+    error = np.linalg.norm(body.positions - truth[50], axis=-1)
+    assert (body.state[legs] == JointState.IMPUTED).all()
+    assert error[legs].max() < 0.25
+    assert (error[legs] < 4 * body.sigma[legs]).all()
+    assert np.delete(error, legs).max() < 0.03
 
 
-def test_what_a_sensor_lacks_is_held_between_its_neighbours_or_unknown_never_seen() -> None:
+def test_what_a_sensor_lacks_is_held_between_its_neighbours_or_completed() -> None:
     coco = SKELETONS["coco17"]
     mapped = np.zeros((20, 17, 3))
     truth = waving(20)
@@ -185,7 +199,7 @@ def test_what_a_sensor_lacks_is_held_between_its_neighbours_or_unknown_never_see
     cleaned, _ = clean(stream(mapped, skeleton="coco17"))
     state = cleaned[15].bodies[0].state
     assert state[J["spine2"]] == JointState.IMPUTED
-    assert state[J["left_foot"]] == JointState.UNKNOWN
+    assert state[J["left_foot"]] == JointState.IMPUTED
     assert state[J["left_elbow"]] == JointState.REFINED
     assert np.linalg.norm(positions(cleaned)[15] - truth[15], axis=-1)[J["left_wrist"]] < 0.05
 
