@@ -19,6 +19,10 @@ SAME = 1e-6
 MIN_NOISE = 0.001
 """Metres along an axis, from frame to frame: of a sensor with less, a joint that repeats itself may be at rest."""
 
+MOST_ALIKE = 0.1
+"""Share of the coordinates of joints that did move that may repeat themselves: with more, the sensor rounds, and what
+rests repeats itself."""
+
 _MIN_NEW = 5
 """frames that were no repetition of the whole body"""
 
@@ -37,20 +41,23 @@ def frozen_joints(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
     for b in range(count):
         recent = positions[b, max(frames - RECENT - 1, 0) :]
         new, repeated, most = 0, np.zeros(joints), 0
+        coordinates, alike = 0, 0
         for t in range(1, len(recent)):
-            same, repeats = np.ones(joints, dtype=np.uint8), 0
+            same, repeats = np.zeros(joints, dtype=np.uint8), 0
             for joint in range(joints):
                 for axis in range(3):
-                    if not abs(recent[t, joint, axis] - recent[t - 1, joint, axis]) < SAME:
-                        same[joint] = 0
-                repeats += same[joint]
+                    same[joint] += abs(recent[t, joint, axis] - recent[t - 1, joint, axis]) < SAME
+                repeats += same[joint] == 3
+                if same[joint] < 3 and math.isfinite(recent[t, joint, 0] - recent[t - 1, joint, 0]):
+                    coordinates += 3
+                    alike += same[joint]
             if 2 * repeats <= joints:
                 new += 1
                 for joint in range(joints):
-                    repeated[joint] += same[joint]
+                    repeated[joint] += same[joint] == 3
                     most = max(most, repeated[joint])
         limit = 0.5 * max(new, _MIN_NEW)
-        if most > limit and median(_noise(recent)) > MIN_NOISE:
+        if most > limit and alike <= MOST_ALIKE * coordinates and median(_noise(recent)) > MIN_NOISE:
             for joint in range(joints):
                 found[b, joint] = repeated[joint] > limit
     return found

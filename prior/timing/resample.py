@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.timing.rate import FPS
+from steadypose.prior.timing.republished import Republished
 
 PERIOD_NS = round(1e9 / FPS)
 MAX_GAP_NS = 150_000_000
@@ -38,6 +39,7 @@ class Resampler:
         """Start a new grid at the next frame."""
         self._anchor: int | None = None
         self._ticks = 0
+        self._republished = Republished()
         self._newest_ns: int | None = None
         self._period_ns = float(PERIOD_NS)
         self._seen_ns = np.full((2, self._slots, 22), np.iinfo(np.int64).min // 2)
@@ -51,7 +53,7 @@ class Resampler:
     def update(
         self, stamp_ns: int, positions: NDArray[np.float64], confidence: NDArray[np.float64]
     ) -> list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
-        """Take a frame and give the grid frames that it completes.
+        """Take a frame and give the grid frames that it completes; one that is republished counts as none.
 
         Args:
             stamp_ns: capture time, later than the last.
@@ -64,6 +66,8 @@ class Resampler:
         if self._anchor is None:
             first = -(-(stamp_ns - LOOK_AHEAD_NS) // PERIOD_NS) * PERIOD_NS  # rounded up
             self._anchor = first if self._aligned else stamp_ns
+        if self._republished.update(positions):
+            return []
         if self._newest_ns is not None:
             self._period_ns += PERIOD_GAIN * (min(stamp_ns - self._newest_ns, PERIOD_NS) - self._period_ns)
         self._newest_ns = stamp_ns

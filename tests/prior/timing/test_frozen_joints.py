@@ -30,3 +30,16 @@ def test_a_body_that_is_repeated_whole_has_no_joint_frozen() -> None:
     assert not frozen_joints(np.repeat(seen[:, :1], RECENT + 1, axis=1)).any()
     slower[:, :, WRIST] = slower[:, :1, WRIST]
     assert np.flatnonzero(frozen_joints(slower[0:1, -RECENT - 1 :])[0]).tolist() == [WRIST]
+
+
+def test_what_a_sensor_rounds_is_not_frozen_while_it_rests() -> None:
+    rng = np.random.default_rng(0)
+    seen = (waving(50) + rng.normal(0.0, 0.001, (50, 22, 3)))[None]
+    seen[:, :, 12:] += 0.02 * rng.standard_normal((1, 50, 10, 3))
+    rounded = 0.02 * np.round(seen / 0.02)
+    resting = (np.diff(rounded[0, -RECENT:], axis=0) == 0).all(axis=-1).mean(axis=0) > 0.5
+    assert resting.any()
+    assert not frozen_joints(rounded).any()
+    rounded = 0.001 * np.round((seen + 0.005 * rng.standard_normal(seen.shape)) / 0.001)
+    rounded[:, -RECENT:, WRIST] = rounded[:, -RECENT - 1, None, WRIST]
+    assert np.flatnonzero(frozen_joints(rounded)[0]).tolist() == [WRIST], "by the millimetre, what stays is frozen"
