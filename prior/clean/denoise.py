@@ -17,7 +17,7 @@ from numba import njit
 
 from steadypose.prior.body.skeleton import HIPS, J
 from steadypose.prior.clean.frame import BodyWindows, Bools, Floats
-from steadypose.prior.clean.history import History
+from steadypose.prior.clean.history import BRIEF_S, History
 from steadypose.prior.models.hgvae.features import from_tracks
 from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS
@@ -114,6 +114,8 @@ class Denoise:
         seen = np.isfinite(history.positions[-1 - back][..., 0])
         # also in a frame without any sighting: else the estimate would jump to the smoother's
         seen |= ~seen.any(axis=1, keepdims=True)
+        # and between two sightings that are near
+        seen |= history.seen_since(back) & (history.unseen_s[-1 - back] < BRIEF_S)
         known = seen & np.isfinite(reconstructed[..., 0] + smoothed.sigma)
         moved = np.where(known[..., None], reconstructed - smoothed.positions, 0.0)
         square = np.square(moved).mean(axis=-1)

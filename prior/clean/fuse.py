@@ -14,6 +14,7 @@ from steadypose.msgs.types import JointState
 from steadypose.prior.body.inverse_kinematics import RIGID, fit_lengths, place_joints, solve_pose
 from steadypose.prior.body.skeleton import BONES_BETWEEN, PARENT
 from steadypose.prior.clean.frame import Bools, Estimate, Floats, Imputed, Person
+from steadypose.prior.clean.history import BRIEF_S
 from steadypose.prior.clean.occluded import OccludedJoints
 from steadypose.prior.clean.slow_error import SlowError
 from steadypose.prior.timing.fixed_lag import Smoothed
@@ -133,7 +134,9 @@ class Fuse:
             here = (unseen <= unseen.min(axis=1, keepdims=True)) & np.isfinite(deviation)
             variance = _merge(body, seen, here, precision)
             length_variance = slow_error.length_variance[slots] + _of_rigid(person.length_variance[slots])
-            body = fit_lengths(body, offsets, np.where(here, _MIN_VARIANCE, variance), length_variance)
+            # nor between two sightings that are near: put on its bones for a frame or two, a joint would flicker
+            stays = here | (seen_later[slots] & (unseen < BRIEF_S))
+            body = fit_lengths(body, offsets, np.where(stays, _MIN_VARIANCE, variance), length_variance)
             fitted = solve_pose(body, offsets, decoded)[0]
         placed = np.isfinite(deviation).any(axis=1)
         state, sigma = _states(unseen, known), _stated(unseen, deviation, precision)

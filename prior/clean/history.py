@@ -12,6 +12,10 @@ BRIDGED = 3
 """Frames: gaps of the whole body up to this long are interpolated linearly. The models are trained on hidden limbs, not
 on flickering bodies, and would pass the flicker on."""
 
+BRIEF_S = 2.5 / FPS
+"""Seconds: a joint that was seen less long ago, and is seen again within the delay, is treated like those that are seen.
+Of joints dropped in three of ten frames, the acceleration error is 2.5 instead of 2.8 mm/frame² (validation)."""
+
 
 class History:
     """The last frames of S bodies, the newest last. The pipeline appends; all stages read.
