@@ -13,7 +13,7 @@ BRIDGED = 3
 on flickering bodies, and would pass the flicker on."""
 
 BRIEF_S = 2.5 / FPS
-"""Seconds: a joint that was seen less long ago, and is seen again within the delay, is treated like those that are seen.
+"""Seconds: a joint that was seen less long ago, and is seen again within the delay, is treated like those seen.
 Of joints dropped in three of ten frames, the acceleration error is 2.5 instead of 2.8 mm/frame² (validation)."""
 
 
