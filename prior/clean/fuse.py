@@ -126,7 +126,7 @@ class Fuse:
                 completed_sigma = np.where(hidden, imputed.sigma[slots], np.inf)
             occluded = self.occluded.update(slots, seen, deviation, unseen, seen_later[slots], body, completed_sigma)
             if occluded is not None:
-                row, joint = occluded.index.T
+                row, joint = occluded.joints.T
                 body[row, joint] = occluded.positions
                 precision.seen[row, joint], precision.prior[row, joint] = 0.0, 1.0 / np.square(occluded.sigma)
                 known[row, joint] |= occluded.sigma <= MOST_SIGMA

@@ -25,12 +25,12 @@ class Placed(NamedTuple):
     """N occluded joints.
 
     Attributes:
-        index: (N, 2) row of the body, and the joint.
+        joints: (N, 2) row of the body, and the joint.
         positions: (N, 3) metres.
         sigma: (N,) metres, standard deviation along an axis.
     """
 
-    index: NDArray[np.intp]
+    joints: NDArray[np.intp]
     positions: Floats
     sigma: Floats
 

@@ -106,7 +106,7 @@ def test_a_joint_never_seen_is_where_the_completion_has_it_on_average_and_goes_w
             np.arange(1), seen, sigma, unseen, np.zeros((1, 22), dtype=bool), completed, np.full((1, 22), 0.03)
         )
         assert answer is not None
-        assert answer.index.tolist() == [[0, joint] for joint in ARM]
+        assert answer.joints.tolist() == [[0, joint] for joint in ARM]
         np.testing.assert_array_equal(answer.sigma, 0.03)
         off.append(answer.positions - frame[0, ARM])
     assert not asked.rows
@@ -160,7 +160,7 @@ def test_what_ships_believes_a_foot_that_stands_more_than_its_completion() -> No
             np.arange(1), standing, sigma, unseen.copy(), np.zeros((1, 22), dtype=bool), wrong, np.full((1, 22), 0.1)
         )
         assert answer is not None
-        if len(answer.index):
+        if len(answer.joints):
             found.append(answer)
     off = np.array([np.linalg.norm(each.positions - standing[0, feet], axis=-1) for each in found])
     assert off.max() < 0.06
