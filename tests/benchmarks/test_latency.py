@@ -55,5 +55,5 @@ def test_percentiles() -> None:
     assert percentiles(range(101)) == {"p50": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
 
 
-def test_the_outage_is_the_longest_time_between_two_messages() -> None:
-    assert longest_gap([10.0, 10.033, 11.7, 11.733]) == 1.667
+def test_the_outage_is_the_longest_time_between_two_messages_that_begins_with_the_kill() -> None:
+    assert longest_gap([10.0, 10.033, 11.7, 11.733, 14.0], 0.5) == 1.667
