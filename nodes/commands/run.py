@@ -127,9 +127,9 @@ class _Run:
         endpoints = [transport.endpoint(name) for name in self._launch.nodes]
         terminal = self._console.is_terminal
         with (
+            Supervisor(self._launch.nodes, self._arguments, self._clock, self._print) as supervisor,
             Subscriber(endpoints, DIAGNOSTICS, keys=keys, clear_text=transport.clear_text) as subscriber,
             Live(console=self._console, auto_refresh=False, transient=True) if terminal else nullcontext() as live,
-            Supervisor(self._launch.nodes, self._arguments, self._clock, self._print) as supervisor,
         ):
             status = None
             try:

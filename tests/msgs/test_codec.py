@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
 from tests.helpers.msg_strategies import ANY, EXAMPLES, clean, diagnostics, raw
 
-from steadypose.msgs.codec import DecodeError, decode, encode, typestore, wire_type
+from steadypose.msgs.codec import ROS_DEFINITIONS, DecodeError, decode, encode, typestore, wire_type
 from steadypose.msgs.limits import MAX_BODIES, MAX_VALUES
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, TOPICS
 from steadypose.msgs.types import Diagnostics, Message
@@ -33,6 +34,12 @@ def test_the_other_byte_order_is_read_too(topic: str):
     big_endian = store.serialize_cdr(store.deserialize_cdr(PAYLOADS[topic], name), name, little_endian=False)
     assert bytes(big_endian[:2]) == b"\0\0"
     assert decode(topic, bytes(big_endian)) == EXAMPLES[topic]
+
+
+@pytest.mark.parametrize("name", ROS_DEFINITIONS)
+@pytest.mark.parametrize("store", [Stores.ROS2_HUMBLE, Stores.LATEST])
+def test_messages_of_ros_are_what_ros_says_they_are(name: str, store: Stores):
+    assert typestore().hash_rihs01(name) == get_typestore(store).hash_rihs01(name)
 
 
 def test_what_is_decoded_owns_its_arrays():
