@@ -1,7 +1,4 @@
-"""``python -m steadypose.benchmarks.systems.fuzz``: readers on malformed input.
-
-    python -m steadypose.benchmarks.systems.fuzz --seconds 600
-    python -m steadypose.benchmarks.systems.fuzz --seconds 60 --only codec recording
+"""Readers on malformed input.
 
 Inputs are whole ones, damaged: bits flipped, bytes taken out, doubled and exchanged, numbers replaced by extreme ones;
 so most get past the first check. Each must be read, or refused with the reader's own error, within `SLOW_S`, and the
@@ -10,9 +7,7 @@ process must not grow. Where atheris is installed, ``--guided`` lets it look for
 
 from __future__ import annotations
 
-import argparse
 import io
-import json
 import random
 import resource
 import sys
@@ -20,14 +15,19 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FunctionType
 
 import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import Progress
 
 from steadypose import PACKAGE
+from steadypose.benchmarks.provenance import require_committed
+from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.benchmarks.systems.motion_files import AMC, ASF, BVH, amass
 from steadypose.msgs.codec import DecodeError, decode, encode
 from steadypose.msgs.recording import RecordingError, RecordingReader
@@ -42,11 +42,32 @@ from steadypose.prior.motion.bvh import read_bvh
 from steadypose.prior.motion.clip import MotionError
 from steadypose.prior.motion.npz import read_amass
 
+DEPENDS_ON = ()
+
 SLOW_S = 5.0
 """that a reader may take for an input of some kilobytes"""
 NUMBERS = (b"nan", b"inf", b"-1", b"0", b"1e999", b"1e-320", b"9" * 40, b"0x1", b"", b"{", b"}", b'"', b"\n", b"\0")
-SETTLED = 1000
-"""inputs after which memory is first measured: caches are full by then"""
+TURN_S = 5.0
+"""of each reader in its turn"""
+QUICK_INPUTS = 20_000
+
+
+@dataclass(frozen=True)
+class Args:
+    """Damaged inputs to every reader of files and messages. Ctrl-C ends it with what there is by then."""
+
+    inputs: int = 10_000_000
+    """of all readers together, each of which has as much time"""
+    only: tuple[str, ...] = ()
+    """these readers alone"""
+    seed: int = 0
+    """of the damage"""
+    guided: float = 0.0
+    """seconds for which atheris looks for ways through the code of one reader instead"""
+    quick: bool = False
+    """a few inputs, to see that it works; nothing is written unless --out says where"""
+    out: Path | None = None
+    """folder for the JSON file; benchmarks/results unless --quick"""
 
 
 @dataclass(frozen=True)
@@ -136,34 +157,72 @@ def targets(folder: Path) -> dict[str, Target]:
     }
 
 
-def fuzz(name: str, target: Target, seconds: float, random_: random.Random) -> dict[str, object]:
-    """Damage and read inputs for this long; returns the outcome."""
-    ended, counts = time.monotonic() + seconds, Counter[str]()
-    slowest, settled_mb, bad = 0.0, 0.0, []
+@dataclass
+class Found:
+    """What came of a reader's inputs so far.
+
+    Attributes:
+        counts: inputs by outcome: ``read``, ``refused``, ``undocumented``.
+        slowest_s: the longest that an input took.
+        bad: the first undocumented errors, each with its input.
+    """
+
+    counts: Counter[str] = field(default_factory=Counter)
+    slowest_s: float = 0.0
+    bad: list[dict[str, str]] = field(default_factory=list)
+
+
+def fuzz(target: Target, found: Found, seconds: float, random_: random.Random) -> None:
+    """Damage and read inputs for this long, and add up what comes of them."""
+    ended = time.monotonic() + seconds
     while (now := time.monotonic()) < ended:
         content = mutate(random_.choice(target.seeds), random_)
         try:
             target.read(content)
-            counts["read"] += 1
+            found.counts["read"] += 1
         except target.errors:
-            counts["refused"] += 1
+            found.counts["refused"] += 1
         except Exception as error:
-            counts["undocumented"] += 1
-            if len(bad) < 3:
-                bad.append({"error": traceback.format_exception_only(error)[-1].strip(), "input": content.hex()[:400]})
-        slowest = max(slowest, time.monotonic() - now)
-        if counts.total() == SETTLED:
-            settled_mb = _most_mb()
-    grown = _most_mb() - settled_mb if settled_mb else 0.0
-    return {"inputs": counts.total(), **counts, "slowest_s": round(slowest, 3), "grown_mb": round(grown, 1), "bad": bad}
+            found.counts["undocumented"] += 1
+            if len(found.bad) < 3:
+                what = traceback.format_exception_only(error)[-1].strip()
+                found.bad.append({"error": what, "input": content.hex()[:400]})
+        found.slowest_s = max(found.slowest_s, time.monotonic() - now)
+
+
+def in_turn(chosen: Mapping[str, Target], inputs: int, seed: int, progress: Progress) -> tuple[dict[str, Found], float]:
+    """Every reader for `TURN_S` after the other, until there were so many inputs, or Ctrl-C.
+
+    Returns:
+        What came of them by reader, and by how many megabytes the process has grown since the first turns.
+    """
+    random_, found = random.Random(seed), {name: Found() for name in chosen}
+    bar = progress.add_task("damaged inputs", total=inputs)
+    settled_mb: float | None = None
+    try:
+        while (total := sum(each.counts.total() for each in found.values())) < inputs:
+            settled_mb = _most_mb() if total and settled_mb is None else settled_mb
+            for name, target in chosen.items():
+                fuzz(target, found[name], TURN_S, random_)
+                progress.update(bar, completed=sum(each.counts.total() for each in found.values()))
+    except KeyboardInterrupt:
+        pass
+    return found, 0.0 if settled_mb is None else _most_mb() - settled_mb
 
 
 def _most_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def guided(name: str, target: Target, seconds: float) -> None:
-    """Coverage-guided fuzzing with atheris, which ends the process."""
+def guided(chosen: Mapping[str, Target], seconds: float) -> None:
+    """Coverage-guided fuzzing of one reader with atheris, which ends the process.
+
+    Raises:
+        SystemExit: several are chosen.
+    """
+    if len(chosen) != 1:
+        raise SystemExit(f"expected one reader with --guided, got {', '.join(chosen)}; choose it with --only")
+    [(name, target)] = chosen.items()
     import atheris  # pyright: ignore[reportMissingImports, reportMissingModuleSource]
 
     def one(content: bytes) -> None:
@@ -183,24 +242,49 @@ def guided(name: str, target: Target, seconds: float) -> None:
         atheris.Fuzz()
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=60.0, help="for all readers together")
-    parser.add_argument("--only", nargs="+", default=[], help="these readers alone")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--guided", action="store_true", help="by coverage, with atheris; one reader")
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        chosen = {k: t for k, t in targets(Path(folder)).items() if not arguments.only or k in arguments.only}
-        share, failed = arguments.seconds / len(chosen), False
-        for name, target in chosen.items():
-            if arguments.guided:
-                guided(name, target, share)
-            found = fuzz(name, target, share, random.Random(arguments.seed))
-            failed |= bool(found["bad"]) or float(str(found["slowest_s"])) > SLOW_S
-            print(json.dumps({"reader": name, **found}), flush=True)
-    return 1 if failed else 0
+def main(args: Args) -> None:
+    """Damage, read, print, write. Exit status 1 if a reader failed or was slow."""
+    written = bool(args.out) or not args.quick
+    if written:
+        require_committed(args.out or RESULTS)
+    console, began = Console(), time.monotonic()
+    with tempfile.TemporaryDirectory() as folder, Progress(console=console) as progress:
+        chosen = {name: t for name, t in targets(Path(folder)).items() if not args.only or name in args.only}
+        if args.guided:
+            guided(chosen, args.guided)
+        found, grown_mb = in_turn(chosen, QUICK_INPUTS if args.quick else args.inputs, args.seed, progress)
+    table = _table(found, grown_mb, time.monotonic() - began)
+    show(table, console)
+    bad = {name: each.bad for name, each in found.items() if each.bad}
+    if written:
+        saved = save(
+            "fuzz", sys.argv[1:], [table], {"bad": bad, "grown_mb": round(grown_mb, 1)}, DEPENDS_ON, args.out or RESULTS
+        )
+        console.print(f"wrote {saved}")
+    if bad or any(each.slowest_s > SLOW_S for each in found.values()):
+        console.print_json(data=bad)
+        sys.exit(1)
+
+
+def _table(found: Mapping[str, Found], grown_mb: float, seconds: float) -> Table:
+    outcomes = ("read", "refused", "undocumented")
+    rows = [
+        [name, f"{each.counts.total():,}", *(f"{each.counts[k]:,}" for k in outcomes), f"{each.slowest_s:.2f}"]
+        for name, each in found.items()
+    ]
+    total = [f"{sum(each.counts[k] for each in found.values()):,}" for k in outcomes]
+    slowest = max(each.slowest_s for each in found.values())
+    everything = f"{sum(each.counts.total() for each in found.values()):,}"
+    return Table(
+        name="fuzz",
+        title="Damaged inputs of every reader",
+        columns=["reader", "inputs", *outcomes, "slowest, s"],
+        rows=[*rows, ["all", everything, *total, f"{slowest:.2f}"]],
+        note="Whole inputs with bits flipped, bytes removed, doubled and exchanged, numbers made extreme. Undocumented: "
+        f"answered with an error that is not the reader's own. In one process, {seconds / 60:.1f} minutes, in which it "
+        f"grew by {grown_mb:.1f} MB.",
+    )
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main(tyro.cli(Args))
