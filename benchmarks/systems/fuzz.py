@@ -280,9 +280,9 @@ def _table(found: Mapping[str, Found], grown_mb: float, seconds: float) -> Table
         title="Damaged inputs of every reader",
         columns=["reader", "inputs", *outcomes, "slowest, s"],
         rows=[*rows, ["all", everything, *total, f"{slowest:.2f}"]],
-        note="Whole inputs with bits flipped, bytes removed, doubled and exchanged, numbers made extreme. Undocumented: "
-        f"answered with an error that is not the reader's own. In one process, {seconds / 60:.1f} minutes, in which it "
-        f"grew by {grown_mb:.1f} MB.",
+        note="Whole inputs with bits flipped, bytes removed, doubled and exchanged, numbers made extreme. "
+        f"Undocumented: answered with an error that is not the reader's own. In {seconds / 60:.1f} minutes the one "
+        f"process grew by {grown_mb:.1f} MB.",
     )
 
 
