@@ -6,7 +6,7 @@ import ctypes
 import gc
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 _DONTNEED = 4
 """``MADV_DONTNEED`` of madvise(2)"""
@@ -36,7 +36,7 @@ def _give_back() -> None:
     libc = ctypes.CDLL(None)
     if hasattr(libc, "malloc_trim"):
         libc.malloc_trim(0)
-    with open("/proc/self/maps", encoding="utf-8") as maps:
+    with suppress(OSError), open("/proc/self/maps", encoding="utf-8") as maps:
         for line in maps:
             if " r-xp " in line and "llvmlite" in line:
                 begin, end = (int(address, 16) for address in line.split()[0].split("-"))
