@@ -1,7 +1,7 @@
 """Any camera of the system, with MediaPipe's pose landmarker: without depth, distances follow from the body's size.
 
-MediaPipe is an optional extra, and its model a file of its own (docs/sources.md says where from). What runs with
-OpenCV and MediaPipe is in `nodes.sources.webcam_device`.
+MediaPipe is an optional extra; it brings a model that finds one body, others are files of their own (docs/sources.md
+says where from). What runs with OpenCV and MediaPipe is in `nodes.sources.webcam_device`.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ class WebcamSettings:
     video: str = path_setting()
     """a video to read instead; a relative path starts at the launch file"""
     model: str = path_setting()
-    """MediaPipe's pose landmarker, a .task file; a relative path starts at the launch file"""
+    """a pose landmarker for MediaPipe, a .task file, in place of its own, which finds one body; a relative path starts at
+    the launch file"""
     bodies: int = 1
-    """maximum number of bodies to detect"""
+    """maximum number of bodies to detect; more than one with a model alone"""
     field_of_view: float = 1.05
     """radians, of the image's width, where the lens is not calibrated: scales how far away bodies seem"""
 
@@ -55,10 +56,15 @@ def open_webcam(settings: WebcamSettings, context: SourceContext) -> WebcamSourc
     Raises:
         LaunchError: the model is missing, or a setting cannot be used.
     """
-    if not Path(settings.model).is_file():
+    if settings.model and not Path(settings.model).is_file():
         raise LaunchError(
-            f"[input.webcam] model: expected MediaPipe's pose landmarker, a .task file, got {settings.model!r}; "
-            f"download one, such as {MODEL}"
+            f"[input.webcam] model: expected a pose landmarker for MediaPipe, a .task file, got {settings.model!r}; "
+            f"download one, such as {MODEL}, or leave it out: MediaPipe's own finds one body"
+        )
+    if settings.bodies > 1 and not settings.model:
+        raise LaunchError(
+            f"[input.webcam] bodies: MediaPipe's own model finds one, got {settings.bodies}; for more, give a model, such "
+            f"as {MODEL}"
         )
     if not settings.video:
         return WebcamSource(settings, context)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -17,7 +18,7 @@ from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_mediapipe, pinhole
 from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import CameraError, count_failure
-from steadypose.nodes.sources.webcam import WebcamSettings
+from steadypose.nodes.sources.webcam import MODEL, WebcamSettings
 
 Landmarker = Callable[[NDArray[Any], int], Any]
 """an RGB image (H, W, 3) and its milliseconds, which rise, to a ``PoseLandmarkerResult``"""
@@ -121,11 +122,44 @@ class Webcam:
 
 @contextmanager
 def mediapipe_landmarker(settings: WebcamSettings) -> Iterator[Landmarker]:
-    """MediaPipe's pose landmarker, in its mode for video.
+    """MediaPipe's pose landmarker, in its mode for video: of the model that is given, or the one it comes with.
 
     Raises:
-        LaunchError: the model is none.
+        LaunchError: the model is none, or there is none.
     """
+    with _landmarker_of(settings) if settings.model else _own_landmarker() as landmarker:
+        yield landmarker
+
+
+@contextmanager
+def _own_landmarker() -> Iterator[Landmarker]:
+    """Of one body. MediaPipe would smooth what it finds, which is the prior's task."""
+    try:
+        from mediapipe.python.solutions.pose import Pose  # pyright: ignore[reportMissingImports]
+    except ModuleNotFoundError as error:
+        if error.name == "mediapipe":
+            raise
+        raise LaunchError(
+            f"[input.webcam] model: this MediaPipe comes without one (0.10 does, for Python up to 3.12); download one, "
+            f"such as {MODEL}"
+        ) from error
+
+    def alone(landmarks: Any) -> list[Any]:
+        return [] if landmarks is None else [landmarks.landmark]
+
+    with Pose(smooth_landmarks=False) as pose:
+
+        def find(image: NDArray[Any], _: int) -> SimpleNamespace:
+            found = pose.process(image)
+            return SimpleNamespace(
+                pose_landmarks=alone(found.pose_landmarks), pose_world_landmarks=alone(found.pose_world_landmarks)
+            )
+
+        yield find
+
+
+@contextmanager
+def _landmarker_of(settings: WebcamSettings) -> Iterator[Landmarker]:
     # an extra, of which nobody need have the types
     import mediapipe  # pyright: ignore[reportMissingImports]
     from mediapipe.tasks.python import BaseOptions, vision  # pyright: ignore[reportMissingImports]

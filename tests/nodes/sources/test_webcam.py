@@ -179,7 +179,7 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        (WebcamSettings(), r"a \.task file, got ''; download one, such as https"),
+        (WebcamSettings(bodies=2), r"bodies: MediaPipe's own model finds one, got 2; .* such as https"),
         (WebcamSettings(model="gone.task"), "got 'gone.task'; download one"),
     ],
 )
@@ -200,11 +200,18 @@ def test_without_mediapipe_it_says_what_to_install(model: str, monkeypatch: pyte
         open_input(InputSettings(source="webcam", webcam=WebcamSettings(model=model)), SystemClock())
 
 
-def test_the_launch_file_names_what_to_download() -> None:
+def test_the_launch_file_needs_no_download() -> None:
     launch = Launch.read("webcam")
     assert launch.settings(InputSettings).source == "webcam"
     assert not launch.transport.lossless
-    assert launch.settings(InputSettings).webcam.model.endswith("launch/pose_landmarker_full.task")
+    assert launch.settings(InputSettings).webcam == WebcamSettings()
+
+
+def test_mediapipes_own_model_looks_at_each_picture_of_a_film(video: Path) -> None:
+    pytest.importorskip("mediapipe.python.solutions", reason="no MediaPipe with a model of its own")
+    frames = [frame for _, frame in VideoSource(WebcamSettings(video=str(video)), NOT_CALIBRATED)]
+    assert len(frames) == FRAMES
+    assert not any(frame.bodies for frame in frames if isinstance(frame, PoseRaw)), "nobody is in them"
 
 
 def test_mediapipe_itself_refuses_a_file_that_is_no_model(model: str) -> None:
