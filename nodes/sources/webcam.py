@@ -37,8 +37,8 @@ class WebcamSettings:
     video: str = path_setting()
     """a video to read instead; a relative path starts at the launch file"""
     model: str = path_setting()
-    """a pose landmarker for MediaPipe, a .task file, in place of its own, which finds one body; a relative path starts at
-    the launch file"""
+    """a pose landmarker for MediaPipe, a .task file, in place of its own, which finds one body; a relative path starts
+    at the launch file"""
     bodies: int = 1
     """maximum number of bodies to detect; more than one with a model alone"""
     field_of_view: float = 1.05
@@ -63,8 +63,8 @@ def open_webcam(settings: WebcamSettings, context: SourceContext) -> WebcamSourc
         )
     if settings.bodies > 1 and not settings.model:
         raise LaunchError(
-            f"[input.webcam] bodies: MediaPipe's own model finds one, got {settings.bodies}; for more, give a model, such "
-            f"as {MODEL}"
+            f"[input.webcam] bodies: MediaPipe's own model finds one, got {settings.bodies}; for more, give a model, "
+            f"such as {MODEL}"
         )
     if not settings.video:
         return WebcamSource(settings, context)
