@@ -11,7 +11,7 @@ from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.checks.window import tracks
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
-from steadypose.prior.body.likeness import Likeness, Stance, likeness, likenesses, stance
+from steadypose.prior.body.likeness import Likeness, Stance, likeness, likenesses, medians, stance
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.adapt import SensorFrame
 
@@ -78,7 +78,7 @@ def check_jumps(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
         for body in raw.bodies:
             if len(body.positions) != len(skeleton.joints):
                 continue
-            middle = np.nanmedian(body.positions, axis=0)
+            middle = medians(body.positions)
             if body.id in last and raw.stamp_ns > (stamp_ns := last[body.id][0]):
                 speeds.append(np.linalg.norm(middle - last[body.id][1]) / (raw.stamp_ns - stamp_ns) * 1e9)
             last[body.id] = raw.stamp_ns, middle

@@ -79,9 +79,9 @@ def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | 
     if seen.sum() < MIN_SPANS:
         return None
     logs = np.log(np.maximum(lengths[:, seen] / HUMAN[seen], NO_LENGTH))
-    middle = np.nanmedian(logs, axis=0)
+    middle = medians(logs)
     scale = float(np.median(middle))
-    spread = np.minimum(np.nanmedian(np.abs(logs - middle), axis=0), 1.0)
+    spread = np.minimum(medians(np.abs(logs - middle)), 1.0)
     off = np.clip(middle - scale, -3.0, 3.0)
     worst = int(np.argmax(np.abs(off)))
     return Likeness(
@@ -91,6 +91,13 @@ def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | 
         SPAN_NAMES[int(np.flatnonzero(seen)[worst])],
         float(np.exp(off[worst])),
     )
+
+
+def medians(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Of (N, ...) over N, of what is not NaN; NaN where all is: numpy's ``nanmedian`` in a tenth of its time."""
+    ordered, count = np.sort(values, axis=0), (~np.isnan(values)).sum(axis=0)
+    middle = np.stack([np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)])
+    return np.take_along_axis(ordered, middle, axis=0).mean(axis=0)
 
 
 def likenesses(positions: NDArray[np.floating]) -> list[Likeness]:
