@@ -72,7 +72,7 @@ def check_jumps(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     skeleton = SKELETONS.get(messages[-1].skeleton)
     if skeleton is None:
         return
-    last: dict[int, tuple[int, Floats]] = {}
+    last: dict[int, tuple[int, NDArray[np.floating]]] = {}
     speeds = []
     for raw in messages:
         for body in raw.bodies:
