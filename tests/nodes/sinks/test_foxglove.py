@@ -7,6 +7,7 @@ import json
 import os
 import socket
 import struct
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -76,21 +77,21 @@ def test_a_client_gets_markers(make_launch: Callable[..., Launch]) -> None:
         assert (channel["encoding"], channel["schemaName"]) == ("cdr", "visualization_msgs/msg/MarkerArray")
         assert "Marker[] markers" in channel["schema"]
         client.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": channel["id"]}]}))
-        got: list[bytes] = []
-        client._socket.settimeout(0.2)
+        got, subscribed = b"", threading.Event()
 
-        def received() -> bool:
-            publisher.publish(POSE_WORLD, worlds[-1])
-            try:
+        def publish() -> None:  # when the server has noted the subscription, it does not say
+            while not subscribed.wait(0.02):
+                publisher.publish(POSE_WORLD, worlds[-1])
+
+        publishing = threading.Thread(target=publish)
+        publishing.start()
+        try:
+            while not got:
                 kind, data = client.receive()
-            except OSError:
-                return False
-            got.extend([data] if kind == 2 and data[0] == 1 else [])
-            return bool(got)
-
-        client._socket.settimeout(20)
-        publisher.publish(POSE_WORLD, worlds[-1])
-        until(received)
-        client.close()
-    (message,) = [deserialise(got[0][13:], "visualization_msgs/msg/MarkerArray")]
+                got = data if kind == 2 and data[0] == 1 else b""
+        finally:
+            subscribed.set()
+            publishing.join()
+            client.close()
+    message = deserialise(got[13:], "visualization_msgs/msg/MarkerArray")
     assert {mark.ns.partition("/")[2] for mark in message.markers} == {"joints", "bones", "velocity", "name"}
