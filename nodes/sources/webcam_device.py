@@ -150,7 +150,7 @@ def _own_landmarker() -> Iterator[Landmarker]:
     with Pose(smooth_landmarks=False) as pose:
 
         def find(image: NDArray[Any], _: int) -> SimpleNamespace:
-            found = pose.process(image)
+            found: Any = pose.process(image)
             return SimpleNamespace(
                 pose_landmarks=alone(found.pose_landmarks), pose_world_landmarks=alone(found.pose_world_landmarks)
             )
