@@ -157,6 +157,14 @@ class Sensors:
             noise += rate * 10 ** rng.uniform(-3.0, -2.0) * rng.standard_normal((shape[0], 1, 1))
         if kind == "white" and rng.random() < 0.06:  # a camera of 15 frames a second, read at 30
             noise[1:-1:2] = 0.5 * (noise[:-2:2] + noise[2::2])
+        if rng.random() < 0.15:  # noise that swells and ebbs, of each joint or of the body
+            noise *= np.exp(0.7 * _coloured((shape[0], rng.choice([1, 22]), 1), 0.98, rng))
+        if rng.random() < 0.12:
+            noise *= rng.choice([0.1, 1.0])
+            noise += _shaking(truth, rng)
+        if rng.random() < 0.05:
+            step = 10 ** rng.uniform(-2.5, -1.4)
+            noise = np.round((truth + noise) / step) * step - truth
         return noise
 
     def _real(self, rng: Rng) -> tuple[Floats, Floats]:
@@ -197,6 +205,9 @@ class Sensors:
                     seen[clip, rows, pair] = np.nan
             if rng.random() < 0.08:
                 seen[clip, rng.random(frames) < 10 ** rng.uniform(-2.0, -0.5)] = np.nan
+            if rng.random() < 0.08:  # joints that flicker
+                flickering = (rng.random(22) < rng.choice([0.3, 1.0])) * 10 ** rng.uniform(-1.3, -0.3)
+                seen[clip][rng.random((frames, 22)) < flickering] = np.nan
         few = np.flatnonzero(rng.random(count) < 0.15)
         seen[np.ix_(few, np.arange(frames), np.array(_ABSENT))] = np.nan
         hidden = np.flatnonzero(rng.random(count) < 0.2)
@@ -225,6 +236,17 @@ def _coloured(shape: tuple[int, ...], memory: float, rng: Rng) -> Floats:
     for t in range(1, len(noise)):
         noise[t] = memory * noise[t - 1] + np.sqrt(1 - memory**2) * noise[t]
     return noise
+
+
+def _shaking(truth: Floats, rng: Rng) -> Floats:
+    """(T, 22, 3) metres, errors of a camera 1 to 4 m away that shakes: joints share its displacement and rotation."""
+    frames, amplitude = len(truth), 10 ** rng.uniform(-2.7, -1.4)
+    memory = rng.choice([0.0, rng.uniform(0.3, 0.95)])
+    towards = rng.standard_normal(3) * (1.0, 1.0, 0.2)
+    distance = rng.uniform(1.0, 4.0)
+    camera = truth[0, 0] + distance * towards / np.linalg.norm(towards)
+    turned = amplitude / distance * rng.choice([0.0, 1.0]) * _coloured((frames, 1, 3), memory, rng)
+    return amplitude * _coloured((frames, 1, 3), memory, rng) + np.cross(turned, truth - camera)
 
 
 def _monocular_errors(truth: Floats, rng: Rng) -> Floats:

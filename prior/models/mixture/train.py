@@ -59,6 +59,10 @@ SPEED_WEIGHT, MAX_SPEED_WEIGHT = 0.5, 60.0
 """Weight of a joint's position error: 1 + (speed / SPEED_WEIGHT m/s)², at most MAX_SPEED_WEIGHT. Joints are fast in few
 frames, in which filters lag most. Acceleration errors are weighted by the inverse of its root."""
 
+HARM = 1.0
+"""Weight of the position error above that of the expert nearest to the truth, relative to it: where a sensor's errors
+last, smoothness must not be bought by lag."""
+
 DEVIATION = 0.3
 """Weight of the negative log-likelihood in the loss."""
 
@@ -162,9 +166,11 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
         seen = known * (batch.gap == 0).float()
         each = [errors(experts[:, :, :, m], batch.truth, seen, batch.counts) for m in range(EXPERTS)]
         position, acceleration = (torch.stack(values) for values in zip(*each, strict=True))
+        nearest = position.amin(dim=0)
         best = (position + acceleration).argmin(dim=0, keepdim=True)
         position, acceleration = position.gather(0, best)[0], acceleration.gather(0, best)[0]
     relative = own.position / (position + MIN_MM) + smooth * own.acceleration / (acceleration + MIN_SMOOTH_MM)
+    relative = relative + HARM * (own.position / (nearest + MIN_MM) - 1.0).relu()
     square = torch.where(known[..., None], places - batch.truth, 0.0).square().mean(dim=-1).detach() * 1e6
     density = 0.5 * (variance.log() + square / variance)
     likelihood = (density * known).sum(dim=(1, 2)) / known.sum(dim=(1, 2)).clamp(min=1)
