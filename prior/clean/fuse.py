@@ -28,7 +28,7 @@ class FuseSettings:
         enabled: whether to fuse; off, the body stands as the refinement model decoded it, where its pelvis was seen.
         prior_sigma: metres, of a joint placed by the refinement model, when its body is well seen.
         prior_drift: m/s, how fast that grows for a joint that is not seen.
-        fade: seconds after which a joint that is neither seen nor completed within `MOST_SIGMA` is unknown.
+        fade: seconds after which a joint that is neither seen nor completed within `MAX_SIGMA` is unknown.
         weights: weight set of the occlusion network, or a path to a ``.safetensors`` file.
     """
 
@@ -39,7 +39,7 @@ class FuseSettings:
     weights: str = "default"
 
 
-MOST_SIGMA = 0.25
+MAX_SIGMA = 0.25
 """Metres along an axis: a completed joint is known while its standard deviation is at most this, however long it was
 not seen."""
 
@@ -129,7 +129,7 @@ class Fuse:
                 row, joint = occluded.joints.T
                 body[row, joint] = occluded.positions
                 precision.seen[row, joint], precision.prior[row, joint] = 0.0, 1.0 / np.square(occluded.sigma)
-                known[row, joint] |= occluded.sigma <= MOST_SIGMA
+                known[row, joint] |= occluded.sigma <= MAX_SIGMA
             # of a frame that was lost whole, the smoother knows more
             here = (unseen <= unseen.min(axis=1, keepdims=True)) & np.isfinite(deviation)
             variance = _merge(body, seen, here, precision)

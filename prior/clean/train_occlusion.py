@@ -52,7 +52,7 @@ SEEN_FIRST = 8, 40
 
 DELAYS = (0, 0, 2, 4, 4, 8, 16)
 
-LEAST_MM, DEVIATION = 30.0, 0.02
+MIN_MM, DEVIATION = 30.0, 0.02
 """Added to the best candidate's error, by which errors are divided; and weight of the likelihood."""
 
 _ARMS, _LEGS = limbs(("shoulder", "elbow", "wrist")), limbs(("knee", "ankle", "foot"))
@@ -168,7 +168,7 @@ def loss_of(network: OcclusionNet, rows: dict[str, Tensor]) -> tuple[Tensor, Ten
     best = 1e3 * (rows["candidates"] - rows["truth"][:, None]).norm(dim=-1).min(dim=-1).values
     square = off.detach().square().sum(dim=-1)
     likelihood = 3.0 * log_sigma + 0.5 * square * torch.exp(-2.0 * log_sigma)
-    return (error / (LEAST_MM + best)).mean() + DEVIATION * likelihood.mean(), error, best
+    return (error / (MIN_MM + best)).mean() + DEVIATION * likelihood.mean(), error, best
 
 
 def train_occlusion(options: TrainingOptions) -> Path:

@@ -19,7 +19,7 @@ SAME = 1e-6
 MIN_NOISE = 0.001
 """Metres along an axis, from frame to frame: of a sensor with less, a joint that repeats itself may be at rest."""
 
-MOST_ALIKE = 0.1
+MAX_ALIKE = 0.1
 """Share of the coordinates of joints that did move that may repeat themselves: with more, the sensor rounds, and what
 rests repeats itself."""
 
@@ -57,7 +57,7 @@ def frozen_joints(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
                     repeated[joint] += same[joint] == 3
                     most = max(most, repeated[joint])
         limit = 0.5 * max(new, _MIN_NEW)
-        if most > limit and alike <= MOST_ALIKE * coordinates and median(_noise(recent)) > MIN_NOISE:
+        if most > limit and alike <= MAX_ALIKE * coordinates and median(_noise(recent)) > MIN_NOISE:
             for joint in range(joints):
                 found[b, joint] = repeated[joint] > limit
     return found

@@ -25,7 +25,7 @@ FROM_ROOT, FASTEST = 0.5, 3.0
 HEIGHT, HIGHEST = 0.1, 0.6
 """Metres by which heights are divided, and beyond which no more is told."""
 
-SIGMA, LEAST_SIGMA, MOST_SIGMA = 0.01, 1e-3, 1.0
+SIGMA, MIN_SIGMA, MAX_SIGMA = 0.01, 1e-3, 1.0
 """Metres: the deviation whose logarithm is 0, and those beyond which no more is told."""
 
 _JOINTS = list(CONTACT_JOINTS)
@@ -67,7 +67,7 @@ def contact_features(
         np.clip((from_root - from_root_before) / step @ back, -FASTEST, FASTEST),
         np.clip(height, -HIGHEST, HIGHEST)[..., None] / HEIGHT,
         np.clip(velocity @ back, -FASTEST, FASTEST),
-        np.log(np.clip(sigma[:, _JOINTS], LEAST_SIGMA, MOST_SIGMA) / SIGMA)[..., None],
+        np.log(np.clip(sigma[:, _JOINTS], MIN_SIGMA, MAX_SIGMA) / SIGMA)[..., None],
         np.ones((*known.shape, 1)),
     ]
     of_joints = np.nan_to_num(np.concatenate(parts, axis=-1), nan=0.0) * known[..., None]

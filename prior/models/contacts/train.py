@@ -47,7 +47,7 @@ SIDE_BY_SIDE = 64
 DELAYS = (0, 2, 4, 4, 8)
 """Frames, of the smoother."""
 
-LEAST_SPEED = 0.1
+MIN_SPEED = 0.1
 """m/s: a clip is drawn as often as its feet are fast, and one that stands still as if they were this fast."""
 
 SCALES = (0.8, 1.15)
@@ -91,7 +91,7 @@ def smoothed_clips(motion: MotionSet, count: int, seed: int) -> Pool:
     starts = motion.all_windows(FRAMES, 5)[:, 0]
     feet = motion.positions[:, [J["left_ankle"], J["right_ankle"]]].numpy()
     moved = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(feet, axis=0), axis=-1).mean(axis=1) * FPS)])
-    chances = LEAST_SPEED + (moved[starts + FRAMES - 1] - moved[starts]) / FRAMES
+    chances = MIN_SPEED + (moved[starts + FRAMES - 1] - moved[starts]) / FRAMES
     first = rng.choice(starts, count, p=chances / chances.sum())
     parts = [
         _smoothed(motion, first[k : k + SIDE_BY_SIDE], rng)

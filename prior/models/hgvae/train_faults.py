@@ -60,13 +60,13 @@ Floats = NDArray[np.float64]
 WINDOWS = 2000
 """for each error, number of joints missing and pace, of which the rarest rate leaves a few"""
 
-FASTER, MOST_DRAWS = (1, 2, 3), 12
+FASTER, MAX_DRAWS = (1, 2, 3), 12
 """strides of the windows among which each pace is looked for, and how often as many are drawn: what is fast is rare"""
 
 BATCH = 64
 """windows in each step of the fault network's optimiser"""
 
-LEAST_FAULT = 0.015
+MIN_FAULT = 0.015
 """Metres along an axis, over the frames that are scored: a joint less off than that, or than the sensor's own error, is
 no fault worth the name, and one less off than a fifth of it is none."""
 
@@ -147,7 +147,7 @@ def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np
     for k in np.flatnonzero(lacking < 0.7):
         alone, few = seen[k : k + 1], lacking[k] < 0.4
         alone[:] = hide_joints(alone, int(rng.integers(1, MISSING[-1])), rng) if few else occlude(alone, rng)
-    limit = np.maximum(LEAST_FAULT, sigma)[:, None]
+    limit = np.maximum(MIN_FAULT, sigma)[:, None]
     shown = np.isfinite(seen[:, -RECENT:, :, 0]).any(axis=1)
     off = (astray > limit) | lost
     clear = torch.from_numpy(shown & (off | (astray < 0.2 * limit) & (repeated == 0))).float()
@@ -221,7 +221,7 @@ def _at_paces(windows: Windows, frames: int, count: int, rng: np.random.Generato
     """Windows (B, T, 22, 3), up to ``count`` of each class of `PACES`, and body sizes."""
     kept: list[tuple[Floats, Floats]] = []
     wanted = np.full(len(PACES), count)
-    for _ in range(MOST_DRAWS):
+    for _ in range(MAX_DRAWS):
         positions, sizes = windows.draw(count, frames, rng, FASTER)
         of_class = np.digitize(pace(positions.reshape(count, frames, -1).swapaxes(1, 2)), PACE_EDGES)
         rows = np.concatenate([np.flatnonzero(of_class == p)[:most] for p, most in enumerate(wanted)])

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.models.occlusion.candidates import CANDIDATES
-from steadypose.prior.models.occlusion.form import LEAST_LOG_SIGMA, MOST_LOG_SIGMA
+from steadypose.prior.models.occlusion.form import MAX_LOG_SIGMA, MIN_LOG_SIGMA
 from steadypose.prior.models.weights_io import Arrays, load_weights
 
 Floats = NDArray[np.float64]
@@ -103,4 +103,4 @@ def _weigh(features, joint, candidates, read, of_joint, think, think_bias, write
             positions[row, axis] = 0.0
             for c in range(CANDIDATES):
                 positions[row, axis] += out[c] / total * candidates[row, c, axis]
-        sigma[row] = SIGMA_SCALE * 1e-3 * np.exp(min(max(out[CANDIDATES], LEAST_LOG_SIGMA), MOST_LOG_SIGMA))
+        sigma[row] = SIGMA_SCALE * 1e-3 * np.exp(min(max(out[CANDIDATES], MIN_LOG_SIGMA), MAX_LOG_SIGMA))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from steadypose.prior.models.occlusion.candidates import CANDIDATES, FEATURES
-from steadypose.prior.models.occlusion.form import LEAST_LOG_SIGMA, MOST_LOG_SIGMA
+from steadypose.prior.models.occlusion.form import MAX_LOG_SIGMA, MIN_LOG_SIGMA
 
 JOINTS = 22
 
@@ -59,4 +59,4 @@ class OcclusionNet(nn.Module):
         millimetres, of features (N, `FEATURES`) of joints (N,)."""
         read = torch.relu(self.read((features - self.mean) / self.deviation) + self.joint[joint])
         written = self.write(torch.relu(self.think(read)) + read)
-        return written[:, :CANDIDATES].softmax(dim=-1), written[:, CANDIDATES].clamp(LEAST_LOG_SIGMA, MOST_LOG_SIGMA)
+        return written[:, :CANDIDATES].softmax(dim=-1), written[:, CANDIDATES].clamp(MIN_LOG_SIGMA, MAX_LOG_SIGMA)

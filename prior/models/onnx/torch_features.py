@@ -16,8 +16,8 @@ from steadypose.prior.models.contacts.features import (
     FROM_ROOT,
     HEIGHT,
     HIGHEST,
-    LEAST_SIGMA,
-    MOST_SIGMA,
+    MAX_SIGMA,
+    MIN_SIGMA,
     SIGMA,
 )
 from steadypose.prior.models.hgvae.completion_features import BIAS_MIN, BIAS_SCALE, CENTIMETRE, GROWTH, LAG, NEAR, STILL
@@ -159,7 +159,7 @@ def contact_features(
         ((from_root - from_root_then) / step @ back).clamp(-FASTEST, FASTEST),
         height[..., None].clamp(-HIGHEST, HIGHEST) / HEIGHT,
         (velocity @ back).clamp(-FASTEST, FASTEST),
-        (sigma[:, joints, None].clamp(LEAST_SIGMA, MOST_SIGMA) / SIGMA).log(),
+        (sigma[:, joints, None].clamp(MIN_SIGMA, MAX_SIGMA) / SIGMA).log(),
         torch.ones_like(height[..., None]),
     ]
     of_joints = torch.cat(parts, dim=-1)

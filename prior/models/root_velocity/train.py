@@ -35,7 +35,7 @@ RATES = (0.75, 1.3)
 SCALES = (0.85, 1.15)
 """Range of factors on people's sizes in training."""
 
-LEAST_SPEED = 0.1
+MIN_SPEED = 0.1
 """m/s: a window is drawn as often as its root is fast, and one that stands still as if it were this fast."""
 
 TILT_SD, YAW_SD = np.deg2rad(3.0), np.deg2rad(10.0)
@@ -112,7 +112,7 @@ def _chances(motion: MotionSet) -> tuple[np.ndarray, np.ndarray]:
     """Where windows may start, and the chance of each: the faster the root, the likelier, for people mostly stand."""
     rows = motion.all_windows(_SPAN, step=2)
     path = motion.positions[rows, 0].diff(dim=1)[..., :2].norm(dim=-1).mean(dim=1).numpy() / FRAME_S
-    weights = LEAST_SPEED + path
+    weights = MIN_SPEED + path
     return rows[:, 0], weights / weights.sum()
 
 
