@@ -19,6 +19,7 @@ PROTOCOLS: dict[str, str] = {
     "world": "root drift and foot skate",
     "contacts": "load of feet, against force plates",
     "humor": "futures, noisy and hidden joints, a simulated detector and depth camera (the HuMoR paper)",
+    "camera_rates": "cameras of 15 to 120 Hz",
     "streaming": "delay found, jitter at matched delay, recovery, lost frames, jittering stamps",
 }
 """Module in this package: what it measures."""

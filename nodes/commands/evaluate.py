@@ -23,6 +23,7 @@ def evaluate(
         "world",
         "contacts",
         "humor",
+        "camera_rates",
         "streaming",
     ],
     split: Literal["val", "test"] = "val",

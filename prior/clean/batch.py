@@ -180,7 +180,7 @@ class StreamBatch:
                 return
             slots, identify = self._settings.max_bodies, self._settings.identify
             stream = self._streams[raw.source] = _Stream(
-                resampler=Resampler(slots, aligned=True),
+                resampler=Resampler(slots, aligned=True, delayed=self._settings.delay > 0),
                 identify=Identify(identify, 2 * slots, self.counters) if identify.enabled else None,
                 offset_ns=now_ns - raw.stamp_ns,
                 last=raw,

@@ -49,7 +49,7 @@ class PriorPipeline:
         self._core = CleanCore(settings, self.counters)
         self._identify = Identify(settings.identify, 2 * slots, self.counters) if settings.identify.enabled else None
         self._slots: Slots[int] = Slots(slots, settings.timeout, self.counters)
-        self._resampler = Resampler(slots)
+        self._resampler = Resampler(slots, delayed=settings.delay > 0)
         self._sensor_pose = SensorPoseGate()
         self._last: PoseRaw | None = None
         self._origin_ns = 0  # stamps within are seconds since: a float of seconds since 1970 would round them
@@ -88,7 +88,7 @@ class PriorPipeline:
             self._origin_ns = raw.stamp_ns
         self._last = raw
         ticks = self._resampler.update(raw.stamp_ns, *self._arranged(raw, layout))
-        cleaned = [self._step(stamp_ns, Sighting(*joints), raw, hurry) for stamp_ns, *joints in ticks]
+        cleaned = [self._step(stamp_ns, Sighting(*joints), raw, hurry=hurry) for stamp_ns, *joints in ticks]
         return flushed + [message for message in cleaned if message is not None]
 
     @property
@@ -99,7 +99,12 @@ class PriorPipeline:
     def flush(self) -> list[PoseClean]:
         """The frames that the delay still holds, oldest first; the stream is then forgotten."""
         last = self._last
-        cleaned = [] if last is None else [self._message(frame, last) for frame in self._core.flush()]
+        cleaned: list[PoseClean] = []
+        if last is not None:
+            for stamp_ns, *joints in self._resampler.drain():
+                message = self._step(stamp_ns, Sighting(*joints), last, hurry=False)
+                cleaned += [] if message is None else [message]
+            cleaned += [self._message(frame, last) for frame in self._core.flush()]
         self._drop(np.ones_like(self._slots.present))
         self._resampler.reset()
         self._sensor_pose.reset()
@@ -113,7 +118,7 @@ class PriorPipeline:
         keys = self._identify.update(raw.stamp_ns, *stacked(found.values())) if self._identify else found
         return self._slots.arrange(zip(keys, found.values(), strict=True))
 
-    def _step(self, stamp_ns: int, seen: Sighting, raw: PoseRaw, hurry: bool) -> PoseClean | None:
+    def _step(self, stamp_ns: int, seen: Sighting, raw: PoseRaw, *, hurry: bool) -> PoseClean | None:
         """One step of the 30 Hz grid."""
         gone = self._slots.advance(stamp_ns, seen.positions)
         if gone.any():

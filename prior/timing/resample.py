@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.timing.decimate import DecimationFilter, Frame
 from steadypose.prior.timing.rate import FPS
 from steadypose.prior.timing.republished import Republished
+
+Floats = NDArray[np.float64]
 
 PERIOD_NS = round(1e9 / FPS)
 MAX_GAP_NS = 150_000_000
@@ -29,17 +32,18 @@ class Resampler:
     Args:
         slots: bodies at most.
         aligned: whether the grid lies at whole multiples of its period, rather than at the first frame.
+        delayed: whether answers are delayed anyway; see `DecimationFilter`.
     """
 
-    def __init__(self, slots: int, *, aligned: bool = False) -> None:
-        self._slots, self._aligned = slots, aligned
+    def __init__(self, slots: int, *, aligned: bool = False, delayed: bool = True) -> None:
+        self._slots, self._aligned, self._delayed = slots, aligned, delayed
         self.reset()
 
     def reset(self) -> None:
         """Start a new grid at the next frame."""
-        self._anchor: int | None = None
-        self._ticks = 0
+        self._tick_ns: int | None = None  # the next grid time
         self._republished = Republished()
+        self._decimation = DecimationFilter(self._slots, delayed=self._delayed)
         self._newest_ns: int | None = None
         self._period_ns = float(PERIOD_NS)
         self._seen_ns = np.full((2, self._slots, 22), np.iinfo(np.int64).min // 2)
@@ -49,10 +53,9 @@ class Resampler:
     def clear(self, slot: NDArray[np.bool_]) -> None:
         """Forget the sightings of these slots (S,)."""
         self._seen_ns[:, slot] = np.iinfo(np.int64).min // 2
+        self._decimation.clear(slot)
 
-    def update(
-        self, stamp_ns: int, positions: NDArray[np.float64], confidence: NDArray[np.float64]
-    ) -> list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
+    def update(self, stamp_ns: int, positions: Floats, confidence: Floats) -> list[Frame]:
         """Take a frame and give the grid frames that it completes; one that is republished counts as none.
 
         Args:
@@ -61,13 +64,23 @@ class Resampler:
             confidence: (S, 22).
 
         Returns:
-            (stamp_ns, positions, confidence) of each grid time reached, oldest first.
+            Frames of the grid times reached, oldest first.
         """
-        if self._anchor is None:
+        if self._tick_ns is None:
             first = -(-(stamp_ns - LOOK_AHEAD_NS) // PERIOD_NS) * PERIOD_NS  # rounded up
-            self._anchor = first if self._aligned else stamp_ns
+            self._tick_ns = first if self._aligned else stamp_ns
         if self._republished.update(positions):
             return []
+        return self._gridded(self._decimation.update(Frame(stamp_ns, positions, confidence)))
+
+    def drain(self) -> list[Frame]:
+        """The grid frames that the decimation filter still holds, at the end of a stream."""
+        return self._gridded(self._decimation.drain())
+
+    def _gridded(self, frames: list[Frame]) -> list[Frame]:
+        return [gridded for frame in frames for gridded in self._interpolated(*frame)]
+
+    def _interpolated(self, stamp_ns: int, positions: Floats, confidence: Floats) -> list[Frame]:
         if self._newest_ns is not None:
             self._period_ns += PERIOD_GAIN * (min(stamp_ns - self._newest_ns, PERIOD_NS) - self._period_ns)
         self._newest_ns = stamp_ns
@@ -82,12 +95,12 @@ class Resampler:
             store[0][seen] = store[1][seen]
             store[1][seen] = value[seen]
         frames = []
-        while (tick := self._anchor + self._ticks * PERIOD_NS) <= stamp_ns + look_ahead_ns:
-            frames.append((tick, *self._at(tick, stamp_ns)))
-            self._ticks += 1
+        while self._tick_ns is not None and self._tick_ns <= stamp_ns + look_ahead_ns:
+            frames.append(Frame(self._tick_ns, *self._at(self._tick_ns, stamp_ns)))
+            self._tick_ns += PERIOD_NS
         return frames
 
-    def _at(self, tick: int, now: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _at(self, tick: int, now: int) -> tuple[Floats, Floats]:
         before, after = self._seen_ns
         span = after - before
         between = (span <= MAX_GAP_NS) & (before - LOOK_AHEAD_NS <= tick) & (tick <= after + LOOK_AHEAD_NS)

@@ -87,3 +87,12 @@ def test_a_cleared_slot_does_not_reach_back_to_the_last_body() -> None:
     frames = resampler.update(2 * PERIOD_NS, line(2 * PERIOD_NS), np.ones((SLOTS, 22)))
     assert np.isnan(frames[0][1][0]).all()
     assert np.isfinite(frames[0][1][1]).all()
+
+
+@pytest.mark.parametrize("hz", [30, 60, 120])
+def test_at_the_end_no_grid_time_is_lost(hz: int) -> None:
+    resampler, end = Resampler(1), 2 * hz
+    stamps = [round(k * 1e9 / hz) for k in range(end + 1)]
+    frames = [f for s in stamps for f in resampler.update(s, line(s)[:1], np.ones((1, 22)))] + resampler.drain()
+    assert [f.stamp_ns for f in frames] == [k * PERIOD_NS for k in range(61)]
+    assert all(np.allclose(f.positions, line(f.stamp_ns)[:1], atol=1e-9) for f in frames)
