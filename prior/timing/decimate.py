@@ -154,7 +154,7 @@ def _fit(time: Floats, positions: Floats) -> _Fit:
     """Fit positions (T, ..., 3) at ``time`` (T,)."""
     basis = np.vander(time, 3, increasing=True)
     solved = np.linalg.pinv(basis)
-    residuals = positions - np.tensordot(basis @ solved, positions, 1)
+    residuals = positions - np.einsum("st,t...->s...", basis @ solved, positions)
     squares = np.square(residuals).sum(axis=-1)
-    value: Floats = np.tensordot(solved[0], positions, 1)
+    value = np.einsum("t,t...->...", solved[0], positions)
     return _Fit(value, squares.sum(axis=0) / (len(time) - 3), np.sqrt(squares.max(axis=0)))
