@@ -126,9 +126,9 @@ class BodyFilter:
 
     @property
     def feet_sigma(self) -> Floats:
-        """(feet,) metres, standard deviation along an axis, root mean square of the three."""
+        """(feet, 3) metres, standard deviation along each axis."""
         places = np.arange(_FEET, len(self._x), _OF_FOOT)
-        return np.sqrt(self._p[:, places, places].mean(axis=0))
+        return np.sqrt(self._p[:, places, places].T)
 
     @property
     def feet_off(self) -> Floats:

@@ -24,6 +24,7 @@ from steadypose.prior.world.contact_reader import Glimpse
 from steadypose.prior.world.ground import Ground
 from steadypose.prior.world.legs import fit_legs, turn_legs
 from steadypose.prior.world.sighting import Sighting
+from steadypose.prior.world.soles import SOLE, Soles
 from steadypose.prior.world.standing import StandingFeet
 
 Floats = NDArray[np.float64]
@@ -32,18 +33,17 @@ Sigma = TypeVar("Sigma", float, NDArray[np.float64])
 FEET: tuple[int, ...] = tuple(J[f"{side}_{part}"] for part in ("ankle", "foot") for side in ("left", "right"))
 """The joints that may stand: heels and toes."""
 
-SOLE: Floats = np.array([0.07, 0.07, 0.022, 0.022])
-"""(4,) metres from the floor to each of `FEET` while it stands: the median over labelled contacts of the training
-motion, the mean over its five sources."""
-
 SOLE_SIGMA = 0.02
-"""Metres, the standard deviation of that between sources and people."""
+"""Metres, how well a foot that stands tells the ground, by `SOLE`: between sources and people, and from stand to stand."""
 
 STANDING = 0.5
 """Probability of rest from which on a foot tells the ground."""
 
 UPRIGHT_M = 0.45
 """Metres from a foot up to the pelvis, at least, of a body whose feet tell the ground: not of one that lies."""
+
+LYING_M = 0.25
+"""Metres from the ground up to the pelvis, at most, of a body whose feet the ground tells nothing: it lies, on heels."""
 
 EASE_S = 0.1
 """Seconds in which a body whose root is seen again comes to be where it is seen."""
@@ -119,6 +119,7 @@ class BodyTrack:
         self._noise = noise
         self._filter = self._start(sighting, np.zeros(3))
         self._standing, self._feet = StandingFeet(len(FEET)), np.full((len(FEET), 3), np.nan)
+        self._soles, self._feet_sigma = Soles(), np.full(len(FEET), np.nan)
         self._dt = 0.0
         self._jumps = 0
         self._before = sighting
@@ -213,8 +214,7 @@ class BodyTrack:
         in_the_world = self._observe_root(sighting)
         self._observe_feet(sighting, in_the_world)
         self._meet_ground(sighting, rest, ground)
-        estimates = np.where(self._filter.placed[:, None], self._filter.feet, np.nan)
-        self._feet = self._standing.update(estimates, self._filter.feet_sigma, rest, self._dt)
+        self._stand(sighting, rest, ground)
         if sighting.root is not None and not sighting.root_seen:
             self._shift = self._filter.position - sighting.root
         else:
@@ -282,6 +282,22 @@ class BodyTrack:
                 if math.isfinite(under):
                     self._filter.observe_foot_height(int(k), under + SOLE[k], math.hypot(ground.sigma, SOLE_SIGMA))
 
+    def _stand(self, sighting: Sighting, rest: Floats, ground: Ground) -> None:
+        """Find where the feet are, by filter and ground, and keep those still that rest."""
+        feet, spread = np.where(self._filter.placed[:, None], self._filter.feet, np.nan), self._filter.feet_sigma
+        floor = np.array([ground.under(foot) for foot in feet - self._soles.heights[:, None] * _UP])
+        seen, sigma = sighting.positions[list(FEET), 2], sighting.sigma[list(FEET)]
+        # What the filter takes to fade with time is, of a sensor, in part an offset of a foot that stays.
+        variance = spread[:, 2] ** 2 + np.where(np.isfinite(sigma), sigma, 0.0) ** 2
+        raised = self._filter.position[2] - np.nan_to_num(floor)
+        upright = np.clip((raised - LYING_M) / (UPRIGHT_M - LYING_M), 0.0, 1.0)
+        feet[:, 2], settled, stands = self._soles.settle(feet[:, 2], variance, floor, ground.sigma, rest, upright)
+        if sighting.root_seen:
+            self._soles.learn(seen - floor, sigma, stands, max(self._dt, FRAME_S))
+        self._feet = self._standing.update(feet, np.sqrt(np.mean(spread**2, axis=1)), rest, self._dt)
+        spread[:, 2] = np.where(np.isfinite(floor), np.sqrt(settled), spread[:, 2])
+        self._feet_sigma = np.sqrt(np.mean(spread**2, axis=1))
+
     def publish(self, sighting: Sighting, contacts: Contacts, lost_sigma: float) -> WorldBody:
         """The body in the world, as of the newest message."""
         place, spread = self._filter.position, self._filter.position_sigma
@@ -290,7 +306,7 @@ class BodyTrack:
         moved = sighting.positions + self._shift
         placed = self._filter.placed
         feet = np.array(FEET)[placed]
-        moved[feet], sigma[feet] = self._feet[placed], self._filter.feet_sigma[placed]
+        moved[feet], sigma[feet] = self._feet[placed], self._feet_sigma[placed]
         moved[0], sigma[0] = place, math.sqrt(float(np.mean(spread**2)))
         positions = fit_legs(moved, sigma, sighting.body.bone_lengths)
         rotations = sighting.body.rotations.astype(np.float64)

@@ -13,7 +13,9 @@ from steadypose.benchmarks.root_drift import METHODS, SEEN_FRAMES, Clip, evaluat
 from steadypose.msgs.types import CONTACTS, JOINTS, JointState, Pose, PoseClean, PoseWorld, Tracking
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.sim.scripts import walk_turn
+from steadypose.prior.world.body_track import FEET
 from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.prior.world.soles import SOLE
 
 FRAME_NS = 33_333_333
 
@@ -280,6 +282,33 @@ def test_uncalibrated_floor_is_found_under_the_feet():
     a, b, c, d = run(messages)[-1].ground_plane
     assert (a, b, c) == (0, 0, 1)
     assert d == pytest.approx(1.2, abs=0.05)
+
+
+def standing_low(calibrated: bool, sigma: float) -> tuple[np.ndarray, np.ndarray]:
+    """Heel and toe (2,) as seen by a sensor that has one foot 4 cm too low, and as published after 3 s of standing."""
+    standing, feet = stream()[0], list(FEET[::2])
+    body = standing.bodies[0]
+    positions = body.positions.copy()
+    positions[list(FEET), 2] = SOLE
+    positions[feet, 2] -= 0.04
+    fields = {"positions": positions, "sigma": np.full(22, sigma)}
+    messages = [changed(standing, fields, stamp_ns=t * FRAME_NS, calibrated=calibrated) for t in range(90)]
+    published = run(messages)[-1].bodies[0].positions
+    np.testing.assert_allclose(published[0], positions[0], atol=0.01)
+    return positions[feet, 2], published[feet, 2]
+
+
+@pytest.mark.parametrize(("calibrated", "least"), [(True, 0.02), (False, 0.01)])
+def test_a_foot_seen_under_the_floor_is_raised_to_it(calibrated: bool, least: float):
+    """Where the floor itself is learned from the feet, by as much as the two differ."""
+    seen, published = standing_low(calibrated, sigma=0.03)
+    assert (published - seen > least).all()
+    assert (published - SOLE[::2] < 0.0).all()
+
+
+def test_one_that_a_sure_sensor_sees_there_is_not():
+    seen, published = standing_low(calibrated=True, sigma=0.002)
+    np.testing.assert_allclose(published, seen, atol=2e-3)
 
 
 def test_settings_are_checked():

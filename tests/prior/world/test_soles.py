@@ -1,0 +1,104 @@
+"""What a floor says of the heights of feet, against integrals over all heights, and where it must say nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import norm
+
+from steadypose.prior.world.soles import AIR_M, SOLE, SOLE_SIGMA, SURPRISE, UNEVEN, Soles
+
+FLOOR, FOUR = np.zeros(4), np.ones(4)
+RESTS = 0.99 * FOUR
+SURE, UNSURE = 0.001**2 * FOUR, 0.02**2 * FOUR
+
+
+def settle(above: float, variances: np.ndarray = UNSURE, rest: np.ndarray = RESTS, floor: np.ndarray = FLOOR):
+    """Of feet so many metres above where they would stand."""
+    return Soles().settle(SOLE + above, variances, floor, 0.0, rest, FOUR)
+
+
+def test_the_standing_part_is_the_product_of_two_gaussians():
+    grid = np.linspace(-0.2, 0.3, 20_001)
+    heights, variances, stands = settle(-0.01)
+    for k in range(4):
+        s = np.hypot(SOLE_SIGMA[k // 2], UNEVEN)
+        seen, stand = norm.pdf(grid, SOLE[k] - 0.01, 0.02), norm.pdf(grid, SOLE[k], s)
+        total = np.hypot(0.02, s)
+        both = seen * stand / (seen * stand).sum()
+        mean, known = (both * grid).sum(), 1 - SURPRISE
+        air = np.hypot(AIR_M, np.sqrt(2 * np.pi) * total)
+        weights = np.array([
+            known * RESTS[k] * norm.pdf(-0.01, 0, total), known * (1 - RESTS[k]) * norm.cdf(-0.01 / total) / air,
+            SURPRISE / air,
+        ])  # fmt: skip
+        weights /= weights.sum()
+        means = np.array([mean, mean, SOLE[k] - 0.01])
+        spreads = np.array([(both * (grid - mean) ** 2).sum()] * 2 + [0.02**2])
+        assert stands[k] == pytest.approx(weights[0])
+        assert heights[k] == pytest.approx(weights @ means, abs=1e-6)
+        assert variances[k] == pytest.approx(weights @ (spreads + means**2) - (weights @ means) ** 2, abs=1e-8)
+
+
+def test_a_foot_seen_under_the_floor_is_raised_whether_it_rests_or_not():
+    for rest in (RESTS, 0.0 * FOUR):
+        raised = settle(-0.03, rest=rest)[0] - (SOLE - 0.03)
+        assert (raised > 0.01).all()
+
+
+def test_a_foot_in_the_air_stays_where_it_is_seen():
+    np.testing.assert_array_equal(settle(0.02, rest=0.0 * FOUR)[0], SOLE + 0.02)
+
+
+def test_a_sure_input_stays_as_it_is():
+    for above in (-0.03, -0.01, 0.01, 0.03):
+        np.testing.assert_allclose(settle(above, SURE)[0], SOLE + above, atol=1e-3)
+
+
+def test_the_floor_is_not_believed_far_above_or_below_it():
+    for above in (-0.3, 0.3):
+        np.testing.assert_allclose(settle(above)[0], SOLE + above, atol=1e-6)
+
+
+def test_where_no_floor_is_known_nothing_is_said():
+    heights, variances, stands = settle(-0.03, floor=np.full(4, np.nan))
+    np.testing.assert_array_equal(heights, SOLE - 0.03)
+    np.testing.assert_array_equal(variances, UNSURE)
+    assert not stands.any()
+
+
+def test_of_a_body_that_lies_nothing_is_said():
+    np.testing.assert_array_equal(Soles().settle(SOLE - 0.03, UNSURE, FLOOR, 0.0, RESTS, 0.0 * FOUR)[0], SOLE - 0.03)
+
+
+@settings(max_examples=200)
+@given(
+    above=st.floats(-0.2, 0.2), sigma=st.floats(1e-3, 0.2), rest=st.floats(0.0, 1.0), floor_sigma=st.floats(0.0, 0.2),
+)  # fmt: skip
+def test_it_moves_feet_towards_the_floor_and_never_past_it(above: float, sigma: float, rest: float, floor_sigma: float):
+    heights, variances, stands = Soles().settle(SOLE + above, sigma**2 * FOUR, FLOOR, floor_sigma, rest * FOUR, FOUR)
+    low, high = sorted((0.0, above))
+    assert ((heights - SOLE > low - 1e-9) & (heights - SOLE < high + 1e-9)).all()
+    assert ((variances > 0.0) & np.isfinite(variances)).all()
+    assert ((stands >= 0.0) & (stands <= 1.0)).all()
+
+
+def test_a_person_whose_feet_stand_higher_is_learned_and_then_left_alone():
+    soles, above = Soles(), SOLE + np.array([0.03, 0.03, 0.01, 0.01])
+    before = soles.settle(above, UNSURE, FLOOR, 0.0, RESTS, FOUR)[0]
+    for _ in range(30 * 60):
+        stands = soles.settle(above, UNSURE, FLOOR, 0.0, RESTS, FOUR)[2]
+        soles.learn(above, 0.02 * FOUR, stands, 1 / 30)
+    after = soles.settle(above, UNSURE, FLOOR, 0.0, RESTS, FOUR)[0]
+    assert (np.abs(after - above) < 0.3 * np.abs(before - above)).all()
+    assert np.ptp(soles.heights.reshape(2, 2), axis=1).max() == 0.0
+
+
+def test_what_no_foot_tells_is_not_learned():
+    soles = Soles()
+    soles.learn(np.full(4, np.nan), 0.02 * FOUR, FOUR, 1 / 30)
+    soles.learn(SOLE + 0.05, np.full(4, np.inf), FOUR, 1 / 30)
+    soles.learn(SOLE + 0.05, 0.02 * FOUR, 0.0 * FOUR, 1 / 30)
+    np.testing.assert_array_equal(soles.heights, SOLE)
