@@ -25,7 +25,7 @@ from steadypose.prior.world.ground import Ground
 from steadypose.prior.world.legs import fit_legs, turn_legs
 from steadypose.prior.world.sighting import Sighting
 from steadypose.prior.world.soles import SOLE, Soles
-from steadypose.prior.world.standing import StandingFeet
+from steadypose.prior.world.standing import StandingFeet, standing_velocity
 
 Floats = NDArray[np.float64]
 Sigma = TypeVar("Sigma", float, NDArray[np.float64])
@@ -120,6 +120,7 @@ class BodyTrack:
         self._filter = self._start(sighting, np.zeros(3))
         self._standing, self._feet = StandingFeet(len(FEET)), np.full((len(FEET), 3), np.nan)
         self._soles, self._feet_sigma = Soles(), np.full(len(FEET), np.nan)
+        self._both_rest = 0.0
         self._dt = 0.0
         self._jumps = 0
         self._before = sighting
@@ -215,6 +216,7 @@ class BodyTrack:
         self._observe_feet(sighting, in_the_world)
         self._meet_ground(sighting, rest, ground)
         self._stand(sighting, rest, ground)
+        self._both_rest = float(rest.reshape(2, 2).max(axis=0).min()) if sighting.root_seen else 0.0
         if sighting.root is not None and not sighting.root_seen:
             self._shift = self._filter.position - sighting.root
         else:
@@ -323,7 +325,7 @@ class BodyTrack:
             id=sighting.body.id,
             root_position=place,
             root_orientation=self._orientation,
-            root_velocity=self._filter.velocity,
+            root_velocity=standing_velocity(self._filter.velocity, self._filter.velocity_sigma, self._both_rest),
             covariance=self._filter.covariance,
             positions=positions,
             rotations=rotations,

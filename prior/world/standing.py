@@ -1,10 +1,12 @@
-"""Where feet that stand are published: still, while their estimate stays within a deadband.
+"""A body that stands is published standing: its feet still, and its root at the velocity of one that sways.
 
 While a foot stands, the filter learns better and better where, so that its estimate creeps. A reader wants a foot that
 stands, and half a standard deviation more adds a tenth to an estimate's error.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,16 @@ DEADBAND = 0.5
 
 EASE_S = 0.1
 """Seconds, the time constant by which a foot that has lifted comes to be where it is estimated."""
+
+SWAY, MOVES = 0.015, 0.1
+"""m/s, the standard deviation along an axis of the velocity of a root that sways over both feet, as in half of the
+training motion with both at rest, and of one that bends or shifts."""
+
+SWAYS = 0.5
+"""Of bodies with both feet at rest, the share that only sways."""
+
+VELOCITY_ERROR = 0.3
+"""Of the standard deviation that the filter states of a velocity that is seen, what validation finds."""
 
 
 class StandingFeet:
@@ -41,3 +53,20 @@ class StandingFeet:
         offset[np.isnan(estimates).any(axis=1)] = 0.0
         self._offset, self._before = offset, estimates
         return estimates + offset
+
+
+def standing_velocity(velocity: Floats, sigma: float, both_rest: float) -> Floats:
+    """The velocity (3,) m/s of a root that may only sway, as estimated with a standard deviation ``sigma``.
+
+    Its mean under a mixture of two: it sways, or moves, and then as estimated.
+
+    Args:
+        velocity: (3,) m/s.
+        sigma: m/s, along an axis, as the filter states it.
+        both_rest: the probability that both feet rest.
+    """
+    error = (VELOCITY_ERROR * sigma) ** 2
+    squared, sway, moves = float(velocity @ velocity), SWAY**2 + error, MOVES**2 + error
+    log_odds = 1.5 * math.log(moves / sway) - 0.5 * squared * (1.0 / sway - 1.0 / moves)
+    odds = SWAYS * both_rest / (1.0 - SWAYS * both_rest) * math.exp(log_odds)
+    return velocity * (1.0 - odds / (1.0 + odds) * error / sway)

@@ -1,12 +1,22 @@
-"""Feet that stand are published still, and never far from where they are estimated."""
+"""Feet that stand are published still, and never far from where they are estimated; a root that sways, slowly."""
 
 from __future__ import annotations
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import norm
 
-from steadypose.prior.world.standing import DEADBAND, EASE_S, StandingFeet
+from steadypose.prior.world.standing import (
+    DEADBAND,
+    EASE_S,
+    MOVES,
+    SWAY,
+    SWAYS,
+    VELOCITY_ERROR,
+    StandingFeet,
+    standing_velocity,
+)
 
 DT = 1 / 30
 SIGMA = np.full(2, 0.01)
@@ -52,3 +62,26 @@ def test_it_is_never_further_off_than_the_deadband(seed: int):
         places, sigma = rng.normal(0.0, 0.02, (2, 3)), rng.uniform(0.0, 0.02, 2)
         published = feet.update(places, sigma, rng.random(2), DT)
         assert (np.linalg.norm(published - places, axis=1) <= DEADBAND * sigma + 1e-12).all()
+
+
+def test_the_velocity_of_a_root_that_sways_is_the_mean_of_the_mixture():
+    velocity, error = np.array([0.03, -0.02, 0.01]), 0.1 * VELOCITY_ERROR
+    seen = [norm.pdf(velocity, scale=np.hypot(sigma, error)).prod() for sigma in (SWAY, MOVES)]
+    weights = np.array([SWAYS, 1 - SWAYS]) * seen
+    sways = weights[0] / weights.sum()
+    expected = sways * velocity * SWAY**2 / (SWAY**2 + error**2) + (1 - sways) * velocity
+    np.testing.assert_allclose(standing_velocity(velocity, 0.1, 1.0), expected)
+
+
+def test_a_root_that_moves_over_resting_feet_or_walks_keeps_its_velocity():
+    bends, slow = np.array([0.0, 0.2, -0.3]), np.array([0.03, 0.0, 0.0])
+    np.testing.assert_allclose(standing_velocity(bends, 0.1, 1.0), bends, rtol=1e-6)
+    np.testing.assert_array_equal(standing_velocity(slow, 0.1, 0.0), slow)
+
+
+@given(speed=st.floats(0.0, 100.0), sigma=st.floats(1e-6, 10.0), both_rest=st.floats(0.0, 1.0))
+def test_no_velocity_grows_or_turns(speed: float, sigma: float, both_rest: float):
+    direction = np.array([0.6, 0.0, 0.8])
+    slowed = standing_velocity(speed * direction, sigma, both_rest)
+    assert 0.0 <= slowed @ direction <= speed * (1.0 + 1e-12)
+    np.testing.assert_allclose(slowed, (slowed @ direction) * direction, atol=1e-9)
