@@ -297,7 +297,7 @@ class BodyTrack:
         if sighting.root_seen:
             self._soles.learn(seen - floor, sigma, stands, max(self._dt, FRAME_S))
         self._feet = self._standing.update(feet, np.sqrt(np.mean(spread**2, axis=1)), rest, self._dt)
-        spread[:, 2] = np.where(np.isfinite(floor), np.sqrt(settled), spread[:, 2])
+        spread[:, 2] = np.minimum(spread[:, 2], np.sqrt(settled))  # else bones would draw at a foot that is held
         self._feet_sigma = np.sqrt(np.mean(spread**2, axis=1))
 
     def publish(self, sighting: Sighting, contacts: Contacts, lost_sigma: float) -> WorldBody:
