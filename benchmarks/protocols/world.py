@@ -27,7 +27,7 @@ from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.root_drift import METHODS, Clip, evaluate_fusion
 from steadypose.benchmarks.scores import figures, interval, score
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
-from steadypose.prior.body.skeleton import JOINTS
+from steadypose.prior.body.skeleton import JOINTS, limbs
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.world.body_track import FEET
 from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
@@ -109,6 +109,8 @@ def measure(clips: MotionClips, answer: Floats) -> dict[str, Any]:
     result = {key: found[key] for key in ("position_mm", "position_ci_mm", "acceleration_mm")}
     result["root_mm"] = round(float(np.nanmean(root)) * 1e3, 2)
     result["root_ci_mm"] = interval(np.nanmean(root, axis=0))
+    legs = np.ravel(limbs(("hip", "knee", "ankle", "foot")))
+    result["legs_mm"] = round(float(np.nanmean(position_error(answer[:, :, legs], clips.positions[:, :, legs]))) * 1e3, 2)
     soles = answer[:, :, FEET, 2] - SOLE
     result["penetration_percent"] = round(100 * float((soles.min(axis=2) < -UNDER).mean()), 2)
     for side in ("left", "right"):
@@ -158,7 +160,7 @@ def _summary(records: list[dict[str, Any]], hidden: Mapping[str, Mapping[str, fl
 
 def _table(records: list[dict[str, Any]], clips: int) -> Table:
     keys = {
-        "position_mm": ("joints, mm", 1), "root_mm": ("root, mm", 1),
+        "position_mm": ("joints, mm", 1), "legs_mm": ("legs, mm", 1), "root_mm": ("root, mm", 1),
         "acceleration_mm": ("acceleration error, mm/frame²", 2), "left_skate_m_s": ("left foot, m/s", 3),
         "right_skate_m_s": ("right foot, m/s", 3), "left_skating_percent": ("left skates, %", 1),
         "right_skating_percent": ("right skates, %", 1), "penetration_percent": ("under the floor, %", 1),
