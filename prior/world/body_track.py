@@ -293,7 +293,9 @@ class BodyTrack:
         variance = spread[:, 2] ** 2 + np.where(np.isfinite(sigma), sigma, 0.0) ** 2
         raised = self._filter.position[2] - np.nan_to_num(floor)
         upright = np.clip((raised - LYING_M) / (UPRIGHT_M - LYING_M), 0.0, 1.0)
-        feet[:, 2], settled, stands = self._soles.settle(feet[:, 2], variance, floor, ground.sigma, rest, upright)
+        feet[:, 2], settled, stands = self._soles.settle(
+            feet[:, 2], variance, floor, ground.sigma, rest, upright, self._dt
+        )
         if sighting.root_seen:
             self._soles.learn(seen - floor, sigma, stands, max(self._dt, FRAME_S))
         self._feet = self._standing.update(feet, np.sqrt(np.mean(spread**2, axis=1)), rest, self._dt)

@@ -28,6 +28,9 @@ UNEVEN = 0.006
 MEMORY_S = 1.5
 """Seconds for which an error of the height of a standing foot lasts: frames closer together tell the same again."""
 
+EASE_S = 0.05
+"""Seconds, the time constant by which feet come to be where the floor has them: what they are off by lasts longer."""
+
 AIR_M = 0.1
 """Metres above the floor among which feet that do not stand, or stand on something else, are taken to be."""
 
@@ -40,6 +43,7 @@ class Soles:
 
     def __init__(self) -> None:
         self._heights, self._variances = SOLE[::2].copy(), SOLE_SIGMA**2
+        self._moved: Floats | None = None
 
     @property
     def heights(self) -> Floats:
@@ -47,8 +51,9 @@ class Soles:
         return np.repeat(self._heights, 2)
 
     def settle(
-        self, heights: Floats, variances: Floats, floor: Floats, floor_sigma: float, rest: Floats, known: Floats
-    ) -> tuple[Floats, Floats, Floats]:
+        self, heights: Floats, variances: Floats, floor: Floats, floor_sigma: float, rest: Floats, known: Floats,
+        dt: float,
+    ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
         """Weigh where feet are seen against the floor.
 
         Args:
@@ -58,12 +63,18 @@ class Soles:
             floor_sigma: metres, its standard deviation.
             rest: (4,) the probability that each rests.
             known: (4,) the probability that the floor, if any, says something of a foot of such a body.
+            dt: seconds since the last call.
 
         Returns:
             (4,) heights and (4,) variances of them; (4,) the probability that each stands on this floor.
         """
         own = np.repeat(self._variances, 2) + UNEVEN**2 + floor_sigma**2
-        return _settle(heights, variances, floor + self.heights, own, rest, known * (1.0 - SURPRISE))
+        settled, left, stands = _settle(heights, variances, floor + self.heights, own, rest, known * (1.0 - SURPRISE))
+        moved = np.nan_to_num(settled - heights)
+        if self._moved is not None:
+            moved = self._moved + (1.0 - math.exp(-dt / EASE_S)) * (moved - self._moved)
+        self._moved = moved
+        return heights + moved, left, stands
 
     def learn(self, above: Floats, sigma: Floats, stands: Floats, dt: float) -> None:
         """Take at what height above the floor the sensor has the feet, after ``dt`` seconds.

@@ -8,16 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from steadypose.prior.world.soles import AIR_M, SOLE, SOLE_SIGMA, SURPRISE, UNEVEN, Soles
+from steadypose.prior.world.soles import AIR_M, EASE_S, SOLE, SOLE_SIGMA, SURPRISE, UNEVEN, Soles
 
 FLOOR, FOUR = np.zeros(4), np.ones(4)
+DT = 1 / 30
 RESTS = 0.99 * FOUR
 SURE, UNSURE = 0.001**2 * FOUR, 0.02**2 * FOUR
 
 
 def settle(above: float, variances: np.ndarray = UNSURE, rest: np.ndarray = RESTS, floor: np.ndarray = FLOOR):
     """Of feet so many metres above where they would stand."""
-    return Soles().settle(SOLE + above, variances, floor, 0.0, rest, FOUR)
+    return Soles().settle(SOLE + above, variances, floor, 0.0, rest, FOUR, DT)
 
 
 def test_the_standing_part_is_the_product_of_two_gaussians():
@@ -70,7 +71,9 @@ def test_where_no_floor_is_known_nothing_is_said():
 
 
 def test_of_a_body_that_lies_nothing_is_said():
-    np.testing.assert_array_equal(Soles().settle(SOLE - 0.03, UNSURE, FLOOR, 0.0, RESTS, 0.0 * FOUR)[0], SOLE - 0.03)
+    np.testing.assert_array_equal(
+        Soles().settle(SOLE - 0.03, UNSURE, FLOOR, 0.0, RESTS, 0.0 * FOUR, DT)[0], SOLE - 0.03
+    )
 
 
 @settings(max_examples=200)
@@ -78,7 +81,9 @@ def test_of_a_body_that_lies_nothing_is_said():
     above=st.floats(-0.2, 0.2), sigma=st.floats(1e-3, 0.2), rest=st.floats(0.0, 1.0), floor_sigma=st.floats(0.0, 0.2),
 )  # fmt: skip
 def test_it_moves_feet_towards_the_floor_and_never_past_it(above: float, sigma: float, rest: float, floor_sigma: float):
-    heights, variances, stands = Soles().settle(SOLE + above, sigma**2 * FOUR, FLOOR, floor_sigma, rest * FOUR, FOUR)
+    heights, variances, stands = Soles().settle(
+        SOLE + above, sigma**2 * FOUR, FLOOR, floor_sigma, rest * FOUR, FOUR, DT
+    )
     low, high = sorted((0.0, above))
     assert ((heights - SOLE > low - 1e-9) & (heights - SOLE < high + 1e-9)).all()
     assert ((variances > 0.0) & np.isfinite(variances)).all()
@@ -87,18 +92,26 @@ def test_it_moves_feet_towards_the_floor_and_never_past_it(above: float, sigma: 
 
 def test_a_person_whose_feet_stand_higher_is_learned_and_then_left_alone():
     soles, above = Soles(), SOLE + np.array([0.03, 0.03, 0.01, 0.01])
-    before = soles.settle(above, UNSURE, FLOOR, 0.0, RESTS, FOUR)[0]
+    before = soles.settle(above, UNSURE, FLOOR, 0.0, RESTS, FOUR, DT)[0]
     for _ in range(30 * 60):
-        stands = soles.settle(above, UNSURE, FLOOR, 0.0, RESTS, FOUR)[2]
-        soles.learn(above, 0.02 * FOUR, stands, 1 / 30)
-    after = soles.settle(above, UNSURE, FLOOR, 0.0, RESTS, FOUR)[0]
+        stands = soles.settle(above, UNSURE, FLOOR, 0.0, RESTS, FOUR, DT)[2]
+        soles.learn(above, 0.02 * FOUR, stands, DT)
+    after = soles.settle(above, UNSURE, FLOOR, 0.0, RESTS, FOUR, DT)[0]
     assert (np.abs(after - above) < 0.3 * np.abs(before - above)).all()
     assert np.ptp(soles.heights.reshape(2, 2), axis=1).max() == 0.0
 
 
+def test_a_foot_comes_to_the_floor_smoothly():
+    soles, away = Soles(), np.full(4, np.nan)
+    soles.settle(SOLE - 0.03, UNSURE, away, 0.0, RESTS, FOUR, DT)
+    goal = settle(-0.03)[0]
+    off = [np.abs(soles.settle(SOLE - 0.03, UNSURE, FLOOR, 0.0, RESTS, FOUR, DT)[0] - goal).max() for _ in range(10)]
+    np.testing.assert_allclose(off, np.abs(goal - SOLE + 0.03).max() * np.exp(-DT / EASE_S * np.arange(1, 11)))
+
+
 def test_what_no_foot_tells_is_not_learned():
     soles = Soles()
-    soles.learn(np.full(4, np.nan), 0.02 * FOUR, FOUR, 1 / 30)
-    soles.learn(SOLE + 0.05, np.full(4, np.inf), FOUR, 1 / 30)
-    soles.learn(SOLE + 0.05, 0.02 * FOUR, 0.0 * FOUR, 1 / 30)
+    soles.learn(np.full(4, np.nan), 0.02 * FOUR, FOUR, DT)
+    soles.learn(SOLE + 0.05, np.full(4, np.inf), FOUR, DT)
+    soles.learn(SOLE + 0.05, 0.02 * FOUR, 0.0 * FOUR, DT)
     np.testing.assert_array_equal(soles.heights, SOLE)
