@@ -24,6 +24,9 @@ SHARES = np.array([0.13, 0.25, 0.15, 0.11, 0.11, 0.13, 0.12])
 """Kinds of sensors and their shares: no error, white noise, AR(1) noise, a real Kinect's errors added to other motion,
 all of these together, the real Kinect's recordings, and a monocular network, which errs in the depth of each bone."""
 
+TURNED = 0.25
+"""Share of clips in which people are turned as a whole, and lie, stand on their hands or roll."""
+
 _SWINGS = (
     ("elbow", ("wrist",)),
     ("shoulder", ("elbow", "wrist")),
@@ -93,6 +96,8 @@ class Sensors:
         about = np.flatnonzero(rng.random(count) < np.where(kind == KINDS.index("monocular"), 0.8, 0.05))
         for places in (seen, truth):
             places[about] -= places[about][:, :, _HIPS].mean(axis=2, keepdims=True)
+        for clip in np.flatnonzero(rng.random(count) < TURNED):
+            _turn(seen[clip], truth[clip], rng)
         return Sensed(seen, truth, confidence, kind)
 
     def _true(self, count: int, rng: Rng) -> Floats:
@@ -267,6 +272,19 @@ def _monocular_errors(truth: Floats, rng: Rng) -> Floats:
         apart = (bone * depth[:, joint])[:, None] * view
         noise[:, joint] += noise[:, PARENTS[joint]] + apart
     return noise
+
+
+def _turn(seen: Floats, truth: Floats, rng: Rng) -> None:
+    """Turn a clip about its first root by any rotation or a tilt, in place; a third of those that are known throughout
+    keep on turning about their root, by up to a revolution a second."""
+    axis = rng.standard_normal(3) * rng.choice([(1.0, 1.0, 1.0), (1.0, 1.0, 0.0)])
+    axis /= np.linalg.norm(axis)
+    turns, pivot = Rotation.from_rotvec(rng.uniform(0, np.pi) * axis), np.nan_to_num(truth[:1, :1])
+    if np.isfinite(truth).all() and rng.random() < 1 / 3:
+        angle = np.arange(len(truth)) / FPS * rng.uniform(0.0, 2 * np.pi)
+        turns, pivot = turns * Rotation.from_rotvec(angle[:, None] * axis), truth[:, :1].copy()
+    for places in (seen, truth):
+        places[:] = np.einsum("...ab,...jb->...ja", turns.as_matrix(), places - pivot) + pivot
 
 
 def _swing(truth: Floats, rng: Rng) -> None:
