@@ -27,6 +27,9 @@ all of these together, the real Kinect's recordings, and a monocular network, wh
 TURNED = 0.25
 """Share of clips in which people are turned as a whole, and lie, stand on their hands or roll."""
 
+CARRIED = 0.15
+"""Share of clips as a moving camera sees them that does not know its pose: a robot's, or one that is bumped into."""
+
 _SWINGS = (
     ("elbow", ("wrist",)),
     ("shoulder", ("elbow", "wrist")),
@@ -113,6 +116,8 @@ class Sensors:
         for clip in np.flatnonzero((rng.random(count) < 0.12) | still):
             if rng.random() < 0.9:
                 _swing(truth[clip], rng)
+        for clip in np.flatnonzero(rng.random(count) < CARRIED):
+            _carry(truth[clip], rng)
         return truth
 
     def _residual(self, rng: Rng) -> Floats:
@@ -215,6 +220,8 @@ class Sensors:
                 seen[clip][rng.random((frames, 22)) < flickering] = np.nan
         few = np.flatnonzero(rng.random(count) < 0.15)
         seen[np.ix_(few, np.arange(frames), np.array(_ABSENT))] = np.nan
+        for clip in np.flatnonzero(rng.random(count) < 0.05):  # sensors of few joints
+            seen[clip][:, rng.random(22) < rng.uniform(0.2, 0.8)] = np.nan
         hidden = np.flatnonzero(rng.random(count) < 0.2)
         if len(hidden):
             seen[hidden] = occlude(seen[hidden], rng)
@@ -272,6 +279,25 @@ def _monocular_errors(truth: Floats, rng: Rng) -> Floats:
         apart = (bone * depth[:, joint])[:, None] * view
         noise[:, joint] += noise[:, PARENTS[joint]] + apart
     return noise
+
+
+def _carry(truth: Floats, rng: Rng) -> None:
+    """Move a clip as a whole, smoothly, in place: it sways by up to 0.5 g at 0.1 to 3 Hz, turns about a camera 1 to 4 m
+    away by up to 1.5 rad/s, or is displaced at once."""
+    time, amplitude = np.arange(len(truth)) / FPS, 10 ** rng.uniform(-1.0, 0.0)
+    towards = rng.uniform(0.0, 2 * np.pi)
+    camera = truth[0, 0] + rng.uniform(1.0, 4.0) * np.array([np.cos(towards), np.sin(towards), 0.0])
+    rate = 2 * np.pi * 10 ** rng.uniform(-1.0, 0.5)
+    swung = np.sin(rate * time + rng.uniform(0.0, 2 * np.pi))
+    kind = rng.random()
+    if kind < 0.45:
+        axis = rng.standard_normal(3)
+        truth += (min(5.0 / rate**2, 0.5) * amplitude * axis / np.linalg.norm(axis) * swung[:, None])[:, None]
+    elif kind < 0.9:
+        turns = Rotation.from_euler("z", min(1.5 / rate, 1.0) * amplitude * swung[:, None]).as_matrix()
+        truth[:] = np.einsum("tab,tjb->tja", turns, truth - camera) + camera
+    else:
+        truth[rng.integers(1, len(truth)) :] += 0.2 * amplitude * rng.standard_normal(3)
 
 
 def _turn(seen: Floats, truth: Floats, rng: Rng) -> None:
