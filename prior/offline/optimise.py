@@ -139,7 +139,6 @@ class Optimiser:
         model = copy.deepcopy(self._model)  # phase two changes its decoder
         with torch.no_grad():
             posterior = model.encode(begun)
-            base = model.around(begun)
         latents = [posterior.local_mean.clone(), posterior.global_mean.clone()]
         if self._seed is not None:
             generator = torch.Generator().manual_seed(self._seed)
@@ -159,7 +158,7 @@ class Optimiser:
                 for p in weights:
                     p.requires_grad = True
                 optimiser.add_param_group({"params": weights, "lr": DECODER_RATE})
-            decoded = base + model.decode(latents[0], latents[1])
+            decoded = model.placed(model.decode(latents[0], latents[1]), begun)
             loss = seen.loss(decoded) + AGREE_WEIGHT * _disagreement(decoded, starts, back)
             if step >= LATENT_STEPS:
                 stray = [(a - b).square().mean() for a, b in zip(weights, before, strict=True)]

@@ -13,10 +13,12 @@ from collections.abc import Callable
 import numpy as np
 
 from steadypose.prior.body.skeleton import PARENTS
-from steadypose.prior.models.hmvae.config import CHANNELS, ROTATION_FEATURES, HMVAEConfig
+from steadypose.prior.models.hmvae.config import CHANNELS, DEVIATION, NO_ROTATION, ROTATION_FEATURES, HMVAEConfig
 from steadypose.prior.models.layers.dense import Floats, dense, leaky_relu
 from steadypose.prior.models.layers.edge_graph import mix_edges, pool_matrix, pooling_levels, unpool_matrix
 from steadypose.prior.models.weights_io import Arrays, load_weights, part
+
+_NO_ROTATION = np.array(NO_ROTATION, dtype=np.float32)
 
 
 class LiveHMVAE:
@@ -79,7 +81,12 @@ class LiveHMVAE:
     def __call__(self, x: Floats) -> Floats:
         """Decode the posterior's mean of windows (B, T, 22, 6): equations 10 and 11."""
         first, *others = self._encoder
-        features = leaky_relu(first(x.reshape(*x.shape[:2], -1)))
+        seen, mean = x, None
+        if self._about_mean:
+            mean = _mean_pose(x)
+            deviation = (_columns(x, mean) - _NO_ROTATION) / np.float32(DEVIATION)
+            seen = np.concatenate([deviation, np.broadcast_to(_first_two(mean), x.shape)], axis=-1)
+        features = leaky_relu(first(seen.reshape(*x.shape[:2], -1)))
         local = self._from_local(self._local(features))
         for layer in others:
             features = leaky_relu(layer(features))
@@ -87,7 +94,40 @@ class LiveHMVAE:
         for layer in self._decoder:
             features = layer(leaky_relu(features))
         decoded = (features + local).reshape(*x.shape[:2], -1, ROTATION_FEATURES)
-        return decoded + x.mean(axis=1, keepdims=True) if self._about_mean else decoded
+        if mean is None:
+            return decoded
+        return _columns(decoded * np.float32(DEVIATION) + _NO_ROTATION, mean.swapaxes(-1, -2))
+
+
+def _rotations(x: Floats) -> Floats:
+    """(..., 3, 3) of the first two columns (..., 6), by Gram and Schmidt."""
+    first, second = x[..., :3], x[..., 3:]
+    first = first / np.maximum(np.linalg.norm(first, axis=-1, keepdims=True), 1e-12)
+    second = second - (first * second).sum(axis=-1, keepdims=True) * first
+    second = second / np.maximum(np.linalg.norm(second, axis=-1, keepdims=True), 1e-12)
+    return np.stack([first, second, np.cross(first, second)], axis=-1)
+
+
+def _mean_pose(x: Floats) -> Floats:
+    """(B, 1, 22, 3, 3) local rotations: the mean of bones' orientations in windows x (B, T, 22, 6)."""
+    local = _rotations(x)
+    orientations = local.copy()
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        orientations[:, :, joint] = orientations[:, :, parent] @ local[:, :, joint]
+    mean = _rotations(_first_two(orientations).mean(axis=1, keepdims=True))
+    local = mean.copy()
+    local[:, :, 1:] = mean[:, :, list(PARENTS[1:])].swapaxes(-1, -2) @ mean[:, :, 1:]
+    return local
+
+
+def _first_two(rotations: Floats) -> Floats:
+    """(..., 6): the first two columns of (..., 3, 3)."""
+    return rotations[..., :2].swapaxes(-1, -2).reshape(*rotations.shape[:-2], ROTATION_FEATURES)
+
+
+def _columns(x: Floats, frame: Floats) -> Floats:
+    """The two columns in x (..., 6), which are vectors, in these frames (..., 3, 3)."""
+    return (x.reshape(*x.shape[:-1], 2, 3) @ frame).reshape(x.shape)
 
 
 class _TemporalLinear:

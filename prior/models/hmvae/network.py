@@ -17,10 +17,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from steadypose.prior.body.skeleton import PARENTS
-from steadypose.prior.models.hmvae.config import CHANNELS, ROTATION_FEATURES, HMVAEConfig
+from steadypose.prior.models.hmvae.config import CHANNELS, DEVIATION, NO_ROTATION, ROTATION_FEATURES, HMVAEConfig
 from steadypose.prior.models.layers.dense import SLOPE
 from steadypose.prior.models.layers.edge_graph import pooling_levels
 from steadypose.prior.models.layers.skeleton_conv import EdgeLinear, SkeletonConv, SkeletonPool, SkeletonUnpool
+from steadypose.prior.models.layers.torch_kinematics import forward_kinematics, from_6d, to_6d
 
 
 class Posterior(NamedTuple):
@@ -66,16 +67,16 @@ class MotionVAE(nn.Module, ABC):
 
     @abstractmethod
     def decode(self, local: Tensor, deep: Tensor) -> Tensor:
-        """Windows (B, T, 22, 6), less `around`, of z_l (B, edges, d) and z_g (B, edges, d)."""
+        """What `placed` makes windows of, (B, T, 22, 6), of z_l (B, edges, d) and z_g (B, edges, d)."""
 
-    def around(self, x: Tensor) -> Tensor:
-        """The part of windows x (B, T, 22, 6) that is added to the decoder's output: their mean pose, or 0."""
-        return x.new_zeros(())
+    def placed(self, decoded: Tensor, x: Tensor) -> Tensor:
+        """Windows (B, T, 22, 6) of `decode`'s answer, where that is about something observed in windows x."""
+        return decoded
 
     def reconstruct(self, x: Tensor) -> Tensor:
         """Decode the posterior's mean: what refinement does with each window (equations 10 and 11)."""
         posterior = self.encode(x)
-        return self.around(x) + self.decode(posterior.local_mean, posterior.global_mean)
+        return self.placed(self.decode(posterior.local_mean, posterior.global_mean), x)
 
 
 class HMVAE(MotionVAE):
@@ -87,10 +88,11 @@ class HMVAE(MotionVAE):
         self.levels = pooling_levels(PARENTS)
         steps = self.steps = config.steps
         c = CHANNELS
+        seen = (config.features, *c[1:])
         self.encoder = nn.ModuleList(
             nn.ModuleList(
                 [
-                    SkeletonConv(c[k], c[k + 1], level.neighbours, config.kernel, config.strides[k]),
+                    SkeletonConv(seen[k], c[k + 1], level.neighbours, config.kernel, config.strides[k]),
                     SkeletonPool(level.groups),
                 ]
             )
@@ -112,13 +114,23 @@ class HMVAE(MotionVAE):
             for k, level in reversed(list(enumerate(self.levels)))
         )
 
-    def around(self, x: Tensor) -> Tensor:
-        """The mean pose (B, 1, 22, 6) of windows, if the decoder is about that; else nothing."""
-        return x.mean(dim=1, keepdim=True) if self.config.about_mean else super().around(x)
+    def placed(self, decoded: Tensor, x: Tensor) -> Tensor:
+        """Windows (B, T, 22, 6): the deviations decoded from the mean pose of windows x, if it is about that."""
+        if not self.config.about_mean:
+            return decoded
+        return _columns(decoded * DEVIATION + decoded.new_tensor(NO_ROTATION), _mean_pose(x).mT)
+
+    def _seen(self, x: Tensor) -> Tensor:
+        """What the encoder sees of windows x: (B, T, 22, features)."""
+        if not self.config.about_mean:
+            return x
+        mean = _mean_pose(x)
+        deviation = (_columns(x, mean) - x.new_tensor(NO_ROTATION)) / DEVIATION
+        return torch.cat([deviation, to_6d(mean).expand_as(x)], dim=-1)
 
     def encode(self, x: Tensor) -> Posterior:
         """The posterior of windows x (B, T, 22, 6), equations 2 and 4."""
-        features = x.flatten(2).transpose(1, 2)
+        features = self._seen(x).flatten(2).transpose(1, 2)
         local = features
         for k, block in enumerate(self.encoder):
             conv, pool = block  # type: ignore[misc]  (a ModuleList of two)
@@ -128,7 +140,7 @@ class HMVAE(MotionVAE):
         return Posterior(*self.to_local(local).chunk(2, dim=-1), *self.to_global(features).chunk(2, dim=-1))
 
     def decode(self, local: Tensor, deep: Tensor) -> Tensor:
-        """Windows (B, T, 22, 6) of z_l (B, E1, d) and z_g (B, E4, d)."""
+        """What `placed` makes windows of, (B, T, 22, 6), of z_l (B, E1, d) and z_g (B, E4, d)."""
         features = self.from_global(deep).reshape(deep.shape[0], -1, self.steps[4])
         local_features = self.from_local(local).reshape(local.shape[0], -1, self.steps[1])
         for k, block in zip(reversed(range(4)), self.decoder, strict=True):
@@ -141,6 +153,23 @@ class HMVAE(MotionVAE):
             if k > 0:
                 features = F.leaky_relu(features, SLOPE)
         return features.transpose(1, 2).reshape(features.shape[0], self.config.window, -1, ROTATION_FEATURES)
+
+
+def _mean_pose(x: Tensor) -> Tensor:
+    """(B, 1, 22, 3, 3) local rotations: the mean pose of windows x (B, T, 22, 6).
+
+    Bones' orientations in space are averaged: an error of a thigh's twist, which cannot be seen on a straight leg, is
+    taken back by the knee frame by frame, but not by the mean of the knee's own rotations.
+    """
+    rotations = from_6d(x)
+    _, orientations = forward_kinematics(rotations, rotations.new_zeros(1, 3).expand(len(PARENTS), 3))
+    mean = from_6d(to_6d(orientations).mean(dim=1, keepdim=True))
+    return torch.cat([mean[:, :, :1], mean[:, :, list(PARENTS[1:])].mT @ mean[:, :, 1:]], dim=2)
+
+
+def _columns(x: Tensor, frame: Tensor) -> Tensor:
+    """The two columns in x (..., 6), which are vectors, in these frames (..., 3, 3)."""
+    return (x.unflatten(-1, (2, 3)) @ frame).flatten(-2)
 
 
 def _join_edges(a: Tensor, b: Tensor, channels: int) -> Tensor:

@@ -64,7 +64,9 @@ def test_the_papers_two_window_lengths_have_the_official_latents(config, local, 
     assert model.decode(*posterior.sample()).shape == x.shape
 
 
-@pytest.mark.parametrize("config", [HMVAEConfig(), HMVAEConfig(64, 15, (2, 2, 2, 2), 12, 24)])
+@pytest.mark.parametrize(
+    "config", [HMVAEConfig(), HMVAEConfig(about_mean=True), HMVAEConfig(64, 15, (2, 2, 2, 2), 12, 24)]
+)
 @pytest.mark.parametrize("bodies", [1, 3])
 def test_the_live_model_reconstructs_as_the_trained_one(config, bodies) -> None:
     torch.manual_seed(bodies)
