@@ -65,6 +65,7 @@ class Hyperparameters:
         learning_rate: of Adam at the start; it falls to a third twice.
         strides: frame strides of windows, drawn with equal probability for each entry.
         kl_weight: beta.
+        joint_weight: lambda.
         denoise: whether its input is corrupted by noise and occlusion, the target being the clean window.
     """
 
@@ -73,10 +74,11 @@ class Hyperparameters:
     learning_rate: float
     strides: Sequence[int] = STRIDES
     kl_weight: float = KL_WEIGHT
+    joint_weight: float = JOINT_WEIGHT
     denoise: bool = False
 
 
-SHORT = Hyperparameters(2_400, 64, 2e-3, kl_weight=2e-5, denoise=True)
+SHORT = Hyperparameters(1_800, 64, 2e-3, kl_weight=1e-5, joint_weight=200.0, denoise=True)
 """The official schedule (250,000 steps of 8 windows at 1e-4) folded into fewer, larger steps; the proportions are kept:
 z_l comes in late, the rate falls twice."""
 
@@ -144,7 +146,8 @@ def fit(
         rotations, offsets = _augment(train.rotations[rows], train.offsets[rows[:, 0]])
         rotations, _ = remove_heading(rotations, model.window // 2 - 1)
         seen = corrupt(rotations, offsets, rng) if hyperparameters.denoise else rotations
-        return _loss(model, seen, rotations, offsets, (done - GLOBAL_FIRST) / LOCAL_WARM_UP, hyperparameters.kl_weight)
+        local_weight = (done - GLOBAL_FIRST) / LOCAL_WARM_UP
+        return _loss(model, seen, rotations, offsets, local_weight, hyperparameters)
 
     run.minimise(loss_of, lambda: evaluate_hmvae(model, val), hyperparameters.batch, seed)
     return run
@@ -191,7 +194,7 @@ def corrupt(rotations: Tensor, offsets: Tensor, rng: np.random.Generator, noise:
 
 
 def _loss(
-    model: MotionVAE, seen: Tensor, rotations: Tensor, offsets: Tensor, local_weight: float, kl_weight: float
+    model: MotionVAE, seen: Tensor, rotations: Tensor, offsets: Tensor, local_weight: float, used: Hyperparameters
 ) -> tuple[Tensor, dict[str, float]]:
     """Equations 3 and 5 to 8, every term a mean; ``local_weight`` is z_l's share of beta, below 0 it is detached."""
     x = to_6d(rotations)
@@ -208,7 +211,7 @@ def _loss(
     l_rot = (matrices - rotations).square().mean()
     l_joints = (joints[0] - joints[1]).square().mean()
     kl = global_kl + min(max(local_weight, 0.0), 1.0) * local_kl
-    loss = l_6d + l_rot + JOINT_WEIGHT * l_joints + kl_weight * kl
+    loss = l_6d + l_rot + used.joint_weight * l_joints + used.kl_weight * kl
     return loss, {
         "loss": loss.item(), "L_6d": l_6d.item(), "KL local": local_kl.item(), "KL global": global_kl.item(),
     }  # fmt: skip
