@@ -110,7 +110,8 @@ def measure(clips: MotionClips, answer: Floats) -> dict[str, Any]:
     result["root_mm"] = round(float(np.nanmean(root)) * 1e3, 2)
     result["root_ci_mm"] = interval(np.nanmean(root, axis=0))
     legs = np.ravel(limbs(("hip", "knee", "ankle", "foot")))
-    result["legs_mm"] = round(float(np.nanmean(position_error(answer[:, :, legs], clips.positions[:, :, legs]))) * 1e3, 2)
+    own = position_error(answer[:, :, legs], clips.positions[:, :, legs])
+    result["legs_mm"] = round(float(np.nanmean(own)) * 1e3, 2)
     soles = answer[:, :, FEET, 2] - SOLE
     result["penetration_percent"] = round(100 * float((soles.min(axis=2) < -UNDER).mean()), 2)
     for side in ("left", "right"):
@@ -175,9 +176,9 @@ def _table(records: list[dict[str, Any]], clips: int) -> Table:
         ],
         note=(
             f"The {clips} clips of {FRAMES} frames that travel farthest, floor known, no alignment. "
-            "Feet: mean horizontal speed of ankle and "
-            f"toe in frames in which they stand in truth; skating: faster than {SKATING:.2f} m/s; under the floor: frames in "
-            f"which a sole (heel {1e3 * SOLE[0]:.0f}, toe {1e3 * SOLE[2]:.0f} mm under its joint) is, by more than {1e3 * UNDER:.0f} mm. "
+            "Feet: mean horizontal speed of ankle and toe in frames in which they stand in truth; skating: faster than "
+            f"{SKATING:.2f} m/s; under the floor: frames in which a sole (heel {1e3 * SOLE[0]:.0f}, toe "
+            f"{1e3 * SOLE[2]:.0f} mm under its joint) is, by more than {1e3 * UNDER:.0f} mm. "
             "Peers tuned on every third clip with other noise."
         ),
     )

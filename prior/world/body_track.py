@@ -34,7 +34,7 @@ FEET: tuple[int, ...] = tuple(J[f"{side}_{part}"] for part in ("ankle", "foot") 
 """The joints that may stand: heels and toes."""
 
 SOLE_SIGMA = 0.02
-"""Metres, how well a foot that stands tells the ground, by `SOLE`: between sources and people, and from stand to stand."""
+"""Metres, how well a foot that stands tells the ground, by `SOLE`: between sources and people, from stand to stand."""
 
 STANDING = 0.5
 """Probability of rest from which on a foot tells the ground."""
@@ -43,7 +43,7 @@ UPRIGHT_M = 0.45
 """Metres from a foot up to the pelvis, at least, of a body whose feet tell the ground: not of one that lies."""
 
 LYING_M = 0.25
-"""Metres from the ground up to the pelvis, at most, of a body whose feet the ground tells nothing: it lies, on heels."""
+"""Metres from the ground up to the pelvis, at most, of a body whose feet the ground tells nothing: it lies."""
 
 EASE_S = 0.1
 """Seconds in which a body whose root is seen again comes to be where it is seen."""

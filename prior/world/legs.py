@@ -16,7 +16,7 @@ LENGTH_SIGMA = 0.025
 _SWEEPS = 4
 _LEGS = np.array(limbs(("hip", "knee", "ankle", "foot")))
 _BONES = np.array([[joint, PARENTS[joint]] for leg in _LEGS for joint in leg[1:]])
-_LEAST_NORM = 1e-6
+_MIN_NORM = 1e-6
 
 
 def fit_legs(positions: Floats, sigma: Floats, bone_lengths: NDArray[np.floating]) -> Floats:
@@ -87,7 +87,7 @@ def _shortest(a, b):
     q = np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0], 0.0])
     q[3] = (a * b).sum() + np.sqrt((a * a).sum() * (b * b).sum())
     norm = np.sqrt((q * q).sum())
-    return q / norm if norm > _LEAST_NORM else np.array([0.0, 0.0, 0.0, 1.0])
+    return q / norm if norm > _MIN_NORM else np.array([0.0, 0.0, 0.0, 1.0])
 
 
 @njit("(f8[:,::1], f8[:,::1], f8[:,::1])", cache=True)
@@ -96,7 +96,7 @@ def _turn(rotations, before, after):
         whole = np.isfinite(rotations[0]).all()
         for joint in leg:
             norm = np.sqrt((rotations[joint] ** 2).sum())
-            whole &= norm > _LEAST_NORM and np.isfinite(norm) and np.isfinite(after[joint]).all()
+            whole &= norm > _MIN_NORM and np.isfinite(norm) and np.isfinite(after[joint]).all()
         if not whole:
             continue
         above, above_turned = rotations[0].copy(), rotations[0].copy()  # global rotations, before and after

@@ -15,7 +15,7 @@ from steadypose.prior.body.skeleton import HIPS, J
 
 Floats = NDArray[np.float64]
 
-LEAST_SIGMA = 0.001
+MIN_SIGMA = 0.001
 """Metres: no joint is taken to be known better, whatever the message says."""
 
 HUNG_SIGMA = 0.05
@@ -24,7 +24,7 @@ HUNG_SIGMA = 0.05
 REACH_M = 2.0
 """Metres: no joint is this far from its own root."""
 
-_LEAST_NORM = 1e-6
+_MIN_NORM = 1e-6
 """Of a quaternion that is to mean a rotation."""
 
 _PELVIS = [J["pelvis"], *HIPS]
@@ -39,7 +39,7 @@ class Sighting:
         positions: (22, 3) metres, world; NaN where there is none.
         orientation: (4,) xyzw of the root in the world, or None if it is not a rotation.
         seen: (22,) whether the sensor saw the joint.
-        sigma: (22,) metres, at least `LEAST_SIGMA`; infinite where the message has no number.
+        sigma: (22,) metres, at least `MIN_SIGMA`; infinite where the message has no number.
         root: (3,) metres, world; None if unknown.
         root_sigma: metres, the standard deviation of `root`; infinite if nothing was seen that tells where it is.
     """
@@ -71,7 +71,7 @@ def sightings(bodies: Sequence[CleanBody], sensor: Floats, place: Floats) -> lis
     positions[~known] = np.nan
     seen = known & ((state == JointState.SEEN) | (state == JointState.REFINED))
     sigma = np.array([body.sigma for body in bodies], dtype=np.float64)
-    sigma = np.maximum(np.where(sigma >= 0.0, sigma, math.inf), LEAST_SIGMA)
+    sigma = np.maximum(np.where(sigma >= 0.0, sigma, math.inf), MIN_SIGMA)
     # A root of which no joint near is seen was hung by the prior from those that are.
     root_sigma = np.where(seen[:, _PELVIS].any(axis=1), sigma[:, 0], np.hypot(sigma[:, 0], HUNG_SIGMA))
     root_sigma = np.where(known[:, 0] & seen.any(axis=1), root_sigma, math.inf)
@@ -93,7 +93,7 @@ def sightings(bodies: Sequence[CleanBody], sensor: Floats, place: Floats) -> lis
 def _orientations(quaternions: Floats, sensor: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Quaternions (N, 4) of any length turned from the sensor's frame to the world, and which of them are rotations."""
     with np.errstate(invalid="ignore"):
-        turns = np.linalg.norm(quaternions, axis=1) >= _LEAST_NORM
+        turns = np.linalg.norm(quaternions, axis=1) >= _MIN_NORM
         turns &= np.isfinite(quaternions).all(axis=1)
     quaternions[~turns] = [0.0, 0.0, 0.0, 1.0]
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
@@ -103,6 +103,6 @@ def _orientations(quaternions: Floats, sensor: Floats) -> tuple[Floats, NDArray[
 def unit_quaternion(quaternion: NDArray[np.floating]) -> Floats | None:
     """A quaternion (4,) of any length at length 1; None if it is no rotation."""
     q = np.asarray(quaternion, dtype=np.float64)
-    if not np.isfinite(q).all() or (length := np.linalg.norm(q)) < _LEAST_NORM:
+    if not np.isfinite(q).all() or (length := np.linalg.norm(q)) < _MIN_NORM:
         return None
     return q / length

@@ -92,9 +92,9 @@ class Soles:
 def _settle(heights, variances, stand, stand_variances, rest, known):
     """Means and variances of heights, and the probability that each foot stands; see `Soles.settle`.
 
-    A mixture of three: a foot stands, and its height is ``stand``; it does not, and is anywhere above that, so that only
-    if it is seen below is it as if it stood; the floor is not as known. The second has the most likely height, not the
-    mean: that of a foot hidden, and so seen with a large deviation, would be far above where it is seen.
+    A mixture of three: a foot stands, and its height is ``stand``; it does not, and is anywhere above that, so that
+    only if it is seen below is it as if it stood; the floor is not as known. The second has the most likely height,
+    not the mean: that of a foot hidden, and so seen with a large deviation, would be far above where it is seen.
     """
     means, left, probability = heights.copy(), variances.copy(), np.zeros(len(heights))
     for k in range(len(heights)):
