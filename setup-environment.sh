@@ -14,6 +14,23 @@ find_python() {
     return 1
 }
 
+install_uv() {
+    if [ -x "$root/.uv/bin/uv" ]; then
+        return
+    fi
+    # by the Python's own pip where that can: putting another into the new folder takes five seconds
+    if "$1" -m pip --python "$1" --version >/dev/null 2>&1; then
+        "$1" -m venv --without-pip "$root/.uv"
+        "$1" -m pip --python "$root/.uv/bin/python" install --quiet --disable-pip-version-check "uv==$UV_VERSION"
+    else
+        "$1" -m venv "$root/.uv" || {
+            echo "Python's venv module is missing. On Debian or Ubuntu: sudo apt install python3-venv" >&2
+            exit 1
+        }
+        "$root/.uv/bin/python" -m pip install --quiet --disable-pip-version-check "uv==$UV_VERSION"
+    fi
+}
+
 install() {
     stamp="$root/.venv/.installed-$(echo "$@" | tr ' ' '-')"
     if [ -e "$stamp" ] && [ ! "$root/uv.lock" -nt "$stamp" ] && [ ! "$root/pyproject.toml" -nt "$stamp" ]; then
@@ -21,20 +38,7 @@ install() {
     fi
     python=$(find_python)
     echo "Installing steadypose[$(echo "$@" | tr ' ' ',')] into $root/.venv, once" >&2
-    if [ ! -x "$root/.uv/bin/uv" ]; then
-        # by the Python's own pip where that can: putting another into the new folder takes five seconds
-        if "$python" -m pip --python "$python" --version >/dev/null 2>&1; then
-            "$python" -m venv --without-pip "$root/.uv"
-            "$python" -m pip --python "$root/.uv/bin/python" install \
-                --quiet --disable-pip-version-check "uv==$UV_VERSION"
-        else
-            "$python" -m venv "$root/.uv" || {
-                echo "Python's venv module is missing. On Debian or Ubuntu: sudo apt install python3-venv" >&2
-                exit 1
-            }
-            "$root/.uv/bin/python" -m pip install --quiet --disable-pip-version-check "uv==$UV_VERSION"
-        fi
-    fi
+    install_uv "$python"
     extras=
     for extra in "$@"; do
         extras="$extras --extra $extra"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
+from bisect import bisect_left
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +20,7 @@ Floats = NDArray[np.float64]
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 Moment = tuple[int, Floats, Floats]
 """stamp, translation (3,) metres and quaternion (4,) xyzw, from the child's frame to the parent's"""
+_stamp = itemgetter(0)
 
 
 class TransformError(LookupError):
@@ -30,7 +32,8 @@ class TransformBuffer:
 
     def __init__(self) -> None:
         self._parents: dict[str, str] = {}
-        self._moments: dict[str, deque[Moment]] = {}
+        self._moments: dict[str, list[Moment]] = {}
+        """by child, in the order of their stamps"""
         self._static: set[str] = set()
 
     def add(self, message: Any, *, static: bool) -> None:
@@ -47,16 +50,14 @@ class TransformBuffer:
                 self._moments.pop(child, None)
             self._parents[child] = parent
             (self._static.add if static else self._static.discard)(child)
-            moments = self._moments.setdefault(child, deque())
+            moments = self._moments.setdefault(child, [])
             moment = stamp_ns(transform.header), place, quaternion
-            if static or not moments:
-                self._moments[child] = deque([moment])
-            elif moment[0] > moments[-1][0]:
-                moments.append(moment)
-            elif moment[0] < moments[-1][0] - CACHE_NS:  # the clock was set back, as when a bag begins again
-                self._moments[child] = deque([moment])
-            while moments and moments[0][0] < moments[-1][0] - CACHE_NS:
-                moments.popleft()
+            if static or (moments and moment[0] < moments[-1][0] - CACHE_NS):
+                moments.clear()  # or the clock was set back, as when a bag begins again
+            at_index = bisect_left(moments, moment[0], key=_stamp)
+            if at_index == len(moments) or moments[at_index][0] != moment[0]:  # the first of a stamp counts, as in tf2
+                moments.insert(at_index, moment)
+            del moments[: bisect_left(moments, moments[-1][0] - CACHE_NS, key=_stamp)]
 
     def lookup(self, target: str, source: str, at_ns: int) -> tuple[Floats, Floats]:
         """The pose of a frame in another at a time.
@@ -102,7 +103,7 @@ class TransformBuffer:
             early = "older than the oldest" if at_ns < first else "newer than the newest"
             off = (first - at_ns if at_ns < first else at_ns - last) / 1e9
             raise TransformError(f"the transform of {frame!r} is wanted for a moment {off:.3f} s {early} heard on /tf")
-        after = next(index for index, moment in enumerate(moments) if moment[0] >= at_ns)
+        after = bisect_left(moments, at_ns, key=_stamp)
         b = moments[after]
         if b[0] == at_ns:
             return b[1], _rotation(b[2])
