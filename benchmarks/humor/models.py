@@ -14,18 +14,20 @@ from steadypose.prior.models.humor.train import fit_transitions
 from steadypose.prior.models.torch_weights import load_network
 from steadypose.prior.motion.dataset import MotionSet
 
-STEPS, BATCH, LEARNING_RATE = 250, 64, 1e-3
+STEPS, BATCH, LEARNING_RATE, EVALUATIONS = 250, 64, 1e-3, 5
 """Of a brief training: a forty-eighth of the sequences that what ships has seen."""
 
 SHIPS, MVAE = "HuMoR, as it ships", "MVAE-like: none of the three"
-
-
 BRIEF = "HuMoR, briefly trained"
 
 VARIANTS: Mapping[str, HumorConfig] = {
     BRIEF: HumorConfig(),
+    "standard prior": HumorConfig(learned_prior=False),
+    "no delta": HumorConfig(residual=False),
+    "no contacts": HumorConfig(contacts=False),
     MVAE: HumorConfig(learned_prior=False, residual=False, contacts=False),
 }
+"""As the paper names them; without SMPL, it has one more: joints that need not be those of a body."""
 
 
 def shipped() -> HumorNet:
@@ -56,5 +58,8 @@ def _trained(config: HumorConfig, train: MotionSet, val: MotionSet, runs: Path, 
     path = runs / stem / f"{stem}.safetensors"
     if not path.is_file():
         card = {"Training": f"{steps} steps of {BATCH} sequences, for the bench"}
-        fit_transitions(config, train, val, path, card, steps, BATCH, LEARNING_RATE, seed=0, known=shipped())
+        fit_transitions(
+            config, train, val, path, card, steps, BATCH, LEARNING_RATE, seed=0, known=shipped(),
+            evaluations=EVALUATIONS,
+        )  # fmt: skip
     return load_network(HumorNet, HumorConfig.from_dict, str(path), "humor")

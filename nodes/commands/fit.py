@@ -7,7 +7,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -27,6 +27,9 @@ from steadypose.nodes.sources.npz import NpzError, read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.clean.adapt import SensorFrame
 
+if TYPE_CHECKING:
+    from steadypose.prior.offline.windows import FittedTrack
+
 Floats = NDArray[np.float64]
 
 
@@ -35,6 +38,7 @@ def fit(
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
     weights: Annotated[str, tyro.conf.arg(metavar="NAME")] = "default",
     delay: Annotated[int, tyro.conf.arg(metavar="K")] = 8,
+    smpl: Annotated[Path | None, tyro.conf.arg(metavar="MODEL.npz")] = None,
     force: bool = False,
 ) -> int:
     """Fit a motion to a recording, with all of it in view: what `clean` cannot do while frames come in.
@@ -57,6 +61,8 @@ def fit(
         out: the recording to make, or .npz with one row for each row of the input; of key points, .npz at 30 Hz.
         weights: of the model of transitions: 'default', or a .safetensors file.
         delay: of `clean`, which initialises the fit, frames at 30 Hz; without effect on key points.
+        smpl: your copy of SMPL or SMPL-H; OUT.smpl.0.npz is its motion, in the form of AMASS' files, and so on for
+            each further body.
         force: replace what is at OUT, if it is a recording or an .npz.
     """
     if not source.exists():
@@ -71,7 +77,9 @@ def fit(
 
     from steadypose.prior.models.humor.network import HumorConfig, HumorNet
     from steadypose.prior.models.torch_weights import load_network
+    from steadypose.prior.offline.smpl import SmplShape
 
+    shape = SmplShape.read(smpl) if smpl else None
     torch.set_num_threads(max((os.cpu_count() or 2) // 2, 1))
     model = load_network(HumorNet, HumorConfig.from_dict, weights, "humor")
     console, started = Console(stderr=True), time.perf_counter()
@@ -79,9 +87,11 @@ def fit(
     folder.mkdir(exist_ok=True)
     with Progress(console=console, disable=not console.is_terminal) as progress:
         if two_d:
-            frames, lines = _fit_picture(source, out, model, folder, progress)
+            frames, tracks, lines = _fit_picture(source, out, model, folder, progress)
         else:
-            frames, lines = _fit_poses(source, out, model, folder, delay, progress)
+            frames, tracks, lines = _fit_poses(source, out, model, folder, delay, progress)
+    if shape is not None:
+        lines += _write_smpl(out, shape, tracks)
     shutil.rmtree(folder)
     spent = time.perf_counter() - started
     console.print(f"{out}: {frames} frames, fitted in {spent:.1f} s", highlight=False, soft_wrap=True)
@@ -92,8 +102,9 @@ def fit(
 
 def _fit_poses(
     source: Path, out: Path, model: Any, folder: Path, delay: int, progress: Progress
-) -> tuple[int, list[str]]:
-    """Fit 3D joints, initialised by the nodes' own pipelines; returns the number of frames, and lines to print."""
+) -> tuple[int, list[FittedTrack | None], list[str]]:
+    """Fit 3D joints, initialised by the nodes' own pipelines; returns the number of frames, what was fitted, and lines
+    to print."""
     from steadypose.nodes.graph.prior_node import make_prior
     from steadypose.nodes.graph.trajectory_node import make_trajectory
     from steadypose.prior.offline.solve import FitSettings
@@ -125,7 +136,7 @@ def _fit_poses(
     fitted = rewritten(messages, fits)
     _write(out, folder, fitted, stamps, fits)
     _explain(out, [(fit.seen.id, fit.seen.stamps_ns, fit.misfit, fit.track) for fit in fits], "m")
-    return len(stamps), [_line(fit) for fit in fits]
+    return len(stamps), [fit.track for fit in fits], [_line(fit) for fit in fits]
 
 
 def _line(fit: Fit) -> str:
@@ -137,8 +148,10 @@ def _line(fit: Fit) -> str:
     return f"{who}: floor at {fit.track.ground[:, 0].mean():.3f} m{far}"
 
 
-def _fit_picture(source: Path, out: Path, model: Any, folder: Path, progress: Progress) -> tuple[int, list[str]]:
-    """Fit key points of one camera; returns the number of frames, and lines to print."""
+def _fit_picture(
+    source: Path, out: Path, model: Any, folder: Path, progress: Progress
+) -> tuple[int, list[FittedTrack | None], list[str]]:
+    """Fit key points of one camera; returns as `_fit_poses`."""
     from steadypose.prior.offline.solve import FitSettings
     from steadypose.prior.offline.windows import MIN_FRAMES, window_bounds
 
@@ -154,7 +167,7 @@ def _fit_picture(source: Path, out: Path, model: Any, folder: Path, progress: Pr
     part.replace(out)
     misfit = track.misfit[0]
     _explain(out, [(0, recording.stamps_ns, misfit, track)], "pixels")
-    return frames, [f"key points lie {np.nanmedian(misfit):.1f} pixels off in the median"]
+    return frames, [track], [f"key points lie {np.nanmedian(misfit):.1f} pixels off in the median"]
 
 
 def _points(source: Path, frames: int) -> Floats | None:
@@ -170,6 +183,22 @@ def _points(source: Path, frames: int) -> Floats | None:
             f"{points.shape}"
         )
     return points.astype(np.float64)
+
+
+def _write_smpl(out: Path, shape: Any, tracks: Sequence[FittedTrack | None]) -> list[str]:
+    """Write the motion of each fitted body as SMPL's; lines to print."""
+    from steadypose.prior.offline.smpl import smpl_motion
+
+    lines = []
+    for number, track in enumerate(tracks):
+        if track is None:
+            continue
+        motion = smpl_motion(shape, track.joints, np.linalg.norm(track.offsets.mean(axis=0), axis=-1))
+        path = out.with_name(f"{out.name}.smpl.{number}.npz")
+        np.savez(path, **motion.arrays)
+        off = np.linalg.norm(motion.joints - track.joints, axis=-1).mean() * 1e3
+        lines.append(f"{path.name}: SMPL's joints lie {off:.0f} mm off the fitted ones in the mean")
+    return lines
 
 
 def _added(arrays: dict[str, NDArray[Any]], track: Any) -> dict[str, NDArray[Any]]:

@@ -38,6 +38,10 @@ WORSE, WORSE_M = 2.0, 0.02
 """A fit whose median misfit is larger than so many times that of ``pose/clean``, and by so many metres more, has
 failed."""
 
+ELSEWHERE, ELSEWHERE_SHARE, STILL = 0.1, 0.4, 0.3
+"""Metres above or below the floor at which the lower foot stands in a share of the frames in which it is slower than
+so many m/s: on stairs or a chair. The model of motion knows but one floor, and would pull feet there."""
+
 _MEDIAN_NORM, _THIRD = 1.538, np.sqrt(20.0)
 """Of the median length of a normal vector in space, and of the deviation of third differences of white noise."""
 
@@ -139,6 +143,16 @@ def lowest_floor(positions: Floats) -> float:
     return float(np.percentile(positions[:, feet, 2].min(axis=1), LOWEST) - rest)
 
 
+def stands_elsewhere(positions: Floats, floor: float) -> bool:
+    """Whether feet of (T, 22, 3) metres stand on more than a floor at this height, metres."""
+    feet = [J[f"{side}_{part}"] for part in ("ankle", "foot") for side in ("left", "right")]
+    heights = positions[:, feet, 2] - floor - np.array(REST_HEIGHT)[2:6]
+    speed = np.linalg.norm(np.gradient(positions[:, feet], 1e-9 * FRAME_NS, axis=0), axis=-1)
+    rows, lower = np.arange(len(positions)), heights.argmin(axis=1)
+    stands = speed[rows, lower] < STILL
+    return bool(stands.any() and (np.abs(heights[rows, lower][stands]) > ELSEWHERE).mean() > ELSEWHERE_SHARE)
+
+
 def noise_of(raw: Floats) -> float:
     """Metres along an axis, of joints (T, 22, 3), by third differences, which motion hardly has."""
     third = np.linalg.norm(np.diff(raw, n=3, axis=0), axis=-1)
@@ -154,12 +168,15 @@ def fit_body(
     folder: Path | None,
     advanced: Callable[[], None] = lambda: None,
 ) -> Fit:
-    """Fit one body; where that fails, ``pose/clean`` stays, and its anomaly is flagged."""
+    """Fit one body; where that fails, or it stands elsewhere, ``pose/clean`` stays, and its anomaly is flagged."""
     from steadypose.prior.offline.windows import fit_track
 
+    positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
+    before = np.linalg.norm(positions - raw, axis=-1)
+    if stands_elsewhere(positions, 0.0 if seen.calibrated else lowest_floor(positions)):
+        return Fit(seen, None, before)
     fitted = fit_track(model, track_of(seen, points), settings, folder, advanced=advanced)
-    raw = seen.in_world("raw_positions")
-    misfit, before = (np.linalg.norm(said - raw, axis=-1) for said in (fitted.joints, seen.in_world("positions")))
+    misfit = np.linalg.norm(fitted.joints - raw, axis=-1)
     known = np.isfinite(before)
     if not np.isfinite(fitted.joints).all() or (
         known.any() and np.median(misfit[known]) > WORSE * np.median(before[known]) + WORSE_M

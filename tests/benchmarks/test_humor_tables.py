@@ -12,7 +12,7 @@ from rich.progress import Progress
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.humor import fits, models
 from steadypose.benchmarks.humor.fits import Answer, load_labels, pictures, scores
-from steadypose.benchmarks.humor.models import MVAE, SHIPS
+from steadypose.benchmarks.humor.models import MVAE, SHIPS, VARIANTS
 from steadypose.benchmarks.humor.prediction import predict, stand_still
 from steadypose.benchmarks.motion import MotionClips, simulated_clips
 from steadypose.benchmarks.protocols import humor
@@ -65,7 +65,8 @@ def test_futures_of_any_model_are_scored(clips: MotionClips) -> None:
 
 
 def test_the_protocol_in_small(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(models, "VARIANTS", {MVAE: models.VARIANTS[MVAE], models.BRIEF: models.VARIANTS[models.BRIEF]})
+    for module in (humor, models):
+        monkeypatch.setattr(module, "VARIANTS", {name: VARIANTS[name] for name in ("no contacts", MVAE)})
     for module in (humor, fits):
         monkeypatch.setattr(module, "FitSettings", lambda: FitSettings(root_steps=0, pose_steps=10, motion_steps=10))
     with Progress(disable=True) as progress:
@@ -76,6 +77,10 @@ def test_the_protocol_in_small(tmp_path: Path, monkeypatch) -> None:
     for table in result.tables:
         assert all(len(row) == len(table.columns) for row in table.rows)
         assert any(row[0] == SHIPS for row in table.rows)
+    assert {"humor_hidden", "humor_noise"} == result.figures.keys()
+    levels = result.data["records"]["levels"]
+    assert {(record["noise_cm"], record["below_m"]) for record in levels} == {(0.0, 1.2), (2.0, 0.0)}
+    assert all(record["all_mm"] is not None for record in levels)
     noisy = {record["method"]: record for record in result.data["records"]["noisy"]}
     assert noisy[SHIPS]["all_mm"] < noisy["as seen"]["all_mm"]
     assert noisy["truth"]["all_mm"] == 0.0

@@ -160,6 +160,7 @@ def fit_transitions(
     seed: int,
     start: str | None = None,
     known: HumorNet | None = None,
+    evaluations: int = 40,
 ) -> Path:
     """Train any configuration on any motion, as the ablations are.
 
@@ -175,6 +176,7 @@ def fit_transitions(
         seed: of weights and of sampling.
         start: weights to go on from: a set or a path.
         known: a model whose statistics of states are taken over: to fit them takes a minute.
+        evaluations: as of `TrainingRun`.
 
     Returns:
         ``path``.
@@ -189,7 +191,7 @@ def fit_transitions(
         _fit_statistics(model, sequences, seed)
     optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=learning_rate / 100)
-    run = TrainingRun(path.parent, model, schedule, iterations, evaluations=40)
+    run = TrainingRun(path.parent, model, schedule, iterations, evaluations)
 
     def loss_of(count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         return transition_loss(model, sequences.draw(count, STEPS, rng), done, rng)

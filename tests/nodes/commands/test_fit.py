@@ -4,20 +4,34 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 from conftest import walk
+from tests.helpers.smpl_model import model_arrays
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
 from steadypose.nodes.cli import main
-from steadypose.nodes.commands.fitting import Fit, bodies_seen, ground_plane, noise_of, rewritten, track_of
+from steadypose.nodes.commands.fitting import (
+    Fit,
+    bodies_seen,
+    fit_body,
+    ground_plane,
+    lowest_floor,
+    noise_of,
+    rewritten,
+    stands_elsewhere,
+    track_of,
+)  # fmt: skip
 from steadypose.nodes.commands.key_points import read_key_points
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.sources.npz import NpzError
 from steadypose.prior.body.skeleton import REST_POSITIONS
+from steadypose.prior.models.humor.network import HumorNet
+from steadypose.prior.motion.npz import read_amass
 from steadypose.prior.offline import solve
 from steadypose.prior.offline.observations import SeenJoints
 from steadypose.prior.offline.solve import FitSettings
@@ -97,6 +111,23 @@ def test_key_points_become_a_motion_in_the_cameras_frame(pictured: Path, tmp_pat
         assert np.nanmedian(np.linalg.norm(projected - told["keypoints"], axis=-1)) < 40.0
         normal = out["ground_plane"][:3]
         assert normal[2] > 0.95
+
+
+def test_with_the_users_model_there_is_a_motion_of_it(seen: Path, tmp_path: Path, capsys) -> None:
+    np.savez(tmp_path / "model.npz", **model_arrays())
+    assert main(["fit", str(seen), str(tmp_path / "out.npz"), "--smpl", str(tmp_path / "model.npz")]) == 0
+    assert "SMPL's joints lie" in capsys.readouterr().err
+    with (tmp_path / "out.npz.smpl.0.npz").open("rb") as file:
+        fps, read = read_amass(file)
+    with np.load(tmp_path / "out.npz") as out:
+        said = out["world_positions"]
+    assert fps == 30.0
+    assert len(read) >= FRAMES - 1
+    moved = said[-1, 0] - said[0, 0]
+    np.testing.assert_allclose(read[-1, 0] - read[0, 0], moved, atol=0.05)
+    (tmp_path / "model.npz").write_bytes(b"no model")
+    assert main(["fit", str(seen), str(tmp_path / "new.npz"), "--smpl", str(tmp_path / "model.npz")]) == 2
+    assert "expected an .npz archive" in capsys.readouterr().err
 
 
 def test_what_is_there_is_kept(seen: Path, tmp_path: Path, capsys) -> None:
@@ -224,6 +255,21 @@ def test_what_clean_has_moved_far_is_not_believed() -> None:
     hidden = np.asarray(~np.isfinite(observed.positions.numpy()).all(axis=-1))
     assert hidden.sum() == 1
     assert hidden[3, 20]
+
+
+def test_who_stands_on_stairs_is_not_fitted_to_a_floor() -> None:
+    positions = np.tile(REST_POSITIONS - [0.0, 0.0, REST_POSITIONS[10, 2] - 0.02], (60, 1, 1))
+    steps = 0.17 * (np.arange(60) // 12)[:, None]
+    assert not stands_elsewhere(positions, 0.0)
+    assert not stands_elsewhere(positions + [0.0, 0.0, 0.3], lowest_floor(positions + [0.0, 0.0, 0.3]))
+    climbing = positions.copy()
+    climbing[..., 2] += steps
+    assert stands_elsewhere(climbing, lowest_floor(climbing))
+    messages = seen_body()
+    for t, (_, message) in enumerate(messages):
+        message.bodies[0].positions = message.bodies[0].positions + np.array([0.0, 0.0, 0.3 * (t > 4)])
+    fit = fit_body(cast(HumorNet, None), bodies_seen(messages, 8)[0], None, FitSettings(), None)
+    assert fit.track is None
 
 
 def test_a_fit_that_fails_leaves_clean_and_is_flagged() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.humor.fits import fitted, pictures, seen_joints, start_of
 from steadypose.benchmarks.motion import MotionClips, simulated_clips
-from steadypose.prior.body.skeleton import REST_OFFSETS, limbs
+from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS, limbs
 from steadypose.prior.models.humor.network import HumorConfig, HumorNet
 from steadypose.prior.models.torch_weights import load_network
 from steadypose.prior.offline import windows
@@ -137,3 +139,13 @@ def test_somebody_at_rest_stays_at_rest(model: HumorNet) -> None:
     assert error(found.joints, still) < 0.02
     assert torch.isfinite(torch.from_numpy(found.joints)).all()
     assert found.joints.shape[1] == len(REST_OFFSETS)
+
+
+def test_who_lies_moves_no_floor(model: HumorNet) -> None:
+    for turned, moves in ((np.pi / 2, False), (0.0, True)):
+        positions = np.tile(REST_POSITIONS, (12, 1, 1)) @ Rotation.from_rotvec([0.0, turned, 0.0]).as_matrix().T
+        positions += [0.0, 0.0, 0.05 - positions[..., 2].min()]
+        start = replace(start_of(positions), ground_known=False)
+        brief = FitSettings(root_steps=0, pose_steps=10, motion_steps=20)
+        found = fit_track(model, Track([start], seen_joints(positions)), brief)
+        assert found.ground.any() == moves
