@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,6 +34,10 @@ from steadypose.prior.clean.slow_error import SlowError, SlowErrorEstimator
 from steadypose.prior.clean.smooth import Smooth
 from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS
+
+IDLE_S = 3.0
+"""Seconds without a body after which only stamps are kept, in a twentieth of the time: every stage is then as it was
+before the first body."""
 
 SPOILED_S = 0.5
 """Seconds that a body may be seen without a publishable estimate, before its state, which then contains NaN, is
@@ -97,6 +100,8 @@ class CleanCore:
         self.fuse = Fuse(settings.fuse, slots)
         self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
         self._newest: _Newest | None = None
+        self._nobody = 0  # frames in a row without a body
+        self._last: CleanFrame | None = None
         self.sensor_noise: SensorNoise | None = None
 
     def step(self, observation: Observation, *, hurry: bool = False) -> CleanFrame | None:
@@ -104,6 +109,15 @@ class CleanCore:
 
         In a hurry, hidden joints are imputed without gradient ascent: for a live node that falls behind.
         """
+        self._nobody = 0 if observation.present.any() else self._nobody + 1
+        if self._last and self._nobody > IDLE_S * FPS:
+            stamp_s = self._smooth.skip(observation.stamp_s)
+            return replace(self._last, estimate=replace(self._last.estimate, stamp_s=stamp_s))
+        self._last = self._answered(observation, hurry=hurry)
+        return self._last
+
+    def _answered(self, observation: Observation, *, hurry: bool) -> CleanFrame | None:
+        """As `step`, through all stages."""
         # of the frame before: all that is fed back
         person, bias_sigma, present = self._person.current, self._slow_error.bias_sigma, observation.present
         gated = self._gate.update(observation)
@@ -135,6 +149,7 @@ class CleanCore:
     def flush(self) -> list[CleanFrame]:
         """The output for the frames that the delay still holds, oldest first."""
         newest, self._newest = self._newest, None
+        self._nobody, self._last = 0, None
         if newest is None:
             return []
         held = self._smooth.flush()
@@ -153,7 +168,7 @@ class CleanCore:
             if step is not None:
                 step.forget(slot)
         if self._newest is not None:
-            self._newest = dataclasses.replace(self._newest, present=self._newest.present & ~slot)
+            self._newest = replace(self._newest, present=self._newest.present & ~slot)
 
     def note_answered(self, frame: CleanFrame, answered: Collection[int]) -> None:
         """Reset bodies that have been seen for `SPOILED_S` without a publishable estimate.

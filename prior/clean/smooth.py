@@ -37,6 +37,10 @@ class Smooth:
         """Take in the newest frame; the estimate of the one ``delay_frames`` before, or None while there is none."""
         return self._mixture.update(gated.positions, gated.observation.stamp_s, gated.observation.confidence)
 
+    def skip(self, stamp_s: float) -> float:
+        """Take in a frame while there is no body; the stamp of the one ``delay_frames`` before."""
+        return self._mixture.skip(stamp_s)
+
     def flush(self) -> list[Smoothed]:
         """The estimates of the last ``delay_frames`` frames (fewer if there were fewer), oldest first."""
         return self._mixture.flush()

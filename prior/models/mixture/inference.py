@@ -65,14 +65,23 @@ class MixtureSmoother:
             stamp_s: seconds of capture, increasing.
             confidence: (S, 22) 0 to 1; 1 if left out.
         """
-        if self._stamps and stamp_s <= self._stamps[-1]:
-            raise ValueError(f"mixture: expected a stamp after {self._stamps[-1]} s, got {stamp_s} s")
         step = stamp_s - self._stamps[-1] if self._stamps else 1 / FPS
         certainty = np.ones((self._slots, 22)) if confidence is None else confidence
-        advance(self._bank, self._count, step, positions, certainty, DENSITIES, MEASUREMENT_SIGMA)
+        self._note(stamp_s)
+        advance(self._bank, self._count - 1, step, positions, certainty, DENSITIES, MEASUREMENT_SIGMA)
+        return self._answer(self.delay) if self._count > self.delay else None
+
+    def skip(self, stamp_s: float) -> float:
+        """Take in a frame that has no body, when the last ``delay`` had none either; the stamp of the frame ``delay``
+        before it."""
+        self._note(stamp_s)
+        return self._stamps[0]
+
+    def _note(self, stamp_s: float) -> None:
+        if self._stamps and stamp_s <= self._stamps[-1]:
+            raise ValueError(f"mixture: expected a stamp after {self._stamps[-1]} s, got {stamp_s} s")
         self._count += 1
         self._stamps = [*self._stamps[-self.delay :], stamp_s] if self.delay else [stamp_s]
-        return self._answer(self.delay) if self._count > self.delay else None
 
     def flush(self) -> list[Smoothed]:
         """The estimates that the delay still holds, oldest first; everything is then forgotten."""

@@ -12,6 +12,7 @@ from steadypose.msgs.types import JointState, Pose, PoseClean, PoseRaw
 from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
+from steadypose.prior.clean import core
 from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
 from steadypose.prior.clean.settings import PriorSettings
 
@@ -283,6 +284,18 @@ class TestBadInput:
         cleaned, _ = clean(messages)
         assert len(cleaned) == 10
         assert np.isfinite(positions(cleaned)).all()
+
+
+@pytest.mark.parametrize("delay", [0, 4])
+def test_to_keep_only_stamps_while_nobody_is_there_changes_nothing(delay: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = noisy(30)
+    visits = [[{id_: frame} for frame in seen] for id_ in (3, 4)]
+    nobody = [{}] * 150
+    people = [*nobody, *visits[0], *nobody, *visits[1], *visits[0], *nobody[:100]]
+    messages = [raw(10**9 + k * PERIOD_NS, present) for k, present in enumerate(people)]
+    idle = [encode(c) for c in clean(messages, delay=delay)[0]]
+    monkeypatch.setattr(core, "IDLE_S", np.inf)
+    assert idle == [encode(c) for c in clean(messages, delay=delay)[0]]
 
 
 def test_end_of_stream_flushes_and_is_passed_on() -> None:
