@@ -46,7 +46,7 @@ def complete(
         out: the recording to make, or .npz.
         optimise: search HM-VAE for the motion that fits what is known, as the paper does: first its latent vectors,
             then its decoder, from the answer of the feed-forward completer. Takes seconds for each window of 64
-            frames, the extra 'train', and weights of your own, for none ship: steadypose train hmvae64 --install.
+            frames and the extra 'train'; no nearer to the truth than the completer, but as lively as people are.
         weights: weight set of the completer: 'default', or a .safetensors file of your own.
         skeletons: TOML with [skeletons.NAME] of joint layouts of your own; a launch file with them will do.
         picture: what was done, as .png, .svg or .pdf.

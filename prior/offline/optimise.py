@@ -35,9 +35,10 @@ Floats = NDArray[np.float64]
 MODEL = "hmvae64"
 """Its weights' name."""
 
-LATENT_STEPS, LATENT_RATE = 50, 0.1
+LATENT_STEPS, LATENT_RATE, RANDOM_RATE = 50, 0.01, 0.1
 DECODER_STEPS, DECODER_RATE = 100, 1e-4
-"""Of Adam, in the first phase over the latent vectors and in the second over the decoder too (official: the same)."""
+"""Of Adam, in the first phase over the latent vectors and in the second over the decoder too. The official rate of the
+latent vectors is that of random ones; from the completer's it takes them far away (docs/experiments.md)."""
 
 JOINT_WEIGHT = 10.0
 """lambda_1 of equation 14."""
@@ -151,7 +152,7 @@ class Optimiser:
         for latent in latents:
             latent.requires_grad = True
         best, least = begun, torch.tensor(torch.inf)
-        optimiser = torch.optim.Adam(latents, lr=LATENT_RATE)
+        optimiser = torch.optim.Adam(latents, lr=LATENT_RATE if self._seed is None else RANDOM_RATE)
         schedule = torch.optim.lr_scheduler.StepLR(optimiser, LATENT_STEPS, gamma=0.1)
         for step in range(LATENT_STEPS + DECODER_STEPS + 1):
             if step == LATENT_STEPS:

@@ -42,13 +42,13 @@ TILT_SD = math.radians(3.0)
 
 _LIMBS = limbs(("elbow", "wrist"), ("knee", "ankle", "foot"))
 
-ABOUT_MEAN_KL_WEIGHT = 0.0003
+ABOUT_MEAN_KL_WEIGHT = 1e-5
 """beta of a model about the mean pose, whose deviations are small: at the paper's beta the KL divergence outweighs what
 the latents gain, and they collapse to the prior."""
 
 NOISY, NOISE, HELD = 0.5, 0.03, 0.25
-"""For a model about the mean pose: share of windows with noise; its largest deviation, metres along an axis, half of
-the variance being slow; and share of these windows with a frozen limb."""
+"""For a model about the mean pose: share of windows with noise; its largest deviation, metres along an axis, any part
+of the variance being slow; and share of these windows with a frozen limb."""
 
 LONG_CONFIG = HMVAEConfig(window=64, kernel=7, strides=(2, 2, 2, 2), local_latent=12, global_latent=24, about_mean=True)
 """Windows of 64 frames for `prior.offline.optimise`: the official sizes, but for a kernel of half as many frames, and
@@ -78,11 +78,11 @@ class Hyperparameters:
     denoise: bool = False
 
 
-SHORT = Hyperparameters(1_800, 64, 2e-3, kl_weight=1e-5, joint_weight=200.0, denoise=True)
+SHORT = Hyperparameters(1_800, 64, 2e-3, kl_weight=ABOUT_MEAN_KL_WEIGHT, joint_weight=200.0, denoise=True)
 """The official schedule (250,000 steps of 8 windows at 1e-4) folded into fewer, larger steps; the proportions are kept:
 z_l comes in late, the rate falls twice."""
 
-LONG = Hyperparameters(20_000, 16, 1e-3, strides=(1,), kl_weight=ABOUT_MEAN_KL_WEIGHT, denoise=True)
+LONG = Hyperparameters(3_000, 16, 1e-3, strides=(1,), kl_weight=ABOUT_MEAN_KL_WEIGHT, joint_weight=100.0, denoise=True)
 
 
 def train_hmvae(options: TrainingOptions) -> Path:
@@ -149,7 +149,7 @@ def fit(
         local_weight = (done - GLOBAL_FIRST) / LOCAL_WARM_UP
         return _loss(model, seen, rotations, offsets, local_weight, hyperparameters)
 
-    run.minimise(loss_of, lambda: evaluate_hmvae(model, val), hyperparameters.batch, seed)
+    run.minimise(loss_of, lambda: evaluate_hmvae(model, val), hyperparameters.batch, seed, clip=1.0)
     return run
 
 
@@ -180,8 +180,9 @@ def corrupt(rotations: Tensor, offsets: Tensor, rng: np.random.Generator, noise:
     count, frames = joints.shape[:2]
     if noise is None:
         sigma = rng.uniform(0.0, NOISE, (count, 1, 1, 1)) * (rng.random((count, 1, 1, 1)) < NOISY)
+        slow = rng.random((count, 1, 1, 1))
         lasting = rng.standard_normal((count, 1, 22, 3))
-        joints += sigma * (rng.standard_normal(joints.shape) + lasting) * math.sqrt(0.5)
+        joints += sigma * (np.sqrt(1.0 - slow) * rng.standard_normal(joints.shape) + np.sqrt(slow) * lasting)
         for row in np.flatnonzero((rng.random(count) < HELD) & (sigma[:, 0, 0, 0] > 0)):
             limb = _LIMBS[int(rng.integers(len(_LIMBS)))]
             first = int(rng.integers(1, frames))
