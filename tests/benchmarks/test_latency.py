@@ -1,12 +1,16 @@
 import dataclasses
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from steadypose.benchmarks.systems.latency import SPACING, crowd, percentiles
-from steadypose.benchmarks.systems.memory import growth
+from steadypose.benchmarks.systems.memory import growth, visits
 from steadypose.benchmarks.systems.restart import longest_gap
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.recording_writer import RecordingWriter
+from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
 
 
@@ -49,6 +53,19 @@ def test_growth_is_the_slope_after_the_start() -> None:
     assert found["slope_mb_per_hour"] == pytest.approx(5.0, abs=0.01)
     assert found["first_mb"] == 100.0
     assert found["last_mb"] == found["most_mb"] == pytest.approx(140.0)
+    assert found["grown_percent"] == pytest.approx(100 * (139 / 133 - 1), abs=0.05)
+
+
+def test_visitors_come_one_after_the_other_and_stay_as_long_as_is_said(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "seen") as writer:
+        for frame in frames(4):
+            writer.write(POSE_RAW, frame, frame.stamp_ns)
+    day = visits(tmp_path / "seen", 0.25, tmp_path / "day")
+    with RecordingReader(day) as reader:
+        stream = [r.message for r in reader.messages([POSE_RAW]) if isinstance(r.message, PoseRaw)]
+    assert [[b.id for b in m.bodies] for m in stream[:32]] == [*[[5]] * 4, *[[]] * 12, *[[6]] * 4, *[[]] * 12]
+    assert np.mean([bool(m.bodies) for m in stream]) == 0.25
+    assert set(np.diff([m.stamp_ns for m in stream]).tolist()) == {41_000_000}
 
 
 def test_percentiles() -> None:
