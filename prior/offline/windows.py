@@ -27,6 +27,9 @@ Floats = NDArray[np.float64]
 FRAMES, OVERLAP = 90, 15
 """Of a window, as in the paper; and how many of them the next one begins with."""
 
+LYING = 0.5
+"""Cosine of the pelvis' tilt, below which a body lies."""
+
 MIN_FRAMES = 8
 """The shortest track that is fitted."""
 
@@ -106,7 +109,7 @@ def fit_track(
             anchor = Anchored(torch.from_numpy(done[-1]["joints"][-shared:]).float())
             bones, ground = torch.from_numpy(done[-1]["offsets"]).float(), float(done[-1]["ground"][0])
             starts = [replace(start, offsets=bones, ground=ground) for start in starts]
-        parts = [_between(start, first, last) for start in starts]
+        parts = [_grounded(_between(start, first, last)) for start in starts]
         seen = [observed.between(first, last) for observed in track.observed]
         path = folder and folder / f"{number:05d}-{_fingerprint(model, parts, seen, settings, anchor, stages)}.npz"
         found = _stored(path)
@@ -123,6 +126,11 @@ def fit_track(
 
 def _between(start: Start, first: int, last: int) -> Start:
     return replace(start, root=start.root[first:last], rotations=start.rotations[first:last])
+
+
+def _grounded(start: Start) -> Start:
+    """The same, with a floor that is certain if the body ever lies: such poses are too unlikely to move it by."""
+    return replace(start, ground_known=start.ground_known or float(start.rotations[:, 0, 2, 2].min()) < LYING)
 
 
 @torch.no_grad()
