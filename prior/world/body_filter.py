@@ -115,11 +115,6 @@ class BodyFilter:
         return np.sqrt(self._p[:, _POSITION, _POSITION])
 
     @property
-    def velocity_sigma(self) -> float:
-        """M/s, standard deviation of the velocity along an axis, root mean square of the three."""
-        return math.sqrt(float(self._p[:, _VELOCITY, _VELOCITY].mean()))
-
-    @property
     def placed(self) -> NDArray[np.bool_]:
         """(feet,) which feet have a place."""
         return self._placed.copy()

@@ -25,7 +25,7 @@ from steadypose.prior.world.ground import Ground
 from steadypose.prior.world.legs import fit_legs, turn_legs
 from steadypose.prior.world.sighting import Sighting
 from steadypose.prior.world.soles import SOLE, Soles
-from steadypose.prior.world.standing import StandingFeet, standing_velocity
+from steadypose.prior.world.standing import VELOCITY_STATED, StandingFeet, standing_velocity
 
 Floats = NDArray[np.float64]
 Sigma = TypeVar("Sigma", float, NDArray[np.float64])
@@ -323,12 +323,18 @@ class BodyTrack:
             tracking = Tracking.LOST
         else:
             tracking = Tracking.OK if sighting.root_seen else Tracking.COASTING
+        velocity, covariance = standing_velocity(
+            self._filter.velocity,
+            self._filter.covariance,
+            self._both_rest,
+            stated=VELOCITY_STATED if sighting.pelvis_seen else 1.0,
+        )
         return WorldBody(
             id=sighting.body.id,
             root_position=place,
             root_orientation=self._orientation,
-            root_velocity=standing_velocity(self._filter.velocity, self._filter.velocity_sigma, self._both_rest),
-            covariance=self._filter.covariance,
+            root_velocity=velocity,
+            covariance=covariance,
             positions=positions,
             rotations=rotations,
             state=state,

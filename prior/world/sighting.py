@@ -42,6 +42,7 @@ class Sighting:
         sigma: (22,) metres, at least `MIN_SIGMA`; infinite where the message has no number.
         root: (3,) metres, world; None if unknown.
         root_sigma: metres, the standard deviation of `root`; infinite if nothing was seen that tells where it is.
+        pelvis_seen: whether the sensor saw it or a hip; else `root` was hung by the prior from joints that it saw.
     """
 
     body: CleanBody
@@ -51,6 +52,7 @@ class Sighting:
     sigma: Floats
     root: Floats | None
     root_sigma: float
+    pelvis_seen: bool
 
     @property
     def root_seen(self) -> bool:
@@ -72,8 +74,8 @@ def sightings(bodies: Sequence[CleanBody], sensor: Floats, place: Floats) -> lis
     seen = known & ((state == JointState.SEEN) | (state == JointState.REFINED))
     sigma = np.array([body.sigma for body in bodies], dtype=np.float64)
     sigma = np.maximum(np.where(sigma >= 0.0, sigma, math.inf), MIN_SIGMA)
-    # A root of which no joint near is seen was hung by the prior from those that are.
-    root_sigma = np.where(seen[:, _PELVIS].any(axis=1), sigma[:, 0], np.hypot(sigma[:, 0], HUNG_SIGMA))
+    pelvis_seen = seen[:, _PELVIS].any(axis=1)
+    root_sigma = np.where(pelvis_seen, sigma[:, 0], np.hypot(sigma[:, 0], HUNG_SIGMA))
     root_sigma = np.where(known[:, 0] & seen.any(axis=1), root_sigma, math.inf)
     turned, turns = _orientations(np.array([body.rotations[0] for body in bodies], dtype=np.float64), sensor)
     return [
@@ -85,6 +87,7 @@ def sightings(bodies: Sequence[CleanBody], sensor: Floats, place: Floats) -> lis
             sigma=sigma[k],
             root=positions[k, 0] if known[k, 0] else None,
             root_sigma=float(root_sigma[k]),
+            pelvis_seen=bool(pelvis_seen[k]),
         )
         for k, body in enumerate(bodies)
     ]

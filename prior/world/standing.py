@@ -27,7 +27,11 @@ SWAYS = 0.5
 """Of bodies with both feet at rest, the share that only sways."""
 
 VELOCITY_ERROR = 0.3
-"""Of the standard deviation that the filter states of a velocity that is seen, what validation finds."""
+"""Of the standard deviation that the filter states of a velocity that is seen, what validation finds of a body that
+stands."""
+
+VELOCITY_STATED = 0.6
+"""Of the same, what is published: what validation finds in motion, from noise of 0 to 4 cm (docs/experiments.md)."""
 
 
 class StandingFeet:
@@ -55,18 +59,28 @@ class StandingFeet:
         return estimates + offset
 
 
-def standing_velocity(velocity: Floats, sigma: float, both_rest: float) -> Floats:
-    """The velocity (3,) m/s of a root that may only sway, as estimated with a standard deviation ``sigma``.
+def standing_velocity(
+    velocity: Floats, covariance: Floats, both_rest: float, *, stated: float
+) -> tuple[Floats, Floats]:
+    """The velocity (3,) m/s of a root that may only sway, and the covariance (6, 6) of [position, velocity] then.
 
-    Its mean under a mixture of two: it sways, or moves, and then as estimated.
+    Mean and covariance under a mixture of two: it sways, or moves, and then as estimated.
 
     Args:
-        velocity: (3,) m/s.
-        sigma: m/s, along an axis, as the filter states it.
+        velocity: (3,) m/s, as the filter estimates it.
+        covariance: (6, 6) of [position, velocity]: m², m²/s, m²/s², as the filter states it.
         both_rest: the probability that both feet rest.
+        stated: of the standard deviation of ``velocity`` that the filter states, what is to be published.
     """
-    error = (VELOCITY_ERROR * sigma) ** 2
+    variance = float(np.trace(covariance[3:, 3:])) / 3.0
+    error = VELOCITY_ERROR**2 * variance
     squared, sway, moves = float(velocity @ velocity), SWAY**2 + error, MOVES**2 + error
     log_odds = 1.5 * math.log(moves / sway) - 0.5 * squared * (1.0 / sway - 1.0 / moves)
     odds = SWAYS * both_rest / (1.0 - SWAYS * both_rest) * math.exp(log_odds)
-    return velocity * (1.0 - odds / (1.0 + odds) * error / sway)
+    sways, slowed = odds / (1.0 + odds), error / sway
+    spread = stated**2 * variance
+    within = sways * SWAY**2 * spread / (SWAY**2 + spread) + (1.0 - sways) * spread
+    scale = np.repeat([1.0, math.sqrt(within / variance)], 3)
+    covariance = covariance * np.outer(scale, scale)
+    covariance[3:, 3:] += sways * (1.0 - sways) * slowed**2 * np.outer(velocity, velocity)
+    return velocity * (1.0 - sways * slowed), covariance

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.stats import norm
 
 from steadypose.prior.world.standing import (
@@ -69,19 +70,38 @@ def test_the_velocity_of_a_root_that_sways_is_the_mean_of_the_mixture():
     seen = [norm.pdf(velocity, scale=np.hypot(sigma, error)).prod() for sigma in (SWAY, MOVES)]
     weights = np.array([SWAYS, 1 - SWAYS]) * seen
     sways = weights[0] / weights.sum()
-    expected = sways * velocity * SWAY**2 / (SWAY**2 + error**2) + (1 - sways) * velocity
-    np.testing.assert_allclose(standing_velocity(velocity, 0.1, 1.0), expected)
+    slowed = velocity * SWAY**2 / (SWAY**2 + error**2)
+    expected = sways * slowed + (1 - sways) * velocity
+    found, covariance = standing_velocity(velocity, _covariance(0.1), 1.0, stated=VELOCITY_ERROR)
+    np.testing.assert_allclose(found, expected)
+    variance = sways * SWAY**2 * error**2 / (SWAY**2 + error**2) + (1 - sways) * error**2
+    between = sways * np.outer(slowed - expected, slowed - expected)
+    between += (1 - sways) * np.outer(velocity - expected, velocity - expected)
+    np.testing.assert_allclose(covariance[3:, 3:], variance * np.eye(3) + between)
 
 
 def test_a_root_that_moves_over_resting_feet_or_walks_keeps_its_velocity():
     bends, slow = np.array([0.0, 0.2, -0.3]), np.array([0.03, 0.0, 0.0])
-    np.testing.assert_allclose(standing_velocity(bends, 0.1, 1.0), bends, rtol=1e-6)
-    np.testing.assert_array_equal(standing_velocity(slow, 0.1, 0.0), slow)
+    np.testing.assert_allclose(standing_velocity(bends, _covariance(0.1), 1.0, stated=0.5)[0], bends, rtol=1e-6)
+    velocity, covariance = standing_velocity(slow, _covariance(0.1), 0.0, stated=1.0)
+    np.testing.assert_array_equal(velocity, slow)
+    np.testing.assert_allclose(covariance, _covariance(0.1))
 
 
-@given(speed=st.floats(0.0, 100.0), sigma=st.floats(1e-6, 10.0), both_rest=st.floats(0.0, 1.0))
-def test_no_velocity_grows_or_turns(speed: float, sigma: float, both_rest: float):
+@given(
+    speed=st.floats(0.0, 100.0), sigma=st.floats(1e-6, 10.0), both_rest=st.floats(0.0, 1.0), stated=st.floats(0.1, 1.0)
+)
+def test_no_velocity_grows_or_turns_and_its_covariance_is_one(
+    speed: float, sigma: float, both_rest: float, stated: float
+):
     direction = np.array([0.6, 0.0, 0.8])
-    slowed = standing_velocity(speed * direction, sigma, both_rest)
+    slowed, covariance = standing_velocity(speed * direction, _covariance(sigma), both_rest, stated=stated)
     assert 0.0 <= slowed @ direction <= speed + 1e-9
     np.testing.assert_allclose(slowed, (slowed @ direction) * direction, atol=1e-9)
+    np.testing.assert_array_equal(covariance, covariance.T)
+    assert np.linalg.eigvalsh(covariance)[0] > 0.0
+
+
+def _covariance(sigma: float) -> NDArray[np.float64]:
+    """(6, 6) of a position known to 2 cm and a velocity to ``sigma`` m/s, correlated."""
+    return np.kron(np.array([[0.02**2, 0.3 * 0.02 * sigma], [0.3 * 0.02 * sigma, sigma**2]]), np.eye(3)).astype(float)
