@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.clean.frame import Bools, Floats
 from steadypose.prior.models.occlusion.candidates import FEATURES, average, describe, forget, new_past, observe
 from steadypose.prior.models.occlusion.inference import LiveOcclusion, Occluded, Weighed
@@ -19,6 +20,12 @@ FORGETTING_S = 2.0, 10.0
 """Seconds after which what was last seen of a joint begins to count less, and after which its deviation is at least the
 completion's: of joints hidden for 4 to 10 s the network, trained on 3 s, states a deviation 1.3 to 1.6 times too small,
 and with this one 0.9 to 1.1 (validation)."""
+
+_UNSEEN_LEGS = 1.2
+"""By how much the completion states too small a deviation of knees, ankles and feet never seen (validation)."""
+
+_NEVER_SEEN = np.ones(22)
+_NEVER_SEEN[np.ravel(limbs(("knee", "ankle", "foot")))] = _UNSEEN_LEGS
 
 
 class Placed(NamedTuple):
@@ -90,7 +97,7 @@ class OccludedJoints:
         return Placed(
             np.concatenate([np.argwhere(occluded), np.argwhere(never)]),
             np.concatenate([weighed.positions, held[never]]),
-            np.concatenate([forgotten, completed_sigma[never]]),
+            np.concatenate([forgotten, (_NEVER_SEEN * completed_sigma)[never]]),
         )
 
     def _weigh(

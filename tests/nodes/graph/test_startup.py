@@ -25,3 +25,17 @@ node.node([sys.argv[1]])
 def test_a_node_loads_nothing_that_its_work_does_without_and_counts_no_garbage_of_its_start(name: str) -> None:
     command = [sys.executable, "-c", SCRIPT, name, *SPARED]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "True True\n"
+
+
+def test_what_compiling_leaves_is_collected() -> None:
+    script = (
+        "import gc\n"
+        "from steadypose.nodes.graph.startup import startup\n"
+        "with startup():\n"
+        "    kept = [[] for _ in range(3_000_000)]\n"
+        "    for each in kept: each.append(each)\n"
+        "    del kept, each\n"
+        "print(gc.get_freeze_count() < 1_000_000, gc.isenabled(), gc.get_threshold()[0] < 10_000)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert run.stdout == "True True True\n"
