@@ -96,7 +96,8 @@ class TCNVAE(MotionVAE):
         for convolution in self.encoder:
             features = F.leaky_relu(convolution(features), SLOPE)
         latent = self.to_latent(features.flatten(1)).unflatten(1, (self.groups, -1))
-        return _only_global(*latent.chunk(2, dim=-1))
+        mean, log_var = latent.chunk(2, dim=-1)
+        return _only_global(mean, log_var.clamp(max=MAX_LOG_VAR))
 
     def decode(self, local: Tensor, deep: Tensor) -> Tensor:
         """Windows (B, T, 22, 6) of z (B, groups, d)."""
@@ -125,6 +126,9 @@ STEPS: Mapping[int, int] = {8: 2000, 64: 800}
 
 FRAMES_A_STEP = 512
 """64 windows of 8 frames, or the official 8 of 64."""
+
+MAX_LOG_VAR = 4.0
+"""Of a TCN-VAE's posterior: unbounded, that of 64 frames bursts after 165 steps, and is not a number from 200 on."""
 
 _STRIDES = {8: STRIDES, 64: (1,)}  # as official, windows of 64 frames keep the frame rate
 _LEARNING_RATE = 1e-3

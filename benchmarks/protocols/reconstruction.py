@@ -48,8 +48,10 @@ def run(bench: Bench) -> Result:
     def scored(method: str, frames: int, decode: Callable[[torch.Tensor], torch.Tensor]) -> dict[str, Any]:
         windows, on = truths[frames]
         truth = joints(windows, on)
-        nothing = np.zeros(truth.shape[:-1], dtype=bool)
-        return {"method": method, "window": frames, **figures(score(joints(decode(windows), on), truth, nothing))}
+        answer, nothing = joints(decode(windows), on), np.zeros(truth.shape[:-1], dtype=bool)
+        if not np.isfinite(answer).all():
+            raise ValueError(f"{method}, {frames} frames: expected joints, and its training has diverged")
+        return {"method": method, "window": frames, **figures(score(answer, truth, nothing))}
 
     records = [scored("centre frame held", 8, lambda windows: windows[:, 3, None].expand_as(windows))]
     model, name = shipped("hmvae"), "HM-VAE as shipped"
