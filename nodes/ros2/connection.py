@@ -81,8 +81,8 @@ def connect(name: str) -> Connection:
             if find_spec("cyclonedds") is None:
                 raise LaunchError(
                     f"ROS 2: {why}; expected the Python that ROS is built for (Humble 3.10, Jazzy 3.12), which "
-                    "`./steadypose` takes if ROS is sourced when there is no .venv yet, and PyYAML, which comes with the "
-                    "extra 'ros2'"
+                    "`./steadypose` takes if ROS is sourced when there is no .venv yet, and PyYAML, which comes with "
+                    "the extra 'ros2'"
                 ) from error
             print(f"ROS 2 over plain DDS: {why}", flush=True)
         else:
