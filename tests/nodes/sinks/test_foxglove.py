@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 
 import pytest
-from conftest import running, until
+from conftest import repeated, running, until
 from tests.helpers.foxglove_client import FoxgloveClient
 from tests.helpers.synthetic_poses import messages
 
@@ -26,30 +25,18 @@ def test_a_client_gets_markers(make_launch: Callable[..., Launch]) -> None:
     with Publisher(launch.transport.endpoint("trajectory")) as publisher, running(node):
         until(lambda: bool(node.url))
 
-        def drawn() -> bool:
-            publisher.publish(POSE_WORLD, worlds[-1])
-            return node.health.stamp_ns > 0
-
-        until(drawn)
-        client = FoxgloveClient(int(node.url.rpartition(":")[2]))
-        channel = client.channels("/steadypose/markers")["/steadypose/markers"]
-        assert (channel["encoding"], channel["schemaName"]) == ("cdr", "visualization_msgs/msg/MarkerArray")
-        assert "Marker[] markers" in channel["schema"]
-        client.subscribe(channel)
-        subscribed = threading.Event()
-
-        def publish() -> None:  # when the server has noted the subscription, it does not say
-            while not subscribed.wait(0.02):
-                publisher.publish(POSE_WORLD, worlds[-1])
-
-        publishing = threading.Thread(target=publish)
-        publishing.start()
-        try:
-            got = client.message()
-        finally:
-            subscribed.set()
-            publishing.join()
-            client.close()
+        with repeated(lambda: publisher.publish(POSE_WORLD, worlds[-1])):
+            # the SDK offers a channel a moment before it knows it, and refuses who subscribes in between
+            until(lambda: node.health.stamp_ns > 0)
+            client = FoxgloveClient(int(node.url.rpartition(":")[2]))
+            try:
+                channel = client.channels("/steadypose/markers")["/steadypose/markers"]
+                assert (channel["encoding"], channel["schemaName"]) == ("cdr", "visualization_msgs/msg/MarkerArray")
+                assert "Marker[] markers" in channel["schema"]
+                client.subscribe(channel)
+                got = client.message()
+            finally:
+                client.close()
     message = deserialise(got, "visualization_msgs/msg/MarkerArray")
     assert {mark.ns.partition("/")[2] for mark in message.markers} == {"joints", "bones", "velocity", "name"}
 

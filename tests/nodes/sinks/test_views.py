@@ -20,7 +20,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
-from conftest import another_python, running, until
+from conftest import another_python, repeated, running, until
 from ruamel.yaml import YAML
 from tests.helpers.foxglove_client import FoxgloveClient
 from tests.helpers.ros_output import Kept
@@ -407,12 +407,16 @@ def schemas(
         running(node),
     ):
         until(lambda: bool(node.url))
-        prior.publish(POSE_CLEAN, stream[-1][0], timeout_s=20)
-        trajectory.publish(POSE_WORLD, stream[-1][1], timeout_s=20)
-        trajectory.publish(DIAGNOSTICS, NEWS)
+
+        def publish() -> None:
+            prior.publish(POSE_CLEAN, stream[-1][0], timeout_s=1)
+            trajectory.publish(POSE_WORLD, stream[-1][1], timeout_s=1)
+            trajectory.publish(DIAGNOSTICS, NEWS)
+
         client = FoxgloveClient(int(node.url.rpartition(":")[2]))
         try:
-            offered = client.channels(*{f"/{topic}" for topic, *_ in sent.sent} - {"/diagnostics"}, "/diagnostics")
+            with repeated(publish):
+                offered = client.channels(*{f"/{topic}" for topic, *_ in sent.sent})
         finally:
             client.close()
     return {topic: channel["schemaName"] for topic, channel in offered.items()}
