@@ -2,9 +2,10 @@
 # these extras; quick when there is nothing to do. What is installed already stays.
 UV_VERSION=0.13.8
 
-# A Python to install with: 3.11 first, for most was measured on it. A name on the PATH may be a stub that cannot run.
+# A Python to install with: 3.11 first, for most was measured on it; where ROS is sourced its own, for rclpy runs on no
+# other. A name on the PATH may be a stub that cannot run.
 find_python() {
-    for name in python3.11 python3.12 python3.13 python3.10 python3; do
+    for name in ${ROS_DISTRO:+python3} python3.11 python3.12 python3.13 python3.10 python3; do
         if "$name" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then
             command -v "$name"
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Protocol
@@ -68,13 +69,24 @@ def connect(name: str) -> Connection:
     """Join the ROS domain: through the rclpy of a ROS that is sourced, or else over plain DDS.
 
     Raises:
-        LaunchError: nothing to do so with is installed.
+        LaunchError: nothing that can do so is installed.
     """
     check_ros()
     if has_sourced_ros():
-        from steadypose.nodes.ros2.rclpy_connection import RclpyConnection
-
-        return RclpyConnection(name)
+        try:
+            from steadypose.nodes.ros2.rclpy_connection import RclpyConnection
+        except ImportError as error:
+            why = f"Python {sys.version_info[0]}.{sys.version_info[1]} cannot import the sourced rclpy: "
+            why += str(error).partition("\n")[0]
+            if find_spec("cyclonedds") is None:
+                raise LaunchError(
+                    f"ROS 2: {why}; expected the Python that ROS is built for (Humble 3.10, Jazzy 3.12), which "
+                    "`./steadypose` takes if ROS is sourced when there is no .venv yet, and PyYAML, which comes with "
+                    "the extra 'ros2'"
+                ) from error
+            print(f"ROS 2 over plain DDS: {why}", flush=True)
+        else:
+            return RclpyConnection(name)
     from steadypose.nodes.ros2.dds import DdsConnection
 
     return DdsConnection()

@@ -162,6 +162,24 @@ def running(*nodes: Node) -> Iterator[list[threading.Thread]]:
         assert not any(thread.is_alive() for thread in threads)
 
 
+@contextmanager
+def repeated(act: Callable[[], object]) -> Iterator[None]:
+    """Do something again and again beside the block: publishers do not say when a subscriber has come."""
+    over = threading.Event()
+
+    def go_on() -> None:
+        while not over.wait(0.02):
+            act()
+
+    thread = threading.Thread(target=go_on)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
 def until(condition: Callable[[], bool], *, timeout_s: float = 30.0) -> None:
     """Look again and again whether something that other threads bring about has come."""
     end = time.monotonic() + timeout_s

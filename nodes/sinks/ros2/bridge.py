@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from steadypose import PACKAGE
 from steadypose.msgs.types import Message, PoseWorld
 from steadypose.nodes.checks.problem import Problem, warning
 from steadypose.nodes.graph.clock import Clock
@@ -13,6 +14,8 @@ from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.ros2.connection import Connection, Publish, check_ros, connect
 from steadypose.nodes.sinks.ros2.settings import Ros2BridgeSettings
 from steadypose.nodes.sinks.ros2.topics import BodyTopics
+
+RVIZ = PACKAGE / "launch/views/steadypose.rviz"
 
 
 def check_ros2(launch: Launch) -> None:
@@ -64,6 +67,7 @@ class Ros2BridgeNode(Node):
         try:
             self._output = RosOutput(connection)
             self._topics = BodyTopics(self._output, self._settings)
+            print(f"RViz: rviz2 -d {RVIZ.resolve()} -f {self._settings.world_frame}", flush=True)
             super().work()
         finally:
             connection.close()

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from steadypose import PACKAGE
 from steadypose.msgs.types import Message
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.extras import require_extra
@@ -20,6 +21,7 @@ from steadypose.nodes.sinks.ros2.topics import BodyTopics
 
 HOST = "127.0.0.1"
 """this machine only, as poses are personal data: from another machine, use ssh -L 8765:localhost:8765 robot"""
+LAYOUT = PACKAGE / "launch/views/foxglove.json"
 
 
 @dataclass(frozen=True)
@@ -44,17 +46,30 @@ def check_foxglove(launch: Launch) -> None:
 
 
 class FoxgloveOutput:
-    """A WebSocket server with a channel for each topic, from its first message on."""
+    """A WebSocket server with a channel for each topic, from its first message on.
+
+    The server keeps no message: what is latched is sent again when somebody subscribes, to all who have.
+    """
 
     def __init__(self, port: int) -> None:
         import foxglove
+        from foxglove.websocket import ServerListener
+
+        self._channels: dict[str, Any] = {}
+        self._latched: dict[str, bytes] = {}
+        output = self
+
+        class Latch(ServerListener):
+            def on_subscribe(self, client: Any, channel: Any) -> None:
+                output.repeat(channel.topic)
 
         self._context = foxglove.Context()
         try:
-            self._server: Any = foxglove.start_server(name="steadypose", host=HOST, port=port, context=self._context)
+            self._server: Any = foxglove.start_server(
+                name="steadypose", host=HOST, port=port, server_listener=Latch(), context=self._context
+            )
         except (OSError, RuntimeError) as error:
             raise LaunchError(f"[foxglove] port {port} cannot be opened: {error}") from error
-        self._channels: dict[str, Any] = {}
 
     @property
     def url(self) -> str:
@@ -69,9 +84,19 @@ class FoxgloveOutput:
             self._channels[topic] = foxglove.Channel(
                 f"/{topic}", schema=schema, message_encoding="cdr", context=self._context
             )
+        if latched:
+            self._latched[topic] = cdr
         self._channels[topic].log(cdr)
 
+    def repeat(self, channel: str) -> None:
+        """Send the latched message of a channel again, if there is one."""
+        topic = channel.removeprefix("/")
+        open_one, cdr = self._channels.get(topic), self._latched.get(topic)
+        if open_one and cdr is not None:
+            open_one.log(cdr)
+
     def drop(self, topic: str) -> None:
+        self._latched.pop(topic, None)
         if channel := self._channels.pop(topic, None):
             channel.close()
 
@@ -95,7 +120,7 @@ class FoxgloveNode(Node):
         try:
             self.url = output.url
             self._topics = BodyTopics(output, Ros2BridgeSettings(world_frame=self._settings.world_frame))
-            print(f"Foxglove: {self.url}, layout launch/views/foxglove.json", flush=True)
+            print(f"Foxglove: {self.url}, layout {LAYOUT.resolve()}", flush=True)
             super().work()
         finally:
             output.close()

@@ -1,4 +1,4 @@
-"""``pose/clean``, ``pose/world`` and ``diagnostics`` as ROS 2 messages of standard types."""
+"""``pose/world`` and ``diagnostics`` as ROS 2 messages of standard types."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from steadypose.msgs.types import Diagnostics, JointState, PoseClean, PoseWorld, Tracking, WorldBody
+from steadypose.msgs.types import Diagnostics, JointState, PoseWorld, Tracking, WorldBody
 from steadypose.nodes.ros2.definitions import header, new
 from steadypose.nodes.sinks.ros2.rep155 import Links, body_name, joint_rotations
 from steadypose.prior.body.skeleton import PARENTS, J
@@ -102,12 +102,6 @@ def body_transforms(world: PoseWorld, name: str, links: Links) -> list[Any]:
         )
         for link, origin, quaternion in zip(links, origins, quaternions, strict=True)
     ]
-
-
-def sensor_transform(clean: PoseClean, world_frame: str) -> Any:
-    """Where the sensor stands, as its calibration says."""
-    pose = clean.sensor_pose
-    return transform(clean.stamp_ns, world_frame, clean.frame_id, pose.position, pose.orientation)
 
 
 def transform(stamp_ns: int, parent: str, child: str, place: np.ndarray, quaternion: np.ndarray) -> Any:

@@ -43,7 +43,7 @@ class BodyTopics:
     def __init__(self, output: Output, settings: Ros2BridgeSettings) -> None:
         self._output, self._settings = output, settings
         self._measured: dict[str, dict[str, np.ndarray]] = {}
-        self._sensor: dict[str, Pose] = {}
+        self._still: dict[str, Pose] = {}
         self._moving: set[str] = set()
 
     def send(self, message: Message) -> int:
@@ -92,20 +92,28 @@ class BodyTopics:
             self._send_of(name, "urdf", new("std_msgs/msg/String", data=urdf(name, measured)), latched=True)
 
     def _send_sensor(self, clean: PoseClean) -> None:
-        """A sensor that stands still goes to /tf_static when it is first heard of, one that moves to /tf with each "
-        "message."""
-        frame, pose = clean.frame_id, clean.sensor_pose
-        if not self._settings.sensor_tf or not clean.calibrated or frame in ("", self._settings.world_frame):
+        """A sensor that stands still goes to /tf_static when it is first heard of, one that moves to /tf with each
+        message. Who listens late gets the last message of /tf_static alone: each has all sensors that stand still."""
+        frame, pose, world = clean.frame_id, clean.sensor_pose, self._settings.world_frame
+        if not self._settings.sensor_tf or not clean.calibrated or frame in ("", world):
             return
-        last = self._sensor.get(frame)
-        if last == pose and frame not in self._moving:
-            return
-        if last is not None:
-            self._moving.add(frame)
-        self._sensor[frame] = pose
-        message = messages.tf_message([messages.sensor_transform(clean, self._settings.world_frame)])
-        moves = frame in self._moving
-        self._send("tf" if moves else "tf_static", "tf2_msgs/msg/TFMessage", message, latched=not moves)
+
+        def transform(frame: str, pose: Pose) -> Any:
+            return messages.transform(clean.stamp_ns, world, frame, pose.position, pose.orientation)
+
+        if frame not in self._moving:
+            last = self._still.get(frame)
+            if last == pose:
+                return
+            if last is None:
+                self._still[frame] = pose
+            else:
+                self._moving.add(frame)
+                del self._still[frame]
+            still = messages.tf_message([transform(*sensor) for sensor in self._still.items()])
+            self._send("tf_static", "tf2_msgs/msg/TFMessage", still, latched=True)
+        if frame in self._moving:
+            self._send("tf", "tf2_msgs/msg/TFMessage", messages.tf_message([transform(frame, pose)]))
 
     def _send(self, topic: str, kind: str, message: Any, *, latched: bool = False) -> None:
         self._output.send(topic, kind, serialise(message, kind), latched=latched)

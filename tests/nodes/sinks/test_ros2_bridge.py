@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from itertools import cycle
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from conftest import another_python, running, until
 from scipy.spatial.transform import Rotation
+from tests.helpers.ros_output import Kept
 from tests.helpers.synthetic_poses import messages
 
 from steadypose.msgs.codec import decode
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseWorld, Tracking
+from steadypose.nodes.commands.doctor.installation import required
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
@@ -149,23 +153,6 @@ def test_a_ros_node_hears_bodies(
     assert "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0" in heard["hash"], "as ROS has it"
 
 
-class Kept:
-    """An output that keeps what is sent, in order."""
-
-    def __init__(self) -> None:
-        self.sent: list[tuple[str, str, bytes, bool]] = []
-        self.dropped: list[str] = []
-
-    def send(self, topic: str, kind: str, cdr: bytes, *, latched: bool = False) -> None:
-        self.sent.append((topic, kind, cdr, latched))
-
-    def drop(self, topic: str) -> None:
-        self.dropped.append(topic)
-
-    def of(self, topic: str) -> list[Any]:
-        return [deserialise(cdr, kind) for name, kind, cdr, _ in self.sent if name == topic]
-
-
 def test_the_whole_message_goes_out_in_its_own_type(stream: tuple[list[PoseClean], list[PoseWorld]]) -> None:
     kept = Kept()
     topics = BodyTopics(kept, Ros2BridgeSettings(world_frame="map"))
@@ -211,6 +198,13 @@ def test_a_sensor_that_stands_is_static_and_one_that_moves_is_not(
     for step in range(3):
         topics.send(dataclasses.replace(still, sensor_pose=Pose(pose.position + step + 1, pose.orientation)))
     assert [it.transforms[0].transform.translation.x for it in kept.of("tf")] == [2.0, 3.0, 4.0]
+    other = dataclasses.replace(still, frame_id="other")
+    third = dataclasses.replace(still, frame_id="third")
+    topics.send(other)
+    topics.send(third)
+    topics.send(dataclasses.replace(other, sensor_pose=Pose(pose.position + 1, pose.orientation)))
+    held = [{it.child_frame_id for it in told.transforms} for told in kept.of("tf_static")]
+    assert held == [{"camera"}, set(), {"other"}, {"other", "third"}, {"third"}], "each has all that stand still"
     silent = Kept()
     for settings, message in (
         (Ros2BridgeSettings(sensor_tf=False), still),
@@ -256,6 +250,44 @@ def test_without_ros_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(connection, "find_spec", lambda name: None)
     with pytest.raises(LaunchError, match="--extra ros2"):
         check_ros2(Launch())
+
+
+@pytest.mark.parametrize("has_dds", [True, False])
+def test_a_sourced_ros_of_another_python_is_not_used(
+    has_dds: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], ros: None
+) -> None:
+    """Such as ROS's own Python 3.12 on the path of a 3.11."""
+    monkeypatch.setattr(connection, "has_sourced_ros", lambda: True)
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    monkeypatch.delitem(sys.modules, "steadypose.nodes.ros2.rclpy_connection", raising=False)
+    if has_dds:
+        connection.connect("test").close()
+        assert "plain DDS" in capsys.readouterr().out
+    else:
+        monkeypatch.setattr(connection, "find_spec", lambda name: None)
+        with pytest.raises(LaunchError, match=r"expected the Python that ROS is built for"):
+            connection.connect("test")
+
+
+FOREIGN = """
+import sys
+from importlib.metadata import packages_distributions
+before = set(sys.modules)
+import rclpy, sensor_msgs.msg
+owners = packages_distributions()
+loaded = {module.partition(".")[0] for module in set(sys.modules) - before}
+packages = [{name.lower() for name in owners.get(module, ())} for module in loaded]
+print(*set().union(*(names for names in packages if not any(name.startswith("ros-") for name in names))))
+"""
+
+
+@pytest.mark.usefixtures("ros")
+def test_a_sourced_rclpy_finds_what_it_imports() -> None:
+    """ROS takes yaml from the system's packages, and those a virtual environment does not see."""
+    done = subprocess.run([sys.executable, "-c", FOREIGN], capture_output=True, text=True, timeout=60, check=True)
+    needed, extras = required()
+    brought = {re.split("[^a-z-]", wanted)[0] for wanted in (*needed, *extras["ros2"])}
+    assert {"numpy", "pyyaml"} <= set(done.stdout.split()) <= brought
 
 
 @pytest.mark.parametrize("frame", ["", "/map"])
