@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +30,40 @@ MEMORY = 0.95
 HORIZONS = (15, 30, 60)
 """Frames after which the root hidden is compared with the truth."""
 
-METHODS: Mapping[str, TrajectorySettings] = {
-    "constant velocity": TrajectorySettings(network=False, contacts=False),
-    "network": TrajectorySettings(contacts=False),
-    "network and contacts": TrajectorySettings(),
+
+class Way(NamedTuple):
+    """What a method answers, in the world.
+
+    Attributes:
+        positions: (T, 22, 3) metres.
+        velocity: (T, 3) m/s, the root's.
+        sigma: (T, 3) metres, the root's standard deviation.
+    """
+
+    positions: Floats
+    velocity: Floats
+    sigma: Floats
+
+
+Method = Callable[[Sequence[PoseClean]], Way]
+"""From a clip as `observe` gives it; each frame is answered by what came until then."""
+
+
+def fusion(settings: TrajectorySettings, messages: Sequence[PoseClean]) -> Way:
+    """What ships, with these settings."""
+    pipeline = TrajectoryPipeline(settings)
+    bodies = [pipeline.process(message)[0].bodies[0] for message in messages]
+    return Way(
+        np.stack([b.positions for b in bodies]).astype(np.float64),
+        np.stack([b.root_velocity for b in bodies]),
+        np.sqrt(np.stack([np.diag(b.covariance)[:3] for b in bodies])),
+    )
+
+
+METHODS: Mapping[str, Method] = {
+    "constant velocity": partial(fusion, TrajectorySettings(network=False, contacts=False)),
+    "network": partial(fusion, TrajectorySettings(contacts=False)),
+    "network and contacts": partial(fusion, TrajectorySettings()),
 }
 """The ways of going on without a root: a Kalman filter alone, with the network's velocity, and with standing feet."""
 
@@ -149,7 +181,7 @@ def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def evaluate_fusion(clips: list[Clip], methods: Mapping[str, TrajectorySettings], seed: int = 0) -> dict[str, Errors]:
+def evaluate_fusion(clips: list[Clip], methods: Mapping[str, Method], seed: int = 0) -> dict[str, Errors]:
     """Run every method over every clip; "as observed" is what goes in, its velocity the difference of frames."""
     errors = {name: Errors() for name in ("as observed", *methods)}
     for number, clip in enumerate(clips):
@@ -157,13 +189,6 @@ def evaluate_fusion(clips: list[Clip], methods: Mapping[str, TrajectorySettings]
         seen = np.stack([m.bodies[0].positions for m in messages]).astype(np.float64)
         velocity = np.gradient(seen[:, 0], FRAME_S, axis=0)
         errors["as observed"].add(clip, seen, velocity, np.full((len(seen), 3), ROOT_NOISE))
-        for name, settings in methods.items():
-            pipeline = TrajectoryPipeline(settings)
-            bodies = [pipeline.process(message)[0].bodies[0] for message in messages]
-            errors[name].add(
-                clip,
-                np.stack([b.positions for b in bodies]).astype(np.float64),
-                np.stack([b.root_velocity for b in bodies]),
-                np.sqrt(np.stack([np.diag(b.covariance)[:3] for b in bodies])),
-            )
+        for name, method in methods.items():
+            errors[name].add(clip, *method(messages))
     return errors

@@ -60,6 +60,18 @@ class BodyNoise:
     network_memory_s: ArrayLike = 0.15
     first_speed: float = 1.0
 
+    def density(self, speed: float) -> float:
+        """Power spectral density of the white-noise acceleration of a root at ``speed`` m/s: m²/s³."""
+        return (self.acceleration + self.acceleration_at_speed * speed) ** 2
+
+    def walk(self, load: Floats, rest: Floats, speed: float) -> Floats:
+        """(feet,) m²/s of the feet's random walks, by the probabilities (feet,) that each bears load, and rests."""
+        slip = math.log(1.0 + self.slip_at_speed * speed)
+        rolls = np.maximum(load - rest, 0.0)
+        walk = rest * (math.log(self.rest) + slip) + rolls * (math.log(self.load) + slip)
+        walk += (1.0 - rest - rolls) * math.log(self.swing)
+        return np.exp(2.0 * walk)
+
 
 class BodyFilter:
     """Root position and velocity, the places of ``feet`` points of the feet, and slow errors.
@@ -139,15 +151,10 @@ class BodyFilter:
         """Move on by ``dt`` seconds, above 0; (feet,) probabilities that each foot bears load, and that it rests."""
         noise = self._noise
         speed = math.hypot(*self._x[_VELOCITY, :2])  # not the height, which the floor has a say in
-        slip = math.log(1.0 + noise.slip_at_speed * speed)
-        rolls = np.maximum(load - rest, 0.0)
-        walk = rest * (math.log(noise.rest) + slip) + rolls * (math.log(noise.load) + slip)
-        walk += (1.0 - rest - rolls) * math.log(noise.swing)
         rates = np.full(1 + len(load), noise.sensor_rate)
         rates[0] += speed / noise.sensor_memory_m
-        density = (noise.acceleration + noise.acceleration_at_speed * speed) ** 2
         kept = np.exp(-dt / np.broadcast_to(np.asarray(noise.network_memory_s, dtype=np.float64), (3,)))
-        _predict(self._x, self._p, dt, density, rates * dt, kept, np.exp(2.0 * walk) * dt)
+        _predict(self._x, self._p, dt, noise.density(speed), rates * dt, kept, noise.walk(load, rest, speed) * dt)
 
     def observe_position(self, position: Floats, jitter: float, bias: float) -> None:
         """Take a root position (3,) in metres as the sensor sees it.
