@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -116,11 +116,12 @@ class FactorGraph:
     def _add(self, terms: Mapping[int, Floats], value: Floats, covariance: Floats) -> None:
         """A factor: the sum of matrices times variables is ``value``, with this covariance."""
         whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-        blocks, about = [], gtsam.Values()
+        blocks: list[Any] = []
+        about = gtsam.Values()
         for key, matrix in terms.items():
             blocks += [key, whiten @ matrix]
             about.insert(key, np.zeros(matrix.shape[1]))
-        factor = gtsam.JacobianFactor(*blocks, whiten @ value, gtsam.noiseModel.Unit.Create(len(value)))
+        factor = gtsam.JacobianFactor(*blocks, whiten @ value, gtsam.noiseModel.Unit.Create(len(value)))  # pyright: ignore
         self._factors.add(gtsam.LinearContainerFactor(factor, about))
 
 

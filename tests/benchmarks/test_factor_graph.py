@@ -77,7 +77,7 @@ def test_a_standing_foot_holds_a_hidden_root() -> None:
     """The network has it at 0.3 m/s: a metre off after 100 frames, but for the feet that stand."""
 
     def off(rest: float) -> float:
-        graph, rng = FactorGraph(BodyNoise()), np.random.default_rng(1)
+        graph, rng, body = FactorGraph(BodyNoise()), np.random.default_rng(1), np.zeros(9)
         for told in frames(rng, 100, 10):
             body, _, _ = graph.update(told._replace(load=np.full(4, rest), rest=np.full(4, rest)), DT)
         return float(np.linalg.norm(body[:2]))
