@@ -149,7 +149,7 @@ class Errors:
         inside = hidden[1:] & hidden[:-1]
         self.seen_skate += list(speed[stands & ~hidden[1:, None] & ~hidden[:-1, None]])
         self.hidden_skate += list(speed[stands & inside[:, None]])
-        for start in range(SEEN_FRAMES, len(hidden) - HIDDEN_FRAMES, SEEN_FRAMES + HIDDEN_FRAMES):
+        for start in range(SEEN_FRAMES, len(hidden) - HIDDEN_FRAMES + 1, SEEN_FRAMES + HIDDEN_FRAMES):
             for h in HORIZONS:
                 at = start + h - 1
                 self.hidden_position[h].append(float(np.linalg.norm(off[at, :2])))
