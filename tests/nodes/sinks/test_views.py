@@ -1,7 +1,7 @@
 """RViz's configuration and Foxglove's layout show what is published, and the sample stream's person is in their view.
 
 No package registry has RViz 2, nor Foxglove's app (Debian's RViz, of ROS 1, draws the same markers). So RViz's part is
-taken by a ROS 2 node (Jazzy's rclpy) that subscribes as the displays do, with their types and QoS, and Foxglove's by the
+taken by a ROS 2 node (rclpy) that subscribes as the displays do, with their types and QoS, and Foxglove's by the
 types of layouts in its SDK and by a client of its server. What a viewer ignores or answers with an error is a misfit;
 each kind of misfit has its test.
 """
