@@ -35,18 +35,25 @@ class FoxgloveClient:
                 offered |= {channel["topic"]: channel for channel in told["channels"]}
         return offered
 
-    def subscribe(self, channel: dict[str, Any]) -> None:
-        asked = {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": channel["id"]}]}
-        data = json.dumps(asked).encode()
-        assert len(data) < 126
-        self._socket.sendall(bytes([0x81, 0x80 | len(data), 0, 0, 0, 0]) + data)
+    def first(self, channel: dict[str, Any]) -> bytes:
+        """Subscribe to a channel and wait for a message.
 
-    def message(self) -> bytes:
-        """Wait for a message of what is subscribed to."""
+        The SDK offers a channel a moment before it knows it, and refuses who subscribes in between.
+        """
+        self._subscribe(channel)
         while True:
             kind, data = self._receive()
             if kind == 2 and data[0] == 1:  # then four bytes of subscription and eight of time
                 return data[13:]
+            if kind == 1 and (told := json.loads(data))["op"] == "status":
+                assert "unknown channel" in told["message"].lower(), told
+                self._subscribe(channel)
+
+    def _subscribe(self, channel: dict[str, Any]) -> None:
+        asked = {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": channel["id"]}]}
+        data = json.dumps(asked).encode()
+        assert len(data) < 126
+        self._socket.sendall(bytes([0x81, 0x80 | len(data), 0, 0, 0, 0]) + data)
 
     def close(self) -> None:
         self._file.close()

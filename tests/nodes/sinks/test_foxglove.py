@@ -26,15 +26,12 @@ def test_a_client_gets_markers(make_launch: Callable[..., Launch]) -> None:
         until(lambda: bool(node.url))
 
         with repeated(lambda: publisher.publish(POSE_WORLD, worlds[-1])):
-            # the SDK offers a channel a moment before it knows it, and refuses who subscribes in between
-            until(lambda: node.health.stamp_ns > 0)
             client = FoxgloveClient(int(node.url.rpartition(":")[2]))
             try:
                 channel = client.channels("/steadypose/markers")["/steadypose/markers"]
                 assert (channel["encoding"], channel["schemaName"]) == ("cdr", "visualization_msgs/msg/MarkerArray")
                 assert "Marker[] markers" in channel["schema"]
-                client.subscribe(channel)
-                got = client.message()
+                got = client.first(channel)
             finally:
                 client.close()
     message = deserialise(got, "visualization_msgs/msg/MarkerArray")
@@ -49,8 +46,8 @@ def test_who_subscribes_late_gets_what_is_latched() -> None:
             output.send("humans/bodies/b1/urdf", "std_msgs/msg/String", cdr, latched=True)
         client = FoxgloveClient(int(output.url.rpartition(":")[2]))
         try:
-            client.subscribe(client.channels("/humans/bodies/b1/urdf")["/humans/bodies/b1/urdf"])
-            assert deserialise(client.message(), "std_msgs/msg/String").data == "at last"
+            got = client.first(client.channels("/humans/bodies/b1/urdf")["/humans/bodies/b1/urdf"])
+            assert deserialise(got, "std_msgs/msg/String").data == "at last"
         finally:
             client.close()
     finally:
