@@ -21,11 +21,8 @@ FORGETTING_S = 2.0, 10.0
 completion's: of joints hidden for 4 to 10 s the network, trained on 3 s, states a deviation 1.3 to 1.6 times too small,
 and with this one 0.9 to 1.1 (validation)."""
 
-_UNSEEN_LEGS = 1.2
-"""By how much the completion states too small a deviation of knees, ankles and feet never seen (validation)."""
-
-_NEVER_SEEN = np.ones(22)
-_NEVER_SEEN[np.ravel(limbs(("knee", "ankle", "foot")))] = _UNSEEN_LEGS
+_LEGS, _UNSEEN_LEG = limbs(("knee", "ankle", "foot")), 1.2
+"""By how much the completion states too small a deviation of legs of which no joint was ever seen (validation)."""
 
 
 class Placed(NamedTuple):
@@ -97,7 +94,7 @@ class OccludedJoints:
         return Placed(
             np.concatenate([np.argwhere(occluded), np.argwhere(never)]),
             np.concatenate([weighed.positions, held[never]]),
-            np.concatenate([forgotten, (_NEVER_SEEN * completed_sigma)[never]]),
+            np.concatenate([forgotten, (_of_legs(never) * completed_sigma)[never]]),
         )
 
     def _weigh(
@@ -118,6 +115,14 @@ class OccludedJoints:
         features = np.empty((len(body), FEATURES), dtype=np.float32)
         _describe(self._past, slots, body, joint, chosen, sigma, completed_sigma, unseen_s, seen_later, features)
         return self.weigher(Occluded(body, joint, chosen, features))
+
+
+def _of_legs(never: Bools) -> Floats:
+    """(B, 22) `_UNSEEN_LEG` at the joints of legs that were never seen, by ``never`` (B, 22) of each joint; else 1."""
+    factors = np.ones(never.shape)
+    for leg in _LEGS:
+        factors[:, leg] = np.where(never[:, leg].all(axis=1), _UNSEEN_LEG, 1.0)[:, None]
+    return factors
 
 
 @njit(cache=True)
