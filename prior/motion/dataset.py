@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import get_args
 
@@ -19,6 +20,9 @@ from steadypose.prior.body.skeleton import MIRROR
 from steadypose.prior.motion.clip import MotionError
 from steadypose.prior.motion.datasets import WeightSet
 from steadypose.prior.timing.rate import FPS
+
+MIN_SPEED = 0.25
+"""m/s, added to the joints' speed, to which the probability of drawing a lively window is proportional."""
 
 _ARRAYS = {"clip_start", "split", "set", "rotations", "positions", "offsets", "contacts", "subject", "action",
            "source"}  # fmt: skip
@@ -130,6 +134,46 @@ class MotionSet:
             np.arange(a, b - window + 1, step) for a, b in zip(self.clip_start, self.clip_start[1:], strict=False)
         ]
         return np.concatenate(starts)[:, None] + np.arange(window)
+
+
+class LivelyWindows:
+    """Draws windows of motion, the faster the likelier, and each source by the square root of its size: a large one
+    of ten exercises would outweigh all others.
+
+    Args:
+        motion: of clips; where their sources are not told, they count as one.
+    """
+
+    def __init__(self, motion: MotionSet) -> None:
+        lengths = np.diff(motion.clip_start)
+        sources = motion.source if len(motion.source) else np.zeros(len(lengths))
+        speed = (motion.positions[1:] - motion.positions[:-1]).norm(dim=-1).mean(dim=1).double().numpy() * FPS
+        speed = np.append(speed, 0.0)
+        speed[motion.clip_start[1:] - 1] = 0.0
+        self._passed = np.concatenate([[0.0], np.cumsum(MIN_SPEED + speed)])
+        self._room = np.repeat(motion.clip_start[1:], lengths) - np.arange(lengths.sum())
+        self._source = np.repeat(np.unique(sources, return_inverse=True)[1], lengths)
+        self._chances = lru_cache(maxsize=4)(self._chances_of)
+
+    def sample(
+        self, count: int, window: int, strides: Sequence[int], generator: np.random.Generator
+    ) -> NDArray[np.int64]:
+        """As `MotionSet.sample`."""
+        stride = generator.choice(np.asarray(strides), size=count)
+        first = np.empty(count, dtype=np.int64)
+        for k in np.unique(stride):
+            starts, chances = self._chances((window - 1) * int(k) + 1)
+            rows = np.flatnonzero(stride == k)
+            chosen = np.searchsorted(chances, generator.random(len(rows)) * chances[-1])
+            first[rows] = starts[np.minimum(chosen, len(starts) - 1)]
+        return first[:, None] + stride[:, None] * np.arange(window)
+
+    def _chances_of(self, span: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Frames at which a window of so many can start, and the sum of their chances up to each."""
+        starts = np.flatnonzero(self._room >= span)
+        worth = self._passed[starts + span] - self._passed[starts]
+        source = self._source[starts]
+        return starts, np.cumsum(worth / np.sqrt(np.bincount(source, worth))[source])
 
 
 def _prepared(path: Path, needed: set[str]) -> NpzFile:

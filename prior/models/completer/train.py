@@ -25,8 +25,13 @@ from steadypose.prior.models.layers.torch_kinematics import forward_kinematics, 
 from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
-from steadypose.prior.motion.dataset import MotionSet, describe_data, mirror_offsets, mirror_rotations
-from steadypose.prior.timing.rate import FPS
+from steadypose.prior.motion.dataset import (
+    LivelyWindows,
+    MotionSet,
+    describe_data,
+    mirror_offsets,
+    mirror_rotations,
+)
 
 Rng = np.random.Generator
 
@@ -38,9 +43,6 @@ GAPS = (5, 64)
 
 CONTEXT = (2, 14)
 """Range of frames that are known around it, before and after together."""
-
-MIN_SPEED = 0.25
-"""m/s, added to the joints' speed, to which the probability of drawing a window is proportional."""
 
 STRIDES = (1, 1, 1, 2)
 """Frame rates, as frames from one to the next."""
@@ -80,12 +82,12 @@ def train_completer(options: TrainingOptions, config: CompleterConfig | None = N
         optimiser, LEARNING_RATE, total_steps=iterations + 1, pct_start=0.05, final_div_factor=40
     )
     run = TrainingRun(path.parent, model, schedule, iterations, evaluations=40)
-    sampler = Sampler(train)
+    lively = LivelyWindows(train)
 
     def loss_of(count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         gap, context = int(rng.integers(GAPS[0], GAPS[1] + 1)), int(rng.integers(CONTEXT[0], CONTEXT[1] + 1))
         frames = gap + context
-        rows = sampler.draw(max(count // frames, 1), frames, rng)
+        rows = lively.sample(max(count // frames, 1), frames, STRIDES, rng)
         return loss(model, Truth.of(train, rows, rng), masks(len(rows), gap, context, rng), rng)
 
     run.minimise(loss_of, lambda: evaluate_completer(model, val), BATCH, seed, clip=1.0)
@@ -141,31 +143,6 @@ class Truth:
         rotations = self.rotations.clone()
         rotations[:, :, 0] = turn.mT[:, None] @ rotations[:, :, 0]
         return rotations, (self.root - origin[:, None]) @ turn
-
-
-class Sampler:
-    """Draws windows of motion, the faster the likelier, and each source by the square root of its size: a large one
-    of ten exercises would outweigh all others."""
-
-    def __init__(self, motion: MotionSet) -> None:
-        lengths = np.diff(motion.clip_start)
-        speed = (motion.positions[1:] - motion.positions[:-1]).norm(dim=-1).mean(dim=1).double().numpy() * FPS
-        speed = np.append(speed, 0.0)
-        speed[motion.clip_start[1:] - 1] = 0.0
-        self._passed = np.concatenate([[0.0], np.cumsum(MIN_SPEED + speed)])
-        self._room = np.repeat(motion.clip_start[1:], lengths) - np.arange(lengths.sum())
-        self._source = np.repeat(np.unique(motion.source, return_inverse=True)[1], lengths)
-
-    def draw(self, count: int, frames: int, rng: Rng) -> NDArray[np.int64]:
-        """(count, frames) frame numbers of windows inside clips, at a random frame rate."""
-        stride = int(rng.choice(STRIDES))
-        span = (frames - 1) * stride + 1
-        starts = np.flatnonzero(self._room >= span)
-        worth = self._passed[starts + span] - self._passed[starts]
-        source = self._source[starts]
-        chances = np.cumsum(worth / np.sqrt(np.bincount(source, worth))[source])
-        chosen = np.searchsorted(chances, rng.random(count) * chances[-1])
-        return starts[np.minimum(chosen, len(starts) - 1)][:, None] + stride * np.arange(frames)
 
 
 def masks(count: int, gap: int, context: int, rng: Rng) -> Bools:

@@ -20,7 +20,14 @@ from steadypose.prior.models.layers.torch_kinematics import forward_kinematics, 
 from steadypose.prior.models.torch_weights import started
 from steadypose.prior.models.training import TrainingOptions, TrainingRun
 from steadypose.prior.models.weights_io import LICENCES
-from steadypose.prior.motion.dataset import MotionSet, describe_data, mirror_offsets, mirror_rotations, remove_heading
+from steadypose.prior.motion.dataset import (
+    LivelyWindows,
+    MotionSet,
+    describe_data,
+    mirror_offsets,
+    mirror_rotations,
+    remove_heading,
+)
 
 JOINT_WEIGHT = 10.0
 """lambda of equation 5."""
@@ -50,9 +57,9 @@ NOISY, NOISE, HELD = 0.5, 0.03, 0.25
 """For a model about the mean pose: share of windows with noise; its largest deviation, metres along an axis, any part
 of the variance being slow; and share of these windows with a frozen limb."""
 
-LONG_CONFIG = HMVAEConfig(window=64, kernel=7, strides=(2, 2, 2, 2), local_latent=12, global_latent=24, about_mean=True)
-"""Windows of 64 frames for `prior.offline.optimise`: the official sizes, but for a kernel of half as many frames, and
-about the mean pose."""
+LONG_CONFIG = HMVAEConfig(window=64, kernel=7, strides=(2, 2, 2, 2), local_latent=24, global_latent=24, about_mean=True)
+"""Windows of 64 frames for `prior.offline.optimise`: the official sizes, but for a kernel of half as many frames, twice
+as many dimensions of z_l, which fast motion takes, and about the mean pose."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,7 @@ class Hyperparameters:
         kl_weight: beta.
         joint_weight: lambda.
         denoise: whether its input is corrupted by noise and occlusion, the target being the clean window.
+        lively: whether fast motion is drawn more often, and large sources less.
     """
 
     iterations: int
@@ -76,13 +84,23 @@ class Hyperparameters:
     kl_weight: float = KL_WEIGHT
     joint_weight: float = JOINT_WEIGHT
     denoise: bool = False
+    lively: bool = False
 
 
 SHORT = Hyperparameters(1_800, 64, 2e-3, kl_weight=ABOUT_MEAN_KL_WEIGHT, joint_weight=200.0, denoise=True)
 """The official schedule (250,000 steps of 8 windows at 1e-4) folded into fewer, larger steps; the proportions are kept:
 z_l comes in late, the rate falls twice."""
 
-LONG = Hyperparameters(3_000, 16, 1e-3, strides=(1,), kl_weight=ABOUT_MEAN_KL_WEIGHT, joint_weight=100.0, denoise=True)
+LONG = Hyperparameters(
+    26_000,
+    16,
+    1e-3,
+    strides=(1, 1, 2, 3),
+    kl_weight=ABOUT_MEAN_KL_WEIGHT,
+    joint_weight=100.0,
+    denoise=True,
+    lively=True,
+)
 
 
 def train_hmvae(options: TrainingOptions) -> Path:
@@ -140,9 +158,10 @@ def fit(
     optimiser = torch.optim.Adam(model.parameters(), lr=hyperparameters.learning_rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.MultiStepLR(optimiser, [int(iterations * f) for f in (0.6, 0.85)], gamma=0.3)
     run = TrainingRun(directory, model, schedule, iterations, evaluations=24)
+    windows = LivelyWindows(train) if hyperparameters.lively else train
 
     def loss_of(count: int, done: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
-        rows = train.sample(count, model.window, strides, rng)
+        rows = windows.sample(count, model.window, strides, rng)
         rotations, offsets = _augment(train.rotations[rows], train.offsets[rows[:, 0]])
         rotations, _ = remove_heading(rotations, model.window // 2 - 1)
         seen = corrupt(rotations, offsets, rng) if hyperparameters.denoise else rotations
