@@ -92,7 +92,7 @@ SHORT = Hyperparameters(1_800, 64, 2e-3, kl_weight=ABOUT_MEAN_KL_WEIGHT, joint_w
 z_l comes in late, the rate falls twice."""
 
 LONG = Hyperparameters(
-    26_000,
+    12_000,
     16,
     1e-3,
     strides=(1, 1, 2, 3),
