@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 from steadypose.benchmarks.metrics import acceleration_error, position_error
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.nodes.commands.fitting import noise_of
-from steadypose.nodes.commands.key_points import PIXEL_SIGMA
+from steadypose.nodes.commands.key_points import track_of_picture
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import LOAD_SPEED, REST_HEIGHT, label_contacts
-from steadypose.prior.body.skeleton import REST_OFFSETS, J
+from steadypose.prior.body.skeleton import J
 from steadypose.prior.models.humor.network import HumorNet
-from steadypose.prior.offline.lift import starts_of_key_points
 from steadypose.prior.offline.motion import float_tensor
-from steadypose.prior.offline.observations import KeyPoints, Observed, Pinhole, SeenJoints, SurfacePoints
-from steadypose.prior.offline.solve import FitSettings, Start, fit_window
-from steadypose.prior.offline.windows import load_of
+from steadypose.prior.offline.observations import Observed, Pinhole, SeenJoints
+from steadypose.prior.offline.solve import PICTURES, FitSettings, Start, fit_window
+from steadypose.prior.offline.windows import Track, load_of
 from steadypose.prior.sim.depth import Stereo, render, spoil
 from steadypose.prior.timing.rate import FPS
 
@@ -94,15 +93,15 @@ class Pictures:
 
     Attributes:
         truth: (T, 22, 3) metres, in a frame that is z up, the camera at 0.
-        starts: of a fit.
-        key_points: what a detector says.
-        points: of a depth camera.
+        seen: (T, 22) which joints a detector found.
+        flat: its key points.
+        deep: these with points of a depth camera.
     """
 
     truth: Floats
-    starts: list[Start]
-    key_points: KeyPoints
-    points: SurfacePoints
+    seen: NDArray[np.bool_]
+    flat: Track
+    deep: Track
 
 
 def pictures(clips: MotionClips, clip: int, rng: np.random.Generator) -> Pictures:
@@ -119,7 +118,6 @@ def pictures(clips: MotionClips, clip: int, rng: np.random.Generator) -> Picture
     confidence = rng.uniform(0.5, 1.0, truth.shape[:2])
     focal, centre = torch.tensor([FOCAL, FOCAL]), torch.tensor(CENTRE)
     camera = Pinhole(focal, centre, float_tensor(rotation), torch.zeros(3))
-    starts = starts_of_key_points(pixels, camera, REST_OFFSETS, -CAMERA_HEIGHT)
     stereo = Stereo()
     wall = np.full((stereo.height, stereo.width), 2.0 * AWAY)
     points = np.full((len(truth), POINTS, 3), np.nan)
@@ -133,15 +131,16 @@ def pictures(clips: MotionClips, clip: int, rng: np.random.Generator) -> Picture
             np.stack([(u[some] - centre[0]) * z / stereo.focal, (v[some] - centre[1]) * z / stereo.focal, z], axis=-1)
             @ rotation.T
         )
-    return Pictures(
-        truth, starts, KeyPoints(float_tensor(pixels), float_tensor(confidence), camera, PIXEL_SIGMA * FOCAL),
-        SurfacePoints(float_tensor(points)),
-    )  # fmt: skip
+    flat, deep = (
+        track_of_picture(pixels, confidence, camera, -CAMERA_HEIGHT, floor_known=True, points=told)
+        for told in (None, points)
+    )
+    return Pictures(truth, np.asarray(np.isfinite(pixels).all(axis=-1)), flat, deep)
 
 
 def camera_settings() -> FitSettings:
     """As ``steadypose fit`` has them for a camera whose height is known."""
-    return replace(FitSettings(), ground_height_sigma=0.05)
+    return replace(PICTURES, ground_height_sigma=0.05)
 
 
 def scores(answers: Sequence[Answer], truth: Floats, hidden: NDArray[np.bool_], contacts: NDArray[np.bool_],

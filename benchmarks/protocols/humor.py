@@ -46,8 +46,8 @@ DEPENDS_ON = (*CLEAN, "humor weights", "offline settings")
 FRAMES = 90
 DELAY = 8
 """Frames: of the live answer that fits start from."""
-CLIPS, PICTURES, FUTURES = 4, 2, 12
-"""Clips of Table 2, of Tables 3 and 4, and of Table 1, taken evenly from all sources of the split."""
+CLIPS, PICTURES, FUTURES, LEVELS = 4, 8, 12, 2
+"""Clips of Table 2, of Tables 3 and 4, of Table 1, and of figure 8, taken evenly from all sources of the split."""
 
 HEIGHTS = (0.0, 0.3, 0.6, 0.9, 1.2)
 """Metres below which joints are hidden, of figure 8."""
@@ -70,8 +70,9 @@ def run(bench: Bench) -> Result:
     clips = bench.clips(FRAMES, 2 if bench.quick else CLIPS)
     noisy = _noisy(bench, clips, models, hide=False)
     hidden = _noisy(bench, clips, models, hide=True)
+    clips = bench.clips(FRAMES, 1 if bench.quick else LEVELS)
+    levels, drawn = _levels(bench, clips, models), len(clips.offsets)
     clips = bench.clips(FRAMES, 1 if bench.quick else PICTURES)
-    levels = _levels(bench, clips, models)
     detector = _pictures(bench, clips, models, depth=False)
     depth = _pictures(bench, clips, models, depth=True)
     records = {"futures": futures, "noisy": noisy, "hidden": hidden, "detector": detector, "depth": depth}
@@ -79,7 +80,7 @@ def run(bench: Bench) -> Result:
     return Result(
         [_futures_table(futures, count), *_fit_tables(records, few)],
         {"data": clips.source, "records": records | {"levels": levels}},
-        _figure_8(levels, few),
+        _figure_8(levels, drawn),
     )
 
 
@@ -143,18 +144,15 @@ def _pictures(bench: Bench, clips: MotionClips, models: dict[str, Any], *, depth
     """Tables 3 and 4: key points of a simulated detector, alone or with the points of a simulated depth camera."""
     taken = [pictures(clips, c, np.random.default_rng((1, c))) for c in range(len(clips.offsets))]
     truth = np.stack([picture.truth for picture in taken], axis=1)
-    unseen = np.stack([~np.isfinite(picture.key_points.pixels.numpy()).all(axis=-1) for picture in taken], axis=1)
+    unseen = np.stack([~picture.seen for picture in taken], axis=1)
     load = load_labels(clips)
     fits = {_PER_FRAME: (models[SHIPS], 2), MVAE: (models[MVAE], 3), SHIPS: (models[SHIPS], 3)}
     records = [{"method": _TRUTH, **scores(_each(truth), truth, unseen, load, -CAMERA_HEIGHT)}]
     for name, (model, stages) in bench.progress.track(fits.items(), description="depth" if depth else "detector"):
         found = [
-            fitted(
-                model, picture.starts, [picture.key_points, *([picture.points] if depth else [])], stages,
-                camera_settings(),
-            )
-            for picture in taken
-        ]  # fmt: skip
+            fitted(model, track.starts, track.observed, stages, camera_settings())
+            for track in (picture.deep if depth else picture.flat for picture in taken)
+        ]
         records.append({"method": name, **scores(found, truth, unseen, load, -CAMERA_HEIGHT)})
     return records
 

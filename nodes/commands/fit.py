@@ -152,7 +152,7 @@ def _fit_picture(
     source: Path, out: Path, model: Any, folder: Path, progress: Progress
 ) -> tuple[int, list[FittedTrack | None], list[str]]:
     """Fit key points of one camera; returns as `_fit_poses`."""
-    from steadypose.prior.offline.solve import FitSettings
+    from steadypose.prior.offline.solve import PICTURES
     from steadypose.prior.offline.windows import MIN_FRAMES, window_bounds
 
     recording = read_key_points(source)
@@ -160,7 +160,7 @@ def _fit_picture(
     if frames < MIN_FRAMES:
         raise NpzError(f"{source}: expected {MIN_FRAMES} frames at 30 Hz or more, got {frames}")
     bar = progress.add_task(source.name, total=len(window_bounds(frames)))
-    track = fit_key_points(model, recording, FitSettings(), folder, lambda: progress.advance(bar))
+    track = fit_key_points(model, recording, PICTURES, folder, lambda: progress.advance(bar))
     part = folder / out.name
     arrays: dict[str, Any] = _added(arrays_of_fit(recording, track), track)
     np.savez(part, **arrays)

@@ -132,7 +132,8 @@ def track_of(seen: Seen, points: Floats | None) -> Track:
     sigma = noise / np.sqrt(confidence)
     observed: list[Observed] = [SeenJoints(float_tensor(raw), float_tensor(sigma))]
     if points is not None:
-        observed.append(SurfacePoints(float_tensor(points)))
+        camera = np.stack([SensorFrame.of(message.sensor_pose).origin for message in seen.clean])
+        observed.append(SurfacePoints(float_tensor(points), float_tensor(camera)))
     return Track([start], observed)
 
 

@@ -19,14 +19,18 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import JOINTS, JointState, Pose
 from steadypose.nodes.graph.clock import FRAME_NS
+from steadypose.nodes.library import clean
 from steadypose.nodes.sources.npz import NpzError, read_arrays, read_stamps
+from steadypose.prior.body.bone_lengths import estimate_offsets
+from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import quaternions, rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.body.skeleton import REST_OFFSETS
 
 if TYPE_CHECKING:
     from steadypose.prior.models.humor.network import HumorNet
-    from steadypose.prior.offline.solve import FitSettings
+    from steadypose.prior.offline.observations import Pinhole
+    from steadypose.prior.offline.solve import FitSettings, Start
     from steadypose.prior.offline.windows import FittedTrack, Track
 
 Floats = NDArray[np.float64]
@@ -36,6 +40,9 @@ PIXEL_SIGMA = 0.01
 
 CAMERA_HEIGHT, CAMERA_HEIGHT_SIGMA = 1.3, 0.3
 """Metres above the floor at which a camera hangs of which that is not known."""
+
+LIFTED_DELAY, LIFTED_SIGMA = 8, 0.08
+"""Of key points as deep as the surface about them: frames, of `clean`; metres that they are off along an axis."""
 
 LONGEST_GAP_NS = 200_000_000
 """over which key points are interpolated"""
@@ -164,14 +171,67 @@ def _on_grid(
     return np.where(np.isfinite(mixed), mixed, pixels[nearest]), sure[nearest]
 
 
-def track_of_key_points(recording: KeyPointRecording) -> Track:
-    """What is to be fitted, and the two motions to start from; the camera is at the origin of the world."""
+def track_of_picture(
+    pixels: Floats,
+    confidence: Floats,
+    camera: Pinhole,
+    floor: float,
+    *,
+    floor_known: bool = False,
+    points: Floats | None = None,
+) -> Track:
+    """What is to be fitted of a person in a picture, and the motions to start from.
+
+    With points, the start is what `clean` says of the key points as deep as the surface about them, which are observed
+    too; without, or if it finds nobody, it is that of `starts_of_key_points`.
+
+    Args:
+        pixels: (T, 22, 2) at 30 Hz, NaN where not found.
+        confidence: (T, 22) 0 to 1.
+        camera: that took it.
+        floor: metres, world, its height, or a guess.
+        floor_known: which of the two.
+        points: (T, N, 3) metres, world, of the body's surface, NaN where there are fewer; None if there are none.
+    """
     import torch
 
-    from steadypose.prior.offline.lift import starts_of_key_points
+    from steadypose.prior.offline.lift import lift, starts_of_key_points
     from steadypose.prior.offline.motion import float_tensor
-    from steadypose.prior.offline.observations import KeyPoints, Observed, Pinhole, SurfacePoints
+    from steadypose.prior.offline.observations import KeyPoints, Observed, SeenJoints, SurfacePoints
     from steadypose.prior.offline.windows import Track
+
+    sigma = PIXEL_SIGMA * float(camera.focal.mean())
+    observed: list[Observed] = [KeyPoints(float_tensor(pixels), float_tensor(confidence), camera, sigma)]
+    starts = starts_of_key_points(pixels, camera, REST_OFFSETS, floor, floor_known=floor_known)
+    if points is not None:
+        lifted = lift(pixels, camera, points)
+        observed.append(SurfacePoints(float_tensor(points), camera.position))
+        observed.append(SeenJoints(float_tensor(lifted), torch.full(lifted.shape[:-1], LIFTED_SIGMA)))
+        starts = _start_of_joints(lifted, floor) or starts
+    return Track(starts, observed)
+
+
+def _start_of_joints(joints: Floats, floor: float) -> list[Start]:
+    """The motion that `clean` makes of joints (T, 22, 3) metres, world; none where it finds nobody in half of it."""
+    from steadypose.prior.offline.solve import Start
+
+    stamps = np.round(np.arange(len(joints)) * FRAME_NS).astype(np.int64)
+    found = clean(joints, stamp_ns=stamps, delay=LIFTED_DELAY)["positions"].astype(float)
+    known = np.flatnonzero(np.isfinite(found).all(axis=(1, 2)))
+    if 2 * len(known) < len(found):
+        return []
+    nearest = known[np.abs(np.arange(len(found))[:, None] - known).argmin(axis=1)]
+    positions = found[nearest]
+    offsets = estimate_offsets(positions)
+    return [Start.of(positions[:, 0], solve_rotations(positions, offsets), offsets, floor)]
+
+
+def track_of_key_points(recording: KeyPointRecording) -> Track:
+    """What is to be fitted of a recording; the camera is at the origin of the world."""
+    import torch
+
+    from steadypose.prior.offline.motion import float_tensor
+    from steadypose.prior.offline.observations import Pinhole
 
     camera = Pinhole(
         float_tensor(recording.focal),
@@ -179,14 +239,14 @@ def track_of_key_points(recording: KeyPointRecording) -> Track:
         float_tensor(recording.rotation),
         position=torch.zeros(3),
     )
-    floor = -(recording.camera_height or CAMERA_HEIGHT)
-    sigma = PIXEL_SIGMA * float(recording.focal.mean())
-    observed: list[Observed] = [
-        KeyPoints(float_tensor(recording.pixels), float_tensor(recording.confidence), camera, sigma)
-    ]
-    if recording.points is not None:
-        observed.append(SurfacePoints(float_tensor(recording.points @ recording.rotation.T)))
-    return Track(starts_of_key_points(recording.pixels, camera, REST_OFFSETS, floor), observed)
+    return track_of_picture(
+        recording.pixels,
+        recording.confidence,
+        camera,
+        -(recording.camera_height or CAMERA_HEIGHT),
+        floor_known=recording.camera_height is not None,
+        points=None if recording.points is None else recording.points @ recording.rotation.T,
+    )
 
 
 def fit_key_points(

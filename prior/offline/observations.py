@@ -130,49 +130,67 @@ _RADII = torch.tensor([radius for _, _, radius in CAPSULES])
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """E_data of points of a depth camera: the distance of each from the nearest capsule about a bone.
+    """E_data of points of a depth camera: how far each is from where the camera sees the nearest capsule about a bone.
+
+    A camera sees the side of a body that is turned to it. The distance from a closed surface would let a point that
+    noise puts behind a limb's middle pull towards its back, and those in front of it alone would then move the body.
 
     Attributes:
         points: (T, N, 3) metres, world; NaN where there are fewer.
+        camera: (3,) metres, world, where it stands, or (T, 3).
         sigma: metres.
     """
 
     points: Tensor
+    camera: Tensor
     sigma: float = POINT_SIGMA
 
     @cached_property
     def _seen(self) -> Tensor:
         return torch.isfinite(self.points).all(dim=-1)
 
+    @cached_property
+    def _rays(self) -> Tensor:
+        """(P, 3) unit vectors from the camera to the points seen."""
+        away = (self.points - self.camera.reshape(-1, 1, 3))[self._seen]
+        return away / away.norm(dim=-1, keepdim=True)
+
     def residual(self, motion: Motion) -> Tensor:
+        """(P, 2) along the ray and across it."""
         frames, _ = torch.nonzero(self._seen, as_tuple=True)
         points, joints = self.points[self._seen], motion.world_joints
         radii = _RADII.to(joints.dtype) * (stature(motion.offsets.detach().numpy()) / REST_HEIGHT)
         with torch.no_grad():  # an argmin has no derivative
-            nearest = _distance(points.unsqueeze(1), joints[frames][:, _STARTS], joints[frames][:, _ENDS], radii)
-            which = nearest.abs().argmin(dim=1)
+            each = _off(
+                points[:, None], self._rays[:, None], joints[frames][:, _STARTS], joints[frames][:, _ENDS], radii
+            )
+            which = each.square().sum(dim=-1).argmin(dim=1)
         starts, ends = torch.tensor(_STARTS)[which], torch.tensor(_ENDS)[which]
-        return _distance(points, joints[frames, starts], joints[frames, ends], radii[which]) / self.sigma
+        return _off(points, self._rays, joints[frames, starts], joints[frames, ends], radii[which]) / self.sigma
 
     def kernel(self, square: Tensor) -> Tensor:
-        return bisquare(square, ROBUST)
+        return bisquare(square.sum(dim=-1), ROBUST)
 
     def between(self, first: int, last: int) -> SurfacePoints:
-        return SurfacePoints(self.points[first:last], self.sigma)
+        camera = self.camera if self.camera.ndim == 1 else self.camera[first:last]
+        return SurfacePoints(self.points[first:last], camera, self.sigma)
 
     def misfit(self, motion: Motion) -> Tensor:
         """(T, 22) the median distance of a frame's points, metres, for every joint: points belong to none."""
-        off = self.residual(motion) * self.sigma
+        off = self.residual(motion).norm(dim=-1) * self.sigma
         frames, _ = torch.nonzero(self._seen, as_tuple=True)
         found = torch.full((len(self.points), motion.joints.shape[1]), torch.nan)
         for frame in frames.unique():
-            found[frame] = off[frames == frame].abs().median()
+            found[frame] = off[frames == frame].median()
         return found
 
 
-def _distance(points: Tensor, starts: Tensor, ends: Tensor, radii: Tensor) -> Tensor:
-    """(...) signed distance to capsules, metres, negative inside."""
+def _off(points: Tensor, rays: Tensor, starts: Tensor, ends: Tensor, radii: Tensor) -> Tensor:
+    """(..., 2) metres from capsules to points seen along unit rays: behind the side that is seen, and beside them."""
     bone = ends - starts
-    along = ((points - starts) * bone).sum(dim=-1) / bone.square().sum(dim=-1).clamp(min=1e-8)
-    nearest = starts + along.clamp(0.0, 1.0).unsqueeze(-1) * bone
-    return ((points - nearest).square().sum(dim=-1) + 1e-10).sqrt() - radii
+    share = ((points - starts) * bone).sum(dim=-1) / bone.square().sum(dim=-1).clamp(min=1e-8)
+    off = points - starts - share.clamp(0.0, 1.0).unsqueeze(-1) * bone
+    along = (off * rays).sum(dim=-1)
+    beside = ((off - along.unsqueeze(-1) * rays).square().sum(dim=-1) + 1e-10).sqrt()
+    front = ((radii.square() - beside.square()).clamp(min=0.0) + 1e-4).sqrt()
+    return torch.stack([along + front, torch.relu(beside - radii)], dim=-1)

@@ -71,6 +71,10 @@ class FitSettings:
     ground_tilt_sigma: float = 0.03
 
 
+PICTURES = FitSettings(bones_sigma=0.03, pose_steps=120, motion_steps=200)
+"""For key points of a picture, which say less of how large a person is, and start farther off."""
+
+
 @dataclass(frozen=True)
 class Start:
     """Initial poses of T frames, in the world.

@@ -17,6 +17,7 @@ from steadypose.benchmarks.humor.prediction import predict, stand_still
 from steadypose.benchmarks.motion import MotionClips, simulated_clips
 from steadypose.benchmarks.protocols import humor
 from steadypose.prior.models.humor.network import HumorConfig, HumorNet
+from steadypose.prior.offline.observations import KeyPoints, SurfacePoints
 from steadypose.prior.offline.solve import FitSettings
 
 
@@ -44,13 +45,15 @@ def test_the_truth_has_no_error_and_what_sinks_goes_through_the_floor(clips: Mot
 
 def test_a_camera_sees_what_is_projected(clips: MotionClips) -> None:
     taken = pictures(clips, 0, np.random.default_rng(0))
-    seen = taken.key_points.pixels.numpy()
-    expected = taken.key_points.camera.project(torch.from_numpy(taken.truth).float()).numpy()
+    key_points, points, _ = taken.deep.observed
+    assert isinstance(key_points, KeyPoints)
+    assert isinstance(points, SurfacePoints)
+    seen = key_points.pixels.numpy()
+    expected = key_points.camera.project(torch.from_numpy(taken.truth).float()).numpy()
     off = np.linalg.norm(seen - expected, axis=-1)
     assert np.nanmedian(off) == pytest.approx(1.18 * fits.PIXELS, rel=0.2)
     assert np.isnan(off).mean() == pytest.approx(fits.MISSED, abs=0.05)
-    points = taken.points.points.numpy()
-    middle = np.nanmean(points, axis=1)
+    middle = np.nanmean(points.points.numpy(), axis=1)
     assert np.linalg.norm(middle - taken.truth.mean(axis=1), axis=-1).max() < 0.4
 
 

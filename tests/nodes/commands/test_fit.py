@@ -64,9 +64,13 @@ def pictured(tmp_path: Path) -> Path:
     return path
 
 
-def key_points(**more: object) -> dict:
+def in_camera() -> np.ndarray:
     body = positions().astype(float)
-    optical = np.stack([-body[..., 1], 1.3 - body[..., 2], 4.0 + body[..., 0] - body[:, :1, 0].mean()], axis=-1)
+    return np.stack([-body[..., 1], 1.3 - body[..., 2], 4.0 + body[..., 0] - body[:, :1, 0].mean()], axis=-1)
+
+
+def key_points(**more: object) -> dict:
+    optical = in_camera()
     pixels = optical[..., :2] / optical[..., 2:] * 900.0 + [640.0, 360.0]
     pixels[3, 4] = np.nan
     told = {"keypoints": pixels, "skeleton": "smpl22", "fps": 30.0, "focal": 900.0, "centre": [640.0, 360.0]}
@@ -111,6 +115,23 @@ def test_key_points_become_a_motion_in_the_cameras_frame(pictured: Path, tmp_pat
         assert np.nanmedian(np.linalg.norm(projected - told["keypoints"], axis=-1)) < 40.0
         normal = out["ground_plane"][:3]
         assert normal[2] > 0.95
+
+
+def test_points_of_the_surface_say_where_somebody_is(tmp_path: Path) -> None:
+    truth = in_camera()
+    rng = np.random.default_rng(0)
+    skin = np.repeat(truth, 4, axis=1) + 0.03 * rng.standard_normal((FRAMES, 88, 3)) - [0.0, 0.0, 0.06]
+    np.savez(tmp_path / "keys.npz", **key_points(points=skin.astype(np.float32)))
+    assert main(["fit", str(tmp_path / "keys.npz"), str(tmp_path / "out.npz")]) == 0
+    with np.load(tmp_path / "out.npz") as out:
+        assert np.linalg.norm(out["positions"] - truth, axis=-1).mean() < 0.1
+
+
+def test_points_of_nobody_are_as_none(tmp_path: Path) -> None:
+    np.savez(tmp_path / "keys.npz", **key_points(points=np.full((FRAMES, 5, 3), np.nan)))
+    assert main(["fit", str(tmp_path / "keys.npz"), str(tmp_path / "out.npz")]) == 0
+    with np.load(tmp_path / "out.npz") as out:
+        assert np.isfinite(out["positions"]).all()
 
 
 def test_with_the_users_model_there_is_a_motion_of_it(seen: Path, tmp_path: Path, capsys) -> None:

@@ -67,10 +67,9 @@ def test_legs_that_are_hidden_for_a_while_go_on(model: HumorNet, truth: np.ndarr
 
 def test_key_points_and_depth_find_the_motion_again(model: HumorNet, clips: MotionClips) -> None:
     taken = pictures(clips, 0, np.random.default_rng(0))
-    flat = fitted(model, taken.starts, [taken.key_points], 2, BRIEF)
-    deep = fitted(model, taken.starts, [taken.key_points, taken.points], 2, BRIEF)
-    assert error(flat.joints, taken.truth) < 0.6  # how far away somebody is, is told by how large they look
-    assert error(deep.joints, taken.truth) < min(0.15, error(flat.joints, taken.truth))
+    flat, deep = (fitted(model, track.starts, track.observed, 2, BRIEF) for track in (taken.flat, taken.deep))
+    assert error(flat.joints, taken.truth) < 0.3
+    assert error(deep.joints, taken.truth) < min(0.1, error(flat.joints, taken.truth))
 
 
 def test_each_stage_lowers_its_energy(model: HumorNet, truth: np.ndarray) -> None:
