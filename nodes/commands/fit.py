@@ -18,7 +18,13 @@ from rich.progress import Progress
 from steadypose.msgs.types import JOINTS, Message, PoseRaw
 from steadypose.nodes.commands.cleaning import stream
 from steadypose.nodes.commands.fitting import Fit, bodies_seen, fit_body, ground_plane, rewritten
-from steadypose.nodes.commands.key_points import arrays_of_fit, fit_key_points, has_key_points, read_key_points
+from steadypose.nodes.commands.key_points import (
+    arrays_of_fit,
+    fit_key_points,
+    has_key_points,
+    in_sight,
+    read_key_points,
+)
 from steadypose.nodes.commands.output import check_output, check_replaceable, put_in_place, write_recording
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
@@ -182,7 +188,7 @@ def _points(source: Path, frames: int) -> Floats | None:
             f"{source}: points: expected ({frames}, N, 3) metres, NaN for what is missing, got {points.dtype} "
             f"{points.shape}"
         )
-    return points.astype(np.float64)
+    return in_sight(points.astype(np.float64))
 
 
 def _write_smpl(out: Path, shape: Any, tracks: Sequence[FittedTrack | None]) -> list[str]:

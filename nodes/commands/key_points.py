@@ -41,6 +41,9 @@ PIXEL_SIGMA = 0.01
 CAMERA_HEIGHT, CAMERA_HEIGHT_SIGMA = 1.3, 0.3
 """Metres above the floor at which a camera hangs of which that is not known."""
 
+HIGHEST, NEAREST, FARTHEST = 100.0, 0.05, 100.0
+"""Metres: of a camera above the floor, and of a point from it."""
+
 LIFTED_DELAY, LIFTED_SIGMA = 8, 0.08
 """Of key points as deep as the surface about them: frames, of `clean`; metres that they are off along an axis."""
 
@@ -103,8 +106,10 @@ def read_key_points(path: Path) -> KeyPointRecording:
     for name in _NUMBERS & arrays.keys():
         if arrays[name].dtype.kind not in "fiu":
             raise NpzError(f"{path}: {name}: expected numbers, got {arrays[name].dtype}")
-    if "camera_height" in arrays and arrays["camera_height"].size != 1:
-        raise NpzError(f"{path}: camera_height: expected one number, got {arrays['camera_height']!r:.80}")
+    height = arrays.get("camera_height")
+    if height is not None and (height.size != 1 or not 0.0 < height.item() < HIGHEST):
+        raise NpzError(f"{path}: camera_height: expected metres above the floor, one number of more than 0 and less "
+                       f"than {HIGHEST:g}, got {height!r:.80}")  # fmt: skip
     name = str(arrays["skeleton"])
     if name not in SKELETONS:
         raise NpzError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {name!r}")
@@ -138,6 +143,8 @@ def read_key_points(path: Path) -> KeyPointRecording:
     sure = np.where(needed, np.where(found, confidence, 0.0)[:, None], np.inf).min(axis=-1)
     sure = np.where(needed.any(axis=1), sure, 0.0)
     pixels[sure <= 0] = np.nan
+    if not np.isfinite(pixels).any():
+        raise NpzError(f"{path}: keypoints: expected somebody, got no key point that is finite and has a confidence")
     count = int((stamps[-1] - stamps[0]) / FRAME_NS + 1e-3) + 1
     grid = stamps[0] + np.round(np.arange(count) * FRAME_NS).astype(np.int64)
     after = np.clip(np.searchsorted(stamps, grid), 1, len(stamps) - 1)
@@ -147,9 +154,16 @@ def read_key_points(path: Path) -> KeyPointRecording:
         raise NpzError(f"{path}: points: expected ({len(stamps)}, N, 3) metres, got {points.shape}")
     return KeyPointRecording(
         grid, *_on_grid(pixels, sure, stamps, grid, nearest), focal, centre, rotation_matrix(pose.orientation),
-        arrays["camera_height"].item() if "camera_height" in arrays else None,
-        None if points is None else np.asarray(points, dtype=np.float64)[nearest],
+        None if height is None else height.item(),
+        None if points is None else in_sight(np.asarray(points, dtype=np.float64)[nearest]),
     )  # fmt: skip
+
+
+def in_sight(points: Floats) -> Floats:
+    """Points (T, N, 3) metres from a depth camera, NaN where none can see them: at its place, where many put what they
+    have no depth of, or too far away."""
+    away = np.linalg.norm(np.where(np.isfinite(points), points, np.inf), axis=-1, keepdims=True)
+    return np.where((away > NEAREST) & (away < FARTHEST), points, np.nan)
 
 
 def _stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:
@@ -197,7 +211,7 @@ def track_of_picture(
 
     from steadypose.prior.offline.lift import lift, starts_of_key_points
     from steadypose.prior.offline.motion import float_tensor
-    from steadypose.prior.offline.observations import KeyPoints, Observed, SeenJoints, SurfacePoints
+    from steadypose.prior.offline.observations import KeyPoints, Observed, SeenJoints, SurfacePoints, thinned
     from steadypose.prior.offline.windows import Track
 
     sigma = PIXEL_SIGMA * float(camera.focal.mean())
@@ -205,7 +219,7 @@ def track_of_picture(
     starts = starts_of_key_points(pixels, camera, REST_OFFSETS, floor, floor_known=floor_known)
     if points is not None:
         lifted = lift(pixels, camera, points)
-        observed.append(SurfacePoints(float_tensor(points), camera.position))
+        observed.append(SurfacePoints(float_tensor(thinned(points)), camera.position))
         observed.append(SeenJoints(float_tensor(lifted), torch.full(lifted.shape[:-1], LIFTED_SIGMA)))
         starts = _start_of_joints(lifted, floor) or starts
     return Track(starts, observed)

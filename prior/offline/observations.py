@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from steadypose.prior.body.skeleton import J
@@ -19,6 +21,9 @@ ROBUST = 5.0
 
 CLEAR = 3.0
 """Standard deviations from which on a joint in space pulls no harder; none is given up: there may be no other."""
+
+MOST_POINTS = 200
+"""Of a surface, a frame, that are fitted."""
 
 POINT_SIGMA = 0.05
 """Metres: error of a depth camera's points five metres away, and of capsules as a body. A limb finds its points within
@@ -183,6 +188,11 @@ class SurfacePoints:
         for frame in frames.unique():
             found[frame] = off[frames == frame].median()
         return found
+
+
+def thinned(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """About `MOST_POINTS` of points (T, N, 3) a frame, evenly: neighbours err alike, and say nothing new."""
+    return points[:, :: max(points.shape[1] // MOST_POINTS, 1)]
 
 
 def _off(points: Tensor, rays: Tensor, starts: Tensor, ends: Tensor, radii: Tensor) -> Tensor:

@@ -127,8 +127,9 @@ def test_points_of_the_surface_say_where_somebody_is(tmp_path: Path) -> None:
         assert np.linalg.norm(out["positions"] - truth, axis=-1).mean() < 0.1
 
 
-def test_points_of_nobody_are_as_none(tmp_path: Path) -> None:
-    np.savez(tmp_path / "keys.npz", **key_points(points=np.full((FRAMES, 5, 3), np.nan)))
+@pytest.mark.parametrize("nothing", [np.nan, np.inf, 0.0, 1e30])
+def test_points_of_nobody_are_as_none(nothing: float, tmp_path: Path) -> None:
+    np.savez(tmp_path / "keys.npz", **key_points(points=np.full((FRAMES, 5, 3), nothing)))
     assert main(["fit", str(tmp_path / "keys.npz"), str(tmp_path / "out.npz")]) == 0
     with np.load(tmp_path / "out.npz") as out:
         assert np.isfinite(out["positions"]).all()
@@ -202,6 +203,9 @@ def test_nobody_in_it_is_said(tmp_path: Path, capsys) -> None:
         ({"focal": ["long"]}, "focal: expected numbers"),
         ({"focal": [1.0, 2.0, 3.0]}, "focal"),
         ({"camera_height": [1.0, 2.0]}, "camera_height"),
+        ({"camera_height": -1.0}, "more than 0"),
+        ({"camera_height": np.nan}, "more than 0"),
+        ({"keypoints": np.full((FRAMES, 22, 2), np.nan)}, "expected somebody"),
         ({"fps": 0.0}, "fps"),
         ({"fps": 1e-9}, "fps"),
         ({"stamp_ns": np.zeros(FRAMES, dtype=np.int64)}, "stamps that grow"),

@@ -27,7 +27,7 @@ from steadypose.prior.offline.energy import (
     huber,
 )
 from steadypose.prior.offline.motion import Motion, Variables
-from steadypose.prior.offline.observations import KeyPoints, Pinhole, SeenJoints, SurfacePoints
+from steadypose.prior.offline.observations import KeyPoints, Pinhole, SeenJoints, SurfacePoints, thinned
 
 FRAMES = 6
 NAMES = ("root", "orientation", "turns", "bones", "ground", "latents")
@@ -160,6 +160,15 @@ def test_points_on_the_side_that_is_seen_cost_nothing(model: HumorNet) -> None:
         assert found.residual(motion)[0, 0].sign() == -np.sign(off[0])
     part = SurfacePoints(skin, moving, 0.01).between(1, 3)
     assert len(part.points) == len(part.camera) == 2
+
+
+@pytest.mark.parametrize(("given", "kept"), [(0, 0), (150, 150), (399, 399), (400, 200), (5000, 200)])
+def test_a_cloud_is_thinned_evenly(given: int, kept: int) -> None:
+    points = np.arange(2 * given * 3, dtype=float).reshape(2, given, 3)
+    found = thinned(points)
+    assert found.shape == (2, kept, 3)
+    steps = np.diff(found[0, :, 0])
+    assert (steps == steps[:1]).all()
 
 
 def test_the_floor_is_moved_and_tilted_with_all_that_stands_on_it(model: HumorNet, variables: Variables) -> None:
