@@ -117,7 +117,7 @@ def track_of(seen: Seen, points: Floats | None) -> Track:
         points: (T, N, 3) metres, world, of its surface, NaN where there are fewer; None where there are none.
     """
     from steadypose.prior.offline.motion import float_tensor
-    from steadypose.prior.offline.observations import Observed, SeenJoints, SurfacePoints, thinned
+    from steadypose.prior.offline.observations import POINT_SHARE, Observed, SeenJoints, SurfacePoints, thinned
     from steadypose.prior.offline.solve import Start
     from steadypose.prior.offline.windows import Track
 
@@ -133,7 +133,7 @@ def track_of(seen: Seen, points: Floats | None) -> Track:
     observed: list[Observed] = [SeenJoints(float_tensor(raw), float_tensor(sigma))]
     if points is not None:
         camera = np.stack([SensorFrame.of(message.sensor_pose).origin for message in seen.clean])
-        observed.append(SurfacePoints(float_tensor(thinned(points)), float_tensor(camera)))
+        observed.append(SurfacePoints(float_tensor(thinned(points)), float_tensor(camera), weight=POINT_SHARE))
     return Track([start], observed)
 
 

@@ -25,6 +25,10 @@ CLEAR = 3.0
 MOST_POINTS = 200
 """Of a surface, a frame, that are fitted."""
 
+POINT_SHARE = 0.03
+"""Of points beside joints in space: what capsules and a depth camera get wrong lasts, and so many points in so many
+frames would outvote joints that are right (docs/experiments.md)."""
+
 POINT_SIGMA = 0.05
 """Metres: error of a depth camera's points five metres away, and of capsules as a body. A limb finds its points within
 `ROBUST` times that."""
@@ -144,11 +148,13 @@ class SurfacePoints:
         points: (T, N, 3) metres, world; NaN where there are fewer.
         camera: (3,) metres, world, where it stands, or (T, 3).
         sigma: metres.
+        weight: share of a point that counts, for neighbours err alike.
     """
 
     points: Tensor
     camera: Tensor
     sigma: float = POINT_SIGMA
+    weight: float = 1.0
 
     @cached_property
     def _seen(self) -> Tensor:
@@ -174,11 +180,11 @@ class SurfacePoints:
         return _off(points, self._rays, joints[frames, starts], joints[frames, ends], radii[which]) / self.sigma
 
     def kernel(self, square: Tensor) -> Tensor:
-        return bisquare(square.sum(dim=-1), ROBUST)
+        return bisquare(square.sum(dim=-1), ROBUST) * self.weight
 
     def between(self, first: int, last: int) -> SurfacePoints:
         camera = self.camera if self.camera.ndim == 1 else self.camera[first:last]
-        return SurfacePoints(self.points[first:last], camera, self.sigma)
+        return replace(self, points=self.points[first:last], camera=camera)
 
     def misfit(self, motion: Motion) -> Tensor:
         """(T, 22) the median distance of a frame's points, metres, for every joint: points belong to none."""

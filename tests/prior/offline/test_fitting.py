@@ -18,6 +18,7 @@ from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS, limbs
 from steadypose.prior.models.humor.network import HumorConfig, HumorNet
 from steadypose.prior.models.torch_weights import load_network
 from steadypose.prior.offline import windows
+from steadypose.prior.offline.observations import POINT_SHARE, SurfacePoints
 from steadypose.prior.offline.solve import STIFFNESS, FitSettings, fit_window, preconditioner
 from steadypose.prior.offline.windows import Track, fit_track, window_bounds
 
@@ -70,6 +71,19 @@ def test_key_points_and_depth_find_the_motion_again(model: HumorNet, clips: Moti
     flat, deep = (fitted(model, track.starts, track.observed, 2, BRIEF) for track in (taken.flat, taken.deep))
     assert error(flat.joints, taken.truth) < 0.3
     assert error(deep.joints, taken.truth) < min(0.1, error(flat.joints, taken.truth))
+
+
+def test_points_do_no_harm_to_joints_that_are_seen(model: HumorNet, clips: MotionClips) -> None:
+    taken = pictures(clips, 0, np.random.default_rng(0))
+    surface = next(term for term in taken.deep.observed if isinstance(term, SurfacePoints))
+    seen = taken.truth + NOISE * np.random.default_rng(0).standard_normal(taken.truth.shape)
+    start = start_of(gaussian_filter1d(seen, 3.0, axis=0, mode="nearest"))
+
+    def off(weight: float) -> float:
+        observed = [*seen_joints(seen), replace(surface, weight=weight)]
+        return error(fitted(model, [start], observed, 2, BRIEF).joints, taken.truth)
+
+    assert off(POINT_SHARE) < 1.05 * off(0.0) < off(1.0)
 
 
 def test_each_stage_lowers_its_energy(model: HumorNet, truth: np.ndarray) -> None:
