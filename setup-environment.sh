@@ -6,7 +6,7 @@ UV_VERSION=0.13.8
 # other. A name on the PATH may be a stub that cannot run.
 find_python() {
     for name in ${ROS_DISTRO:+python3} python3.11 python3.12 python3.13 python3.10 python3; do
-        if "$name" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then
+        if "$name" -I -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then
             command -v "$name"
             return
         fi
@@ -20,15 +20,15 @@ install_uv() {
         return
     fi
     # by the Python's own pip where that can: putting another into the new folder takes five seconds
-    if "$1" -m pip --python "$1" --version >/dev/null 2>&1; then
-        "$1" -m venv --without-pip "$root/.uv"
-        "$1" -m pip --python "$root/.uv/bin/python" install --quiet --disable-pip-version-check "uv==$UV_VERSION"
+    if "$1" -I -m pip --python "$1" --version >/dev/null 2>&1; then
+        "$1" -I -m venv --without-pip "$root/.uv"
+        "$1" -I -m pip --python "$root/.uv/bin/python" install --quiet --disable-pip-version-check "uv==$UV_VERSION"
     else
-        "$1" -m venv "$root/.uv" || {
+        "$1" -I -m venv "$root/.uv" || {
             echo "Python's venv module is missing. On Debian or Ubuntu: sudo apt install python3-venv" >&2
             exit 1
         }
-        "$root/.uv/bin/python" -m pip install --quiet --disable-pip-version-check "uv==$UV_VERSION"
+        "$root/.uv/bin/python" -I -m pip install --quiet --disable-pip-version-check "uv==$UV_VERSION"
     fi
 }
 
@@ -47,8 +47,26 @@ install() {
     # shellcheck disable=SC2086  (words, on purpose)
     (unset VIRTUAL_ENV UV_PROJECT_ENVIRONMENT &&
         "$root/.uv/bin/uv" sync --project "$root" --frozen --inexact --python "$python" $extras)
-    # loops are compiled once, and bytecode written; else the first stream would wait for both
-    echo "Compiling, once" >&2
-    (unset PYTHONDONTWRITEBYTECODE && "$root/.venv/bin/python" -m steadypose.nodes.graph.loops)
+    # else the first stream would wait for it
+    "$root/.venv/bin/python" -I -m steadypose.nodes.graph.loops
     touch "$stamp"
+}
+
+# Extras by name, on top of what is installed.
+add() {
+    known=$(sed -n '/^\[project.optional-dependencies\]/,/^\[/s/^\([a-z0-9-]*\) = \[.*/\1/p' "$root/pyproject.toml")
+    if [ $# -eq 0 ]; then
+        echo "steadypose add: expected an extra, one of $(echo $known)" >&2
+        exit 2
+    fi
+    for extra in "$@"; do
+        if ! echo "$known" | grep -qx -- "$extra"; then
+            echo "steadypose add: no extra '$extra'; there are $(echo $known)" >&2
+            exit 2
+        fi
+        if [ "$extra" = train ] && [ ! -d "$root"/.venv/lib/python*/site-packages/torch ]; then
+            echo "The extra train brings torch with its CUDA libraries: about 5 GB are downloaded; Ctrl-C stops it." >&2
+        fi
+    done
+    install "$@"
 }

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from steadypose.benchmarks import ours
+from steadypose.benchmarks.baselines import smoothnet, window_vaes
+from steadypose.benchmarks.baselines.filters import PEERS, Peer
 from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_clips, prepared_set, simulated_clips
-from steadypose.benchmarks.peers import smoothnet, window_vaes
-from steadypose.benchmarks.peers.filters import PEERS, Peer
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.tuning import Tuned, search
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.models.hmvae.network import MotionVAE
+from steadypose.prior.fit.hmvae_network import MotionVAE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -48,7 +48,7 @@ def correlated(truth: Floats, sigma: float, rng: np.random.Generator, memory: fl
 
 
 def spiked(seen: Floats, rng: np.random.Generator, share: float = 0.01, size: float = 0.30) -> Floats:
-    """One sighting in a hundred lies 30 cm off, in any direction."""
+    """One observation in a hundred lies 30 cm off, in any direction."""
     direction = rng.normal(size=seen.shape)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     hit = rng.random(seen.shape[:-1]) < share

@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.benchmarks.bench import Bench, Result
-from steadypose.benchmarks.protocols import PROTOCOLS, SENSORS
 from steadypose.benchmarks.provenance import require_committed
-from steadypose.benchmarks.results import RESULTS, save, show
+from steadypose.benchmarks.results import RESULTS, log_reading, save, show
+from steadypose.benchmarks.studies import PROTOCOLS, SENSORS
 from steadypose.nodes.graph.threads import one_thread
 
 
@@ -33,8 +33,10 @@ def evaluate(protocol: str, *, split: str, quick: bool, mocap: Path | None, data
             if name in SENSORS and (mocap is None or not (mocap / SENSORS[name]).is_file()):
                 console.print(f"{name}: left out, it needs {SENSORS[name]} (--mocap)", highlight=False)
                 continue
+            if split == "test" and name not in SENSORS and data.is_file():
+                log_reading(name)
             started = time.perf_counter()
-            module = importlib.import_module(f"steadypose.benchmarks.protocols.{name}")
+            module = importlib.import_module(f"steadypose.benchmarks.studies.{name}")
             result: Result = module.run(bench)
             seconds = time.perf_counter() - started
             for task in progress.task_ids:

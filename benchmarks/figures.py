@@ -17,6 +17,7 @@ COLOURS = {
     "held beside the body": "#d8b5a5",
     "Gaussian + Hampel": "#b279a2",
     "bank of smoothers": "#1f6f5c",
+    "whole-body bank": "#0b3d91",
     "Butterworth, offline": "#9d755d",
     "SmoothNet-style": "#f58518",
     "ridge regression": "#eeca3b",

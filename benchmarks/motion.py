@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from steadypose.prior.motion.dataset import MotionSet
 from steadypose.prior.sim.motion import Motion
 from steadypose.prior.sim.scripts import SCRIPTS
 from steadypose.prior.timing.rate import FPS
+from steadypose.training.data.dataset import MotionSet
 
 Floats = NDArray[np.float64]
 
@@ -31,6 +31,8 @@ class MotionClips:
         offsets: (C, 22, 3) metres, each person's bones.
         contacts: (T, C, 8) of `CONTACT_JOINTS`.
         source: what these are, for the results file.
+        person: (C,) who moves (`benchmarks.intervals` makes means over people).
+        data_set: (C,) where each is from: tables have a column for each, before their mean.
     """
 
     positions: Floats
@@ -38,6 +40,8 @@ class MotionClips:
     offsets: Floats
     contacts: NDArray[np.bool_]
     source: dict[str, Any]
+    person: NDArray[np.str_]
+    data_set: NDArray[np.str_]
 
     @property
     def stamps_s(self) -> Floats:
@@ -49,9 +53,11 @@ class MotionClips:
         return self._take(np.arange(0, len(self.offsets), step))
 
     def farthest(self, count: int) -> MotionClips:
-        """The clips in which the pelvis travels the longest paths over the floor."""
+        """So many clips in which the pelvis travels the longest paths over the floor, as many of each person."""
         paths = np.linalg.norm(np.diff(self.positions[:, :, 0, :2], axis=0), axis=-1).sum(axis=0)
-        return self._take(np.sort(np.argsort(-paths, kind="stable")[:count]))
+        order = np.argsort(-paths, kind="stable")
+        taken = [order[self.person[order] == who][:share] for who, share in even_shares(self.person, count).items()]
+        return self._take(np.sort(np.concatenate(taken)))
 
     def _take(self, clips: NDArray[np.intp]) -> MotionClips:
         return replace(
@@ -60,32 +66,52 @@ class MotionClips:
             rotations=self.rotations[:, clips],
             offsets=self.offsets[clips],
             contacts=self.contacts[:, clips],
+            person=self.person[clips],
+            data_set=self.data_set[clips],
         )
 
 
 def prepared_clips(path: Path, split: str, frames: int, most: int) -> MotionClips:
-    """Clips that do not overlap, at most ``most`` of them, from ``prepared.npz``: as many of each source, where it has
-    them, spread evenly over it."""
+    """Clips that do not overlap, at most ``most`` of them, from ``prepared.npz``: as many of each person, where there
+    are as many, spread evenly over what there is of them."""
     motion = prepared_set(path, split)
     rows = motion.all_windows(frames, frames)
-    rows = rows[spread(motion.source[np.searchsorted(motion.clip_start, rows[:, 0], side="right") - 1], most)].T
+    clip = np.searchsorted(motion.clip_start, rows[:, 0], side="right") - 1
+    taken = spread(motion.person[clip], most)
+    rows, clip = rows[taken].T, clip[taken]
+    person = motion.person[clip]
     return MotionClips(
         positions=motion.positions[rows].numpy().astype(np.float64),
         rotations=motion.rotations[rows].numpy().astype(np.float64),
         offsets=motion.offsets[rows[0]].numpy().astype(np.float64),
         contacts=motion.contacts[rows].numpy().astype(bool),
-        source={"file": path.name, "sha256": digest(path), "split": split, "clips": rows.shape[1], "frames": frames},
-    )
+        source={
+            "file": path.name, "sha256": digest(path), "split": split, "clips": rows.shape[1], "frames": frames,
+            "people": {str(who): int((person == who).sum()) for who in np.unique(person)},
+        },
+        person=person,
+        data_set=motion.source[clip],
+    )  # fmt: skip
 
 
-def spread(sources: NDArray[np.str_], most: int) -> NDArray[np.intp]:
-    """Which of (N,) to take, in order: at most so many, as many of each source as it has of an even share."""
-    groups = sorted((np.flatnonzero(sources == source) for source in np.unique(sources)), key=len)
-    taken: list[NDArray[np.intp]] = []
-    for number, group in enumerate(groups):
-        share = (most - sum(map(len, taken))) // (len(groups) - number)
-        taken.append(group[np.unique(np.linspace(0, len(group) - 1, min(share, len(group))).round().astype(int))])
+def spread(people: NDArray[np.str_], most: int) -> NDArray[np.intp]:
+    """Which of (N,) to take, in order: at most so many, as many of each person as there are of an even share, evenly
+    over what there is of them."""
+    taken = []
+    for person, share in even_shares(people, most).items():
+        own = np.flatnonzero(people == person)
+        taken.append(own[np.unique(np.linspace(0, len(own) - 1, share).round().astype(int))])
     return np.sort(np.concatenate(taken))
+
+
+def even_shares(people: NDArray[np.str_], most: int) -> dict[str, int]:
+    """How many of each person to take of ``most``: where one has fewer than an even share, the others get the rest."""
+    names, counts = np.unique(people, return_counts=True)
+    shares: dict[str, int] = {}
+    for place in np.argsort(counts, kind="stable"):
+        even = (most - sum(shares.values())) // (len(names) - len(shares))
+        shares[str(names[place])] = min(even, int(counts[place]))
+    return shares
 
 
 @lru_cache(maxsize=3)
@@ -120,23 +146,25 @@ def digest(path: Path) -> str:
 def simulated_clips(frames: int, most: int, seed: int) -> MotionClips:
     """The same of people of the project's own generator, for machines without prepared motion."""
     parts = []
-    for motion in _people(seed):
+    for number, motion in enumerate(_people(seed)):
         step = round(1 / (motion.times[1] - motion.times[0]) / FPS)
         count = len(motion.times) // (step * frames)
         kept = slice(0, count * step * frames, step)
         for k in range(count):
             rows = slice(k * frames, (k + 1) * frames)
             parts.append((motion.positions[kept][rows], motion.rotations[kept][rows], motion.offsets,
-                          motion.contacts[kept][rows]))  # fmt: skip
+                          motion.contacts[kept][rows], f"simulated {number}"))  # fmt: skip
         if len(parts) >= most:
             break
-    positions, rotations, offsets, contacts = zip(*parts[:most], strict=True)
+    positions, rotations, offsets, contacts, people = zip(*parts[:most], strict=True)
     return MotionClips(
         positions=np.stack(positions, axis=1),
         rotations=np.stack(rotations, axis=1),
         offsets=np.stack(offsets),
         contacts=np.stack(contacts, axis=1),
         source={"simulated people": True, "seed": seed, "clips": len(positions), "frames": frames},
+        person=np.array(people),
+        data_set=np.full(len(people), "simulated"),
     )
 
 

@@ -9,11 +9,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.benchmarks.peers.filters import missing
+from steadypose.benchmarks.baselines.filters import missing
 from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
 from steadypose.prior.clean.denoise import DenoiseSettings
 from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.impute import ImputeSettings
+from steadypose.prior.clean.orient import OrientSettings
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.refine import RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
@@ -29,6 +30,7 @@ OURS: Mapping[str, PriorSettings] = {
         impute=ImputeSettings(enabled=False),
         refine=RefineSettings(enabled=True),
         fuse=FuseSettings(enabled=False),
+        orient=OrientSettings(enabled=False),
     ),
     "steadypose": PriorSettings(),
 }
@@ -51,6 +53,7 @@ class Cleaned:
         sigma: (T', C, 22) metres, the standard deviation stated, along an axis.
         anomaly: (T', C) score, NaN where there was no estimate.
         flagged: (T', C) whether it was flagged as an anomaly.
+        rotations: (T', C, 22, 4) local, xyzw.
     """
 
     stamps_s: Floats
@@ -58,6 +61,7 @@ class Cleaned:
     sigma: Floats
     anomaly: Floats
     flagged: NDArray[np.bool_]
+    rotations: Floats
 
 
 @lru_cache(maxsize=64)
@@ -92,6 +96,7 @@ def run(settings: PriorSettings, seen: Floats, stamps_s: Floats, delay: int, ske
     sigma = np.full(positions.shape[:-1], np.inf)
     anomaly = np.full(sigma.shape[:-1], np.nan)
     flagged = np.zeros(anomaly.shape, dtype=bool)
+    rotations = np.full((*sigma.shape, 4), np.nan)
     for number, messages in enumerate(parts):
         for message in messages:
             row = np.searchsorted(grid, message.stamp_ns)
@@ -99,7 +104,8 @@ def run(settings: PriorSettings, seen: Floats, stamps_s: Floats, delay: int, ske
                 clip = number * SIDE_BY_SIDE + body.id
                 positions[row, clip], sigma[row, clip] = body.positions, body.sigma
                 anomaly[row, clip], flagged[row, clip] = body.anomaly, body.anomaly_flag
-    return Cleaned(grid * 1e-9, positions, sigma, anomaly, flagged)
+                rotations[row, clip] = body.rotations
+    return Cleaned(grid * 1e-9, positions, sigma, anomaly, flagged, rotations)
 
 
 def stream(

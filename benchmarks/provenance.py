@@ -1,25 +1,29 @@
-"""What a result depends on, so that none outlives it: weights and default settings, as digests."""
+"""What a result depends on, so that none outlives it: weights, default settings and code, as digests."""
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from steadypose import PACKAGE
 from steadypose.benchmarks.machine import uncommitted
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.models.weights_io import WEIGHTS
-from steadypose.prior.offline.solve import FitSettings
-from steadypose.prior.world.pipeline import TrajectorySettings
+from steadypose.prior.events.settings import EventSettings
+from steadypose.prior.fit.solve import FitSettings
+from steadypose.prior.models.weights import WEIGHTS
+from steadypose.prior.world.settings import TrajectorySettings
 
 RESULTS = Path(__file__).parent / "results"
 """Where the results lie that the README's tables are written from."""
 
-CLEAN = ("mixture weights", "occlusion weights", "hgvae weights", "prior settings")
+CLEAN = ("mixture weights", "occlusion weights", "hgvae weights", "posture weights", "prior settings")
 """What `pose/clean` depends on with default settings, of what `ships`."""
 
 VARIANTS = (*CLEAN, "hmvae weights")
@@ -53,6 +57,7 @@ def ships() -> dict[str, str]:
            for model, paths in weights.items()},
         **dict(_settings("prior", PriorSettings())),
         **dict(_settings("trajectory", TrajectorySettings())),
+        **dict(_settings("events", EventSettings())),
         **dict(_settings("offline", FitSettings())),
     }  # fmt: skip
 
@@ -72,15 +77,52 @@ def _digest(*parts: bytes) -> str:
     return digest.hexdigest()[:16]
 
 
-def stale(result: Mapping[str, Any]) -> list[str]:
-    """What has changed since a result was measured, of what `ships`; nothing where it holds.
+def code() -> dict[str, str]:
+    """Digest of every module of this project that is imported now, by name, such as ``prior.clean.fuse``."""
+    files = {name: getattr(module, "__file__", None) for name, module in sys.modules.items()}
+    ours = {name.removeprefix("steadypose."): file for name, file in files.items() if name.startswith("steadypose.")}
+    return {name: digest for name, file in sorted(ours.items()) if file and (digest := code_digest(Path(file)))}
 
-    A result's ``measured`` has the digests of that time; one that depends on nothing has none in it.
+
+@cache
+def code_digest(path: Path) -> str:
+    """Of a module's statements, without comments and docstrings, which change no figure; empty if it is not there."""
+    if not path.is_file():
+        return ""
+    tree = ast.parse(path.read_bytes())
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            node.body = [part for part in body if not _is_text(part)]  # type: ignore[attr-defined]
+    return _digest(ast.dump(tree).encode())
+
+
+def _is_text(node: ast.AST) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+
+
+def stale(result: Mapping[str, Any]) -> list[str]:
+    """What has changed since a result was measured; nothing where it holds.
+
+    A result's ``measured`` has the digests of what `ships`, and its ``code`` those of the modules that ran. Results of
+    before 2026-11-23 have no ``code``.
     """
     measured = result.get("measured")
     if measured is None:
         return ["weights", "settings"]
-    return [part for part, digest in measured.items() if ships().get(part) != digest]
+    changed = [part for part, digest in measured.items() if ships().get(part) != digest]
+    if "code" not in result:
+        return [*changed, "code (not recorded)"]
+    modules = [name for name, digest in result["code"].items() if code_digest(_file_of(name)) != digest]
+    if modules:
+        changed.append(f"code ({', '.join(modules[:3])}{', ...' * (len(modules) > 3)})")
+    return changed
+
+
+def _file_of(module: str) -> Path:
+    path = PACKAGE.joinpath(*module.split("."))
+    file = path.with_suffix(".py")
+    return file if file.is_file() else path / "__init__.py"
 
 
 def require_committed(directory: Path) -> None:

@@ -1,7 +1,8 @@
-"""Writes the tables of the last results into the README, between markers.
+"""Writes what was measured where people read it: tables between the README's markers, and all of them on one page.
 
-Where a line reads ``<!-- results:NAME -->``, the text up to ``<!-- /results -->`` is replaced by table NAME of
-``benchmarks/results/*.json``. A table that was measured with other weights or settings than those that ship is refused.
+Where the README reads ``<!-- results:NAME -->``, the text up to ``<!-- /results -->`` is replaced by table NAME of
+``benchmarks/results/*.json``. A table that was measured with other weights, settings or code than those of today is
+refused, unless `stale.STALE` lists it with a reason; it is then marked.
 """
 
 from __future__ import annotations
@@ -18,24 +19,35 @@ from rich.console import Console
 from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.provenance import stale
 from steadypose.benchmarks.results import RESULTS, load
+from steadypose.benchmarks.stale import STALE
 
 _BLOCK = re.compile(r"(<!-- results:(?P<name>[\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
 
 
+HOW = """# Results
+
+Every table of `benchmarks/results/*.json`, written by `python -m steadypose.benchmarks.report`. Under each stand the
+command that makes it, the machine, the commit and the day. *Stale* marks what was measured with other weights, settings
+or code than those of today. Positions are in millimetres, accelerations in mm/frame² at 30 Hz; a delay is in frames of
+30 Hz. Baselines are tuned on every third of the clips that are scored, with other noise; steadypose runs as it ships
+and has nothing to tune.
+"""
+
+
 @dataclass(frozen=True)
 class Args:
-    """Write the measured tables into a Markdown file."""
+    """Write the measured tables into the README and docs/results.md."""
 
-    file: Path = ROOT / "README.md"
+    readme: Path = ROOT / "README.md"
     """holds the markers"""
+    page: Path = ROOT / "docs" / "results.md"
+    """is written anew"""
     results: Path = RESULTS
     """holds the JSON files"""
-    stale: bool = False
-    """write stale tables too, and say of each that it is"""
 
 
 class StaleError(ValueError):
-    """A table was measured with what no longer ships; the message says which, and how to make them anew."""
+    """A table was measured with what is no longer there; the message says which, and how to make them anew."""
 
 
 def markdown(table: Mapping[str, Any], result: Mapping[str, Any]) -> str:
@@ -51,20 +63,24 @@ def markdown(table: Mapping[str, Any], result: Mapping[str, Any]) -> str:
     return "\n".join([*lines, "", f"<sub>`{command}` · {source}</sub>", ""])
 
 
-def fill(text: str, results: Mapping[str, Mapping[str, Any]], allow_stale: bool = False) -> str:
+def fill(text: str, results: Mapping[str, Mapping[str, Any]], excuses: Mapping[str, str] = STALE) -> str:
     """The text with every block between markers replaced.
 
     Raises:
         KeyError: a marker names a table that no result holds.
-        StaleError: one of them holds no longer, and that is not allowed.
+        StaleError: one of them is stale, without an excuse.
     """
     tables = {t["name"]: markdown(t, r) for r in results.values() for t in r["tables"]}
     wanted = {match["name"] for match in _BLOCK.finditer(text)}
-    old = [r for r in results.values() if stale(r) and wanted & {t["name"] for t in r["tables"]}]
-    if old and not allow_stale:
+    old = [
+        r
+        for name, r in results.items()
+        if name not in excuses and wanted & {t["name"] for t in r["tables"]} and stale(r)
+    ]
+    if old:
         raise StaleError(
-            "measured with other weights or settings than those that ship; run again, or pass --stale to have them "
-            "marked:\n" + "\n".join(f"  {r['command']}  ({', '.join(stale(r))})" for r in old)
+            "measured with other weights, settings or code than today's; run again, or list in stale.py:\n"
+            + "\n".join(f"  {r['command']}  ({', '.join(stale(r))})" for r in old)
         )
 
     def block(match: re.Match[str]) -> str:
@@ -76,13 +92,24 @@ def fill(text: str, results: Mapping[str, Mapping[str, Any]], allow_stale: bool 
     return _BLOCK.sub(block, text)
 
 
+def page(results: Mapping[str, Mapping[str, Any]]) -> str:
+    """All tables, by benchmark."""
+    parts = [HOW]
+    for name, result in results.items():
+        parts.append(f"\n## {name.replace('_', ' ').capitalize()}\n")
+        parts += [f"\n{markdown(table, result)}" for table in result["tables"]]
+    return "".join(parts)
+
+
 def main(args: Args) -> None:
-    """Rewrite the file in place."""
+    """Rewrite both files in place."""
+    results = load(args.results)
     try:
-        args.file.write_text(fill(args.file.read_text(), load(args.results), args.stale))
+        args.readme.write_text(fill(args.readme.read_text(), results))
     except StaleError as error:
         raise SystemExit(str(error)) from error
-    Console().print(f"wrote the tables of {args.file}")
+    args.page.write_text(page(results))
+    Console().print(f"wrote the tables of {args.readme} and {args.page}")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import shlex
@@ -14,15 +15,19 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from steadypose.benchmarks.machine import ROOT, describe
-from steadypose.benchmarks.provenance import RESULTS, require_committed, ships
+from steadypose.benchmarks.provenance import RESULTS, code, require_committed, ships
+
+READINGS = RESULTS / "test-readings.csv"
+"""Every time that the test split was scored. A split that is read often is one that things are chosen by: who changes
+something after a reading writes what into the last column."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the README. The first column is text, the others figures.
+    """A table of a result. The first column is text, the others figures.
 
     Attributes:
-        name: of the README's markers.
+        name: of the markers that it is written between.
         title: what is measured, with units.
         columns: headers.
         rows: cells, ready to print.
@@ -60,7 +65,7 @@ def save(
     Args:
         name: of the benchmark.
         arguments: of the command; folders are cut to their last part.
-        tables: for the README.
+        tables: for people.
         data: figures; JSON types.
         depends_on: names of `ships`: when one of them changes, the figures are stale.
         directory: where to.
@@ -75,7 +80,7 @@ def save(
     )
     path = directory / f"{name}.json"
     content = {"benchmark": name, "command": command, "machine": describe()}
-    content["measured"] = {part: ships()[part] for part in depends_on}
+    content |= {"measured": {part: ships()[part] for part in depends_on}, "code": code()}
     content |= {"tables": [asdict(t) for t in tables], **data}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(_nan_to_null(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
@@ -84,7 +89,23 @@ def save(
 
 def load(directory: Path = RESULTS) -> dict[str, dict[str, Any]]:
     """All results by the benchmark's name."""
-    return {path.stem: json.loads(path.read_text()) for path in sorted(directory.glob("*.json"))}
+    return {
+        path.stem: json.loads(path.read_text())
+        for path in sorted(directory.glob("*.json"))
+        if path.name != "stale.json"
+    }
+
+
+def log_reading(study: str) -> None:
+    """Append a line to `READINGS`: the test split is about to be scored by this study, whatever becomes of it."""
+    machine = describe()
+    READINGS.parent.mkdir(parents=True, exist_ok=True)
+    new = not READINGS.is_file()
+    with READINGS.open("a", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        if new:
+            writer.writerow(["date", "commit", "study", "what followed"])
+        writer.writerow([machine["date"], machine["commit"], study, ""])
 
 
 def _nan_to_null(value: Any) -> Any:

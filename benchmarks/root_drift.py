@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
-from steadypose.prior.models.root_velocity.config import FRAME_S
-from steadypose.prior.world.body_track import FEET
-from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.prior.models.root_velocity import FRAME_S
+from steadypose.prior.world.observe import FEET
+from steadypose.prior.world.pipeline import TrajectoryPipeline
+from steadypose.prior.world.settings import TrajectorySettings
 
 Floats = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -31,35 +31,49 @@ class Running(NamedTuple):
     Attributes:
         messages: what they publish, ``pose/world`` and ``diagnostics``, with its topic, as it comes; ends when a node
             fails, or all fall silent.
+        subscriber: where ``messages`` come from, for who does not want to wait for them.
         supervisor: of their processes.
         clock: theirs.
     """
 
     messages: Iterator[tuple[str, Message]]
+    subscriber: Subscriber
     supervisor: Supervisor
     clock: SystemClock
 
 
 @contextmanager
 def running(
-    recording: Path, *, lossless: bool, rate: float = 1.0, loop: bool = False, record: Path | None = None
+    recording: Path,
+    *,
+    lossless: bool,
+    rate: float = 1.0,
+    loop: bool = False,
+    record: Path | None = None,
+    settings: Sequence[str] = (),
 ) -> Iterator[Running]:
     """The node processes at work on a recording, with a recorder where there is a place to ``record`` to."""
-    nodes = [*POSE_NODES, "recorder"] if record else [*POSE_NODES]
+    played = [
+        f"input.recording={json.dumps(str(recording))}",
+        f"input.rate={rate}",
+        f"input.loop={json.dumps(loop)}",
+        f"transport.lossless={json.dumps(lossless)}",
+        *settings,
+    ]
+    if record:  # as on a machine that runs for months: parts, of which the oldest go
+        limits = {"directory": str(record), "split_mb": 50.0, "keep_mb": 200.0}
+        played += [f"recorder.{name}={json.dumps(value)}" for name, value in limits.items()]
+    with running_nodes([*POSE_NODES, "recorder"] if record else [*POSE_NODES], played) as nodes:
+        yield nodes
+
+
+@contextmanager
+def running_nodes(nodes: Sequence[str], settings: Sequence[str]) -> Iterator[Running]:
+    """The processes of these nodes, with these settings over those of ``launch/replay.toml``."""
     console = Console(stderr=True)
     clock = SystemClock()
     with tempfile.TemporaryDirectory(prefix="steadypose-") as folder:
-        settings = [
-            f"nodes={json.dumps(nodes)}",
-            f"input.recording={json.dumps(str(recording))}",
-            f"input.rate={rate}",
-            f"input.loop={json.dumps(loop)}",
-            f"transport.directory={json.dumps(folder)}",
-            f"transport.lossless={json.dumps(lossless)}",
-        ]
-        if record:  # as on a machine that runs for months: parts, of which the oldest go
-            limits = {"directory": str(record), "split_mb": 50.0, "keep_mb": 200.0}
-            settings += [f"recorder.{name}={json.dumps(value)}" for name, value in limits.items()]
+        settings = [*settings, f"nodes={json.dumps(list(nodes))}", f"transport.directory={json.dumps(folder)}"]
         arguments = ["--launch", "replay", *(word for setting in settings for word in ("--set", setting))]
         transport = Launch.read("replay", settings).transport
         endpoints = [transport.endpoint(name) for name in nodes]
@@ -67,7 +81,7 @@ def running(
             Subscriber(endpoints, [POSE_WORLD, DIAGNOSTICS]) as subscriber,
             Supervisor(nodes, arguments, clock, lambda line: console.print(line, markup=False)) as supervisor,
         ):
-            yield Running(_received(subscriber, supervisor), supervisor, clock)
+            yield Running(_received(subscriber, supervisor), subscriber, supervisor, clock)
 
 
 def _received(subscriber: Subscriber, supervisor: Supervisor) -> Iterator[tuple[str, Message]]:

@@ -18,10 +18,15 @@ from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.types import (
     CleanBody,
     Diagnostics,
+    Event,
+    EventKind,
+    Hand,
     Level,
     Message,
+    Phase,
     Pose,
     PoseClean,
+    PoseEvents,
     PoseRaw,
     PoseWorld,
     RawBody,
@@ -117,10 +122,10 @@ def _header_to_wire(stamp_ns: int, frame_id: str) -> Any:
     return _ros("std_msgs/msg/Header")(time, frame_id)
 
 
-def _stamp_from_wire(header: Any) -> int:
-    if header.stamp.nanosec >= 10**9:
-        raise ValueError(f"header.stamp.nanosec: expected under 1000000000, got {header.stamp.nanosec}")
-    return header.stamp.sec * 10**9 + header.stamp.nanosec
+def _ns_from_wire(time: Any) -> int:
+    if time.nanosec >= 10**9:
+        raise ValueError(f"stamp.nanosec: expected under 1000000000, got {time.nanosec}")
+    return time.sec * 10**9 + time.nanosec
 
 
 def _pose_to_wire(position: NDArray[Any], orientation: NDArray[Any]) -> Any:
@@ -153,7 +158,7 @@ def _raw_to_wire(m: PoseRaw) -> Any:
 
 def _raw_from_wire(w: Any) -> PoseRaw:
     return PoseRaw(
-        stamp_ns=_stamp_from_wire(w.header),
+        stamp_ns=_ns_from_wire(w.header.stamp),
         frame_id=w.header.frame_id,
         source=w.source,
         skeleton=w.skeleton,
@@ -194,7 +199,7 @@ def _clean_to_wire(m: PoseClean) -> Any:
 
 def _clean_from_wire(w: Any) -> PoseClean:
     return PoseClean(
-        stamp_ns=_stamp_from_wire(w.header),
+        stamp_ns=_ns_from_wire(w.header.stamp),
         frame_id=w.header.frame_id,
         source=w.source,
         sensor_pose=Pose(_position_from_wire(w.sensor_pose), _orientation_from_wire(w.sensor_pose)),
@@ -248,7 +253,7 @@ def _world_to_wire(m: PoseWorld) -> Any:
 
 def _world_from_wire(w: Any) -> PoseWorld:
     return PoseWorld(
-        stamp_ns=_stamp_from_wire(w.header),
+        stamp_ns=_ns_from_wire(w.header.stamp),
         frame_id=w.header.frame_id,
         source=w.source,
         ground_plane=_own(w.ground_plane, -1),
@@ -272,6 +277,49 @@ def _world_from_wire(w: Any) -> PoseWorld:
     )
 
 
+def _events_to_wire(m: PoseEvents) -> Any:
+    event, vector = _ros("steadypose_msgs/msg/Event"), _ros("geometry_msgs/msg/Vector3")
+    time = _ros("builtin_interfaces/msg/Time")
+    return _ros("steadypose_msgs/msg/PoseEvents")(
+        header=_header_to_wire(m.stamp_ns, m.frame_id),
+        source=m.source,
+        events=[
+            event(
+                body=e.body,
+                kind=int(e.kind),
+                phase=int(e.phase),
+                hand=int(e.hand),
+                confidence=e.confidence,
+                direction=vector(*e.direction.tolist()),
+                since=time(*divmod(e.since_ns, 10**9)),
+            )
+            for e in m.events
+        ],
+        end_of_stream=m.end_of_stream,
+    )
+
+
+def _events_from_wire(w: Any) -> PoseEvents:
+    return PoseEvents(
+        stamp_ns=_ns_from_wire(w.header.stamp),
+        frame_id=w.header.frame_id,
+        source=w.source,
+        events=[
+            Event(
+                body=e.body,
+                kind=EventKind(e.kind),
+                phase=Phase(e.phase),
+                hand=Hand(e.hand),
+                confidence=e.confidence,
+                direction=np.array([e.direction.x, e.direction.y, e.direction.z]),
+                since_ns=_ns_from_wire(e.since),
+            )
+            for e in w.events
+        ],
+        end_of_stream=w.end_of_stream,
+    )
+
+
 def _diagnostics_to_wire(m: Diagnostics) -> Any:
     pair = _ros("diagnostic_msgs/msg/KeyValue")
     status = _ros("diagnostic_msgs/msg/DiagnosticStatus")(
@@ -289,7 +337,7 @@ def _diagnostics_from_wire(w: Any) -> Diagnostics:
         raise ValueError(f"status: expected one, got {len(w.status)}")
     status = w.status[0]
     return Diagnostics(
-        stamp_ns=_stamp_from_wire(w.header),
+        stamp_ns=_ns_from_wire(w.header.stamp),
         node=status.name,
         level=Level(status.level),
         message=status.message,
@@ -307,5 +355,6 @@ _CODECS: dict[type[Message], _Codec] = {
     PoseRaw: _Codec("steadypose_msgs/msg/PoseRaw", _raw_to_wire, _raw_from_wire),
     PoseClean: _Codec("steadypose_msgs/msg/PoseClean", _clean_to_wire, _clean_from_wire),
     PoseWorld: _Codec("steadypose_msgs/msg/PoseWorld", _world_to_wire, _world_from_wire),
+    PoseEvents: _Codec("steadypose_msgs/msg/PoseEvents", _events_to_wire, _events_from_wire),
     Diagnostics: _Codec("diagnostic_msgs/msg/DiagnosticArray", _diagnostics_to_wire, _diagnostics_from_wire),
 }

@@ -8,12 +8,16 @@ A directory of keys holds
 - `server.key`: public key of the publishers to subscribe to; without it they are this machine's own;
 - `servers/HOST.key`: public keys of publishers that each have their own, by host as in their addresses; then those on
   other hosts are not subscribed to.
+
+On this machine an ipc address is private to its user by its directory. A tcp address is not: there a pair of keys that
+only this user can read (`loopback_keys`) keeps other users out.
 """
 
 from __future__ import annotations
 
 import os
 import stat
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -21,8 +25,10 @@ from pathlib import Path
 
 from zmq.auth import create_certificates, load_certificate
 
-from steadypose.msgs.addresses import is_local, parse
+from steadypose.msgs.addresses import TransportError, is_local, local_directory, make_private, parse
 
+MADE_S = 2.0
+"""that another process may take to make the keys of this user"""
 _OWN = "own"
 
 
@@ -127,6 +133,9 @@ def load_keys(directory: str | Path) -> Keys:
         raise ValueError(f"{secret_file}: no such file; make keys with `steadypose keys {directory}`")
     if secret_file.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise ValueError(f"{secret_file} is open to others: run `chmod 600 {secret_file}`, or make new keys")
+    for folder in (directory, directory / "clients", directory / "servers"):
+        if folder.is_dir():
+            _check_folder(folder)
     public, secret = load_certificate(secret_file)
     if secret is None:
         raise ValueError(f"{secret_file}: expected a secret key, found none; make new keys")
@@ -137,3 +146,38 @@ def load_keys(directory: str | Path) -> Keys:
             raise ValueError(f"{directory}: expected keys of 40 characters, got one of {len(key)}")
     clients = _listed(directory / "clients").values()
     return Keys(public, secret, server, frozenset({public, *clients}), _listed(directory / "servers"), directory)
+
+
+def _check_folder(folder: Path) -> None:
+    """Raises:
+    ValueError: others may write to it, and so say who may listen, and whose poses are accepted.
+    """
+    status = folder.stat()
+    others = stat.S_IWOTH if status.st_gid == os.getgid() else stat.S_IWOTH | stat.S_IWGRP
+    if status.st_uid not in (0, os.getuid()):
+        raise ValueError(f"{folder} belongs to user {status.st_uid}: expected keys of one's own; make new ones")
+    if status.st_mode & others:
+        raise ValueError(
+            f"{folder} can be written to by others, who could add keys; run `chmod go-w {folder}`, and look into it"
+        )
+
+
+def loopback_keys() -> Keys:
+    """This user's keys for tcp addresses of this machine, made at first; they last as long as the runtime directory.
+
+    Raises:
+        TransportError: they cannot be made, or others can read them.
+    """
+    directory = local_directory()
+    make_private(directory)
+    folder = directory / "loopback"
+    with suppress(ValueError):  # they are there
+        return create_keys(folder)
+    deadline = time.monotonic() + MADE_S
+    while True:
+        try:
+            return load_keys(folder)
+        except (ValueError, OSError) as error:
+            if time.monotonic() > deadline:
+                raise TransportError(f"{folder}: {error}; remove it, and others are made") from error
+        time.sleep(0.01)

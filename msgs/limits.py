@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import struct
 
-from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_TRUTH, POSE_WORLD
 
 MAX_BODIES = 128
+MAX_EVENTS = 16 * MAX_BODIES
 MAX_VALUES = 1000
 """of one node's diagnostics"""
 
@@ -16,6 +17,7 @@ _BEFORE = {
     POSE_RAW: (_HEADER + "ss" + 7 * "d" + "?", MAX_BODIES),
     POSE_CLEAN: (_HEADER + "s" + 7 * "d" + "?" + "I", MAX_BODIES),
     POSE_WORLD: (_HEADER + "s" + 4 * "d", MAX_BODIES),
+    POSE_EVENTS: (_HEADER + "s", MAX_EVENTS),
     POSE_TRUTH: (_HEADER + "s" + 4 * "d", MAX_BODIES),
     DIAGNOSTICS: (_HEADER + "I" + "B" + "sss", MAX_VALUES),
 }
@@ -23,7 +25,7 @@ _BEFORE = {
 
 def check_size(topic: str, payload: bytes | memoryview) -> None:
     """Raises:
-    ValueError: CDR of a message that holds more bodies, or values, than any is to hold. A million bytes of bodies
+    ValueError: CDR of a message that holds more bodies, events or values than any is to hold. A million bytes of bodies
         without joints would take seconds to decode, in which nobody else is heard.
     """
     before, most = _BEFORE[topic]
@@ -43,4 +45,4 @@ def check_size(topic: str, payload: bytes | memoryview) -> None:
     except struct.error:
         return  # too short, which decoding says better
     if count > most:
-        raise ValueError(f"expected at most {most} bodies or values, got {count}")
+        raise ValueError(f"expected at most {most} bodies, events or values, got {count}")

@@ -2,8 +2,9 @@
 
 The index at the end of a file is used if its checksum is right. Otherwise, as after the writer was killed, the file is
 scanned from its beginning; where bytes are no record, the scan goes on at the next that look like a chunk. A
-chunk whose checksum does not hold is left out and counted; all others are read. What a chunk may become when it is
-decompressed has a limit, so that a small file cannot fill the memory.
+chunk whose checksum does not hold is left out and counted; all others are read. What a chunk, and all chunks of a file,
+may become when they are decompressed has a limit, and so has the number of records in a chunk, so that a small file
+can neither fill the memory nor keep the processor busy.
 """
 
 from __future__ import annotations
@@ -30,6 +31,10 @@ MAX_CHUNK = 2**26
 MAX_RATIO = 250
 """a chunk's size decompressed by its size in the file, above `RATIO_FROM`; skeletons come to a hundred at most"""
 RATIO_FROM = 2**20
+FILE_RATIO_FROM = 2**24
+"""bytes that the chunks of a file may come to, however small it is; above, `MAX_RATIO` times its size"""
+MIN_RECORD = 31
+"""bytes of a message without content: more records than fit into a chunk at this size are none that anybody wrote"""
 
 BROKEN = (
     McapError,
@@ -105,6 +110,7 @@ class McapFile:
         self.places: list[Place] = []
         self.complete = True
         self._lost: dict[int, int] = {}
+        self._left = 0  # bytes that may still be decompressed while the file is gone through
         try:
             indexed = self._read_index()
         except BROKEN:
@@ -135,6 +141,7 @@ class McapFile:
 
     def messages(self, topics: Container[str], start_ns: int | None = None) -> Iterator[Logged]:
         """The messages on ``topics``, as the file calls them, from ``start_ns`` on, by log time, then as written."""
+        self._left = self._budget
         wanted = {channel.id for channel in self.channels.values() if channel.topic in topics}
         waiting: list[tuple[int, int, int, Channel, bytes | memoryview]] = []
         for place in sorted(self.places, key=lambda place: (place.start_ns, place.offset)):
@@ -157,6 +164,10 @@ class McapFile:
         while waiting:
             log_ns, _, _, channel, data = heapq.heappop(waiting)
             yield Logged(log_ns, channel, data)
+
+    @property
+    def _budget(self) -> int:
+        return max(FILE_RATIO_FROM, MAX_RATIO * self._size)
 
     def _lose(self, offset: int, length: int) -> None:
         self._lost[offset] = length
@@ -188,9 +199,13 @@ class McapFile:
         if opcode != Opcode.CHUNK:
             yield opcode, memoryview(body)
             return
-        data = memoryview(_decompressed(body))
-        at = 0
+        data = memoryview(_decompressed(body, self._left))
+        self._left -= len(data)
+        at = records = 0
         while at < len(data):
+            records += 1
+            if records > 100 + at // MIN_RECORD:
+                raise ValueError(f"{records} records in {at} bytes of a chunk")
             inner, length = _RECORD.unpack_from(data, at)
             at += _RECORD.size
             if at + length > len(data):
@@ -233,6 +248,7 @@ class McapFile:
     def _scan(self) -> None:
         """Go through the file from its beginning for whatever can be read."""
         self.complete = False
+        self._left = self._budget
         found: list[tuple[Place, Counter[int]]] = []
         at = len(_MAGIC)
         while at < self._size and not self.complete:
@@ -310,8 +326,12 @@ def _parse(kind: type[_Record], body: bytes | memoryview) -> _Record:
     return record
 
 
-def _decompressed(body: bytes) -> bytes | memoryview:
+def _decompressed(body: bytes, most: int) -> bytes | memoryview:
     """What is in a chunk, if its checksum holds.
+
+    Args:
+        body: of its record.
+        most: bytes that it may come to, if that is less than `MAX_CHUNK`.
 
     Raises:
         BROKEN: it does not, or it would be larger than a chunk may be.
@@ -323,7 +343,7 @@ def _decompressed(body: bytes) -> bytes | memoryview:
     packed = memoryview(body)[at + 8 :]
     if length != len(packed):
         raise ValueError("a chunk of another length than its record")
-    if size > MAX_CHUNK or size > max(RATIO_FROM, MAX_RATIO * len(packed)):
+    if size > min(MAX_CHUNK, most) or size > max(RATIO_FROM, MAX_RATIO * len(packed)):
         raise ValueError(f"a chunk of {len(packed)} bytes that becomes {size}")
     data: bytes | memoryview = packed
     if name == "zstd":

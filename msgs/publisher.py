@@ -8,17 +8,18 @@ import os
 import socket as posix
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import zmq
 
 from steadypose.msgs.addresses import TransportError, is_local, make_private, parse, refuse_used
 from steadypose.msgs.codec import encode, typestore
-from steadypose.msgs.keys import ClientList, Keys
+from steadypose.msgs.delivery import Deliveries
+from steadypose.msgs.keys import ClientList, Keys, loopback_keys
 from steadypose.msgs.limits import check_size
 from steadypose.msgs.topics import TOPICS, check_topic
 from steadypose.msgs.types import Message
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
 
 SEND_HIGH_WATER = 1000
 """messages held for each subscriber that does not keep up"""
-WINDOW = 256
-"""messages of a topic that a reliable subscriber may be behind before it is waited for; with what is sent beside them,
-below half of `SEND_HIGH_WATER`, so that ZeroMQ never drops one"""
 LINGER_MS = 1000
 """how long `Publisher.close` waits for what is on its way"""
 MAX_SUBSCRIPTIONS = 4096
@@ -42,8 +40,19 @@ MAX_NEW_SUBSCRIPTIONS = 256
 REBIND_S = 5.0
 """how long to wait for an address of our own: ZeroMQ gives it back in a thread, soon after the socket was closed"""
 
+_LOOK_S = 1.0
+"""between two looks at who is waited for"""
 _CUT = "subscriptions"
 _DOMAIN = "steadypose"
+
+
+class Resume(NamedTuple):
+    """Where a publisher ended that another one continues."""
+
+    id: int
+    """its number, uint32"""
+    sequence: Mapping[str, int]
+    """of each topic, the sequence of the first message that not all reliable subscribers had taken"""
 
 
 class Publisher:
@@ -64,13 +73,17 @@ class Publisher:
         keys: Keys | None = None,
         reliable: Collection[str] = (),
         clear_text: bool = False,
+        resume: Resume | None = None,
     ) -> None:
         """Bind `endpoint`: `ipc://` and a path, or `tcp://` and an address of this machine and a port.
 
         Args:
-            keys: whose holders may subscribe; the list is reread while this runs.
+            keys: whose holders may subscribe; the list is reread while this runs. A tcp address of this machine without
+                keys is for programs of this user alone, which find `keys.loopback_keys`.
             reliable: names of the subscribers to wait for.
-            clear_text: whether an address that others can reach may do without keys.
+            clear_text: whether a tcp address may do without keys, for whoever can reach it.
+            resume: the publisher of this address that was there before, whose messages are counted on: who has some of
+                them already takes no notice.
 
         Raises:
             TransportError: if the address is malformed, in use, or reachable from outside and `keys` is None.
@@ -81,16 +94,21 @@ class Publisher:
                 f"{endpoint} can be reached from other machines: expected keys, got none; "
                 "make them with `steadypose keys`, or bind tcp://127.0.0.1"
             )
+        if keys is None and transport == "tcp" and not clear_text:
+            keys = loopback_keys()
         typestore()
         self.refused: Counter[str] = Counter()
-        self._keys, self._reliable = keys, frozenset(reliable)
+        self._keys = keys
         self._clients = ClientList(keys) if keys else None
-        self._sequence: Counter[str] = Counter()
-        self._listeners: dict[Listener, dict[str, int]] = {}  # and of each reliable topic, what it expects next
+        self._deliveries = Deliveries(reliable, resume.sequence if resume else {})
+        self._listeners: set[Listener] = set()
         self._subscriptions: set[bytes] = set()
         self._new_subscriptions: Counter[int] = Counter()
         self._new_since = time.monotonic()
-        self._id = int.from_bytes(os.urandom(4), "little")
+        self.id = resume.id if resume else int.from_bytes(os.urandom(4), "little")
+        """of the topics that a publisher of this address may resume; drawn at random"""
+        self._new_id = int.from_bytes(os.urandom(4), "little")  # what is not resumed is not to be taken for repeated
+        self._resumed = frozenset(resume.sequence) if resume else frozenset(TOPICS)
         self._context = zmq.Context()
         self._authenticator = _authenticate(self._context, self._clients) if self._clients else None
         try:
@@ -151,16 +169,44 @@ class Publisher:
             raise ValueError(f"{topic}: expected a message of at most {MAX_FRAME} bytes, got {size}")
         self._note_subscribers()
         deadline = time.monotonic() + timeout_s
-        while self._is_behind(topic):
+        while self._deliveries.waited_for(topic):
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return False
+            self._socket.poll(milliseconds(min(left, _LOOK_S)))
+            self._note_subscribers()
+        id, sequence = self._id_of(topic), self._deliveries.sequence[topic]
+        frame = topic.encode() + b"\0" + PREFIX.pack(VERSION, id, sequence, time.monotonic_ns()) + payload
+        self._socket.send(frame)
+        self._deliveries.sent(topic, frame)
+        return True
+
+    def _id_of(self, topic: str) -> int:
+        return self.id if topic in self._resumed else self._new_id
+
+    def sequence(self, topic: str) -> int:
+        """Of the next message of a topic."""
+        return self._deliveries.sequence[topic]
+
+    def waited_for(self, topic: str) -> frozenset[str]:
+        """The names of the reliable subscribers for whom the next message of a topic waits."""
+        return self._deliveries.waited_for(topic)
+
+    def silent(self, for_s: float) -> frozenset[str]:
+        """The names of reliable subscribers that have not read for so long, though there is something to read."""
+        return self._deliveries.silent(for_s)
+
+    def is_taken(self, topic: str, sequence: int, timeout_s: float = 0.0) -> bool:
+        """Whether all reliable subscribers of a topic have taken a message; waits until they have, or for so long."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._note_subscribers()
+            if self._deliveries.is_taken(topic, sequence):
+                return True
             left = deadline - time.monotonic()
             if left <= 0:
                 return False
             self._socket.poll(milliseconds(left))
-            self._note_subscribers()
-        prefix = PREFIX.pack(VERSION, self._id, self._sequence[topic], time.monotonic_ns())
-        self._socket.send(topic.encode() + b"\0" + prefix + payload)
-        self._sequence[topic] = (self._sequence[topic] + 1) % 2**32
-        return True
 
     @property
     def subscribers(self) -> frozenset[str]:
@@ -189,6 +235,7 @@ class Publisher:
             RuntimeError: keys are no longer checked, and no new subscriber is accepted: make another publisher.
             TransportError: the address was taken by another process meanwhile.
         """
+        self._note_subscribers()
         if self._authenticator and not self._authenticator.is_alive():
             raise RuntimeError("the thread that checks keys has ended; nobody is let in any more")
         if self._clients and self._clients.revoked():
@@ -201,6 +248,7 @@ class Publisher:
         self.refused[cause] += 1
         self._socket.close(0)
         self._listeners.clear()
+        self._deliveries.leave_all()
         self._subscriptions.clear()
         deadline = time.monotonic() + REBIND_S
         while True:
@@ -211,14 +259,6 @@ class Publisher:
                 if error.errno != errno.EADDRINUSE or time.monotonic() > deadline:
                     raise TransportError(f"cannot publish at {self.endpoint} again: {error.strerror}") from error
             time.sleep(0.01)
-
-    def _is_behind(self, topic: str) -> bool:
-        following = self._sequence[topic]
-        return any(
-            topic in expected and (following - expected[topic]) % 2**32 >= WINDOW
-            for listener, expected in self._listeners.items()
-            if listener.name in self._reliable
-        )
 
     def _note_subscribers(self) -> None:
         for _ in range(SEND_HIGH_WATER):  # whoever floods this is not to keep it from publishing
@@ -232,10 +272,11 @@ class Publisher:
             elif frame[:1] == b"\0":
                 self._subscriptions.discard(frame[1:])
                 if listener := read_subscription(frame[1:]):
-                    self._listeners.pop(listener, None)
+                    self._listeners.discard(listener)
+                    self._deliveries.leave(listener)
             elif taken := read_taken(frame, TOPICS):
-                if taken.publisher == self._id:
-                    self._note_taken(taken.instance, taken.topic, taken.following)
+                if taken.publisher == self._id_of(taken.topic):
+                    self._deliveries.take(taken)
             else:
                 self._note_new(received)
 
@@ -243,14 +284,9 @@ class Publisher:
         self._subscriptions.add(prefix)
         self._note_new(received)
         if listener := read_subscription(prefix):
-            self._listeners[listener] = {topic: self._sequence[topic] for topic in listener.reliable}
-
-    def _note_taken(self, instance: int, topic: str, following: int) -> None:
-        for listener, expected in self._listeners.items():
-            if listener.instance == instance and topic in expected:
-                further = (following - expected[topic]) % 2**32
-                if further <= (self._sequence[topic] - expected[topic]) % 2**32:
-                    expected[topic] = following
+            self._listeners.add(listener)
+            for frame in self._deliveries.join(listener):
+                self._socket.send(prefix + b"\0" + frame)
 
     def _note_new(self, received: zmq.Frame) -> None:
         """Count what a connection asks for, and close one that asks for too much."""

@@ -6,8 +6,9 @@ import math
 import os
 import struct
 import time
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -16,7 +17,8 @@ import zmq
 
 from steadypose.msgs.addresses import TransportError, check_private, is_local, parse
 from steadypose.msgs.codec import DecodeError, decode, typestore
-from steadypose.msgs.keys import Keys
+from steadypose.msgs.keys import Keys, loopback_keys
+from steadypose.msgs.principals import Principals
 from steadypose.msgs.publisher import KEEPALIVE, milliseconds
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.types import Diagnostics, Message
@@ -29,12 +31,13 @@ HIGH_WATER = 1000
 """messages a subscriber holds unread, unless it says otherwise"""
 MAX_RECEIVED = 2**26
 """bytes of a frame that is received at all; with one beyond, ZeroMQ ends the connection"""
-ACKNOWLEDGE = 16
-"""messages of a topic between two times that a reliable subscriber says how far it is"""
 DRIFT = 1e-4
 """of two machines' clocks against each other: more than any crystal has"""
 REVIVE_S = 0.5
 """without another attempt, a connection that was lost is given up by ZeroMQ, and made anew here"""
+
+SECOND = "second publisher"
+"""the cause of what is refused because its source is another publisher's"""
 
 _PUBLISHERS = 256
 _EVENT = struct.Struct("=HI")  # of ZeroMQ's monitor; zmq.utils.monitor, which reads it too, brings asyncio
@@ -59,11 +62,13 @@ class Subscriber:
         *,
         conflate: bool = False,
         reliable: bool = False,
+        context: int = 0,
         lifespan_s: float = math.inf,
         high_water: int = HIGH_WATER,
         keys: Keys | None = None,
         clear_text: bool = False,
         name: str = "",
+        principals: Principals | None = None,
     ) -> None:
         """Connect to `endpoints`, now or as soon as a publisher is there, and subscribe to `topics`.
 
@@ -71,12 +76,15 @@ class Subscriber:
             conflate: keep the newest message alone: for a picture or a control loop that wants the state, not the
                 history. For one topic and without a name, because ZeroMQ then keeps one message of each publisher,
                 and one subscription to it; open a subscriber for each topic.
-            reliable: miss no pose of a publisher that names this subscriber: it waits, as long as this one is behind.
+            reliable: miss no pose of a publisher that names this subscriber: it waits, as long as this one is behind,
+                and sends what one of this name before had not taken again.
+            context: messages before those to be sent again, too.
             lifespan_s: what was sent longer ago is dropped, but for news of nodes and the end of a stream: a program
                 that was stopped for a minute is not to take that minute's poses for new ones.
             high_water: messages held unread, beyond which the newest are lost; 0 holds all there is memory for.
-            keys: for publishers that have them.
-            clear_text: whether to listen to another machine without keys.
+            keys: for publishers that have them; a tcp address of this machine without any is one of this user's own.
+            clear_text: whether to listen at a tcp address without keys.
+            principals: who publishes what, where several subscribers are to agree on it.
             name: what `Publisher.subscribers` calls this subscriber; without one it is not among them.
 
         Raises:
@@ -102,13 +110,18 @@ class Subscriber:
         self.dropped: Counter[str] = Counter()
         self.late: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
+        self._principals = principals or Principals()
+        self._connection = self if len(self._endpoints) == 1 else None
         self._lifespan_ns = lifespan_s * 1e9
         self._local = all(map(is_local, self._endpoints))
         self._expected: OrderedDict[tuple[int, str], int] = OrderedDict()
         self._offsets: OrderedDict[int, tuple[int, int]] = OrderedDict()  # of each publisher's clock, and when found
         news = [topic for topic in topics if TOPICS[topic] is Diagnostics]
         waited_for = tuple(topic for topic in topics if topic not in news) if reliable else ()
-        self._listener = Listener(name, int.from_bytes(os.urandom(4), "little"), waited_for)
+        self._listener = Listener(name, int.from_bytes(os.urandom(4), "little"), waited_for, context)
+        self._for_me = self._listener.subscription() + b"\0"
+        self._untaken: deque[Taken] = deque()
+        self._taken: OrderedDict[tuple[int, str], Taken] = OrderedDict()
         self._lost: dict[str, float] = {}
         self._looked = 0.0
         self._context = zmq.Context()
@@ -121,7 +134,7 @@ class Subscriber:
         self.socket.setsockopt(zmq.LINGER, 0)
         for option, value in KEEPALIVE.items():
             self.socket.setsockopt(option, value)
-        self._keys = keys
+        self._keys, self._clear_text = keys, clear_text
         self._monitor = self.socket.get_monitor_socket(_HANDSHAKES | zmq.EVENT_DISCONNECTED | _RETRIES)
         try:
             prefixes = [topic.encode() + b"\0" for topic in topics] + ([self._listener.subscription()] if name else [])
@@ -141,14 +154,47 @@ class Subscriber:
 
     def _connect(self, endpoint: str) -> None:
         self.socket.setsockopt(zmq.IPV6, "[" in endpoint)
-        if self._keys:
-            self.socket.curve_publickey = self._keys.public
-            self.socket.curve_secretkey = self._keys.secret
-            self.socket.curve_serverkey = self._keys.server_at(endpoint)
+        keys = self._keys
+        if keys is None and not self._clear_text and parse(endpoint)[0] == "tcp":
+            keys = loopback_keys()
+        if keys:
+            self.socket.curve_publickey = keys.public
+            self.socket.curve_secretkey = keys.secret
+            self.socket.curve_serverkey = keys.server_at(endpoint)
+        else:
+            self.socket.curve_server = False  # what was set for the address before does not hold for this one
         self.socket.connect(endpoint)
 
-    def receive(self, timeout_s: float) -> tuple[str, Message] | None:
-        """The next message and its topic, or None if none came in `timeout_s`."""
+    def receive(self, timeout_s: float, *, taken: bool = True) -> tuple[str, Message] | None:
+        """The next message and its topic, or None if none came in `timeout_s`.
+
+        Args:
+            taken: whether the message counts as taken; if not, `take` says so later. Of a reliable subscriber only.
+        """
+        received = self._receive(timeout_s)
+        if taken and self._untaken:
+            self.take(len(self._untaken))
+        return received
+
+    def arrived(self, topic: str) -> int:
+        """How many messages of a topic had been published when the newest arrived, those that were lost included."""
+        return sum(following for (_, of), following in self._expected.items() if of == topic)
+
+    def take(self, number: int) -> None:
+        """Tell publishers that this reliable subscriber has done with the oldest `number` of messages, or if it is 0,
+        that it is still there."""
+        news = {(taken.publisher, taken.topic): taken for taken in (self._untaken.popleft() for _ in range(number))}
+        self._taken.update(news)
+        while len(self._taken) > _PUBLISHERS:
+            self._taken.popitem(last=False)
+        for taken in news.values() if number else self._taken.values():
+            self._tell(taken)
+
+    def _tell(self, taken: Taken) -> None:
+        with suppress(zmq.Again):  # who does not listen is told again
+            self.socket.send(taken.frame(), zmq.NOBLOCK)
+
+    def _receive(self, timeout_s: float) -> tuple[str, Message] | None:
         deadline = time.monotonic() + timeout_s
         while True:
             now = time.monotonic()
@@ -166,6 +212,7 @@ class Subscriber:
                 return received
 
     def _read(self, frame: bytes) -> tuple[str, Message] | None:
+        frame = frame.removeprefix(self._for_me)
         if len(frame) > MAX_FRAME:
             return self._refuse("too large")
         end = frame.find(b"\0")
@@ -178,16 +225,38 @@ class Subscriber:
         if version != VERSION:
             return self._refuse("version")
         if not self._count(publisher, topic, sequence):
+            if taken := self._taken.get((publisher, topic)):  # a publisher goes on where it last heard from here
+                return self._tell(taken)
             return self._refuse("repeated")
         late = self._age_ns(publisher, sent_ns) > self._lifespan_ns
         try:
             message = decode(topic, memoryview(frame)[end + 1 + PREFIX.size :])
         except DecodeError:
+            self._pass_over(Taken(self._listener.instance, publisher, (sequence + 1) % 2**32, topic))
             return self._refuse("undecodable")
+        if not isinstance(message, Diagnostics) and not self._principals.admits(
+            topic, message.source, publisher, self._connection, ended=message.end_of_stream
+        ):
+            self._pass_over(Taken(self._listener.instance, publisher, (sequence + 1) % 2**32, topic))
+            return self._refuse(SECOND)
+        if topic in self._listener.reliable:
+            self._untaken.append(Taken(self._listener.instance, publisher, (sequence + 1) % 2**32, topic))
         if late and not isinstance(message, Diagnostics) and not message.end_of_stream:
             self.late[topic] += 1
             return None
         return topic, message
+
+    def _pass_over(self, refused: Taken) -> None:
+        """Count a message that nobody will take as taken, with the one before it."""
+        if refused.topic not in self._listener.reliable:
+            return
+        for index in reversed(range(len(self._untaken))):
+            taken = self._untaken[index]
+            if (taken.publisher, taken.topic) == (refused.publisher, refused.topic):
+                self._untaken[index] = refused
+                return
+        self._taken[refused.publisher, refused.topic] = refused
+        self._tell(refused)
 
     def _count(self, publisher: int, topic: str, sequence: int) -> bool:
         """Count what is missing before `sequence`; False if it is no later than what came before."""
@@ -201,8 +270,8 @@ class Subscriber:
         self._expected.move_to_end((publisher, topic))
         if len(self._expected) > _PUBLISHERS:
             self._expected.popitem(last=False)
-        if topic in self._listener.reliable and following % ACKNOWLEDGE == 0:
-            self.socket.send(Taken(self._listener.instance, publisher, following, topic).frame())
+        if topic in self._listener.reliable and (publisher, topic) not in self._taken:
+            self._taken[publisher, topic] = Taken(self._listener.instance, publisher, sequence, topic)
         return True
 
     def _age_ns(self, publisher: int, sent_ns: int) -> int:

@@ -3,11 +3,12 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from steadypose.msgs.types import Diagnostics, Message, PoseClean, PoseRaw, PoseWorld
+from steadypose.msgs.types import Diagnostics, Message, PoseClean, PoseEvents, PoseRaw, PoseWorld
 
 POSE_RAW = "pose/raw"
 POSE_CLEAN = "pose/clean"
 POSE_WORLD = "pose/world"
+POSE_EVENTS = "pose/events"
 POSE_TRUTH = "pose/truth"
 """the ground truth of a simulated stream"""
 DIAGNOSTICS = "diagnostics"
@@ -17,6 +18,7 @@ TOPICS: Mapping[str, type[Message]] = MappingProxyType(
         POSE_RAW: PoseRaw,
         POSE_CLEAN: PoseClean,
         POSE_WORLD: PoseWorld,
+        POSE_EVENTS: PoseEvents,
         POSE_TRUTH: PoseWorld,
         DIAGNOSTICS: Diagnostics,
     }

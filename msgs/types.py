@@ -68,6 +68,41 @@ class Tracking(IntEnum):
     """predicted for too long to be of use"""
 
 
+class EventKind(IntEnum):
+    """What a person does."""
+
+    ENTERED = 0
+    LEFT = 1
+    NEAR = 2
+    """within reach of the sensor"""
+    STANDS = 3
+    """upright on the feet, walking included"""
+    SITS = 4
+    LIES = 5
+    FELL = 6
+    """came to lie fast, and has not got up since"""
+    HAND_RAISED = 7
+    WAVES = 8
+    POINTS = 9
+    FACES_SENSOR = 10
+
+
+class Phase(IntEnum):
+    """Where an event is in its course."""
+
+    BEGINS = 0
+    HOLDS = 1
+    ENDS = 2
+
+
+class Hand(IntEnum):
+    """Whose event it is; `NONE` for those of the whole body."""
+
+    NONE = 0
+    LEFT = 1
+    RIGHT = 2
+
+
 class Level(IntEnum):
     """The levels of diagnostic_msgs/DiagnosticStatus."""
 
@@ -361,6 +396,55 @@ class PoseWorld(_Record):
 
 
 @dataclass(slots=True, eq=False)
+class Event(_Record):
+    """Something that one body does."""
+
+    body: int
+    """`WorldBody.id`, int32"""
+    kind: EventKind
+    phase: Phase
+    hand: Hand
+    """of HAND_RAISED, WAVES and POINTS"""
+    confidence: float
+    """0 to 1: the probability of its condition, given the standard deviations of the joints it was computed from"""
+    direction: Float64
+    """(3,) of POINTS: unit vector, world, from the head through the wrist; zeros otherwise"""
+    since_ns: int
+    """capture, nanoseconds: when it began"""
+
+    def __post_init__(self) -> None:
+        self._integer("body", -_INT32, _INT32)
+        self._integer("kind", EventKind.ENTERED, EventKind.FACES_SENSOR + 1)
+        self._integer("phase", Phase.BEGINS, Phase.ENDS + 1)
+        self._integer("hand", Hand.NONE, Hand.RIGHT + 1)
+        self.kind, self.phase, self.hand = EventKind(self.kind), Phase(self.phase), Hand(self.hand)
+        self._number("confidence")
+        self._array("direction", np.float64, 3)
+        self._integer("since_ns", 0, _SECONDS_END * 10**9)
+
+
+@dataclass(slots=True, eq=False)
+class PoseEvents(_Record):
+    """`pose/events`: all that begins, holds or ends at one moment. Sent when something begins or ends, and once a
+    second."""
+
+    stamp_ns: int
+    """of the `pose/world` it was computed from, nanoseconds"""
+    frame_id: str
+    """the world's name"""
+    source: str
+    """the camera or recording, by name"""
+    events: list[Event]
+    end_of_stream: bool = False
+    """the source ends here: sent once, without events"""
+
+    def __post_init__(self) -> None:
+        self._stamp()
+        self._texts("frame_id", "source")
+        self._list("events", Event)
+
+
+@dataclass(slots=True, eq=False)
 class Diagnostics(_Record):
     """`diagnostics`: how one node is doing; on the wire a diagnostic_msgs/DiagnosticArray of one status."""
 
@@ -382,4 +466,4 @@ class Diagnostics(_Record):
             raise self._fail("values", "strings for keys and values", repr(self.values)[:80])
 
 
-Message = PoseRaw | PoseClean | PoseWorld | Diagnostics
+Message = PoseRaw | PoseClean | PoseWorld | PoseEvents | Diagnostics

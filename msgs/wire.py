@@ -6,8 +6,9 @@ From the publisher, one frame is one message:
 
 with little-endian integers; `sent` is in nanoseconds of the publisher's monotonic clock.
 
-To the publisher, beside the subscriptions of ZeroMQ itself: the name of a subscriber, as a subscription to what nobody
-publishes, and from one that must miss nothing, which messages it has taken.
+To the publisher, beside the subscriptions of ZeroMQ itself: the name of a subscriber, as a subscription, and from one
+that must miss nothing, which messages it has taken. What is for that subscriber alone, because it had not taken it when
+it was started again, has that subscription and a zero byte before it.
 """
 
 from __future__ import annotations
@@ -36,10 +37,13 @@ class Listener(NamedTuple):
     """drawn at random at start, so that a restarted publisher is recognised as a new one, uint32"""
     reliable: tuple[str, ...] = ()
     """topics of which it must miss nothing"""
+    context: int = 0
+    """messages of each that it wants to see again, if the one of this name before it had taken them"""
 
     def subscription(self) -> bytes:
-        """What it subscribes to, to be known."""
-        return _NAME + b"\0".join([self.name.encode(), b"%08x" % self.instance, " ".join(self.reliable).encode()])
+        """What it subscribes to, to be known, and to be sent what is for it alone."""
+        topics = " ".join(self.reliable).encode()
+        return _NAME + b"\0".join([self.name.encode(), b"%08x" % self.instance, topics, b"%d" % self.context])
 
 
 def read_subscription(prefix: bytes) -> Listener | None:
@@ -47,8 +51,8 @@ def read_subscription(prefix: bytes) -> Listener | None:
     if not prefix.startswith(_NAME):
         return None
     try:
-        name, instance, topics = prefix.removeprefix(_NAME).split(b"\0")
-        return Listener(name.decode(), int(instance, 16), tuple(topics.decode().split()))
+        name, instance, topics, context = prefix.removeprefix(_NAME).split(b"\0")
+        return Listener(name.decode(), int(instance, 16), tuple(topics.decode().split()), int(context))
     except ValueError:
         return None
 

@@ -20,6 +20,10 @@ COMMANDS = {
     "run": ("steadypose.nodes.commands.run:run", "start the nodes of a launch file, watch them, show how they do"),
     "node": ("steadypose.nodes.commands.node:node", "one node, for another machine or a supervisor such as systemd"),
     "clean": ("steadypose.nodes.commands.clean:clean", "clean a recording or .npz offline, with the nodes' own code"),
+    "retarget": (
+        "steadypose.nodes.commands.retarget:retarget",
+        "a recording's person as a robot's motion, by its URDF",
+    ),
     "fit": (
         "steadypose.nodes.commands.fit:fit",
         "fit a motion to a recording: slower than clean, and with all of it in view",
@@ -28,6 +32,7 @@ COMMANDS = {
         "steadypose.nodes.commands.complete:complete",
         "key frames to motion, a part of a body to all of it, offline",
     ),
+    "export": ("steadypose.nodes.commands.export:export", "cleaned motion as BVH, GLB, CSV or TRC, for other programs"),
     "echo": ("steadypose.nodes.commands.inspect.echo:echo", "print the messages of a topic or recording"),
     "hz": ("steadypose.nodes.commands.inspect.hz:hz", "measure the rate of a topic or recording"),
     "info": ("steadypose.nodes.commands.inspect.info:info", "what is in a recording, or on a topic"),
@@ -36,8 +41,8 @@ COMMANDS = {
     "prepare": ("steadypose.nodes.commands.prepare:prepare", "motion capture into training data"),
     "train": ("steadypose.nodes.commands.train:train", "train a model of the prior"),
     "evaluate": (
-        "steadypose.nodes.commands.evaluate:evaluate",
-        "measure the prior against its tuned peers, by protocol",
+        "steadypose.benchmarks.command:evaluate",
+        "measure steadypose beside tuned baselines, study by study (in a checkout)",
     ),
     "simulate": (
         "steadypose.nodes.commands.simulate:simulate",
@@ -48,6 +53,10 @@ COMMANDS = {
         "a camera's lens and place in the world, into its launch file",
     ),
     "doctor": ("steadypose.nodes.commands.doctor.command:doctor", "what is missing on this machine, and how to get it"),
+    "install-service": (
+        "steadypose.nodes.commands.install_service:install_service",
+        "run a launch file at every boot, under systemd",
+    ),
     "keys": ("steadypose.nodes.commands.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),
 }
 
@@ -88,6 +97,11 @@ def _main(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except ModuleNotFoundError as error:
+        if error.name == "steadypose.benchmarks":
+            print(
+                f"steadypose {name}: the studies are not installed: expected a checkout of the project", file=sys.stderr
+            )
+            return USAGE_ERROR
         missing = (error.name or "").partition(".")[0]
         if (extra := extra_of(missing)) is None:
             raise

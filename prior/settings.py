@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any, get_args, get_type_hints
 
@@ -48,6 +48,12 @@ def check_range(name: str, value: float, least: float, most: float) -> None:
     """
     if not least <= value <= most:
         raise ValueError(f"{name}: expected {least:g} to {most:g}, got {value:g}")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The end of an error's sentence: the known name that was probably meant, if there is one."""
+    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
+    return f", did you mean {close[0]!r}?" if close else ""
 
 
 def _kind_of_items(cls: type, key: str) -> type | None:

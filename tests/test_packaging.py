@@ -26,7 +26,7 @@ def checkout(tmp_path: Path) -> Path:
     command = root / ".venv" / "bin" / "steadypose"
     command.write_text('#!/bin/sh\npwd\nprintf "%s|" "$@"\n')
     command.chmod(0o755)
-    (root / ".venv" / ".installed-oak-ros2-view").touch()
+    (root / ".venv" / ".installed-oak-ros2-view-web").touch()
     return root
 
 
@@ -107,7 +107,7 @@ def test_a_wheel_holds_one_package_with_all_that_running_takes(tmp_path: Path) -
     ]
     assert {f"steadypose/{name}" for name in wanted} <= set(names)
     assert len([name for name in names if name.endswith(".mcap")]) == 1
-    assert not [name for name in names if "/results/" in name or "__pycache__" in name]
+    assert not [name for name in names if "/benchmarks/" in name or "__pycache__" in name]
     assert Path(wheel).stat().st_size < 30e6, "of which 11 MB are the HM-VAE of 64 frames, for complete --optimise"
 
 

@@ -37,10 +37,10 @@ from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.csv import CsvError, CsvSource
 from steadypose.nodes.sources.npz import NpzError, NpzSource
 from steadypose.prior.body.layouts import SKELETONS
-from steadypose.prior.motion.amc import read_amc, read_asf
-from steadypose.prior.motion.bvh import read_bvh
-from steadypose.prior.motion.clip import MotionError
-from steadypose.prior.motion.npz import read_amass
+from steadypose.prior.mocap.amc import read_amc, read_asf
+from steadypose.prior.mocap.bvh import read_bvh
+from steadypose.prior.mocap.clip import MotionError
+from steadypose.prior.mocap.npz import read_amass
 
 DEPENDS_ON = ()
 

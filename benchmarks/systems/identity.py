@@ -1,6 +1,6 @@
 """Whether people keep their ids when they cross and hide each other: `prior.clean.identify` on unnumbered bodies.
 
-Streams are made from seeds by the project's simulator; their tracker knows who is who, so each sighting's person is
+Streams are made from seeds by the project's simulator; their tracker knows who is who, so each observation's person is
 known. The methods get the bodies of each frame in random order and without ids.
 """
 
@@ -177,7 +177,7 @@ METHODS: dict[str, Callable[[], Method]] = {
 def score(frames: list[Frame], method: Method) -> dict[str, float]:
     """Id switches as CLEAR MOT counts them (Bernardin and Stiefelhagen 2008), and how much was given an id at all.
 
-    A switch is a sighting of a person under another id than this person's last. ``mistaken`` are those under an id
+    A switch is an observation of a person under another id than this person's last. ``mistaken`` are those under an id
     that was another person's; the others are people taken to be new.
     """
     last: dict[int, int] = {}

@@ -37,12 +37,15 @@ from steadypose.nodes.graph.clock import FRAME_NS, Timeline
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.prior.world.pipeline import TrajectoryPipeline
+from steadypose.prior.world.settings import TrajectorySettings
 
 DEPENDS_ON = WORLD
 
 CROWDS = (1, 4, 8)
-LIVE_CROWDS = (1, 4, 8)
+LIVE_CROWDS = (1, 2, 4, 8, 16, 32)
+LATEST_MS = 150.0
+"""limit: 99 of 100 poses of the newest frame are no later, whatever the load"""
 SPACING = 0.8
 """metres between the copies of a body"""
 WARM_UP = 60
@@ -113,7 +116,9 @@ def live(recording: Path, warm_up_s: float, seconds: float, progress: Progress, 
     news: dict[str, Diagnostics] = {}
     sent_from = -1
     bar = progress.add_task(title, total=seconds)
-    with running(recording, lossless=False) as (messages, _, clock):
+    bodies: list[int] = []
+    most = f"prior.max_bodies={max(LIVE_CROWDS)}"
+    with running(recording, lossless=False, settings=[most]) as (messages, _, _, clock):
         for topic, message in messages:
             now = clock.now_ns()
             if isinstance(message, Diagnostics):
@@ -122,6 +127,7 @@ def live(recording: Path, warm_up_s: float, seconds: float, progress: Progress, 
                     timeline = Timeline.from_values(message.values) or timeline
             elif topic == POSE_WORLD and timeline and message.stamp_ns > timeline.stamp_ns + warm_up_s * 1e9:
                 sent_from = message.stamp_ns if sent_from < 0 else sent_from
+                bodies.append(len(getattr(message, "bodies", ())))
                 late_ms.append((now - timeline.wall(message.stamp_ns) - delay_ns) / 1e6)
                 progress.update(bar, completed=(message.stamp_ns - sent_from) / 1e9)
                 if message.stamp_ns - sent_from >= seconds * 1e9:
@@ -139,6 +145,7 @@ def live(recording: Path, warm_up_s: float, seconds: float, progress: Progress, 
         "expected": expected,
         "arrived": len(late_ms),
         "counted": dict(dropped),
+        "bodies_answered": round(float(np.mean(bodies)), 2),
         "latency_ms": percentiles(late_ms),
     }
 
@@ -209,21 +216,34 @@ def _compute_table(results: list[dict[str, Any]]) -> Table:
     )
 
 
+def carried(results: list[dict[str, Any]]) -> int:
+    """The most bodies that are all answered in 99 of 100 frames; 0 if not even one is."""
+    in_full = (
+        r["bodies"] for r in results if r["bodies_answered"] * r["arrived"] >= 0.99 * r["bodies"] * r["expected"]
+    )
+    return max(in_full, default=0)
+
+
 def _live_table(results: list[dict[str, Any]]) -> Table:
     return Table(
         name="live",
-        title="From capture to pose/world at 30 Hz, less the delay, ms",
-        columns=["bodies", "p50", "p95", "p99", "longest", "frames", "dropped"],
+        title="From capture to pose/world at 30 Hz, less the delay, ms, against the number of bodies",
+        columns=["bodies", "p50", "p95", "p99", "longest", "frames", "dropped", "bodies answered", "in time"],
         rows=[
             [
                 str(r["bodies"]),
                 *(f"{r['latency_ms'][p]:.1f}" for p in ("p50", "p95", "p99", "max")),
                 str(r["expected"]),
                 str(r["expected"] - r["arrived"]),
+                f"{r['bodies_answered']:.1f}",
+                "yes" if r["latency_ms"]["p99"] <= LATEST_MS else "no",
             ]
             for r in results
         ],
-        note="Three node processes and this subscriber, live transport: a node that is late drops its oldest frames.",
+        note="Three node processes and this subscriber, live transport. Where there is no time for all, the bodies "
+        "farthest from the sensor are left out, and then frames, the newest of which are worked on first: in time is a "
+        f"p99 of {LATEST_MS:g} ms. This machine carries "
+        f"{carried(results)} bodies, all answered in 99 of 100 frames.",
     )
 
 

@@ -7,15 +7,18 @@ frame's period. Times are the thread's processor time, which other processes of 
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import Progress
@@ -23,20 +26,27 @@ from rich.progress import Progress
 from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.provenance import WORLD, require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
-from steadypose.benchmarks.systems.latency import WARM_UP, crowd, percentiles
+from steadypose.benchmarks.running import START_S, running_nodes
+from steadypose.benchmarks.systems.latency import LATEST_MS, WARM_UP, crowd, percentiles
 from steadypose.msgs.recording import RecordingReader
-from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
+from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.commands.cleaning import clean_recording
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.prior.timing.rate import FPS
+from steadypose.prior.world.pipeline import TrajectoryPipeline
+from steadypose.prior.world.settings import TrajectorySettings
 
 DEPENDS_ON = WORLD
 
 KIOSKS = (1, 4, 8, 16)
+LIVE_KIOSKS = (1, 4, 8, 16, 32)
+WARM_UP_S = 5.0
+"""before messages count, in which a server that has too much to do finds that out"""
 NETWORK_NS = 3_000_000
 """what a message travels"""
 PERIOD_MS = FRAME_NS / 1e6
@@ -101,6 +111,46 @@ def serve(
     }
 
 
+def serve_live(frames: list[PoseRaw], kiosks: int, seconds: float) -> dict[str, Any]:
+    """Milliseconds from capture to arrival of ``pose/world``, less the delay, of a server's nodes; and what is lost.
+
+    The kiosks are publishers of this process, one body each, at 30 Hz, captured one after the other within the period.
+    """
+    names = [f"kiosk {k}" for k in range(kiosks)]
+    stream = crowd(frames, 1)
+    delay_ns = PriorSettings().delay * FRAME_NS
+    late_ms: list[float] = []
+    sent = answered = 0
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="steadypose-"))
+        publishers = [stack.enter_context(Publisher(f"ipc://{folder}/{k}")) for k in range(kiosks)]
+        settings = [
+            f"server.kiosks={json.dumps([publisher.endpoint for publisher in publishers])}",
+            f"prior.max_bodies={kiosks}",
+            "prior.score.enabled=false",
+            "prior.impute.enabled=false",
+            "transport.lossless=false",
+        ]
+        nodes = stack.enter_context(running_nodes(["prior", "trajectory"], settings))
+        for publisher in publishers:
+            if not publisher.wait_for_subscribers({"prior"}, timeout_s=START_S):
+                raise RuntimeError(f"expected the prior within {START_S:g} s, and it did not come")
+        began_ns = nodes.clock.now_ns()
+        for period in range(round((WARM_UP_S + seconds) * FPS)):
+            raw = next(stream)
+            for k, publisher in enumerate(publishers):
+                stamp_ns = began_ns + round((period + k / kiosks) * FRAME_NS)
+                nodes.clock.sleep(stamp_ns - nodes.clock.now_ns())
+                if nodes.clock.now_ns() - stamp_ns < FRAME_NS:  # else this process has no time to be a kiosk
+                    publisher.publish(POSE_RAW, dataclasses.replace(raw, source=names[k], stamp_ns=stamp_ns))
+                    sent += period >= WARM_UP_S * FPS
+            while received := nodes.subscriber.receive(0):
+                if period >= WARM_UP_S * FPS and received[0] == POSE_WORLD:
+                    late_ms.append((nodes.clock.now_ns() - received[1].stamp_ns - delay_ns) / 1e6)
+                    answered += bool(getattr(received[1], "bodies", ()))
+    return {"kiosks": kiosks, "sent": sent, "answered": answered, "latency_ms": percentiles(late_ms or [np.nan])}
+
+
 def clean_rate(recording: Path) -> dict[str, float]:
     """Seconds of a recorded stream that one core cleans in a second."""
     with tempfile.TemporaryDirectory() as folder:
@@ -122,12 +172,14 @@ def main(args: Args) -> None:
         frames = [m for _, _, m in islice(reader.messages([POSE_RAW]), 600) if isinstance(m, PoseRaw)]
     with Progress(console=console) as progress:
         served = [serve(frames, kiosks, on, periods, progress.track) for kiosks in KIOSKS for on in (False, True)]
+    lived = [serve_live(frames, kiosks, periods / 30) for kiosks in LIVE_KIOSKS]
     cleaned = clean_rate(args.recording)
-    table = _table(served, cleaned)
-    show(table, console)
+    tables = [_table(served, cleaned), _live_table(lived)]
+    for table in tables:
+        show(table, console)
     if args.out or not args.quick:
-        data = {"served": served, "cleaned": cleaned, "streams_a_core": _streams_a_core(served)}
-        console.print(f"wrote {save('scale', sys.argv[1:], [table], data, DEPENDS_ON, args.out or RESULTS)}")
+        data = {"served": served, "live": lived, "cleaned": cleaned, "streams_a_core": _streams_a_core(served)}
+        console.print(f"wrote {save('scale', sys.argv[1:], tables, data, DEPENDS_ON, args.out or RESULTS)}")
 
 
 def _streams_a_core(served: list[dict[str, Any]]) -> dict[str, int]:
@@ -138,6 +190,25 @@ def _streams_a_core(served: list[dict[str, Any]]) -> dict[str, int]:
         return max(in_time, default=0)
 
     return {"prior": most("prior", True), "prior without": most("prior", False), "trajectory": most("trajectory", True)}
+
+
+def _live_table(lived: list[dict[str, Any]]) -> Table:
+    return Table(
+        name="scale_live",
+        title="A server's kiosks, from capture to pose/world at 30 Hz, less the delay, ms",
+        columns=["kiosks", "p50", "p95", "p99", "longest", "answered, %", "in time"],
+        rows=[
+            [
+                str(r["kiosks"]),
+                *(f"{r['latency_ms'][p]:.1f}" for p in ("p50", "p95", "p99", "max")),
+                f"{100 * r['answered'] / r['sent']:.1f}",
+                "yes" if r["latency_ms"]["p99"] <= LATEST_MS else "no",
+            ]
+            for r in lived
+        ],
+        note="One body a kiosk, score and imputation off. Answered: messages of a kiosk that came back with its body. "
+        f"In time: a p99 of {LATEST_MS:g} ms, for what is answered.",
+    )
 
 
 def _table(served: list[dict[str, Any]], cleaned: dict[str, float]) -> Table:

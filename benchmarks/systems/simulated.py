@@ -26,7 +26,7 @@ from steadypose.benchmarks.metrics import acceleration_error, contact_speed, len
 from steadypose.benchmarks.provenance import WORLD, require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.msgs.types import CONTACTS, Message, Pose, PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.commands.cleaning import stream
+from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sources.recording import RecordingSource
@@ -36,7 +36,8 @@ from steadypose.prior.body.skeleton import PARENTS, J
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
-from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.prior.world.pipeline import TrajectoryPipeline
+from steadypose.prior.world.settings import TrajectorySettings
 
 Floats = NDArray[np.float64]
 

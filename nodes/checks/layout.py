@@ -10,10 +10,10 @@ import numpy as np
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.checks.window import bodies
-from steadypose.nodes.graph.settings import nearest
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
 from steadypose.prior.body.likeness import likenesses
 from steadypose.prior.clean.slots import MIN_JOINTS
+from steadypose.prior.settings import nearest
 
 UNIT_TOLERANCE = 0.01
 ENOUGH = 5
@@ -52,7 +52,7 @@ def _unknown(messages: Sequence[PoseRaw]) -> Problem:
     close = nearest(name.lower().replace("_", "").replace("-", ""), SKELETONS)
     return error(
         "unknown_skeleton",
-        f"skeleton {name!r}: expected one of {', '.join(SKELETONS)}{close}{hint}; of joints of your own, see "
+        f"skeleton {name!r}{close}{hint}: expected one of {', '.join(SKELETONS)}; of joints of your own, see "
         "docs/sources.md",
     )
 

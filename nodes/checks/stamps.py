@@ -54,7 +54,14 @@ def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem
             "frame, with all its bodies; put bodies of one moment into one message",
         )
     rate = SECOND_NS / max(float(np.median(steps)), 1.0)
-    if 0 < rate < SLOW_HZ:
+    if (longer := _stretched(rate)) is not None:
+        unit, factor = longer
+        yield error(
+            "stamps_unit",
+            f"stamps are {1 / rate:.3g} s apart: they seem to be {unit} taken for seconds, expected the time of "
+            f"capture; divide by {factor:.0f}",
+        )
+    elif 0 < rate < SLOW_HZ:
         yield warning(
             "slow",
             f"stamps are {1e3 / rate:.0f} ms apart, {rate:.1f} frames a second: expected {SLOW_HZ:.0f} or more, best "
@@ -93,6 +100,14 @@ def _unit(stamps: np.ndarray) -> Problem | None:
             # whole seconds count up by one now and then; what is finer by every frame
             if RATES_HZ[0] <= SECOND_NS / (step * factor) <= RATES_HZ[1] or (unit == "seconds" and step <= 1):
                 return _of_unit(unit, f"stamps are {step:g} ns apart, {SECOND_NS / step:.3g} frames a second", factor)
+    return None
+
+
+def _stretched(rate: float) -> tuple[str, float] | None:
+    """The unit that was taken for seconds, of stamps so many times too far apart."""
+    for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6)):
+        if RATES_HZ[0] <= rate * factor <= RATES_HZ[1]:
+            return unit, factor
     return None
 
 

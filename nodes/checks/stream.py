@@ -33,6 +33,7 @@ class StreamCheck:
     def __init__(self, max_bodies: int, *, identified: bool = False) -> None:
         self._max_bodies, self._identified = max_bodies, identified
         self._window = Window()
+        self._heard_ns = 0
         self._ended = False
 
     def see(self, raw: PoseRaw, at_ns: int) -> None:
@@ -40,6 +41,10 @@ class StreamCheck:
         self._ended = raw.end_of_stream
         if not raw.end_of_stream:
             self._window.add(raw, at_ns)
+
+    def heard(self, at_ns: int) -> None:
+        """A message came, and was dropped unread for want of time."""
+        self._heard_ns = at_ns
 
     def problems(self, now_ns: int, *, live: bool) -> list[Problem]:
         """What is wrong with the stream now.
@@ -57,7 +62,7 @@ class StreamCheck:
         last = self._window.last
         if last is None or self._ended:
             return
-        if live and (silent_ns := now_ns - last.at_ns) > SILENT_NS:
+        if live and (silent_ns := now_ns - max(last.at_ns, self._heard_ns)) > SILENT_NS:
             yield error(
                 "stopped",
                 f"no message for {silent_ns / 1e9:.0f} s, after {self._window.received}: the tracker has stopped, "
@@ -113,6 +118,11 @@ class StreamChecks:
         if len(self._checks) > self._streams:
             del self._checks[next(iter(self._checks))]
         check.see(raw, at_ns)
+
+    def heard(self, source: str, at_ns: int) -> None:
+        """A message of a source came, and was dropped unread."""
+        if check := self._checks.get(source if self._streams > 1 else ""):
+            check.heard(at_ns)
 
     def problems(self, now_ns: int, *, live: bool) -> list[Problem]:
         """As of `StreamCheck.problems`; of several streams each with its source's name."""

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
 import os
 import re
 import signal
+import subprocess
+import sys
 import traceback
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnContext
+from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +28,16 @@ from rich.progress import Progress
 
 from steadypose.nodes.commands.cleaning import clean_recording
 from steadypose.nodes.commands.user_errors import is_for_user
+from steadypose.nodes.driving import NOBODY
 from steadypose.nodes.graph.extras import require_extra
+from steadypose.nodes.graph.safe_python import command, environment
 from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sources.motion import SUFFIXES
 
 MANIFEST = "manifest.jsonl"
 _LINE = '{"input": '
 """how each line of it begins"""
-FILES = (".npz", ".csv")
+FILES = (".npz", ".csv", *SUFFIXES)
 """endings of files of poses that are cleaned into an .npz each"""
 
 Settings = Mapping[str, Mapping[str, Any]]
@@ -110,7 +113,7 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
         console: for progress and what went wrong.
 
     Returns:
-        the exit status: 1 if one could not be cleaned, or not be read to the end.
+        the exit status: 1 if one could not be cleaned, shows nobody, or could not be read to the end.
 
     Raises:
         LaunchError: nothing can be done at all.
@@ -130,7 +133,7 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
         if job.replace or not os.path.lexists(job.out):
             manifest.add(job, {"state": "started"})
     cleaning = on_ray(waiting, settings) if ray else on_cores(waiting, settings, jobs or _cores())
-    failed = damaged = 0
+    failed = damaged = empty = 0
     with Progress(console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task(folder.name, total=len(found), completed=known)
         for job, result in cleaning:
@@ -145,9 +148,14 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
                 causes = ", ".join(f"{cause}: {n}" for cause, n in result["unread"].items())
                 console.print(f"{job.source}: damaged; {causes}", style="red", markup=False, highlight=False)
             elif not result["poses"]:
-                console.print(f"{job.source}: no body was recognised", markup=False, highlight=False)
-    console.print(f"{out}: {len(found) - failed} of {len(found)} recordings are clean", highlight=False)
-    return 1 if failed or damaged else 0
+                empty += 1
+                console.print(f"{job.source}: {NOBODY}", style="red", markup=False, highlight=False, soft_wrap=True)
+            for problem in result.get("problems", ()):
+                text = f"{job.source}: {problem}"
+                console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    nobody = f"; {empty} of them without anybody in it" if empty else ""
+    console.print(f"{out}: {len(found) - failed} of {len(found)} recordings are clean{nobody}", highlight=False)
+    return 1 if failed or damaged or empty else 0
 
 
 class Manifest:
@@ -179,7 +187,7 @@ class Manifest:
                 try:
                     entry = json.loads(line)
                     self._known[entry["input"]] = entry
-                except (ValueError, KeyError, TypeError):
+                except (ValueError, KeyError, TypeError, RecursionError):
                     continue
         elif out.exists() and any(out.iterdir()):
             raise LaunchError(f"{out}: expected a new folder, or one with the {MANIFEST} of an earlier call")
@@ -220,7 +228,7 @@ class Manifest:
 
 def _models() -> str:
     """A digest of the weights that ship, which differs from that of another release."""
-    from steadypose.prior.models import weights_io as checkpoint  # brings torch
+    from steadypose.prior.models import weights as checkpoint
 
     files = sorted(file for file in checkpoint.WEIGHTS.iterdir() if file.suffix in (".safetensors", ".json"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
@@ -243,25 +251,25 @@ def on_cores(jobs: Iterable[Job], settings: Settings, cores: int) -> Iterator[tu
 
     A process that dies, for want of memory or by a fault in a library, takes one recording with it, not the rest.
     """
-    context = multiprocessing.get_context("spawn")
     waiting = deque(jobs)
     idle: list[_Worker] = []
     busy: dict[Connection, _Worker] = {}
     try:
         while waiting or busy:
             while waiting and len(busy) < cores:
-                worker = idle.pop() if idle else _Worker(context, settings)
+                worker = idle.pop() if idle else _Worker(settings)
                 worker.send(waiting.popleft())
                 busy[worker.connection] = worker
             for connection in wait(list(busy)):
                 worker = busy.pop(connection)  # type: ignore[index]  (all that is waited for are connections)
                 result = worker.receive()
-                if worker.process.is_alive():
+                if worker.process.poll() is None:
                     idle.append(worker)
                 yield worker.job, result
     finally:
         for worker in [*idle, *busy.values()]:
             worker.process.kill()  # whatever it writes is not in its place before it is whole
+            worker.process.wait()
 
 
 class _Worker:
@@ -269,11 +277,13 @@ class _Worker:
 
     job: Job
 
-    def __init__(self, context: SpawnContext, settings: Settings) -> None:
-        self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, settings), daemon=True)
-        self.process.start()
+    def __init__(self, settings: Settings) -> None:
+        self.connection, theirs = Pipe()
+        serve = command("steadypose.nodes.commands.batch:serve", str(theirs.fileno()))
+        self.process = subprocess.Popen(serve, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env=environment())
         theirs.close()  # so that its end closes with the process
+        with suppress(OSError):
+            self.connection.send(settings)
 
     def send(self, job: Job) -> None:
         self.job = job
@@ -284,11 +294,13 @@ class _Worker:
         try:
             return self.connection.recv()
         except (EOFError, OSError):
-            self.process.join()
-            return _failed(f"the process that cleaned it ended with status {self.process.exitcode}")
+            return _failed(f"the process that cleaned it ended with status {self.process.wait()}")
 
 
-def _serve(connection: Connection, settings: Settings) -> None:
+def serve() -> None:
+    """Clean what comes through a connection, until it is closed."""
+    connection = Connection(int(sys.argv[1]))
+    settings = connection.recv()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one, which ends it
     while True:
         try:

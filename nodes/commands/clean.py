@@ -11,8 +11,12 @@ from rich.progress import Progress
 
 from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
 from steadypose.nodes.commands.cleaning import clean_recording
-from steadypose.nodes.commands.output import check_output
+from steadypose.nodes.commands.output import check_format, check_output
+from steadypose.nodes.commands.printable import printable
+from steadypose.nodes.commands.setting_names import check_settings, full_key, pipeline_sections
+from steadypose.nodes.driving import NOBODY
 from steadypose.nodes.graph.launch import apply_override, read_toml
+from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.body.own_layouts import add_layouts
 
@@ -23,6 +27,7 @@ def clean(
     delay: Annotated[int | None, tyro.conf.arg(metavar="K")] = None,
     settings: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="STAGE.OPTION=VALUE")] = (),
     skeletons: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     jobs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     ray: bool = False,
     force: bool = False,
@@ -31,35 +36,44 @@ def clean(
 
     A folder of recordings is cleaned into another, as many at once as there are cores, or on a Ray cluster.
     OUT/manifest.jsonl says what became of each; started again, the command does what is not done yet. A recording
-    that cannot be cleaned does not stop the others. The exit status is 1 if one could not be cleaned, or is damaged so
-    that a part of it could not be read.
+    that cannot be cleaned does not stop the others. The exit status is 1 if one could not be cleaned, shows nobody, or
+    is damaged so that a part of it could not be read.
 
     Args:
         source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
-            or a folder with any number of these, at any depth.
-        out: the recording to make, or .npz with one row for each row of the input; or the folder for them.
+            motion, as .bvh of any rig, .trc, .c3d, AMASS' .npz or .npy; or a folder with any number of these, at any
+            depth.
+        out: the recording to make, or .npz or .csv with one row for each row of the input; or the folder for them.
         delay: frames at 30 Hz to wait for, 0 to 16; more is smoother. 4 unless given.
-        settings: any setting of [prior], such as gate.enabled=false, or of [trajectory], such as
-            trajectory.contacts=false. May be given again. Weights of your own ('steadypose train') are settings too:
-            smooth.weights, encode.weights, trajectory.weights=NAME, or the path of a .safetensors file.
+        settings: any setting of [prior] or [trajectory], such as gate.enabled=false or trajectory.contacts=false; the
+            end of its name will do, where there is one such setting only. May be given again. Weights of your own
+            ('steadypose train') are settings too: smooth.weights, encode.weights, trajectory.weights=NAME, or the path
+            of a .safetensors file.
         skeletons: TOML with [skeletons.NAME] of joint layouts of your own; a launch file with them will do.
+        rig: TOML that says of files of motion what they do not: metres (the size of their unit), up, fps, skeleton (of
+            arrays), and [canonical], which of their joints left_elbow and the others of smpl22 are.
         jobs: of a folder, how many recordings at once, each in a process of its own that takes about 1 GB of
             memory; as many as there are cores unless given.
         ray: clean a folder on the Ray cluster that this machine belongs to, or that RAY_ADDRESS names, or else on
             one started here; its machines must see IN and OUT under the same paths. Needs the extra 'ray'.
-        force: replace what is at OUT, if it is a recording or an .npz. In a folder, what an earlier call made is
-            replaced without being asked for, and all else is kept in any case.
+        force: replace what is at OUT, if it is a recording, an .npz or a .csv. In a folder, what an earlier call made
+            is replaced without being asked for, and all else is kept in any case.
     """
     table: dict[str, Any] = {"prior": {}, "trajectory": {}}
     if delay is not None:
         table["prior"]["delay"] = delay
     for override in settings:
-        apply_override(table, override if override.startswith("trajectory.") else f"prior.{override}")
+        apply_override(table, full_key(override, pipeline_sections()))
+    check_settings(table)
     if skeletons is not None:
         table["skeletons"] = read_toml(skeletons).get("skeletons", {})
         add_layouts(table["skeletons"])
+    if rig is not None:
+        table["rig"] = read_toml(rig)
+    check_format(out)
     check_output(source, out)
     console = Console(stderr=True)
+    compile_missing(lambda line: console.print(printable(line), markup=False, highlight=False, soft_wrap=True))
     if is_folder_of_recordings(source):
         return clean_folder(source, out, table, jobs, ray, console)
     if ray or jobs is not None:
@@ -81,7 +95,8 @@ def clean(
     for problem in done.problems:
         console.print(f"  {problem}", highlight=False, markup=False, soft_wrap=True, style="yellow")
     if not done.poses:
-        console.print(f"  no body was recognised: is the skeleton right, are the units metres? See what {source} holds")
+        hint = f"steadypose info {source} says what it holds"
+        console.print(f"  {NOBODY}; {hint}", style="red", highlight=False, markup=False, soft_wrap=True)
     if done.unread:
         console.print(f"  {source} is damaged: what could be read of it is clean", style="red", highlight=False)
-    return 1 if done.unread else 0
+    return 1 if done.unread or not done.poses else 0

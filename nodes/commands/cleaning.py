@@ -3,55 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from steadypose.msgs.recording import RecordingWriter
-from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
-from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.checks.stream import StreamCheck
-from steadypose.nodes.commands.output import check_replaceable, put_in_place, unfinished
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.commands.output import ARRAY_FILES, check_replaceable, put_in_place, unfinished, write_arrays
+from steadypose.nodes.driving import OfflineRun
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sinks.recorder import LogTimes
-from steadypose.nodes.sources.recording import open_recording, with_end
+from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.own_layouts import add_layouts
-
-CHECKED, CHECKED_NS = 45, 1_500_000_000
-"""frames between two looks at whether the input can be right, and the time in which they count as having come"""
-
-
-class Cleaner(Protocol):
-    """What `stream` needs of a `PriorPipeline`."""
-
-    def process(self, raw: PoseRaw) -> list[PoseClean]: ...
-
-
-class Placer(Protocol):
-    """What `stream` needs of a `TrajectoryPipeline`."""
-
-    def process(self, clean: PoseClean) -> list[PoseWorld]: ...
-
-
-def stream(
-    messages: Iterable[tuple[str, Message]], prior: Cleaner, trajectory: Placer
-) -> Iterator[tuple[str, Message]]:
-    """All that the nodes publish when the input node publishes ``messages``: these, and the answers to each.
-
-    Both pipelines are new, or have seen the end of their last stream.
-    """
-    for topic, message in with_end(messages):
-        yield topic, message
-        if isinstance(message, PoseRaw):
-            for clean in prior.process(message):
-                yield POSE_CLEAN, clean
-                for world in trajectory.process(clean):
-                    yield POSE_WORLD, world
 
 
 @dataclass(frozen=True)
@@ -90,8 +58,9 @@ def clean_recording(
 
     Args:
         source: a recording or file of poses.
-        out: the recording to make, or .npz.
-        settings: ``[prior]``, ``[trajectory]`` and, if it has them, ``[skeletons]`` of a launch file.
+        out: the recording to make, or .npz or .csv.
+        settings: ``[prior]``, ``[trajectory]`` and, if it has them, ``[skeletons]`` of a launch file; ``rig`` is what a
+            file of motion does not say.
         replace: whether what is at ``out`` may be replaced, if it is a recording or an .npz.
         began: called with the number of frames.
         advanced: called after each.
@@ -99,56 +68,36 @@ def clean_recording(
     Raises:
         LaunchError, RecordingError, NpzError: the input cannot be used, or the output not be made.
     """
-    to_npz = out.suffix == ".npz"
+    to_file = out.suffix in ARRAY_FILES
     check_replaceable(out, replace=replace)
     add_layouts(settings.get("skeletons", {}))
-    frames = open_recording(source)
-    # these bring torch, which takes seconds: not before it is known that there is something to do
-    from steadypose.nodes.graph.prior_node import make_prior
-    from steadypose.nodes.graph.threads import one_thread
-    from steadypose.nodes.graph.trajectory_node import make_trajectory
-    from steadypose.prior.clean.settings import PriorSettings
-
-    one_thread()
-    prior, trajectory = make_prior(settings["prior"]), make_trajectory(settings["trajectory"])
+    frames = open_recording(source, settings.get("rig", {}))
+    run = OfflineRun(frames, settings)
     began(len(frames))
     collector = NpzCollector()
-    stamps_ns: list[int] = []
-    poses = 0
-    problems: dict[str, str] = {}
-    prior_settings = PriorSettings.from_dict(settings["prior"])
-    check = StreamCheck(prior_settings.max_bodies, identified=prior_settings.identify.enabled)
     log_times = LogTimes()
     started = time.perf_counter()
     with unfinished(out) as part:
-        with nullcontext() if to_npz else RecordingWriter(part) as writer:
-            for topic, message in stream(frames, prior, trajectory):
+        with nullcontext() if to_file else RecordingWriter(part) as writer:
+            for topic, message in run:
                 if writer:
                     writer.write(topic, message, log_times.next(topic, message.stamp_ns))
                 else:
                     collector.add(message)
                 if isinstance(message, PoseRaw) and not message.end_of_stream:
-                    now_ns = len(stamps_ns) * CHECKED_NS // CHECKED
-                    check.see(message, now_ns)
-                    if len(stamps_ns) % CHECKED == CHECKED - 1:
-                        for problem in check.problems(now_ns, live=False):
-                            problems.setdefault(problem.cause, f"{problem.cause}: {problem.text}")
-                    stamps_ns.append(message.stamp_ns)
                     advanced()
-                elif isinstance(message, PoseClean):
-                    poses += len(message.bodies)
-        if not stamps_ns:
+        stamps_ns = run.stamps_ns
+        if not len(stamps_ns):
             raise LaunchError(f"{source}: expected frames, but none of {len(frames)} could be read")
-        if to_npz:
-            arrays: dict[str, Any] = collector.arrays(np.array(stamps_ns, np.int64))
-            np.savez(part, **arrays)
+        if to_file:
+            write_arrays(part, collector.arrays(stamps_ns))
         put_in_place(part, out)
     return Cleaned(
         frames=len(stamps_ns),
-        duration_s=(max(stamps_ns) - min(stamps_ns)) / 1e9,
+        duration_s=float(np.ptp(stamps_ns)) / 1e9,
         spent_s=time.perf_counter() - started,
-        poses=poses,
-        refused={cause: n for cause, n in (frames.refused + prior.counters + trajectory.counters).items() if n},
-        problems=list(problems.values()),
+        poses=run.poses,
+        refused=dict(run.refused),
+        problems=run.diagnosis.texts,
         unread={cause: n for cause, n in frames.refused.items() if n},
     )

@@ -9,10 +9,11 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from steadypose.nodes.commands.output import check_output
+from steadypose.nodes.commands.output import check_format, check_output
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
+from steadypose.nodes.sources.recording import NO_RIG
 from steadypose.prior.body.own_layouts import add_layouts
 
 
@@ -22,6 +23,7 @@ def complete(
     optimise: bool = False,
     weights: Annotated[str, tyro.conf.arg(metavar="NAME")] = "default",
     skeletons: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     force: bool = False,
 ) -> int:
@@ -30,7 +32,7 @@ def complete(
     Missing are joints that are NaN or of confidence 0, in any frame, and frames between stamps more than 1/20 s apart.
     Known joints stay unchanged, so clean a noisy recording first: steadypose clean IN CLEAN. OUT has a frame every
     1/30 s from the first stamp to the last, interpolated where the input has other stamps. Completed joints have the
-    state IMPUTED, and a standard deviation that grows with the time to the nearest sighting. In gaps of up to two
+    state IMPUTED, and a standard deviation that grows with the time to the nearest observation. In gaps of up to two
     seconds the motion is plausible; in longer ones it becomes less so, and after 8 s without any joint a new stretch
     begins.
 
@@ -42,32 +44,31 @@ def complete(
 
     Args:
         source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
-            what is missing is NaN, or 0 in confidence (T, J).
-        out: the recording to make, or .npz.
+            what is missing is NaN, or 0 in confidence (T, J); or motion, as 'clean' reads it. Of an .npz or .csv
+            that 'clean' wrote, what it imputed is missing.
+        out: the recording to make, or .npz or .csv.
         optimise: search HM-VAE for the motion that fits what is known, as the paper does: first its latent vectors,
             then its decoder, from the answer of the feed-forward completer. Takes seconds for each window of 64
-            frames and the extra 'train'; no nearer to the truth than the completer, but as lively as people are.
+            frames and the extra 'train'; no nearer to the truth than the completer, but as fast-moving as people.
         weights: weight set of the completer: 'default', or a .safetensors file of your own.
         skeletons: TOML with [skeletons.NAME] of joint layouts of your own; a launch file with them will do.
+        rig: TOML that says of files of motion what they do not: see 'clean'.
         picture: what was done, as .png, .svg or .pdf.
-        force: replace what is at OUT, if it is a recording or an .npz.
+        force: replace what is at OUT, if it is a recording, an .npz or a .csv.
     """
     if skeletons is not None:
         add_layouts(read_toml(skeletons).get("skeletons", {}))
+    check_format(out)
     check_output(source, out, *([picture] if picture else []))
     if picture is not None and picture.suffix not in (".png", ".svg", ".pdf"):
         raise LaunchError(f"--picture: expected a name ending in .png, .svg or .pdf, got {picture}")
     one_thread()
     # these compile and load: not before it is known that there is something to do
-    from steadypose.nodes.commands.completing import complete_recording
-    from steadypose.prior.models.completer.inference import LiveCompleter
-    from steadypose.prior.offline.parts import PartsCompleter
-    from steadypose.prior.offline.sigma import Uncertainty
+    from steadypose.nodes.commands.completing import complete_recording, load_completer
 
-    completer = LiveCompleter.load(weights)
-    fill = PartsCompleter(completer)
+    fill, uncertainty = load_completer(weights)
     if optimise:
-        from steadypose.prior.offline.optimise import Optimiser
+        from steadypose.prior.fit.optimise import Optimiser
 
         fill = Optimiser.load("default", fill)
     console = Console(stderr=True)
@@ -77,7 +78,8 @@ def complete(
             source,
             out,
             fill,
-            Uncertainty(completer.config.never_sigma, completer.config.half_frames),
+            uncertainty,
+            rig=read_toml(rig) if rig else NO_RIG,
             replace=force,
             began=lambda frames: progress.update(bar, total=frames),
             advanced=lambda frame: progress.update(bar, completed=frame),

@@ -16,25 +16,36 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import CleanBody, JointState, Message, Pose, PoseClean, PoseRaw
-from steadypose.nodes.commands.output import check_replaceable, put_in_place, unfinished, write_recording
+from steadypose.nodes.commands.output import (
+    ARRAY_FILES,
+    check_replaceable,
+    put_in_place,
+    unfinished,
+    write_arrays,
+    write_recording,
+)
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
-from steadypose.nodes.sources.recording import open_recording, with_end
+from steadypose.nodes.sources.recording import NO_RIG, open_recording, with_end
+from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.kinematics import quaternions, rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, finite_joints
-from steadypose.prior.models.root_velocity.inference import LiveRootVelocity
-from steadypose.prior.offline.complete import Completed, Fill, complete
-from steadypose.prior.offline.root_path import is_root_centred, root_path
-from steadypose.prior.offline.sigma import Uncertainty
+from steadypose.prior.complete.body import Completed, Fill, complete
+from steadypose.prior.complete.parts import PartsCompleter
+from steadypose.prior.complete.root_path import is_root_centred, root_path
+from steadypose.prior.complete.sigma import Uncertainty
+from steadypose.prior.models.completer.inference import LiveCompleter
+from steadypose.prior.models.root_velocity import LiveRootVelocity
 from steadypose.prior.timing.resample import PERIOD_NS
-from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.prior.world.pipeline import TrajectoryPipeline
+from steadypose.prior.world.settings import TrajectorySettings
 
 Floats = NDArray[np.float64]
 
 APART_NS = 8_000_000_000
-"""A longer gap without any sighting of a body is not filled: a new stretch begins."""
+"""A longer gap without any observation of a body is not filled: a new stretch begins."""
 
 BETWEEN_NS = PERIOD_NS * 3 // 2
 """Joints seen so far apart, at most, are joined by a line; between others motion is filled in."""
@@ -98,12 +109,28 @@ class Done:
     centred: list[int]
 
 
+@dataclass(frozen=True)
+class Completion:
+    """What came of a recording.
+
+    Attributes:
+        raws: ``pose/raw`` as it was, with its end.
+        answers: ``pose/clean`` and ``pose/world`` with their topics, in order.
+        done: the summary.
+    """
+
+    raws: list[PoseRaw]
+    answers: list[tuple[str, Message]]
+    done: Done
+
+
 def complete_recording(
     source: Path,
     out: Path,
     fill: Fill,
     uncertainty: Uncertainty,
     *,
+    rig: Mapping[str, Any] = NO_RIG,
     replace: bool = False,
     began: Callable[[int], None] = lambda frames: None,
     advanced: Callable[[int], None] = lambda frame: None,
@@ -112,9 +139,10 @@ def complete_recording(
 
     Args:
         source: a recording or file of poses.
-        out: the recording to make, or .npz.
+        out: the recording to make, or .npz or .csv.
         fill: a completer.
         uncertainty: standard deviations of its output.
+        rig: what a file of motion does not say.
         replace: whether what is at ``out`` may be replaced, if it is a recording or an .npz.
         began: called with the number of frames of all bodies together.
         advanced: called with how many of them are done.
@@ -123,15 +151,44 @@ def complete_recording(
         LaunchError, RecordingError, NpzError: the input cannot be used, or the output not be made.
     """
     check_replaceable(out, replace=replace)
-    frames = open_recording(source)
+    completion = complete_source(open_recording(source, rig), str(source), fill, uncertainty, began, advanced)
+    with unfinished(out) as part:
+        if out.suffix in ARRAY_FILES:
+            write_arrays(part, completed_arrays(completion))
+        else:
+            every = [*((POSE_RAW, message) for message in completion.raws), *completion.answers]
+            write_recording(part, sorted(every, key=lambda pair: pair[1].stamp_ns))
+        put_in_place(part, out)
+    return completion.done
+
+
+def load_completer(weights: str) -> tuple[PartsCompleter, Uncertainty]:
+    """The completer of a weight set, and the standard deviations of its output."""
+    completer = LiveCompleter.load(weights)
+    return PartsCompleter(completer), Uncertainty(completer.config.never_sigma, completer.config.half_frames)
+
+
+def complete_source(
+    frames: RecordedSource,
+    name: str,
+    fill: Fill,
+    uncertainty: Uncertainty,
+    began: Callable[[int], None] = lambda frames: None,
+    advanced: Callable[[int], None] = lambda frame: None,
+) -> Completion:
+    """Complete what a source has; ``name`` is what errors call it, the rest as of `complete_recording`.
+
+    Raises:
+        LaunchError: it shows nobody.
+    """
     messages = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
     raws = [message for message in messages if not message.end_of_stream]
     if not raws:
-        raise LaunchError(f"{source}: expected frames, but none of {len(frames)} could be read")
+        raise LaunchError(f"{name}: expected frames, but none of {len(frames)} could be read")
     anchor = min(message.stamp_ns for message in raws)
-    stretches = [stretch for body, seen in _sightings(source, raws).items() for stretch in _on_grid(body, seen, anchor)]
+    stretches = [stretch for body, seen in _sightings(name, raws).items() for stretch in _on_grid(body, seen, anchor)]
     if not stretches:
-        raise LaunchError(f"{source}: expected a body with joints in some frame, got none; see what it holds: info")
+        raise LaunchError(f"{name}: expected a body with joints in some frame, got none; see what it holds: info")
     began(sum(len(stretch.given) for stretch in stretches))
     done: list[tuple[Stretch, Completed]] = []
     before = 0
@@ -147,20 +204,8 @@ def complete_recording(
     for message in clean:
         answers.append((POSE_CLEAN, message))
         answers += [(POSE_WORLD, answer) for answer in world.process(_moved(message, paths, anchor))]
-    with unfinished(out) as part:
-        if out.suffix == ".npz":
-            collector = NpzCollector()
-            for _, message in answers:
-                collector.add(message)
-            stamps = np.array([message.stamp_ns for message in clean if not message.end_of_stream], np.int64)
-            arrays: dict[str, Any] = collector.arrays(stamps)
-            np.savez(part, **arrays)
-        else:
-            every = [*((POSE_RAW, message) for message in messages), *answers]
-            write_recording(part, sorted(every, key=lambda pair: pair[1].stamp_ns))
-        put_in_place(part, out)
     known = [completed.known.mean() for _, completed in done]
-    return Done(
+    summary = Done(
         frames=len(clean) - 1,
         bodies=len({stretch.body for stretch, _ in done}),
         given=float(np.average(known, weights=[len(s.given) for s, _ in done])),
@@ -170,9 +215,21 @@ def complete_recording(
         refused={cause: n for cause, n in (frames.refused + world.counters).items() if n},
         centred=centred,
     )
+    return Completion(messages, answers, summary)
 
 
-def _sightings(source: Path, raws: Iterable[PoseRaw]) -> Mapping[int, Sightings]:
+def completed_arrays(completion: Completion) -> dict[str, NDArray[Any]]:
+    """The arrays of ``clean``, with a row for each frame of the grid on which there is a body."""
+    collector = NpzCollector()
+    stamps = []
+    for _, message in completion.answers:
+        collector.add(message)
+        if isinstance(message, PoseClean) and not message.end_of_stream:
+            stamps.append(message.stamp_ns)
+    return collector.arrays(np.array(stamps, np.int64))
+
+
+def _sightings(source: str, raws: Iterable[PoseRaw]) -> Mapping[int, Sightings]:
     """Every body of a recording, in the z-up world."""
     found: dict[int, Sightings] = defaultdict(Sightings)
     for message in raws:
@@ -212,7 +269,7 @@ def _on_grid(body: int, seen: Sightings, anchor_ns: int) -> list[Stretch]:
 
 
 def _interpolated(stamps: NDArray[np.int64], places: Floats, ticks: NDArray[np.int64]) -> Floats:
-    """(N, 3) at ``ticks`` (N,); NaN where no sighting is near."""
+    """(N, 3) at ``ticks`` (N,); NaN where no observation is near."""
     after = np.searchsorted(stamps, ticks).clip(0, len(stamps) - 1)
     before = np.where(stamps[after] > ticks, np.maximum(after - 1, 0), after)
     span = stamps[after] - stamps[before]

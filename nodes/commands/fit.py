@@ -15,26 +15,26 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
-from steadypose.msgs.types import JOINTS, Message, PoseRaw
-from steadypose.nodes.commands.cleaning import stream
-from steadypose.nodes.commands.fitting import Fit, bodies_seen, fit_body, ground_plane, rewritten
-from steadypose.nodes.commands.key_points import (
-    arrays_of_fit,
-    fit_key_points,
-    has_key_points,
-    in_sight,
-    read_key_points,
+from steadypose.msgs.types import JOINTS
+from steadypose.nodes.commands.fit_source import Fitted, fit_source, fitted_arrays, load_transitions, with_bones
+from steadypose.nodes.commands.fitting import Fit
+from steadypose.nodes.commands.key_points import arrays_of_fit, fit_key_points, has_key_points, read_key_points
+from steadypose.nodes.commands.output import (
+    ARRAY_FILES,
+    check_format,
+    check_output,
+    check_replaceable,
+    put_in_place,
+    write_arrays,
+    write_recording,
 )
-from steadypose.nodes.commands.output import check_output, check_replaceable, put_in_place, write_recording
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sources.npz import NpzError, read_arrays
 from steadypose.nodes.sources.recording import open_recording
-from steadypose.prior.clean.adapt import SensorFrame
 
 if TYPE_CHECKING:
-    from steadypose.prior.offline.windows import FittedTrack
+    from steadypose.prior.fit.windows import FittedTrack
 
 Floats = NDArray[np.float64]
 
@@ -64,15 +64,17 @@ def fit(
 
     Args:
         source: a recording, a .csv or .npz, as for `clean`; or an .npz with key points.
-        out: the recording to make, or .npz with one row for each row of the input; of key points, .npz at 30 Hz.
+        out: the recording to make, or .npz or .csv with one row for each row of the input; of key points, .npz at
+            30 Hz.
         weights: of the model of transitions: 'default', or a .safetensors file.
         delay: of `clean`, which initialises the fit, frames at 30 Hz; without effect on key points.
         smpl: your copy of SMPL or SMPL-H; OUT.smpl.0.npz is its motion, in the form of AMASS' files, and so on for
             each further body.
-        force: replace what is at OUT, if it is a recording or an .npz.
+        force: replace what is at OUT, if it is a recording, an .npz or a .csv.
     """
     if not source.exists():
         raise LaunchError(f"{source} does not exist: expected a recording, an .npz or a .csv")
+    check_format(out)
     check_output(source, out)
     check_replaceable(out, replace=force)
     two_d = has_key_points(source)
@@ -81,13 +83,11 @@ def fit(
     require_extra("train")
     import torch
 
-    from steadypose.prior.models.humor.network import HumorConfig, HumorNet
-    from steadypose.prior.models.torch_weights import load_network
-    from steadypose.prior.offline.smpl import SmplShape
+    from steadypose.prior.fit.smpl import SmplShape
 
     shape = SmplShape.read(smpl) if smpl else None
     torch.set_num_threads(max((os.cpu_count() or 2) // 2, 1))
-    model = load_network(HumorNet, HumorConfig.from_dict, weights, "humor")
+    model = load_transitions(weights)
     console, started = Console(stderr=True), time.perf_counter()
     folder = out.with_name(f".{out.name}.fit")
     folder.mkdir(exist_ok=True)
@@ -111,38 +111,18 @@ def _fit_poses(
 ) -> tuple[int, list[FittedTrack | None], list[str]]:
     """Fit 3D joints, initialised by the nodes' own pipelines; returns the number of frames, what was fitted, and lines
     to print."""
-    from steadypose.nodes.graph.prior_node import make_prior
-    from steadypose.nodes.graph.trajectory_node import make_trajectory
-    from steadypose.prior.offline.solve import FitSettings
-    from steadypose.prior.offline.windows import MIN_FRAMES, window_bounds
+    from steadypose.prior.fit.windows import window_bounds
 
-    frames = open_recording(source)
-    points = _points(source, len(frames))
-    messages = list(stream(frames, make_prior({"delay": delay}), make_trajectory({})))
-    bodies = bodies_seen(messages, MIN_FRAMES)
-    if not bodies:
-        raise LaunchError(
-            f"{source}: expected somebody who is seen for {MIN_FRAMES} frames or more, found nobody; is the skeleton "
-            "right, are the units metres? `steadypose info` says what it holds"
-        )
-    stamps = np.array([m.stamp_ns for _, m in messages if isinstance(m, PoseRaw) and not m.end_of_stream], np.int64)
-    total = sum(len(window_bounds(len(seen.bodies))) for seen in bodies)
-    bar = progress.add_task(source.name, total=total)
-    fits = []
-    for number, seen in enumerate(bodies):
-        own = folder / f"{number:04d}"
-        own.mkdir(exist_ok=True)
-        near = None if points is None else points[np.abs(stamps[None] - seen.stamps_ns[:, None]).argmin(axis=1)]
-        if near is not None:
-            near = np.stack([
-                SensorFrame.of(message.sensor_pose).to_world(frame)
-                for message, frame in zip(seen.clean, near, strict=True)
-            ])  # fmt: skip
-        fits.append(fit_body(model, seen, near, FitSettings(), own, lambda: progress.advance(bar)))
-    fitted = rewritten(messages, fits)
-    _write(out, folder, fitted, stamps, fits)
+    bar = progress.add_task(source.name, total=None)
+    fitted = fit_source(
+        open_recording(source), str(source), _points(source), model=model, delay=delay, folder=folder,
+        began=lambda bodies: progress.update(bar, total=sum(len(window_bounds(len(b.bodies))) for b in bodies)),
+        advanced=lambda: progress.advance(bar),
+    )  # fmt: skip
+    _write(out, folder, fitted)
+    fits = fitted.fits
     _explain(out, [(fit.seen.id, fit.seen.stamps_ns, fit.misfit, fit.track) for fit in fits], "m")
-    return len(stamps), [fit.track for fit in fits], [_line(fit) for fit in fits]
+    return len(fitted.stamps_ns), [fit.track for fit in fits], [_line(fit) for fit in fits]
 
 
 def _line(fit: Fit) -> str:
@@ -158,8 +138,8 @@ def _fit_picture(
     source: Path, out: Path, model: Any, folder: Path, progress: Progress
 ) -> tuple[int, list[FittedTrack | None], list[str]]:
     """Fit key points of one camera; returns as `_fit_poses`."""
-    from steadypose.prior.offline.solve import PICTURES
-    from steadypose.prior.offline.windows import MIN_FRAMES, window_bounds
+    from steadypose.prior.fit.solve import PICTURES
+    from steadypose.prior.fit.windows import MIN_FRAMES, window_bounds
 
     recording = read_key_points(source)
     frames = len(recording.stamps_ns)
@@ -168,7 +148,7 @@ def _fit_picture(
     bar = progress.add_task(source.name, total=len(window_bounds(frames)))
     track = fit_key_points(model, recording, PICTURES, folder, lambda: progress.advance(bar))
     part = folder / out.name
-    arrays: dict[str, Any] = _added(arrays_of_fit(recording, track), track)
+    arrays: dict[str, Any] = with_bones(arrays_of_fit(recording, track), track)
     np.savez(part, **arrays)
     part.replace(out)
     misfit = track.misfit[0]
@@ -176,24 +156,14 @@ def _fit_picture(
     return frames, [track], [f"key points lie {np.nanmedian(misfit):.1f} pixels off in the median"]
 
 
-def _points(source: Path, frames: int) -> Floats | None:
-    """(T, N, 3) metres, points of the surface, of an .npz that has them."""
-    if source.suffix != ".npz":
-        return None
-    points = read_arrays(source, ("points",)).get("points")
-    if points is None:
-        return None
-    if points.dtype.kind not in "fiu" or points.ndim != 3 or len(points) != frames or points.shape[-1] != 3:
-        raise NpzError(
-            f"{source}: points: expected ({frames}, N, 3) metres, NaN for what is missing, got {points.dtype} "
-            f"{points.shape}"
-        )
-    return in_sight(points.astype(np.float64))
+def _points(source: Path) -> NDArray[Any] | None:
+    """Points of the surface, of an .npz that has them."""
+    return read_arrays(source, ("points",)).get("points") if source.suffix == ".npz" else None
 
 
 def _write_smpl(out: Path, shape: Any, tracks: Sequence[FittedTrack | None]) -> list[str]:
     """Write the motion of each fitted body as SMPL's; lines to print."""
-    from steadypose.prior.offline.smpl import smpl_motion
+    from steadypose.prior.fit.smpl import smpl_motion
 
     lines = []
     for number, track in enumerate(tracks):
@@ -207,34 +177,15 @@ def _write_smpl(out: Path, shape: Any, tracks: Sequence[FittedTrack | None]) -> 
     return lines
 
 
-def _added(arrays: dict[str, NDArray[Any]], track: Any) -> dict[str, NDArray[Any]]:
-    """With bones and ground, where there is one person; of several, .misfit.npz has them for each."""
-    bones = np.linalg.norm(track.offsets.mean(axis=0), axis=-1)
-    return arrays | {"bone_lengths": bones, "ground_plane": ground_plane(track.ground.mean(axis=0))}
-
-
-def _write(
-    out: Path,
-    folder: Path,
-    messages: Sequence[tuple[str, Message]],
-    stamps: NDArray[np.int64],
-    fits: Sequence[Fit],
-) -> None:
+def _write(out: Path, folder: Path, fitted: Fitted) -> None:
     """Write the output whole, or not at all."""
     part = folder / out.name
-    if out.suffix == ".npz":
-        collector = NpzCollector()
-        for _, message in messages:
-            collector.add(message)
-        arrays: dict[str, Any] = collector.arrays(stamps)
-        tracks = {fit.seen.id: fit.track for fit in fits if fit.track is not None}
-        if len(tracks) == 1:
-            arrays = _added(arrays, next(iter(tracks.values())))
-        np.savez(part, **arrays)
+    if out.suffix in ARRAY_FILES:
+        write_arrays(part, fitted_arrays(fitted))
     else:
         if part.exists():  # of a call that was killed
             shutil.rmtree(part)
-        write_recording(part, messages)
+        write_recording(part, fitted.messages)
     put_in_place(part, out)
 
 

@@ -19,9 +19,9 @@ from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.adapt import SensorFrame
 
 if TYPE_CHECKING:
-    from steadypose.prior.models.humor.network import HumorNet
-    from steadypose.prior.offline.solve import FitSettings
-    from steadypose.prior.offline.windows import FittedTrack, Track
+    from steadypose.prior.fit.humor_network import HumorNet
+    from steadypose.prior.fit.solve import FitSettings
+    from steadypose.prior.fit.windows import FittedTrack, Track
 
 Floats = NDArray[np.float64]
 
@@ -116,10 +116,10 @@ def track_of(seen: Seen, points: Floats | None) -> Track:
         seen: the body.
         points: (T, N, 3) metres, world, of its surface, NaN where there are fewer; None where there are none.
     """
-    from steadypose.prior.offline.motion import float_tensor
-    from steadypose.prior.offline.observations import POINT_SHARE, Observed, SeenJoints, SurfacePoints, thinned
-    from steadypose.prior.offline.solve import Start
-    from steadypose.prior.offline.windows import Track
+    from steadypose.prior.fit.motion import float_tensor
+    from steadypose.prior.fit.observations import POINT_SHARE, Observed, SeenJoints, SurfacePoints, thinned
+    from steadypose.prior.fit.solve import Start
+    from steadypose.prior.fit.windows import Track
 
     positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
     offsets = estimate_offsets(positions)
@@ -170,7 +170,7 @@ def fit_body(
     advanced: Callable[[], None] = lambda: None,
 ) -> Fit:
     """Fit one body; where that fails, or it stands elsewhere, ``pose/clean`` stays, and its anomaly is flagged."""
-    from steadypose.prior.offline.windows import fit_track
+    from steadypose.prior.fit.windows import fit_track
 
     positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
     before = np.linalg.norm(positions - raw, axis=-1)

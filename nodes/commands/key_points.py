@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import JOINTS, JointState, Pose
+from steadypose.nodes.driving import clean_arrays
 from steadypose.nodes.graph.clock import FRAME_NS
-from steadypose.nodes.library import clean
-from steadypose.nodes.sources.npz import NpzError, read_arrays, read_stamps
+from steadypose.nodes.sources.npz import ArraySource, NpzError, read_arrays, read_stamps
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import quaternions, rotation_matrix
@@ -28,10 +28,10 @@ from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.body.skeleton import REST_OFFSETS
 
 if TYPE_CHECKING:
-    from steadypose.prior.models.humor.network import HumorNet
-    from steadypose.prior.offline.observations import Pinhole
-    from steadypose.prior.offline.solve import FitSettings, Start
-    from steadypose.prior.offline.windows import FittedTrack, Track
+    from steadypose.prior.fit.humor_network import HumorNet
+    from steadypose.prior.fit.observations import Pinhole
+    from steadypose.prior.fit.solve import FitSettings, Start
+    from steadypose.prior.fit.windows import FittedTrack, Track
 
 Floats = NDArray[np.float64]
 
@@ -209,10 +209,10 @@ def track_of_picture(
     """
     import torch
 
-    from steadypose.prior.offline.lift import lift, starts_of_key_points
-    from steadypose.prior.offline.motion import float_tensor
-    from steadypose.prior.offline.observations import KeyPoints, Observed, SeenJoints, SurfacePoints, thinned
-    from steadypose.prior.offline.windows import Track
+    from steadypose.prior.fit.lift import lift, starts_of_key_points
+    from steadypose.prior.fit.motion import float_tensor
+    from steadypose.prior.fit.observations import KeyPoints, Observed, SeenJoints, SurfacePoints, thinned
+    from steadypose.prior.fit.windows import Track
 
     sigma = PIXEL_SIGMA * float(camera.focal.mean())
     observed: list[Observed] = [KeyPoints(float_tensor(pixels), float_tensor(confidence), camera, sigma)]
@@ -227,10 +227,12 @@ def track_of_picture(
 
 def _start_of_joints(joints: Floats, floor: float) -> list[Start]:
     """The motion that `clean` makes of joints (T, 22, 3) metres, world; none where it finds nobody in half of it."""
-    from steadypose.prior.offline.solve import Start
+    from steadypose.prior.fit.solve import Start
 
     stamps = np.round(np.arange(len(joints)) * FRAME_NS).astype(np.int64)
-    found = clean(joints, stamp_ns=stamps, delay=LIFTED_DELAY)["positions"].astype(float)
+    told = {"positions": joints, "stamp_ns": stamps, "skeleton": np.array("smpl22")}
+    settings = {"prior": {"delay": LIFTED_DELAY}, "trajectory": {}}
+    found = clean_arrays(ArraySource(Path("key points"), told), settings)["positions"].astype(float)
     known = np.flatnonzero(np.isfinite(found).all(axis=(1, 2)))
     if 2 * len(known) < len(found):
         return []
@@ -244,8 +246,8 @@ def track_of_key_points(recording: KeyPointRecording) -> Track:
     """What is to be fitted of a recording; the camera is at the origin of the world."""
     import torch
 
-    from steadypose.prior.offline.motion import float_tensor
-    from steadypose.prior.offline.observations import Pinhole
+    from steadypose.prior.fit.motion import float_tensor
+    from steadypose.prior.fit.observations import Pinhole
 
     camera = Pinhole(
         float_tensor(recording.focal),
@@ -271,7 +273,7 @@ def fit_key_points(
     advanced: Callable[[], None] = lambda: None,
 ) -> FittedTrack:
     """Fit one person."""
-    from steadypose.prior.offline.windows import fit_track
+    from steadypose.prior.fit.windows import fit_track
 
     if recording.camera_height is None:
         settings = replace(settings, ground_height_sigma=CAMERA_HEIGHT_SIGMA)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import logging
-import signal
 from collections.abc import Sequence
 
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError, nearest
-from steadypose.nodes.graph.startup import startup
+from steadypose.nodes.graph.loops import COMPILED, compile_missing
+from steadypose.nodes.graph.node import supervisor_id
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.graph.startup import startup, stop_on_signals
 from steadypose.nodes.graph.topology import NODES, load
+from steadypose.prior.settings import nearest
 
 
 def node(arguments: Sequence[str]) -> None:
@@ -29,8 +31,9 @@ def node(arguments: Sequence[str]) -> None:
     if given.name not in NODES:
         raise LaunchError(f"no node {given.name!r}{nearest(given.name, NODES)}; there are {', '.join(NODES)}")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    if given.name in COMPILED and not supervisor_id():  # else the run has done it
+        compile_missing(logging.info)
     with startup():
         process = load(NODES[given.name].node)(Launch.read(given.launch, given.set))
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: process.stop())
+    stop_on_signals(lambda *_: process.stop())
     process.run()

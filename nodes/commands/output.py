@@ -4,15 +4,28 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.recording_writer import recorded_parts
 from steadypose.msgs.types import Message
 from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.csv_table import write_csv
 from steadypose.nodes.sinks.recorder import LogTimes
+
+ARRAY_FILES = (".npz", ".csv")
+"""endings of outputs that are one file of arrays"""
+OTHER_FORMATS = {
+    *(".npy", ".json", ".jsonl", ".txt", ".tsv", ".xlsx", ".pkl", ".pt", ".h5", ".hdf5", ".mat", ".parquet", ".bag"),
+    *(".bvh", ".fbx", ".glb", ".gltf", ".c3d", ".trc", ".mp4", ".gif", ".png"),
+}
+"""endings that are never meant as a recording's name, which is that of a folder"""
 
 
 def check_output(source: Path, *outputs: Path) -> None:
@@ -26,6 +39,17 @@ def check_output(source: Path, *outputs: Path) -> None:
             raise LaunchError(f"{out}: expected its folder {out.resolve().parent} to exist; make it first")
 
 
+def check_format(out: Path) -> None:
+    """Raises:
+    LaunchError: an output of poses has the ending of a format that is not one of a recording or of arrays.
+    """
+    if out.suffix in OTHER_FORMATS:
+        raise LaunchError(
+            f"{out}: expected .npz or .csv for arrays, or a name without ending for a recording, got {out.suffix}; "
+            "`steadypose export` writes .bvh, .glb and .trc"
+        )
+
+
 def check_replaceable(out: Path, *, replace: bool) -> None:
     """Raises:
     LaunchError: something is there that is not to be replaced, or is nothing that these commands make.
@@ -34,9 +58,9 @@ def check_replaceable(out: Path, *, replace: bool) -> None:
         return
     if not replace:
         raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
-    if out.suffix == ".npz":
+    if out.suffix in ARRAY_FILES:
         if not out.is_file():
-            raise LaunchError(f"{out} is no file: expected an .npz to replace")
+            raise LaunchError(f"{out} is no file: expected an {out.suffix} to replace")
         return
     try:
         recorded_parts(out)
@@ -70,8 +94,17 @@ def write_recording(path: Path, messages: Iterable[tuple[str, Message]]) -> None
             writer.write(topic, message, log_times.next(topic, message.stamp_ns))
 
 
+def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write the arrays of `NpzCollector` as the file's ending says: one of `ARRAY_FILES`."""
+    if path.suffix == ".csv":
+        write_csv(path, arrays)
+    else:
+        named: dict[str, Any] = dict(arrays)
+        np.savez(path, **named)
+
+
 def put_in_place(part: Path, out: Path) -> None:
     """Move what was written to ``part``, in the same file system, to ``out``; a recording there is replaced."""
-    if out.suffix != ".npz" and out.exists():
+    if out.suffix not in ARRAY_FILES and out.exists():
         shutil.rmtree(out)
     part.replace(out)

@@ -5,51 +5,73 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
+import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from steadypose.prior.motion.clip import Clip, MotionError, documented
-from steadypose.prior.motion.datasets import DATA_SETS, SPLITS, UNREADABLE, DataSet, Dropped
-from steadypose.prior.motion.prepare import FPS, Prepared, at_speed, prepare_clip, write_prepared
+from steadypose.nodes.graph.launch import read_toml
+from steadypose.prior.mocap.clip import Clip, MotionError, documented
+from steadypose.prior.mocap.files import SUFFIXES, describe
+from steadypose.training.data.datasets import DATA_SETS, SPLITS, UNREADABLE, DataSet, Dropped, read_own
+from steadypose.training.data.prepare import FPS, Prepared, at_speed, prepare_clip, write_prepared
 
 
 class PrepareError(ValueError):
     """There is nothing to prepare; the message says what was looked for."""
 
 
-def prepare(mocap: Path, out: Path = Path("data"), speeds: tuple[float, ...] = (1.0,)) -> None:
+def prepare(
+    mocap: Path,
+    out: Path = Path("data"),
+    speeds: tuple[float, ...] = (1.0,),
+    rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+) -> None:
     """Turn motion capture into training data: 22 joints at 30 Hz, z up, on a floor, with contacts and splits.
 
     Writes prepared.npz, and prepare-report.json, which lists every recording that was left out and why. Validation
     and test hold out people, never frames; what is chosen is chosen on validation, and nothing on test. Models
-    trained on the set 'default' may go into products; 'research' is what only non-commercial models may use, and
-    what these validate on tests the default ones.
+    trained on the set 'default' may go into products; 'research' is what only non-commercial models may use;
+    'measure' trains none.
 
     What is read, by the name of the archive (.tar.xz, .npz) or folder:
       cmu_amc, cmu_bvh, cmu_expmap   CMU Graphics Lab, free for all uses            default
+      cmu_more                       the same, some fifteen more people             default
       cmu_dance                      the same: salsa; martial arts and dance test   default
       reactidle                      ReActIdle, MIT                                 default
       ui_prmd                        UI-PRMD, the Vicon's joints, public domain     default
       bandai_1, bandai_2             Bandai-Namco, CC BY-NC                         research
       amass                          AMASS' .npz, non-commercial                    research
-      own                            your own BVH; folders 'val', 'test' hold out   default
+      dancedb                        five dancers, research only                    measure
+      lafan1                         four actors, CC BY-NC-ND                       measure
+      own, or any other name         your own; folders 'val', 'test' hold out       default
+
+    Your own are .bvh of any rig, .trc, .c3d (extra 'mocap'), AMASS' .npz, or arrays, .npy with --rig. Joints, units and
+    the axis that points up are recognised; a folder is a person.
 
     Try:
       steadypose prepare mocap/                        all of it, a few minutes
       steadypose prepare mocap/cmu_amc.tar.xz --out /tmp/cmu
+      steadypose prepare my-takes/ --rig studio.toml   files that are not recognised
       steadypose prepare mocap/ --speeds 1 --speeds 2   fast motion to train on
 
     Args:
         mocap: folder with these, or one of them.
         out: folder to write to.
         speeds: training recordings of 50 frames a second and more are played once at each of these speeds.
+        rig: TOML that says of your own files what they do not: metres (the size of their unit), up, fps, skeleton (of
+            arrays), and [canonical], which of their joints left_elbow and the others of smpl22 are.
     """
     console = Console()
     sources = find_sources(mocap)
+    if rig is not None:
+        read = partial(read_own, description=describe(read_toml(rig)))
+        sources = [(path, replace(s, read=read) if s.name == "own" else s) for path, s in sources]
     result = _Result()
     columns = (
         TextColumn("{task.description:<24}"),
@@ -83,6 +105,8 @@ def find_sources(mocap: Path) -> list[tuple[Path, DataSet]]:
         raise PrepareError(f"expected a folder or archive of motion capture, '{mocap}' does not exist")
     candidates = [mocap] if mocap.is_file() else [*sorted(mocap.iterdir()), mocap]
     found = [(path, s) for s in DATA_SETS for path in candidates if s.matches(path)]
+    if not found and any(path.suffix in SUFFIXES for path in ([mocap] if mocap.is_file() else mocap.rglob("*"))):
+        found = [(mocap, s) for s in DATA_SETS if s.name == "own"]
     if not found:
         known = ", ".join(s.files.removesuffix(r"\b.*") for s in DATA_SETS)
         raise PrepareError(f"expected files named {known} in '{mocap}', found none")

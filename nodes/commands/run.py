@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import secrets
 import signal
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -21,14 +22,21 @@ from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Level
 from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.commands.printable import printable
+from steadypose.nodes.commands.setting_names import check_settings, in_launch_file
 from steadypose.nodes.graph import health_file
 from steadypose.nodes.graph.clock import FRAME_NS, POLL_S, Clock, SystemClock
 from steadypose.nodes.graph.health_file import write_health
 from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.ledger import LOSSES, Ledger, losses
+from steadypose.nodes.graph.loops import COMPILED, compile_missing
+from steadypose.nodes.graph.node import RUN
+from steadypose.nodes.graph.run_lock import RunLock
+from steadypose.nodes.graph.startup import stop_on_signals
 from steadypose.nodes.graph.supervisor import Supervisor
 from steadypose.nodes.graph.systemd import ALIVE, READY, STOPPING, notify
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, load
-from steadypose.nodes.sinks.recorder import RecorderSettings
+from steadypose.nodes.sinks.recorder import RecorderSettings, free_directory
+from steadypose.nodes.sources.recording import DAMAGE
 
 LINE_NS = 5_000_000_000
 """between lines where there is no terminal for a table"""
@@ -61,34 +69,50 @@ def run(
         loop: play it again and again.
         record: a recording to make of all topics.
         view: serve the picture for a browser, and print its address.
-        settings: any setting of the launch file, over what it says. May be given again.
+        settings: any setting of the launch file, over what it says; the end of its name will do, where there is one
+            such setting only: delay=2. May be given again.
     """
-    overrides = list(settings)
+    overrides = in_launch_file(settings)
     if input is not None and input.suffix.lower() in VIDEOS:
         launch = "webcam" if launch == REPLAY else launch
-        overrides += ['input.source="webcam"', f"input.webcam.video={json.dumps(str(input.resolve()))}"]
+        overrides += ['input.source="webcam"', f"input.webcam.video={_toml(input.resolve())}"]
         overrides.append("transport.lossless=true")  # a film can wait
     elif input is not None:
-        overrides += ['input.source="recording"', f"input.recording={json.dumps(str(input.resolve()))}"]
+        overrides += ['input.source="recording"', f"input.recording={_toml(input.resolve())}"]
     if rate is not None:
         overrides.append(f"input.rate={rate}")
     if loop:
         overrides.append("input.loop=true")
     if record is not None:
-        overrides.append(f"recorder.directory={json.dumps(str(record.resolve()))}")
+        overrides.append(f"recorder.directory={_toml(record.resolve())}")
     nodes = Launch.read(launch, overrides).nodes
     nodes = [*nodes, *(name for name, asked in (("recorder", record), ("viewer", view)) if asked and name not in nodes)]
     overrides.append(f"nodes={json.dumps(nodes)}")
     settled = Launch.read(launch, overrides)
+    # a log file has no width, and a table cut to 80 columns says little
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    if "recorder" in nodes and (changed := free_directory(settled)):
+        overrides.append(f"recorder.directory={_toml(changed)}")
+        settled = Launch.read(launch, overrides)
+        console.print(f"recording to {printable(str(changed))}: the folder asked for is there already", soft_wrap=True)
+    if settings:
+        check_settings(settled.sections)
     _check(settled)
     arguments = ["--launch", launch]
     for override in overrides:
         arguments += ["--set", override]
-    for request in (signal.SIGTERM, signal.SIGINT):  # a shell that starts this in the background ignores the latter
-        signal.signal(request, signal.default_int_handler)
-    # a log file has no width, and a table cut to 80 columns says little
-    console = Console(width=None if sys.stdout.isatty() else 140)
-    return _Run(settled, arguments, console, SystemClock()).watch()
+    stop_on_signals(signal.default_int_handler)
+    with RunLock(settled) as lock:
+        if COMPILED & {*nodes}:
+            compile_missing(lambda line: console.print(printable(line), markup=False, highlight=False, soft_wrap=True))
+        identity = secrets.token_hex(8)
+        watched = _Run(settled, arguments, console, SystemClock(), identity=identity, writes_health=lock.has_health)
+        return watched.watch()
+
+
+def _toml(path: Path) -> str:
+    """A path as a TOML string: JSON's, but for what it escapes as two halves of one character."""
+    return json.dumps(str(path), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _check(launch: Launch) -> None:
@@ -101,12 +125,24 @@ def _check(launch: Launch) -> None:
 class _Run:
     """One run: the processes, their diagnostics, and when it is over."""
 
-    def __init__(self, launch: Launch, arguments: list[str], console: Console, clock: Clock) -> None:
+    def __init__(
+        self,
+        launch: Launch,
+        arguments: list[str],
+        console: Console,
+        clock: Clock,
+        *,
+        identity: str = "",
+        writes_health: bool = True,
+    ) -> None:
         self._launch = launch
         self._arguments = arguments
         self._console = console
         self._clock = clock
+        self._id = identity
+        self._writes_health = writes_health
         self._diagnostics: dict[str, Diagnostics] = {}
+        self._ledger = Ledger(launch)
         self._problems: dict[str, set[str]] = {}
         self._over = False
         waited_for = frozenset[str]().union(*map(launch.reliable_subscribers, POSE_NODES))
@@ -127,11 +163,11 @@ class _Run:
         endpoints = [transport.endpoint(name) for name in self._launch.nodes]
         terminal = self._console.is_terminal
         with (
-            Supervisor(self._launch.nodes, self._arguments, self._clock, self._print) as supervisor,
+            Supervisor(self._launch.nodes, self._arguments, self._clock, self._print, self._id) as supervisor,
             Subscriber(endpoints, DIAGNOSTICS, keys=keys, clear_text=transport.clear_text) as subscriber,
             Live(console=self._console, auto_refresh=False, transient=True) if terminal else nullcontext() as live,
         ):
-            status = None
+            status, interrupted = None, False
             try:
                 while status is None:
                     received = subscriber.receive(POLL_S)
@@ -143,16 +179,27 @@ class _Run:
                     self._report(supervisor)
                     status = self._exit_status(supervisor)
             except KeyboardInterrupt:
-                status = 0
+                status, interrupted = 0, True
             notify(STOPPING)
             supervisor.stop()
-            (transport.ipc_directory / health_file.NAME).unlink(missing_ok=True)
+            if self._writes_health:
+                (transport.ipc_directory / health_file.NAME).unlink(missing_ok=True)
             while received := subscriber.receive(0):
                 self._receive(received, supervisor)
-        self._console.print(table(self._launch.nodes, self._diagnostics, supervisor, summary=True))
-        if status == 0 and (lost := self._not_recorded(supervisor)):
+        for name, diagnostics in self._diagnostics.items():
+            values = diagnostics.values | self._ledger.away(name, self._diagnostics)
+            self._diagnostics[name] = dataclasses.replace(diagnostics, values=values)
+        with suppress(OSError):
+            self._console.print(table(self._launch.nodes, self._diagnostics, supervisor, summary=True))
+        if unread := self._not_read():
+            self._print(f"{unread}: what could be read of the input was played")
+            status = status or 1
+        if status == 0 and not interrupted and (lost := self._not_through()):
+            self._print(f"not every frame went through: {lost}")
+            status = 1
+        if lost := self._not_recorded(supervisor):
             self._print(f"the recording is not complete: {lost}")
-            return 1
+            status = status or 1
         return status
 
     def _report(self, supervisor: Supervisor) -> None:
@@ -160,24 +207,34 @@ class _Run:
         if self._clock.monotonic_ns() - self._reported_ns < REPORT_NS:
             return
         self._reported_ns = self._clock.monotonic_ns()
-        write_health(self._launch.transport.ipc_directory, sorted(self._required), supervisor, self._diagnostics)
+        if self._writes_health:
+            write_health(self._launch.transport.ipc_directory, sorted(self._required), supervisor, self._diagnostics)
         if not self._ready and all(name in self._diagnostics for name in self._required):
             self._ready = True
             notify(READY)
         notify(ALIVE)
 
     def _print(self, line: str) -> None:
-        self._console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
+        """Print a line. Where it cannot be written, because the disk is full or the terminal gone, poses go on."""
+        try:
+            self._console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
+        except BrokenPipeError:  # who read it wants no more
+            raise
+        except OSError:
+            return
 
     def _receive(self, received: tuple[str, object], supervisor: Supervisor) -> None:
         diagnostics = received[1]
         if not isinstance(diagnostics, Diagnostics) or diagnostics.node not in supervisor.children:
             return
+        if diagnostics.values.get(RUN, "") != self._id:  # of another run, or a node by itself, at the same address
+            return
         supervisor.children[diagnostics.node].heard()
         last = self._diagnostics.get(diagnostics.node)
         if last is None or _counts(last) != _counts(diagnostics):
             self._progress_ns = self._clock.monotonic_ns()
-        self._diagnostics[diagnostics.node] = diagnostics
+        restarts = supervisor.children[diagnostics.node].restarts
+        self._diagnostics[diagnostics.node] = self._ledger.note(diagnostics, restarts)
         self._print_problems(diagnostics)
 
     def _print_problems(self, diagnostics: Diagnostics) -> None:
@@ -192,7 +249,8 @@ class _Run:
 
     def _show(self, supervisor: Supervisor, live: Live | None) -> None:
         if live:
-            live.update(table(self._launch.nodes, self._diagnostics, supervisor), refresh=True)
+            with suppress(OSError):
+                live.update(table(self._launch.nodes, self._diagnostics, supervisor), refresh=True)
         elif self._clock.monotonic_ns() - self._printed_ns >= LINE_NS:
             self._printed_ns = self._clock.monotonic_ns()
             self._print(line(self._launch.nodes, self._diagnostics, supervisor))
@@ -227,9 +285,24 @@ class _Run:
             return ""
         if "recorder" in supervisor.failed:
             return "the recorder could not run"
-        values = self._diagnostics["recorder"].values if "recorder" in self._diagnostics else {}
-        causes = [f"{key} {n}" for key, n in values.items() if key.startswith(("dropped.", "refused.")) and n != "0"]
-        return ", ".join(causes)
+        return losses(self._diagnostics["recorder"], *LOSSES) if "recorder" in self._diagnostics else ""
+
+    def _not_through(self) -> str:
+        """What a launch that is to lose nothing has lost, or could not read; empty if nothing."""
+        if not self._launch.transport.lossless:
+            return ""
+        found = {
+            name: losses(diagnostics, *(LOSSES if name == "pose_input" else ("dropped.",)))
+            for name, diagnostics in self._diagnostics.items()
+            if NODES[name].delivery is not Delivery.BEST_EFFORT
+        }
+        return "; ".join(f"{name}: {lost}" for name, lost in found.items() if lost)
+
+    def _not_read(self) -> str:
+        """What of a recording could not be read, because it is damaged; empty if all could."""
+        values = self._diagnostics["pose_input"].values if "pose_input" in self._diagnostics else {}
+        unread = {key.removeprefix("refused."): n for key, n in values.items() if key.startswith("refused.")}
+        return ", ".join(f"{cause}: {n}" for cause, n in unread.items() if cause.startswith(DAMAGE))
 
     def _drained(self) -> bool:
         """Whether the end of the stream has come through every node."""
@@ -272,6 +345,7 @@ def table(
             {
                 "node": name,
                 "state": state.partition(" ")[0],
+                "in": str(_sum(values, "in.")) if topic else "",
                 "frames": values.get(f"count.{topic}") or values.get("written", ""),
                 "Hz": _short(values.get(f"mean_rate.{topic}" if summary else f"rate.{topic}"), 1),
                 "latency ms\np50/p99": _pair(values, "latency_ms"),
@@ -319,7 +393,7 @@ def line(nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supe
         trouble = _sum(values, "dropped."), _sum(values, "refused.")
         parts.append(
             f"{topic} {_short(values[f'rate.{topic}'], 1)} Hz"
-            + (f", {late} ms" if late else "")
+            + (f", latency p50/p99 {late} ms" if late else "")
             + (f", {trouble[0]} dropped, {trouble[1]} refused" if any(trouble) else "")
             + problems
         )

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Literal, get_args
 
-import torch
-
+from steadypose.nodes.commands.training_data import little_data
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.prior.models.distributed import join, neighbours, writes
-from steadypose.prior.models.torch_weights import install as install_weights
-from steadypose.prior.models.training import TrainingOptions
-from steadypose.prior.motion.datasets import WeightSet
+from steadypose.training.data.datasets import WeightSet
+from steadypose.training.distributed import join, set_threads, writes
+from steadypose.training.loop import TrainingOptions
+from steadypose.training.weights import install as install_weights
 
 
 def train(
@@ -26,7 +26,9 @@ def train(
         "humor",
         "correction",
         "mixture",
+        "body_modes",
         "occlusion",
+        "posture",
     ],
     data: Path = Path("data/prepared.npz"),
     weights: Literal["default", "research", "kinect_v2"] | None = None,
@@ -47,14 +49,15 @@ def train(
     runs/MODEL-SET; a launch file takes their path. Those that ship are replaced only when asked to, and kept.
 
     Args:
-        model: mixture (the smoother), hmvae (refinement), hmvae64 ('complete --optimise'), hgvae (anomaly score and
-            imputation), hgvae-wide (the same in the paper's size, for recordings), trajectory (root velocity),
-            contacts, humor (transitions, for 'steadypose fit'), occlusion (what to believe of a hidden joint),
-            completer ('steadypose complete'), or correction (a sensor's own error).
+        model: mixture (the smoother), body_modes (which joints it smooths together, in seconds), hmvae (refinement),
+            hmvae64 ('complete --optimise'), hgvae (anomaly score and imputation), hgvae-wide (the same in the paper's
+            size, for recordings), trajectory (root velocity), contacts, humor (transitions, for 'steadypose fit'),
+            occlusion (weights of a hidden joint), posture (how joints lie to each other), completer ('steadypose
+            complete'), or correction (a sensor's own error).
         data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon; for
-            mixture and occlusion, the folder of the recordings, which they take at several speeds.
+            mixture, body_modes and occlusion, the folder of the recordings, which they take at several speeds.
         weights: the set to train: 'default' takes only data free for products, 'research' all of it (there is none of
-            mixture and occlusion); a correction is named after its sensor, kinect_v2.
+            mixture, body_modes and occlusion); a correction is named after its sensor, kinect_v2.
         runs: where checkpoints and curves go.
         iterations: optimiser steps; the model's own number, if left out. Fewer make a weaker model sooner.
         start: weights to go on from, a set or a .safetensors file: with motion of one's own and a third of the
@@ -64,29 +67,33 @@ def train(
         install: put the weights where nodes find them by the set's name; what they replace goes to 'previous' there.
     """
     join()
-    torch.set_num_threads(max(threads // neighbours(), 1))
+    set_threads(threads)
     if model == "hmvae":
-        from steadypose.prior.models.hmvae.train import train_hmvae as train_model
+        from steadypose.training.recipes.hmvae import train_hmvae as train_model
     elif model == "hmvae64":
-        from steadypose.prior.models.hmvae.train import train_long_hmvae as train_model
+        from steadypose.training.recipes.hmvae import train_long_hmvae as train_model
     elif model == "hgvae":
-        from steadypose.prior.models.hgvae.train import train_hgvae as train_model
+        from steadypose.training.recipes.hgvae import train_hgvae as train_model
     elif model == "hgvae-wide":
-        from steadypose.prior.models.hgvae.train import train_hgvae_wide as train_model
+        from steadypose.training.recipes.hgvae import train_hgvae_wide as train_model
     elif model == "mixture":
-        from steadypose.prior.models.mixture.train import train_mixture as train_model
+        from steadypose.training.recipes.mixture import train_mixture as train_model
+    elif model == "body_modes":
+        from steadypose.training.recipes.body_modes import train_modes as train_model
     elif model == "trajectory":
-        from steadypose.prior.models.root_velocity.train import train_trajectory as train_model
+        from steadypose.training.recipes.root_velocity import train_trajectory as train_model
     elif model == "completer":
-        from steadypose.prior.models.completer.train import train_completer as train_model
+        from steadypose.training.recipes.completer import train_completer as train_model
     elif model == "contacts":
-        from steadypose.prior.models.contacts.train import train_contacts as train_model
+        from steadypose.training.recipes.contacts import train_contacts as train_model
     elif model == "occlusion":
-        from steadypose.prior.clean.train_occlusion import train_occlusion as train_model
+        from steadypose.training.recipes.occlusion import train_occlusion as train_model
+    elif model == "posture":
+        from steadypose.training.recipes.posture import train_posture as train_model
     elif model == "humor":
-        from steadypose.prior.models.humor.train import train_humor as train_model
+        from steadypose.training.recipes.humor import train_humor as train_model
     else:
-        from steadypose.prior.models.sensor_bias.train import train_correction as train_model
+        from steadypose.training.recipes.sensor_bias import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")
     if name not in (sets := _weight_sets(model)):
         raise LaunchError(f"--weights: expected {' or '.join(sets)} for {model}, got {name}")
@@ -96,6 +103,8 @@ def train(
         options = TrainingOptions(data, runs, name, iterations, seed, start)
     except ValueError as error:
         raise LaunchError(f"--{error}") from error
+    if warning := little_data(data, name):
+        print(warning, file=sys.stderr)
     path = train_model(options)
     if writes():
         print(f"weights: {install_weights(path) if install else path}")
@@ -105,4 +114,4 @@ def _weight_sets(model: str) -> tuple[str, ...]:
     """The sets of weights that a model can be trained for."""
     if model == "correction":
         return ("kinect_v2",)
-    return ("default",) if model in ("mixture", "occlusion") else get_args(WeightSet)
+    return ("default",) if model in ("mixture", "body_modes", "occlusion") else get_args(WeightSet)

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from steadypose.msgs.addresses import local_directory, make_private
 from steadypose.msgs.keys import Keys, load_keys
-from steadypose.nodes.graph.settings import LaunchError, check_addresses, nearest, path_setting
+from steadypose.nodes.graph.settings import LaunchError, check_addresses, path_setting
 from steadypose.nodes.graph.topology import NODES
+from steadypose.prior.settings import nearest
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class TransportSettings:
     """a recording can wait, a camera cannot: true lets a node hold up its source while it is slow, or not there yet;
     false drops its oldest frames"""
     queue: int = 8
-    """not lossless: frames a node keeps when it falls behind"""
+    """not lossless: frames a node keeps at most when it falls behind; once the oldest is late, all but the newest go"""
     lifespan_s: float = 1.0
     """not lossless: age of a message, from its sending on, from which a node drops it instead of taking it for new"""
     clear_text: bool = False

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 
+from steadypose import PACKAGE
 from steadypose.nodes.graph.settings import LaunchError
 
 
@@ -17,17 +20,24 @@ class Extra:
     """what needs it"""
     modules: tuple[str, ...]
     """which it brings, by the names they are imported by"""
+    size: str = ""
+    """what it downloads, where that is much"""
 
 
 EXTRAS: Mapping[str, Extra] = {
     "dev": Extra("the tests", ("pytest",)),
+    "docs": Extra("the documentation as a site", ("mkdocs",)),
+    "export": Extra("steadypose export to .glb", ("pygltflib",)),
     "foxglove": Extra("poses live in Foxglove", ("foxglove",)),
+    "mocap": Extra("reading .c3d", ("ezc3d",)),
     "oak": Extra("an OAK camera as the source, and calibrating any camera", ("depthai", "cv2")),
     "ray": Extra("steadypose clean --ray, on a cluster", ("ray",)),
     "ros2": Extra("the ROS 2 bridge, and skeletons from ROS 2 topics", ("cyclonedds",)),
     "ros2-test": Extra("the tests of ROS 2", ("rclpy",)),
-    "train": Extra("steadypose train, fit and evaluate", ("torch", "roma", "sklearn")),
+    "train": Extra("steadypose train, fit and evaluate", ("torch", "roma", "sklearn"), "5 GB, torch with CUDA"),
+    "retarget": Extra("steadypose retarget: motion for a robot or an avatar", ("mink", "mujoco", "daqp")),
     "view": Extra("the picture in the browser, and steadypose plot", ("rerun", "matplotlib")),
+    "web": Extra("poses in the browser: steadypose run web", ("websockets",)),
     "webcam": Extra("a webcam as the source", ("mediapipe",)),
 }
 """by the name in ``[project.optional-dependencies]``; a module that several bring stands at one of them"""
@@ -49,7 +59,22 @@ def extra_of(module: str) -> str | None:
 
 def how_to_install(missing: Sequence[str], extra: str) -> str:
     """What to say of modules that an extra brings and that are not installed."""
+    size = f" ({EXTRAS[extra].size})" if EXTRAS[extra].size else ""
     return (
-        f"needs {', '.join(missing)}, which comes with the extra {extra!r} and is not installed: "
-        f"`pip install 'steadypose[{extra}]'`, or in the checkout `.uv/bin/uv sync --frozen --inexact --extra {extra}`"
+        f"needs {', '.join(missing)}, which comes with the extra {extra!r}{size} and is not installed: "
+        f"{install_command(extra)}"
     )
+
+
+def install_command(extra: str = "") -> str:
+    """What to type to install an extra, or steadypose itself anew, where this Python looks for packages.
+
+    The name is not on the package index yet, so it is the checkout that is named.
+    """
+    if (PACKAGE.parents[1] / "pyproject.toml").exists():
+        checkout = str(PACKAGE.parents[1])
+        if Path(sys.prefix) == Path(checkout, ".venv"):
+            return f"./steadypose add {extra}" if extra else "rm -f .venv/.installed-* && ./steadypose doctor"
+    else:
+        checkout = "PATH/TO/CHECKOUT"
+    return f"pip install '{checkout}[{extra}]'" if extra else f"pip install --upgrade --force-reinstall {checkout}"

@@ -9,12 +9,16 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.types import Diagnostics, Level
-from steadypose.nodes.checks.problem import Problem, as_values
+from steadypose.nodes.checks.problem import Problem, as_values, error
 from steadypose.nodes.graph.clock import Clock
+from steadypose.nodes.graph.topology import NODES
 
 REPORT_NS = 1_000_000_000
 """between two reports"""
+STALL_NS = 2_000_000_000
+"""input without output for so long is no progress"""
 SAMPLES = 1000
 """latencies and compute times kept for the percentiles: half a minute at 30 Hz"""
 
@@ -26,21 +30,28 @@ class Health:
         clock: of the node.
 
     Attributes:
-        state: in a word or two: ``starting``, ``running``, ``waiting for prior``, ``stopped``.
+        state: in a word or two: ``starting``, ``running``, ``waiting for prior``, ``stopped``;
+            reported as ``stalled`` where frames come in and none go out.
+        unread: who of those that are waited for does not read; then that is the state of one that is ``running``.
         counts: messages refused and dropped by the node itself, by cause.
-        published: messages published, by topic.
+        published: messages published, by topic; where a node goes on for another one, by both.
+        received: messages worked on, by topic.
         ended: topics of which the end of the stream was seen.
         stamp_ns: capture of the newest frame, nanoseconds.
     """
 
     def __init__(self, clock: Clock) -> None:
         self.state = "starting"
+        self.unread = ""
         self.counts: Counter[str] = Counter()
         self.published: Counter[str] = Counter()
+        self.received: Counter[str] = Counter()
         self.ended: set[str] = set()
         self.stamp_ns = 0
         self._clock = clock
         self._queue = 0
+        self._received_ns = 0
+        self._unanswered_ns: int | None = None  # since when input has come and nothing has gone out
         self._latency_ns: deque[int] = deque(maxlen=SAMPLES)
         self._compute_ns: deque[int] = deque(maxlen=SAMPLES)
         self._first_and_last_ns: dict[str, tuple[int, int]] = {}
@@ -54,6 +65,33 @@ class Health:
         """Whether it is time for the next report."""
         return self._clock.monotonic_ns() - self._reported_at >= REPORT_NS
 
+    def go_on_from(self, published: Mapping[str, int]) -> None:
+        """Count on from what the node before this one had published."""
+        self.published.update(published)
+        self._published_before.update(published)
+
+    def note_received(self, topic: str) -> None:
+        """A frame was taken to be worked on."""
+        self.received[topic] += 1
+        self._received_ns = self._clock.monotonic_ns()
+        if self._unanswered_ns is None:
+            self._unanswered_ns = self._received_ns
+
+    def stall(self, node: str) -> list[Problem]:
+        """The problem of a node that takes frames and gives none."""
+        now = self._clock.monotonic_ns()
+        if NODES[node].stream is None or self._unanswered_ns is None or now - self._received_ns > STALL_NS:
+            return []
+        if now - self._unanswered_ns <= STALL_NS:
+            return []
+        return [
+            error(
+                "no_output",
+                f"frames come in and for {(now - self._unanswered_ns) / 1e9:.0f} s none went out: see what is refused, "
+                "and who is waited for",
+            )
+        ]
+
     def note_published(self, topic: str, at_ns: int, latency_ns: int | None) -> None:
         """A message was published.
 
@@ -63,6 +101,8 @@ class Health:
             latency_ns: from capture, less the delay that is meant; None where it is not known.
         """
         self.published[topic] += 1
+        if topic != DIAGNOSTICS:
+            self._unanswered_ns = None
         self._first_and_last_ns[topic] = self._first_and_last_ns.get(topic, (at_ns, at_ns))[0], at_ns
         if latency_ns is not None:
             self._latency_ns.append(latency_ns)
@@ -93,9 +133,12 @@ class Health:
         lost = counts.total() + refused_by_node
         newly_lost, self._lost_before = lost - self._lost_before, lost
         worst = max(problems, key=lambda problem: problem.level, default=None)
-        values = {"state": self.state, "ended": " ".join(sorted(self.ended)), "queue": str(self._queue)}
+        stalled = any(problem.cause == "no_output" for problem in problems)
+        state = self.unread or "stalled" if self.state == "running" and (self.unread or stalled) else self.state
+        values = {"state": state, "ended": " ".join(sorted(self.ended)), "queue": str(self._queue)}
         self._queue = 0
         values |= {f"count.{topic}": str(n) for topic, n in self.published.items()}
+        values |= {f"in.{topic}": str(n) for topic, n in self.received.items()}
         values |= {f"rate.{topic}": f"{rate:.2f}" for topic, rate in self._rates.items()}
         values |= {
             f"mean_rate.{topic}": f"{(self.published[topic] - 1) * 1e9 / max(last - first, 1):.2f}"

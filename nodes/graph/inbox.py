@@ -12,10 +12,14 @@ from steadypose.msgs.types import Diagnostics, Message
 
 READ_AHEAD = 64
 """messages a node takes off a socket before it works on one"""
+DEADLINE_NS = 100_000_000
+"""that a frame may be older than the newest of its stream; then it is that one's turn. Such gaps are bridged"""
 
 
 class Inbox:
     """Messages received and not yet processed.
+
+    Who can drop frames works on the newest first: once the oldest that waits is late, all but the newest go.
 
     With several subscribers, as for the kiosks of a server, each has a queue of its own, and they take turns: one that
     floods the node loses only its own messages.
@@ -32,6 +36,19 @@ class Inbox:
         if len(subscribers) > 1:
             for subscriber in subscribers:
                 self._poller.register(subscriber.socket, zmq.POLLIN)
+
+    def dropped_of(self, message: Message) -> bool:
+        """Whether frames of a message's stream were dropped since this was last asked of it."""
+        source = _source(message)
+        dropped = [queue.sources for queue in self._queues if source in queue.sources]
+        for sources in dropped:
+            sources.discard(source)
+        return bool(dropped)
+
+    @property
+    def sources(self) -> frozenset[str]:
+        """Of which frames were dropped and none has been worked on since."""
+        return frozenset(source for queue in self._queues for source in queue.sources)
 
     @property
     def overrun(self) -> int:
@@ -64,6 +81,7 @@ class _Queue:
 
     def __init__(self, subscriber: Subscriber, limit: int | None) -> None:
         self.overrun = 0
+        self.sources: set[str] = set()
         self.waiting: deque[tuple[str, Message]] = deque()
         self._subscriber = subscriber
         self._limit = limit
@@ -72,16 +90,41 @@ class _Queue:
         for _ in range(READ_AHEAD):
             if self._limit is None and len(self.waiting) >= READ_AHEAD:
                 break
-            received = self._subscriber.receive(0 if self.waiting else timeout_s)
+            received = self._subscriber.receive(0 if self.waiting else timeout_s, taken=False)
             if received is None:
                 break
             self.waiting.append(received)
-            if self._limit is not None and len(self.waiting) > self._limit:
-                self._drop_oldest_frame()
+            if self._limit is not None:
+                self._drop_late(*received)
+                if len(self.waiting) > self._limit:
+                    self._drop(next((frame for frame in self.waiting if _is_frame(frame[1])), None))
 
-    def _drop_oldest_frame(self) -> None:
-        for index, (_, message) in enumerate(self.waiting):
-            if not isinstance(message, Diagnostics) and not message.end_of_stream:
-                del self.waiting[index]
-                self.overrun += 1
-                return
+    def _drop_late(self, topic: str, newest: Message) -> None:
+        """Drop the frames before the newest of a stream, if the oldest of them is late."""
+        if not _is_frame(newest):
+            return
+        before = [
+            frame
+            for frame in self.waiting
+            if frame[0] == topic
+            and frame[1] is not newest
+            and _is_frame(frame[1])
+            and _source(frame[1]) == _source(newest)
+        ]
+        if before and newest.stamp_ns - before[0][1].stamp_ns > DEADLINE_NS:
+            for frame in before:
+                self._drop(frame)
+
+    def _drop(self, frame: tuple[str, Message] | None) -> None:
+        if frame is not None:
+            self.waiting = deque(other for other in self.waiting if other is not frame)
+            self.overrun += 1
+            self.sources.add(_source(frame[1]))
+
+
+def _is_frame(message: Message) -> bool:
+    return not isinstance(message, Diagnostics) and not message.end_of_stream
+
+
+def _source(message: Message) -> str:
+    return "" if isinstance(message, Diagnostics) else message.source

@@ -3,7 +3,7 @@
 A launch file is TOML, one section a subject, and read strictly: a key that does not exist is an error that names
 the nearest one that does. Every section may be left out; the defaults play nothing but run. The sections of nodes are
 declared in `nodes.graph.topology`; ``[prior]`` and ``[trajectory]`` are passed on as they are to the stages they
-configure (`prior.clean.pipeline.PriorSettings`, `prior.world.pipeline.TrajectorySettings`), which check them just as
+configure (`prior.clean.settings.PriorSettings`, `prior.world.settings.TrajectorySettings`), which check them just as
 strictly.
 """
 
@@ -18,10 +18,10 @@ from typing import Any, TypeVar
 from steadypose import PACKAGE
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.nodes.graph.access import ServerSettings, TransportSettings
-from steadypose.nodes.graph.settings import LaunchError, nearest, resolve_paths
+from steadypose.nodes.graph.settings import LaunchError, resolve_paths
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, load
 from steadypose.prior.body.own_layouts import add_layouts
-from steadypose.prior.settings import build_settings
+from steadypose.prior.settings import build_settings, nearest
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -29,6 +29,8 @@ else:
     import tomli as tomllib
 
 Settings = TypeVar("Settings")
+
+TOO_DEEP = "lists or tables within lists, hundreds deep: expected settings, which are two or three deep"
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,8 @@ class Launch(_EveryLaunch):
     """the sections of nodes that the file has; see `settings` and `table`"""
 
     def __post_init__(self) -> None:
+        if not self.nodes:
+            raise LaunchError(f"nodes: expected one or more of {', '.join(NODES)}, got none")
         for node in self.nodes:
             if node not in NODES:
                 raise LaunchError(
@@ -135,6 +139,8 @@ def read_toml(file: Path) -> dict[str, Any]:
         return tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise LaunchError(f"{file} is not TOML: {error}") from error
+    except RecursionError as error:
+        raise LaunchError(f"{file}: {TOO_DEEP}") from error
     except OSError as error:
         raise LaunchError(f"{file} cannot be read: {error.strerror}") from error
 
@@ -179,6 +185,8 @@ def apply_override(table: dict[str, Any], override: str) -> None:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text
+    except RecursionError as error:
+        raise LaunchError(f"{path.strip()}: {TOO_DEEP}") from error
     *sections, key = (part.strip() for part in path.split("."))
     for section in sections:
         table = table.setdefault(section, {})

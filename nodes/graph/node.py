@@ -6,7 +6,8 @@ frames, drops the oldest and counts them. What a node's `Delivery` says comes be
 
 **Order of start.** With ``lossless``, a node opens its publisher, waits until its reliable subscribers are there, and
 only then subscribes itself. So a stream starts when the whole way to its end is open, whatever the order in which the
-processes came up, and its first frame is not lost; and it halts while a node on the way is started again.
+processes came up, and its first frame is not lost; and it halts while a node on the way is started again, which is then
+given again what the one before it had not answered (`relay`).
 
 **Latency.** Stamps are of capture, and in a replay long past. The input node says in its diagnostics which stamp
 it plays at which time (`Timeline`); with that, every node knows how late it is. Stamps are never touched.
@@ -25,21 +26,29 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import ClassVar
 
+from steadypose.msgs.delivery import DEAF_S
+from steadypose.msgs.principals import Principals
+from steadypose.msgs.subscriber import SECOND
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.checks.problem import Problem, error
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock, Timeline
-from steadypose.nodes.graph.health import Health
+from steadypose.nodes.graph.health import STALL_NS, Health
 from steadypose.nodes.graph.inbox import Inbox
 from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.relay import CONTEXT, Relay
 from steadypose.nodes.graph.systemd import ALIVE, READY, notify
 from steadypose.nodes.graph.topology import NODES, Delivery
 
 logger = logging.getLogger(__name__)
 
+WAITING = "waiting for"
+"""begins the state of a node that waits for its listeners"""
 SUPERVISOR = "STEADYPOSE_SUPERVISOR"
 """environment: the process that started this node; without it, the node stops"""
+RUN = "STEADYPOSE_RUN"
+"""environment, and a value of diagnostics: which run the node is of"""
 
 
 def supervisor_id() -> int:
@@ -59,15 +68,39 @@ class Node(ABC):
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         self.launch = launch
         self.clock: Clock = clock or SystemClock()
-        self.timeline: Timeline | None = None
+        self._timeline: Timeline | None = None
+        self._set_ns = 0
         self.health = Health(self.clock)
         self._stopping = False
         self._required = launch.reliable_subscribers(self.name)
         self._blocked_ns = 0
         self._disconnected: Counter[str] = Counter()
+        self._deaf: frozenset[str] = frozenset()
         self._inbox: Inbox | None = None
         self._refused_before: Counter[str] = Counter()
         self._supervisor = supervisor_id()
+        self._run = os.environ.get(RUN, "")
+        self._relay: Relay | None = None
+
+    @property
+    def timeline(self) -> Timeline | None:
+        """Which moment of capture is played when; None until that is known."""
+        return self._timeline
+
+    @timeline.setter
+    def timeline(self, timeline: Timeline | None) -> None:
+        self._timeline = timeline
+        self._set_ns = self.clock.now_ns() - self.clock.monotonic_ns()
+
+    def _late_ns(self, timeline: Timeline, stamp_ns: int) -> int:
+        """How late it is for a stamp; where the wall clock was set since the timeline was told, by the nearer of both.
+
+        Which of the two a stamp is of cannot be known: what was captured before it was set still comes after.
+        """
+        now_ns = self.clock.now_ns()
+        set_by_ns = now_ns - self.clock.monotonic_ns() - self._set_ns
+        late_ns = now_ns - timeline.wall(stamp_ns)
+        return min(late_ns, late_ns - set_by_ns, key=abs)
 
     @abstractmethod
     def handle(self, topic: str, message: Message) -> None:
@@ -81,6 +114,10 @@ class Node(ABC):
         """Problems with this node's stream since the last call."""
         return []
 
+    def mark(self, message: Message) -> tuple[int, int]:
+        """What the node after this one needs to know of a message that was published and taken."""
+        return message.stamp_ns, int(not isinstance(message, Diagnostics) and message.end_of_stream)
+
     @property
     def queue_limit(self) -> int | None:
         """Frames kept when this node falls behind; None: it loses nothing."""
@@ -93,6 +130,20 @@ class Node(ABC):
     def behind(self) -> bool:
         """Whether frames wait that will be dropped if this node does not catch up."""
         return self.queue_limit is not None and self._inbox is not None and len(self._inbox) > 0
+
+    def gap_is_ours(self, message: Message) -> bool:
+        """Whether frames of a message's stream, just before it, were dropped here."""
+        return self._inbox is not None and self._inbox.dropped_of(message)
+
+    @property
+    def dropped_sources(self) -> frozenset[str]:
+        """Sources that go on, though their last messages were dropped here."""
+        return self._inbox.sources if self._inbox is not None else frozenset()
+
+    @property
+    def dropped_late(self) -> int:
+        """Frames dropped here so far because they were late."""
+        return self._inbox.overrun if self._inbox is not None else 0
 
     def stop(self) -> None:
         """Ask the node to end; `run` returns within `POLL_S` and what the message at hand takes."""
@@ -112,7 +163,10 @@ class Node(ABC):
         """
         transport = self.launch.transport
         keys = transport.curve_keys()
-        transport.make_ipc_directory()
+        folder, declared = transport.make_ipc_directory(), NODES[self.name]
+        if not declared.subscribes or (transport.lossless and declared.delivery is not Delivery.BEST_EFFORT):
+            lag = CONTEXT if transport.lossless and not declared.subscribes else 0
+            self._relay = Relay(folder / f"{self.name}.progress", declared.publishes, self._supervisor, lag)
         with ExitStack() as stack:
             self._publisher = stack.enter_context(
                 Publisher(
@@ -120,21 +174,28 @@ class Node(ABC):
                     keys=keys,
                     reliable=self._required,
                     clear_text=transport.clear_text,
+                    resume=self._relay.resume if self._relay else None,
                 )
             )
+            if self._relay:
+                self._relay.begin(self._publisher)
+            if self._relay and self._relay.resume:
+                self.health.go_on_from(self._relay.resume.sequence)
             self._await_subscribers()
-            declared = NODES[self.name]
             if declared.subscribes:
+                principals = Principals()
                 self._subscribers = [
                     stack.enter_context(
                         Subscriber(
                             addresses,
                             sorted(declared.topics),
                             reliable=transport.lossless and self.queue_limit is None,
+                            context=self._relay.context if self._relay else 0,
                             lifespan_s=math.inf if self.queue_limit is None else transport.lifespan_s,
                             keys=keys,
                             clear_text=transport.clear_text,
                             name=self.name,
+                            principals=principals,
                         )
                     )
                     for addresses in self._addresses()
@@ -167,6 +228,7 @@ class Node(ABC):
         assert self._inbox is not None, "a node that subscribes to none has no messages to take"
         received = self._inbox.next(timeout_s)
         if received is None:
+            self.settle()
             return False
         self.health.note_queue(len(self._inbox))
         topic, message = received
@@ -176,6 +238,7 @@ class Node(ABC):
                 self.timeline = Timeline.from_values(message.values)
         else:
             self.health.stamp_ns = message.stamp_ns
+            self.health.note_received(topic)
         started, self._blocked_ns = self.clock.monotonic_ns(), 0
         try:
             self.handle(topic, message)
@@ -183,9 +246,23 @@ class Node(ABC):
             self.refuse(topic, error)
         if not isinstance(message, Diagnostics):
             self.health.note_computed(self.clock.monotonic_ns() - started - self._blocked_ns)
+            if self._relay:
+                self._relay.handled()
+                # what was handled before this process began counts, too, and once
+                self.health.received[topic] = self._subscribers[0].arrived(topic)
             if message.end_of_stream:
                 self.note_end(topic)
+        self.settle()  # at once: what is not taken comes twice if this process dies now
         return True
+
+    def settle(self, timeout_s: float = 0.0) -> bool:
+        """Tell publishers which of their messages are answered; whether all that was published was taken."""
+        if self._relay is None:
+            return True
+        answered = self._relay.settle(self._publisher, timeout_s)
+        if answered and self.queue_limit is None:
+            self._subscribers[0].take(answered)
+        return self._relay.settled
 
     def refuse(self, topic: str, error: Exception) -> None:
         """Count a message that could not be worked on, and log the first of its kind."""
@@ -203,21 +280,28 @@ class Node(ABC):
         Returns:
             False if the node was stopped while it waited.
         """
+        if self._relay and self._inbox is not None and self._relay.knows(topic, message):
+            return True
         requested_at = self.clock.monotonic_ns()
         self._await_subscribers()
         while not self._publisher.publish(topic, message, timeout_s=POLL_S):
             if self._stopping:
                 self.health.counts[f"dropped.stopped {topic}"] += 1
                 return False
+            if self.health.state == "running" and self.clock.monotonic_ns() - requested_at > STALL_NS:
+                self.health.state = f"{WAITING} {', '.join(sorted(self._publisher.waited_for(topic)))} to go on"
             self.report_if_due()
+        if self.health.state.startswith(WAITING):
+            self.health.state = "running"
         now = self.clock.monotonic_ns()
         self._blocked_ns += now - requested_at
         of_frame = not isinstance(message, Diagnostics) and not message.end_of_stream
         latency_ns = None
         if of_frame and self.timeline:  # the delay is of the stream's time, which may run faster
-            late_ns = self.clock.now_ns() - self.timeline.wall(message.stamp_ns)
-            latency_ns = late_ns - round(delay_ns / self.timeline.rate)
+            latency_ns = self._late_ns(self.timeline, message.stamp_ns) - round(delay_ns / self.timeline.rate)
         self.health.note_published(topic, now, latency_ns)
+        if self._relay:
+            self._relay.published(self._publisher, topic, self.mark(message))
         if not isinstance(message, Diagnostics):
             self.health.stamp_ns = message.stamp_ns
             if message.end_of_stream:
@@ -241,7 +325,11 @@ class Node(ABC):
             self._stopping = True
         notify(ALIVE)
         self._publisher.check()
-        self._disconnected = self._publisher.refused
+        if self._relay and self._inbox is not None:
+            self._subscribers[0].take(0)  # who waits in `publish` is not deaf
+        self._disconnected, self._deaf = self._publisher.refused, self._publisher.silent(DEAF_S)
+        unread = self._publisher.silent(STALL_NS / 1e9)
+        self.health.unread = f"{WAITING} {', '.join(sorted(unread))} to read" if unread else ""
         # a subscriber without room for this second's diagnostics can have those of the next
         self._publisher.publish(DIAGNOSTICS, self.diagnostics(), timeout_s=0)
 
@@ -254,7 +342,17 @@ class Node(ABC):
                 received.update({f"dropped.lost {topic}": n for topic, n in subscriber.dropped.items()})
                 received.update({f"dropped.expired {topic}": n for topic, n in subscriber.late.items()})
                 received.update({f"refused.{cause}": n for cause, n in subscriber.refused.items()})
-        return self.health.report(self.name, received, self.status(), [*self._wire_problems(), *self.problems()])
+        problems = [*self._wire_problems(), *self._deaf_problems(), *self.problems(), *self.health.stall(self.name)]
+        run = {RUN: self._run} if self._run else {}
+        return self.health.report(self.name, received, self.status() | run, problems)
+
+    def _deaf_problems(self) -> Iterator[Problem]:
+        if self._deaf:
+            yield error(
+                "deaf",
+                f"{', '.join(sorted(self._deaf))} has not read for {DEAF_S:g} s, and is not waited for any more: what "
+                "it misses is counted there; stop it, or, if it is a second one of that name, call it something else",
+            )
 
     def _wire_problems(self) -> Iterator[Problem]:
         """Problems with received bytes that are no messages, since the last call."""
@@ -262,6 +360,12 @@ class Node(ABC):
             return
         refused = sum((subscriber.refused for subscriber in self._subscribers), Counter[str]())
         new, self._refused_before = refused - self._refused_before, refused
+        if second := new.pop(SECOND, 0):
+            yield error(
+                "second_publisher",
+                f"{second} messages came from a second publisher of a source, and were refused: expected one publisher "
+                "a source; give each sensor a name of its own (`source` of its messages), or stop one of the two",
+            )
         if new:
             yield error(
                 "not_a_message",
@@ -275,7 +379,7 @@ class Node(ABC):
             return
         missing = ", ".join(sorted(self._required - self._publisher.subscribers))
         logger.info("%s: waiting for %s", self.name, missing)
-        state, self.health.state = self.health.state, f"waiting for {missing}"
+        state, self.health.state = self.health.state, f"{WAITING} {missing}"
         self.report()
         while not self._stopping and not self._publisher.wait_for_subscribers(self._required, timeout_s=POLL_S):
             self.report_if_due()

@@ -9,10 +9,11 @@ from typing import Any
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW
 from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.checks.answers import Answers
-from steadypose.nodes.checks.problem import Problem, error
+from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.checks.stream import StreamChecks
 from steadypose.nodes.graph.clock import FRAME_NS, Clock
 from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.load import BodyLimit
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
@@ -69,16 +70,22 @@ class PriorNode(Node):
         settings = PriorSettings.from_dict(launch.table("prior"))
         self._checks = StreamChecks(settings.max_bodies, identified=settings.identify.enabled, streams=kiosks or 1)
         self._started_ns = self.clock.now_ns()
+        self._limit = BodyLimit(settings.max_bodies, self.clock)
 
     def handle(self, topic: str, message: Message) -> None:
         if not isinstance(message, PoseRaw):
             return
         self._checks.see(message, self.clock.now_ns())
         self._answers.asked(message)
+        started_ns, gap = self.clock.monotonic_ns(), self.gap_is_ours(message)
         if isinstance(self._pipeline, StreamBatch):
-            cleaned = self._pipeline.process_at(message, self.clock.monotonic_ns(), hurry=self.behind)
+            cleaned = self._pipeline.process_at(message, started_ns, hurry=self.behind, gap=gap)
         else:
-            cleaned = self._pipeline.process(message, hurry=self.behind)
+            cleaned = self._pipeline.process(message, hurry=self.behind, gap=gap)
+        if self.queue_limit is not None:
+            spent_ns = self.clock.monotonic_ns() - started_ns
+            self._limit.note(self._pipeline.bodies, spent_ns, self.dropped_late)
+            self._pipeline.most_bodies = self._limit.bodies
         for clean in cleaned:
             self._bodies = len(clean.bodies)
             self._anomalies += sum(body.anomaly_flag for body in clean.bodies)
@@ -87,11 +94,23 @@ class PriorNode(Node):
 
     def problems(self) -> list[Problem]:
         now_ns = self.clock.now_ns()
+        for source in self.dropped_sources:
+            self._checks.heard(source, now_ns)
+            if isinstance(self._pipeline, StreamBatch):
+                self._pipeline.heard(source, self.clock.monotonic_ns())
         found = self._checks.problems(now_ns, live=self.timeline is None or self.timeline.is_now)
         if not self._checks.seen and now_ns - self._started_ns > self._patience_ns:
             return [self._no_source(now_ns)]
         in_general = self._answers.problems()
-        return found or in_general
+        return [*(found or in_general), *self._overload()]
+
+    def _overload(self) -> Iterator[Problem]:
+        if self._limit.bodies < self._pipeline.offered:
+            yield warning(
+                "overload",
+                f"this machine has time for {self._limit.bodies} of {self._pipeline.offered} bodies: those farthest "
+                "from the sensor are left out; switch off [prior.score] and [prior.impute], or take a faster machine",
+            )
 
     @property
     def _patience_ns(self) -> int:

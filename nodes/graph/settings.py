@@ -1,9 +1,8 @@
-"""What every settings dataclass of a launch file shares: its error, paths, addresses, and the nearest known name."""
+"""What every settings dataclass of a launch file shares: its error, paths and addresses."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import field, fields, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -44,9 +43,3 @@ def check_addresses(setting: str, addresses: list[str]) -> None:
     for address in addresses:
         if not isinstance(address, str):
             raise LaunchError(f"{setting}: expected addresses such as tcp://192.168.1.21:7111, got {address!r}")
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """The end of an error's sentence: the known name that was probably meant, if there is one."""
-    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
-    return f", did you mean {close[0]!r}?" if close else ""

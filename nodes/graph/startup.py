@@ -5,9 +5,11 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from types import FrameType
 
 _DONTNEED = 4
 """``MADV_DONTNEED`` of madvise(2)"""
@@ -24,22 +26,33 @@ def startup() -> Iterator[None]:
     """Start within this: imports and loading make two hundred thousand objects that stay, and leave memory free.
 
     The garbage collector looks for none among them: not now, for a tenth of the time, nor ever, for 50 ms each time.
-    Only who compiles loops makes more than that. Compiling leaves 400 MB, so the process then starts anew, with the
-    loops that are now on disk; once, for where nothing can be written they are compiled each time.
+    Only who compiles loops makes more than that. `loops.compile_missing` compiles those of the settings that ship;
+    other settings may need more, and a damaged one is compiled again. Compiling leaves up to 400 MB, so the process
+    then starts anew, once, with the loops that are now on disk.
     """
-    thresholds, collections = gc.get_threshold(), gc.get_stats()[0]["collections"]
+    thresholds = gc.get_threshold()
     gc.set_threshold(_STARTS_WITH)
     try:
         yield
     finally:
         gc.freeze()
         gc.set_threshold(*thresholds)
-    if gc.get_stats()[0]["collections"] > collections and _COMPILED not in os.environ:
+    cache = sys.modules.get("steadypose.prior.loop_cache")
+    if cache is not None and cache.saved and _COMPILED not in os.environ:
         os.environ[_COMPILED] = "1"
         sys.stdout.flush()
         os.execv(sys.executable, sys.orig_argv)
     if sys.platform == "linux":
         _give_back()
+
+
+def stop_on_signals(stop: Callable[[int, FrameType | None], object]) -> None:
+    """Call this at what asks a process to stop: SIGTERM, Ctrl-C, also where a shell that starts it in the background
+    ignores that, and the end of its terminal, unless nohup(1) had that ignored."""
+    for request in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(request, stop)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, stop)
 
 
 def _give_back() -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Sequence
 
+from steadypose.nodes.graph import safe_python
 from steadypose.nodes.graph.clock import Clock
-from steadypose.nodes.graph.node import SUPERVISOR
+from steadypose.nodes.graph.node import RUN, SUPERVISOR
 from steadypose.nodes.graph.topology import NODES
 
 BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
@@ -31,13 +31,7 @@ USAGE_ERROR = 2
 """exit status of a node that cannot do what its launch file says: if it never could, it never will"""
 ORDER = tuple(NODES)
 """of stopping"""
-COMMAND = (
-    sys.executable,
-    "-c",
-    # the working directory is not looked through for modules (python -P, which 3.10 does not have): it may hold others
-    "import sys; sys.path[:] = [p for p in sys.path if p]; from steadypose.nodes.cli import main; sys.exit(main())",
-    "node",
-)
+COMMAND = (*safe_python.command("steadypose.nodes.cli:main"), "node")
 
 
 class Child:
@@ -49,11 +43,14 @@ class Child:
         restarts: their number.
     """
 
-    def __init__(self, name: str, command: Sequence[str], clock: Clock, log: Callable[[str], None]) -> None:
+    def __init__(
+        self, name: str, command: Sequence[str], clock: Clock, log: Callable[[str], None], run: str = ""
+    ) -> None:
         self.name = name
         self.state = "ended"
         self.restarts = 0
         self._command = command
+        self._run = run
         self._clock = clock
         self._log = log
         self._crashes = 0
@@ -140,7 +137,7 @@ class Child:
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env=_environment(),
+            env=_environment(self._run),
             # Ctrl-C is for the supervisor, which stops its nodes in order
             start_new_session=True,
         )
@@ -157,17 +154,24 @@ class Child:
                 self._log(line.rstrip())
 
 
-def _environment() -> dict[str, str]:
+def _environment(run: str) -> dict[str, str]:
     """Of a node: that of this process, which is its supervisor, less what systemd says to this process alone."""
-    kept = {key: value for key, value in os.environ.items() if key not in ("NOTIFY_SOCKET", "WATCHDOG_USEC")}
-    return kept | {SUPERVISOR: str(os.getpid()), "PYTHONSAFEPATH": "1"}
+    kept = safe_python.environment()
+    for said in ("NOTIFY_SOCKET", "WATCHDOG_USEC"):
+        kept.pop(said, None)
+    return kept | {SUPERVISOR: str(os.getpid()), RUN: run}
 
 
 class Supervisor:
     """The nodes of a launch, each in a process. A context manager; leaving it stops them all."""
 
     def __init__(
-        self, nodes: Sequence[str], arguments: Sequence[str], clock: Clock, log: Callable[[str], None]
+        self,
+        nodes: Sequence[str],
+        arguments: Sequence[str],
+        clock: Clock,
+        log: Callable[[str], None],
+        run: str = "",
     ) -> None:
         """Start the nodes.
 
@@ -175,11 +179,12 @@ class Supervisor:
             nodes: their names.
             arguments: of ``steadypose node NAME``, the same for all.
             log: where a line from a node, or about it, goes; called from several threads.
+            run: what tells this run's nodes from others', in their diagnostics.
         """
         self._clock = clock
         self._polled_ns = clock.monotonic_ns()
         self.children = {
-            name: Child(name, [*COMMAND, name, *arguments], clock, log)
+            name: Child(name, [*COMMAND, name, *arguments], clock, log, run)
             for name in sorted(nodes, key=ORDER.index, reverse=True)
         }
 

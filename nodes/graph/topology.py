@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Any
 
-from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_TRUTH, POSE_WORLD
 
 
 class Delivery(Enum):
@@ -84,9 +84,18 @@ NODES: Mapping[str, NodeDeclaration] = {
         subscribes={"prior": (POSE_CLEAN,), "pose_input": (DIAGNOSTICS,)},
         section="trajectory",
     ),
+    "events": NodeDeclaration(
+        node="steadypose.nodes.graph.events_node:EventsNode",
+        publishes=(POSE_EVENTS,),
+        subscribes={"trajectory": (POSE_WORLD,), "prior": (POSE_CLEAN,), "pose_input": (DIAGNOSTICS,)},
+        section="events",
+        settings="steadypose.prior.events.settings:EventSettings",
+        optional=True,
+    ),
     "ros2_bridge": NodeDeclaration(
         node="steadypose.nodes.sinks.ros2.bridge:Ros2BridgeNode",
         subscribes={
+            "events": (POSE_EVENTS, DIAGNOSTICS),
             "trajectory": (POSE_WORLD, DIAGNOSTICS),
             "prior": (POSE_CLEAN, DIAGNOSTICS),
             "pose_input": (POSE_RAW, DIAGNOSTICS),
@@ -98,6 +107,7 @@ NODES: Mapping[str, NodeDeclaration] = {
     "foxglove": NodeDeclaration(
         node="steadypose.nodes.sinks.ros2.foxglove:FoxgloveNode",
         subscribes={
+            "events": (POSE_EVENTS, DIAGNOSTICS),
             "trajectory": (POSE_WORLD, DIAGNOSTICS),
             "prior": (POSE_CLEAN, DIAGNOSTICS),
             "pose_input": (POSE_RAW, DIAGNOSTICS),
@@ -106,6 +116,27 @@ NODES: Mapping[str, NodeDeclaration] = {
         settings="steadypose.nodes.sinks.ros2.foxglove:FoxgloveSettings",
         delivery=Delivery.BEST_EFFORT,
         preflight="steadypose.nodes.sinks.ros2.foxglove:check_foxglove",
+    ),
+    "web": NodeDeclaration(
+        node="steadypose.nodes.sinks.web.node:WebNode",
+        subscribes={
+            "events": (POSE_EVENTS, DIAGNOSTICS),
+            "trajectory": (POSE_WORLD, DIAGNOSTICS),
+            "prior": (DIAGNOSTICS,),
+            "pose_input": (DIAGNOSTICS,),
+        },
+        section="web",
+        settings="steadypose.nodes.sinks.web.settings:WebSettings",
+        delivery=Delivery.BEST_EFFORT,
+        preflight="steadypose.nodes.sinks.web.settings:check_web",
+    ),
+    "retarget": NodeDeclaration(
+        node="steadypose.nodes.sinks.retarget.node:RetargetNode",
+        subscribes={"trajectory": (POSE_WORLD, DIAGNOSTICS), "pose_input": (DIAGNOSTICS,)},
+        section="retarget",
+        settings="steadypose.nodes.sinks.retarget.settings:RetargetSettings",
+        delivery=Delivery.BEST_EFFORT,
+        preflight="steadypose.nodes.sinks.retarget.settings:check_retarget",
     ),
     "viewer": NodeDeclaration(
         node="steadypose.nodes.sinks.viewer.node:ViewerNode",
@@ -118,7 +149,7 @@ NODES: Mapping[str, NodeDeclaration] = {
     ),
     "recorder": NodeDeclaration(
         node="steadypose.nodes.sinks.recorder:RecorderNode",
-        subscribes=_ALL_STREAMS,
+        subscribes={**_ALL_STREAMS, "events": (POSE_EVENTS, DIAGNOSTICS)},
         section="recorder",
         settings="steadypose.nodes.sinks.recorder:RecorderSettings",
         delivery=Delivery.RELIABLE,
@@ -129,13 +160,15 @@ NODES: Mapping[str, NodeDeclaration] = {
 """by name, in the order in which they are stopped: with the stream, so that what is on its way arrives, and the
 recorder has it"""
 
-POSE_NODES = tuple(name for name, declared in NODES.items() if declared.publishes)
-"""the publishers of poses; what a subscriber from outside the graph (echo, hz) connects to"""
+POSE_NODES = tuple(name for name, declared in NODES.items() if declared.publishes and not declared.optional)
+"""the publishers of poses, which run unless a launch file says otherwise"""
 
 
 def publishers(topic: str) -> list[str]:
     """The nodes to listen to for a topic: for ``diagnostics`` those that publish poses."""
-    return [name for name in POSE_NODES if topic in (*NODES[name].publishes, DIAGNOSTICS)]
+    if topic == DIAGNOSTICS:
+        return list(POSE_NODES)
+    return [name for name, declared in NODES.items() if topic in declared.publishes]
 
 
 def load(reference: str) -> Any:

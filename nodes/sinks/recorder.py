@@ -6,19 +6,23 @@ messages and counts them, until there is room again. Started again, it goes on w
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
+import os
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.recording import RecordingError, RecordingWriter
+from steadypose.msgs.recording_writer import recorded_parts
 from steadypose.msgs.topics import DIAGNOSTICS, TOPICS
 from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import LaunchError, nearest, path_setting
+from steadypose.nodes.graph.settings import LaunchError, path_setting
+from steadypose.prior.settings import nearest
 
 logger = logging.getLogger(__name__)
 
@@ -76,11 +80,33 @@ class RecorderSettings:
 
 def check_recorder(launch: Launch) -> None:
     """Raises:
-    LaunchError: the recording is there already.
+    LaunchError: there is nothing to record to.
+    """
+    if not launch.settings(RecorderSettings).directory:
+        raise LaunchError("[recorder] directory: expected the recording to make, got none; give --record")
+
+
+def free_directory(launch: Launch) -> Path | None:
+    """Where to record instead of the directory of the settings; None: there.
+
+    A run that is started again goes on in the next part of the same recording: stamps rise, and limits hold for all
+    of it. What is replayed would have the same stamps again, so it gets a new directory; as does what finds something
+    else in its place.
     """
     directory = launch.settings(RecorderSettings).directory
-    if Path(directory).exists():
-        raise LaunchError(f"{directory} exists: expected a new directory to record to")
+    wanted = Path(directory)
+    if not directory or not os.path.lexists(wanted) or (not launch.transport.lossless and _is_recording(wanted)):
+        return None
+    others = (wanted.with_name(f"{wanted.name}-{number}") for number in itertools.count(2))
+    return next(other for other in others if not os.path.lexists(other))
+
+
+def _is_recording(directory: Path) -> bool:
+    try:
+        recorded_parts(directory)
+    except (OSError, RecordingError):
+        return False
+    return True
 
 
 class LogTimes:
@@ -109,8 +135,7 @@ class RecorderNode(Node):
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
         settings = launch.settings(RecorderSettings)
-        if not settings.directory:
-            raise LaunchError("[recorder] directory: expected the recording to make, got none; give --record")
+        check_recorder(launch)
         self._settings = settings
         self._full = False
         self._checked_ns = self._synced_ns = 0

@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Message, Pose, PoseRaw, RawBody
+from steadypose.nodes.checks.arrays import axes_hint, count_hint, frames_hint, skeleton_hint, stamps_hint
+from steadypose.nodes.sources.cleaned import CLEANED, as_input
 from steadypose.prior.body.layouts import SKELETONS
-from steadypose.prior.npz_size import check_arrays
+from steadypose.prior.npz import check_arrays
 
 STAMPS_END_NS = 2**31 * 10**9
 """ROS 2 counts seconds in 31 bits"""
@@ -46,15 +48,19 @@ class ArraySource:
     def __init__(self, path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         self.path = path
         self.refused: Counter[str] = Counter()
+        if "skeleton" not in arrays and "positions" in arrays:
+            raise NpzError(f"{path}: expected an array 'skeleton', a name{count_hint(arrays['positions'].shape)}")
         self._skeleton = _text(path, arrays, "skeleton")
         if self._skeleton not in SKELETONS:
-            raise NpzError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {self._skeleton!r}")
+            hint = skeleton_hint(self._skeleton, np.shape(arrays.get("positions", ())))
+            raise NpzError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {self._skeleton!r}{hint}")
         joints = len(SKELETONS[self._skeleton].joints)
         positions = _numbers(path, arrays, "positions")
         if positions.ndim not in (3, 4) or positions.shape[-2:] != (joints, 3):
             raise NpzError(
                 f"{path}: positions: expected shape (T, {joints}, 3), or (T, bodies, {joints}, 3), for "
                 f"{self._skeleton}, got {positions.shape}; in metres, NaN for what is missing"
+                f"{axes_hint(positions.shape, self._skeleton)}"
             )
         frames = len(positions)
         if not frames:
@@ -107,7 +113,7 @@ class NpzSource(ArraySource):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, read_arrays(path, _ARRAYS))
+        super().__init__(path, as_input(read_arrays(path, (*_ARRAYS, *CLEANED))))
 
 
 def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
@@ -173,7 +179,7 @@ def read_stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> 
             span = f", {stamps.min()} to {stamps.max()}" if stamps.size and stamps.dtype.kind in "iuf" else ""
             raise NpzError(
                 f"{path}: stamp_ns: expected {frames} integers of 0 or more and under {STAMPS_END_NS}, nanoseconds of "
-                f"capture; got {stamps.dtype} of shape {stamps.shape}{span}"
+                f"capture; got {stamps.dtype} of shape {stamps.shape}{span}{stamps_hint(stamps, frames)}"
             )
         return stamps.astype(np.int64)
     if "fps" in arrays:
@@ -183,4 +189,4 @@ def read_stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> 
         if frames / fps.item() * 1e9 >= STAMPS_END_NS:
             raise NpzError(f"{path}: fps: {frames} frames at {fps.item():g} a second last longer than stamps can hold")
         return np.round(np.arange(frames) * (1e9 / float(fps.item()))).astype(np.int64)
-    raise NpzError(f"{path}: expected stamp_ns (T,), nanoseconds of capture, or fps; got neither")
+    raise NpzError(f"{path}: expected stamp_ns (T,), nanoseconds of capture, or fps; got neither{frames_hint(arrays)}")

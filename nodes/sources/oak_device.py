@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.types import PoseRaw, RawBody
 from steadypose.nodes.graph.clock import POLL_S, Clock
 from steadypose.nodes.sources.camera import CameraError, count_failure
-from steadypose.nodes.sources.oak import OakSettings
+from steadypose.nodes.sources.camera_settings import OakSettings
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.camera.depth_lifting import lift
 from steadypose.prior.camera.gravity import GravityEstimator

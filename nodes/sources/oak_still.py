@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.nodes.sources.camera import CameraError
-from steadypose.nodes.sources.oak import OakSettings
+from steadypose.nodes.sources.camera_settings import OakSettings
 from steadypose.nodes.sources.oak_device import (
     DEPTH_FPS,
     SYNC_THRESHOLD,

@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from contextlib import closing
+from typing import NamedTuple
 
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.graph.clock import POLL_S, Clock, Timeline
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.node import Node, supervisor_id
-from steadypose.nodes.sources.progress import Progress, ProgressFile
+from steadypose.nodes.graph.node import Node
 from steadypose.nodes.sources.recording import with_end
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import LiveSource, RecordedSource
@@ -23,10 +23,19 @@ LOOP_PAUSE_NS = 1_000_000_000
 """between the end of a stream and its start over; long enough for every stage to let go of its bodies"""
 
 
+class Position(NamedTuple):
+    """Where a recording is."""
+
+    loops_ns: int = 0
+    """by how much stamps are later than in the recording, because it was played before"""
+    messages: int = 0
+    """of this time through, that were published"""
+
+
 class PoseInputNode(Node):
     """Publishes ``pose/raw``, and ``pose/truth`` where the source has it; ends when the source does.
 
-    When it is restarted while it plays a recording, it resumes where it was, so that stamps never go back.
+    When it is restarted while it plays a recording for listeners who miss nothing, it resumes where they are.
     """
 
     name = "pose_input"
@@ -44,20 +53,19 @@ class PoseInputNode(Node):
         self._loop = settings.loop
         self._pose = settings.calibration.pose
         self._last_ns: int | None = None
-        self._at = Progress()
+        self._at = Position()
         self._pace: Timeline | None = None  # on the monotonic clock, so that setting the wall clock halts nothing
-        self._progress = ProgressFile(launch.transport.ipc_directory / "pose_input.progress", supervisor_id())
 
     def handle(self, topic: str, message: Message) -> None:
         raise AssertionError("the input node subscribes to none")
 
     def work(self) -> None:
         if isinstance(self._source, LiveSource):
-            self._relay(self._source)
+            self._pass_on(self._source)
         else:
             self._play(self._source)
 
-    def _relay(self, source: LiveSource) -> None:
+    def _pass_on(self, source: LiveSource) -> None:
         """Pass a camera's skeletons on as they come."""
         with closing(source.frames()) as frames:
             for frame in frames:
@@ -77,21 +85,29 @@ class PoseInputNode(Node):
                 self.report_if_due()
 
     def _play(self, source: RecordedSource) -> None:
-        began = self._progress.read()
+        began = Position(*self._relay.begun.mark) if self._relay and self._relay.begun else Position()
         for topic, message in with_end(self._messages(source, began.loops_ns)):
             if self._at <= began and not _is_end(message):
-                continue  # the node that was here before has published it
+                continue  # the node that was here before has published it, and it was taken
             if message.stamp_ns != self._last_ns:
                 self._wait_for(message.stamp_ns)
             if self.stopping:
                 return
-            self._progress.write(self._at)
             try:
                 self.publish(topic, self._with_pose(message))
             except ValueError as error:  # a message that was recorded, and still cannot be sent
                 self.refuse(topic, error)
+            self.settle()
             self.report_if_due()
-        self._progress.close(finished=True)
+        while not self.settle(POLL_S):  # what was not taken is here alone
+            if self.stopping:
+                return
+            self.report_if_due()
+        if self._relay:
+            self._relay.close(finished=True)
+
+    def mark(self, message: Message) -> tuple[int, int]:
+        return self._at
 
     def problems(self) -> list[Problem]:
         return self._source.problems() if isinstance(self._source, LiveSource) else []
@@ -119,7 +135,7 @@ class PoseInputNode(Node):
             newest_ns = 0
             first_ns: int | None = None
             for count, (topic, message) in enumerate(source, start=1):
-                self._at = Progress(shift_ns, count)
+                self._at = Position(shift_ns, count)
                 first_ns = message.stamp_ns if first_ns is None else first_ns
                 newest_ns = max(newest_ns, message.stamp_ns)
                 yield topic, dataclasses.replace(message, stamp_ns=message.stamp_ns + shift_ns) if shift_ns else message

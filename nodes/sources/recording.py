@@ -1,4 +1,4 @@
-"""Recorded skeletons: a rosbag2 directory, an ``.mcap``, an ``.npz`` or a ``.csv``."""
+"""Recorded skeletons: a rosbag2 directory, an ``.mcap``, an ``.npz``, a ``.csv``, or a file of motion."""
 
 from __future__ import annotations
 
@@ -6,16 +6,24 @@ import dataclasses
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from steadypose.msgs.recording import RecordingError, RecordingReader
 from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Diagnostics, Message, PoseRaw
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.csv import CsvSource
+from steadypose.nodes.sources.motion import MotionSource, holds_motion
 from steadypose.nodes.sources.npz import NpzSource
 from steadypose.nodes.sources.source import RecordedSource
 
-LOST = "bytes of a damaged recording"
+NO_RIG: Mapping[str, Any] = MappingProxyType({})
+_FILES = ".csv, .npz, .bvh, .trc, .c3d or .npy"
+
+LOST, BROKEN, UNDECODABLE = "bytes of a damaged recording", "damaged recording", "undecodable"
+DAMAGE = (LOST, BROKEN, UNDECODABLE)
+"""how the causes begin that count what a recording holds and nobody can read"""
 
 
 class RecordingSource:
@@ -45,23 +53,30 @@ class RecordingSource:
                     if not isinstance(message, Diagnostics) and not message.end_of_stream:
                         yield topic, message
             except RecordingError:
-                self.refused["damaged recording"] += 1
+                self.refused[BROKEN] += 1
             self.refused[LOST] = recording.lost_bytes
-            self.refused.update({f"undecodable {topic}": n for topic, n in recording.refused.items()})
+            self.refused.update({f"{UNDECODABLE} {topic}": n for topic, n in recording.refused.items()})
 
 
-def open_recording(path: str | Path) -> RecordedSource:
-    """The recording at ``path``: a rosbag2 directory, an ``.mcap``, an ``.npz`` or a ``.csv``.
+def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG) -> RecordedSource:
+    """The recording at ``path``: a rosbag2 directory, an ``.mcap``, an ``.npz``, a ``.csv``, or a file of motion.
+
+    Args:
+        path: of the recording.
+        rig: what a file of motion does not say (`prior.mocap.files.Description`).
 
     Raises:
         LaunchError: there is nothing at the path.
-        RecordingError, NpzError, CsvError: the file holds no skeletons. All are ValueErrors that say what to do.
+        RecordingError, NpzError, CsvError, MotionError: the file holds no skeletons. All are ValueErrors that say what
+            to do.
     """
     if not str(path):
-        raise LaunchError("[input] recording: expected a recording, .npz or .csv to play, got none; give --input")
+        raise LaunchError(f"[input] recording: expected a recording or {_FILES} to play, got none; give --input")
     path = Path(path)
     if not path.exists():
-        raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, an .npz or a .csv")
+        raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, or {_FILES}")
+    if holds_motion(path):
+        return MotionSource(path, rig)
     formats: Mapping[str, Callable[[Path], RecordedSource]] = {".npz": NpzSource, ".csv": CsvSource}
     return formats.get(path.suffix, RecordingSource)(path)
 

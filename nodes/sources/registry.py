@@ -11,14 +11,16 @@ from steadypose.msgs.keys import Keys
 from steadypose.nodes.graph.clock import Clock, SystemClock
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError, nearest, path_setting
+from steadypose.nodes.graph.settings import LaunchError, path_setting
 from steadypose.nodes.sources.calibration import CalibrationSettings
+from steadypose.nodes.sources.camera_settings import OakSettings, WebcamSettings
 from steadypose.nodes.sources.merge import MergeSettings, MergeSource
-from steadypose.nodes.sources.oak import OakSettings, OakSource
+from steadypose.nodes.sources.oak import OakSource
 from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source
 from steadypose.nodes.sources.source import LiveSource, RecordedSource, SourceContext
 from steadypose.nodes.sources.tf import TfSettings, TfSource
-from steadypose.nodes.sources.webcam import WebcamSettings, open_webcam
+from steadypose.nodes.sources.webcam import open_webcam
+from steadypose.prior.settings import nearest
 
 _SOURCE = "source"
 

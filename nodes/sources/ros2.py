@@ -11,12 +11,13 @@ from rosbags.serde import SerdeError
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.checks.problem import Problem, warning
 from steadypose.nodes.graph.clock import POLL_S
-from steadypose.nodes.graph.settings import LaunchError, nearest
-from steadypose.nodes.ros2.connection import check_ros, connect
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.ros2.connect import check_ros, connect
 from steadypose.nodes.ros2.definitions import deserialise
 from steadypose.nodes.sources.adapters import from_azure_kinect, from_pose_array
 from steadypose.nodes.sources.source import LiveSource, SourceContext
 from steadypose.prior.body.layouts import SKELETONS
+from steadypose.prior.settings import nearest
 
 TYPES = {"MarkerArray": "visualization_msgs/msg/MarkerArray", "PoseArray": "geometry_msgs/msg/PoseArray"}
 

@@ -12,7 +12,8 @@ from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.checks.problem import Problem, error
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2.connection import Connection, check_ros, connect
+from steadypose.nodes.ros2.connect import check_ros, connect
+from steadypose.nodes.ros2.connection import Connection
 from steadypose.nodes.ros2.definitions import deserialise
 from steadypose.nodes.ros2.tf import TransformBuffer, TransformError
 from steadypose.nodes.sources.source import LiveSource

@@ -8,46 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from steadypose.nodes.graph.clock import Clock
-from steadypose.nodes.graph.settings import LaunchError, path_setting
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import CameraSource, Connection
+from steadypose.nodes.sources.camera_settings import MODEL, WebcamSettings
 from steadypose.nodes.sources.source import SourceContext
-from steadypose.prior.settings import check_range
 
 if TYPE_CHECKING:
     from steadypose.nodes.sources.webcam_video import VideoSource
-
-MODEL = (
-    "https://storage.googleapis.com/mediapipe-models/pose_landmarker/pose_landmarker_full/float16/latest/"
-    "pose_landmarker_full.task"
-)
-
-
-@dataclass(frozen=True)
-class WebcamSettings:
-    """``[input.webcam]``: any camera that the system knows, and MediaPipe."""
-
-    camera: int = 0
-    """its number: 0 is /dev/video0"""
-    video: str = path_setting()
-    """a video to read instead; a relative path starts at the launch file"""
-    model: str = path_setting()
-    """a pose landmarker for MediaPipe, a .task file, in place of its own, which finds one body; a relative path starts
-    at the launch file"""
-    bodies: int = 1
-    """maximum number of bodies to detect; more than one with a model alone"""
-    field_of_view: float = 1.05
-    """radians, of the image's width, where the lens is not calibrated: scales how far away bodies seem"""
-
-    def __post_init__(self) -> None:
-        check_range("[input.webcam] camera", self.camera, 0, 1000)
-        check_range("[input.webcam] bodies", self.bodies, 1, 64)
-        check_range("[input.webcam] field_of_view", self.field_of_view, 0.1, 3.0)
 
 
 def open_webcam(settings: WebcamSettings, context: SourceContext) -> WebcamSource | VideoSource:

@@ -18,7 +18,7 @@ from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_mediapipe, pinhole
 from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import CameraError, count_failure
-from steadypose.nodes.sources.webcam import MODEL, WebcamSettings
+from steadypose.nodes.sources.camera_settings import MODEL, WebcamSettings
 
 Landmarker = Callable[[NDArray[Any], int], Any]
 """an RGB image (H, W, 3) and its milliseconds, which rise, to a ``PoseLandmarkerResult``"""

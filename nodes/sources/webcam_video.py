@@ -13,7 +13,7 @@ from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Message
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.calibration import CalibrationSettings
-from steadypose.nodes.sources.webcam import WebcamSettings
+from steadypose.nodes.sources.camera_settings import WebcamSettings
 from steadypose.nodes.sources.webcam_device import Landmarker, PoseFinder, mediapipe_landmarker
 
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import CHILDREN, COLLARS, HIPS, PARENT, PARENTS, SHOULDERS, J, finite_joints
+from steadypose.prior.compiled import njit
 
 Floats = NDArray[np.float64]
 
@@ -216,7 +216,7 @@ def _turned_back(m, v):
 
 
 @njit(cache=True)
-def _write_product(a, b, out):
+def write_product(a, b, out):
     """Write ``a @ b``, both (3, 3)."""
     for i in range(3):
         for j in range(3):
@@ -232,7 +232,7 @@ def _axes(left, up):
 
 
 @njit(cache=True)
-def _write_rotation(axis, sine, cosine, rest, out):
+def write_rotation(axis, sine, cosine, rest, out):
     """Write Rodrigues' rotation: ``sine`` times the cross product with ``axis``, ``cosine`` times the identity, and
     ``rest`` times the outer product of ``axis`` with itself."""
     for i in range(3):
@@ -254,9 +254,9 @@ def write_swing(a, b, out):
     cosine = _dot(a, b)
     if cosine < -1.0 + 1e-8:  # opposite directions have no smallest rotation: any half turn will do
         other = (1.0, 0.0, 0.0) if abs(a[0]) < 0.9 else (0.0, 1.0, 0.0)
-        _write_rotation(_normalised(_cross(a, other)), 0.0, -1.0, 2.0, out)
+        write_rotation(_normalised(_cross(a, other)), 0.0, -1.0, 2.0, out)
     else:
-        _write_rotation(_cross(a, b), 1.0, cosine, 1.0 / (1.0 + cosine), out)
+        write_rotation(_cross(a, b), 1.0, cosine, 1.0 / (1.0 + cosine), out)
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -376,10 +376,10 @@ def _solve(positions, observed, offsets, local, placed):
                     write_swing(_less(_at(rest, target), _at(rest, joint)), direction, turn)
                     direction = _normalised(direction)
                     angle = _twist(joint, p, seen, above, turn, direction) if _HINGED[joint] else 0.0
-                    _write_rotation(direction, math.sin(angle), math.cos(angle), 1.0 - math.cos(angle), twist)
-                    _write_product(twist, turn, local[frame, joint])
+                    write_rotation(direction, math.sin(angle), math.cos(angle), 1.0 - math.cos(angle), twist)
+                    write_product(twist, turn, local[frame, joint])
                     break
-            _write_product(above, local[frame, joint], world[joint])
+            write_product(above, local[frame, joint], world[joint])
 
 
 @njit(cache=True)
@@ -396,4 +396,4 @@ def _place(local, offsets, placed):
             bone = _turned(above, _at(offsets[frame], joint))
             for i in range(3):
                 placed[frame, joint, i] = placed[frame, PARENT[joint], i] + bone[i]
-            _write_product(above, local[frame, joint], world[joint])
+            write_product(above, local[frame, joint], world[joint])

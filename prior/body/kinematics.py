@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
+from steadypose.prior.compiled import njit
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ REST_HEIGHT: Floats = np.array(
 
 
 def forward_kinematics(rotations: Floats, offsets: Floats, root: Floats) -> tuple[Floats, Floats]:
-    """Joint positions from local rotations and bones; with gradients: `prior.models.layers.torch_kinematics`.
+    """Joint positions from local rotations and bones; with gradients: `prior.fit.torch_kinematics`.
 
     Args:
         rotations: (..., 22, 3, 3) local rotation matrices.

@@ -237,9 +237,71 @@ KINECT25 = Skeleton(
     },
 )  # fmt: skip
 
+# The body of COCO-WholeBody: COCO's 17 and three points of each foot.
+COCO_WHOLEBODY23 = Skeleton(
+    "coco_wholebody23",
+    (
+        *COCO17.joints, "left_big_toe", "left_small_toe", "left_heel", "right_big_toe", "right_small_toe",
+        "right_heel",
+    ),
+    {**COCO17.table, **_sides({"left_foot": _mean("left_big_toe", "left_small_toe")}, ("left", "right"))},
+)  # fmt: skip
+
+# Halpe's body (AlphaPose, RTMPose, Pose2Sim): COCO's 17, the head's top, neck, the hips' middle, and the feet.
+HALPE26 = Skeleton(
+    "halpe26",
+    (
+        *COCO17.joints, "head", "neck", "hip", "left_big_toe", "right_big_toe", "left_small_toe", "right_small_toe",
+        "left_heel", "right_heel",
+    ),
+    {**COCO_WHOLEBODY23.table, "pelvis": "hip", "neck": "neck"},
+)  # fmt: skip
+
+# SMPL's own: the 22 and a point of each hand.
+SMPL24 = Skeleton("smpl24", (*JOINTS, "left_hand", "right_hand"), CANONICAL.table)
+
+# ZED's BODY_18 (COCO's with a neck, in OpenPose's order) and BODY_34, as the SDK numbers them.
+ZED18 = Skeleton(
+    "zed18",
+    (
+        "NOSE", "NECK", "RIGHT_SHOULDER", "RIGHT_ELBOW", "RIGHT_WRIST", "LEFT_SHOULDER", "LEFT_ELBOW", "LEFT_WRIST",
+        "RIGHT_HIP", "RIGHT_KNEE", "RIGHT_ANKLE", "LEFT_HIP", "LEFT_KNEE", "LEFT_ANKLE", "RIGHT_EYE", "LEFT_EYE",
+        "RIGHT_EAR", "LEFT_EAR",
+    ),
+    {
+        "pelvis": _mean("LEFT_HIP", "RIGHT_HIP"),
+        "neck": "NECK",
+        "head": _mean("LEFT_EAR", "RIGHT_EAR"),
+        **_sides({f"left_{j}": f"LEFT_{j.upper()}" for j in _ARMS_AND_LEGS}, ("LEFT", "RIGHT")),
+    },
+)  # fmt: skip
+
+ZED34 = Skeleton(
+    "zed34",
+    (
+        "PELVIS", "NAVAL_SPINE", "CHEST_SPINE", "NECK", "LEFT_CLAVICLE", "LEFT_SHOULDER", "LEFT_ELBOW", "LEFT_WRIST",
+        "LEFT_HAND", "LEFT_HANDTIP", "LEFT_THUMB", "RIGHT_CLAVICLE", "RIGHT_SHOULDER", "RIGHT_ELBOW", "RIGHT_WRIST",
+        "RIGHT_HAND", "RIGHT_HANDTIP", "RIGHT_THUMB", "LEFT_HIP", "LEFT_KNEE", "LEFT_ANKLE", "LEFT_FOOT",
+        "RIGHT_HIP", "RIGHT_KNEE", "RIGHT_ANKLE", "RIGHT_FOOT", "HEAD", "NOSE", "LEFT_EYE", "LEFT_EAR", "RIGHT_EYE",
+        "RIGHT_EAR", "LEFT_HEEL", "RIGHT_HEEL",
+    ),
+    {
+        "pelvis": "PELVIS",
+        "spine2": "NAVAL_SPINE",
+        "spine3": "CHEST_SPINE",
+        "neck": "NECK",
+        "head": "HEAD",
+        **_sides({f"left_{j}": f"LEFT_{j.upper()}" for j in (*_ARMS_AND_LEGS, "foot")}, ("LEFT", "RIGHT")),
+        **_sides({"left_collar": "LEFT_CLAVICLE"}, ("LEFT", "RIGHT")),
+    },
+)  # fmt: skip
+
 _SKELETONS: dict[str, Skeleton] = {
     s.name: s
-    for s in (CANONICAL, COCO17, BLAZEPOSE33, H36M17, KINECT22, KINECT25, AZURE_KINECT32, ZED38, OPENPOSE25)
+    for s in (
+        CANONICAL, COCO17, BLAZEPOSE33, H36M17, KINECT22, KINECT25, AZURE_KINECT32, ZED38, OPENPOSE25, SMPL24,
+        COCO_WHOLEBODY23, HALPE26, ZED18, ZED34,
+    )
 }  # fmt: skip
 SKELETONS: Mapping[str, Skeleton] = MappingProxyType(_SKELETONS)
 """Every skeleton that ``pose/raw`` may name: these, and those of the user's own (`own_layouts`)."""

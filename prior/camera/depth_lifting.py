@@ -25,10 +25,10 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.layouts import COCO17
+from steadypose.prior.compiled import njit
 
 Floats = NDArray[np.float64]
 

@@ -152,7 +152,7 @@ class Sighting:
 
 
 def match_views(views: list[Sightings]) -> list[list[Sighting]]:
-    """The bodies of several cameras at one moment, one list of sightings for each body."""
+    """The bodies of several cameras at one moment, one list of observations for each body."""
     groups: list[list[Sighting]] = []
     for view in sorted(views, key=lambda view: -len(view.joints)):
         own = [Sighting(j, c, view.eye) for j, c in zip(view.joints, view.confidence, strict=True)]
@@ -181,8 +181,8 @@ def match_bodies(some: Floats, others: Floats) -> list[tuple[int, int]]:
 def merge_joints(sightings: list[Sighting]) -> tuple[Floats, Floats]:
     """Joints (22, 3) and their confidence (22,) of a body that several cameras see.
 
-    The precision of a sighting, up to a factor, is ``c² / d² (I + (1 / ALONG² - 1) r rᵀ)`` for confidence c, distance d
-    and line of sight r; the confidence that all were wrong is the product.
+    The precision of an observation, up to a factor, is ``c² / d² (I + (1 / ALONG² - 1) r rᵀ)`` for confidence c,
+    distance d and line of sight r; the confidence that all were wrong is the product.
     """
     joints = np.array([sighting.joints for sighting in sightings])
     confidence = np.array([sighting.confidence for sighting in sightings])

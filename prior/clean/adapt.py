@@ -17,7 +17,7 @@ from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, finite_joints
 from steadypose.prior.clean.frame import CleanFrame, Floats
 
 MAX_DISTANCE = 30.0
-"""Metres from the sensor beyond which a joint is no sighting."""
+"""Metres from the sensor beyond which a joint is no observation."""
 MAX_PLACE = 10_000.0
 """Metres from the world's origin beyond which no sensor stands: joints lose their millimetres."""
 MAX_SIZE, MIN_BONES = 2.5, 4

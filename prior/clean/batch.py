@@ -32,10 +32,11 @@ from steadypose.prior.clean.adapt import (
 from steadypose.prior.clean.core import CleanCore
 from steadypose.prior.clean.frame import Bools, CleanFrame, Observation, SensorNoise
 from steadypose.prior.clean.identify import Identify
-from steadypose.prior.clean.pipeline import BACKWARDS_NS
+from steadypose.prior.clean.pipeline import BACKWARDS_NS, CATCH_UP
 from steadypose.prior.clean.sensor_pose import SensorPoseGate, Verdict
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.clean.slots import Slots
+from steadypose.prior.clean.stamp_gate import SLOWEST_NS, StampGate
 from steadypose.prior.timing.resample import PERIOD_NS, Resampler
 
 PATIENCE_NS = 2 * PERIOD_NS
@@ -84,9 +85,11 @@ class StreamBatch:
     Attributes:
         counters: messages, bodies and joints refused or dropped so far, by cause.
         delay_frames: frames at 30 Hz between a frame and its answer.
+        most_bodies: of all streams that are worked on, as of `PriorPipeline`.
     """
 
     def __init__(self, settings: PriorSettings, max_streams: int) -> None:
+        self.most_bodies = settings.max_bodies
         self.counters: Counter[str] = Counter()
         self.delay_frames = settings.delay
         self._settings, self._max_streams = settings, max_streams
@@ -94,6 +97,7 @@ class StreamBatch:
         self._core = CleanCore(settings, self.counters)
         self._slots: Slots[tuple[str, int]] = Slots(settings.max_bodies, settings.timeout, self.counters)
         self._streams: dict[str, _Stream] = {}
+        self._stamps: dict[str, StampGate] = {}
         self._waiting: dict[int, list[Sighting]] = {}
         self._origin_ns = 0
         self._done_ns: int | None = None
@@ -103,19 +107,35 @@ class StreamBatch:
         """How many there are now."""
         return len(self._streams)
 
-    def process_at(self, raw: PoseRaw, now_ns: int, *, hurry: bool = False) -> list[PoseClean]:
+    def process_at(self, raw: PoseRaw, now_ns: int, *, hurry: bool = False, gap: bool = False) -> list[PoseClean]:
         """Take a message of any stream, and give the frames of all streams that are then complete, oldest first.
 
         Args:
             raw: the message.
             now_ns: its arrival, on the server's clock.
-            hurry: as of `PriorPipeline.process`.
+            hurry, gap: as of `PriorPipeline.process`.
         """
+        stamps = self._stamps.pop(raw.source, None) or StampGate(self._timeout_ns, BACKWARDS_NS, self.counters)
+        self._stamps[raw.source] = stamps
+        if len(self._stamps) > 2 * self._max_streams:
+            del self._stamps[next(iter(self._stamps))]
+        admitted = stamps.admit(raw, now_ns, gap=gap)
+        if not admitted:
+            self.heard(raw.source, now_ns)
+        cleaned = [clean for held, at in admitted for clean in self._process(held, at, hurry=hurry, gap=gap)]
+        return cleaned if admitted else self._advance(now_ns, hurry)
+
+    def heard(self, source: str, now_ns: int) -> None:
+        """Note that a stream goes on, though its message was dropped by the node."""
+        if stream := self._streams.get(source):
+            stream.heard_ns = now_ns
+
+    def _process(self, raw: PoseRaw, now_ns: int, *, hurry: bool, gap: bool) -> list[PoseClean]:
         cleaned: list[PoseClean] = []
-        if self._done_ns is not None and now_ns - self._done_ns > self._timeout_ns + 2 * PATIENCE_NS:
+        if not gap and self._done_ns is not None and now_ns - self._done_ns > self._timeout_ns + 2 * PATIENCE_NS:
             cleaned += self.flush()  # all were silent, and start anew
         for name, stream in list(self._streams.items()):
-            if now_ns - stream.heard_ns > self._timeout_ns and name != raw.source:
+            if not gap and now_ns - stream.heard_ns > self._timeout_ns and name != raw.source:
                 self.counters["stream_silent"] += 1
                 self._forget(name)
         stream = self._streams.get(raw.source)
@@ -127,11 +147,21 @@ class StreamBatch:
         else:
             layout = layout_of(raw, self.counters)
             if layout is not None and self._is_pose_accepted(raw):
-                self._take(raw, layout, now_ns)
+                self._take(raw, layout, now_ns, gap=gap)
         cleaned += self._advance(now_ns, hurry)
         if self._streams and all(stream.last.end_of_stream for stream in self._streams.values()):
             cleaned += self.flush()  # nobody is left for whose sake there will be another frame
         return cleaned
+
+    @property
+    def bodies(self) -> int:
+        """That are worked on."""
+        return self._slots.taken
+
+    @property
+    def offered(self) -> int:
+        """Bodies that are worked on, and those that would be if there were time."""
+        return self._slots.taken + self._slots.left_out
 
     @property
     def sensor_noise(self) -> SensorNoise | None:
@@ -163,10 +193,11 @@ class StreamBatch:
             self._forget(raw.source)
         return verdict is not Verdict.SUSPECT
 
-    def _take(self, raw: PoseRaw, layout: Skeleton, now_ns: int) -> None:
+    def _take(self, raw: PoseRaw, layout: Skeleton, now_ns: int, *, gap: bool) -> None:
         """Put a stream's message on the grid."""
         stream = self._streams.get(raw.source)
-        if stream and not -BACKWARDS_NS < raw.stamp_ns - stream.last.stamp_ns <= self._timeout_ns:
+        longest_ns = SLOWEST_NS if gap else self._timeout_ns
+        if stream and not -BACKWARDS_NS < raw.stamp_ns - stream.last.stamp_ns <= longest_ns:
             self.counters["stream_gap" if raw.stamp_ns > stream.last.stamp_ns else "stamp_jumped_back"] += 1
             self._forget(raw.source)
             stream = None
@@ -216,11 +247,16 @@ class StreamBatch:
         found = sightings(raw, layout, sensor, self.counters, numbered=stream.identify is not None)
         own = stream.identify.update(raw.stamp_ns, *stacked(found.values())) if stream.identify else found
         keys = [None if key is None else (raw.source, key) for key in own]
-        return self._slots.arrange(zip(keys, found.values(), strict=True))
+        named = list(zip(keys, found.values(), strict=True))
+        if (out := self._slots.crowded_out(self.most_bodies, named, sensor.origin)).any():
+            self._drop(out)
+        return self._slots.arrange(named)
 
     def _advance(self, now_ns: int, hurry: bool) -> list[PoseClean]:
         """Process the grid times that wait for no further stream."""
         cleaned: list[PoseClean] = []
+        if hurry:
+            self._catch_up(now_ns)
         while self._waiting:
             tick_ns = min(self._waiting) if self._done_ns is None else self._done_ns + PERIOD_NS
             awaited = any(s.newest_ns < tick_ns and not s.last.end_of_stream for s in self._streams.values())
@@ -244,6 +280,19 @@ class StreamBatch:
             if frame is not None:
                 cleaned += self._split(frame)
         return cleaned
+
+    def _catch_up(self, now_ns: int) -> None:
+        """Skip grid times that are so late that to work on them would make all others later."""
+        if self._done_ns is None:
+            return
+        late = (now_ns - PATIENCE_NS - self._done_ns) // PERIOD_NS - CATCH_UP
+        if late <= 0 or not self._waiting:
+            return
+        for _ in range(late):
+            self._done_ns += PERIOD_NS
+            self._waiting.pop(self._done_ns, None)
+        self.counters["frames_skipped"] += int(late)
+        self._slots.excuse(self._done_ns)
 
     def _merged(self, parts: list[Sighting]) -> Sighting:
         slots = self._settings.max_bodies

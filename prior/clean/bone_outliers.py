@@ -11,20 +11,20 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from steadypose.prior.body.skeleton import CHILDREN, PARENT, limbs
 from steadypose.prior.clean.frame import Bools, Floats
+from steadypose.prior.compiled import njit
 
 MIN_SHARE, MIN_DIFFERENCE, DEVIATIONS = 0.5, 0.1, 6.0
 """An impossible length differs from the mean by more than this share of it, these metres and these standard
-deviations (chosen on validation, docs/experiments.md)."""
+deviations (chosen on validation, benchmarks/NOTEBOOK.md)."""
 
 MIN_DEVIATION = 0.01
 """metres"""
 
 MEMORY, FIRST = 45, 15
-"""Frames of the running mean and deviation; and sightings before which nothing is judged."""
+"""Frames of the running mean and deviation; and observations before which nothing is judged."""
 
 WINSORISED = 2.0
 """Standard deviations at which differences are clipped before they update mean and deviation: an outlier changes them

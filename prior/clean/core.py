@@ -25,6 +25,7 @@ from steadypose.prior.clean.fuse import Fuse
 from steadypose.prior.clean.gate import Gate
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.impute import Impute
+from steadypose.prior.clean.orient import Orient
 from steadypose.prior.clean.person import PersonEstimator
 from steadypose.prior.clean.reconstruct import Reconstruct
 from steadypose.prior.clean.refine import Refine
@@ -98,6 +99,7 @@ class CleanCore:
         self._score = Scorer(settings.score, settings.encode.weights, slots) if score else None
         self._impute = Impute(settings.impute, delay, slots, counters) if impute else None
         self.fuse = Fuse(settings.fuse, slots)
+        self._orient = Orient(settings.orient, slots) if settings.orient.enabled else None
         self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
         self._newest: _Newest | None = None
         self._nobody = 0  # frames in a row without a body
@@ -163,6 +165,7 @@ class CleanCore:
         steps = (
             self._gate, self._correct, self._history, self._smooth, self._denoise, self._slow_error,
             self._person, self._score, self._impute, self._refine, self.fuse,
+            self._orient,
         )  # fmt: skip
         for step in steps:
             if step is not None:
@@ -203,4 +206,6 @@ class CleanCore:
             self._history.seen_since(back),
             newest.present,
         )
+        if self._orient:
+            estimate = self._orient.update(estimate)
         return CleanFrame(estimate, newest.score, self._history.observed[at], self._history.confidence[at])

@@ -8,8 +8,7 @@ import numpy as np
 
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.clean.frame import Bools, Gated
-from steadypose.prior.models.sensor_bias.features import HISTORY, SMOOTHER_DENSITY, features, recall, trunk_frame
-from steadypose.prior.models.sensor_bias.inference import LiveCorrection
+from steadypose.prior.models.sensor_bias import HISTORY, SMOOTHER_DENSITY, LiveCorrection, features, recall, trunk_frame
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
 from steadypose.prior.timing.ring import Ring
 

@@ -154,7 +154,7 @@ class Estimate:
     Attributes:
         stamp_s: seconds since the stream began.
         positions: (S, 22, 3) metres; NaN for a body without an estimate.
-        rotations: (S, 22, 3, 3) local, solved for these positions.
+        rotations: (S, 22, 3, 3) local, for these positions.
         offsets: (S, 22, 3) metres, the person's bones.
         sigma: (S, 22) metres, standard deviation along an axis.
         state: (S, 22) `JointState`.

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import JointState
@@ -17,6 +16,7 @@ from steadypose.prior.clean.frame import Bools, Estimate, Floats, Imputed, Perso
 from steadypose.prior.clean.history import BRIEF_S
 from steadypose.prior.clean.occluded import OccludedJoints
 from steadypose.prior.clean.slow_error import SlowError
+from steadypose.prior.compiled import njit
 from steadypose.prior.timing.fixed_lag import Smoothed
 
 
@@ -134,7 +134,7 @@ class Fuse:
             here = (unseen <= unseen.min(axis=1, keepdims=True)) & np.isfinite(deviation)
             variance = _merge(body, seen, here, precision)
             length_variance = slow_error.length_variance[slots] + _of_rigid(person.length_variance[slots])
-            # nor between two sightings that are near: put on its bones for a frame or two, a joint would flicker
+            # nor between two observations that are near: put on its bones for a frame or two, a joint would flicker
             stays = here | (seen_later[slots] & (unseen < BRIEF_S))
             body = fit_lengths(body, offsets, np.where(stays, _MIN_VARIANCE, variance), length_variance)
             fitted = solve_pose(body, offsets, decoded)[0]

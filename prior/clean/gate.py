@@ -7,13 +7,12 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import MIRROR, limbs
 from steadypose.prior.clean.bone_outliers import BoneOutliers
 from steadypose.prior.clean.frame import Bools, Floats, Gated, Observation
-from steadypose.prior.compiled import median
+from steadypose.prior.compiled import median, njit
 from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
 from steadypose.prior.timing.frozen_joints import RECENT, frozen_joints
 from steadypose.prior.timing.rate import FPS
@@ -43,7 +42,7 @@ _EXCHANGED = tuple(np.concatenate(limbs(chain)) for chain in (("elbow", "wrist")
 _BASES = tuple(np.concatenate(limbs((joint,))) for joint in ("shoulder", "hip"))
 _SWAP_APART = 0.15  # metres between prediction and observation, mean of a limb's joints, for an exchange to be tested
 _SWAP_BETTER = 0.4  # an exchange must reduce that distance to this share
-_JUMP_FACTOR = 7.0  # times the jitter: one sighting in a thousand is further from its prediction
+_JUMP_FACTOR = 7.0  # times the jitter: one observation in a thousand is further from its prediction
 _JITTER_FRAMES = 15  # of the running mean of the jitter
 _UNIT_DISTANCE = 2.6  # median distance to this filter's prediction, of white noise of 1 along each axis
 _MEAN_FRAMES, _MEAN_FACTOR = 9, 3.0  # of a joint's running mean distance to its prediction; and multiple of it

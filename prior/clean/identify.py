@@ -28,7 +28,7 @@ class IdentifySettings:
     Attributes:
         enabled: whether ids are assigned here and the source's ignored; off, the source's are passed on.
         birth: seconds for which an unknown body must be seen before it gets an id.
-        death: seconds without a sighting after which a person is forgotten, and gets a new id on return.
+        death: seconds without an observation after which a person is forgotten, and gets a new id on return.
     """
 
     enabled: bool = False

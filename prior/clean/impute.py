@@ -4,7 +4,7 @@ Completion network and encoder complete a window in one pass. From there, option
 maximises log p(z) + log p(x | z) of the observed entries, each weighted by its confidence, and the decoded window is
 the result. The ascent is warm-started: the latents' offsets are kept as the window slides. With the completion network,
 one step a frame reduces the error of limbs hidden for 0.5 to 1 s by 5 to 6 % and takes a third of a frame's time more
-(docs/experiments.md), so by default none is taken.
+(benchmarks/NOTEBOOK.md), so by default none is taken.
 
 The paper instead ascends log p(z | x) in the missing entries themselves. That drifts from the truth with every step
 (`steadypose evaluate hgvae`): the posterior is narrowest for windows that are easy to encode, not for correct ones.
@@ -17,9 +17,9 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from steadypose.prior.clean.frame import BodyWindows, Bools, Floats, Imputed
+from steadypose.prior.compiled import njit
 from steadypose.prior.models.hgvae.features import Tracks, from_tracks
 from steadypose.prior.models.hgvae.inference import Reconstruction
 

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.clean.frame import Bools, Floats
+from steadypose.prior.compiled import njit
 from steadypose.prior.models.occlusion.candidates import FEATURES, average, describe, forget, new_past, observe
 from steadypose.prior.models.occlusion.inference import LiveOcclusion, Occluded, Weighed
 

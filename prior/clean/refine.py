@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import heading, yaw_matrix
 from steadypose.prior.clean.frame import Bools, Floats, Gated, Person
+from steadypose.prior.compiled import njit
 from steadypose.prior.models.hmvae.inference import LiveHMVAE
 from steadypose.prior.timing.ring import Ring
 
@@ -23,7 +23,7 @@ class RefineSettings:
     Attributes:
         enabled: whether to refine; off, the default, the solved rotations pass unchanged and no model is loaded. With
             `impute` and `fuse` on, observed joints stay as smoothed and hidden ones as completed, so that refinement
-            changes nothing by 0.1 mm (validation people, docs/experiments.md).
+            changes nothing by 0.1 mm (validation people, benchmarks/NOTEBOOK.md).
         weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
     """
 

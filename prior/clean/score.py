@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from steadypose.prior.clean.frame import BodyWindows, Bools, Floats, Score
 from steadypose.prior.models.hgvae.anomaly import SENSOR_SIGMAS, Calibration, decimals, joint_odds, pace
-from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
+from steadypose.prior.models.hgvae.live_faults import LiveFaultNet
 from steadypose.prior.timing.rate import FPS
 
 MEAN_ANOMALY = 0.54
 """Mean anomaly at which the scale is 1. Of a body that follows validation's distribution it would be 1 / ln 10 = 0.43;
-chosen on validation (docs/experiments.md)."""
+chosen on validation (benchmarks/NOTEBOOK.md)."""
 
 MAX_COUNTED = 2.0
 """At which a frame's anomaly is clipped in the mean, so that a fault of a second hardly changes it."""

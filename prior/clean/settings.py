@@ -13,6 +13,7 @@ from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.gate import GateSettings
 from steadypose.prior.clean.identify import IdentifySettings
 from steadypose.prior.clean.impute import ImputeSettings
+from steadypose.prior.clean.orient import OrientSettings
 from steadypose.prior.clean.person import PersonSettings
 from steadypose.prior.clean.reconstruct import ReconstructSettings
 from steadypose.prior.clean.refine import RefineSettings
@@ -32,12 +33,12 @@ class PriorSettings:
         delay: look-ahead, frames at 30 Hz between a frame and its answer, 0 to 16 (the default, 4, is half of HM-VAE's
             window: the paper's centre-frame refinement).
         max_bodies: bodies tracked at once.
-        timeout: seconds without a sighting after which a body is dropped, and without a frame after which the
+        timeout: seconds without an observation after which a body is dropped, and without a frame after which the
             stream starts anew.
         bias_sigma: metres along an axis, expected standard deviation of the sensor's slow error: the prior of its
             estimate from the stream, and the least that a fault has to exceed. Depth cameras have 2 cm or more.
         identify: whether ids are the source's (the default) or assigned by the prior.
-        gate, correct, smooth, encode, denoise, bones, score, impute, refine, fuse: settings of the stages.
+        gate, correct, smooth, encode, denoise, bones, score, impute, refine, fuse, orient: settings of the stages.
     """
 
     delay: int = 4
@@ -55,6 +56,7 @@ class PriorSettings:
     impute: ImputeSettings = field(default_factory=ImputeSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     fuse: FuseSettings = field(default_factory=FuseSettings)
+    orient: OrientSettings = field(default_factory=OrientSettings)
 
     def __post_init__(self) -> None:
         check_range("[prior] delay", self.delay, 0, MAX_DELAY)

@@ -25,23 +25,55 @@ class Slots(Generic[Key]):
     Args:
         count: of slots.
         timeout_s: seconds without a sighting after which a body is dropped.
-        counters: gets ``body_too_little_seen`` and ``too_many_bodies``.
+        counters: gets ``body_too_little_seen``, ``too_many_bodies`` and ``body_for_load``.
 
     Attributes:
         keys: (S,) key of each slot's body; None of a free slot.
         present: (S,) which slots hold a body that has been seen at a grid time.
+        left_out: bodies of the newest message for which there is no time.
     """
 
     def __init__(self, count: int, timeout_s: float, counters: Counter[str]) -> None:
         self._timeout_ns, self._counters = timeout_s * 1e9, counters
         self.keys: list[Key | None] = [None] * count
+        self._most = count
+        self.left_out = 0
+        self._distance = np.full(count, np.inf)
         self.present = np.zeros(count, dtype=bool)
         self._last_seen_ns = np.zeros(count, dtype=np.int64)  # 0: not on the grid yet
+
+    def crowded_out(self, most: int, sightings: Iterable[tuple[Key | None, Sighting]], sensor: Floats) -> Bools:
+        """The slots (S,) of bodies beyond the ``most`` that there is time for: those that were seen farthest away.
+
+        Args:
+            most: bodies, from now on.
+            sightings: of the newest message, as of `arrange`.
+            sensor: (3,) metres, where it stands.
+        """
+        self._most = most
+        out = np.zeros(len(self.keys), dtype=bool)
+        if most < len(self.keys):
+            for key, seen in sightings:
+                if key is not None and key in self.keys:
+                    self._distance[self.keys.index(key)] = _distance(seen.positions, sensor)
+            taken = [slot for slot, key in enumerate(self.keys) if key is not None]
+            out[sorted(taken, key=self._distance.__getitem__)[most:]] = True
+        return out
+
+    @property
+    def taken(self) -> int:
+        """How many slots hold a body."""
+        return sum(key is not None for key in self.keys)
+
+    def excuse(self, stamp_ns: int) -> None:
+        """Bodies were not looked at until now: none has been out of sight."""
+        self._last_seen_ns[self._last_seen_ns > 0] = stamp_ns
 
     def arrange(self, sightings: Iterable[tuple[Key | None, Sighting]]) -> Sighting:
         """Sort bodies into slots by key (None: a body without one, which is left out): joints and confidence by
         slot."""
         positions, confidence = np.full((len(self.keys), 22, 3), np.nan), np.zeros((len(self.keys), 22))
+        self.left_out = 0
         for key, seen in sightings:
             if key is None:
                 continue
@@ -75,7 +107,18 @@ class Slots(Generic[Key]):
         if None not in self.keys:
             self._counters["too_many_bodies"] += 1
             return None
+        if self.taken >= self._most:
+            self._counters["body_for_load"] += 1
+            self.left_out += 1
+            return None
         slot = self.keys.index(None)
         self.keys[slot] = key
         self._last_seen_ns[slot] = 0
+        self._distance[slot] = np.inf
         return slot
+
+
+def _distance(positions: Floats, sensor: Floats) -> float:
+    """Metres from a sensor to the middle of the joints (22, 3) that it sees."""
+    seen = positions[finite_joints(positions)]
+    return float(np.linalg.norm(seen.mean(axis=0) - sensor)) if len(seen) else np.inf

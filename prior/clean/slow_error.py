@@ -14,12 +14,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from steadypose.prior.body.inverse_kinematics import RIGID
 from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.clean.frame import Bools, Floats
-from steadypose.prior.compiled import median
+from steadypose.prior.compiled import median, njit
 from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS
 

@@ -1,6 +1,6 @@
 """The errors of a depth camera's body tracker, as a random process with parameters fitted to a real Kinect.
 
-For each joint, as `prior.sim.fit` finds on UI-PRMD:
+For each joint, as `training.recipes.sensor_noise` finds on UI-PRMD:
 
 - an **offset**, constant for a session, and a **bias** that drifts with the *distance the joint travels*, not with
 time:

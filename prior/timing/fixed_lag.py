@@ -8,8 +8,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from steadypose.prior.compiled import njit
 
 Array = NDArray[np.float64]
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from steadypose.prior.compiled import median
+from steadypose.prior.compiled import median, njit
 
 RECENT = 15
 """Frames in which a joint that repeats itself must do so mostly."""

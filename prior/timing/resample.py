@@ -25,7 +25,7 @@ PERIOD_GAIN = 0.1
 class Resampler:
     """Interpolates every slot's joints to grid times ``anchor + n / 30 s``, as frames come in.
 
-    Between two sightings of a joint its position is interpolated linearly, with the lesser confidence. A grid
+    Between two observations of a joint its position is interpolated linearly, with the lesser confidence. A grid
     frame is returned as soon as a frame is no more than 10 ms older: a stream of 30 Hz whose stamps jitter by a
     few milliseconds then costs no extra frame of delay.
 
@@ -51,7 +51,7 @@ class Resampler:
         self._confidence = np.zeros((2, self._slots, 22))
 
     def clear(self, slot: NDArray[np.bool_]) -> None:
-        """Forget the sightings of these slots (S,)."""
+        """Forget the observations of these slots (S,)."""
         self._seen_ns[:, slot] = np.iinfo(np.int64).min // 2
         self._decimation.clear(slot)
 
@@ -86,7 +86,7 @@ class Resampler:
         self._newest_ns = stamp_ns
         look_ahead_ns = min(LOOK_AHEAD_NS, round(LOOK_AHEAD_PERIODS * self._period_ns))
         seen = np.isfinite(positions[..., 0])
-        # Row 1 is each joint's last sighting, row 0 the one before.
+        # Row 1 is each joint's last observation, row 0 the one before.
         for store, value in (
             (self._seen_ns, np.full(seen.shape, stamp_ns)),
             (self._positions, positions),

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import PARENTS, limbs
+from steadypose.prior.compiled import njit
 
 Floats = NDArray[np.float64]
 

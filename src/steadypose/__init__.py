@@ -1,27 +1,101 @@
 """Clean, world-space human pose for robots and kiosks, live, from any noisy 3D skeleton source.
 
+On arrays: `clean`, `complete`, `fit`, `plot`. Frame by frame: `Filter`. On topics: `Publisher`, `Subscriber` and the
+messages. Data to try them on: `sample`.
+
 In the repository the rooms `msgs`, `prior`, `nodes`, `launch` and `benchmarks` stand at the top; they are installed in
 here, so that nobody's own package of such a name is shadowed.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from steadypose.nodes.library import clean
+    from steadypose.msgs.transport import Publisher, Subscriber
+    from steadypose.msgs.types import (
+        CONTACTS,
+        JOINTS,
+        CleanBody,
+        Diagnostics,
+        JointState,
+        Pose,
+        PoseClean,
+        PoseRaw,
+        PoseWorld,
+        RawBody,
+        Tracking,
+        WorldBody,
+    )
+    from steadypose.nodes.library.arrays import clean, complete, fit, plot
+    from steadypose.nodes.library.filter import Filter
+    from steadypose.nodes.library.inputs import InputWarning
+    from steadypose.nodes.library.poses import Poses
+    from steadypose.nodes.library.sample import sample
+    from steadypose.prior.body.layouts import SKELETONS
 
-__all__ = ["PACKAGE", "clean"]
+    __version__: str
+
+__all__ = [
+    "CONTACTS",
+    "JOINTS",
+    "PACKAGE",
+    "SKELETONS",
+    "CleanBody",
+    "Diagnostics",
+    "Filter",
+    "InputWarning",
+    "JointState",
+    "Pose",
+    "PoseClean",
+    "PoseRaw",
+    "PoseWorld",
+    "Poses",
+    "Publisher",
+    "RawBody",
+    "Subscriber",
+    "Tracking",
+    "WorldBody",
+    "__version__",
+    "clean",
+    "complete",
+    "fit",
+    "plot",
+    "sample",
+]
 
 PACKAGE = Path(__file__).parent
 """Where this package lies, with launch files, weights and a sample stream inside."""
 
+_MESSAGES = (
+    *("CONTACTS", "JOINTS", "CleanBody", "Diagnostics", "JointState", "Pose", "PoseClean", "PoseRaw", "PoseWorld"),
+    *("RawBody", "Tracking", "WorldBody"),
+)
+_MODULES = {
+    **dict.fromkeys(_MESSAGES, "msgs.types"),
+    **dict.fromkeys(("Publisher", "Subscriber"), "msgs.transport"),
+    **dict.fromkeys(("clean", "complete", "fit", "plot"), "nodes.library.arrays"),
+    "Filter": "nodes.library.filter",
+    "InputWarning": "nodes.library.inputs",
+    "Poses": "nodes.library.poses",
+    "SKELETONS": "prior.body.layouts",
+    "sample": "nodes.library.sample",
+}
+"""where each public name is"""
+
 
 def __getattr__(name: str) -> Any:
     # a subscriber needs `steadypose.msgs` alone, and nothing that the library imports
-    if name == "clean":
-        from steadypose.nodes.library import clean
+    if name == "__version__":
+        from importlib.metadata import version
 
-        return clean
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return version("steadypose")
+    if name in _MODULES:
+        return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})

@@ -1,5 +1,6 @@
 """A small part of the bench, as a check against regression: wide tolerances, people of our own simulator."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,21 +9,21 @@ from matplotlib.figure import Figure
 from rich.progress import Progress
 
 from steadypose.benchmarks import figures, ours
+from steadypose.benchmarks.baselines import smoothnet
+from steadypose.benchmarks.baselines.filters import OFFLINE, Peer, missing
 from steadypose.benchmarks.bench import Bench, over_seeds
 from steadypose.benchmarks.corruption import gaussian, hide
 from steadypose.benchmarks.metrics import position_error
 from steadypose.benchmarks.motion import MotionClips, simulated_clips
-from steadypose.benchmarks.peers import smoothnet
-from steadypose.benchmarks.peers.filters import OFFLINE, Peer, missing
-from steadypose.benchmarks.protocols.reconstruction import slide
-from steadypose.benchmarks.protocols.spoiled import against_best, calibration_table, reliability_bins, run_conditions
-from steadypose.benchmarks.protocols.streaming import recovery
 from steadypose.benchmarks.scores import figures as figures_of
 from steadypose.benchmarks.scores import pivot, score
+from steadypose.benchmarks.studies.reconstruction import slide
+from steadypose.benchmarks.studies.spoiled import against_best, calibration_table, reliability_bins, run_conditions
+from steadypose.benchmarks.studies.streaming import recovery
 from steadypose.prior.body.skeleton import J
+from steadypose.prior.fit.hmvae_network import HMVAE
+from steadypose.prior.fit.torch_weights import load_tensors
 from steadypose.prior.models.hmvae.config import HMVAEConfig
-from steadypose.prior.models.hmvae.network import HMVAE
-from steadypose.prior.models.torch_weights import load_tensors
 
 
 @pytest.fixture(scope="module")
@@ -40,10 +41,15 @@ def test_simulated_clips_are_bodies_on_a_floor(clips: MotionClips) -> None:
     )
 
 
-def test_the_clips_that_travel_farthest_are_kept_in_order(clips: MotionClips) -> None:
+def test_the_clips_that_travel_farthest_are_kept_in_order_as_many_of_each_person(clips: MotionClips) -> None:
     paths = [np.linalg.norm(np.diff(clip[:, 0, :2], axis=0), axis=-1).sum() for clip in clips.positions.swapaxes(0, 1)]
-    kept = sorted(sorted(range(6), key=lambda c: -paths[c])[:2])
-    np.testing.assert_array_equal(clips.farthest(2).positions, clips.positions[:, kept])
+    alone = replace(clips, person=np.full(6, "a"))
+    np.testing.assert_array_equal(alone.farthest(2).positions, clips.positions[:, sorted(np.argsort(paths)[-2:])])
+    people = np.array(["a", "a", "b", "b", "b", "c"])
+    chosen = replace(clips, person=people).farthest(3)
+    assert chosen.person.tolist() == ["a", "b", "c"]
+    best = [max(range(2), key=paths.__getitem__), max(range(2, 5), key=paths.__getitem__), 5]
+    np.testing.assert_array_equal(chosen.positions, clips.positions[:, best])
 
 
 def test_steadypose_takes_noise_away_and_answers_for_hidden_joints(clips: MotionClips) -> None:

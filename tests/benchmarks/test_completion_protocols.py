@@ -9,12 +9,12 @@ import pytest
 from rich.progress import Progress
 from scipy.spatial.transform import Rotation
 
+from steadypose.benchmarks.baselines import inbetween
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.metrics import npss, quaternion_distance
 from steadypose.benchmarks.motion import as_set, simulated_clips
-from steadypose.benchmarks.peers import inbetween
-from steadypose.benchmarks.protocols import completion, interpolation
-from steadypose.benchmarks.protocols.interpolation import BEFORE, Truth, measure, relate
+from steadypose.benchmarks.studies import completion, interpolation
+from steadypose.benchmarks.studies.interpolation import BEFORE, Truth, measure, relate
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 from rich.progress import Progress
 
 from steadypose.benchmarks.bench import Bench
-from steadypose.benchmarks.protocols import contacts
+from steadypose.benchmarks.studies import contacts
 from steadypose.prior.body.skeleton import J
 
 NAMES = [f"{side}_{part}" for side in ("left", "right") for part in ("ankle", "heel", "toe")]

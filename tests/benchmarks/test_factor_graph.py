@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from steadypose.prior.world.body_filter import BodyNoise
-from steadypose.prior.world.body_track import JITTER_SHARE
+from steadypose.prior.world.filter import JITTER_SHARE
+from steadypose.prior.world.kalman import BodyNoise
 
 pytest.importorskip("gtsam", reason="gtsam has no wheels for Python 3.10")
-from steadypose.benchmarks.peers.factor_graph import FactorGraph, Told
+from steadypose.benchmarks.baselines.factor_graph import FactorGraph, Told
 
 DT = 1 / 30.0
 NOISE = BodyNoise(acceleration_at_speed=0.0, slip_at_speed=0.0, network_memory_s=0.2)

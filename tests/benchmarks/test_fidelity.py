@@ -8,12 +8,13 @@ from matplotlib.figure import Figure
 from rich.progress import Progress
 
 from steadypose.benchmarks import ours
+from steadypose.benchmarks.baselines.bank import bank
+from steadypose.benchmarks.baselines.filters import Peer, raw
+from steadypose.benchmarks.baselines.whole_body_bank import whole_body_bank
 from steadypose.benchmarks.bench import Answer, Bench, Methods
 from steadypose.benchmarks.corruption import along_sight
 from steadypose.benchmarks.motion import spread
-from steadypose.benchmarks.peers.bank import bank
-from steadypose.benchmarks.peers.filters import Peer, raw
-from steadypose.benchmarks.protocols import fidelity
+from steadypose.benchmarks.studies import fidelity
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J
 
 
@@ -62,23 +63,24 @@ def test_errors_are_sorted_by_the_speed_of_the_joint() -> None:
     assert found["by_speed"]["2-4 m/s"]["found_by_stated"] == pytest.approx(4 / np.sqrt(3), abs=1e-3)
 
 
-def test_clips_are_taken_evenly_from_sources_as_far_as_these_go() -> None:
-    sources = np.array(["a"] * 50 + ["b"] * 3 + ["c"] * 20)
-    taken = spread(sources, 21)
-    assert {s: int((sources[taken] == s).sum()) for s in "abc"} == {"a": 9, "b": 3, "c": 9}
+def test_clips_are_taken_evenly_from_people_as_far_as_these_go() -> None:
+    people = np.array(["a"] * 50 + ["b"] * 3 + ["c"] * 20)
+    taken = spread(people, 21)
+    assert {s: int((people[taken] == s).sum()) for s in "abc"} == {"a": 9, "b": 3, "c": 9}
     assert (np.diff(taken) > 0).all()
-    assert len(spread(sources, 500)) == len(sources)
+    assert len(spread(people, 500)) == len(people)
 
 
 def test_the_protocol_gives_tables_and_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    peers = (Peer("raw", raw, (0,)), Peer("bank of smoothers", bank), Peer("half", lambda seen, _, delay: seen * 0.5))
+    banks = Peer("bank of smoothers", bank), Peer("whole-body bank", whole_body_bank)
+    peers = (Peer("raw", raw, (0,)), *banks, Peer("half", lambda seen, _, delay: seen * 0.5))
     methods = Methods(peers, {"steadypose": ours.OURS["steadypose"]}, (0, 4), networks=False)
     monkeypatch.setattr(fidelity, "methods", lambda _: methods)
     with Progress(disable=True) as progress:
         result = fidelity.run(Bench(quick=True, mocap=None, data=Path("nowhere.npz"), progress=progress))
     table = next(t for t in result.tables if t.name == "fidelity-speed-4")
-    assert [row[0] for row in table.rows][:4] == [
-        "none: raw", "none: best filter", "none: bank of smoothers", "none: steadypose",
+    assert [row[0] for row in table.rows][:5] == [
+        "none: raw", "none: best filter", "none: bank of smoothers", "none: whole-body bank", "none: steadypose",
     ]  # fmt: skip
     assert table.rows[0][1:] == ["0.0"] * (len(table.columns) - 1)
     assert all(isinstance(figure, Figure) for figure in result.figures.values())

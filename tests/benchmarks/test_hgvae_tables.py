@@ -3,13 +3,14 @@ import pytest
 import torch
 from tests.helpers.bodies import waving
 
-from steadypose.benchmarks.hgvae import imputation, models
-from steadypose.benchmarks.hgvae.faults import BEGINS, FAULTS, MIN_MOTION
+from steadypose.benchmarks.studies import hgvae_imputation as imputation
+from steadypose.benchmarks.studies import hgvae_models as models
+from steadypose.benchmarks.studies.hgvae_faults import BEGINS, FAULTS, MIN_MOTION
 from steadypose.prior.body.skeleton import MIRROR, REST_OFFSETS, J
 from steadypose.prior.models.hgvae.features import in_frame_of, to_tracks
-from steadypose.prior.models.hgvae.network import HGVAE
-from steadypose.prior.models.hgvae.windows import Windows, mean_tracks, standardise
-from steadypose.prior.motion.dataset import MotionSet
+from steadypose.training.data.dataset import MotionSet
+from steadypose.training.data.hgvae_windows import Windows, mean_tracks, standardise
+from steadypose.training.networks.hgvae import HGVAE
 
 
 def windows_of(*actions: str) -> MotionSet:

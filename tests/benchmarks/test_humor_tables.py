@@ -10,15 +10,16 @@ import torch
 from rich.progress import Progress
 
 from steadypose.benchmarks.bench import Bench
-from steadypose.benchmarks.humor import fits, models
-from steadypose.benchmarks.humor.fits import Answer, load_labels, pictures, scores
-from steadypose.benchmarks.humor.models import MVAE, SHIPS, VARIANTS
-from steadypose.benchmarks.humor.prediction import predict, stand_still
 from steadypose.benchmarks.motion import MotionClips, simulated_clips
-from steadypose.benchmarks.protocols import humor
-from steadypose.prior.models.humor.network import HumorConfig, HumorNet
-from steadypose.prior.offline.observations import KeyPoints, SurfacePoints
-from steadypose.prior.offline.solve import FitSettings
+from steadypose.benchmarks.studies import humor
+from steadypose.benchmarks.studies import humor_fits as fits
+from steadypose.benchmarks.studies import humor_models as models
+from steadypose.benchmarks.studies.humor_fits import Answer, load_labels, pictures, scores
+from steadypose.benchmarks.studies.humor_models import MVAE, SHIPS, VARIANTS
+from steadypose.benchmarks.studies.humor_prediction import predict, stand_still
+from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
+from steadypose.prior.fit.observations import KeyPoints, SurfacePoints
+from steadypose.prior.fit.solve import FitSettings
 
 
 @pytest.fixture(scope="module")

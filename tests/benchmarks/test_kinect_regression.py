@@ -1,9 +1,15 @@
 import numpy as np
 import torch
 
-from steadypose.benchmarks.kinect.clips import OTHER_SIDE, SCORED
+from steadypose.benchmarks.baselines.kinect_regression import (
+    _OTHER_SIDE,
+    Smoothed,
+    _mirrored,
+    ridge,
+    temporal_convolution,
+)
 from steadypose.benchmarks.metrics import position_error
-from steadypose.benchmarks.peers.kinect_regression import _OTHER_SIDE, Smoothed, _mirrored, ridge, temporal_convolution
+from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22
 

@@ -1,13 +1,14 @@
+import dataclasses
 from functools import partial
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from steadypose.benchmarks.kinect.clips import SCORED, Clip
-from steadypose.benchmarks.kinect.methods import best_without, run_filter
-from steadypose.benchmarks.kinect.scoring import align, deviation, learn_offset, score
-from steadypose.benchmarks.peers.filters import Peer, constant_velocity, gaussian_hampel, one_euro
+from steadypose.benchmarks.baselines.filters import Peer, constant_velocity, gaussian_hampel, one_euro
+from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip
+from steadypose.benchmarks.studies.kinect_methods import best_without, run_filter
+from steadypose.benchmarks.studies.kinect_scoring import align, deviation, learn_offset, score, summary
 from steadypose.benchmarks.tuning import Tuned
 
 REST = np.array(
@@ -117,3 +118,28 @@ def test_a_filter_is_chosen_by_the_others_figures() -> None:
     found = Tuned({"density": 0.5}, tried)
     assert [best_without(s, found, peer)["density"] for s in ("s01", "s02", "s03")] == [5.0, 0.5, 0.5]
     assert best_without("s01", Tuned({}, []), peer) == {}
+
+
+def test_what_moves_is_what_is_left_without_the_clips_own_constant_offset() -> None:
+    still = [clip(s, 40) for s in range(3)]
+    truths = [c.centres for c in still]
+    scores = score(truths, align(truths, [c.raw for c in still]), np.zeros_like(OFFSET))
+    assert scores.position.mean() > 0.03
+    # the trunk's frame is that of the joints as seen, which an offset tilts a little
+    assert scores.moving.mean() < 0.2 * scores.position.mean()
+    np.testing.assert_array_equal(scores.moving, score(truths, align(truths, [c.raw for c in still]), OFFSET).moving)
+
+
+def test_who_is_out_of_step_has_figures_and_is_in_no_mean() -> None:
+    clips = [clip(s, 30)._replace(subject=who, name=f"m01_{who}_e01") for s, who in enumerate(("s01", "s02", "s03"))]
+    truths = [c.centres for c in clips]
+    scores = score(truths, align(truths, [c.raw for c in clips]), np.zeros_like(OFFSET))
+    lagged = dataclasses.replace(scores, **{
+        name: np.array([9.0, *getattr(scores, name)[1:]]) for name in ("position", "moving", "acceleration")
+    })  # fmt: skip
+    a, b = summary(clips, scores), summary(clips, lagged)
+    assert b["groups"]["s01"] == {"position_mm": 9000.0, "moving_mm": 9000.0, "acceleration_mm": 9000.0}
+    for name in ("position", "moving", "acceleration"):
+        assert a[f"{name}_mm"] == b[f"{name}_mm"] == pytest.approx(1e3 * getattr(scores, name)[1:].mean(), abs=1e-2)
+        assert a[f"{name}_ci_mm"] == b[f"{name}_ci_mm"]
+    assert a["groups"]["done right"] == b["groups"]["done right"]

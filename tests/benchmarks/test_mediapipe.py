@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from steadypose.benchmarks.protocols.mediapipe import Stream, error_of
+from steadypose.benchmarks.studies.mediapipe import Stream, error_of
 from steadypose.prior.body.skeleton import J
 
 

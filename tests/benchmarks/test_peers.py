@@ -3,9 +3,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from steadypose.benchmarks.peers.bank import bank, noise_found
-from steadypose.benchmarks.peers.beside import beside
-from steadypose.benchmarks.peers.filters import (
+from steadypose.benchmarks.baselines.bank import bank, noise_found
+from steadypose.benchmarks.baselines.beside import beside
+from steadypose.benchmarks.baselines.filters import (
     FILTERS,
     OFFLINE,
     PEERS,
@@ -15,7 +15,7 @@ from steadypose.benchmarks.peers.filters import (
     hold_last,
     interpolate,
 )
-from steadypose.benchmarks.peers.kalman import fixed_lag, process_noise, transition
+from steadypose.benchmarks.baselines.kalman import fixed_lag, process_noise, transition
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
 

@@ -11,20 +11,20 @@ import pytest
 from rich.progress import Progress
 
 from steadypose.benchmarks import ours
+from steadypose.benchmarks.baselines.filters import missing
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.motion import MotionClips
-from steadypose.benchmarks.peers.filters import missing
-from steadypose.benchmarks.protocols import hidden_joints, noisy_joints
 from steadypose.benchmarks.scores import figures, score
+from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 
 CONDITIONS = {"perfect": lambda truth, rng: truth} | hidden_joints.CONDITIONS | noisy_joints.CONDITIONS
 GOLDEN = {
-    "perfect": (0.12, None, 0.172),
-    "1 cm": (6.2, None, 1.63),
-    "arm behind": (8.6, 57.3, 2.28),
-    "0.5 s": (7.1, 52.6, 2.04),
-    "4 cm": (19.0, None, 3.97),
-    "lasting 2 cm, spikes, swaps": (27.6, None, 2.66),
+    "perfect": (0.06, None, 0.062),
+    "1 cm": (5.7, None, 2.47),
+    "arm behind": (7.7, 46.4, 2.92),
+    "0.5 s": (6.4, 44.5, 2.72),
+    "4 cm": (18.5, None, 6.15),
+    "lasting 2 cm, spikes, swaps": (26.3, None, 2.23),
 }
 WORSE = 1.1
 

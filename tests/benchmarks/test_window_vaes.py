@@ -1,11 +1,11 @@
 import pytest
 import torch
 
+from steadypose.benchmarks.baselines.window_vaes import CONFIGS, MVAE, TCNVAE, trained
 from steadypose.benchmarks.motion import as_set, simulated_clips
-from steadypose.benchmarks.peers.window_vaes import CONFIGS, MVAE, TCNVAE, trained
-from steadypose.prior.models.hmvae.network import HMVAE
-from steadypose.prior.models.layers.skeleton_conv import SkeletonConv
-from steadypose.prior.models.layers.torch_kinematics import forward_kinematics
+from steadypose.prior.fit.hmvae_network import HMVAE
+from steadypose.prior.fit.skeleton_conv import SkeletonConv
+from steadypose.prior.fit.torch_kinematics import forward_kinematics
 
 
 def in_use(model: torch.nn.Module) -> int:

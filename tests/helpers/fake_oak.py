@@ -18,7 +18,7 @@ os.environ.setdefault("DEPTHAI_LEVEL", "error")
 import depthai as dai
 
 from steadypose.nodes.graph.clock import Clock
-from steadypose.nodes.sources.oak import OakSettings
+from steadypose.nodes.sources.camera_settings import OakSettings
 from steadypose.nodes.sources.oak_device import Host
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.body.skeleton import REST_OFFSETS

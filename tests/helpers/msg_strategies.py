@@ -4,13 +4,18 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.types import (
     CleanBody,
     Diagnostics,
+    Event,
+    EventKind,
+    Hand,
     Level,
+    Phase,
     Pose,
     PoseClean,
+    PoseEvents,
     PoseRaw,
     PoseWorld,
     RawBody,
@@ -100,6 +105,26 @@ WORLD = st.builds(
     bodies=st.lists(WORLD_BODIES, max_size=2),
     end_of_stream=st.booleans(),
 )
+EVENTS = st.builds(
+    PoseEvents,
+    stamp_ns=STAMPS,
+    frame_id=TEXTS,
+    source=TEXTS,
+    events=st.lists(
+        st.builds(
+            Event,
+            body=IDS,
+            kind=st.sampled_from(EventKind),
+            phase=st.sampled_from(Phase),
+            hand=st.sampled_from(Hand),
+            confidence=st.floats(),
+            direction=f64(3),
+            since_ns=STAMPS,
+        ),
+        max_size=3,
+    ),
+    end_of_stream=st.booleans(),
+)
 DIAGNOSIS = st.builds(
     Diagnostics,
     stamp_ns=STAMPS,
@@ -112,6 +137,7 @@ ANY = st.one_of(
     st.tuples(st.just(POSE_RAW), RAW),
     st.tuples(st.just(POSE_CLEAN), CLEAN),
     st.tuples(st.sampled_from([POSE_WORLD, POSE_TRUTH]), WORLD),
+    st.tuples(st.just(POSE_EVENTS), EVENTS),
     st.tuples(st.just(DIAGNOSTICS), DIAGNOSIS),
 )
 
@@ -149,6 +175,11 @@ def world(stamp_ns: int = 0) -> PoseWorld:
     return PoseWorld(stamp_ns, "world", "test", np.array([0, 0, 1, 0]), [body])
 
 
+def events(stamp_ns: int = 0) -> PoseEvents:
+    event = Event(7, EventKind.POINTS, Phase.BEGINS, Hand.LEFT, 0.9, np.array([1, 0, 0]), stamp_ns)
+    return PoseEvents(stamp_ns, "world", "test", [event])
+
+
 def diagnostics(stamp_ns: int = 0) -> Diagnostics:
     return Diagnostics(stamp_ns, "prior", Level.WARN, "3 dropped or refused", {"rate": "30.0", "refused.nan": "3"})
 
@@ -157,6 +188,7 @@ EXAMPLES = {
     POSE_RAW: raw(),
     POSE_CLEAN: clean(),
     POSE_WORLD: world(),
+    POSE_EVENTS: events(),
     POSE_TRUTH: world(),
     DIAGNOSTICS: diagnostics(),
 }

@@ -13,9 +13,9 @@ from rosbags.typesys import Stores, get_typestore
 from tests.helpers.msg_strategies import ANY, EXAMPLES, clean, diagnostics, raw
 
 from steadypose.msgs.codec import ROS_DEFINITIONS, DecodeError, decode, encode, typestore, wire_type
-from steadypose.msgs.limits import MAX_BODIES, MAX_VALUES
-from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, TOPICS
-from steadypose.msgs.types import Diagnostics, Message
+from steadypose.msgs.limits import MAX_BODIES, MAX_EVENTS, MAX_VALUES
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD, TOPICS
+from steadypose.msgs.types import Diagnostics, Message, Pose, PoseEvents
 
 PAYLOADS = {topic: encode(message) for topic, message in EXAMPLES.items()}
 TOPIC_NAMES = st.sampled_from(list(TOPICS))
@@ -152,6 +152,9 @@ def test_more_than_a_message_may_hold_is_refused_before_it_is_decoded(topic: str
     if isinstance(example, Diagnostics):
         large = dataclasses.replace(example, values={str(k): "" for k in range(MAX_VALUES + 1)})
         fits = dataclasses.replace(example, values={str(k): "" for k in range(MAX_VALUES)})
+    elif isinstance(example, PoseEvents):
+        large = dataclasses.replace(example, events=example.events[:1] * (MAX_EVENTS + 1))
+        fits = dataclasses.replace(example, events=example.events[:1] * MAX_EVENTS)
     else:
         large = dataclasses.replace(example, bodies=example.bodies[:1] * (MAX_BODIES + 1))
         fits = dataclasses.replace(example, bodies=example.bodies[:1] * MAX_BODIES)
@@ -161,3 +164,33 @@ def test_more_than_a_message_may_hold_is_refused_before_it_is_decoded(topic: str
     # no more than counted is looked at
     with pytest.raises(DecodeError, match="expected at most"):
         decode(topic, encode(large)[:300])
+
+
+ORIENTATION = np.array([0.1, -0.2, 0.3, 0.9])
+"""x, y, z, w: no two alike, so that no order is another's."""
+
+
+def test_a_quaternion_goes_over_the_wire_as_x_y_z_w():
+    sent = raw()
+    sent.sensor_pose = Pose(np.array([1.0, 2.0, 3.0]), ORIENTATION)
+    payload = encode(sent)
+    pose = struct.pack("<7d", 1.0, 2.0, 3.0, 0.1, -0.2, 0.3, 0.9)
+    assert payload.count(pose) == 1
+    assert decode(POSE_RAW, payload).sensor_pose.orientation.tolist() == ORIENTATION.tolist()  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("topic", [POSE_RAW, POSE_CLEAN, POSE_WORLD])
+def test_a_quaternion_of_ros_has_its_names_in_our_order(topic: str):
+    """What another node writes by the names x, y, z and w is read in that order, and the reverse."""
+    store, name = typestore(), wire_type(TOPICS[topic])
+    wire = store.deserialize_cdr(PAYLOADS[topic], name)
+    pose = wire.bodies[0].root_pose if topic == POSE_WORLD else wire.sensor_pose  # type: ignore[attr-defined]
+    quaternion = pose.orientation
+    quaternion.x, quaternion.y, quaternion.z, quaternion.w = ORIENTATION.tolist()
+    message = decode(topic, bytes(store.serialize_cdr(wire, name)))
+    read = message.bodies[0].root_orientation if topic == POSE_WORLD else message.sensor_pose.orientation  # type: ignore[union-attr]
+    assert read.tolist() == ORIENTATION.tolist()
+    wire = store.deserialize_cdr(encode(message), name)
+    pose = wire.bodies[0].root_pose if topic == POSE_WORLD else wire.sensor_pose  # type: ignore[attr-defined]
+    written = pose.orientation
+    assert [written.x, written.y, written.z, written.w] == ORIENTATION.tolist()

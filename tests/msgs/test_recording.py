@@ -2,8 +2,10 @@
 
 import contextlib
 import dataclasses
+import struct
 import subprocess
 import sys
+import time
 import tracemalloc
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -14,8 +16,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.records import Chunk, McapRecord, MessageIndex
 from mcap.records import Message as Record
 from mcap.stream_reader import StreamReader, breakup_chunk
@@ -24,8 +28,9 @@ from rosbags.highlevel import AnyReader
 from tests.helpers.msg_strategies import ANY, EXAMPLES, raw
 
 from steadypose.msgs.codec import DEFINITIONS, decode, encode, typestore, wire_type
+from steadypose.msgs.mcap_file import McapFile
 from steadypose.msgs.recording import Recorded, RecordingError, RecordingReader, RecordingWriter
-from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
 from steadypose.msgs.types import Message
 
 START_NS = 1_700_000_000_000_000_000
@@ -42,7 +47,7 @@ def stream(frames: int = 90) -> tuple[Recorded, ...]:
         if frame >= 4:
             heard += [(POSE_CLEAN, stamp - 4 * FRAME_NS), (POSE_WORLD, stamp - 4 * FRAME_NS)]
         if frame % 30 == 0:
-            heard.append((DIAGNOSTICS, stamp))
+            heard += [(POSE_EVENTS, stamp), (DIAGNOSTICS, stamp)]
     return tuple(Recorded(topic, stamp, dataclasses.replace(EXAMPLES[topic], stamp_ns=stamp)) for topic, stamp in heard)
 
 
@@ -81,7 +86,7 @@ def test_what_went_in_comes_out_in_the_order_of_stamps(whole: Path):
     with RecordingReader(whole) as reader:
         assert list(reader) == sorted(stream(), key=lambda recorded: recorded.stamp_ns)
         assert reader.topics == tuple(TOPICS)
-        assert [reader.count(topic) for topic in TOPICS] == [90, 86, 86, 90, 3]
+        assert [reader.count(topic) for topic in TOPICS] == [90, 86, 86, 3, 90, 3]
         assert reader.duration_s == pytest.approx(89 / 30, abs=1e-6)
         assert (reader.start_ns, reader.end_ns) == (START_NS, START_NS + 89 * FRAME_NS)
         assert reader.complete
@@ -431,6 +436,29 @@ def test_what_a_chunk_becomes_has_a_limit(compression: CompressionType, tmp_path
         assert tracemalloc.get_traced_memory()[1] < 2**24
     finally:
         tracemalloc.stop()
+
+
+def test_a_file_of_empty_records_takes_no_time(tmp_path: Path):
+    """Each chunk of a few hundred bytes is a mebibyte of records of nine."""
+    data = bytes([Opcode.SCHEMA]) + bytes(8)
+    inner = data * (2**20 // len(data))
+    packed = zstandard.compress(inner)
+    body = struct.pack("<QQQII", 0, 0, len(inner), 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    chunk = struct.pack("<BQ", Opcode.CHUNK, len(body)) + body
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + chunk * (36_000 // len(chunk)))
+    started = time.process_time()
+    with pytest.raises(RecordingError):
+        RecordingReader(path)
+    assert time.process_time() - started < 2.0, "it took 27 s to go through them all"
+
+
+def test_all_chunks_of_a_file_become_no_more_than_it_may(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = foreign(tmp_path / "ros.mcap", ros_definition(), payload=bytes(2**18), compression=CompressionType.ZSTD)
+    monkeypatch.setattr(McapFile, "_budget", 2**17)
+    with RecordingReader(path) as reader:
+        assert list(reader) == []
+        assert reader.gaps
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

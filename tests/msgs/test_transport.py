@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import os
 import socket
+import stat
 import tempfile
 import threading
 import time
@@ -15,10 +16,11 @@ import pytest
 import zmq
 from tests.helpers.msg_strategies import EXAMPLES, diagnostics, raw
 
+from steadypose.msgs import principals
 from steadypose.msgs import publisher as publishing
 from steadypose.msgs.addresses import local_address, local_directory, make_private
 from steadypose.msgs.codec import encode
-from steadypose.msgs.keys import Keys, create_keys, load_keys
+from steadypose.msgs.keys import Keys, create_keys, load_keys, loopback_keys
 from steadypose.msgs.subscriber import MAX_RECEIVED
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import MAX_FRAME, VERSION, Publisher, Subscriber, TransportError
@@ -134,7 +136,7 @@ def test_publishers_of_one_topic_are_counted_apart(tmp_path: Path):
             assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
         for publisher in (first, first, second, first, second):
             publisher.publish(DIAGNOSTICS, diagnostics())
-            publisher.publish(POSE_RAW, raw())
+            publisher.publish(POSE_RAW, dataclasses.replace(raw(), source=f"camera {publisher is first}"))
         for _ in range(10):
             assert subscriber.receive(SOON_S)
         assert not subscriber.dropped
@@ -344,7 +346,7 @@ def test_topics_are_checked(tmp_path: Path):
 
 
 def test_garbage_is_counted_by_cause(rogue: zmq.Socket[bytes]):
-    with Subscriber(address(rogue), POSE_RAW) as subscriber:
+    with Subscriber(address(rogue), POSE_RAW, clear_text=True) as subscriber:
         subscriber.socket.setsockopt(zmq.SUBSCRIBE, b"")
         wait_until(lambda: rogue.poll(0) and rogue.recv() == b"\1")
         for garbage in [
@@ -376,7 +378,7 @@ def test_garbage_is_counted_by_cause(rogue: zmq.Socket[bytes]):
 
 
 def test_sequence_numbers_wrap(rogue: zmq.Socket[bytes]):
-    with Subscriber(address(rogue), POSE_RAW) as subscriber:
+    with Subscriber(address(rogue), POSE_RAW, clear_text=True) as subscriber:
         assert rogue.poll(round(SOON_S * 1000))
         for sequence in (2**32 - 3, 2**32 - 1, 0, 4):
             rogue.send(frame(sequence))
@@ -386,7 +388,7 @@ def test_sequence_numbers_wrap(rogue: zmq.Socket[bytes]):
 
 
 def test_a_flood_of_garbage_does_not_outlast_the_timeout(rogue: zmq.Socket[bytes]):
-    with Subscriber(address(rogue), POSE_RAW) as subscriber:
+    with Subscriber(address(rogue), POSE_RAW, clear_text=True) as subscriber:
         assert rogue.poll(round(SOON_S * 1000))
         for _ in range(10):
             rogue.send(b"pose/raw\0")
@@ -397,7 +399,7 @@ def test_a_flood_of_garbage_does_not_outlast_the_timeout(rogue: zmq.Socket[bytes
 
 @pytest.mark.parametrize("size", [MAX_FRAME, MAX_RECEIVED])
 def test_a_frame_too_large_is_counted_and_the_next_is_heard(size: int, rogue: zmq.Socket[bytes]):
-    with Subscriber(address(rogue), POSE_RAW) as subscriber:
+    with Subscriber(address(rogue), POSE_RAW, clear_text=True) as subscriber:
         assert rogue.poll(round(SOON_S * 1000))
         rogue.send(frame(0, bytes(size)))
         sequence = itertools.count(1)
@@ -411,7 +413,7 @@ def test_messages_that_are_old_are_dropped_and_counted_but_not_the_end(rogue: zm
         return topic + b"\0" + prefix + encode(message)
 
     end = dataclasses.replace(raw(5), bodies=[], end_of_stream=True)
-    with Subscriber(address(rogue), [POSE_RAW, DIAGNOSTICS], lifespan_s=1.0) as subscriber:
+    with Subscriber(address(rogue), [POSE_RAW, DIAGNOSTICS], lifespan_s=1.0, clear_text=True) as subscriber:
         for _ in range(2):
             assert rogue.poll(round(SOON_S * 1000))
             rogue.recv()
@@ -459,8 +461,8 @@ def test_a_flood_of_subscriptions_is_cut_off_and_forgotten(endpoint: str):
 
 def test_what_a_subscriber_says_of_itself_is_not_believed_blindly(endpoint: str):
     with (
-        Publisher(endpoint, reliable={"x"}) as publisher,
-        Subscriber(publisher.endpoint, POSE_RAW, name="friend") as friend,
+        Publisher(endpoint, reliable={"x"}, clear_text=True) as publisher,
+        Subscriber(publisher.endpoint, POSE_RAW, name="friend", clear_text=True) as friend,
         zmq.Context() as context,
         context.socket(zmq.XSUB) as hostile,
     ):
@@ -618,3 +620,88 @@ def test_keys_that_are_none_are_refused(tmp_path: Path):
     (tmp_path / "own.key_secret").write_text((tmp_path / "own.key").read_text())
     with pytest.raises(ValueError, match="expected a secret key, found none"):
         load_keys(tmp_path)
+
+
+def test_a_source_has_one_publisher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    paths = [f"ipc://{tmp_path}/{n}" for n in range(2)]
+    with (
+        Publisher(paths[0]) as first,
+        Publisher(paths[1]) as second,
+        Subscriber(paths, POSE_RAW, name="test") as subscriber,
+    ):
+        for publisher in (first, second):
+            assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
+        for stamp in range(10):
+            first.publish(POSE_RAW, raw(stamp))
+            assert subscriber.receive(SOON_S) == (POSE_RAW, raw(stamp))
+            second.publish(POSE_RAW, raw(5_000_000 + stamp))
+        assert subscriber.receive(NEVER_S) is None
+        assert subscriber.refused == {"second publisher": 10}
+        second.publish(POSE_RAW, dataclasses.replace(raw(1), source="another"))
+        assert subscriber.receive(SOON_S), "under a name of its own it is heard"
+        monkeypatch.setattr(principals, "AWAY_S", 0.0)
+        second.publish(POSE_RAW, raw(2))
+        assert subscriber.receive(SOON_S) == (POSE_RAW, raw(2)), "the first is gone"
+
+
+def test_subscribers_of_one_program_agree_on_whose_a_source_is(tmp_path: Path):
+    paths, agreed = [f"ipc://{tmp_path}/{n}" for n in range(2)], principals.Principals()
+    with (
+        Publisher(paths[0]) as kiosk,
+        Publisher(paths[1]) as other,
+        Subscriber(paths[0], POSE_RAW, name="test", principals=agreed) as near,
+        Subscriber(paths[1], POSE_RAW, name="test", principals=agreed) as far,
+    ):
+        for publisher in (kiosk, other):
+            assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
+            publisher.publish(POSE_RAW, raw(1))
+            assert near.receive(SOON_S if publisher is kiosk else 0) or publisher is other
+        assert far.receive(NEVER_S) is None
+        assert far.refused == {"second publisher": 1}
+
+
+def test_a_tcp_address_of_this_machine_is_for_this_user_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def as_user(name: str) -> None:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / name))
+        (tmp_path / name).mkdir(exist_ok=True)
+
+    as_user("me")
+    with Publisher("tcp://127.0.0.1:*") as publisher, Subscriber(publisher.endpoint, POSE_RAW, name="mine") as mine:
+        assert publisher.wait_for_subscribers(["mine"], timeout_s=SOON_S)
+        as_user("you")
+        with (
+            Subscriber(publisher.endpoint, POSE_RAW, name="yours") as yours,
+            Subscriber(publisher.endpoint, POSE_RAW, name="plain", clear_text=True) as plain,
+        ):
+            publisher.publish(POSE_RAW, raw(1))
+            assert mine.receive(SOON_S) == (POSE_RAW, raw(1))
+            for stranger in (yours, plain):
+                assert stranger.receive(NEVER_S) is None
+            assert publisher.subscribers == {"mine"}
+    assert stat.S_IMODE((tmp_path / "me" / "steadypose" / "loopback" / "own.key_secret").stat().st_mode) == 0o600
+
+
+def test_one_subscriber_hears_an_ipc_and_a_tcp_address(tmp_path: Path):
+    with (
+        Publisher(f"ipc://{tmp_path}/a") as near,
+        Publisher("tcp://127.0.0.1:*") as far,
+        Publisher(f"ipc://{tmp_path}/b") as last,
+    ):
+        publishers = (near, far, last)
+        with Subscriber([publisher.endpoint for publisher in publishers], POSE_RAW, name="test") as subscriber:
+            for stamp, publisher in enumerate(publishers):
+                assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
+                publisher.publish(POSE_RAW, dataclasses.replace(raw(stamp), source=str(stamp)))
+                assert subscriber.receive(SOON_S)
+
+
+def test_two_processes_that_make_the_keys_at_once_have_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    made: list[Keys] = []
+    threads = [threading.Thread(target=lambda: made.append(loopback_keys())) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == 8
+    assert len({keys.secret for keys in made}) == 1

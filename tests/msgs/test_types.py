@@ -14,9 +14,14 @@ from steadypose.msgs.types import (
     CONTACTS,
     JOINTS,
     CleanBody,
+    Event,
+    EventKind,
+    Hand,
     JointState,
+    Phase,
     Pose,
     PoseClean,
+    PoseEvents,
     PoseRaw,
     RawBody,
     Tracking,
@@ -114,6 +119,13 @@ def test_the_definitions_name_joints_and_states_alike():
     assert {s.name: s.value for s in JointState} == _with_prefix(constants, "STATE_")
     assert {t.name: t.value for t in Tracking} == _with_prefix(_constants("WorldBody"), "TRACKING_")
     assert set(CONTACTS) < set(JOINTS)
+    event = _constants("Event")
+    kinds = {kind.name: kind.value for kind in EventKind}
+    phases = {phase.name: phase.value for phase in Phase}
+    assert {
+        name: value for name, value in event.items() if not name.startswith("HAND_") or name in kinds
+    } == kinds | phases
+    assert {f"HAND_{hand.name}": hand.value for hand in Hand}.items() <= event.items()
 
 
 @pytest.mark.parametrize("kind", [RawBody, CleanBody])
@@ -125,6 +137,10 @@ def test_the_definitions_have_the_fields_of_the_rest():
     header = {"stamp_ns", "frame_id"}
     assert set(_fields("PoseRaw")) - {"header"} == {f.name for f in dataclasses.fields(PoseRaw)} - header
     assert set(_fields("PoseClean")) - {"header"} == {f.name for f in dataclasses.fields(PoseClean)} - header
+    assert set(_fields("PoseEvents")) - {"header"} == {f.name for f in dataclasses.fields(PoseEvents)} - header
+    assert [name.replace("since", "since_ns") for name in _fields("Event")] == [
+        f.name for f in dataclasses.fields(Event)
+    ]
     root = {"root_position", "root_orientation"}
     assert set(_fields("WorldBody")) - {"root_pose"} == {f.name for f in dataclasses.fields(WorldBody)} - root
 

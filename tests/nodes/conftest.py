@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import shutil
 import subprocess
@@ -16,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from tests.helpers.synthetic_poses import walker
 
 from steadypose.msgs.recording import RecordingWriter
@@ -24,11 +22,6 @@ from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.prior.models.hmvae.config import HMVAEConfig
-from steadypose.prior.models.hmvae.network import HMVAE
-from steadypose.prior.models.root_velocity.config import TrajectoryConfig
-from steadypose.prior.models.root_velocity.network import TrajectoryNet
-from steadypose.prior.models.torch_weights import save_weights
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -65,18 +58,9 @@ def folder() -> Iterator[Path]:
 
 
 @pytest.fixture(scope="session")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Untrained models, as overrides of a launch file: enough to see that messages go the right way."""
-    torch.manual_seed(0)
-    torch.set_num_threads(1)
-    folder = tmp_path_factory.mktemp("weights")
-    hmvae, trajectory = HMVAEConfig(), TrajectoryConfig()
-    save_weights(folder / "a.safetensors", HMVAE(hmvae), dataclasses.asdict(hmvae), {})
-    save_weights(folder / "b.safetensors", TrajectoryNet(trajectory), dataclasses.asdict(trajectory), {})
-    return {
-        "prior.refine.weights": str(folder / "a.safetensors"),
-        "trajectory.weights": str(folder / "b.safetensors"),
-    }
+def weights() -> dict[str, str]:
+    """The weights that ship, as overrides of a launch file."""
+    return {"prior.refine.weights": "default", "trajectory.weights": "default"}
 
 
 @pytest.fixture
@@ -160,6 +144,11 @@ def running(*nodes: Node) -> Iterator[list[threading.Thread]]:
             node.stop()
             thread.join(20)
         assert not any(thread.is_alive() for thread in threads)
+
+
+def listeners(node: Node) -> set[str]:
+    """The names of who listens to a node that runs in another thread, which alone may read its sockets."""
+    return {listener.name for listener in list(node._publisher._listeners)}
 
 
 @contextmanager

@@ -71,3 +71,72 @@ def test_what_is_missing_is_named() -> None:
 
 def test_the_first_is_ten_lines() -> None:
     assert len([line for line in PROGRAMS[0].splitlines() if line.strip()]) <= 10
+
+
+def test_it_is_a_dictionary_still_and_knows_its_arrays_by_name(tmp_path: Path) -> None:
+    poses = steadypose.clean(walked(), fps=30.0)
+    assert isinstance(poses, dict)
+    assert poses.to_dict() == dict(poses)
+    assert type(poses.to_dict()) is dict
+    np.testing.assert_array_equal(poses.world, poses["world_positions"])
+    np.testing.assert_array_equal(poses.positions["head"], poses["positions"][:, 15])
+    np.testing.assert_allclose(poses.t, np.arange(FRAMES) / 30, atol=1e-9)
+    np.savez(tmp_path / "poses.npz", allow_pickle=False, **poses)
+    again = steadypose.clean(tmp_path / "poses.npz")
+    assert np.linalg.norm(again.world - poses.world, axis=-1).mean() < 0.02
+    with pytest.raises(ValueError, match="expected no fps beside a file"):
+        steadypose.clean(tmp_path / "poses.npz", fps=30)
+
+
+def test_as_a_table_and_as_a_dataset() -> None:
+    joints = np.stack([walked(), walked() + [3.0, 0.0, 0.0]], axis=1)
+    poses = steadypose.clean(joints, fps=30.0)
+    table = poses.to_pandas()
+    assert len(table) == 2 * FRAMES
+    second = table[table["body"] == 1]
+    np.testing.assert_array_equal(second["left_wrist_x"], poses.world["left_wrist"][:, 1, 0])
+    np.testing.assert_array_equal(second["head_state"], poses.state["head"][:, 1])
+    data = poses.to_xarray()
+    assert data["positions"].dims == ("time", "body", "joint", "axis")
+    wrist = data["world_positions"].sel(joint="left_wrist", body=1)
+    np.testing.assert_array_equal(wrist, poses.world["left_wrist"][:, 1])
+    moment = steadypose.Filter(delay=0)(walked()[0], 0.0)
+    assert moment is not None
+    assert len(moment.to_pandas()) == 1
+    assert moment.to_xarray()["sigma"].dims == ("joint",)
+
+
+def test_the_sample_has_its_truth() -> None:
+    sample = steadypose.sample()
+    assert sample.positions.shape == sample.truth.shape == (len(sample.stamp_ns), 22, 3)
+    assert 0.1 < np.isnan(sample.positions).mean() < 0.5
+    assert 0.5 < np.nanmedian(sample.positions[:, 0, 2]) < 1.2, "z is up, in metres"
+    assert np.nanmedian(np.linalg.norm(sample.positions - sample.truth, axis=-1)) < 0.06
+    assert steadypose.sample("crossing").positions.shape[1:] == (2, 22, 3)
+    with pytest.raises(ValueError, match="no sample 'walk_trun', did you mean 'walk_turn'"):
+        steadypose.sample("walk_trun")
+
+
+def test_key_frames_are_completed_and_drawn(tmp_path: Path) -> None:
+    joints = walked()
+    keys = np.arange(0, FRAMES, 10)
+    stamps = np.round(keys * 1e9 / 30).astype(np.int64)
+    poses = steadypose.complete(joints[keys], stamp_ns=stamps)
+    assert poses["positions"].shape == (keys[-1] + 1, 22, 3)
+    np.testing.assert_allclose(poses["positions"][keys], joints[keys], atol=1e-6)
+    assert (poses.state["head"][1:10] == steadypose.JointState.IMPUTED).all()
+    figure = steadypose.plot(poses, tmp_path / "picture.png")
+    assert figure.axes
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+def test_a_fit_is_that_of_the_command(tmp_path: Path) -> None:
+    from steadypose.nodes.cli import main
+
+    joints = walked()[:40]
+    np.savez(tmp_path / "in.npz", positions=joints, skeleton="smpl22", fps=30.0)
+    assert main(["fit", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 0
+    poses = steadypose.fit(joints, fps=30.0)
+    with np.load(tmp_path / "out.npz") as written:
+        assert set(poses) == set(written)
+        np.testing.assert_allclose(poses.positions, written["positions"], atol=1e-4)

@@ -1,38 +1,71 @@
-"""The rooms of the prior import downwards only."""
+"""Imports run one way: no circle of modules, no circle of rooms, and the prior's rooms import downwards only."""
 
 from __future__ import annotations
 
 import ast
-from collections import defaultdict
+from collections.abc import Mapping
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
 
 from steadypose import PACKAGE
 
-FLOORS = ("body", "timing", "camera", "motion", "models", "clean", "world", "sim", "offline")
-"""from the ground up: a room imports from those before it"""
-
-AT_MOST = 25
-"""arrows between rooms"""
-
-
-def arrows() -> dict[tuple[str, str], list[str]]:
-    """Which room imports which, and in which modules."""
-    found: dict[tuple[str, str], list[str]] = defaultdict(list)
-    for path in (PACKAGE / "prior").rglob("*.py"):
-        room = path.relative_to(PACKAGE / "prior").parts[0]
-        for node in ast.walk(ast.parse(path.read_text())):
-            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            for name in names:
-                parts = name.split(".")
-                if parts[:2] == ["steadypose", "prior"] and len(parts) > 2 and parts[2] != room:
-                    found[room, parts[2]].append(path.stem)
-    return found
+FLOORS = ("timing", "body", "camera", "mocap", "models", "events", "sim", "clean", "world", "complete", "fit")
+"""of the prior, from the ground up: a room imports from those before it"""
+AT_MOST = 22
+"""arrows between them"""
 
 
-def test_rooms_import_downwards() -> None:
-    between = {(a, b): where for (a, b), where in arrows().items() if a in FLOORS and b in FLOORS}
-    up = {arrow: where for arrow, where in between.items() if FLOORS.index(arrow[0]) < FLOORS.index(arrow[1])}
-    assert not up
-    assert len(between) <= AT_MOST
+def module_name(path: Path) -> str:
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {
+    module_name(path): path
+    for room in ("msgs", "prior", "training", "nodes", "benchmarks")
+    for path in (PACKAGE / room).rglob("*.py")
+}
+
+
+def imports(path: Path) -> set[str]:
+    """Modules of this project that a module imports, wherever in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("steadypose."):
+            parent = (node.module or "").removeprefix("steadypose.")
+            children = {f"{parent}.{alias.name}" for alias in node.names}
+            found |= children & MODULES.keys() or {parent}
+    return found & MODULES.keys()
+
+
+GRAPH = {name: imports(path) - {name} for name, path in MODULES.items()}
+
+
+def circle(graph: Mapping[str, set[str]]) -> list[str]:
+    try:
+        list(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def folded(depth: int) -> dict[str, set[str]]:
+    """The graph of rooms: the first parts of modules' names."""
+    graph: dict[str, set[str]] = {}
+    for name, others in GRAPH.items():
+        room = ".".join(name.split(".")[:depth])
+        graph.setdefault(room, set()).update(".".join(other.split(".")[:depth]) for other in others)
+    return {room: others - {room} for room, others in graph.items()}
+
+
+def test_no_modules_and_no_rooms_import_each_other_in_a_circle() -> None:
+    assert circle(GRAPH) == []
+    assert circle({room: others for room, others in folded(2).items() if not room.startswith("benchmarks")}) == []
+
+
+def test_the_priors_rooms_import_downwards() -> None:
     rooms = {path.name for path in (PACKAGE / "prior").iterdir() if (path / "__init__.py").is_file()}
     assert rooms == set(FLOORS)
+    between = {(a[6:], b[6:]) for a, others in folded(2).items() for b in others if {a[6:], b[6:]} <= rooms}
+    assert not {(a, b) for a, b in between if FLOORS.index(a) < FLOORS.index(b)}
+    assert len(between) <= AT_MOST

@@ -1,10 +1,12 @@
 """What runs needs no torch: a whole stream, through both pipelines, in a process where there is none."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from tests.helpers.bodies import PERIOD_NS, waving
 
 from steadypose import PACKAGE
@@ -48,31 +50,22 @@ def test_a_stream_is_cleaned_without_torch(tmp_path: Path) -> None:
     assert np.isfinite(cleaned["anomaly"][10:]).all()
 
 
-def test_only_training_mentions_torch() -> None:
-    allowed = {
-        "network",
-        "train",
-        "windows",
-        "completion",
-        "faults",
-        "train_completion",
-        "train_faults",
-        "train_occlusion",
-    }
-    allowed |= {"graph", "skeleton_conv", "torch_kinematics", "torch_weights", "training", "distributed"}
-    allowed |= {
-        "state",
-        "rollout",
-        "initial",
-        "motion",
-        "energy",
-        "observations",
-        "solve",
-        "lift",
-        "smpl",
-    }  # of HuMoR and fit
-    allowed |= {"torch_features", "modules", "export"}  # of ONNX
-    allowed |= {"optimise"}  # of offline completion, with an extra
-    files = [*(PACKAGE / "prior").rglob("*.py"), *(PACKAGE / "nodes" / "graph").rglob("*.py")]
-    found = {file.stem for file in files if "import torch" in file.read_text()}
-    assert found - allowed == {"dataset"}  # of motion, for training
+def test_torch_is_imported_by_fits_and_training_alone() -> None:
+    running = [path for room in ("msgs", "prior", "nodes") for path in (PACKAGE / room).rglob("*.py")]
+    at_the_top = re.compile(r"^(import|from) (torch|roma)", re.M)
+    importing = [path.relative_to(PACKAGE) for path in running if at_the_top.search(path.read_text())]
+    assert {str(path.parent) for path in importing} == {"prior/fit"}
+
+
+@pytest.mark.parametrize(
+    ("room", "may_not"),
+    [
+        ("msgs", "prior|training|nodes|benchmarks"),
+        ("prior", "training|nodes|benchmarks"),
+        ("training", "nodes|benchmarks"),
+    ],
+)
+def test_no_room_imports_one_that_imports_it(room: str, may_not: str) -> None:
+    upward = re.compile(rf"^\s*(?:from|import) steadypose\.({may_not})\b", re.M)
+    found = {path.name: upward.findall(path.read_text()) for path in (PACKAGE / room).rglob("*.py")}
+    assert {name: rooms for name, rooms in found.items() if rooms} == {}

@@ -1,4 +1,7 @@
-"""After the warm-up, no frame waits for a loop: not the first with two people, nor with somebody half hidden."""
+"""After the warm-up, no frame waits for a loop: not the first with two people, nor with somebody half hidden.
+
+And the number of loops that the progress of compiling counts to is theirs.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+from steadypose.prior.loop_cache import LOOPS
+
 SCRIPT = """
 import sys
 sys.path[:0] = sys.argv[1:]
 import numpy as np
 from numba.core import event
 from conftest import walk
+from steadypose.nodes.graph.loops import compile_from_the_end
 from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
 from steadypose.prior.clean.settings import PriorSettings
 
@@ -26,6 +32,7 @@ with event.install_recorder("numba:compile") as compiled:
         frame.bodies = frame.bodies[: 1 if index >= 45 else 3]
         pipeline.process(frame)
 print(sorted({str(made.data["dispatcher"]) for _, made in compiled.buffer}))
+compile_from_the_end()
 """
 
 
@@ -36,3 +43,5 @@ def test_no_loop_is_left_for_a_frame_to_wait_for(tmp_path: Path) -> None:
     ran = subprocess.run([sys.executable, "-c", SCRIPT, *paths], env=cold, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.strip() == "[]"
+    (folder,) = (tmp_path / "steadypose").iterdir()
+    assert len(list(folder.iterdir())) == LOOPS

@@ -16,7 +16,7 @@ from steadypose.nodes.commands.doctor.machine import (
     check_processor,
     check_webcam,
 )
-from steadypose.nodes.commands.doctor.running import check_messages, check_models, check_streams
+from steadypose.nodes.commands.doctor.running import check_loops, check_messages, check_models, check_streams
 
 
 def doctor(live: bool = False, launch: str = "replay") -> int:
@@ -70,6 +70,7 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     check_memory,
     check_clock,
     check_messages,
+    check_loops,
     check_models,
     check_streams,
     check_camera,

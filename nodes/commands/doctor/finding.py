@@ -6,19 +6,11 @@ from dataclasses import dataclass
 from enum import Enum
 
 from steadypose import PACKAGE
+from steadypose.nodes.graph.extras import install_command
 
 PROJECT = PACKAGE.parents[1] / "pyproject.toml"
 """of a checkout; an installed wheel has none"""
-INSTALL = (
-    "in the checkout: rm -f .venv/.installed-* && ./steadypose doctor"
-    if PROJECT.exists()
-    else "pip install --upgrade --force-reinstall steadypose"
-)
-INSTALL_EXTRA = (
-    "in the checkout: .uv/bin/uv sync --frozen --inexact --extra {}"
-    if PROJECT.exists()
-    else "pip install 'steadypose[{}]'"
-)
+INSTALL = install_command()
 
 
 class Verdict(Enum):

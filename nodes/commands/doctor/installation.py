@@ -7,8 +7,8 @@ import sys
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
 
-from steadypose.nodes.commands.doctor.finding import INSTALL, INSTALL_EXTRA, PROJECT, Finding, Verdict
-from steadypose.nodes.graph.extras import EXTRAS
+from steadypose.nodes.commands.doctor.finding import INSTALL, PROJECT, Finding, Verdict
+from steadypose.nodes.graph.extras import EXTRAS, install_command
 
 PYTHONS = ((3, 10), (3, 13))
 """the oldest and the newest that all packages of an installation come for"""
@@ -35,9 +35,9 @@ def check_packages() -> Iterator[Finding]:
     else:
         yield Finding("packages", Verdict.GOOD, ", ".join(f"{name} {version(name)}" for name in KEY_PACKAGES))
     for extra, wanted in sorted(extras.items()):
-        if missing := _missing(wanted):
-            found = f"{EXTRAS[extra].purpose}: {'; '.join(missing)}"
-            yield Finding(f"optional: {extra}", Verdict.NOTE, found, INSTALL_EXTRA.format(extra))
+        if _missing(wanted):
+            size = f" ({EXTRAS[extra].size})" if EXTRAS[extra].size else ""
+            yield Finding(f"extra {extra}", Verdict.NOTE, f"{EXTRAS[extra].purpose}{size}: {install_command(extra)}")
 
 
 def required() -> tuple[list[str], dict[str, list[str]]]:

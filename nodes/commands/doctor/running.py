@@ -63,9 +63,29 @@ def _round_trip(endpoint: str) -> float:
         return time.perf_counter() - started
 
 
+def check_loops() -> Iterator[Finding]:
+    """The compiled loops, as the nodes load them, and where they are kept."""
+    from steadypose.nodes.graph.loops import compile_missing
+    from steadypose.prior import loop_cache
+
+    said: list[str] = []
+    damaged = loop_cache.remove_damaged()
+    compile_missing(said.append)
+    from steadypose.nodes.graph.trajectory_node import make_trajectory
+
+    make_trajectory({})
+    folder = loop_cache.writable()
+    if folder is None or not loop_cache.is_complete():
+        fix = "export XDG_CACHE_HOME=FOLDER, one that only you may write to"
+        yield Finding("compiled loops", Verdict.NOTE, " ".join(said[-1:]), fix)
+    else:
+        mended = f"; {damaged} were damaged, and are compiled anew" if damaged else ""
+        yield Finding("compiled loops", Verdict.GOOD, f"in {folder}{mended}")
+
+
 def check_models() -> Iterator[Finding]:
     """The weights that the nodes load, and what a frame costs with them."""
-    from steadypose.prior.models.weights_io import load_weights
+    from steadypose.prior.models.weights import load_weights
 
     whole = True
     for model in MODELS:

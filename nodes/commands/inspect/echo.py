@@ -14,7 +14,7 @@ import tyro
 from numpy.typing import NDArray
 
 from steadypose.msgs.topics import TOPICS
-from steadypose.msgs.types import JOINTS, Diagnostics, JointState, Message, PoseClean, PoseRaw, WorldBody
+from steadypose.msgs.types import JOINTS, Diagnostics, JointState, Message, PoseClean, PoseEvents, PoseRaw, WorldBody
 from steadypose.nodes.commands.inspect.topic import (
     Address,
     Count,
@@ -65,6 +65,13 @@ def _lines(topic: str, message: Message) -> Iterator[str]:
         yield f"{stamp}  {message.node}: {message.level.name} {message.message}"
         return
     end = "  end of stream" if message.end_of_stream else ""
+    if isinstance(message, PoseEvents):
+        yield f"{stamp}  {message.source}  {plural(len(message.events), 'event', 'events')}{end}"
+        for event in message.events:
+            hand = f"{event.hand.name.lower()} " if event.hand else ""
+            what = f"{hand}{event.kind.name.lower()} {event.phase.name.lower()}"
+            yield f"  {event.body}: {what}, confidence {event.confidence:.2f}"
+        return
     kind = f"  {message.skeleton}" if isinstance(message, PoseRaw) else ""
     delay = f"  delay {message.delay_frames}" if isinstance(message, PoseClean) else ""
     yield f"{stamp}  {message.source}{kind}{delay}  {plural(len(message.bodies), 'body', 'bodies')}{end}"

@@ -15,7 +15,8 @@ from steadypose.msgs.codec import wire_type
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.transport import Subscriber
-from steadypose.msgs.types import Diagnostics, Message, PoseClean, PoseRaw
+from steadypose.msgs.types import Diagnostics, Message, PoseClean, PoseEvents, PoseRaw
+from steadypose.nodes.commands.inspect.files import describe_file
 from steadypose.nodes.commands.inspect.hz import Rate
 from steadypose.nodes.commands.inspect.topic import (
     Address,
@@ -44,7 +45,7 @@ def info(
       steadypose info pose/world
 
     Args:
-        target: a topic, such as pose/clean, or a recording.
+        target: a topic, such as pose/clean, or a recording, .npz or .csv.
         launch: the launch file, or the name of one of the project's own, whose addresses to look at.
         endpoints: the address to look at. May be given again.
 
@@ -52,8 +53,9 @@ def info(
         0, or 1 if nobody publishes the topic.
     """
     if target not in TOPICS:
-        for line in _describe_recording(recording_at(target)):
-            print(line)
+        path = recording_at(target)
+        for line in describe_file(path) if path.suffix in (".npz", ".csv") else _describe_recording(path):
+            print(printable(line))
         return 0
     print(f"{target}: {wire_type(TOPICS[target])}")
     published = False
@@ -86,7 +88,10 @@ class _Contents:
             self._note("skeleton", message.skeleton)
         if isinstance(message, PoseClean):
             self._note("delay", f"{message.delay_frames} frames")
-        self._bodies.update(body.id for body in message.bodies)
+        if isinstance(message, PoseEvents):
+            self._bodies.update(event.body for event in message.events)
+        else:
+            self._bodies.update(body.id for body in message.bodies)
 
     def _note(self, what: str, name: str) -> None:
         self._names.setdefault(what, Counter())[name] += 1

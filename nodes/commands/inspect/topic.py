@@ -22,8 +22,8 @@ from steadypose.msgs.types import Message
 from steadypose.nodes.graph.access import TransportSettings
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import nearest
 from steadypose.nodes.graph.topology import publishers
+from steadypose.prior.settings import nearest
 
 PATIENCE_S = 3.0
 """without a message, after which a hint is printed"""

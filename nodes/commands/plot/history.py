@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
-from steadypose.msgs.types import JOINTS, Diagnostics, PoseClean, PoseRaw, PoseWorld, Tracking
+from steadypose.msgs.types import JOINTS, Diagnostics, Message, PoseClean, PoseEvents, PoseRaw, PoseWorld, Tracking
 from steadypose.nodes.sinks.drawing import to_world
+from steadypose.nodes.sources.cleaned import Arrays, as_messages, is_output
+from steadypose.nodes.sources.npz import ArraySource, read_arrays
+from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 
 SENSOR = {"sensor.jitter_mm", "sensor.slow_error_mm"}
@@ -83,6 +86,10 @@ class History:
     def track(self, topic: str, body: int) -> Track | None:
         return self.tracks.get(topic, {}).get(body)
 
+    @property
+    def bodies(self) -> list[int]:
+        return sorted({body for tracks in self.tracks.values() for body in tracks})
+
     def longest(self) -> int | None:
         """The body with the most messages on the furthest topic that has any."""
         for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH):
@@ -92,34 +99,69 @@ class History:
 
 
 def read_history(recording: Path) -> History:
+    """A recording as arrays."""
+    with RecordingReader(recording) as reader:
+        history = gather(reader.path.name, reader, reader.start_ns)
+        history.dropped_or_refused.update({f"unreadable {topic}": count for topic, count in reader.refused.items()})
+        if not reader.complete:
+            history.dropped_or_refused["bytes cut off"] = reader.lost_bytes
+    return history
+
+
+def history_of_arrays(arrays: Arrays, name: str = "arrays") -> History:
+    """What ``clean``, ``complete`` or ``fit`` gave as arrays; or, of an input, what went in.
+
+    Raises:
+        NpzError: they are neither.
+    """
+    messages = as_messages(arrays) if is_output(arrays) else ArraySource(Path(name), arrays)
+    return _of_source(name, messages)
+
+
+def history_of_path(path: Path) -> History:
+    """A recording, an ``.npz`` or a ``.csv``.
+
+    Raises:
+        RecordingError, NpzError, CsvError: it cannot be read.
+    """
+    if path.suffix == ".npz" and path.exists():
+        return history_of_arrays(read_arrays(path), path.name)
+    if path.suffix in (".npz", ".csv"):
+        return _of_source(path.name, open_recording(path))
+    return read_history(path)
+
+
+def _of_source(name: str, messages: Iterable[tuple[str, Message]]) -> History:
+    stamped = [(topic, message.stamp_ns, message) for topic, message in messages]
+    return gather(name, stamped, min((stamp_ns for _, stamp_ns, _ in stamped), default=0))
+
+
+def gather(name: str, messages: Iterable[tuple[str, int, Message]], start_ns: int) -> History:
+    """Messages as arrays, each with its topic and stamp; ``name`` is the stream's, which begins at ``start_ns``."""
     rows: dict[tuple[str, int], list[Row]] = {}
     stamps: dict[str, list[float]] = {}
     dropped_or_refused: dict[str, Mapping[str, str]] = {}
     sources, skeletons = Counter[str](), Counter[str]()
     observable = np.zeros(len(JOINTS), bool)
-    with RecordingReader(recording) as reader:
-        history = History(reader.path.name)
-        for topic, stamp_ns, message in reader:
-            if isinstance(message, Diagnostics):
-                dropped_or_refused[message.node] = message.values
-                for key in SENSOR & message.values.keys():
-                    with suppress(ValueError):  # of a recording that others wrote
-                        history.sensor.setdefault(key.removeprefix("sensor."), []).append(float(message.values[key]))
-                continue
-            if message.end_of_stream:
-                continue
-            time = (stamp_ns - reader.start_ns) / 1e9
-            stamps.setdefault(topic, []).append(time)
-            sources[message.source] += 1
-            history.calibrated &= getattr(message, "calibrated", True)
-            if isinstance(message, PoseRaw) and message.skeleton in SKELETONS:
-                skeletons[message.skeleton] += 1
-                observable |= SKELETONS[message.skeleton].observable
-            for body, row in _rows(message, time):
-                rows.setdefault((topic, body), []).append(row)
-        history.dropped_or_refused.update({f"unreadable {topic}": count for topic, count in reader.refused.items()})
-        if not reader.complete:
-            history.dropped_or_refused["bytes cut off"] = reader.lost_bytes
+    history = History(name)
+    for topic, stamp_ns, message in messages:
+        if isinstance(message, Diagnostics):
+            dropped_or_refused[message.node] = message.values
+            for key in SENSOR & message.values.keys():
+                with suppress(ValueError):  # of a recording that others wrote
+                    history.sensor.setdefault(key.removeprefix("sensor."), []).append(float(message.values[key]))
+            continue
+        if message.end_of_stream or isinstance(message, PoseEvents):
+            continue
+        time = (stamp_ns - start_ns) / 1e9
+        stamps.setdefault(topic, []).append(time)
+        sources[message.source] += 1
+        history.calibrated &= getattr(message, "calibrated", True)
+        if isinstance(message, PoseRaw) and message.skeleton in SKELETONS:
+            skeletons[message.skeleton] += 1
+            observable |= SKELETONS[message.skeleton].observable
+        for body, row in _rows(message, time):
+            rows.setdefault((topic, body), []).append(row)
     history.stamps = {topic: np.array(times) for topic, times in stamps.items()}
     for (topic, body), found in rows.items():
         track = Track(*(np.array(column) for column in zip(*found, strict=True)))

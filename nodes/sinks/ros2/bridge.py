@@ -11,7 +11,8 @@ from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2.connection import Connection, Publish, check_ros, connect
+from steadypose.nodes.ros2.connect import check_ros, connect
+from steadypose.nodes.ros2.connection import Connection, Publish
 from steadypose.nodes.sinks.ros2.settings import Ros2BridgeSettings
 from steadypose.nodes.sinks.ros2.topics import BodyTopics
 

@@ -52,14 +52,20 @@ def marker_array(world: PoseWorld, bodies: Mapping[str, WorldBody]) -> Any:
     return new("visualization_msgs/msg/MarkerArray", markers=markers)
 
 
-def odometry(world: PoseWorld, name: str, body: WorldBody) -> Any:
+def odometry(world: PoseWorld, name: str, body: WorldBody, turn_covariance: np.ndarray) -> Any:
     """``nav_msgs/Odometry`` of a body's root: pose in the world, velocity in its own frame, both with covariance.
 
-    Rotations and angular velocities are without an estimate of their own: their variance is `UNKNOWN_VARIANCE`.
+    Angular velocities are without an estimate of their own: their variance is `UNKNOWN_VARIANCE`.
+
+    Args:
+        world: the message.
+        name: of the body.
+        body: one of the message's.
+        turn_covariance: (3, 3) rad², of the root's orientation, about the world's axes.
     """
     turned = Rotation.from_quat(body.root_orientation).as_matrix()
     pose_covariance, twist_covariance = np.eye(6) * UNKNOWN_VARIANCE, np.eye(6) * UNKNOWN_VARIANCE
-    pose_covariance[:3, :3] = body.covariance[:3, :3]
+    pose_covariance[:3, :3], pose_covariance[3:, 3:] = body.covariance[:3, :3], turn_covariance
     twist_covariance[:3, :3] = turned.T @ body.covariance[3:, 3:] @ turned
     pose = _pose(body.root_position, body.root_orientation)
     twist = new("geometry_msgs/msg/Twist", linear=_vector(turned.T @ body.root_velocity))

@@ -8,11 +8,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from steadypose.msgs.codec import encode
-from steadypose.msgs.types import Diagnostics, Message, Pose, PoseClean, PoseRaw, PoseWorld
+from steadypose.msgs.types import Diagnostics, Message, Pose, PoseClean, PoseEvents, PoseRaw, PoseWorld, WorldBody
 from steadypose.nodes.ros2.definitions import new, serialise
 from steadypose.nodes.sinks.ros2 import messages
 from steadypose.nodes.sinks.ros2.rep155 import frames, joint_angles, measures, urdf
 from steadypose.nodes.sinks.ros2.settings import Ros2BridgeSettings
+from steadypose.prior.body.kinematics import rotation_matrix
+from steadypose.prior.models.posture.root import RootCovariance
 
 MARKERS, POSES, BODIES = "steadypose/markers", "steadypose/poses", "humans/bodies"
 GROWN = 0.02
@@ -42,6 +44,7 @@ class BodyTopics:
 
     def __init__(self, output: Output, settings: Ros2BridgeSettings) -> None:
         self._output, self._settings = output, settings
+        self._root_covariance = RootCovariance()
         self._measured: dict[str, dict[str, np.ndarray]] = {}
         self._still: dict[str, Pose] = {}
         self._moving: set[str] = set()
@@ -55,6 +58,9 @@ class BodyTopics:
         elif isinstance(message, PoseClean):
             self._output.send("steadypose/pose_clean", "steadypose_msgs/msg/PoseClean", encode(message))
             self._send_sensor(message)
+        elif isinstance(message, PoseEvents):
+            events = dataclasses.replace(message, frame_id=self._settings.world_frame)
+            self._output.send("steadypose/pose_events", "steadypose_msgs/msg/PoseEvents", encode(events))
         elif isinstance(message, PoseWorld):
             return self._send_world(dataclasses.replace(message, frame_id=self._settings.world_frame))
         return 0
@@ -79,11 +85,16 @@ class BodyTopics:
             transforms += messages.body_transforms(world, name, links)
             state = messages.joint_state(world, name, joint_angles(links))
             self._send_of(name, "joint_states", state)
-            self._send_of(name, "odom", messages.odometry(world, name, body))
+            self._send_of(name, "odom", messages.odometry(world, name, body, self._turn_covariance(body)))
             self._send_urdf(name, measures(body))
         if transforms:
             self._send("tf", "tf2_msgs/msg/TFMessage", messages.tf_message(transforms))
         return refused
+
+    def _turn_covariance(self, body: WorldBody) -> np.ndarray:
+        """(3, 3) rad², of the root's orientation."""
+        positions, sigma = body.positions.astype(np.float64), body.sigma.astype(np.float64)
+        return self._root_covariance(positions[None], sigma[None], rotation_matrix(body.root_orientation)[None])[0]
 
     def _send_urdf(self, name: str, measured: dict[str, np.ndarray]) -> None:
         last = self._measured.get(name)

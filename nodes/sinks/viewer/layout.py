@@ -31,15 +31,12 @@ RATE_RGB = {POSE_RAW: RAW_RGB, POSE_CLEAN: _rgb(STATE_COLOURS[JointState.REFINED
 LEGEND = """
 | | |
 |---|---|
-| green | seen: as the sensor gave it |
-| blue | refined: seen, and corrected |
-| orange | imputed: not seen, inferred; the sphere is its standard deviation |
-| grey, raw | the sensor's own joints: the whiter, the surer |
-| grey, world | the truth of a simulated stream |
-| discs at feet, hands | contacts |
-| arrow | velocity: 1 m/s is 1 m |
-| axes at the origin | 0.5 m: x red, y green, z blue; the grid is 0.5 m |
-| red dots, dashed line | flagged; the score from which on a pose is |
+| green, blue | seen; seen and corrected |
+| orange | imputed; the sphere is its standard deviation |
+| grey | raw: the whiter, the surer; world: the truth |
+| discs, arrow | contacts; velocity, 1 m/s is 1 m |
+| axes, grid | 0.5 m: x red, y green, z blue |
+| red | flagged; the score from which on |
 """
 
 
@@ -110,9 +107,9 @@ def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool) -> rrb.Bluepri
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
-                scene("raw", "raw: what the sensor says", distance=2.5, height=0.5, floor=calibrated),
-                scene("clean", "clean: seen, refined, imputed", distance=2.5, height=0.5, floor=calibrated),
-                scene("world", "world: path and contacts", distance=3.2, height=1.3, floor=True),
+                scene("raw", "raw: what the sensor says", distance=2.05, height=0.4, floor=calibrated),
+                scene("clean", "clean: seen, refined, imputed", distance=2.05, height=0.4, floor=calibrated),
+                scene("world", "world: path and contacts", distance=2.8, height=1.1, floor=True),
             ),
             rrb.Horizontal(
                 *([plot("anomaly", "anomaly score")] if scored else []),

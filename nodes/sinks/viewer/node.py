@@ -15,15 +15,12 @@ from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.sinks.viewer.scene import PoseView
-from steadypose.nodes.sinks.viewer.server import LOOPBACK, ViewerServer
+from steadypose.nodes.sinks.viewer.server import FLUSH_S, LOOPBACK, ViewerServer
 from steadypose.nodes.sinks.viewer.settings import ViewerSettings
 from steadypose.prior.clean.settings import PriorSettings
 
 if TYPE_CHECKING:
     import rerun as rr
-
-FLUSH_S = 0.05
-"""between batches of drawings: longer looks jerky, shorter costs more in wrapping than in drawings"""
 
 
 class ViewerNode(Node):
@@ -38,7 +35,7 @@ class ViewerNode(Node):
             self._view = PoseView(recording, flagged_from(self.launch))
             print(f"viewer: {self._server.url}", flush=True)
             if settings.host not in (LOOPBACK, "localhost", "::1"):
-                print(f"viewer: whoever reaches {settings.host} sees the people here, without a password", flush=True)
+                print(f"viewer: who listens on the network of {settings.host} sees the people here", flush=True)
             try:
                 super().run()
             finally:
@@ -54,7 +51,7 @@ class ViewerNode(Node):
         self._view.log(topic, message)
 
     def status(self) -> dict[str, str]:
-        return {"address": self._server.url}
+        return {"address": self._server.url.partition("?")[0]}  # without the token, for diagnostics are recorded
 
 
 def flagged_from(launch: Launch) -> float:
@@ -67,5 +64,5 @@ def connect(server: ViewerServer) -> rr.RecordingStream:
     import rerun as rr
 
     recording = rr.RecordingStream("steadypose", batcher_config=rr.ChunkBatcherConfig(flush_tick=FLUSH_S))
-    recording.connect_grpc(server.data_url)
+    server.show(recording)
     return recording

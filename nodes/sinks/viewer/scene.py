@@ -17,6 +17,7 @@ from steadypose.msgs.types import (
     JointState,
     Message,
     PoseClean,
+    PoseEvents,
     PoseRaw,
     PoseWorld,
     RawBody,
@@ -94,7 +95,7 @@ class PoseView:
         if isinstance(message, Diagnostics):
             self._draw_rates(message)
             return
-        if message.end_of_stream:
+        if message.end_of_stream or isinstance(message, PoseEvents):
             return
         self._set_time(topic, message.stamp_ns)
         if isinstance(message, PoseRaw):

@@ -14,16 +14,16 @@ class ViewerSettings:
     """``[viewer]``: the picture in the browser."""
 
     host: str = "127.0.0.1"
-    """address to serve at. Any other than this machine's own shows people in a room, without a password, to whoever
-    shares the network: ``ssh -L 9090:localhost:9090 -L 9091:localhost:9091 robot`` carries the picture safely"""
+    """address to serve at. Any other than this machine's own shows people in a room to whoever listens on the network:
+    ``ssh -L 9090:localhost:9090 robot`` carries the picture safely"""
     port: int = 9090
-    """of the web page; the drawings come on the next one"""
+    """of the web page and the drawings"""
 
     def __post_init__(self) -> None:
         if not self.host:
             raise LaunchError("[viewer] host: expected an address to serve at, such as 127.0.0.1, got none")
-        if not 1 <= self.port <= 65534:
-            raise LaunchError(f"[viewer] port: expected 1 to 65534, got {self.port}")
+        if not 1 <= self.port <= 65535:
+            raise LaunchError(f"[viewer] port: expected 1 to 65535, got {self.port}")
 
 
 def check_viewer(launch: Launch) -> None:

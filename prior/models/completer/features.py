@@ -12,12 +12,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.kinematics import heading, quaternions, rotation_matrices, yaw_matrix
 from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENTS, J, finite_joints
+from steadypose.prior.compiled import njit
 from steadypose.prior.models.completer.config import BENDS, FEATURES
 from steadypose.prior.timing.rate import FPS
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from steadypose.prior.models.hgvae.fault_features import RECENT
-from steadypose.prior.models.weights_io import weights_path
+from steadypose.prior.compiled import njit
+from steadypose.prior.models.hgvae.live_faults import RECENT
+from steadypose.prior.models.weights import weights_path
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]

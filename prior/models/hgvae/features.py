@@ -3,7 +3,7 @@
 The path is a low-passed mean of the visible joints of the trunk, so that it neither jitters with one noisy joint nor
 jumps when one disappears. All joints but the pelvis are relative to it; the pelvis's track is relative to the path's
 mean, and so holds the locomotion. Unobserved entries are interpolated: in a gap, a joint's offset from its parent is
-interpolated linearly; before the first and after the last sighting it is held. Completion starts from this.
+interpolated linearly; before the first and after the last observation it is held. Completion starts from this.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, REST_POSITIONS, SHOULDERS, TRUNK, J
+from steadypose.prior.compiled import njit
 
 _SIDES = np.array([HIPS, SHOULDERS])
 _TALL = np.array([J[n] for n in ("left_knee", "left_ankle", "right_knee", "right_ankle", "spine1", "spine2", "spine3",

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.models.hgvae.completion_inference import LiveCompletion
 from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, TRACK_LOG_VAR, HGVAEConfig
 from steadypose.prior.models.hgvae.features import hang_unseen
+from steadypose.prior.models.hgvae.live_completion import LiveCompletion
 from steadypose.prior.models.layers.compiled_graph import LOG_VAR_RANGE, Floats, Network, Program
-from steadypose.prior.models.weights_io import Arrays, load_weights, part
+from steadypose.prior.models.weights import Arrays, load_weights, part
 
 
 class Reconstruction(NamedTuple):

@@ -16,7 +16,7 @@ from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.models.hmvae.config import CHANNELS, DEVIATION, NO_ROTATION, ROTATION_FEATURES, HMVAEConfig
 from steadypose.prior.models.layers.dense import Floats, dense, leaky_relu
 from steadypose.prior.models.layers.edge_graph import mix_edges, pool_matrix, pooling_levels, unpool_matrix
-from steadypose.prior.models.weights_io import Arrays, load_weights, part
+from steadypose.prior.models.weights import Arrays, load_weights, part
 
 _NO_ROTATION = np.array(NO_ROTATION, dtype=np.float32)
 

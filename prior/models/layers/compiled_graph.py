@@ -13,10 +13,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from steadypose.prior.models.weights_io import Arrays, part
+from steadypose.prior.compiled import njit
+from steadypose.prior.models.weights import Arrays, part
 
 Floats = NDArray[np.float32]
 

@@ -1,14 +1,16 @@
 """The experts of the mixture: a bank of fixed-lag smoothers.
 
-Every joint is tracked by constant-velocity Kalman filters that differ in the density of their process noise, each with
-the fixed-lag smoother of its last frames (see `FixedLagRTS`, of which these are many side by side). One of small
-density averages noise away and lags behind fast motion; one of large density follows everything, noise included.
+Every mode of the body's motion, and every joint that is no part of the body, is a track
+(`prior.models.mixture.tracks`), followed by constant-velocity Kalman filters that differ in the density of their
+process noise, each with the fixed-lag smoother of its last frames (see `FixedLagRTS`, of which these are many side by
+side). One of small density averages noise away and lags behind fast motion; one of large density follows everything,
+noise included.
 
 Their mean, weighted by each filter's likelihood, is the static multiple-model estimate (Bar-Shalom, Li and Kirubarajan
 2001, section 11.6), with exponential forgetting. The measurement noise is unknown: for each filter it is the most
 likely one given the innovations (concentrated likelihood), so that only the ratio of process to measurement noise
-distinguishes the filters. That mean is one more expert; the experts' weights are computed by
-`prior.models.mixture.network`, from `prior.models.mixture.features`. Training and the live node share this code.
+distinguishes the filters. That mean, of each track, is one more expert; the experts' weights are computed by
+`training.networks.mixture`, from `prior.models.mixture.features`. Training and the live node share this code.
 """
 
 from __future__ import annotations
@@ -16,13 +18,26 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.compiled import njit
+from steadypose.prior.models.mixture.tracks import (
+    HELD,
+    MEMORY,
+    SETTLED,
+    clipped,
+    fill_in,
+    predict,
+    regroup,
+    turn,
+    update,
+    weigh,
+)
 
 DENSITIES = np.array([0.01, 0.045, 0.2, 0.9, 4.0, 15.0, 60.0, 400.0])
-"""m²/s³, process densities of the smoothers, stiff to loose, for a measurement of `MEASUREMENT_SIGMA`."""
+"""m²/s³, process densities of the smoothers, stiff to loose, for a measurement of `MEASUREMENT_SIGMA` and a track whose
+variance is the joints' mean."""
 
 MEASUREMENT_SIGMA = 0.02
 """Metres along an axis, at full confidence. Only its ratio to the density matters."""
@@ -35,21 +50,11 @@ MULTIPLE_MODEL = len(DENSITIES)
 RAW = EXPERTS - 1
 """Indices of the last two"""
 
-MEMORY = 9
-"""Time constant of the likelihoods' exponential forgetting, in sightings: 5 to 15 differ by 3 % at most
-(validation)."""
-
-MIN_SCALE = 1e-4
-"""Added to every normalised squared innovation: a floor of the noise at a hundredth of `MEASUREMENT_SIGMA`."""
-
 MEAN_FRAMES = 18
 """Frames of the running means of distances and differences."""
 
 LOG_FLOOR = 3e-4
 """Metres, floor of lengths in logarithms."""
-
-INITIAL_SPEED = 1.0
-"""m/s along an axis, standard deviation of a new joint's velocity."""
 
 LAGS = ((1, 1), (2, 1), (3, 1), (2, 3))
 """Order and spacing (frames) of the differences of raw positions, whose sizes distinguish noise from motion."""
@@ -57,7 +62,9 @@ _HISTORY = 7
 
 
 class Bank(NamedTuple):
-    """State of S bodies, J joints, M smoothers and K frames: the delay and the newest.
+    """State of S bodies, J joints in as many tracks, M smoothers and K frames: the delay and the newest.
+
+    The first eight are of tracks, not of joints.
 
     Attributes:
         position: (S, J, M, K, 3) metres, of each frame given all measurements so far.
@@ -69,7 +76,7 @@ class Bank(NamedTuple):
         log_variances: (S, J, M) sums, with forgetting, of the logarithms of the innovations' variance.
         sightings: (S, J) number of terms of these sums, with forgetting.
         raw: (S, J, K, 3) metres, the raw position, or the last one; NaN before the first.
-        unseen: (S, J, K) frames since the joint was last seen; -1 before the first sighting.
+        unseen: (S, J, K) frames since the joint was last seen; -1 before the first observation.
         confidence: (S, J, K).
         recent: (S, J, 7, 3) metres, raw positions of the last frames; NaN where unseen.
         distances: (S, J, M, 2) metres², running means of the squared distances between neighbouring experts.
@@ -79,6 +86,10 @@ class Bank(NamedTuple):
         place: (S, J, 3) metres, the pose in the frame last described; NaN before.
         age: (S, J, 3) frames that the running means of experts, differences and bones contain.
         heading: (S, 2) cosine and sine of the body's heading.
+        modes: (S, J, J) orthogonal, joints by tracks: joints are ``modes @ tracks``.
+        eigenvalue: (S, J) variance of each track's acceleration, relative to the joints' mean.
+        member: (S, J) 1 if a joint is of the body, 0 if it is a track by itself.
+        streak: (S, J) frames in a row in which a joint was seen.
     """
 
     position: NDArray[np.float64]
@@ -101,6 +112,10 @@ class Bank(NamedTuple):
     place: NDArray[np.float64]
     age: NDArray[np.float64]
     heading: NDArray[np.float64]
+    modes: NDArray[np.float64]
+    eigenvalue: NDArray[np.float64]
+    member: NDArray[np.float64]
+    streak: NDArray[np.float64]
 
 
 def new_bank(bodies: int, delay: int) -> Bank:
@@ -127,6 +142,10 @@ def new_bank(bodies: int, delay: int) -> Bank:
         place=np.empty((bodies, joints, 3)),
         age=np.empty((bodies, joints, 3)),
         heading=np.empty((bodies, 2)),
+        modes=np.empty((bodies, joints, joints)),
+        eigenvalue=np.empty((bodies, joints)),
+        member=np.empty((bodies, joints)),
+        streak=np.empty((bodies, joints)),
     )
     forget(bank, np.ones(bodies, dtype=bool))
     return bank
@@ -136,14 +155,15 @@ def forget(bank: Bank, slot: NDArray[np.bool_]) -> None:
     """Forget the bodies in these slots (S,)."""
     for values in bank:
         values[slot] = 0.0
-    for values in (bank.position, bank.raw, bank.recent, bank.place):
+    for values in (bank.raw, bank.recent, bank.place):
         values[slot] = np.nan
+    bank.modes[slot], bank.eigenvalue[slot] = np.eye(bank.modes.shape[1]), 1.0
     bank.unseen[slot] = -1.0
     bank.heading[slot] = (1.0, 0.0)
 
 
 @njit(cache=True, error_model="numpy")
-def advance(bank, count, step, positions, confidence, densities, sigma):
+def advance(bank, count, step, positions, confidence, densities, sigma, covariance):
     """Take in a frame: predict and update all filters and smoothers.
 
     Args:
@@ -154,73 +174,96 @@ def advance(bank, count, step, positions, confidence, densities, sigma):
         confidence: (S, J) 0 to 1.
         densities: `DENSITIES`.
         sigma: `MEASUREMENT_SIGMA`.
+        covariance: (J, J) of joints' accelerations along an axis, of mean variance 1 (`body_covariance`).
     """
-    bodies, joints, experts, frames, _ = bank.position.shape
+    bodies, joints, _, frames, _ = bank.position.shape
     slot, last = count % frames, (count - 1) % frames
-    keep = 1.0 - 1.0 / MEMORY
+    seen, known = np.empty(joints, dtype=np.bool_), np.empty(joints, dtype=np.bool_)
+    members = np.empty(joints, dtype=np.bool_)
     for s in range(bodies):
         for j in range(joints):
-            seen = np.isfinite(positions[s, j, 0] + positions[s, j, 1] + positions[s, j, 2])
-            known = bank.unseen[s, j, last] >= 0
-            bank.confidence[s, j, slot] = confidence[s, j] if seen else 0.0
-            bank.unseen[s, j, slot] = 0.0 if seen else bank.unseen[s, j, last] + 1.0 if known else -1.0
+            members[j] = bank.member[s, j] > 0.0
+        for j in range(joints):
+            seen[j] = np.isfinite(positions[s, j, 0] + positions[s, j, 1] + positions[s, j, 2])
+            known[j] = bank.unseen[s, j, last] >= 0
+            bank.confidence[s, j, slot] = confidence[s, j] if seen[j] else 0.0
+            bank.unseen[s, j, slot] = 0.0 if seen[j] else bank.unseen[s, j, last] + 1.0 if known[j] else -1.0
             for axis in range(3):
                 for k in range(_HISTORY - 1):
                     bank.recent[s, j, k, axis] = bank.recent[s, j, k + 1, axis]
-                came = positions[s, j, axis] if seen else np.nan
+                came = positions[s, j, axis] if seen[j] else np.nan
                 bank.recent[s, j, _HISTORY - 1, axis] = came
-                bank.raw[s, j, slot, axis] = bank.raw[s, j, last, axis] if known and not seen else came
-            if seen:
+                bank.raw[s, j, slot, axis] = bank.raw[s, j, last, axis] if known[j] and not seen[j] else came
+            if seen[j]:
                 _measure_differences(bank.recent[s, j], bank.sizes[s, j], bank.age[s, j])
-            variance = (sigma / min(max(confidence[s, j], 0.1), 1.0)) ** 2
-            if seen and known:
-                bank.sightings[s, j] = keep * bank.sightings[s, j] + 1.0
-            for m in range(experts):
-                position, own_variance = bank.position[s, j, m], bank.variance[s, j, m]
-                with_position, with_velocity = bank.with_position[s, j, m], bank.with_velocity[s, j, m]
-                velocity = bank.velocity[s, j, m]
-                if not known:
-                    if seen:
-                        for k in range(frames):
-                            with_position[k] = with_velocity[k] = 0.0
-                        for axis in range(3):
-                            position[slot, axis] = positions[s, j, axis]
-                            velocity[axis] = 0.0
-                        with_position[slot] = own_variance[slot] = variance
-                        bank.velocity_variance[s, j, m] = INITIAL_SPEED**2
-                    continue
-                own = bank.velocity_variance[s, j, m]
-                growth, covariance = densities[m] * step, with_velocity[last]
-                ahead = with_position[last] + step * (2 * covariance + step * (own + growth / 3))
-                for k in range(frames):
-                    with_position[k] += step * with_velocity[k]
+        if seen.any():
+            for j in range(joints):
+                bank.streak[s, j] = bank.streak[s, j] + 1.0 if seen[j] else 0.0
+                held, settled = bank.unseen[s, j, slot] <= HELD, bank.streak[s, j] > SETTLED
+                members[j] = known[j] and (held if bank.member[s, j] > 0.0 else settled)
+            _change_body(bank, s, members, covariance)
+        _track(bank, s, slot, last, step, positions[s], confidence[s], seen, known, members, densities, sigma)
+
+
+@njit(cache=True, error_model="numpy")
+def _change_body(bank, s, members, covariance):
+    """Let these joints (J,) form the body, if they do not yet."""
+    changed = False
+    for j in range(len(members)):
+        changed |= members[j] != (bank.member[s, j] > 0.0)
+        bank.member[s, j] = 1.0 if members[j] else 0.0
+    if not changed:
+        return
+    by = regroup(members, covariance, bank.modes[s], bank.eigenvalue[s])
+    squared = by * by
+    turn(bank.position[s], by)
+    turn(bank.velocity[s], by)
+    turn(bank.variance[s], squared)
+    turn(bank.with_position[s], squared)
+    turn(bank.with_velocity[s], squared)
+    turn(bank.velocity_variance[s], squared)
+    turn(bank.squared_innovations[s], squared)
+    turn(bank.log_variances[s], squared)
+    turn(bank.sightings[s], squared)
+
+
+@njit(cache=True, error_model="numpy")
+def _track(bank, s, slot, last, step, positions, confidence, seen, known, members, densities, sigma):
+    """Predict and update all filters of a body. A track of a single joint has that joint's number."""
+    joints, modes = len(seen), bank.modes[s]
+    weight, variance, updated = np.empty(joints), np.empty(joints), np.empty(joints, dtype=np.bool_)
+    measured, filled = np.zeros((joints, 3)), np.empty((joints, 3))
+    best = weigh(confidence, seen, members, weight)
+    for t in range(joints):
+        share = 0.0
+        for j in range(joints):
+            if modes[j, t] != 0.0 and weight[j] > 0.0:
+                share += modes[j, t] ** 2 * weight[j]
                 for axis in range(3):
-                    position[slot, axis] = position[last, axis] + step * velocity[axis]
-                with_position[slot] = own_variance[slot] = ahead
-                covariance = with_velocity[slot] = covariance + step * (own + growth / 2)
-                bank.velocity_variance[s, j, m] = own = own + growth
-                if not seen:
-                    continue
-                total = ahead + variance
-                a = positions[s, j, 0] - position[slot, 0]
-                b = positions[s, j, 1] - position[slot, 1]
-                c = positions[s, j, 2] - position[slot, 2]
-                square = (a * a + b * b + c * c) / (3.0 * total)
-                bank.squared_innovations[s, j, m] = keep * bank.squared_innovations[s, j, m] + square + MIN_SCALE
-                bank.log_variances[s, j, m] = keep * bank.log_variances[s, j, m] + np.log(total)
-                for k in range(frames):
-                    gain = with_position[k] / total
-                    position[k, 0] += gain * a
-                    position[k, 1] += gain * b
-                    position[k, 2] += gain * c
-                    own_variance[k] -= gain * with_position[k]
-                    with_position[k] -= gain * ahead
-                    with_velocity[k] -= gain * covariance
-                gain = covariance / total
-                velocity[0] += gain * a
-                velocity[1] += gain * b
-                velocity[2] += gain * c
-                bank.velocity_variance[s, j, m] = own - gain * covariance
+                    measured[t, axis] += modes[j, t] * weight[j] * positions[j, axis]
+        updated[t] = share > 0.0
+        own = best if members[t] else clipped(confidence[t])
+        variance[t] = (sigma / own) ** 2 / max(share, 1e-3) if updated[t] else 0.0
+        if known[t]:
+            predict(
+                bank.position[s, t], bank.variance[s, t], bank.with_position[s, t], bank.with_velocity[s, t],
+                bank.velocity[s, t], bank.velocity_variance[s, t], slot, last, step, bank.eigenvalue[s, t] * densities,
+            )  # fmt: skip
+            if updated[t]:
+                bank.sightings[s, t] = (1.0 - 1.0 / MEMORY) * bank.sightings[s, t] + 1.0
+    for m in range(len(densities)):
+        filled[:] = measured
+        for j in range(joints):
+            if members[j] and weight[j] < 1.0:
+                fill_in(filled, modes, j, 1.0 - weight[j], bank.position[s, :, m, slot])
+        for t in range(joints):
+            if updated[t]:
+                update(
+                    bank.position[s, t, m], bank.variance[s, t, m], bank.with_position[s, t, m],
+                    bank.with_velocity[s, t, m], bank.velocity[s, t, m], bank.velocity_variance[s, t, m : m + 1],
+                    bank.squared_innovations[s, t, m : m + 1], bank.log_variances[s, t, m : m + 1],
+                    slot, known[t], filled[t], variance[t],
+                )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")

@@ -7,11 +7,12 @@ heading.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from steadypose.prior.body.skeleton import PARENTS, J
+from steadypose.prior.compiled import njit
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
+    EXPERTS,
     LAGS,
     LOG_FLOOR,
     MEAN_FRAMES,
@@ -48,7 +49,7 @@ _MULTIPLE_MODEL = _POSE + 6
 _SIGHTING = _MULTIPLE_MODEL + 6
 _DELAY = _SIGHTING + 6
 """Offsets of the groups of features: log-distances between neighbouring experts (the smoothers by density, then the raw
-joint), three each; vectors between these; sizes of differences; bone; pose; multiple-model estimate; sighting;
+joint), three each; vectors between these; sizes of differences; bone; pose; multiple-model estimate; observation;
 delay."""
 FEATURES = _DELAY + len(_DELAYS) + 1
 """Features of each joint."""
@@ -72,20 +73,20 @@ def describe(bank, count, back, parents, experts, features, scale, gap, between)
         experts: (S, J, EXPERTS, 3) metres, written; NaN of a joint not yet seen.
         features: (S, J, FEATURES) float32, written.
         scale: (S,) metres along an axis, estimated noise of the body's joints; written.
-        gap: (S, J) frames to the nearest sighting, before or after; 0 if seen in this frame, -1 if not yet; written.
+        gap: (S, J) frames to the nearest observation, before or after; 0 if seen in this frame, -1 if not yet; written.
         between: (S, J) metres along an axis, standard deviation of the multiple-model estimate of a joint in a gap
-            between two sightings, in a frame in which other joints of the body are seen; otherwise 0; written.
+            between two observations, in a frame in which other joints of the body are seen; otherwise 0; written.
     """
     bodies, joints, _, frames, _ = bank.position.shape
     slot = (count - 1 - back) % frames
     weights, noise = np.empty((joints, _SMOOTHERS)), np.empty(joints)
     for s in range(bodies):
         total, seen_joints = 0.0, 0.0
+        _write_experts(
+            bank.position[s, :, :, slot], bank.modes[s], bank.squared_innovations[s], bank.log_variances[s],
+            bank.sightings[s], bank.raw[s, :, slot], bank.unseen[s, :, slot], experts[s], weights, noise,
+        )  # fmt: skip
         for j in range(joints):
-            noise[j] = multiple_model_weights(
-                bank.squared_innovations[s, j], bank.log_variances[s, j], bank.sightings[s, j], weights[j]
-            )
-            _write_experts(bank.position[s, j, :, slot], bank.raw[s, j, slot], weights[j], experts[s, j])
             gap[s, j], between[s, j] = bank.unseen[s, j, slot], 0.0
             if gap[s, j] > 0.0:
                 for since in range(1, back + 1):
@@ -131,15 +132,36 @@ def describe(bank, count, back, parents, experts, features, scale, gap, between)
 
 
 @njit(cache=True, error_model="numpy")
-def _write_experts(smoothed, raw, weights, experts):
-    """Write a joint's experts (EXPERTS, 3), from its smoothers' positions (M, 3), their weights and the raw
-    position."""
-    for axis in range(3):
-        experts[MULTIPLE_MODEL, axis] = 0.0
+def _write_experts(tracks, modes, squared_innovations, log_variances, sightings, raw, unseen, experts, weights, noise):
+    """Write the joints' experts (J, EXPERTS, 3), their smoothers' weights (J, M) and noise (J,)."""
+    joints = len(tracks)
+    own, found = np.empty((joints, _SMOOTHERS)), np.empty(joints)
+    mean = np.zeros((joints, 3))
+    for t in range(joints):
+        found[t] = multiple_model_weights(squared_innovations[t], log_variances[t], sightings[t], own[t])
         for m in range(_SMOOTHERS):
-            experts[m, axis] = smoothed[m, axis]
-            experts[MULTIPLE_MODEL, axis] += weights[m] * smoothed[m, axis]
-        experts[RAW, axis] = raw[axis]
+            for axis in range(3):
+                mean[t, axis] += own[t, m] * tracks[t, m, axis]
+    for j in range(joints):
+        noise[j] = 0.0
+        for m in range(_SMOOTHERS):
+            weights[j, m] = 0.0
+        for m in range(EXPERTS):
+            for axis in range(3):
+                experts[j, m, axis] = 0.0 if unseen[j] >= 0.0 else np.nan
+        for axis in range(3):
+            experts[j, RAW, axis] = raw[j, axis]
+        for t in range(joints):
+            share = modes[j, t]
+            if share == 0.0:
+                continue
+            noise[j] += share * share * found[t]
+            for m in range(_SMOOTHERS):
+                weights[j, m] += share * share * own[t, m]
+                for axis in range(3):
+                    experts[j, m, axis] += share * tracks[t, m, axis]
+            for axis in range(3):
+                experts[j, MULTIPLE_MODEL, axis] += share * mean[t, axis]
 
 
 @njit(cache=True, error_model="numpy")
@@ -194,7 +216,7 @@ def _write_vector(heading, x, y, z, unit, features, at):
 
 @njit(cache=True, error_model="numpy")
 def _describe_sighting(unseen, gap, confidence, age, back, scale, features):
-    """Sighting and delay; all else is set to 0."""
+    """Observation and delay; all else is set to 0."""
     for k in range(FEATURES):
         features[k] = 0.0
     for k, delay in enumerate(_DELAYS):

@@ -17,7 +17,7 @@ CORRECTION = 2.0
 """Bound of the correction along an axis, in units of the estimated noise."""
 
 COASTING = 0.1
-"""m/s: least growth of a joint's standard deviation with the time to its nearest sighting."""
+"""m/s: least growth of a joint's standard deviation with the time to its nearest observation."""
 
 MIN_LOG_SIGMA, MAX_LOG_SIGMA = -3.0, 6.0
 """Range of the natural logarithm of the standard deviation in millimetres."""

@@ -9,9 +9,9 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from steadypose.prior.compiled import njit
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
     EXPERTS,
@@ -23,8 +23,17 @@ from steadypose.prior.models.mixture.bank import (
     new_bank,
 )
 from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
-from steadypose.prior.models.mixture.form import COASTING, CORRECTION, MAX_LOG_SIGMA, MIN_LOG_SIGMA, OUTPUTS, REACH
-from steadypose.prior.models.weights_io import load_weights
+from steadypose.prior.models.mixture.form import (
+    COASTING,
+    CORRECTION,
+    MAX_LOG_SIGMA,
+    MIN_LOG_SIGMA,
+    OUTPUTS,
+    REACH,
+)
+from steadypose.prior.models.mixture.modes import body_covariance
+from steadypose.prior.models.mixture.whiteness import Whiteness
+from steadypose.prior.models.weights import load_weights
 from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS
 
@@ -49,6 +58,8 @@ class MixtureSmoother:
         shapes = (joints, joints, body, body, (slots, 22, OUTPUTS))
         self._memory = _Memory(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
         self._bank = new_bank(slots, delay)
+        self._whiteness, self._fallback = Whiteness(slots), np.zeros(slots)
+        self._covariance = body_covariance()
         self._experts = np.empty((slots, 22, EXPERTS, 3))
         self._features = np.empty((slots, 22, FEATURES), dtype=np.float32)
         self._scale, self._gap, self._between = np.empty(slots), np.empty((slots, 22)), np.empty((slots, 22))
@@ -68,7 +79,8 @@ class MixtureSmoother:
         step = stamp_s - self._stamps[-1] if self._stamps else 1 / FPS
         certainty = np.ones((self._slots, 22)) if confidence is None else confidence
         self._note(stamp_s)
-        advance(self._bank, self._count - 1, step, positions, certainty, DENSITIES, MEASUREMENT_SIGMA)
+        self._fallback = self._whiteness.fallback(positions)
+        advance(self._bank, self._count - 1, step, positions, certainty, DENSITIES, MEASUREMENT_SIGMA, self._covariance)
         return self._answer(self.delay) if self._count > self.delay else None
 
     def skip(self, stamp_s: float) -> float:
@@ -93,6 +105,7 @@ class MixtureSmoother:
     def forget(self, slot: NDArray[np.bool_]) -> None:
         """Forget the bodies in these slots (S,), with the estimates that the delay still holds."""
         forget(self._bank, slot)
+        self._whiteness.forget(slot)
         for values in self._memory:
             values[slot] = 0.0
 
@@ -104,8 +117,8 @@ class MixtureSmoother:
         places, sigma = np.full((self._slots, 22, 3), np.nan), np.full((self._slots, 22), np.inf)
         for slot in np.flatnonzero((self._gap >= 0).any(axis=1)):
             outputs = _outputs(self._features[slot], self._net, self._memory, slot)
-            heading, scale, gap, between = bank.heading[slot], self._scale[slot], self._gap[slot], self._between[slot]
-            _mixed(outputs, self._experts[slot], heading, scale, gap, between, places[slot], sigma[slot])
+            frame = bank.heading[slot], self._scale[slot], self._gap[slot], self._between[slot], self._fallback[slot]
+            _mixed(outputs, self._experts[slot], *frame, places[slot], sigma[slot])
         return Smoothed(self._stamps[-1 - back], places, sigma)
 
 
@@ -253,8 +266,8 @@ def _concatenated(a, b, c):
 
 
 @njit(cache=True, error_model="numpy")
-def _mixed(outputs, experts, heading, scale, gap, between, places, sigma):
-    """`prior.models.mixture.network.answer` for one body; joints never seen are not written."""
+def _mixed(outputs, experts, heading, scale, gap, between, fallback, places, sigma):
+    """`training.networks.mixture.answer` for one body; joints never seen are not written."""
     cos, sin = heading
     weights, reach = np.empty(EXPERTS), np.empty(EXPERTS)
     for j in range(len(outputs)):
@@ -292,6 +305,7 @@ def _mixed(outputs, experts, heading, scale, gap, between, places, sigma):
             for m in range(RAW):
                 places[j, axis] += weights[m] * (experts[j, m, axis] - came)
             places[j, axis] += came
+            places[j, axis] += fallback * free * (experts[j, MULTIPLE_MODEL, axis] - places[j, axis])
         log_sigma = min(max(np.float64(out[2 * EXPERTS + 3]), MIN_LOG_SIGMA), MAX_LOG_SIGMA)
         coasted = COASTING / FPS * gap[j]
         sigma[j] = np.sqrt((1e-3 * np.exp(log_sigma)) ** 2 + coasted**2)

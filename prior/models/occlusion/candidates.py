@@ -2,7 +2,7 @@
 
 The smoother lets a joint coast, which is right for a foot that stands. The completion network places it from the rest
 of the body, which is right for an arm that swings. And a joint may keep its offset from the nearest joint seen, turned
-with the trunk, which is right for an arm that rests. `prior.models.occlusion.network` weighs the three by `FEATURES`
+with the trunk, which is right for an arm that rests. `training.networks.occlusion` weighs the three by `FEATURES`
 numbers that are invariant to the body's position and heading.
 """
 
@@ -12,16 +12,16 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import BONES_BETWEEN, MIRROR, PARENT, J
+from steadypose.prior.compiled import njit
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]
 
 CANDIDATES = 3
-"""Coasting by the smoother, completed by the network, held beside the body."""
+"""Coasting by the smoother, completed by the network, held in the body frame."""
 
 FEATURES = 20
 """Of each occluded joint."""
@@ -81,7 +81,7 @@ def forget(past: Past, slot: NDArray[np.bool_]) -> None:
 
 @njit(cache=True)
 def observe(past, slot, positions, sigma, unseen_s, held):
-    """Update the state with a body's frame, and write its pose with occluded joints held beside those seen.
+    """Update the state with a body's frame, and write its pose with occluded joints held in the body frame.
 
     Args:
         past: a `Past`.

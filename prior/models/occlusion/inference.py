@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from steadypose.prior.compiled import njit
 from steadypose.prior.models.occlusion.candidates import CANDIDATES
 from steadypose.prior.models.occlusion.form import MAX_LOG_SIGMA, MIN_LOG_SIGMA
-from steadypose.prior.models.weights_io import Arrays, load_weights
+from steadypose.prior.models.weights import Arrays, load_weights
 
 Floats = NDArray[np.float64]
 

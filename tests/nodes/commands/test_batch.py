@@ -145,7 +145,7 @@ def test_a_process_that_dies_takes_one_recording_with_it(tmp_path: Path) -> None
 def test_a_process_that_died_between_two_recordings_takes_one_with_it(tmp_path: Path) -> None:
     worker = object.__new__(_Worker)
     worker.connection, theirs = multiprocessing.Pipe()
-    worker.process = Mock(exitcode=-9)
+    worker.process = Mock(wait=lambda: -9)
     theirs.close()
     worker.send(Job(tmp_path / "a.npz", tmp_path / "b.npz"))
     assert worker.receive() == {"state": "failed", "error": "the process that cleaned it ended with status -9"}
@@ -228,7 +228,7 @@ def test_recordings_are_told_from_folders_of_them(tmp_path: Path) -> None:
         ("used", {}, "manifest.jsonl of an earlier call"),
         ("out", {"jobs": 0}, "expected 1 or more, got 0"),
         ("out", {"jobs": 2, "ray": True}, "Ray decides"),
-        ("out", {"settings": ("refine.enabeld=false",)}, "did you mean 'enabled'"),
+        ("out", {"settings": ("refine.enabeld=false",)}, "did you mean 'refine.enabled'"),
     ],
 )
 def test_what_cannot_be_done_is_said(tmp_path: Path, out: str, more: dict[str, Any], expected: str) -> None:
@@ -290,5 +290,5 @@ def test_a_ray_cluster_gives_the_same(
 
 def test_without_ray_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(LaunchError, match=r"steadypose\[ray\]"):
+    with pytest.raises(LaunchError, match=r"the extra .ray."):
         list(batch.on_ray([], {}))

@@ -103,7 +103,7 @@ def test_settings_reach_the_stages(tmp_path: Path, options: tuple[str, ...]) -> 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ({"settings": ("refine.enabeld=false",)}, "did you mean 'enabled'"),
+        ({"settings": ("refine.enabeld=false",)}, "did you mean 'refine.enabled'"),
         ({"settings": ("trajectory.contact=false",)}, "contacts"),
         ({"settings": ("delay",)}, "expected section.key=value"),
         ({"delay": 99}, "delay: expected 0 to 16"),

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from steadypose.nodes.cli import COMMANDS, USAGE_ERROR, main
+from steadypose.nodes.graph.extras import install_command
 from steadypose.nodes.graph.launch import bundled
-from steadypose.prior.models.weights_io import WEIGHTS
+from steadypose.prior.models.weights import WEIGHTS
 
 
 def python(code: str) -> str:
@@ -152,5 +153,5 @@ def test_what_an_extra_brings_is_named(missing: str, extra: str, arguments: list
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == USAGE_ERROR
     assert f"needs {missing}" in done.stderr
-    assert f"pip install 'steadypose[{extra}]'" in done.stderr
+    assert install_command(extra) in done.stderr
     assert "Traceback" not in done.stderr

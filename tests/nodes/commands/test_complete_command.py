@@ -14,7 +14,7 @@ from steadypose.msgs.types import JointState, PoseClean
 from steadypose.nodes.commands.complete import complete
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.offline import optimise
+from steadypose.prior.fit import optimise
 
 
 def write(path: Path, positions: np.ndarray, **more: object) -> Path:

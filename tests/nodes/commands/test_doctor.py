@@ -14,6 +14,8 @@ import pytest
 from steadypose.nodes.commands.doctor import command, installation, machine, running
 from steadypose.nodes.commands.doctor.command import doctor
 from steadypose.nodes.commands.doctor.finding import INSTALL, Finding, Verdict
+from steadypose.nodes.graph import extras
+from steadypose.nodes.graph.extras import install_command
 
 
 def verdicts(check) -> dict[str, Verdict]:
@@ -36,7 +38,7 @@ def test_exit_status_says_whether_the_main_job_can_run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fine = Finding("Python", Verdict.GOOD, "3.11.7")
-    note = Finding("optional: view", Verdict.NOTE, "not installed", "install [this]")
+    note = Finding("extra view", Verdict.NOTE, "not installed", "install [this]")
     with_checks(monkeypatch, fine, note)
     assert doctor() == 0
     assert "install [this]" in capsys.readouterr().out
@@ -76,11 +78,11 @@ def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(installation, "version", lacking)
     findings = {finding.what: finding for finding in installation.check_packages()}
-    extra = findings["optional: view"]
+    extra = findings["extra view"]
     assert extra.verdict is Verdict.NOTE
     assert extra.found.startswith("the picture in the browser, and steadypose plot: ")
-    assert "rerun-sdk not installed, expected >=" in extra.found
-    assert extra.fix.endswith("uv sync --frozen --inexact --extra view")
+    assert extra.found.endswith(install_command("view"))
+    assert not extra.fix, "one line an extra"
     packages = findings["packages"]
     assert packages.verdict is Verdict.BAD
     assert "pyzmq not installed, expected >=27" in packages.found
@@ -111,7 +113,7 @@ def test_an_installed_wheel_is_asked_what_it_requires(monkeypatch: pytest.Monkey
     assert needed == told[:2]
     assert extras == {"view": told[2:3], "ros2": told[3:]}
     assert verdicts(installation.check_packages)["packages"] is Verdict.GOOD
-    assert "optional: ros2" not in verdicts(installation.check_packages)
+    assert "extra ros2" not in verdicts(installation.check_packages)
 
 
 def test_another_python_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,7 +156,7 @@ def test_a_path_too_long_for_sockets(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 
 def test_missing_weights_are_missing_and_nothing_is_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from steadypose.prior.models import weights_io as checkpoint
+    from steadypose.prior.models import weights as checkpoint
 
     monkeypatch.setattr(checkpoint, "WEIGHTS", tmp_path / "weights")
     findings = command._examine(running.check_models)
@@ -163,7 +165,7 @@ def test_missing_weights_are_missing_and_nothing_is_timed(monkeypatch: pytest.Mo
 
 
 def test_damaged_weights_are_not_taken_for_whole(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from steadypose.prior.models import weights_io as checkpoint
+    from steadypose.prior.models import weights as checkpoint
 
     for model in running.MODELS:
         (tmp_path / f"{model}-default.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0garbage!")
@@ -230,3 +232,21 @@ def test_it_needs_nothing_that_it_looks_for() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("BAD") >= 3
+
+
+@pytest.mark.parametrize(
+    ("checkout", "prefix", "command"),
+    [
+        (True, ".venv", "./steadypose add view"),
+        (True, "elsewhere", "pip install 'CHECKOUT[view]'"),
+        (False, "elsewhere", "pip install 'PATH/TO/CHECKOUT[view]'"),
+    ],
+)
+def test_what_to_type_can_be_typed_here(
+    checkout: bool, prefix: str, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if checkout:
+        (tmp_path / "pyproject.toml").touch()
+    monkeypatch.setattr(extras, "PACKAGE", tmp_path / "src" / "steadypose")
+    monkeypatch.setattr(extras.sys, "prefix", str(tmp_path / prefix))
+    assert install_command("view") == command.replace("'CHECKOUT", f"'{tmp_path}")

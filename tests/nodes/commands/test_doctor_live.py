@@ -60,7 +60,7 @@ def test_a_good_tracker(file: str) -> None:
 def test_a_bad_tracker(file: str) -> None:
     status, text = heard(file, [dataclasses.replace(raw, skeleton="smpl") for raw in walk(30)])
     assert status == 1
-    assert "did you mean 'smpl22'" in text
+    assert "most like 'smpl22'" in text
 
 
 def test_no_tracker(file: str) -> None:

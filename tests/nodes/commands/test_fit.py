@@ -30,11 +30,11 @@ from steadypose.nodes.commands.key_points import read_key_points
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.sources.npz import NpzError
 from steadypose.prior.body.skeleton import REST_POSITIONS
-from steadypose.prior.models.humor.network import HumorNet
-from steadypose.prior.motion.npz import read_amass
-from steadypose.prior.offline import solve
-from steadypose.prior.offline.observations import SeenJoints
-from steadypose.prior.offline.solve import FitSettings
+from steadypose.prior.fit import solve
+from steadypose.prior.fit.humor_network import HumorNet
+from steadypose.prior.fit.observations import SeenJoints
+from steadypose.prior.fit.solve import FitSettings
+from steadypose.prior.mocap.npz import read_amass
 
 FRAMES = 24
 
@@ -181,7 +181,7 @@ def test_what_cannot_be_done_is_said(
 def test_without_torch_it_says_what_to_install(seen: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setattr("steadypose.nodes.graph.extras.find_spec", lambda name: None)
     assert main(["fit", str(seen), str(tmp_path / "out.npz")]) == 2
-    assert "steadypose[train]" in capsys.readouterr().err
+    assert "add train" in capsys.readouterr().err
 
 
 def test_nobody_in_it_is_said(tmp_path: Path, capsys) -> None:

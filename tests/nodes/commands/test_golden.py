@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.commands.cleaning import stream
+from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.trajectory_node import make_trajectory
 from steadypose.nodes.sources.recording import open_recording

@@ -13,10 +13,12 @@ from tests.helpers.synthetic_poses import messages
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw
-from steadypose.nodes.commands.plot.command import PlotError, plot
+from steadypose.nodes.commands.plot.command import plot
 from steadypose.nodes.commands.plot.errors import errors_of
 from steadypose.nodes.commands.plot.history import read_history
 from steadypose.nodes.commands.plot.panels import busiest_joints
+from steadypose.nodes.commands.plot.picture import PlotError
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.body.skeleton import J
 
 PICTURE = b"\x89PNG"
@@ -147,7 +149,7 @@ def test_a_recording_without_bodies_says_so(tmp_path: Path) -> None:
 
 
 def test_what_is_not_one_recording_says_what_to_draw(tmp_path: Path) -> None:
-    with pytest.raises(PlotError, match=r"steadypose clean x\.npz x, then plot x"):
+    with pytest.raises(LaunchError, match=r"x\.npz does not exist: expected"):
         plot(Path("x.npz"), tmp_path / "x.png")
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

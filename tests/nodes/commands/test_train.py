@@ -7,8 +7,8 @@ import torch
 
 from steadypose.nodes.commands import train as command
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.prior.models import torch_weights
-from steadypose.prior.models.training import TrainingOptions
+from steadypose.training import weights as training_weights
+from steadypose.training.loop import TrainingOptions
 
 
 @pytest.fixture
@@ -22,11 +22,11 @@ def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
     def train_hmvae(options: TrainingOptions) -> Path:
         path = options.path("hmvae")
-        torch_weights.save_weights(path, torch.nn.Linear(2, 1), {}, {"Model": "small"})
+        training_weights.save_weights(path, torch.nn.Linear(2, 1), {}, {"Model": "small"})
         return path
 
-    monkeypatch.setattr("steadypose.prior.models.weights_io.WEIGHTS", folder)
-    monkeypatch.setattr("steadypose.prior.models.hmvae.train.train_hmvae", train_hmvae)
+    monkeypatch.setattr("steadypose.prior.models.weights.WEIGHTS", folder)
+    monkeypatch.setattr("steadypose.training.recipes.hmvae.train_hmvae", train_hmvae)
     return folder
 
 

@@ -16,7 +16,7 @@ from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Pose, PoseClean, PoseRaw, PoseWorld, RawBody
 from steadypose.nodes.commands.clean import clean
-from steadypose.nodes.commands.cleaning import stream
+from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode, make_prior
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode, make_trajectory

@@ -55,7 +55,7 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("[input.webcam]\nbodies = 0", "bodies: expected 1 to 64, got 0"),
         ("[input.merge]\ncameras = [7111, 7112]", "cameras: expected addresses such as tcp://.*, got 7111"),
         ("[server]\nkiosks = [7111]", "kiosks: expected addresses such as tcp://.*, got 7111"),
-        ("[viewer]\nport = 65535", "port: expected 1 to 65534, got 65535"),
+        ("[viewer]\nport = 65536", "port: expected 1 to 65535, got 65536"),
         ("[input", "is not TOML"),
     ],
 )
@@ -94,3 +94,11 @@ def test_who_must_hear_whom(write) -> None:
     assert launch.reliable_subscribers("recorder") == frozenset()
     live = Launch.read(write("[transport]\nlossless = false"))
     assert live.reliable_subscribers("pose_input") == frozenset(), "a camera waits for nobody"
+
+
+def test_brackets_without_end_are_no_setting(write) -> None:
+    for text in ("x = " + "[" * 5000, "[[" * 5000, "x = " + "{a=" * 5000):
+        with pytest.raises(LaunchError):
+            Launch.read(write(text))
+    with pytest.raises(LaunchError, match=r"input\.rate: lists or tables within lists"):
+        Launch.read(write(""), ["input.rate=" + "[" * 5000])

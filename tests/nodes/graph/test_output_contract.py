@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from steadypose.msgs.contract import are_unit, broken
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import JointState, Message, Pose, PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.commands.cleaning import stream
+from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.trajectory_node import make_trajectory
 

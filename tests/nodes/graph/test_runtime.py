@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import START_NS, VirtualClock, raw, running, until, walking
+from conftest import START_NS, VirtualClock, listeners, raw, running, until, walking
 
 from steadypose.msgs.publisher import SEND_HIGH_WATER
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW
@@ -73,7 +73,7 @@ class Script:
     def __init__(self, messages: list[tuple[str, Message]]) -> None:
         self.messages = messages
 
-    def receive(self, timeout_s: float) -> tuple[str, Message] | None:
+    def receive(self, timeout_s: float, *, taken: bool = True) -> tuple[str, Message] | None:
         return self.messages.pop(0) if self.messages else None
 
 
@@ -123,7 +123,7 @@ def test_publishers_take_turns_and_who_floods_loses_its_own(tmp_path: Path) -> N
 
 def test_a_source_faster_than_reading_does_not_keep_a_node_from_working() -> None:
     class Endless(Script):
-        def receive(self, timeout_s: float) -> tuple[str, Message]:
+        def receive(self, timeout_s: float, *, taken: bool = True) -> tuple[str, Message]:
             return POSE_RAW, raw(0)
 
     assert Inbox([Endless([])], limit=3).next(0) is not None  # type: ignore[arg-type]
@@ -164,7 +164,7 @@ def test_the_stream_halts_while_a_listener_is_away(make_launch: MakeLaunch) -> N
         source.publish(POSE_RAW, raw(0))
         first.take_until(lambda: len(first.got) == 1)
         first.close()
-        until(lambda: "trajectory" not in node._publisher.subscribers)
+        until(lambda: "trajectory" not in listeners(node))
         for i in range(1, 10):
             source.publish(POSE_RAW, raw(i))
         again = Listener(launch, "prior", [POSE_CLEAN], name="trajectory")
@@ -179,7 +179,7 @@ def test_a_message_that_fails_is_counted_and_the_next_one_is_served(make_launch:
     with Publisher(launch.transport.endpoint("pose_input"), reliable={"prior"}) as source, running(node):
         listener = Listener(launch, "prior", [POSE_CLEAN], name="test")
         assert source.wait_for_subscribers({"prior"}, timeout_s=10)
-        until(lambda: "test" in node._publisher.subscribers)
+        until(lambda: "test" in listeners(node))
         for i in range(6):
             source.publish(POSE_RAW, raw(i, skeleton="bad" if i % 2 else "smpl22"))
         listener.take_until(lambda: len(listener.got) == 3)
@@ -254,7 +254,27 @@ def test_a_node_stops_though_its_listener_does_not_read(make_launch: MakeLaunch)
         while source.publish(POSE_RAW, message, timeout_s=1.0) or node.health.published[POSE_CLEAN] > before:
             before = node.health.published[POSE_CLEAN]
             assert before < 10 * SEND_HIGH_WATER, "nothing holds the node up"
+        until(lambda: node.health.unread == "waiting for trajectory to read")
         node.stop()
         until(lambda: node.health.state == "stopped")
         deaf.close()
-    assert node.health.counts[f"dropped.stopped {POSE_CLEAN}"] == 1
+
+
+def test_input_without_output_is_not_called_running(make_launch: MakeLaunch, clock: VirtualClock) -> None:
+    node = Echo(make_launch(nodes='["prior"]'), clock)
+    node.health.state = "running"
+    with Publisher(node.launch.transport.endpoint("prior")) as node._publisher:
+        for _ in range(4):
+            assert node.diagnostics().values["state"] == "running"
+            node.health.note_received(POSE_RAW)
+            clock.time_ns += 600_000_000
+        report = node.diagnostics()
+        assert (report.values["state"], report.level) == ("stalled", Level.ERROR)
+        assert "problem.no_output" in report.values
+        node.publish(DIAGNOSTICS, report)
+        assert node.diagnostics().values["state"] == "stalled", "news of itself are no output"
+        node.publish(POSE_CLEAN, clean(raw(0)))
+        assert node.diagnostics().values["state"] == "running"
+        node.health.note_received(POSE_RAW)
+        clock.time_ns += 60_000_000_000
+        assert node.diagnostics().values["state"] == "running", "nothing comes any more: that is no fault of its own"

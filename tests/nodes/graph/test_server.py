@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from conftest import VirtualClock, running, until, walk
+from conftest import VirtualClock, listeners, running, until, walk
 
 from steadypose.msgs.keys import create_keys
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
@@ -52,8 +52,8 @@ def test_two_kiosks_and_a_server(
         subscriber = stack.enter_context(heard)
         for publisher in (door, desk):
             assert publisher.wait_for_subscribers({"prior"}, timeout_s=20)
-        until(lambda: {"trajectory"} <= prior._publisher.subscribers)
-        until(lambda: {"test"} <= trajectory._publisher.subscribers)
+        until(lambda: clock.sleep(33_333_333) or {"trajectory"} <= listeners(prior))
+        until(lambda: clock.sleep(33_333_333) or {"test"} <= listeners(trajectory))
         for k in range(FRAMES):
             clock.time_ns += 33_333_333
             for publisher, name in ((door, "door"), (desk, "desk")):

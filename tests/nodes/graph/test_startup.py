@@ -23,16 +23,19 @@ node.node([sys.argv[1]])
 
 @pytest.mark.parametrize("name", ["prior", "trajectory"])
 def test_a_node_loads_nothing_that_its_work_does_without_and_counts_no_garbage_of_its_start(name: str) -> None:
-    command = [sys.executable, "-c", SCRIPT, name, *SPARED]
+    # the modes of a body with hidden joints are eigenvectors, for which numba calls scipy's LAPACK
+    spared = [module for module in SPARED if (name, module) != ("prior", "scipy.linalg")]
+    command = [sys.executable, "-c", SCRIPT, name, *spared]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "True True\n"
 
 
-def test_who_has_made_as_many_objects_as_one_who_compiles_starts_anew_once() -> None:
+def test_who_has_compiled_starts_anew_once_with_what_is_now_on_disk() -> None:
     script = """
 print("starts")
 from steadypose.nodes.graph.startup import startup
+from steadypose.prior import loop_cache
 with startup():
-    kept = [[] for _ in range(600_000)]
+    loop_cache.saved.add("a loop")
 print("works")
 """
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -28,7 +28,8 @@ from steadypose.nodes.commands.doctor.installation import required
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2 import connection
+from steadypose.nodes.ros2 import connect
+from steadypose.nodes.ros2.connection import Connection
 from steadypose.nodes.ros2.definitions import deserialise, stamp_ns
 from steadypose.nodes.ros2.tf import TransformBuffer
 from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, RosOutput, check_ros2
@@ -140,6 +141,8 @@ def test_a_ros_node_hears_bodies(
     np.testing.assert_allclose(turned.apply(odom["velocity"]), body.root_velocity, atol=1e-9)
     covariance = np.array(odom["pose_covariance"]).reshape(6, 6)
     np.testing.assert_array_equal(covariance[:3, :3], body.covariance[:3, :3])
+    assert (np.linalg.eigvalsh(covariance[3:, 3:]) > 1e-5).all()  # half a degree, at least
+    assert np.trace(covariance[3:, 3:]) < 3.0 * np.pi**2
     twist = turned.as_matrix() @ np.array(odom["twist_covariance"]).reshape(6, 6)[:3, :3] @ turned.as_matrix().T
     np.testing.assert_allclose(twist, body.covariance[3:, 3:], atol=1e-9)
 
@@ -247,8 +250,8 @@ def test_a_type_that_is_not_to_be_had_is_told_and_the_rest_goes_on() -> None:
 
 
 def test_without_ros_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "find_spec", lambda name: None)
-    with pytest.raises(LaunchError, match="--extra ros2"):
+    monkeypatch.setattr(connect, "find_spec", lambda name: None)
+    with pytest.raises(LaunchError, match="add ros2"):
         check_ros2(Launch())
 
 
@@ -257,16 +260,16 @@ def test_a_sourced_ros_of_another_python_is_not_used(
     has_dds: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], ros: None
 ) -> None:
     """Such as ROS's own Python 3.12 on the path of a 3.11."""
-    monkeypatch.setattr(connection, "has_sourced_ros", lambda: True)
+    monkeypatch.setattr(connect, "has_sourced_ros", lambda: True)
     monkeypatch.setitem(sys.modules, "rclpy", None)
     monkeypatch.delitem(sys.modules, "steadypose.nodes.ros2.rclpy_connection", raising=False)
     if has_dds:
-        connection.connect("test").close()
+        connect.connect("test").close()
         assert "plain DDS" in capsys.readouterr().out
     else:
-        monkeypatch.setattr(connection, "find_spec", lambda name: None)
+        monkeypatch.setattr(connect, "find_spec", lambda name: None)
         with pytest.raises(LaunchError, match=r"expected the Python that ROS is built for"):
-            connection.connect("test")
+            connect.connect("test")
 
 
 FOREIGN = """
@@ -297,11 +300,11 @@ def test_a_frame_that_ros_does_not_take(frame: str) -> None:
 
 
 @pytest.fixture(params=["dds", "rclpy"])
-def join(request: pytest.FixtureRequest, ros: None) -> Iterator[Callable[[], connection.Connection]]:
+def join(request: pytest.FixtureRequest, ros: None) -> Iterator[Callable[[], Connection]]:
     """Each way into ROS."""
-    opened: list[connection.Connection] = []
+    opened: list[Connection] = []
 
-    def open_one() -> connection.Connection:
+    def open_one() -> Connection:
         if request.param == "dds":
             from steadypose.nodes.ros2.dds import DdsConnection
 
@@ -317,7 +320,7 @@ def join(request: pytest.FixtureRequest, ros: None) -> Iterator[Callable[[], con
         one.close()
 
 
-def test_who_joins_late_gets_what_is_latched(join: Callable[[], connection.Connection]) -> None:
+def test_who_joins_late_gets_what_is_latched(join: Callable[[], Connection]) -> None:
     said = deserialise_text("a robot")
     first = join()
     first.publisher("description", "std_msgs/msg/String", latched=True)(said)

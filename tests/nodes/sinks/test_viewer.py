@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import itertools
 import os
@@ -11,6 +12,7 @@ import socket
 import subprocess
 import sys
 import threading
+import urllib.error
 import urllib.request
 from pathlib import Path
 from typing import Any
@@ -27,8 +29,11 @@ from steadypose.nodes.graph.access import TransportSettings
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.drawing import STATE_COLOURS
+from steadypose.nodes.sinks.viewer import drawings
 from steadypose.nodes.sinks.viewer import node as viewer_node
+from steadypose.nodes.sinks.viewer.drawings import Drawings
 from steadypose.nodes.sinks.viewer.node import ViewerNode
+from steadypose.nodes.sinks.viewer.page import is_own_name
 from steadypose.nodes.sinks.viewer.scene import PATH_SECONDS, PoseView
 from steadypose.nodes.sinks.viewer.server import LOOPBACK, ViewerError, ViewerServer
 from steadypose.nodes.sinks.viewer.settings import ViewerSettings
@@ -217,27 +222,20 @@ def test_nothing_seen_and_nonsense_are_drawn_without_complaint(view: PoseView) -
     view.log(POSE_RAW, PoseRaw(0, "", "", "azure_kinect32", CAMERA, False, [nothing, nonsense]))
 
 
-def free_ports() -> int:
-    """A port that is free together with the next."""
-    while True:
-        with socket.socket() as first, socket.socket() as second:
-            first.bind((LOOPBACK, 0))
-            port = first.getsockname()[1]
-            try:
-                second.bind((LOOPBACK, port + 1))
-            except OSError:
-                continue
-            return port
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return probe.getsockname()[1]
 
 
 def test_the_server_shows_a_page_on_this_machine_alone() -> None:
-    port = free_ports()
+    port = free_port()
     with ViewerServer(port) as server:
         page = urllib.request.urlopen(server.url, timeout=10).read()
         assert b"rerun" in page.lower()
         for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
             address, state = line.split()[1], line.split()[3]
-            if state == "0A" and int(address.split(":")[1], 16) in (port, port + 1):
+            if state == "0A" and int(address.split(":")[1], 16) == port:
                 assert address.startswith("0100007F"), "listens beyond 127.0.0.1"
         with pytest.raises(ViewerError, match=f"port {port} is not to be had"):
             ViewerServer(port)
@@ -245,7 +243,7 @@ def test_the_server_shows_a_page_on_this_machine_alone() -> None:
 
 
 def test_the_server_goes_with_a_node_that_is_killed() -> None:
-    port = free_ports()
+    port = free_port()
     code = (
         "from steadypose.nodes.sinks.viewer.server import ViewerServer; "
         f"s = ViewerServer({port}); print(s._process.pid, flush=True); input()"
@@ -310,18 +308,78 @@ def test_the_node_draws_what_is_published_and_ends_with_its_server(
 def test_without_rerun_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "rerun" else found(name))
-    with pytest.raises(LaunchError, match="--extra view"):
-        ViewerServer(free_ports())
+    with pytest.raises(LaunchError, match="add view"):
+        ViewerServer(free_port())
 
 
 def test_the_page_may_call_nobody_but_this_server() -> None:
     """By itself Rerun's page sends telemetry and asks for news; its policy has the browser refuse that."""
-    port = free_ports()
+    port = free_port()
     with ViewerServer(port) as server, urllib.request.urlopen(server.url, timeout=20) as answer:
         assert b"<html" in answer.read().lower()
         rules = dict(rule.strip().split(" ", 1) for rule in answer.headers["Content-Security-Policy"].split(";"))
-    assert rules["connect-src"].split() == ["'self'", "blob:", "data:", f"http://127.0.0.1:{port + 1}"]
+    assert rules["connect-src"].split() == ["'self'", "blob:", "data:"]
     assert not [word for rule in rules.values() for word in rule.split() if word in ("*", "http:", "https:")]
+
+
+def asked(url: str, host: str | None = None) -> int:
+    request = urllib.request.Request(url, headers={"Host": host} if host else {})
+    try:
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_who_does_not_know_the_token_sees_no_drawings() -> None:
+    with ViewerServer(free_port()) as server:
+        recording = viewer_node.connect(server)
+        recording.log("a", rr.TextLog("somebody"))
+        with urllib.request.urlopen(server.data_url, timeout=20) as answer:
+            assert answer.read(3) == b"RRF"
+        at, token, name = server.data_url.rsplit("/", 2)
+        for guess in ("", f"/{name}", f"/{'x' * len(token)}/{name}", f"/{token[:-1]}/{name}", f"/{token}/./{name}"):
+            with contextlib.suppress(urllib.error.HTTPError), urllib.request.urlopen(at + guess, timeout=20) as answer:
+                assert not answer.read().startswith(b"RRF"), guess
+        recording.disconnect()
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("localhost", 200), ("127.0.0.1:9090", 200), ("[::1]:9090", 200), ("192.168.1.7", 200),
+        (socket.gethostname(), 200),
+        ("evil.example", 403), ("127.0.0.1.evil.example:9090", 403), ("[evil", 403), ("", 403),
+    ],
+)  # fmt: skip
+def test_a_page_of_another_name_is_nobodys(host: str, status: int) -> None:
+    assert is_own_name(host, frozenset({"localhost", socket.gethostname().lower()})) == (status == 200)
+
+
+def test_a_name_that_was_made_to_lead_here_gets_nothing() -> None:
+    with ViewerServer(free_port()) as server:
+        for url in (server.url, server.data_url):
+            assert asked(url, host="evil.example") == 403
+        assert asked(server.url) == 200
+
+
+def test_a_browser_that_comes_late_gets_the_beginning_and_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawings, "FIRST", 2)
+    monkeypatch.setattr(drawings, "MOST_BYTES", 3)
+    kept = Drawings()
+    early = kept.follow()
+    for number in range(3):
+        kept.add(b"%d" % number)
+    assert [next(early) for _ in range(3)] == [b"0", b"1", b"2"]
+    for number in range(3, 9):
+        kept.add(b"%d" % number)
+    late = kept.follow()
+    assert [next(late) for _ in range(5)] == [b"0", b"1", b"6", b"7", b"8"]
+    assert [next(early) for _ in range(3)] == [b"6", b"7", b"8"], "who is too slow misses some"
+    kept.add(b"9")
+    assert (next(early), next(late)) == (b"9", b"9")
+    kept.close()
+    assert list(late) == []
 
 
 def test_a_host_that_is_none() -> None:

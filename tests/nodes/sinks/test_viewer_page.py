@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from tests.helpers.synthetic_poses import messages
-from tests.nodes.sinks.test_viewer import free_ports
+from tests.nodes.sinks.test_viewer import free_port
 
 from steadypose.msgs.types import JointState
 from steadypose.nodes.sinks.viewer.layout import CONTACT_RGB, RAW_RGB, STATE_RGB
@@ -49,7 +49,7 @@ def is_drawn(screenshot: bytes) -> bool:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; on Debian: apt-get install chromium")
 def test_the_page_draws_three_panels_and_reaches_nobody_but_this_machine() -> None:
-    with ViewerServer(free_ports()) as server, playwright.sync_playwright() as play:
+    with ViewerServer(free_port()) as server, playwright.sync_playwright() as play:
         recording = connect(server)
         view = PoseView(recording)
         for topic, message in messages(4.0):

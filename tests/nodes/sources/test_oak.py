@@ -28,7 +28,8 @@ from steadypose.nodes.graph.trajectory_node import TrajectoryNode
 from steadypose.nodes.sources import oak_device
 from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import PAUSES_S
-from steadypose.nodes.sources.oak import OakSettings, OakSource
+from steadypose.nodes.sources.camera_settings import OakSettings
+from steadypose.nodes.sources.oak import OakSource
 from steadypose.nodes.sources.oak_device import FRAME_ID, QUEUE, TIMEOUT_S, Host
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.registry import InputSettings, open_input

@@ -14,7 +14,7 @@ from steadypose.nodes.commands.calibrate.command import CalibrateOak, calibrate
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.sources import oak_still
 from steadypose.nodes.sources.camera import CameraError
-from steadypose.nodes.sources.oak import OakSettings
+from steadypose.nodes.sources.camera_settings import OakSettings
 from steadypose.nodes.sources.oak_still import Still, capture
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.camera.calibration import CalibrationError

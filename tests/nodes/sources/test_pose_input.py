@@ -55,6 +55,9 @@ class Sent:
             self.at.append((self._clock.time_ns, message))
         return True
 
+    def silent(self, for_s: float) -> frozenset[str]:
+        return frozenset()
+
     def check(self) -> None: ...
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import VirtualClock, running, until, walk
+from conftest import VirtualClock, listeners, running, until, walk
 from scipy.spatial.transform import Rotation
 
-from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Pose, PoseRaw, PoseWorld, RawBody
 from steadypose.nodes.graph.launch import Launch
@@ -75,14 +75,17 @@ def test_two_cameras_become_one_world(
     ):
         for publisher in (left, right):
             assert publisher.wait_for_subscribers({"merge"}, timeout_s=20)
-        until(lambda: {"prior", "test"} <= nodes[0]._publisher.subscribers)
-        until(lambda: {"trajectory"} <= nodes[1]._publisher.subscribers)
-        until(lambda: {"test"} <= nodes[2]._publisher.subscribers)
+        until(lambda: clock.sleep(33_333_333) or {"prior", "test"} <= listeners(nodes[0]))
+        until(lambda: clock.sleep(33_333_333) or {"trajectory"} <= listeners(nodes[1]))
+        until(lambda: clock.sleep(33_333_333) or {"test"} <= listeners(nodes[2]))
         for k in range(FRAMES):
             clock.time_ns += 33_333_333
             left.publish(POSE_RAW, views["left"][k])
             right.publish(POSE_RAW, views["right"][k])
             until(lambda k=k: nodes[0]._source._received.total() == 2 * (k + 1))  # type: ignore[union-attr]
+            for before, after, topic in zip(nodes, nodes[1:], (POSE_RAW, POSE_CLEAN), strict=False):
+                # who falls behind takes the newest alone
+                until(lambda a=after, b=before, t=topic: a.health.received[t] >= b.health.published[t] - 1)
 
         def answered() -> bool:
             while received := subscriber.receive(0):
@@ -112,7 +115,7 @@ def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path) -> None:
         assert next(frames) is None
         assert camera.wait_for_subscribers({"merge"}, timeout_s=20)
         camera.publish(POSE_RAW, first)
-        camera._sequence[POSE_RAW] += 3  # which nobody heard
+        camera._deliveries.sequence[POSE_RAW] += 3  # which nobody heard
         camera.publish(POSE_RAW, last)
         until(lambda: (next(frames), source._received.total())[1] == 2)
     assert source.status()["dropped.lost pose/raw"] == "3"

@@ -22,9 +22,10 @@ from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources import webcam, webcam_device
 from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import PAUSES_S
+from steadypose.nodes.sources.camera_settings import WebcamSettings
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import SourceContext
-from steadypose.nodes.sources.webcam import WebcamSettings, WebcamSource
+from steadypose.nodes.sources.webcam import WebcamSource
 from steadypose.nodes.sources.webcam_device import Lens
 from steadypose.nodes.sources.webcam_video import VideoSource
 
@@ -196,7 +197,7 @@ def test_values_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
 
 def test_without_mediapipe_it_says_what_to_install(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
-    with pytest.raises(LaunchError, match="--extra webcam"):
+    with pytest.raises(LaunchError, match="add webcam"):
         open_input(InputSettings(source="webcam", webcam=WebcamSettings(model=model)), SystemClock())
 
 

@@ -13,7 +13,7 @@ from steadypose.prior.body.kinematics import (
     rotation_matrix,
 )
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
-from steadypose.prior.models.layers import torch_kinematics
+from steadypose.prior.fit import torch_kinematics
 
 
 def naive_fk(rotations: np.ndarray, offsets: np.ndarray, root: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ def error_mm(found: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(found - truth, axis=-1)[30:].mean() * 1000)
 
 
-@pytest.mark.parametrize(("delay", "share"), [(0, 0.9), (4, 0.95)])
+@pytest.mark.parametrize(("delay", "share"), [(0, 0.95), (4, 0.95)])
 def test_in_noise_the_answer_is_nearer_to_the_truth(delay: int, share: float) -> None:
     truth = waving(120)
     seen = truth + np.random.default_rng(0).normal(0.0, 0.04, truth.shape)
@@ -84,7 +84,7 @@ def test_motion_that_the_model_does_not_know_takes_its_belief_away_and_lasting_e
         return [place / apart for place in found]
 
     near, far = moved(0.01, 0.04), moved(0.2, 0.04)
-    assert near[-1] > 0.8
+    assert near[-1] > 0.75
     assert max(far) < 0.01, "at once, not when the mean has it"
     assert max(moved(0.01, 0.001)) < 0.02
 

@@ -9,7 +9,8 @@ from tests.helpers.synthetic_poses import walker
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.prior.world.pipeline import TrajectoryPipeline
+from steadypose.prior.world.settings import TrajectorySettings
 
 FRAMES = 150
 OPTICAL = Rotation.from_quat(Pose.from_up("-y").orientation)

@@ -26,11 +26,11 @@ from steadypose.prior.models.completer.features import (
     solved_rotations,
 )
 from steadypose.prior.models.completer.inference import LiveCompleter
-from steadypose.prior.models.completer.network import Completer
-from steadypose.prior.models.completer.train import Truth, answer, masks, train_completer
-from steadypose.prior.models.torch_weights import arrays_of
-from steadypose.prior.models.training import TrainingOptions
-from steadypose.prior.motion.dataset import MotionSet
+from steadypose.training.data.dataset import MotionSet
+from steadypose.training.loop import TrainingOptions
+from steadypose.training.networks.completer import Completer
+from steadypose.training.recipes.completer import Truth, answer, masks, train_completer
+from steadypose.training.weights import arrays_of
 
 SMALL = CompleterConfig(width=16, heads=2, layers=2)
 USUAL = np.tile([0.0, 0.0, 0.0, 1.0], (22, 1))
@@ -163,10 +163,10 @@ def test_windows_of_training_are_of_one_person_and_keep_something() -> None:
 
 
 def test_training_learns_to_fill_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("steadypose.prior.models.completer.train.BATCH", 60)
-    monkeypatch.setattr("steadypose.prior.models.completer.train.GAPS", (5, 12))
-    monkeypatch.setattr("steadypose.prior.models.completer.train.evaluate_completer", lambda *_: {"val": 1.0})
-    monkeypatch.setattr("steadypose.prior.models.completer.train.calibrate", lambda model, _: model.config)
+    monkeypatch.setattr("steadypose.training.recipes.completer.BATCH", 60)
+    monkeypatch.setattr("steadypose.training.recipes.completer.GAPS", (5, 12))
+    monkeypatch.setattr("steadypose.training.recipes.completer.evaluate_completer", lambda *_: {"val": 1.0})
+    monkeypatch.setattr("steadypose.training.recipes.completer.calibrate", lambda model, _: model.config)
     data = prepared(tmp_path / "m.npz")
     whole = train_completer(TrainingOptions(data, tmp_path / "a", iterations=4), SMALL).read_bytes()
     steps = iter(range(100))

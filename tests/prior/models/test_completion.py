@@ -7,8 +7,8 @@ import torch
 from tests.prior.models.test_hgvae import SMALL, awake
 
 from steadypose.prior.body.skeleton import PARENTS, J
-from steadypose.prior.models.hgvae.completion import CompletionNet, certainty_of
-from steadypose.prior.models.hgvae.completion_features import (
+from steadypose.prior.models.hgvae.config import SCALE, CompletionConfig
+from steadypose.prior.models.hgvae.live_completion import (
     FIRST_LOG_VAR,
     GROWTH,
     HALF_CERTAIN_SIGMA,
@@ -18,9 +18,9 @@ from steadypose.prior.models.hgvae.completion_features import (
     Features,
     completion_features,
 )
-from steadypose.prior.models.hgvae.config import SCALE, CompletionConfig
-from steadypose.prior.models.hgvae.train_completion import train_completion
-from steadypose.prior.models.hgvae.windows import Windows
+from steadypose.training.data.hgvae_windows import Windows
+from steadypose.training.networks.hgvae_completion import CompletionNet, certainty_of
+from steadypose.training.recipes.hgvae_completion import train_completion
 
 WRIST = J["left_wrist"]
 TRACKS = slice(3 * WRIST, 3 * WRIST + 3)

@@ -9,11 +9,10 @@ import pytest
 import torch
 
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, label_contacts, yaw_matrix
-from steadypose.prior.models.contacts.features import FEATURES, OF_JOINT, contact_features
-from steadypose.prior.models.contacts.inference import LiveContacts
-from steadypose.prior.models.contacts.network import ContactConfig, ContactNet
-from steadypose.prior.models.torch_weights import arrays_of
+from steadypose.prior.models.contacts import FEATURES, OF_JOINT, LiveContacts, contact_features
 from steadypose.prior.sim.scripts import walk_turn
+from steadypose.training.networks.contacts import ContactConfig, ContactNet
+from steadypose.training.weights import arrays_of
 
 DT = 1 / 30
 FEET = slice(2, 6)

@@ -7,7 +7,7 @@ from tests.helpers.values import gated
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import MIRROR, J
 from steadypose.prior.clean.correct import Correct, CorrectSettings
-from steadypose.prior.models.sensor_bias.features import (
+from steadypose.prior.models.sensor_bias import (
     FEATURES,
     HISTORY,
     CorrectionConfig,
@@ -15,7 +15,7 @@ from steadypose.prior.models.sensor_bias.features import (
     recall,
     trunk_frame,
 )
-from steadypose.prior.models.sensor_bias.network import CorrectionNet, mirror_features
+from steadypose.training.networks.sensor_bias import CorrectionNet, mirror_features
 
 CAMERA = np.array([-3.0, 0.5, 1.2])
 

@@ -11,16 +11,17 @@ from tests.helpers.bodies import waving
 from tests.prior.models.test_hmvae import prepared
 
 from steadypose.prior.body.skeleton import J
+from steadypose.prior.fit.torch_weights import load_tensors
 from steadypose.prior.models.hgvae.config import CompletionConfig, HGVAEConfig, Level
-from steadypose.prior.models.hgvae.faults import load_fault_net
 from steadypose.prior.models.hgvae.features import from_tracks, hang_unseen, in_frame_of, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
-from steadypose.prior.models.hgvae.network import HGVAE, Gaussian, dct_matrix
-from steadypose.prior.models.hgvae.train import train_hgvae
-from steadypose.prior.models.layers.graph import GraphBlock, GraphLinear
-from steadypose.prior.models.torch_weights import arrays_of, load_tensors
-from steadypose.prior.models.training import TrainingOptions
-from steadypose.prior.models.weights_io import WEIGHTS
+from steadypose.prior.models.weights import WEIGHTS
+from steadypose.training.loop import TrainingOptions
+from steadypose.training.networks.graph import GraphBlock, GraphLinear
+from steadypose.training.networks.hgvae import HGVAE, Gaussian, dct_matrix
+from steadypose.training.networks.hgvae_faults import load_fault_net
+from steadypose.training.recipes.hgvae import train_hgvae
+from steadypose.training.weights import arrays_of
 
 SMALL = HGVAEConfig(
     frames=12,
@@ -210,10 +211,10 @@ def test_the_gradient_of_the_live_score_is_that_of_its_differences() -> None:
 
 
 def test_training_writes_weights_their_card_and_their_scale(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("steadypose.prior.models.weights_io.WEIGHTS", tmp_path / "weights")
+    monkeypatch.setattr("steadypose.prior.models.weights.WEIGHTS", tmp_path / "weights")
     config = replace(SMALL, frames=20)
-    monkeypatch.setattr("steadypose.prior.models.hgvae.train.MODELS", {"hgvae": config})
-    monkeypatch.setattr("steadypose.prior.models.hgvae.train_faults.WINDOWS", 16)
+    monkeypatch.setattr("steadypose.training.recipes.hgvae.MODELS", {"hgvae": config})
+    monkeypatch.setattr("steadypose.training.recipes.hgvae_faults.WINDOWS", 16)
     path = train_hgvae(TrainingOptions(prepared(tmp_path / "m.npz"), tmp_path / "runs", iterations=2))
     state, stored = load_tensors(str(path), "hgvae")
     HGVAE(HGVAEConfig.from_dict(stored)).load_state_dict(state)

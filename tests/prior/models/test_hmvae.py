@@ -11,22 +11,17 @@ from tests.helpers.bodies import waving
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.clean.refine import rotations_of
+from steadypose.prior.fit.hmvae_network import HMVAE, Posterior
+from steadypose.prior.fit.skeleton_conv import SkeletonConv
+from steadypose.prior.fit.torch_kinematics import forward_kinematics, from_6d, remove_heading, to_6d, yaw_rotation
+from steadypose.prior.fit.torch_weights import load_tensors
 from steadypose.prior.models.hmvae.config import HMVAEConfig
 from steadypose.prior.models.hmvae.inference import LiveHMVAE
-from steadypose.prior.models.hmvae.network import HMVAE, Posterior
-from steadypose.prior.models.hmvae.train import SHORT, train_hmvae
-from steadypose.prior.models.layers.skeleton_conv import SkeletonConv
-from steadypose.prior.models.layers.torch_kinematics import forward_kinematics, from_6d, to_6d
-from steadypose.prior.models.torch_weights import arrays_of, load_tensors
-from steadypose.prior.models.training import TrainingOptions
-from steadypose.prior.models.weights_io import WEIGHTS, load_weights
-from steadypose.prior.motion.dataset import (
-    MotionSet,
-    mirror_offsets,
-    mirror_rotations,
-    remove_heading,
-    yaw_rotation,
-)
+from steadypose.prior.models.weights import WEIGHTS, load_weights
+from steadypose.training.data.dataset import MotionSet, mirror_offsets, mirror_rotations
+from steadypose.training.loop import TrainingOptions
+from steadypose.training.recipes.hmvae import SHORT, train_hmvae
+from steadypose.training.weights import arrays_of
 
 
 def random_rotations(*shape: int) -> torch.Tensor:
@@ -155,8 +150,8 @@ def test_a_missing_split_and_a_missing_file_are_said(tmp_path: Path) -> None:
 
 
 def test_training_resumes_where_it_was_killed_and_ends_the_same(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("steadypose.prior.models.weights_io.WEIGHTS", tmp_path / "weights")
-    monkeypatch.setattr("steadypose.prior.models.hmvae.train.SHORT", replace(SHORT, batch=4))
+    monkeypatch.setattr("steadypose.prior.models.weights.WEIGHTS", tmp_path / "weights")
+    monkeypatch.setattr("steadypose.training.recipes.hmvae.SHORT", replace(SHORT, batch=4))
     data = prepared(tmp_path / "m.npz")
     whole = train_hmvae(TrainingOptions(data, tmp_path / "a", iterations=6)).read_bytes()
 

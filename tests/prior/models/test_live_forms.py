@@ -7,15 +7,13 @@ import pytest
 import torch
 from tests.prior.models.test_hgvae import awake
 
-from steadypose.prior.models.hgvae.completion_inference import LiveCompletion
 from steadypose.prior.models.hgvae.config import FaultNetConfig
-from steadypose.prior.models.hgvae.fault_features import fault_features
-from steadypose.prior.models.hgvae.fault_inference import LiveFaultNet
-from steadypose.prior.models.hgvae.faults import FaultNet
-from steadypose.prior.models.sensor_bias.features import FEATURES, CorrectionConfig
-from steadypose.prior.models.sensor_bias.inference import LiveCorrection
-from steadypose.prior.models.sensor_bias.network import CorrectionNet
-from steadypose.prior.models.torch_weights import arrays_of
+from steadypose.prior.models.hgvae.live_completion import LiveCompletion
+from steadypose.prior.models.hgvae.live_faults import LiveFaultNet, fault_features
+from steadypose.prior.models.sensor_bias import FEATURES, CorrectionConfig, LiveCorrection
+from steadypose.training.networks.hgvae_faults import FaultNet
+from steadypose.training.networks.sensor_bias import CorrectionNet
+from steadypose.training.weights import arrays_of
 
 SEEDS = pytest.mark.parametrize("seed", range(5))
 

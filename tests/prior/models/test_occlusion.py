@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.helpers.bodies import waving
 
-from steadypose.benchmarks.peers.beside import beside
+from steadypose.benchmarks.baselines.beside import beside
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.occluded import OccludedJoints
 from steadypose.prior.models.occlusion.candidates import FEATURES
 from steadypose.prior.models.occlusion.inference import SIGMA_SCALE, LiveOcclusion, Occluded, Weighed
-from steadypose.prior.models.occlusion.network import OcclusionConfig, OcclusionNet
-from steadypose.prior.models.torch_weights import arrays_of
+from steadypose.training.networks.occlusion import OcclusionConfig, OcclusionNet
+from steadypose.training.weights import arrays_of
 
 Floats = NDArray[np.float64]
 
@@ -112,6 +113,22 @@ def test_a_joint_never_seen_is_where_the_completion_has_it_on_average_and_goes_w
     assert not asked.rows
     shake = np.diff(off[10:], axis=0).std()
     assert shake < 0.01, "of 0.028, what differs from frame to frame in the completion"
+
+
+def test_a_leg_that_was_never_seen_is_stated_a_fifth_less_sure_and_one_seen_in_part_is_not() -> None:
+    joints, standing = OccludedJoints("default", 1), waving(1)
+    joints.weigher = Asked()
+    left, part = [J[f"left_{name}"] for name in ("knee", "ankle", "foot")], [J["right_ankle"], J["right_foot"]]
+    unseen, sigma, seen = np.zeros((1, 22)), np.full((1, 22), 0.005), standing.copy()
+    for gone in (left, part, ARM[1:]):
+        unseen[:, gone], sigma[:, gone], seen[:, gone] = np.inf, np.inf, np.nan
+    answer = joints.update(
+        np.arange(1), seen, sigma, unseen, np.zeros((1, 22), dtype=bool), standing, np.full((1, 22), 0.05)
+    )
+    assert answer is not None
+    stated = dict(zip(answer.joints[:, 1].tolist(), answer.sigma.tolist(), strict=True))
+    expected = {joint: 0.06 if joint in left else 0.05 for joint in sorted((*left, *part, ARM[1]))}
+    assert stated == {joint: pytest.approx(value) for joint, value in expected.items()}
 
 
 def test_what_was_last_seen_is_forgotten_until_the_completions_deviation_is_stated() -> None:

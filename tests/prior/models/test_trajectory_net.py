@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from steadypose.prior.models.root_velocity.config import TrajectoryConfig
-from steadypose.prior.models.root_velocity.inference import LiveRootVelocity
-from steadypose.prior.models.root_velocity.network import RootMotion, TrajectoryNet
-from steadypose.prior.models.torch_weights import arrays_of
+from steadypose.prior.models.root_velocity import LiveRootVelocity, TrajectoryConfig
+from steadypose.training.networks.root_velocity import RootMotion, TrajectoryNet
+from steadypose.training.weights import arrays_of
 
 
 @pytest.fixture

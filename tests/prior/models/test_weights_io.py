@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from steadypose.prior.models.weights_io import _OTHER_SIZES, _PARTS, WEIGHTS, WeightsError, load_weights
+from steadypose.prior.models.weights import _OTHER_SIZES, _PARTS, WEIGHTS, WeightsError, load_weights
 
 
 def model_of(path: Path) -> str:

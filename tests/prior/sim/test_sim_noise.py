@@ -11,9 +11,6 @@ import pytest
 from scipy.stats import spearmanr
 
 from steadypose.prior.body.skeleton import MIRROR, J
-from steadypose.prior.sim.error_statistics import statistics
-from steadypose.prior.sim.kinect_errors import Clip, align, errors
-from steadypose.prior.sim.kinect_errors import simulate as simulate_clips
 from steadypose.prior.sim.noise import (
     KINECT_NOISE,
     SWAP_GROUPS,
@@ -27,6 +24,9 @@ from steadypose.prior.sim.noise import (
     travelled,
 )
 from steadypose.prior.sim.scripts import SCRIPTS
+from steadypose.training.data.error_statistics import statistics
+from steadypose.training.data.kinect_errors import Clip, align, errors
+from steadypose.training.data.kinect_errors import simulate as simulate_clips
 
 MODEL = NoiseModel.load()
 NO_JUMPS = replace(MODEL, jump_rate=np.zeros(22))

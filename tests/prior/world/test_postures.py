@@ -15,9 +15,9 @@ from steadypose.msgs.types import Tracking
 from steadypose.prior.body.skeleton import J, limbs
 from steadypose.prior.sim.motion import Motion
 from steadypose.prior.sim.scripts import idle, sit_rise, walk_turn
-from steadypose.prior.world.body_track import FEET
-from steadypose.prior.world.ground import STOOD_S
-from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
+from steadypose.prior.world.observe import FEET
+from steadypose.prior.world.pipeline import TrajectoryPipeline
+from steadypose.prior.world.settings import TrajectorySettings
 
 STEP_M, TREAD_M = 0.17, 0.55
 
@@ -86,10 +86,10 @@ def told(name: str, calibrated: bool):
     messages = [replace(m, calibrated=calibrated) for m in observe(clip, np.random.default_rng(0))]
     bodies = [world.bodies[0] for message in messages for world in pipeline.process(message)]
     assert {body.tracking for body in bodies} == {Tracking.OK}
-    ground = pipeline._scenes[messages[0].source].ground
-    levels = [level.height for level in ground.levels if level.stood_s > STOOD_S]
+    scene = pipeline.scene(messages[0].source)
+    assert scene
     seen = np.array([message.bodies[0].positions for message in messages])
-    return clip.positions, seen, np.array([body.positions for body in bodies]), ground.height, levels
+    return clip.positions, seen, np.array([body.positions for body in bodies]), scene.floor.height, scene.floor.levels
 
 
 @pytest.mark.parametrize("calibrated", [True, False])

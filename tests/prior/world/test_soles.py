@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from steadypose.prior.world.soles import AIR_M, EASE_S, SOLE, SOLE_SIGMA, SURPRISE, UNEVEN, Soles
+from steadypose.prior.world.feet import AIR_M, FLOOR_EASE_S, OUTLIER, SOLE_SIGMA, UNEVEN, Soles
+from steadypose.prior.world.observe import SOLE
 
 FLOOR, FOUR = np.zeros(4), np.ones(4)
 DT = 1 / 30
@@ -29,11 +30,11 @@ def test_the_standing_part_is_the_product_of_two_gaussians():
         seen, stand = norm.pdf(grid, SOLE[k] - 0.01, 0.02), norm.pdf(grid, SOLE[k], s)
         total = np.hypot(0.02, s)
         both = seen * stand / (seen * stand).sum()
-        mean, known = (both * grid).sum(), 1 - SURPRISE
+        mean, known = (both * grid).sum(), 1 - OUTLIER
         air = np.hypot(AIR_M, np.sqrt(2 * np.pi) * total)
         weights = np.array([
             known * RESTS[k] * norm.pdf(-0.01, 0, total), known * (1 - RESTS[k]) * norm.cdf(-0.01 / total) / air,
-            SURPRISE / air,
+            OUTLIER / air,
         ])  # fmt: skip
         weights /= weights.sum()
         means = np.array([mean, mean, SOLE[k] - 0.01])
@@ -106,7 +107,7 @@ def test_a_foot_comes_to_the_floor_smoothly():
     soles.settle(SOLE - 0.03, UNSURE, away, 0.0, RESTS, FOUR, DT)
     goal = settle(-0.03)[0]
     off = [np.abs(soles.settle(SOLE - 0.03, UNSURE, FLOOR, 0.0, RESTS, FOUR, DT)[0] - goal).max() for _ in range(10)]
-    np.testing.assert_allclose(off, np.abs(goal - SOLE + 0.03).max() * np.exp(-DT / EASE_S * np.arange(1, 11)))
+    np.testing.assert_allclose(off, np.abs(goal - SOLE + 0.03).max() * np.exp(-DT / FLOOR_EASE_S * np.arange(1, 11)))
 
 
 def test_what_no_foot_tells_is_not_learned():

@@ -8,60 +8,52 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from steadypose.prior.world.standing import (
-    DEADBAND,
-    EASE_S,
-    MOVES,
-    SWAY,
-    SWAYS,
-    VELOCITY_ERROR,
-    StandingFeet,
-    standing_velocity,
-)
+from steadypose.prior.world.compose import MOVES, SWAY, SWAYS, VELOCITY_ERROR, standing_velocity
+from steadypose.prior.world.feet import DEADBAND, EASE_S, StillFeet
 
 DT = 1 / 30
-SIGMA = np.full(2, 0.01)
-RESTS, SWINGS = np.ones(2), np.zeros(2)
+SIGMA = np.full(4, 0.01)
+RESTS, SWINGS = np.ones(4), np.zeros(4)
 
 
 def test_a_foot_that_stands_does_not_follow_what_it_is_uncertain_by():
-    feet, places = StandingFeet(2), np.zeros((2, 3))
+    feet, places = StillFeet(), np.zeros((4, 3))
     wander = 0.3 * DEADBAND * SIGMA[0] * np.sin(np.arange(30))
     published = [feet.update(places + [x, 0.0, 0.0], SIGMA, RESTS, DT) for x in wander]
-    np.testing.assert_allclose(published, np.broadcast_to(published[0], (30, 2, 3)), atol=1e-12)
+    np.testing.assert_allclose(published, np.broadcast_to(published[0], (30, 4, 3)), atol=1e-12)
 
 
 def test_it_is_dragged_along_by_an_estimate_that_goes_on_moving():
-    feet = StandingFeet(2)
-    estimates = np.zeros((30, 2, 3))
+    feet = StillFeet()
+    estimates = np.zeros((30, 4, 3))
     estimates[..., 0] = 0.01 * np.arange(30)[:, None]
     published = [feet.update(places, SIGMA, RESTS, DT) for places in estimates]
     np.testing.assert_allclose(estimates[-1, :, 0] - published[-1][:, 0], DEADBAND * SIGMA, atol=1e-12)
 
 
 def test_a_foot_that_has_lifted_comes_to_its_estimate_smoothly():
-    feet = StandingFeet(2)
-    feet.update(np.zeros((2, 3)), SIGMA, RESTS, DT)
-    place = np.array([[0.004, 0.0, 0.0]] * 2)
+    feet = StillFeet()
+    feet.update(np.zeros((4, 3)), SIGMA, RESTS, DT)
+    place = np.array([[0.004, 0.0, 0.0]] * 4)
     feet.update(place, SIGMA, RESTS, DT)
     off = np.array([np.linalg.norm(feet.update(place, SIGMA, SWINGS, DT) - place, axis=1).max() for _ in range(30)])
     np.testing.assert_allclose(off, 0.004 * np.exp(-DT / EASE_S * np.arange(1, 31)), atol=1e-12)
 
 
 def test_a_foot_of_no_known_place_has_none_and_stands_anew():
-    feet, nowhere = StandingFeet(2), np.full((2, 3), np.nan)
-    feet.update(np.zeros((2, 3)), SIGMA, RESTS, DT)
+    feet, nowhere = StillFeet(), np.full((4, 3), np.nan)
+    feet.update(np.zeros((4, 3)), SIGMA, RESTS, DT)
     assert np.isnan(feet.update(nowhere, SIGMA, RESTS, DT)).all()
-    np.testing.assert_array_equal(feet.update(np.ones((2, 3)), SIGMA, RESTS, DT), np.ones((2, 3)))
+    np.testing.assert_array_equal(feet.update(np.ones((4, 3)), SIGMA, RESTS, DT), np.ones((4, 3)))
 
 
 @settings(max_examples=50)
 @given(seed=st.integers(0, 10_000))
 def test_it_is_never_further_off_than_the_deadband(seed: int):
-    rng, feet = np.random.default_rng(seed), StandingFeet(2)
+    rng, feet = np.random.default_rng(seed), StillFeet()
     for _ in range(20):
-        places, sigma = rng.normal(0.0, 0.02, (2, 3)), rng.uniform(0.0, 0.02, 2)
-        published = feet.update(places, sigma, rng.random(2), DT)
+        places, sigma = rng.normal(0.0, 0.02, (4, 3)), rng.uniform(0.0, 0.02, 4)
+        published = feet.update(places, sigma, rng.random(4), DT)
         assert (np.linalg.norm(published - places, axis=1) <= DEADBAND * sigma + 1e-12).all()
 
 

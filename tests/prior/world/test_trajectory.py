@@ -7,15 +7,18 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.root_drift import METHODS, SEEN_FRAMES, Clip, evaluate_fusion, observe
 from steadypose.msgs.types import CONTACTS, JOINTS, JointState, Pose, PoseClean, PoseWorld, Tracking
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.sim.scripts import walk_turn
-from steadypose.prior.world.body_track import FEET
-from steadypose.prior.world.pipeline import TrajectoryPipeline, TrajectorySettings
-from steadypose.prior.world.soles import SOLE
+from steadypose.prior.world.floor import Floor
+from steadypose.prior.world.observe import FEET, SOLE
+from steadypose.prior.world.pipeline import MAX_SOURCES, TrajectoryPipeline
+from steadypose.prior.world.settings import TrajectorySettings
 
 FRAME_NS = 33_333_333
 
@@ -37,8 +40,8 @@ def stream() -> tuple[PoseClean, ...]:
     return tuple(observe(first, np.random.default_rng(0)))
 
 
-def run(messages, settings: TrajectorySettings | None = None) -> list[PoseWorld]:
-    pipeline = TrajectoryPipeline(settings or TrajectorySettings())
+def run(messages, chosen: TrajectorySettings | None = None) -> list[PoseWorld]:
+    pipeline = TrajectoryPipeline(chosen or TrajectorySettings())
     return [world for message in messages for world in pipeline.process(message)]
 
 
@@ -90,8 +93,8 @@ def test_coasts_while_the_root_is_hidden_and_says_so():
 
 
 def test_lost_when_uncertain_for_long():
-    settings = TrajectorySettings(network=False, contacts=False, lost_sigma=0.2)
-    tracking = [w.bodies[0].tracking for w in run(stream(), settings)]
+    blind = TrajectorySettings(network=False, contacts=False, lost_sigma=0.2)
+    tracking = [w.bodies[0].tracking for w in run(stream(), blind)]
     assert tracking[SEEN_FRAMES + 59] == Tracking.LOST
     assert tracking[SEEN_FRAMES + 60] == Tracking.OK
 
@@ -176,7 +179,7 @@ def test_sensor_pose_that_is_none_is_refused():
     pipeline = TrajectoryPipeline(TrajectorySettings())
     assert pipeline.process(replace(stream()[0], sensor_pose=Pose(np.zeros(3), np.zeros(4)))) == []
     assert pipeline.process(replace(stream()[0], sensor_pose=Pose(np.full(3, np.nan), np.array([0.0, 0, 0, 1])))) == []
-    assert pipeline.counters["sensor pose is not a pose"] == 2
+    assert pipeline.counters["sensor_pose_invalid"] == 2
 
 
 def test_unknown_joints_stay_unknown():
@@ -204,9 +207,9 @@ def test_stamps_that_repeat_or_step_back_are_refused_and_a_restart_is_taken():
         assert pipeline.process(replace(message, stamp_ns=message.stamp_ns + hour))
     assert pipeline.process(replace(stream()[19], stamp_ns=stream()[19].stamp_ns + hour)) == []
     assert pipeline.process(replace(stream()[18], stamp_ns=stream()[18].stamp_ns + hour)) == []
-    assert pipeline.counters["stamp is not after the last"] == 2
+    assert pipeline.counters["stamp_repeated"] == pipeline.counters["stamp_out_of_order"] == 1
     again = [w for m in stream() for w in pipeline.process(m)]
-    assert pipeline.counters["stamps went back: started anew"] == 1
+    assert pipeline.counters["stamp_jumped_back"] == 1
     assert again == run(stream())
 
 
@@ -230,7 +233,7 @@ def test_one_id_twice_in_a_message_is_counted():
     pipeline = TrajectoryPipeline(TrajectorySettings())
     (world,) = pipeline.process(replace(stream()[0], bodies=[stream()[0].bodies[0]] * 2))
     assert len(world.bodies) == 1
-    assert pipeline.counters["body id twice in a message"] == 1
+    assert pipeline.counters["body_id_repeated"] == 1
 
 
 def test_a_jump_is_not_believed_until_it_lasts():
@@ -309,6 +312,34 @@ def test_a_foot_seen_under_the_floor_is_raised_to_it(calibrated: bool, least: fl
 def test_one_that_a_sure_sensor_sees_there_is_not():
     seen, published = standing_low(calibrated=True, sigma=0.002)
     np.testing.assert_allclose(published, seen, atol=2e-3)
+
+
+def test_sources_are_forgotten_beyond_a_limit_the_longest_unheard_first():
+    pipeline = TrajectoryPipeline(TrajectorySettings())
+    for k in range(500):
+        pipeline.process(replace(stream()[0], source=f"camera {k}", bodies=[]))
+        pipeline.process(replace(stream()[0], source="camera 0", stamp_ns=k + 1, bodies=[]))
+    kept = [k for k in range(500) if pipeline.scene(f"camera {k}")]
+    assert kept == [0, *range(501 - MAX_SOURCES, 500)]
+    assert pipeline.counters["source_forgotten"] == 500 - MAX_SOURCES
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_nothing_of_a_body_is_left_in_the_one_that_has_its_id_next(seed: int):
+    """Whatever was observed before the timeout; all but the floor, which bodies share."""
+    rng, pipeline = np.random.default_rng(seed), TrajectoryPipeline(TrajectorySettings())
+    for t in range(12):
+        body = stream()[t].bodies[0]
+        positions = body.positions + rng.normal(0.0, 0.2, (22, 3))
+        positions[rng.random(22) < 0.2] = np.nan
+        fields = {"positions": positions, "state": rng.integers(0, 4, 22).astype(np.uint8), "sigma": rng.random(22)}
+        pipeline.process(changed(stream()[t], fields))
+    scene = pipeline.scene(stream()[0].source)
+    assert scene
+    scene.floor = Floor(calibrated=True)
+    later = [replace(m, stamp_ns=m.stamp_ns + 2 * 10**9) for m in stream()[:12]]
+    assert [w for m in later for w in pipeline.process(m)] == run(later)
 
 
 def test_settings_are_checked():

@@ -1,0 +1,176 @@
+"""Filters that are freely available, as peers.
+
+A peer takes clips side by side, (T, ..., 3) metres with NaN where a joint is missing, and their stamps, and gives each
+frame's answer as it stands ``delay`` frames later; at the end of a clip, with the frames there are. All use the real
+time between frames, where time enters at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, sosfiltfilt
+
+from steadypose.benchmarks.baselines.bank import bank
+from steadypose.benchmarks.baselines.beside import beside
+from steadypose.benchmarks.baselines.kalman import fixed_lag
+from steadypose.benchmarks.baselines.whole_body_bank import whole_body_bank
+from steadypose.prior.timing.fixed_lag import OneEuroFilter
+from steadypose.prior.timing.rate import FPS
+
+Floats = NDArray[np.float64]
+
+OFFLINE = -1
+"""The delay of a method that needs the whole recording."""
+
+_HAMPEL_HALF = 5  # frames to either side, as far as they are known by then
+_HAMPEL_FLOOR = 0.005  # metres: in a still body, a spread of nothing would make every observation an outlier
+_GAUSSIAN_PAST = 12  # frames
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A method and the range of its parameters.
+
+    Attributes:
+        name: in tables.
+        run: (seen, stamps_s, delay, **parameters) to answers of seen's shape.
+        delays: those that it has; None for any.
+        space: lowest and highest of each parameter, searched evenly in its logarithm.
+    """
+
+    name: str
+    run: Callable[..., Floats]
+    delays: tuple[int, ...] | None = None
+    space: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def missing(seen: Floats) -> NDArray[np.bool_]:
+    """(T, ...) of (T, ..., 3)."""
+    return np.asarray(~np.isfinite(seen).all(axis=-1))
+
+
+def raw(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
+    """As it came."""
+    return seen
+
+
+def hold_last(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
+    """The input; a missing joint is held at its last position."""
+    return np.take_along_axis(seen, _last_seen(seen)[..., None], axis=0)
+
+
+def interpolate(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
+    """The input; a missing joint is interpolated linearly if its next observation is at most ``delay`` frames away, and
+    otherwise held."""
+    frames = np.arange(len(seen)).reshape(-1, *[1] * (seen.ndim - 2))
+    gone = missing(seen)
+    last = _last_seen(seen)
+    after = np.minimum.accumulate(np.where(gone, len(seen), frames)[::-1])[::-1]
+    bridged = (after < len(seen)) & ((after - frames <= delay) | (delay == OFFLINE))
+    after = np.where(bridged, after, last)
+    start, end = stamps_s[last], stamps_s[after]
+    share = np.where(after > last, (stamps_s[frames] - start) / np.where(after > last, end - start, 1.0), 0.0)
+    a, b = (np.take_along_axis(seen, index[..., None], axis=0) for index in (last, after))
+    return np.where(gone[..., None], a + share[..., None] * (b - a), seen)
+
+
+def one_euro(seen: Floats, stamps_s: Floats, delay: int, min_cutoff_hz: float, beta: float) -> Floats:
+    """The One-Euro filter (Casiez et al. 2012)."""
+    smoother = OneEuroFilter(min_cutoff_hz, beta)
+    return np.stack([smoother.update(frame, stamp) for frame, stamp in zip(seen, stamps_s, strict=True)])
+
+
+def constant_velocity(seen: Floats, stamps_s: Floats, delay: int, density: float) -> Floats:
+    """Kalman filter of constant velocity; with a delay, its fixed-lag RTS smoother."""
+    return fixed_lag(seen, stamps_s, delay, 2, density)
+
+
+def constant_acceleration(seen: Floats, stamps_s: Floats, delay: int, density: float) -> Floats:
+    """Kalman filter of constant acceleration; with a delay, its fixed-lag RTS smoother."""
+    return fixed_lag(seen, stamps_s, delay, 3, density)
+
+
+def gaussian_hampel(seen: Floats, stamps_s: Floats, delay: int, sigma_s: float, threshold: float) -> Floats:
+    """Mean of the frames around, weighted by a Gaussian of ``sigma_s`` seconds, cut off ``delay`` frames ahead, of
+    what a Hampel filter has cleared of outliers (Pearson et al. 2016)."""
+    cleared = _hampel(seen, delay, threshold)
+    total, weights = np.zeros_like(cleared), np.zeros(seen.shape[:-1])
+    for shift in range(-_GAUSSIAN_PAST, delay + 1):
+        frames, others = _overlap(len(seen), shift)
+        time = (stamps_s[others] - stamps_s[frames]).reshape(-1, *[1] * (seen.ndim - 2))
+        weight = np.where(missing(cleared[others]), 0.0, np.exp(-0.5 * (time / sigma_s) ** 2))
+        total[frames] += weight[..., None] * np.nan_to_num(cleared[others])
+        weights[frames] += weight
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return hold_last(np.where((weights > 0)[..., None], total / weights[..., None], np.nan), stamps_s, delay)
+
+
+def butterworth(seen: Floats, stamps_s: Floats, delay: int, cutoff_hz: float) -> Floats:
+    """Second-order Butterworth, forwards and backwards over the whole clip, gaps interpolated: offline."""
+    answers = np.full(seen.shape, np.nan)
+    filled = interpolate(seen, stamps_s, OFFLINE).reshape(len(seen), -1)
+    flat = answers.reshape(len(seen), -1)
+    ends = len(seen) - np.isfinite(seen).reshape(len(seen), -1)[::-1].argmax(axis=0)
+    sections = butter(2, cutoff_hz, fs=FPS, output="sos")
+    for end in np.unique(ends):
+        these = (ends == end) & np.isfinite(filled[0])
+        if these.any():
+            flat[:end, these] = sosfiltfilt(sections, filled[:end, these], axis=0, padlen=min(15, end - 1))
+    return answers
+
+
+PEERS: tuple[Peer, ...] = (
+    Peer("raw", raw, (0,)),
+    Peer("hold last", hold_last, (0,)),
+    Peer("held beside the body", beside, (0,)),
+    Peer("linear interpolation", interpolate),
+    Peer("One-Euro", one_euro, (0,), {"min_cutoff_hz": (0.1, 10.0), "beta": (0.05, 30.0)}),
+    Peer("Kalman, constant velocity", constant_velocity, None, {"density": (0.002, 50.0)}),
+    Peer("Kalman, constant acceleration", constant_acceleration, None, {"density": (0.05, 5e4)}),
+    Peer("Gaussian + Hampel", gaussian_hampel, None, {"sigma_s": (0.01, 0.4), "threshold": (2.0, 12.0)}),
+    Peer("bank of smoothers", bank),
+    Peer("whole-body bank", whole_body_bank),
+    Peer("Butterworth, offline", butterworth, (OFFLINE,), {"cutoff_hz": (0.5, 12.0)}),
+)
+"""Those without training. With a delay, a Kalman filter is the fixed-lag RTS smoother of its model."""
+
+FILTERS: tuple[Peer, ...] = tuple(peer for peer in PEERS if peer.run not in (hold_last, interpolate, beside))
+"""Where every joint is always given, there are no gaps to fill."""
+
+
+def _last_seen(seen: Floats) -> NDArray[np.intp]:
+    """(T, ...) the frame of each joint's last observation, 0 before the first."""
+    frames = np.arange(len(seen)).reshape(-1, *[1] * (seen.ndim - 2))
+    return np.maximum.accumulate(np.where(missing(seen), 0, frames))
+
+
+def _overlap(frames: int, shift: int) -> tuple[slice, slice]:
+    """The frames t for which t + shift is one too, and these."""
+    start, end = max(0, -shift), max(0, min(frames, frames - shift))
+    return slice(start, end), slice(start + shift, max(0, end + shift))
+
+
+def _hampel(seen: Floats, delay: int, threshold: float) -> Floats:
+    shifts = range(-_HAMPEL_HALF, min(delay, _HAMPEL_HALF) + 1)
+    around = np.full((len(shifts), *seen.shape), np.nan)
+    for row, shift in enumerate(shifts):
+        frames, others = _overlap(len(seen), shift)
+        around[row, frames] = seen[others]
+    median = _median(around)
+    spread = 1.4826 * _median(np.linalg.norm(around - median, axis=-1))
+    off = np.linalg.norm(seen - median, axis=-1)
+    with np.errstate(invalid="ignore"):
+        return np.where((off > threshold * np.maximum(spread, _HAMPEL_FLOOR))[..., None], median, seen)
+
+
+def _median(values: Floats) -> Floats:
+    """Median over the first axis without NaN; sorting is many times faster than numpy's nanmedian."""
+    ordered = np.sort(values, axis=0)
+    count = np.isfinite(values).sum(axis=0)
+    low, high = np.maximum(count - 1, 0) // 2, count // 2
+    high = np.minimum(high, len(values) - 1)
+    return (np.take_along_axis(ordered, low[None], 0)[0] + np.take_along_axis(ordered, high[None], 0)[0]) / 2

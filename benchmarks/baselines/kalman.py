@@ -1,0 +1,140 @@
+"""Kalman filters of a constant derivative with fixed-lag smoothing, over many joints at once.
+
+Written for comparison, as the textbook has it (Bar-Shalom, Li and Kirubarajan 2001, sections 6.2 and 8.6). The smoother
+is the filter of a state that the last positions are part of (Anderson and Moore 1979, section 7.3), which is what
+Rauch, Tung and Striebel's backward sweep over these frames gives.
+"""
+
+from __future__ import annotations
+
+from math import factorial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.prior.compiled import njit
+
+Floats = NDArray[np.float64]
+
+_UNKNOWN = (1e3, 1.0, 5.0)
+"""Standard deviations of a joint never seen: metres, m/s, m/s²."""
+
+
+class Smoothed(NamedTuple):
+    """What a smoother says of (T, N) joints."""
+
+    positions: Floats  # (T, N, 3) metres, each frame's given the measurements up to ``delay`` frames later
+    log_likelihood: Floats  # (T, N) of each measurement, given those before; 0 where there is none, or none before
+
+
+def transition(order: int, step: float) -> Floats:
+    """(n, n) state transition over ``step`` seconds: Taylor's series."""
+    return np.array(
+        [[step ** (j - i) / factorial(j - i) if j >= i else 0.0 for j in range(order)] for i in range(order)]
+    )
+
+
+def process_noise(order: int, step: float) -> Floats:
+    """(n, n) covariance that white noise of unit density on the last derivative adds in ``step`` seconds."""
+    ahead = [order - 1 - i for i in range(order)]
+    return np.array([[step ** (a + b + 1) / (factorial(a) * factorial(b) * (a + b + 1)) for b in ahead] for a in ahead])
+
+
+def fixed_lag(
+    seen: Floats, stamps_s: Floats, delay: int, order: int, density: float, measurement_sigma: float = 0.02
+) -> Floats:
+    """Each frame's estimate, given the measurements up to ``delay`` frames later (those there are, at the end).
+
+    Args:
+        seen: (T, ..., 3) metres, NaN where missing.
+        stamps_s: (T,) seconds.
+        delay: frames.
+        order: 2 for constant velocity, 3 for constant acceleration.
+        density: power spectral density of the noise on the derivative after that: m²/s³ for 2, m²/s⁵ for 3.
+        measurement_sigma: metres.
+
+    Returns:
+        (T, ..., 3); NaN where a joint had not been seen by then.
+    """
+    sigma = np.full(seen.shape[:-1], measurement_sigma)
+    return smooth(seen, stamps_s, delay, order, density, sigma).positions.reshape(seen.shape)
+
+
+def smooth(seen: Floats, stamps_s: Floats, delay: int, order: int, density: float, sigma: Floats) -> Smoothed:
+    """The same with a measurement noise of its own for each observation, ``sigma`` (T, ...) metres; joints in a row."""
+    frames = len(seen)
+    z = np.ascontiguousarray(seen.reshape(frames, -1, 3))
+    steps = np.diff(stamps_s)
+    forward = np.array([transition(order, step) for step in steps]).reshape(-1, order, order)
+    added = np.array([density * process_noise(order, step) for step in steps]).reshape(-1, order, order)
+    variance = np.ascontiguousarray(np.square(sigma).reshape(frames, -1))
+    answers, likelihood = np.full(z.shape, np.nan), np.zeros(z.shape[:2])
+    _smooth(z, variance, forward, added, np.square(_UNKNOWN[:order]), min(delay, frames - 1), answers, likelihood)
+    return Smoothed(answers, likelihood)
+
+
+@njit(cache=True, error_model="numpy")
+def _smooth(z, variance, forward, added, unknown, delay, answers, likelihood):  # pragma: no cover
+    frames, joints, _ = z.shape
+    n, lags = len(unknown), delay + 1
+    place = np.empty((lags, 3))  # of the last frames, by frame number modulo lags
+    cross = np.empty((lags, n))  # their covariance with the newest state
+    state, covariance, ahead = np.empty((n, 3)), np.empty((n, n)), np.empty((n, n))
+    column = np.empty(n)
+    for j in range(joints):
+        state[:] = 0.0
+        covariance[:] = np.diag(unknown)
+        known = False
+        for t in range(frames):
+            if t > 0:
+                f = forward[t - 1]  # upper triangular with ones on the diagonal
+                for i in range(n):
+                    for k in range(i + 1, n):
+                        for axis in range(3):
+                            state[i, axis] += f[i, k] * state[k, axis]
+                for i in range(n):
+                    for k in range(n):
+                        ahead[i, k] = covariance[i, k]
+                        for m in range(i + 1, n):
+                            ahead[i, k] += f[i, m] * covariance[m, k]
+                for i in range(n):
+                    for k in range(n):
+                        covariance[i, k] = ahead[i, k] + added[t - 1, i, k]
+                        for m in range(k + 1, n):
+                            covariance[i, k] += ahead[i, m] * f[k, m]
+                for past in range(min(t, lags)):
+                    for i in range(n):
+                        for k in range(i + 1, n):
+                            cross[past, i] += f[i, k] * cross[past, k]
+            for i in range(n):
+                cross[t % lags, i] = covariance[0, i]
+            for axis in range(3):
+                place[t % lags, axis] = state[0, axis]
+            if np.isfinite(z[t, j, 0]) and np.isfinite(z[t, j, 1]) and np.isfinite(z[t, j, 2]):
+                total = covariance[0, 0] + variance[t, j]
+                a, b, c = z[t, j, 0] - state[0, 0], z[t, j, 1] - state[0, 1], z[t, j, 2] - state[0, 2]
+                if known:
+                    likelihood[t, j] = -1.5 * np.log(total) - 0.5 * (a * a + b * b + c * c) / total
+                known = True
+                for i in range(n):
+                    column[i] = covariance[0, i]
+                for past in range(min(t + 1, lags)):
+                    gain = cross[past, 0] / total
+                    place[past, 0] += gain * a
+                    place[past, 1] += gain * b
+                    place[past, 2] += gain * c
+                    for i in range(n):
+                        cross[past, i] -= gain * column[i]
+                for i in range(n):
+                    gain = column[i] / total
+                    state[i, 0] += gain * a
+                    state[i, 1] += gain * b
+                    state[i, 2] += gain * c
+                    for k in range(n):
+                        covariance[i, k] -= gain * column[k]
+            if known and t >= delay:
+                answers[t - delay, j] = place[(t - delay) % lags]
+        if known:
+            for t in range(max(frames - delay, 0), frames):
+                answers[t, j] = place[t % lags]

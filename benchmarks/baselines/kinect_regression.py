@@ -1,0 +1,187 @@
+"""Peers that learn a Kinect's error from recordings with a reference, trained in seconds.
+
+Both read poses in the frame of the trunk, smoothed by a constant-velocity Kalman filter, and predict a correction of
+the 13 scored joints of that smoother: a ridge regression on one frame (66 inputs), and a temporal convolution over 24
+frames, up to 4 of them ahead, with 64 channels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.linear_model import Ridge
+from torch import Tensor, nn
+
+from steadypose.benchmarks.baselines.kalman import fixed_lag
+from steadypose.benchmarks.metrics import body_frame
+from steadypose.prior.body.kinematics import rigid_alignment
+from steadypose.prior.body.layouts import KINECT22, to_canonical
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.timing.rate import FPS
+
+Floats = NDArray[np.float64]
+
+_FRAMES, _MAX_AHEAD = 24, 4
+_BATCH = 128
+_MIN_SCALE = 0.01  # metres
+_INPUT_NOISE = 0.1  # standard deviations
+_SIDES = str.maketrans("LR", "RL")
+_OTHER_SIDE = [
+    KINECT22.joints.index(name[0].translate(_SIDES) + name[1:] if name[1].isupper() else name)
+    for name in KINECT22.joints
+]
+_CORNERS = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A clip, smoothed.
+
+    Attributes:
+        inputs: (T, 66) metres, joints in the trunk's frame, from the middle of the hips; smoothed with the part
+            of the delay that the regression does not look ahead itself.
+        answer: (T, 13, 3) metres, the scored joints, smoothed with the whole delay.
+        trunk: (T, 3, 3) the trunk's frame in that of the answer.
+    """
+
+    inputs: Floats
+    answer: Floats
+    trunk: Floats
+
+    def corrected(self, missing: Floats) -> Floats:
+        """(T, 13, 3) the answer with (T, 39) in the trunk's frame added."""
+        return self.answer + np.einsum("tab,tjb->tja", self.trunk, missing.reshape(len(missing), -1, 3))
+
+    def missing(self, truth: Floats) -> Floats:
+        """(T, 39) what the answer lacks to the truth, which is first aligned to it as a whole."""
+        rotation, translation = rigid_alignment(truth, self.answer)
+        gap = truth @ rotation.T + translation - self.answer
+        return np.einsum("tba,tjb->tja", self.trunk, gap).reshape(len(gap), -1)
+
+
+def smoothed(clips: Sequence[Floats], scored: Sequence[int], delay: int, ahead: int, density: float) -> list[Smoothed]:
+    """Clips (T, 22, 3) of a Kinect's own joints, ready for a regression of this delay that itself looks ``ahead``."""
+    longest = max(map(len, clips))
+    seen = np.full((longest, len(clips), *clips[0].shape[1:]), np.nan)
+    for number, clip in enumerate(clips):
+        seen[: len(clip), number] = clip
+    stamps = np.arange(longest) / FPS
+    late = fixed_lag(seen, stamps, delay, 2, density)
+    early = late if ahead == 0 else fixed_lag(seen, stamps, delay - ahead, 2, density)
+    result = []
+    for number, clip in enumerate(clips):
+        answer = to_canonical(KINECT22, late[: len(clip), number])[0]
+        result.append(Smoothed(_in_trunk(early[: len(clip), number]), answer[:, list(scored)], _trunk(answer)))
+    return result
+
+
+def _trunk(canonical: Floats) -> Floats:
+    return body_frame(*(canonical[:, J[name]] for name in _CORNERS))
+
+
+def _in_trunk(kinect: Floats) -> Floats:
+    canonical = to_canonical(KINECT22, kinect)[0]
+    hips = (canonical[:, J["left_hip"]] + canonical[:, J["right_hip"]]) / 2
+    return np.einsum("tba,tjb->tja", _trunk(canonical), kinect - hips[:, None]).reshape(len(kinect), -1)
+
+
+def ridge(train: Sequence[Smoothed], truths: Sequence[Floats], penalty: float) -> Callable[[Smoothed], Floats]:
+    """Fit on clips with their truths (T, 13, 3); gives a function from a clip to its answer."""
+    x = np.concatenate([clip.inputs for clip in train])
+    y = np.concatenate([clip.missing(truth) for clip, truth in zip(train, truths, strict=True)])
+    known = np.isfinite(y).all(axis=1)
+    model = Ridge(alpha=penalty).fit(x[known], y[known])
+    return lambda clip: clip.corrected(model.predict(clip.inputs))
+
+
+class TemporalConvolution(nn.Module):
+    """(B, 24, 66) standardised poses to (B, 39), what is missing at one of them, standardised."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Dropout(0.15), nn.Conv1d(66, 64, 8), nn.ReLU(), nn.Dropout(0.3),
+            nn.Conv1d(64, 64, 8), nn.ReLU(), nn.Dropout(0.3),
+            nn.Conv1d(64, 39, 10),
+        )  # fmt: skip
+
+    def forward(self, poses: Tensor) -> Tensor:
+        return self.layers(poses.transpose(1, 2))[..., 0]
+
+
+def temporal_convolution(
+    train: Sequence[Smoothed],
+    truths: Sequence[Floats],
+    mirror: Sequence[int],
+    ahead: int,
+    steps: int,
+    seed: int,
+) -> Callable[[Smoothed], Floats]:
+    """The same by a network.
+
+    Six people are few: half of each batch is mirrored, and a window's joints all lie a little elsewhere.
+
+    Args:
+        train: clips.
+        truths: of them, (T, 13, 3).
+        mirror: for each of the 13 joints, which of them is the other side's.
+        ahead: frames of the window that are later than the one that is answered.
+        steps: of training.
+        seed: of weights and sampling.
+    """
+    torch.manual_seed(seed)
+    rng = np.random.default_rng(seed)
+    windows = torch.cat([_windows(clip, ahead) for clip in train])
+    gaps = np.concatenate([clip.missing(truth) for clip, truth in zip(train, truths, strict=True)])
+    known = np.flatnonzero(np.isfinite(gaps).all(axis=1))
+    targets = torch.from_numpy(gaps).float()
+    # Both sides count, for standardised poses to be mirrored as poses are.
+    poses, errors = windows[known, -1 - ahead], targets[known]
+    poses, errors = torch.cat([poses, _mirrored(poses, _OTHER_SIDE)]), torch.cat([errors, _mirrored(errors, mirror)])
+    mean, scale = poses.mean(dim=0), poses.std(dim=0).clamp(min=_MIN_SCALE)
+    error_mean, error_scale = errors.mean(dim=0), errors.std(dim=0)
+    net = TemporalConvolution()
+    optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3, weight_decay=1e-2)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
+    for _ in range(steps):
+        rows = torch.from_numpy(rng.choice(known, _BATCH))
+        x, y = windows[rows], targets[rows]
+        half = _BATCH // 2
+        x = torch.cat([_mirrored(x[:half], _OTHER_SIDE), x[half:]])
+        y = torch.cat([_mirrored(y[:half], mirror), y[half:]])
+        found = net((x - mean) / scale + _INPUT_NOISE * torch.randn(_BATCH, 1, x.shape[2]))
+        loss = (found * error_scale + error_mean - y).unflatten(1, (-1, 3)).norm(dim=-1).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    net.eval()
+
+    @torch.inference_mode()
+    def answer(clip: Smoothed) -> Floats:
+        missing = net((_windows(clip, ahead) - mean) / scale) * error_scale + error_mean
+        return clip.corrected(missing.double().numpy())
+
+    return answer
+
+
+def look_ahead(delay: int) -> int:
+    """Frames that the convolution looks ahead at a delay; the smoother before it has the rest."""
+    return min(delay, _MAX_AHEAD)
+
+
+def _windows(clip: Smoothed, ahead: int) -> Tensor:
+    """(T, 24, 66), the clip's ends repeated; views of one padded copy."""
+    x = torch.from_numpy(clip.inputs).float()
+    before = x[:1].expand(_FRAMES - 1 - ahead, -1)
+    return torch.cat([before, x, x[-1:].expand(ahead, -1)]).unfold(0, _FRAMES, 1).transpose(1, 2)
+
+
+def _mirrored(vectors: Tensor, other_side: Sequence[int]) -> Tensor:
+    """Vectors (..., 3 J) in the trunk's frame as a mirror across its xz plane shows them."""
+    joints = vectors.unflatten(-1, (-1, 3))[..., list(other_side), :]
+    return (joints * joints.new_tensor([1.0, -1.0, 1.0])).flatten(-2)

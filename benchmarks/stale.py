@@ -1,0 +1,32 @@
+"""Results that stand although the code, weights or settings have changed since, each with the reason."""
+
+BEFORE = "measured before results recorded the code that ran"
+FROZEN = "a finished study, whose code is gone"
+
+STALE = {
+    "calibration": BEFORE,
+    "camera_rates": BEFORE,
+    "completion": BEFORE,
+    "contacts": BEFORE,
+    "depth_lifting": FROZEN,
+    "events": BEFORE,
+    "fuzz": BEFORE,
+    "hgvae": BEFORE,
+    "hidden_joints": BEFORE,
+    "humor": BEFORE,
+    "identity": BEFORE,
+    "importers": FROZEN,
+    "interpolation": BEFORE,
+    "kinect_vicon": BEFORE,
+    "latency": BEFORE,
+    "mediapipe": BEFORE,
+    "memory": BEFORE,
+    "noisy_joints": BEFORE,
+    "reconstruction": BEFORE,
+    "restart": BEFORE,
+    "scale": BEFORE,
+    "simulated": BEFORE,
+    "streaming": BEFORE,
+    "world": BEFORE,
+}
+"""Benchmark: why its figures are kept. `tests/benchmarks/test_report.py` holds this list against the results."""

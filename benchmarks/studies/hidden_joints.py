@@ -1,0 +1,143 @@
+"""Hidden joints: below 0.9 m (HuMoR's occlusion), an arm behind the trunk, limbs away for 0.2 to 2 seconds, and never
+seen.
+
+Seen joints carry 1 cm of noise. But for joints never seen, for which a filter has no answer, each clip begins with half
+a second in which everything is seen. HuMoR scores 43 points on the body's surface; these are 22 joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.benchmarks import figures
+from steadypose.benchmarks.baselines.beside import beside
+from steadypose.benchmarks.baselines.conditional_gaussian import ConditionalGaussian
+from steadypose.benchmarks.baselines.filters import PEERS, Peer
+from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
+from steadypose.benchmarks.ours import OURS
+from steadypose.benchmarks.provenance import VARIANTS
+from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.scores import pivot
+from steadypose.benchmarks.studies.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
+from steadypose.prior.body.skeleton import limbs
+from steadypose.prior.timing.rate import FPS
+
+Floats = NDArray[np.float64]
+
+DEPENDS_ON = VARIANTS
+
+BESIDE = "held beside the body"
+GAUSSIAN = "conditional Gaussian"
+KNOW_THE_BODY = (BESIDE, GAUSSIAN)
+"""Baselines that a filter of each joint is not."""
+
+NOISE = 0.01
+"""Metres."""
+SEEN_FIRST = 15
+"""Frames."""
+BURSTS_S = (0.2, 0.5, 1.0, 2.0)
+
+_LEGS = [joint for leg in limbs(("knee", "ankle", "foot")) for joint in leg]
+_ARM = limbs(("shoulder", "elbow", "wrist"))[0]
+"""What of a body is never seen: behind a counter, or out of the picture."""
+
+
+def _masked(
+    truth: Floats, rng: np.random.Generator, mask: Callable[[Floats, np.random.Generator], NDArray[np.bool_]]
+) -> Floats:
+    hidden = mask(truth, rng)
+    hidden[:SEEN_FIRST] = False
+    return hide(gaussian(truth, NOISE, rng), hidden)
+
+
+def _without(truth: Floats, rng: np.random.Generator, joints: Sequence[int]) -> Floats:
+    seen = gaussian(truth, NOISE, rng)
+    seen[:, :, list(joints)] = np.nan
+    return seen
+
+
+def _burst(truth: Floats, rng: np.random.Generator, seconds: float) -> NDArray[np.bool_]:
+    frames, clips, joints, _ = truth.shape
+    return bursts((frames, clips, joints), round(seconds * FPS), SEEN_FIRST, rng)
+
+
+CONDITIONS: dict[str, Condition] = {
+    "below 0.9 m": partial(_masked, mask=lambda truth, _: below(truth)),
+    "arm behind": partial(_masked, mask=lambda truth, _: arm_behind(truth)),
+    **{f"{s:g} s": partial(_masked, mask=partial(_burst, seconds=s)) for s in BURSTS_S},
+    "legs never": partial(_without, joints=_LEGS),
+    "arm never": partial(_without, joints=_ARM),
+}
+
+
+def run(bench: Bench) -> Result:
+    """Every method in every condition."""
+    clips = bench.clips()
+    kept = ("arm behind", "0.5 s") if bench.quick else tuple(CONDITIONS)
+    gaussian = ConditionalGaussian(bench.training_clips().positions.reshape(-1, 22, 3))
+    peers = (*PEERS, Peer(GAUSSIAN, partial(given_the_seen, gaussian=gaussian), (0,)))
+    data = run_conditions(bench, clips, {name: CONDITIONS[name] for name in kept}, peers)
+    records = data["records"]
+    note = (
+        f"{clips.positions.shape[1]} clips of {len(clips.positions)} frames, 22 joints, 1 cm of noise on those seen; "
+        f"the first {SEEN_FIRST} frames of a clip are seen in full. A duration: one lower arm or leg is away for so "
+        f"long. Never: knees and all below them, or an arm, in no frame of a clip. {GAUSSIAN}: the mean of what is "
+        f"hidden given what is seen, of one Gaussian over training poses; without hips and shoulders, {BESIDE}. {HOW}"
+    )
+    groups = (("hidden", "hidden joints"), ("seen", "seen joints"))
+    tables: list[Table] = [_summary_table(records, note)]
+    tables += [
+        pivot(records, "condition", f"{group}_mm", "hidden_joints" if group == "hidden" else "hidden_joints-seen",
+              f"Hidden joints: error of {text}, mm", note)
+        for group, text in groups
+    ]  # fmt: skip
+    tables.append(
+        pivot(records, "condition", "acceleration_mm", "hidden_joints-acceleration",
+              "Hidden joints: acceleration error of all joints, mm/frame²", note, digits=2)
+    )  # fmt: skip
+    tables.append(calibration_table(data["calibration"], "hidden_joints-calibration"))
+    timed = [
+        {**r, "seconds": float(r["condition"].removesuffix(" s"))} for r in records if r["condition"].endswith(" s")
+    ]
+    pictures = {
+        "hidden_bursts": figures.curves(
+            [r for r in timed if r["delay"] == 4 or r["method"] in ("hold last", "One-Euro")], "seconds",
+            {"hidden_mm": "error of hidden joints, mm", "seen_mm": "error of seen joints, mm"},
+            "a limb is away for, s", "Bursts, delay of at most 4 frames",
+        )
+    }  # fmt: skip
+    bins = reliability_bins(data["calibration"], "steadypose", 4)
+    if bins:
+        pictures["hidden_reliability"] = figures.reliability(bins, "steadypose, delay 4: hidden joints")
+    return Result(tables, {"data": clips.source, **data}, pictures)
+
+
+def given_the_seen(seen: Floats, stamps_s: Floats, delay: int, gaussian: ConditionalGaussian) -> Floats:
+    """The input; a hidden joint at its conditional mean, or held beside the body where that has no frame to be in."""
+    found = gaussian(seen)
+    return np.where(np.isfinite(found), found, beside(seen, stamps_s, delay))
+
+
+def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
+    """The peer nearest to the truth that does not know the body, those that do, and ours: hidden joints, mm."""
+    conditions = list(dict.fromkeys(r["condition"] for r in records))
+    rows: list[list[str]] = []
+    for delay in (0, 4):
+        for name in ("best filter", *KNOW_THE_BODY, "steadypose"):
+            cells = []
+            for condition in conditions:
+                mine = [r for r in records if r["condition"] == condition and 0 <= r["delay"] <= delay]
+                if name == "best filter":
+                    mine = [r for r in mine if r["method"] not in (*OURS, *KNOW_THE_BODY)]
+                else:
+                    mine = [r for r in mine if r["method"] == name and r["delay"] in (delay, 0)][-1:]
+                found = [r["hidden_mm"] for r in mine if "hidden_mm" in r]  # raw has no answer
+                cells.append(f"{min(found):.0f}" if found else "–")
+            rows.append([f"delay {delay}: {name}", *cells])
+    return Table("hidden_joints-summary", "Hidden joints: their error, mm", ["method", *conditions], rows, note)

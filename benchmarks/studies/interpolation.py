@@ -1,0 +1,345 @@
+"""Motion between two ends (HM-VAE, table 2): gaps of 5 to 45 frames, 10 frames known before and one after.
+
+The protocol of LAFAN1 (Harvey et al. 2020) on our motion, with its figures: L2Q of global rotations, L2P of global
+joints by the deviation that each has in training, NPSS. LAFAN1 itself is not our data, and its figures are of other
+motion on another skeleton; what can be compared is the ratio to slerp's and lerp's. Of a few clips, HM-VAE is searched
+too, as in the paper's section 4. Also paths: of wrists and ankles (figure 4), and of the root (figure 5): interpolated,
+completed, and integrated from the body's motion.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from steadypose.benchmarks.baselines import inbetween
+from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.metrics import contact_speed, npss, quaternion_distance
+from steadypose.benchmarks.motion import MotionClips, as_set, prepared_set
+from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.scores import interval
+from steadypose.prior.body.inverse_kinematics import place_joints
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, global_rotations, heading, quaternions, yaw_matrix
+from steadypose.prior.body.skeleton import JOINTS, J
+from steadypose.prior.complete.body import Fill
+from steadypose.prior.complete.parts import PartsCompleter
+from steadypose.prior.complete.root_path import bridge
+from steadypose.prior.fit.optimise import Optimiser
+from steadypose.prior.models.completer.inference import LiveCompleter
+from steadypose.prior.models.root_velocity import LiveRootVelocity
+from steadypose.training.data.dataset import MotionSet
+
+Floats = NDArray[np.float64]
+
+DEPENDS_ON = ("completer weights", "trajectory weights", "hmvae64 weights")
+
+GAPS = (5, 15, 30, 45)
+BEFORE, AFTER = 10, 1
+SEARCHED = 8
+"""Clips on which HM-VAE is searched, which takes seconds for each."""
+FRAMES = BEFORE + max(GAPS) + AFTER
+
+_FEET = [k for k, joint in enumerate(CONTACT_JOINTS) if JOINTS[joint].endswith(("ankle", "foot"))]
+_FOOT_JOINTS = [CONTACT_JOINTS[k] for k in _FEET]
+
+
+class Truth(NamedTuple):
+    """C clips of T frames, with the gap to be filled.
+
+    Attributes:
+        positions: (C, T, 22, 3) metres.
+        rotations: (C, T, 22, 3, 3) local.
+        offsets: (C, 22, 3) metres, bones.
+        contacts: (C, T, 8) of `CONTACT_JOINTS`.
+        gap: its frames.
+    """
+
+    positions: Floats
+    rotations: Floats
+    offsets: Floats
+    contacts: NDArray[np.bool_]
+    gap: slice
+
+    @classmethod
+    def of(cls, clips: MotionClips, gap: int) -> Truth:
+        """The first frames of clips, with joints placed by forward kinematics."""
+        rows = slice(0, BEFORE + gap + AFTER)
+        rotations = clips.rotations[rows].swapaxes(0, 1)
+        joints = place_joints(rotations, clips.offsets[:, None]) + clips.positions[rows].swapaxes(0, 1)[:, :, :1]
+        contacts = clips.contacts[rows].swapaxes(0, 1)
+        return cls(joints, rotations, clips.offsets, contacts, slice(BEFORE, BEFORE + gap))
+
+    def some(self, count: int) -> Truth:
+        """``count`` of the clips, spread evenly."""
+        clips = np.unique(np.linspace(0, len(self.offsets) - 1, count).round().astype(int))
+        return Truth(self.positions[clips], self.rotations[clips], self.offsets[clips], self.contacts[clips], self.gap)
+
+    @property
+    def given(self) -> Floats:
+        """(C, T, 22, 3) metres, the joints, NaN in the gap."""
+        given = self.positions.copy()
+        given[:, self.gap] = np.nan
+        return given
+
+
+def run(bench: Bench) -> Result:
+    """Every method over every gap."""
+    clips = bench.clips(FRAMES, 96)
+    train = prepared_set(bench.data, "train") if bench.data.is_file() else as_set(bench.training_clips())
+    deviation = place_deviation(train)
+    completer = LiveCompleter.load("default")
+    methods: dict[str, inbetween.InBetween] = {
+        "zero velocity": inbetween.zero_velocity,
+        "slerp and lerp": inbetween.slerp_and_lerp,
+        "cubic spline": inbetween.cubic_spline,
+        "nearest training window": inbetween.NearestWindow(train),
+        "completer": lambda positions, rotations, offsets: completer(positions, offsets),
+    }
+    records: list[dict[str, Any]] = []
+    for gap in bench.progress.track(GAPS, description="interpolation"):
+        truth = Truth.of(clips, gap)
+        records.append(
+            {"method": "truth", "gap": gap, **measure(truth, truth.rotations, truth.positions[:, :, 0], deviation)}
+        )
+        for name, method in methods.items():
+            rotations, root = method(truth.given, truth.rotations, truth.offsets)
+            records.append({"method": name, "gap": gap, **measure(truth, rotations, root, deviation)})
+    relate(records)
+    searches = search(bench, clips, completer, deviation)
+    paths = root_paths(clips, completer)
+    source = {**clips.source, "gaps": GAPS, "known before and after": (BEFORE, AFTER)}
+    figures = {"interpolation_paths": draw_paths(bench, completer)}
+    return Result(
+        [
+            _table(records, len(clips.offsets)),
+            _search_table(searches),
+            _paths_table(paths, len(clips.offsets)),
+        ],
+        {"data": source, "records": records, "searches": searches, "root paths": paths},
+        figures,
+    )
+
+
+def place_deviation(train: MotionSet, windows: int = 4000) -> Floats:
+    """(22, 3) metres: standard deviations of joints over training windows, in the root's frame before a gap."""
+    rows = train.all_windows(FRAMES, 7)
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, windows).round().astype(int))]
+    joints = train.positions[rows].double().numpy()
+    turn = yaw_matrix(heading(train.rotations[rows[:, BEFORE - 1], 0].double().numpy()))
+    origin = joints[:, BEFORE - 1, None, :1] * [1.0, 1.0, 0.0]
+    return ((joints - origin) @ turn[:, None]).std(axis=(0, 1))
+
+
+def measure(truth: Truth, rotations: Floats, root: Floats, deviation: Floats) -> dict[str, Any]:
+    """Figures of an answer in the gap; accelerations across its ends.
+
+    Args:
+        truth: C clips of T frames.
+        rotations: (C, T, 22, 3, 3) local, the answer's.
+        root: (C, T, 3) metres, the answer's.
+        deviation: (22, 3) metres, as of `place_deviation`, by which L2P is normalised.
+    """
+    joints = place_joints(rotations, truth.offsets[:, None]) + root[:, :, None]
+    gap = truth.gap
+    around = slice(gap.start - 2, gap.stop + AFTER)
+    turned = [quaternions(global_rotations(np.asarray(r[:, gap]))) for r in (rotations, truth.rotations)]
+    l2q = np.stack([quaternion_distance(a, b) for a, b in zip(*turned, strict=True)]).mean(axis=1)
+    turn = yaw_matrix(heading(truth.rotations[:, gap.start - 1, 0]))[:, None]
+    off = (joints - truth.positions)[:, gap] @ turn / deviation
+    l2p = np.sqrt((off**2).sum(axis=(-1, -2))).mean(axis=1)
+    sign = np.where((turned[0] * turned[1]).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    shape = (len(root), gap.stop - gap.start, -1)
+    error = np.linalg.norm(joints - truth.positions, axis=-1)[:, gap].mean(axis=(1, 2))
+    local = np.linalg.norm(
+        (joints - joints[:, :, :1]) - (truth.positions - truth.positions[:, :, :1]), axis=-1
+    )[:, gap].mean(axis=(1, 2))  # fmt: skip
+    bends = [np.linalg.norm(np.diff(x[:, around], n=2, axis=1), axis=-1) for x in (joints, truth.positions)]
+    missed = np.linalg.norm(np.diff((joints - truth.positions)[:, around], n=2, axis=1), axis=-1)
+    stamps = np.arange(gap.stop - gap.start + 2) / 30.0
+    edges = slice(gap.start - 1, gap.stop + 1)
+    skate = [
+        contact_speed(x[edges][:, _FOOT_JOINTS], c[edges][:, _FEET], stamps)
+        for x, c in zip(joints, truth.contacts, strict=True)
+    ]
+    return {
+        "l2q": round(float(l2q.mean()), 4),
+        "l2p": round(float(l2p.mean()), 4),
+        "npss": round(npss((sign * turned[0]).reshape(shape), turned[1].reshape(shape)), 4),
+        "position_mm": round(float(error.mean()) * 1e3, 2),
+        "position_ci_mm": interval(error),
+        "local_mm": round(float(local.mean()) * 1e3, 2),
+        "own_acceleration_mm": round(float(bends[0].mean()) * 1e3, 3),
+        "acceleration_mm": round(float(missed.mean()) * 1e3, 3),
+        "skate_m_s": round(float(np.nanmean(np.stack(skate))), 4),
+        "clips": len(root),
+    }
+
+
+def relate(records: list[dict[str, Any]]) -> None:
+    """Add to each record the ratios of its errors to slerp's and lerp's, and of its acceleration to the truth's."""
+    for record in records:
+        line, true = (
+            next(r for r in records if r["gap"] == record["gap"] and r["method"] == name)
+            for name in ("slerp and lerp", "truth")
+        )
+        for key in ("l2q", "l2p"):
+            record[f"{key}_of_line"] = round(record[key] / line[key], 3)
+        record["acceleration_of_true"] = round(record["own_acceleration_mm"] / true["own_acceleration_mm"], 3)
+
+
+def search(bench: Bench, clips: MotionClips, completer: LiveCompleter, deviation: Floats) -> list[dict[str, Any]]:
+    """Section 4 beside its start, on `SEARCHED` clips, from the completer's answer or from random latents."""
+    parts = PartsCompleter(completer)
+    fills: dict[str, Fill] = {
+        "completer": completer,
+        "HM-VAE searched from there": Optimiser.load("default", parts),
+        "HM-VAE searched from random latents": Optimiser.load("default", parts, seed=0),
+    }
+    records: list[dict[str, Any]] = []
+    for gap in bench.progress.track(GAPS[-1:] if bench.quick else GAPS, description="search"):
+        truth = Truth.of(clips, gap).some(1 if bench.quick else SEARCHED)
+        line = inbetween.slerp_and_lerp(truth.given, truth.rotations, truth.offsets)
+        for name, poses in (("truth", (truth.rotations, truth.positions[:, :, 0])), ("slerp and lerp", line)):
+            records.append({"method": name, "gap": gap, **measure(truth, *poses, deviation)})
+        for name, fill in fills.items():
+            began = time.process_time()
+            answer = fill(truth.given, truth.offsets)
+            seconds = (time.process_time() - began) / len(truth.offsets)
+            records.append(
+                {"method": name, "gap": gap, **measure(truth, *answer, deviation), "seconds": round(seconds, 2)}
+            )
+    relate(records)
+    return records
+
+
+def root_paths(clips: MotionClips, completer: LiveCompleter) -> list[dict[str, Any]]:
+    """Errors of the root in gaps: by lerp, completed, and integrated from the motion of the completed or true body."""
+    network = LiveRootVelocity.load("default")
+    records = []
+    for gap in GAPS:
+        truth = Truth.of(clips, gap)
+        rotations, completed = completer(truth.given, truth.offsets)
+        _, line = inbetween.slerp_and_lerp(truth.given, truth.rotations, truth.offsets)
+
+        def read(poses: Floats, truth: Truth = truth) -> Floats:
+            roots = truth.positions[:, :, 0].copy()
+            inside = slice(truth.gap.start - 1, truth.gap.stop + 1)
+            for clip, (turned, bones) in enumerate(zip(poses, truth.offsets, strict=True)):
+                joints = place_joints(turned, bones)
+                roots[clip, inside] = bridge(network, joints, turned[:, 0], roots[clip, inside])
+            return roots
+
+        ways = {
+            "line": line, "completer": completed, "root velocity of the body completed": read(rotations),
+            "root velocity of the true body": read(truth.rotations),
+        }  # fmt: skip
+        for name, way in ways.items():
+            error = np.linalg.norm(way - truth.positions[:, :, 0], axis=-1)[:, truth.gap].mean(axis=1)
+            records.append({"method": name, "gap": gap, "root_mm": round(float(error.mean()) * 1e3, 2)})
+    return records
+
+
+def _table(records: list[dict[str, Any]], clips: int) -> Table:
+    columns: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
+        "l2q": ("L2Q", lambda r: f"{r['l2q']:.3f}"),
+        "l2q_of_line": ("of slerp's", lambda r: f"{r['l2q_of_line']:.2f}"),
+        "l2p": ("L2P", lambda r: f"{r['l2p']:.3f}"),
+        "l2p_of_line": ("of lerp's", lambda r: f"{r['l2p_of_line']:.2f}"),
+        "npss": ("NPSS", lambda r: f"{r['npss']:.3f}"),
+        "position": ("MPJPE, mm", lambda r: f"{r['position_mm']:.1f}"),
+        "local": ("about the root, mm", lambda r: f"{r['local_mm']:.1f}"),
+        "acceleration": ("acceleration, of the true", lambda r: f"{r['acceleration_of_true']:.2f}"),
+        "missed": ("its error, mm/frame²", lambda r: f"{r['acceleration_mm']:.2f}"),
+        "skate": ("feet that stand, m/s", lambda r: f"{r['skate_m_s']:.3f}"),
+    }
+    rows = sorted(records, key=lambda r: r["gap"])
+    return Table(
+        name="interpolation",
+        title="Motion in gaps, 10 frames known before and one after (HM-VAE, table 2)",
+        columns=["method", "gap, frames", *(text for text, _ in columns.values())],
+        rows=[[r["method"], str(r["gap"]), *(cell(r) for _, cell in columns.values())] for r in rows],
+        note=(
+            f"{clips} clips, spread evenly over the sources. On LAFAN1, which is other motion on another skeleton, the "
+            "two-stage transformer of Qin et al. 2022 has 0.45, 0.46, 0.56 and 0.70 of slerp's L2Q at 5, 15, 30 and 45 "
+            "frames, and 0.28, 0.32, 0.39 and 0.49 of lerp's L2P; HM-VAE 1.09, 0.87, 0.96 and 1.00 of slerp's."
+        ),
+    )
+
+
+def _search_table(records: list[dict[str, Any]]) -> Table:
+    rows = [r for r in sorted(records, key=lambda r: r["gap"]) if r["method"] != "truth"]
+    return Table(
+        name="interpolation-search",
+        title="HM-VAE of 64 frames searched for a motion that meets what is known (HM-VAE, section 4)",
+        columns=[
+            "method", "gap, frames", "L2Q", "of slerp's", "MPJPE, mm", "about the root, mm",
+            "acceleration, of the true", "s a clip",
+        ],
+        rows=[
+            [
+                r["method"], str(r["gap"]), f"{r['l2q']:.3f}", f"{r['l2q_of_line']:.2f}", f"{r['position_mm']:.1f}",
+                f"{r['local_mm']:.1f}", f"{r['acceleration_of_true']:.2f}",
+                f"{r['seconds']:.2f}" if "seconds" in r else "",
+            ]
+            for r in rows
+        ],
+        note=f"{rows[0]['clips']} of the clips; equation 14 over the latents, then equation 15 over the decoder too.",
+    )  # fmt: skip
+
+
+def _paths_table(records: list[dict[str, Any]], clips: int) -> Table:
+    names = dict.fromkeys(r["method"] for r in records)
+    found = {(r["method"], r["gap"]): f"{r['root_mm']:.1f}" for r in records}
+    return Table(
+        name="interpolation-paths",
+        title="The root's way in gaps, mm (HM-VAE, figure 5)",
+        columns=["method", *(f"{gap} frames" for gap in GAPS)],
+        rows=[[name, *(found[name, gap] for gap in GAPS)] for name in names],
+        note=f"{clips} clips. Root velocities are summed up, and the way is made to meet both ends.",
+    )
+
+
+KEY_FRAMES = (30, 15, 5)
+"""Intervals of key frames in the picture, as in the paper's figure 4."""
+
+
+def draw_paths(bench: Bench, completer: LiveCompleter) -> Figure:
+    """Left wrist and right ankle about the root, from the side, of the farthest travelling clip, by key frames."""
+    clip = bench.clips(91, 24).farthest(1)
+    rotations, offsets = clip.rotations[:, 0], clip.offsets[0]
+    true = place_joints(rotations, offsets)
+    root = clip.positions[:, 0, 0]
+    turn = yaw_matrix(heading(rotations[:, 0]))
+    figure = Figure(figsize=(13, 4.4), layout="constrained")
+    for axis, step in zip(figure.subplots(1, len(KEY_FRAMES)), KEY_FRAMES, strict=True):
+        given = (true + root[:, None])[None].copy()
+        keys = np.arange(len(true)) % step == 0
+        given[:, ~keys] = np.nan
+        line, _ = inbetween.slerp_and_lerp(given, rotations[None], offsets[None])
+        ours = np.concatenate(
+            [
+                completer(given[:, a : b + 1], offsets[None])[0][0, : -1 if b < len(true) - 1 else None]
+                for a, b in zip(range(0, len(true) - 1, 30), range(30, len(true), 30), strict=True)
+            ]
+        )
+        for name, poses, colour in (
+            ("truth", rotations, "#7f7f7f"),
+            ("slerp", line[0], "#4c78a8"),
+            ("completer", ours, "#e45756"),
+        ):
+            joints = (place_joints(poses, offsets)[: len(true)] @ turn)[:, [J["left_wrist"], J["right_ankle"]]]
+            for k in range(2):
+                axis.plot(joints[:, k, 0], joints[:, k, 2], color=colour, lw=1.3, label=name if k == 0 else None)
+        shown = (true @ turn)[keys][:, [J["left_wrist"], J["right_ankle"]]]
+        axis.plot(shown[..., 0].ravel(), shown[..., 2].ravel(), "k.", ms=5)
+        axis.set(title=f"a key frame every {step}", xlabel="forward of the root, m", aspect="equal")
+        axis.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("above the root, m")
+    figure.axes[0].legend(frameon=False, fontsize=8)
+    figure.suptitle("Left wrist (above) and right ankle, from the side (HM-VAE, figure 4)", fontsize=10)
+    return figure

@@ -1,0 +1,221 @@
+"""What is compared on a Kinect: filters, peers that learn, and ours, each for the person who is left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.benchmarks import ours
+from steadypose.benchmarks.baselines import kinect_regression, smoothnet
+from steadypose.benchmarks.baselines.filters import FILTERS, Peer
+from steadypose.benchmarks.bench import Bench, tune
+from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.motion import digest
+from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED, Clip, Floats, side_by_side
+from steadypose.benchmarks.studies.kinect_scoring import quick_score
+from steadypose.benchmarks.tuning import Tuned, loss
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.correct import CorrectSettings
+from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.timing.rate import FPS
+from steadypose.training.loop import TrainingOptions
+from steadypose.training.recipes.sensor_bias import train_correction
+
+RIDGE, RIDGE_PENALTY = "ridge regression", 2200.0
+"""The penalty is what a search on s07 and s08 found, the same at every delay."""
+TCN = "temporal convolution"
+UNKNOWN, KNOWN = "steadypose", "steadypose, sensor known"
+
+
+class Stated(NamedTuple):
+    """Our output for a clip, besides positions."""
+
+    sigma: Floats  # (T, 13) metres
+    anomaly: Floats  # (T,)
+    flagged: NDArray[np.bool_]  # (T,)
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to clean clips, at one delay.
+
+    Attributes:
+        name: in tables.
+        delay: frames.
+        run: clips to (T, 13, 3) metres each, and what ours states of them.
+        parameters: found by tuning.
+    """
+
+    name: str
+    delay: int
+    run: Callable[[Sequence[Clip]], tuple[list[Floats], list[Stated] | None]]
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+def run_filter(clips: Sequence[Clip], run: Callable[[Floats, Floats], Floats]) -> list[Floats]:
+    """A filter's answers for each clip, (T, 13, 3) metres. All clips go through it at once, side by side."""
+    batch = side_by_side([clip.raw for clip in clips])
+    answers = run(batch, np.arange(len(batch)) / FPS)
+    return [answers[: len(clip.raw), number] for number, clip in enumerate(clips)]
+
+
+def run_ours(clips: Sequence[Clip], settings: PriorSettings, delay: int) -> tuple[list[Floats], list[Stated]]:
+    """Each clip, cleaned as by ``steadypose clean --delay K``.
+
+    The command gives the same numbers for each clip alone, but for its last few frames, where a shorter clip ends by
+    absence and not with the stream (0.05 mm of a clip's mean, up to 4 mm in its last frame).
+    """
+    batch = side_by_side([clip.kinect for clip in clips])
+    cleaned = ours.run(settings, batch, np.arange(len(batch)) / FPS, delay, "kinect22")
+    scored = [J[name] for name in SCORED]
+    positions, sigma = cleaned.positions[:, :, scored], cleaned.sigma[:, :, scored]
+    lengths = [len(clip.kinect) for clip in clips]
+    return (
+        [positions[:n, c] for c, n in enumerate(lengths)],
+        [Stated(sigma[:n, c], cleaned.anomaly[:n, c], cleaned.flagged[:n, c]) for c, n in enumerate(lengths)],
+    )
+
+
+@dataclass
+class Kinect:
+    """The methods, with each person left out in turn; what does not depend on the person is computed once.
+
+    Attributes:
+        bench: where this runs.
+        data: ``ui_prmd.npz``.
+        clips: of all people.
+        taught: of all people, the clips that peers learn from.
+    """
+
+    bench: Bench
+    data: Path
+    clips: Sequence[Clip]
+    taught: Sequence[Clip]
+    _answers: dict[tuple[str, int, str], tuple[Floats, Stated]] = field(default_factory=dict)
+
+    def tuned(self, on: Sequence[Clip]) -> dict[tuple[str, int], Tuned]:
+        """One parameter search for each filter and delay on the clips of all people, with figures for each subject."""
+        groups = {subject: [c for c in on if c.subject == subject] for subject in dict.fromkeys(c.subject for c in on)}
+
+        def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
+            answers = dict(zip((c.name for c in on), run_filter(on, _at(peer, delay, parameters)), strict=True))
+            found = {s: quick_score(some, [answers[c.name] for c in some]) for s, some in groups.items()}
+            figures = {f"{s} {key}": value for s, some in found.items() for key, value in some.items()}
+            return {**figures, **{key: _mean(found, key) for key in ("position_mm", "acceleration_mm")}}
+
+        return tune(self.bench, evaluate, "Kinect", FILTERS)
+
+    def methods(self, left_out: str, tuned: Mapping[tuple[str, int], Tuned]) -> Iterator[Method]:
+        """All methods, tuned and trained without this person."""
+        densities: dict[int, float] = {}
+        for (name, delay), search in tuned.items():
+            peer = next(p for p in FILTERS if p.name == name)
+            parameters = best_without(left_out, search, peer)
+            if name == "Kalman, constant velocity":
+                densities[delay] = parameters["density"]
+            yield Method(name, delay, partial(_filtered, run=_at(peer, delay, parameters)), parameters)
+        for delay in self.bench.delays:
+            for net in self.bench.smoothnets:
+                one = partial(_filtered, run=partial(_by_network, net=net, delay=delay))
+                yield Method("SmoothNet-style", delay, one)
+        learners = Learners(
+            [c for c in self.taught if c.subject != left_out], densities, 60 if self.bench.quick else 1000
+        )
+        for delay in self.bench.delays:
+            yield learners.ridge(delay)
+            yield learners.convolution(delay)
+        known = PriorSettings(correct=CorrectSettings(sensor=str(self.correction(left_out))))
+        for delay in self.bench.delays:
+            yield Method(UNKNOWN, delay, partial(self._once, name=UNKNOWN, settings=PriorSettings(), delay=delay))
+            yield Method(KNOWN, delay, partial(run_ours, settings=known, delay=delay))
+
+    def correction(self, left_out: str) -> Path:
+        """The sensor's correction, trained without this person, or found in ``runs`` from an earlier call."""
+        steps = 40 if self.bench.quick else 4000
+        folder = ROOT / "runs" / f"kinect-{digest(self.data)}-{steps}"
+        name = f"correction-without-{left_out}"
+        path = folder / name / f"{name}.safetensors"
+        if not path.is_file():
+            self.bench.progress.stop()  # training draws a bar of its own
+            subjects = tuple(s for s in dict.fromkeys(c.subject for c in self.taught) if s != left_out)
+            train_correction(TrainingOptions(self.data, folder, f"without-{left_out}", steps), subjects)
+            self.bench.progress.start()
+        return path
+
+    def _once(
+        self, clips: Sequence[Clip], name: str, settings: PriorSettings, delay: int
+    ) -> tuple[list[Floats], list[Stated]]:
+        """`run_ours` over the clips of all people, cached."""
+        if (name, delay, clips[0].name) not in self._answers:
+            positions, stated = run_ours(self.clips, settings, delay)
+            for clip, own, sigma in zip(self.clips, positions, stated, strict=True):
+                self._answers[name, delay, clip.name] = own, sigma
+        found = [self._answers[name, delay, clip.name] for clip in clips]
+        return [own for own, _ in found], [sigma for _, sigma in found]
+
+
+def best_without(left_out: str, search: Tuned, peer: Peer) -> dict[str, float]:
+    """Of the points that a search tried, the parameters that are best for the others."""
+    if not search.tried:
+        return search.parameters
+
+    def of_others(point: Mapping[str, float]) -> float:
+        keys = ("position_mm", "acceleration_mm")
+        others = {k: v for k, v in point.items() if k.endswith(keys) and " " in k and not k.startswith(left_out)}
+        return loss({key: float(np.mean([v for k, v in others.items() if k.endswith(key)])) for key in keys})
+
+    winner = min(search.tried, key=of_others)
+    return {name: winner[name] for name in peer.space}
+
+
+class Learners:
+    """The peers that learn from the Kinect beside Vicon; their clips, smoothed once for each delay."""
+
+    def __init__(self, clips: Sequence[Clip], densities: Mapping[int, float], steps: int) -> None:
+        self._densities, self._steps = densities, steps
+        self._truths = [clip.centres for clip in clips]
+        self._lesson = lru_cache(maxsize=1)(partial(self._smoothed, clips))
+
+    def ridge(self, delay: int) -> Method:
+        """The ridge regression, fitted at once."""
+        answer = kinect_regression.ridge(self._lesson(delay, 0), self._truths, RIDGE_PENALTY)
+        return Method(RIDGE, delay, partial(self._run, answer, delay, 0))
+
+    def convolution(self, delay: int) -> Method:
+        """The temporal convolution, trained at once."""
+        ahead = kinect_regression.look_ahead(delay)
+        lesson = self._lesson(delay, ahead)
+        answer = kinect_regression.temporal_convolution(lesson, self._truths, OTHER_SIDE, ahead, self._steps, seed=0)
+        return Method(TCN, delay, partial(self._run, answer, delay, ahead))
+
+    def _run(
+        self, answer: Callable[[kinect_regression.Smoothed], Floats], delay: int, ahead: int, clips: Sequence[Clip]
+    ) -> tuple[list[Floats], None]:
+        return [answer(clip) for clip in self._smoothed(clips, delay, ahead)], None
+
+    def _smoothed(self, clips: Sequence[Clip], delay: int, ahead: int) -> list[kinect_regression.Smoothed]:
+        """Clips as the regressions read them, smoothed as was found best for this delay."""
+        scored = [J[name] for name in SCORED]
+        return kinect_regression.smoothed([clip.kinect for clip in clips], scored, delay, ahead, self._densities[delay])
+
+
+def _at(peer: Peer, delay: int, parameters: Mapping[str, float]) -> Callable[[Floats, Floats], Floats]:
+    return partial(peer.run, delay=delay, **parameters)
+
+
+def _by_network(seen: Floats, stamps_s: Floats, net: smoothnet.SmoothNet, delay: int) -> Floats:
+    return smoothnet.smooth(net, seen, (delay,))[0]
+
+
+def _filtered(clips: Sequence[Clip], run: Callable[[Floats, Floats], Floats]) -> tuple[list[Floats], None]:
+    return run_filter(clips, run), None
+
+
+def _mean(found: Mapping[str, Mapping[str, float]], key: str) -> float:
+    return round(float(np.mean([figures[key] for figures in found.values()])), 3)

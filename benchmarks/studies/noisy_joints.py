@@ -1,0 +1,92 @@
+"""Noisy joints: HuMoR's protocol (90 frames, 4 cm), swept over levels, and noise of the kinds that sensors make.
+
+HuMoR adds independent noise to every joint (Rempe et al. 2021, section 5.2). Independent noise flatters low-pass
+filters: the other conditions have correlated noise, spikes, and exchanged limbs.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.benchmarks import figures
+from steadypose.benchmarks.baselines.filters import FILTERS
+from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.corruption import correlated, gaussian, spiked, swapped
+from steadypose.benchmarks.provenance import VARIANTS
+from steadypose.benchmarks.scores import pivot
+from steadypose.benchmarks.studies.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
+
+Floats = NDArray[np.float64]
+
+DEPENDS_ON = VARIANTS
+
+LEVELS_CM = (1, 2, 4, 8)
+
+
+def _independent(truth: Floats, rng: np.random.Generator, level_cm: int) -> Floats:
+    return gaussian(truth, level_cm / 100, rng)
+
+
+def _lasting(truth: Floats, rng: np.random.Generator) -> Floats:
+    return correlated(truth, 0.02, rng)
+
+
+def _with_spikes(truth: Floats, rng: np.random.Generator) -> Floats:
+    return spiked(gaussian(truth, 0.01, rng), rng)
+
+
+def _with_swaps(truth: Floats, rng: np.random.Generator) -> Floats:
+    return swapped(gaussian(truth, 0.01, rng), rng)
+
+
+def _with_all(truth: Floats, rng: np.random.Generator) -> Floats:
+    return spiked(swapped(correlated(truth, 0.02, rng), rng), rng)
+
+
+CONDITIONS: dict[str, Condition] = {
+    **{f"{level} cm": partial(_independent, level_cm=level) for level in LEVELS_CM},
+    "lasting 2 cm": _lasting,
+    "1 cm, spikes": _with_spikes,
+    "1 cm, swaps": _with_swaps,
+    "lasting 2 cm, spikes, swaps": _with_all,
+}
+"""Standard deviation along an axis; "lasting": correlation 0.9 from a frame to the next."""
+
+
+def run(bench: Bench) -> Result:
+    """Every method in every condition."""
+    clips = bench.clips()
+    kept = ("4 cm", "lasting 2 cm, spikes, swaps") if bench.quick else tuple(CONDITIONS)
+    data = run_conditions(bench, clips, {name: CONDITIONS[name] for name in kept}, FILTERS)
+    records = data["records"]
+    note = f"{clips.positions.shape[1]} clips of {len(clips.positions)} frames, 22 joints. {HOW}"
+    tables = [
+        pivot(records, "condition", "position_mm", "noisy_joints", "Noisy joints: MPJPE, mm", note),
+        pivot(records, "condition", "acceleration_mm", "noisy_joints-acceleration",
+              "Noisy joints: acceleration error, mm/frame² (times 0.9: m/s²)", note, digits=2),
+    ]  # fmt: skip
+    tables.append(calibration_table(data["calibration"], "noisy_joints-calibration"))
+    levels = [
+        {**record, "level": level}
+        for record in records
+        for level in LEVELS_CM
+        if record["condition"] == f"{level} cm" and record["delay"] in (0, 4)
+    ]
+    panels = {"position_mm": "MPJPE, mm", "acceleration_mm": "acceleration error, mm/frame²"}
+    pictures = {
+        "noise_levels": figures.curves(
+            [r for r in levels if r["delay"] == 4 or r["method"] in ("raw", "One-Euro")],
+            "level", panels, "noise, cm", "Noisy joints, delay of at most 4 frames", log=True,
+        ),
+        "noise_delays": figures.curves(
+            [r for r in records if r["condition"] == "4 cm" and r["delay"] >= 0], "delay", panels,
+            "delay, frames", "Noise of 4 cm",
+        ),
+    }  # fmt: skip
+    bins = reliability_bins(data["calibration"], "steadypose", 4)
+    if bins:
+        pictures["noise_reliability"] = figures.reliability(bins, "steadypose, delay 4: noisy joints")
+    return Result(tables, {"data": clips.source, **data}, pictures)

@@ -1,0 +1,214 @@
+"""How joints are turned: orientations on motion whose files have rotations, and the heading from a real Kinect.
+
+Joints of people that nothing was trained on (CMU's 02, DanceDB, LAFAN1; `rotations_truth`) go in with noise; global
+orientations of the 17 joints that carry another are compared. A file's joint at rest is not turned as the canonical
+one: "file" is against the file's orientations after one constant rotation a clip and joint, fitted to the method's own
+answer to the joints without noise (`rotations_scoring.align`). It has the difference of definitions in it, which the
+rows without noise show. "Noise alone" is against that answer itself. The first two seconds of a clip are not scored.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from steadypose.benchmarks import ours
+from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.corruption import correlated, gaussian
+from steadypose.benchmarks.provenance import VARIANTS
+from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.studies.kinect_clips import side_by_side
+from steadypose.benchmarks.studies.rotations_baselines import Baseline, baselines
+from steadypose.benchmarks.studies.rotations_scoring import align, score, spread
+from steadypose.benchmarks.studies.rotations_truth import SCORED, SKIPPED, read
+from steadypose.prior.body.kinematics import global_rotations, heading, rotation_matrices
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.orient import OrientSettings
+from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.models.posture.root import RootCovariance
+from steadypose.prior.timing.rate import FPS
+from steadypose.training.data.ui_prmd import VALIDATION_SUBJECTS, load_pairs
+
+Floats = NDArray[np.float64]
+
+DEPENDS_ON = VARIANTS
+
+DELAY = PriorSettings().delay
+LASTING_S = 0.5
+"""Seconds in which the correlation of noise that lasts falls to 1 / e."""
+PERFECT, AIMED, OURS = "none", "aimed bones", "steadypose"
+METHODS: Mapping[str, PriorSettings] = {
+    AIMED: PriorSettings(orient=OrientSettings(enabled=False)),
+    "HM-VAE, one pass": ours.OURS["HM-VAE"],
+    OURS: PriorSettings(),
+}
+
+
+class _Turned(NamedTuple):
+    """Of one method: orientations (T, C, 17, 3, 3), and the root's covariance (T, C, 3, 3) rad²."""
+
+    orientations: Floats
+    covariance: Floats
+
+
+def run(bench: Bench) -> Result:
+    """Every method in every condition; then the real Kinect."""
+    assert bench.mocap is not None
+    clips = read(bench.mocap, bench.split, 4 if bench.quick else 16)
+    rng, scored = np.random.default_rng(bench.seeds[0]), slice(SKIPPED, None)
+    conditions = {
+        PERFECT: clips.positions,
+        "white, 1 cm": gaussian(clips.positions, 0.01, rng),
+        "white, 2 cm": gaussian(clips.positions, 0.02, rng),
+        "lasting, 2 cm": correlated(clips.positions, 0.02, rng, math.exp(-1.0 / (LASTING_S * FPS))),
+    }
+    roots = baselines(bench.training_clips(), bench.seeds[0])
+    perfect: dict[str, Floats] = {}
+    records: list[dict[str, Any]] = []
+    for condition, seen in bench.progress.track(conditions.items(), description="rotations"):
+        for method, found in _answers(seen, roots).items():
+            own = perfect.setdefault(method, found.orientations)
+            record: dict[str, Any] = {"method": method, "noise": condition}
+            for against, truth in (("noise alone", own), ("file", align(clips.orientations, own))):
+                record[against] = score(found.orientations[scored], truth[scored], clips.positions[scored])
+                record[against]["sources"] = {
+                    source: score(*(part[scored][:, clips.source == source]
+                                    for part in (found.orientations, truth, clips.positions)))["all"]
+                    for source in np.unique(clips.source)
+                }  # fmt: skip
+            record["squared error over variance"] = _ratio(found, own, scored)
+            records.append(record)
+    kinect = _kinect(bench, roots)
+    data = {"clips": {source: int((clips.source == source).sum()) for source in np.unique(clips.source)},
+            "records": records, "kinect": kinect}  # fmt: skip
+    return Result([_table(records, tuple(roots)), _bends(records), _kinect_table(kinect)], data)
+
+
+def _answers(seen: Floats, roots: Mapping[str, Baseline]) -> dict[str, _Turned]:
+    """Of all methods, to joints (T, C, 22, 3)."""
+    found: dict[str, _Turned] = {}
+    joints = seen
+    for name, settings in METHODS.items():
+        cleaned = ours.run(settings, seen, np.arange(len(seen)) / FPS, DELAY)
+        turned = global_rotations(_matrices(cleaned.rotations))[:, :, list(SCORED)]
+        found[name] = _Turned(
+            turned, _covariance(cleaned, turned) if name == OURS else np.full((*turned.shape[:2], 3, 3), np.nan)
+        )
+        joints = cleaned.positions if name == OURS else joints
+    for name, root in roots.items():  # of the root alone, from the joints that ours publishes
+        turned = found[AIMED].orientations.copy()
+        turned[:, :, 0] = root(joints.reshape(-1, 22, 3)).reshape(turned[:, :, 0].shape)
+        found[name] = _Turned(turned, np.full((*turned.shape[:2], 3, 3), np.nan))
+    return found
+
+
+def _covariance(cleaned: ours.Cleaned, turned: Floats) -> Floats:
+    """(T, C, 3, 3) of the roots of orientations (T, C, 17, 3, 3)."""
+    parts = cleaned.positions.reshape(-1, 22, 3), cleaned.sigma.reshape(-1, 22), turned[:, :, 0].reshape(-1, 3, 3)
+    return RootCovariance()(*parts).reshape(turned[:, :, 0].shape)
+
+
+def _matrices(quaternions: Floats) -> Floats:
+    return rotation_matrices(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True))
+
+
+def _ratio(found: _Turned, truth: Floats, scored: slice) -> float:
+    """Mean squared error of the root over the variance stated, an axis: 1 where it is honest."""
+    apart = (truth[scored, :, 0] @ found.orientations[scored, :, 0].swapaxes(-1, -2)).reshape(-1, 3, 3)
+    error, covariance = Rotation.from_matrix(apart).as_rotvec(), found.covariance[scored].reshape(-1, 3, 3)
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    if not known.any():
+        return math.nan
+    white = np.linalg.solve(covariance[known], error[known][..., None])[..., 0]
+    return round(float((error[known] * white).sum(axis=-1).mean()) / 3.0, 3)
+
+
+def _kinect(bench: Bench, roots: Mapping[str, Baseline]) -> dict[str, list[float]]:
+    """Degrees, median and 95th percentile, by which the heading is off that of Vicon's hips and shoulders, each clip's
+    median removed: two systems do not mean the same point by "hip"."""
+    assert bench.mocap is not None
+    pairs = [pair for subject in VALIDATION_SUBJECTS for pair in
+             load_pairs(bench.mocap / "ui_prmd.npz", (subject,))[:: 40 if bench.quick else 6]]  # fmt: skip
+    seen = side_by_side([pair.kinect for pair in pairs])
+    off: dict[str, list[Floats]] = {}
+    for name, settings in METHODS.items():
+        cleaned = ours.run(settings, seen, np.arange(len(seen)) / FPS, DELAY, "kinect22")
+        for clip, pair in enumerate(pairs):
+            length = len(pair.kinect)
+            mine = {name: _matrices(cleaned.rotations[:length, clip, 0])}
+            if name == OURS:
+                mine |= {other: root(cleaned.positions[:length, clip]) for other, root in roots.items()}
+            true = _heading(pair.vicon)
+            for method, turned in mine.items():
+                apart = np.angle(np.exp(1j * (heading(turned) - true)))
+                off.setdefault(method, []).append(apart - np.nanmedian(apart))
+    return {method: spread(np.concatenate(parts)) for method, parts in off.items()}
+
+
+def _heading(vicon: Floats) -> Floats:
+    """(T,) radians, the mean direction of hips and shoulders of joints (T, 22, 3)."""
+    left = np.sum([vicon[:, J[f"left_{part}"]] - vicon[:, J[f"right_{part}"]] for part in ("hip", "shoulder")], axis=0)
+    return np.arctan2(-left[:, 0], left[:, 1])
+
+
+def _pair(values: list[float]) -> str:
+    return f"{values[0]:.1f} / {values[1]:.1f}"
+
+
+def _table(records: list[dict[str, Any]], roots: tuple[str, ...]) -> Table:
+    """A row a condition and method."""
+    rows = []
+    for record in records:
+        alone, against = record["noise alone"], record["file"]
+        whole = record["method"] not in roots
+        ratio = record["squared error over variance"]
+        rows.append(
+            [
+                f"{record['noise']}: {record['method']}",
+                *(_pair(part["all"]) if whole else "" for part in (alone, against)),
+                *(_pair(alone[key]) for key in ("root", "heading", "tilt")), _pair(against["root"]),
+                *(_pair(alone[key]) if whole else "" for key in ("direction", "twist")),
+                f"{alone['turn beyond']:.2f}" if whole else "", f"{alone['root turn beyond']:.2f}",
+                "" if math.isnan(ratio) else f"{ratio:.2f}",
+            ]
+        )  # fmt: skip
+    return Table(
+        "rotations", "Rotations: error of joints' orientations in degrees, median / 95th percentile",
+        ["noise: method", "17 joints", "17 joints, file", "root", "heading", "tilt", "root, file", "direction", "twist",
+         "turn beyond", "root turn beyond", "root², by variance"],
+        rows,
+        "People whom nothing was trained on, delay 4. Against the method's answer to the same joints without noise; "
+        '"file": against the rotations of the file, after one constant rotation a clip and joint. Direction: of bones; '
+        "twist: of hips and shoulders about theirs; turn beyond: degrees a frame beyond the true turn. Details: "
+        "`benchmarks/studies/rotations.py`.",
+    )  # fmt: skip
+
+
+def _bends(records: list[dict[str, Any]]) -> Table:
+    """Twist by how straight a limb is, and all joints by speed."""
+    kept = [record for record in records if record["method"] in METHODS]
+    rows = [
+        [
+            f"{record['noise']}: {record['method']}",
+            *(_pair(record["file"]["by bend"][bend]["twist"]) for bend in ("straight", "half", "bent")),
+            *(_pair(record["file"]["by speed"][speed]) for speed in ("slow", "middling", "fast")),
+        ]
+        for record in kept
+    ]
+    return Table(
+        "rotations-bend", "Rotations by bend of the limb (twist of hips and shoulders) and by speed, degrees, file",
+        ["noise: method", "straight, < 10°", "10 to 30°", "bent", "< 0.5 m/s", "0.5 to 1.5", "faster"], rows,
+    )  # fmt: skip
+
+
+def _kinect_table(kinect: Mapping[str, list[float]]) -> Table:
+    return Table(
+        "rotations-kinect", "Real Kinect: heading in degrees, median / 95th percentile",
+        ["method", "heading"], [[method, _pair(values)] for method, values in kinect.items()],
+        "UI-PRMD's s07 and s08 against the mean of Vicon's hips and shoulders, each clip's median removed, delay 4.",
+    )  # fmt: skip

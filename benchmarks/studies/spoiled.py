@@ -1,0 +1,144 @@
+"""What the protocols on spoiled joints share: conditions over validation motion, every method in each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.benchmarks.baselines.filters import OFFLINE, PEERS, Peer, missing
+from steadypose.benchmarks.bench import Answer, Bench, Methods, answers, over_seeds, tune, tuning_log
+from steadypose.benchmarks.metrics import bootstrap_ratio, position_error, reliability, sigma_ratio
+from steadypose.benchmarks.motion import MotionClips
+from steadypose.benchmarks.ours import OURS
+from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.scores import Scores, figures, pivot, score
+
+Floats = NDArray[np.float64]
+Condition = Callable[[Floats, np.random.Generator], Floats]
+"""Truth (T, C, 22, 3) to what is seen of it."""
+
+TUNED_ON = 3
+"""Peers are tuned on every third of the very clips that are scored, with other noise: this favours them."""
+
+HOW = (
+    "Peers are tuned on every third of these very clips with other noise, each with the same number of evaluations, "
+    "for the least sum of position error (mm) and acceleration error (mm/frame²); steadypose runs as it ships. A "
+    "delayed Kalman filter is a fixed-lag RTS smoother. SmoothNet-style: mean over seeds."
+)
+
+
+def run_conditions(
+    bench: Bench, clips: MotionClips, conditions: Mapping[str, Condition], peers: Sequence[Peer] = PEERS
+) -> dict[str, Any]:
+    """Every method in every condition: records, calibration, what was tried.
+
+    The records carry ``condition``, ``method``, ``delay``, and `figures`; ours, where a peer runs at their delay,
+    also the ratio of their errors to those of the best such peer.
+    """
+    records: list[dict[str, Any]] = []
+    calibration: list[dict[str, Any]] = []
+    tried: dict[str, Any] = {}
+    for number, (name, spoil) in enumerate(conditions.items()):
+        some = clips.every(TUNED_ON)
+        tuning_seen = spoil(some.positions, np.random.default_rng((number, 1)))
+
+        def evaluate(
+            peer: Peer,
+            delay: int,
+            parameters: Mapping[str, float],
+            truth: Floats = some.positions,
+            tuning_seen: Floats = tuning_seen,
+        ) -> dict[str, float]:
+            answer = peer.run(tuning_seen, clips.stamps_s, delay, **parameters)
+            found = figures(score(answer, truth, missing(tuning_seen), align=False))
+            return {key: found[key] for key in ("position_mm", "acceleration_mm")}
+
+        tuned = tune(bench, evaluate, name, peers)
+        tried[name] = tuning_log(tuned)
+        seen = spoil(clips.positions, np.random.default_rng((number, 0)))
+        hidden = missing(seen)
+        scored: list[tuple[Answer, Scores]] = []
+        for answer in answers(bench, seen, clips.stamps_s, tuned, name, Methods.all(bench, peers)):
+            scored.append((answer, score(answer.positions, clips.positions, hidden)))
+            if answer.sigma is not None:
+                error = position_error(answer.positions, clips.positions)
+                row = {"condition": name, "method": answer.method, "delay": answer.delay}
+                calibration.append({**row, **_calibration(error, answer.sigma, hidden)})
+        records += over_seeds([_record(name, *one, scored) for one in scored])
+    return {"records": records, "calibration": calibration, "tuning": tried}
+
+
+def _record(condition: str, answer: Answer, scores: Scores, scored: Sequence[tuple[Answer, Scores]]) -> dict[str, Any]:
+    record: dict[str, Any] = {
+        "condition": condition,
+        "method": answer.method,
+        "delay": answer.delay,
+        "parameters": dict(answer.parameters),
+        **figures(scores),
+    }
+    if answer.method in OURS:
+        record["against_best_peer"] = against_best(answer, scores, scored)
+    return record
+
+
+def against_best(answer: Answer, scores: Scores, scored: Sequence[tuple[Answer, Scores]]) -> dict[str, Any]:
+    """Ratios of errors, with their 95 % intervals over clips, to the best peer that needs no longer delay.
+
+    Best is the one with the least of that very error, so that it may be another peer for each.
+    """
+    rivals = [(a, s) for a, s in scored if a.method not in OURS and a.delay <= answer.delay and a.delay != OFFLINE]
+    ratios: dict[str, Any] = {}
+    for name in ("position", "seen", "hidden", "acceleration_error"):
+        mine = getattr(scores, name)
+        usable = [(a, getattr(s, name)) for a, s in rivals]
+        known = np.isfinite(mine)
+        # a peer that leaves a joint without an answer is not the best at answering
+        usable = [(a, theirs) for a, theirs in usable if known.any() and np.isfinite(theirs[known]).all()]
+        if usable:
+            rival, theirs = min(usable, key=lambda pair: float(pair[1][known].mean()))
+            ratio = bootstrap_ratio(mine[known], theirs[known])
+            ratios[name] = {"peer": f"{rival.method}, delay {rival.delay}", "ratio": [round(v, 4) for v in ratio]}
+    return ratios
+
+
+def _calibration(error: Floats, sigma: Floats, hidden: NDArray[np.bool_]) -> dict[str, Any]:
+    """Error found by standard deviation stated, for seen and hidden joints, and the points of a reliability plot."""
+    return {
+        group: {
+            "ratio": round(sigma_ratio(error[mask], sigma[mask]), 3),
+            "bins_m": reliability(error[mask], sigma[mask]),
+        }
+        for group, mask in (("seen", ~hidden), ("hidden", hidden))
+        if mask.any()
+    }
+
+
+def reliability_bins(calibration: Sequence[Mapping[str, Any]], method: str, delay: int) -> dict[str, Any]:
+    """Of one method, the points of the reliability plot by condition and group."""
+    return {
+        f"{row['condition']}, {group}": row[group]["bins_m"]
+        for row in calibration
+        if (row["method"], row["delay"]) == (method, delay)
+        for group in ("seen", "hidden")
+        if group in row
+    }
+
+
+def calibration_table(calibration: Sequence[Mapping[str, Any]], name: str) -> Table:
+    """Error found by standard deviation stated: of seen joints, and after a stroke of hidden ones, by condition."""
+    records = [
+        {**row, "cell": " / ".join(f"{row[group]['ratio']:.2f}" for group in ("seen", "hidden") if group in row)}
+        for row in calibration
+    ]
+    hidden = any("hidden" in row for row in calibration)
+    return pivot(
+        records,
+        "condition",
+        "cell",
+        name,
+        "Error found by standard deviation stated" + (": seen / hidden joints" if hidden else ""),
+        "Root mean square of their ratio along an axis: 1 is honest, above is too sure of itself.",
+    )

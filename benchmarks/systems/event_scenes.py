@@ -1,0 +1,254 @@
+"""Simulated scenes in which people do what `prior.events` tells, with the truth of when.
+
+Onsets are of the true motion, which no noise touches, by measures of their own where there are such: the script's
+times for waving and pointing, the pelvis' height for sitting, standing and lying, the camera's view for coming and
+going.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from steadypose.msgs.types import EventKind, Hand
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.events.features import HAND
+from steadypose.prior.events.settings import EventSettings
+from steadypose.prior.sim.body import random_offsets
+from steadypose.prior.sim.gait import RATE, Stand, Turn, Walk, plan
+from steadypose.prior.sim.motion import SIGN, ArmAction, Intent, Motion, perform
+from steadypose.prior.sim.scripts import SCRIPTS
+from steadypose.prior.sim.timing import minimum_jerk
+
+Floats = NDArray[np.float64]
+DOUBT = 0.05
+"""metres, or radians, beyond a threshold, up to which it need not be told that it was crossed"""
+SHORTEST_S = 0.25
+"""what lasts less need not be told, and may be"""
+GRAVITY = 9.81
+
+
+class Label(NamedTuple):
+    """Something that one person does."""
+
+    person: int
+    kind: EventKind
+    hand: Hand
+    start_s: float
+    end_s: float
+    required: bool = True
+    """whether it has to be told; if not, as between a threshold and its margin, it may be"""
+
+
+class Scene(NamedTuple):
+    """Motions of all people, and what they do."""
+
+    motions: list[Motion]
+    labels: list[Label]
+    undecided: frozenset[EventKind] = frozenset()
+    """kinds that the scene says nothing of: what looks like them may be told or not"""
+
+
+def gestures(rng: np.random.Generator) -> Scene:
+    """Stand before the camera, and raise hands, wave and point, one after the other, either arm."""
+    acts = rng.permutation([(act, side) for act in ("raise", "wave", "point") for side in ("left", "right")])
+    ground = plan((rng.uniform(2.2, 3.0), rng.uniform(-0.3, 0.3)), np.pi + rng.uniform(-0.4, 0.4), [Stand(28.0)])
+    intent, labels = Intent(ground), []
+    t, at = ground.times, 1.5
+    for act, side in acts:
+        lasts, blend = rng.uniform(2.4, 3.2), rng.uniform(0.5, 0.9)
+        weight = minimum_jerk((t - at) / blend) - minimum_jerk((t - at - lasts + blend) / blend)
+        sign, hand = SIGN[side], Hand.LEFT if side == "left" else Hand.RIGHT
+        goal = np.broadcast_to(_goal(rng, act, sign), (len(t), 3)).copy()
+        if act == "wave":
+            began = at + blend
+            ample = 0.22 * minimum_jerk((t - began) / 0.3)
+            beat = 2.0 * np.pi * rng.uniform(1.2, 1.9) * (t - began)
+            goal += np.stack([0.0 * t, sign * ample * np.sin(beat), -0.25 * ample * np.sin(beat) ** 2], axis=-1)
+            labels.append(Label(0, EventKind.WAVES, hand, began, at + lasts - blend))
+        if act == "point":
+            labels.append(Label(0, EventKind.POINTS, hand, at + blend, at + lasts - blend))
+        pole = np.array([-0.35, 0.75 * sign, -0.9])
+        intent.arms[side].append(ArmAction(weight, goal, pole, "shoulder"))
+        at += lasts + rng.uniform(0.8, 1.4)
+    motion = perform(intent, _person(rng), rng)
+    return Scene([motion], [*labels, *_common(0, motion)])
+
+
+def _goal(rng: np.random.Generator, act: str, sign: float) -> Floats:
+    """Where the wrist goes, from the shoulder, in arm lengths: forward, left, up."""
+    if act == "raise":
+        return np.array([rng.uniform(0.1, 0.4), sign * rng.uniform(0.1, 0.4), rng.uniform(0.55, 0.85)])
+    if act == "wave":
+        return np.array([0.30, sign * 0.36, 0.42])
+    aside, up = rng.uniform(-0.2, 1.2), rng.uniform(-0.35, 0.3)
+    return 1.2 * np.array([np.cos(aside) * np.cos(up), sign * np.sin(aside) * np.cos(up), np.sin(up)])
+
+
+def comes_and_goes(rng: np.random.Generator) -> Scene:
+    """Walk into view, up to the camera, stand, turn, and leave."""
+    side = rng.choice([-1.0, 1.0])
+    parts: list[Stand | Walk | Turn] = [
+        Stand(0.5), Walk([(2.4, 0.6 * side), (1.0, rng.uniform(-0.1, 0.1))], rng.uniform(0.9, 1.3)),
+        Stand(rng.uniform(1.0, 2.5)), Turn(np.pi * 0.9 * side, 2.2), Stand(0.4),
+        Walk([(2.2, -0.6 * side), (2.6, -3.2 * side)], rng.uniform(0.9, 1.3)), Stand(2.0),
+    ]  # fmt: skip
+    motion = perform(Intent(plan((2.8, 3.2 * side), -side * np.pi / 2, parts)), _person(rng), rng)
+    return Scene([motion], _common(0, motion))
+
+
+def falls(rng: np.random.Generator) -> Scene:
+    """Stand, then topple over like a pole, to any side, and stay there."""
+    return _tips(rng, _toppling)
+
+
+def lies_down(rng: np.random.Generator) -> Scene:
+    """Stand, then lie down slowly, and stay there."""
+    return _tips(rng, lambda t: 0.5 * np.pi * minimum_jerk(t / 5.0))
+
+
+def _toppling(t: Floats) -> Floats:
+    """(T,) radians from upright of a pole of 1.2 m that topples: theta'' = 3 g sin(theta) / 2 l, up to the floor."""
+    angle, speed, angles = 0.1, 0.0, []
+    for moment in t:
+        if moment > 0:
+            speed += 1.5 * GRAVITY / 1.2 * np.sin(angle) / RATE
+            angle = min(angle + speed / RATE, 0.5 * np.pi)
+        angles.append(angle)
+    return np.array(angles) - 0.1 * np.cos(np.array(angles)).clip(0.0)
+
+
+def _tips(rng: np.random.Generator, tilt: Callable[[Floats], Floats]) -> Scene:
+    """Stand, then tip over as a whole about the feet, by ``tilt`` radians from a moment on."""
+    standing = perform(Intent(plan((2.8, 0.0), rng.uniform(-np.pi, np.pi), [Stand(12.0)])), _person(rng), rng)
+    began, toward = rng.uniform(2.5, 4.0), rng.uniform(-np.pi, np.pi)
+    angle = tilt(standing.times - began)
+    axis = np.array([-np.sin(toward), np.cos(toward), 0.0])
+    turn = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
+    pivot = np.array([2.8, 0.0, 0.0])
+    rotations = standing.rotations.copy()
+    rotations[:, 0] = turn @ rotations[:, 0]
+    root = np.einsum("tij,tj->ti", turn, standing.root - pivot) + pivot
+    root[:, 2] += 0.11 * np.sin(angle)  # half the trunk's depth
+    contacts = standing.contacts & (angle < 0.2)[:, None]
+    motion = Motion(standing.times, standing.offsets, root, rotations, contacts)
+    down = float(standing.times[np.argmax(motion.positions[:, J["neck"], 2] < 0.4)])
+    labels = [*_common(0, motion), Label(0, EventKind.LIES, Hand.NONE, down, float(standing.times[-1]))]
+    if tilt is _toppling:
+        labels.append(Label(0, EventKind.FELL, Hand.NONE, down, float(standing.times[-1])))
+    return Scene([motion], labels)
+
+
+def _of_script(name: str, *undecided: EventKind) -> Callable[[np.random.Generator], Scene]:
+    def scene(rng: np.random.Generator) -> Scene:
+        motions = SCRIPTS[name](rng)
+        labels = [label for person, motion in enumerate(motions) for label in _common(person, motion)]
+        return Scene(motions, labels, frozenset(undecided))
+
+    return scene
+
+
+def sits(rng: np.random.Generator) -> Scene:
+    """Sit down on a chair twice, and rise."""
+    (motion,) = SCRIPTS["sit_rise"](rng)
+    height = motion.root[:, 2]
+    low, high = float(height.min()), float(np.median(height[:60]))
+    labels = [label for label in _common(0, motion) if label.kind != EventKind.STANDS]
+    labels += _while(
+        0, EventKind.SITS, Hand.NONE, motion.times, height < low + 0.15 * (high - low), height < 0.5 * (low + high)
+    )
+    labels += _while(
+        0, EventKind.STANDS, Hand.NONE, motion.times, height > high - 0.2 * (high - low), height > 0.5 * (high + low)
+    )
+    return Scene([motion], labels)
+
+
+SCENES: Mapping[str, Callable[[np.random.Generator], Scene]] = {
+    "gestures": gestures,
+    "comes and goes": comes_and_goes,
+    "sits": sits,
+    "falls": falls,
+    "lies down": lies_down,
+    "walks": _of_script("walk_turn"),
+    "idles": _of_script("idle"),
+    # a hand held out at a shelf, or raised to one behind the back's hiding arm: who is to say that it does not point?
+    "reaches": _of_script("reach", EventKind.POINTS, EventKind.HAND_RAISED),
+    "two cross": _of_script("crossing"),
+}
+
+
+def _person(rng: np.random.Generator) -> Floats:
+    return random_offsets(rng, rng.uniform(1.55, 1.90))
+
+
+def _common(person: int, motion: Motion) -> list[Label]:
+    """What the true joints of any scene tell: near, facing the camera, upright, hands above the neck."""
+    s, p, t = EventSettings(), motion.positions, motion.times
+    left = p[:, J["left_hip"]] - p[:, J["right_hip"]] + p[:, J["left_shoulder"]] - p[:, J["right_shoulder"]]
+    facing = np.arctan2(-left[:, 0], left[:, 1])
+    away = np.hypot(motion.root[:, 0], motion.root[:, 1])
+    toward = np.arctan2(-motion.root[:, 1], -motion.root[:, 0])
+    turned = np.abs(np.angle(np.exp(1j * (facing - toward))))
+    hips = motion.root[:, 2]
+    up = hips > 0.5 * hips[0]
+    upright = p[:, J["neck"], 2] - p[:, J["pelvis"], 2] > 0.3
+    labels = [
+        *_while(person, EventKind.NEAR, Hand.NONE, t, away < s.near - DOUBT, away < s.near + s.near_margin),
+        *_while(
+            person,
+            EventKind.FACES_SENSOR,
+            Hand.NONE,
+            t,
+            (turned < s.faces - DOUBT) & up,
+            (turned < s.faces + s.faces_margin) & up,
+        ),
+        *_while(person, EventKind.STANDS, Hand.NONE, t, hips > 0.85 * hips[0], hips > 0.65 * hips[0]),
+    ]
+    for side, hand in (("left", Hand.LEFT), ("right", Hand.RIGHT)):
+        forearm = p[:, J[f"{side}_wrist"]] - p[:, J[f"{side}_elbow"]]
+        forearm /= np.linalg.norm(forearm, axis=1, keepdims=True)
+        above = p[:, J[f"{side}_wrist"], 2] + HAND * forearm[:, 2] - p[:, J["neck"], 2]
+        raised, nearly = above > s.raised + DOUBT, above > s.raised - s.raised_margin
+        labels += _while(person, EventKind.HAND_RAISED, hand, t, raised & upright, nearly & upright)
+    return labels
+
+
+def _while(
+    person: int, kind: EventKind, hand: Hand, t: Floats, holds: NDArray[np.bool_], nearly: NDArray[np.bool_]
+) -> Iterator[Label]:
+    """A label for each time that it nearly holds: required from where it holds, if it ever does."""
+    for begin, end in runs(nearly):
+        held = np.flatnonzero(holds[begin:end])
+        start = begin + int(held[0]) if len(held) else begin
+        yield Label(person, kind, hand, float(t[start]), float(t[end - 1]), len(held) > 0)
+
+
+def in_view(labels: Sequence[Label], person: int, t: Floats, seen: NDArray[np.bool_]) -> Iterator[Label]:
+    """The labels of a person as far as a camera can tell them: who comes into view has entered, and what they do then
+    begins then.
+
+    Args:
+        labels: of all people.
+        person: whose are wanted.
+        t: (T,) seconds.
+        seen: (T,) whether most of the person is in the camera's view.
+    """
+    for first, after in runs(seen):
+        begin, end = float(t[first]), float(t[after - 1])
+        yield Label(person, EventKind.ENTERED, Hand.NONE, begin, begin)
+        if after < len(t):
+            yield Label(person, EventKind.LEFT, Hand.NONE, end, end)
+        for label in labels:
+            start_s, end_s = max(label.start_s, begin), min(label.end_s, end)
+            if label.person == person and start_s < end_s:
+                yield label._replace(start_s=start_s, end_s=end_s)
+
+
+def runs(holds: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and one past the last index of each time that it holds."""
+    edges = np.diff(np.concatenate([[0], holds.astype(int), [0]]))
+    return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))

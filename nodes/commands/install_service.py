@@ -1,0 +1,172 @@
+"""``steadypose install-service``: a launch file at every boot, under systemd; and how to undo it."""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from steadypose.nodes.commands.service_unit import MARK, Service
+from steadypose.nodes.graph.launch import Launch, find
+from steadypose.nodes.graph.loops import compile_missing
+from steadypose.nodes.graph.settings import LaunchError
+
+UNITS = Path("/etc/systemd/system")
+BOOTED = Path("/run/systemd/system")
+"""there where systemd runs this machine (sd_booted(3))"""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One thing that is done: a command, or a file that is written."""
+
+    command: tuple[str, ...] = ()
+    file: Path | None = None
+    text: str = ""
+
+    def __str__(self) -> str:
+        return f"write {self.file}" if self.file else shlex.join(self.command)
+
+    def do(self) -> None:
+        """Raises:
+        LaunchError: it failed.
+        """
+        try:
+            if self.file:
+                self.file.write_text(self.text, encoding="utf-8")
+            else:
+                subprocess.run(self.command, check=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            raise LaunchError(
+                f"`{self}` failed ({error}); what was done before stays: --uninstall undoes it"
+            ) from error
+
+
+def install_service(
+    launch: Annotated[str, tyro.conf.Positional] = "oak",
+    name: str = "steadypose",
+    user: str = "",
+    dry_run: bool = False,
+    uninstall: bool = False,
+) -> int:
+    """Run a launch file at every boot, as a service of systemd with a user of its own.
+
+    Says what it does as it does it: the user, the unit, and its start. Folders are systemd's to make: recordings in
+    /var/lib/NAME, compiled loops in /var/cache/NAME, sockets and health.json in /run/NAME. The service sees no
+    homes, writes nowhere else, and uses no device but cameras.
+
+    Args:
+        launch: a launch file, or the name of one of the project's own. A file outside all homes, such as in /etc.
+        name: of the service, and of its folders.
+        user: an existing user to run it as; unless given, one is made with the service's name.
+        dry_run: print what would be done, and do nothing.
+        uninstall: stop and remove the service, its compiled loops, and its user if it was made for it. What is in
+            /var/lib/NAME is kept.
+    """
+    console = Console(highlight=False, soft_wrap=True)
+    if uninstall:
+        steps = list(_undo(name))
+    else:
+        service = _service(launch, name, user)
+        steps = list(_install(service))
+        if dry_run:
+            console.print(service.unit(), markup=False)
+    if not dry_run and os.geteuid() != 0:
+        raise LaunchError("expected root: run it with sudo, or with --dry-run to see what it does")
+    if not (uninstall or dry_run):
+        # as root, so that all users find them beside the package
+        compile_missing(lambda line: console.print(line, markup=False))
+    for step in steps:
+        console.print(f"+ {step}", markup=False)
+        if not dry_run:
+            step.do()
+    if uninstall and _state(name).exists():
+        console.print(f"{_state(name)} is kept: remove it, and user {name}, if you do not need its recordings")
+    elif not (uninstall or dry_run or BOOTED.exists()):
+        console.print("systemd does not run here: the service starts at the next boot that it runs")
+    elif not (uninstall or dry_run):
+        console.print(
+            f"it runs: `systemctl status {name}`, `journalctl -fu {name}`, /run/{name}/steadypose/health.json"
+        )
+    return 0
+
+
+def _service(launch: str, name: str, user: str) -> Service:
+    """Raises:
+    LaunchError: a service could not run so.
+    """
+    if user and not _has_user(user):
+        raise LaunchError(f"--user: there is no user {user!r}; leave it out to have one made")
+    file = find(launch)
+    settled = Launch.read(file)
+    command = Path(sys.executable).with_name("steadypose")
+    if not command.exists():
+        raise LaunchError(f"expected {command}, found none: install steadypose into this Python's environment")
+    own = launch if not Path(launch).expanduser().is_file() else str(file)
+    groups = tuple(group.gr_name for group in grp.getgrall() if group.gr_name == "video")
+    service = Service(name, user or name, not user, command, own, groups)
+    service.check(settled, Path(sys.prefix), Path(sys.base_prefix))
+    unit = _unit(name)
+    if unit.exists() and MARK not in unit.read_text(encoding="utf-8", errors="replace"):
+        raise LaunchError(f"{unit} was not made by this command: remove it, or give the service another --name")
+    return service
+
+
+def _install(service: Service) -> Iterator[Step]:
+    if service.is_new_user and not _has_user(service.user):
+        home = ("--home-dir", str(service.state), "--no-create-home", "--shell", "/usr/sbin/nologin")
+        yield Step(("useradd", "--system", "--user-group", *home, service.user))
+    yield Step(file=_unit(service.name), text=service.unit())
+    if BOOTED.exists():
+        yield Step(("systemctl", "daemon-reload"))
+    yield Step(("systemctl", "enable", _unit(service.name).name))
+    if BOOTED.exists():  # also where an older unit runs
+        yield Step(("systemctl", "restart", "--no-block", _unit(service.name).name))
+
+
+def _undo(name: str) -> Iterator[Step]:
+    """Raises:
+    LaunchError: there is no such service, or it is somebody else's.
+    """
+    unit = _unit(name)
+    if not unit.exists():
+        raise LaunchError(f"there is no {unit}: nothing to remove")
+    text = unit.read_text(encoding="utf-8", errors="replace")
+    if MARK not in text:
+        raise LaunchError(f"{unit} was not made by this command: expected one that begins with {MARK!r}")
+    stop = ("systemctl", "disable", *(["--now"] if BOOTED.exists() else []), unit.name)
+    yield Step(stop)
+    yield Step(("rm", "-f", str(unit)))
+    if BOOTED.exists():
+        yield Step(("systemctl", "daemon-reload"))
+    yield Step(("rm", "-rf", f"/var/cache/{name}"))
+    if (state := _state(name)).exists() and not any(state.iterdir()):
+        yield Step(("rmdir", str(state)))
+    if f"\nUser={name}\n" in text and _has_user(name) and (not state.exists() or not any(state.iterdir())):
+        yield Step(("userdel", name))
+
+
+def _unit(name: str) -> Path:
+    return UNITS / f"{name}.service"
+
+
+def _state(name: str) -> Path:
+    return Path("/var/lib", name)
+
+
+def _has_user(name: str) -> bool:
+    try:
+        pwd.getpwnam(name)
+    except KeyError:
+        return False
+    return True

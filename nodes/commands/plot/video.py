@@ -1,0 +1,258 @@
+"""``steadypose plot --video``: a body as the sensor gave it, cleaned, and in the world, side by side and moving.
+
+Left and right have colours of their own, and what was not observed at the moment is drawn faintly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.types import JOINTS, JointState
+from steadypose.nodes.commands.plot.history import History, Track
+from steadypose.nodes.commands.plot.picture import PlotError, body_of
+from steadypose.nodes.graph.extras import how_to_install
+from steadypose.nodes.sinks.drawing import ALL_BONES, CONTACT_COLOUR, CONTACT_INDICES, bones, facing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+VIDEOS = (".gif", ".mp4")
+FPS = 15
+"""of the video: half of the poses', which is smooth enough"""
+PANEL_INCHES, STAGE_WIDTH, DPI = (2.3, 3.4), 1.6, 80
+"""of a panel; how much wider that of the world is"""
+LEFT, RIGHT, MIDDLE, GHOST, FLOOR = "#0072b2", "#d55e00", "#3c3c3c", "#cfcfcf", "#e6e6e6"
+FAINT = 0.3
+"""opacity of what was not observed"""
+ELEVATION = 0.22
+"""radians that the view looks down"""
+TURNED = 0.5
+"""radians that the view is turned from the front"""
+TALL = 1.8
+"""metres of room above the floor"""
+PATH_FRAMES = 150
+"""of the way over the floor that are shown"""
+SHADES = (1.0, 0.8, 0.6, 0.45, 0.3, 0.15)
+"""of each colour on white, which a GIF has: few, and the same in all frames, or colours flicker"""
+
+Floats = NDArray[np.float64]
+
+
+def write_video(history: History, path: Path, body: int | None = None) -> int:
+    """Write the video of one body, as the ending says, at about `FPS`; returns the number of frames.
+
+    Raises:
+        PlotError: there is nothing to draw, or no such body.
+        ModuleNotFoundError: OpenCV is not installed, for an .mp4.
+    """
+    chosen = body_of(history, body)
+    lead = next(t for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW) if (t := history.track(topic, chosen)) is not None)
+    period = max(float(np.median(np.diff(lead.time))), 1e-3) if len(lead.time) > 1 else 1.0 / FPS
+    step = max(round(1.0 / FPS / period), 1)
+    frames = _frames(history, chosen, lead, step)
+    count = (_write_gif if path.suffix == ".gif" else _write_mp4)(frames, path, 1.0 / (step * period))
+    if not count:
+        raise PlotError(f"{history.name}: expected frames in which body {chosen} is seen, found none")
+    return count
+
+
+class View:
+    """An orthographic projection: right and up in the picture, of points in the world.
+
+    Args:
+        front: (3,) unit vector, horizontal, that faces the viewer but for a small turn.
+    """
+
+    def __init__(self, front: Floats) -> None:
+        cos, sin = np.cos(TURNED), np.sin(TURNED)
+        toward = np.array([cos * front[0] - sin * front[1], sin * front[0] + cos * front[1], 0.0])
+        up = np.cos(ELEVATION) * np.array([0.0, 0.0, 1.0]) - np.sin(ELEVATION) * toward
+        self._axes = np.stack([[-toward[1], toward[0], 0.0], up], axis=1)
+
+    def __call__(self, points: Floats) -> Floats:
+        """(..., 2) metres of points (..., 3) metres."""
+        return points @ self._axes
+
+
+def _frames(history: History, body: int, lead: Track, step: int) -> Iterator[NDArray[np.uint8]]:
+    """(H, W, 3) pictures, RGB, of every so many rows of the track that leads."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    raw, clean, world = (history.track(topic, body) for topic in (POSE_RAW, POSE_CLEAN, POSE_WORLD))
+    view = View(next((f for row in lead.positions if (f := facing(row)) is not None), np.array([1.0, 0.0, 0.0])))
+    draws: dict[str, Callable[[Axes, int], None]] = {}
+    if clean is not None:
+        if np.isfinite(clean.raw).any():
+            shown = bones(history.observable)
+            draws["raw"] = _follower(clean, view, lambda ax, row: _raw(ax, view, clean, row, shown))
+        draws["clean"] = _follower(clean, view, lambda ax, row: _sticks(ax, view, clean, row))
+    elif raw is not None and world is None:
+        draws["raw"] = _follower(raw, view, lambda ax, row: _sticks(ax, view, raw, row, bones(history.observable)))
+    if world is not None:
+        at = np.searchsorted(world.time, lead.time - 1e-6).clip(0, len(world.time) - 1)
+        draws["world"] = _stage(world, at, view)
+    width, height = PANEL_INCHES
+    widths = [STAGE_WIDTH if title == "world" else 1.0 for title in draws]
+    figure = Figure(figsize=(width * sum(widths), height), dpi=DPI)
+    axes = figure.subplots(1, len(draws), squeeze=False, width_ratios=widths)[0]
+    figure.subplots_adjust(0.0, 0.085, 1.0, 0.93, wspace=0.0)
+    for number, title in enumerate(draws):
+        middle = (sum(widths[:number]) + widths[number] / 2) / sum(widths)
+        figure.text(middle, 0.985, title, ha="center", va="top", fontsize=11, weight="bold")
+    canvas = FigureCanvasAgg(figure)
+    figure.legend(
+        handles=[
+            *(Line2D([], [], color=c, lw=3, label=name) for name, c in (("left", LEFT), ("right", RIGHT))),
+            Line2D([], [], color=MIDDLE, lw=3, alpha=FAINT, label="faint: not observed"),
+        ],
+        loc="lower center", ncols=3, frameon=False, fontsize=9, borderaxespad=0.1,
+    )  # fmt: skip
+    for row in range(0, len(lead.time), step):
+        for ax, draw in zip(axes, draws.values(), strict=True):
+            ax.clear()
+            draw(ax, row)
+            ax.set_aspect("equal", adjustable="box")
+            ax.axis("off")
+        canvas.draw()
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _follower(track: Track, view: View, draw: Callable[[Axes, int], None]) -> Callable[[Axes, int], None]:
+    """Draws with the body in the middle of the panel, which it fills."""
+    middle = _smooth(np.nanmean(np.where(np.isfinite(track.positions), track.positions, np.nan), axis=1))
+    low, high = np.nanpercentile(track.positions[..., 2], (1, 99)) if len(track.time) else (0.0, 1.8)
+    middle[:, 2] = (low + high) / 2
+    half = 0.58 * max(float(high - low), 0.5)
+
+    def panel(ax: Axes, row: int) -> None:
+        draw(ax, row)
+        centre = view(middle[row])
+        aspect = PANEL_INCHES[0] / (0.845 * PANEL_INCHES[1])
+        ax.set_xlim(centre[0] - half * aspect, centre[0] + half * aspect)
+        ax.set_ylim(centre[1] - half, centre[1] + half)
+
+    return panel
+
+
+def _stage(world: Track, at: NDArray[np.intp], view: View) -> Callable[[Axes, int], None]:
+    """Draws the body where it is on the floor, with the way that it came."""
+    floor = float(np.nanpercentile(world.positions[..., 2].min(axis=1), 5))
+    root = world.positions[:, 0] * [1.0, 1.0, 0.0] + [0.0, 0.0, floor]
+    low, high = np.nanmin(root[:, :2], axis=0) - 0.4, np.nanmax(root[:, :2], axis=0) + 0.4
+    across, along = (np.linspace(low[axis], high[axis], 7) for axis in (0, 1))
+    lines = [np.array([[x, low[1], floor], [x, high[1], floor]]) for x in across]
+    lines += [np.array([[low[0], y, floor], [high[0], y, floor]]) for y in along]
+    corners = view(
+        np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (floor, floor + TALL)])
+    )
+    (left, bottom), (right, top) = corners.min(axis=0), corners.max(axis=0)
+
+    def panel(ax: Axes, row: int) -> None:
+        from matplotlib.collections import LineCollection
+
+        here = int(at[row])
+        ax.add_collection(LineCollection([view(line) for line in lines], colors=FLOOR, linewidths=0.8))
+        ax.plot(*view(root[max(here - PATH_FRAMES, 0) : here + 1]).T, color=MIDDLE, lw=1.2, alpha=FAINT)
+        _sticks(ax, view, world, here)
+        loaded = world.positions[here, CONTACT_INDICES[world.contacts[here] > 0.5]]
+        ax.plot(*view(loaded).T, "o", color=CONTACT_COLOUR, markersize=4, markeredgewidth=0)
+        ax.set_xlim(left, right)
+        ax.set_ylim(bottom, top)
+
+    return panel
+
+
+def _raw(ax: Axes, view: View, clean: Track, row: int, shown: NDArray[np.intp]) -> None:
+    """What went in, over what came out of it."""
+    _lines(ax, view(clean.positions[row]), ALL_BONES, [GHOST] * len(ALL_BONES), 2.0, np.ones(len(ALL_BONES)))
+    _lines(ax, view(clean.raw[row]), shown, [_side(child) for _, child in shown], 3.0, np.ones(len(shown)))
+
+
+def _sticks(ax: Axes, view: View, track: Track, row: int, shown: NDArray[np.intp] = ALL_BONES) -> None:
+    opacity = np.ones(len(shown))
+    if track.state.size:
+        observed = np.isin(track.state[row], (JointState.SEEN, JointState.REFINED))
+        opacity = np.where(observed[shown].all(axis=1), 1.0, FAINT)
+    _lines(ax, view(track.positions[row]), shown, [_side(child) for _, child in shown], 3.0, opacity)
+
+
+def _lines(ax: Axes, flat: Floats, pairs: NDArray[np.intp], colours: list[str], width: float, opacity: Floats) -> None:
+    from matplotlib.collections import LineCollection
+
+    there = np.flatnonzero(np.isfinite(flat[pairs]).all(axis=(1, 2)))
+    ax.add_collection(
+        LineCollection(
+            list(flat[pairs[there]]),
+            colors=[colours[bone] for bone in there],
+            alpha=opacity[there].tolist(),
+            linewidths=width,
+            capstyle="round",
+        )
+    )
+
+
+def _side(joint: int) -> str:
+    name = JOINTS[joint]
+    return LEFT if name.startswith("left_") else RIGHT if name.startswith("right_") else MIDDLE
+
+
+def _smooth(path: Floats, frames: int = 15) -> Floats:
+    """(T, 3), gaps filled, averaged over so many frames, so that a view that follows it does not shake."""
+    rows = np.arange(len(path))
+    filled = np.zeros_like(path)
+    for axis in range(path.shape[1]):
+        known = np.isfinite(path[:, axis])
+        filled[:, axis] = np.interp(rows, rows[known], path[known, axis]) if known.any() else 0.0
+    padded = np.pad(filled, ((frames // 2, frames // 2), (0, 0)), mode="edge")
+    return np.stack([np.convolve(column, np.full(frames, 1 / frames), "valid") for column in padded.T], axis=1)
+
+
+def _palette() -> list[int]:
+    """Red, green and blue, 0 to 255, of each colour in turn."""
+    from matplotlib.colors import to_rgb
+
+    colours = [np.array(to_rgb(name)) for name in (LEFT, RIGHT, MIDDLE, CONTACT_COLOUR, "black")]
+    shades = [1.0 - shade * (1.0 - colour) for colour in colours for shade in SHADES]
+    return np.round(255 * np.array([np.ones(3), *shades])).astype(int).ravel().tolist()
+
+
+def _write_gif(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> int:
+    from PIL import Image
+
+    pictures = [Image.fromarray(frame) for frame in frames]
+    if not pictures:
+        return 0
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(_palette())
+    first, *rest = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    first.save(path, save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, optimize=True)
+    return len(pictures)
+
+
+def _write_mp4(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> int:
+    try:
+        import cv2
+    except ImportError as error:
+        raise PlotError(f"{path}: {how_to_install(['cv2'], 'oak')}; or write a .gif") from error
+    writer: Any = None
+    count = 0
+    for frame in frames:
+        picture = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2, ::-1]
+        if writer is None:
+            codec = cv2.VideoWriter.fourcc(*"vp09")  # plays in browsers; H.264 is in no OpenCV that is installed by pip
+            writer = cv2.VideoWriter(str(path), codec, fps, picture.shape[1::-1])
+            if not writer.isOpened():
+                raise PlotError(f"{path}: this OpenCV cannot write VP9; write a .gif")
+        writer.write(np.ascontiguousarray(picture))
+        count += 1
+    if writer is not None:
+        writer.release()
+    return count

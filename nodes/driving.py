@@ -1,0 +1,157 @@
+"""Both pipelines over what is recorded, as fast as they go: what the offline commands and the library share."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
+from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
+from steadypose.nodes.checks.stream import StreamCheck
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sources.recording import with_end
+from steadypose.nodes.sources.source import RecordedSource
+from steadypose.prior.clean.settings import PriorSettings
+
+CHECKED, CHECKED_NS = 45, 1_500_000_000
+"""frames between two looks at whether the input can be right, and the time in which they count as having come"""
+
+NOBODY = "nobody_recognised: no body in any frame; is the skeleton right, are the units metres?"
+"""what is said of an input that came to nothing"""
+
+Settings = Mapping[str, Mapping[str, Any]]
+
+
+class Cleaner(Protocol):
+    """What `stream` needs of a `PriorPipeline`."""
+
+    def process(self, raw: PoseRaw) -> list[PoseClean]: ...
+
+
+class Placer(Protocol):
+    """What `stream` needs of a `TrajectoryPipeline`."""
+
+    def process(self, clean: PoseClean) -> list[PoseWorld]: ...
+
+
+def stream(
+    messages: Iterable[tuple[str, Message]], prior: Cleaner, trajectory: Placer
+) -> Iterator[tuple[str, Message]]:
+    """All that the nodes publish when the input node publishes ``messages``: these, and the answers to each.
+
+    Both pipelines are new, or have seen the end of their last stream.
+    """
+    for topic, message in with_end(messages):
+        yield topic, message
+        if isinstance(message, PoseRaw):
+            for clean in prior.process(message):
+                yield POSE_CLEAN, clean
+                for world in trajectory.process(clean):
+                    yield POSE_WORLD, world
+
+
+class Diagnosis:
+    """Problems of a stream that comes without a wall clock: its frames count as having come at 30 Hz.
+
+    Attributes:
+        problems: texts by cause, each as it was first found.
+        frames: that came.
+    """
+
+    def __init__(self, settings: PriorSettings) -> None:
+        self.problems: dict[str, str] = {}
+        self._check = StreamCheck(settings.max_bodies, identified=settings.identify.enabled)
+        self.frames = 0
+
+    def see(self, raw: PoseRaw) -> None:
+        """Take the next frame, without looking at it yet."""
+        self._check.see(raw, self.frames * CHECKED_NS // CHECKED)
+        self.frames += 1
+
+    def look(self) -> list[str]:
+        """Examine the last of them; returns what is newly wrong, a line each."""
+        found = self._check.problems((self.frames - 1) * CHECKED_NS // CHECKED, live=False)
+        new = {problem.cause: problem.text for problem in found if problem.cause not in self.problems}
+        self.problems |= new
+        return [f"{cause}: {text}" for cause, text in new.items()]
+
+    @property
+    def texts(self) -> list[str]:
+        """What is wrong, a line each."""
+        return [f"{cause}: {text}" for cause, text in self.problems.items()]
+
+
+class OfflineRun:
+    """A recorded source through both pipelines; iterating gives all messages of `stream`, once.
+
+    Args:
+        source: the recording.
+        settings: ``[prior]`` and ``[trajectory]`` of a launch file.
+
+    Attributes:
+        diagnosis: what is wrong with the input.
+        poses: number of bodies in the output so far.
+
+    Raises:
+        LaunchError: a setting that is not known, or cannot be.
+    """
+
+    def __init__(self, source: RecordedSource, settings: Settings) -> None:
+        # these compile loops: not before it is known that there is something to do
+        from steadypose.nodes.graph.prior_node import make_prior
+        from steadypose.nodes.graph.threads import one_thread
+        from steadypose.nodes.graph.trajectory_node import make_trajectory
+
+        one_thread()
+        self._source = source
+        self._prior, self._trajectory = make_prior(settings["prior"]), make_trajectory(settings["trajectory"])
+        self._stamps_ns: list[int] = []
+        self.diagnosis = Diagnosis(PriorSettings.from_dict(settings["prior"]))
+        self.poses = 0
+
+    def __iter__(self) -> Iterator[tuple[str, Message]]:
+        for topic, message in stream(self._source, self._prior, self._trajectory):
+            if isinstance(message, PoseRaw) and not message.end_of_stream:
+                self._stamps_ns.append(message.stamp_ns)
+                self.diagnosis.see(message)
+                if self.diagnosis.frames % CHECKED == 0:
+                    self.diagnosis.look()
+            elif isinstance(message, PoseClean):
+                self.poses += len(message.bodies)
+            yield topic, message
+        if self.diagnosis.frames % CHECKED:
+            self.diagnosis.look()
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(T,) of the input."""
+        return np.array(self._stamps_ns, np.int64)
+
+    @property
+    def refused(self) -> Counter[str]:
+        """What was refused or dropped, by cause."""
+        counted = self._source.refused + self._prior.counters + self._trajectory.counters
+        return Counter({cause: n for cause, n in counted.items() if n})
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Run all of it; the arrays of `NpzCollector`, a row for each frame of the input.
+
+        Raises:
+            LaunchError: no frame could be read.
+        """
+        collector = NpzCollector()
+        for _, message in self:
+            collector.add(message)
+        if not self._stamps_ns:
+            raise LaunchError(f"expected frames, but none of {len(self._source)} could be read")
+        return collector.arrays(self.stamps_ns)
+
+
+def clean_arrays(source: RecordedSource, settings: Settings) -> dict[str, NDArray[Any]]:
+    """The arrays of `OfflineRun`, where nothing else of it is wanted."""
+    return OfflineRun(source, settings).arrays()

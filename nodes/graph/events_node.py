@@ -1,0 +1,69 @@
+"""The events node: ``pose/world`` in, ``pose/events`` out."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.topics import POSE_EVENTS
+from steadypose.msgs.types import Message, Phase, PoseClean, PoseEvents, PoseWorld
+from steadypose.nodes.graph.clock import Clock
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.node import Node
+from steadypose.prior.events.detector import NOWHERE, EventDetector
+from steadypose.prior.events.settings import EventSettings
+
+REPEAT_NS = 1_000_000_000
+"""of the stream, after which what holds is told again"""
+
+
+class EventStream:
+    """The events of one stream as the messages of ``pose/events``, and where its sensor stands.
+
+    Args:
+        settings: the thresholds.
+    """
+
+    def __init__(self, settings: EventSettings) -> None:
+        self._detector = EventDetector(settings)
+        self._told_ns: int | None = None
+        self.sensor: NDArray[np.float64] = NOWHERE
+
+    def process(self, world: PoseWorld) -> PoseEvents | None:
+        """What is to be published of a message of ``pose/world``; None if nothing is."""
+        events = self._detector.update(world, self.sensor)
+        told = self._told_ns
+        since_ns = REPEAT_NS if told is None else abs(world.stamp_ns - told)
+        changed = any(event.phase != Phase.HOLDS for event in events)
+        if not changed and not world.end_of_stream and since_ns < REPEAT_NS:
+            return None
+        self._told_ns = None if world.end_of_stream else world.stamp_ns
+        return PoseEvents(world.stamp_ns, world.frame_id, world.source, events, world.end_of_stream)
+
+
+class EventsNode(Node):
+    """Runs an `EventStream` over each source of what the trajectory node gives."""
+
+    name = "events"
+
+    def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
+        super().__init__(launch, clock)
+        self._settings = launch.settings(EventSettings)
+        self._streams: dict[str, EventStream] = {}
+
+    def handle(self, topic: str, message: Message) -> None:
+        if isinstance(message, PoseClean):
+            position = message.sensor_pose.position
+            if np.isfinite(position).all():
+                self._stream(message.source).sensor = position
+        elif isinstance(message, PoseWorld):
+            events = self._stream(message.source).process(message)
+            if events is not None:
+                self.publish(POSE_EVENTS, events)
+
+    def _stream(self, source: str) -> EventStream:
+        stream = self._streams.pop(source, None) or EventStream(self._settings)
+        self._streams[source] = stream
+        if len(self._streams) > max(len(self.launch.server.kiosks), 1):  # one came back under another name
+            del self._streams[next(iter(self._streams))]
+        return stream

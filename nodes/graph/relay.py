@@ -1,0 +1,112 @@
+"""What a lossless node has answered, so that the one after it is given what it had not.
+
+An input has been answered once all that was published until it was worked on is taken by all reliable subscribers; only
+then is it taken here. So whatever dies on the way, each message is still kept by somebody before it. A node that begins
+anew is given `CONTEXT` answered inputs as well, lest bodies begin anew with it; what it makes of them, its subscribers
+have, and it is not published again.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+
+from steadypose.msgs.publisher import Publisher, Resume
+from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
+from steadypose.nodes.graph.clock import FRAME_NS
+from steadypose.nodes.graph.progress import Progress, ProgressFile
+
+CONTEXT = 128
+"""messages: the four seconds of a stream of 30 Hz that the longest window, and twice the longest delay, are within"""
+BACK_NS = 1_000_000_000
+"""a stamp so far before the last is of a stream that begins anew"""
+
+
+class Relay:
+    """Inputs, and what was published because of them.
+
+    Args:
+        file: keeps the progress for the next node.
+        topics: that the node publishes, two at most.
+        supervisor: process id of the node's supervisor, without whom nobody begins where this one ends; or 0.
+        lag: messages before those that were not taken at which the next one begins. Of a source: a node that dies with
+            it has to be given its context.
+    """
+
+    def __init__(self, file: Path, topics: tuple[str, ...], supervisor: int, lag: int = 0) -> None:
+        self._file = ProgressFile(file, supervisor)
+        self._topics = topics
+        self.begun = self._file.read() if topics else None
+        self._answered = self.begun if self.begun and any(self.begun.sequence) else None
+        self.context = CONTEXT if topics and supervisor else 0
+        """answered inputs to be given again to one that begins anew"""
+        self._recent: deque[Progress] = deque(maxlen=lag + 1)
+        self._untaken: deque[tuple[str, int, tuple[int, int]]] = deque()
+        self._published = self._taken = 0
+        self._inputs: deque[int] = deque()  # of each, how much was published until it was worked on
+        self._newest_ns = 0
+
+    @property
+    def resume(self) -> Resume | None:
+        """Where the publisher of the node before ended."""
+        if self.begun is None:
+            return None
+        return Resume(self.begun.publisher, dict(zip(self._topics, self.begun.sequence, strict=False)))
+
+    def begin(self, publisher: Publisher) -> None:
+        """Note who publishes: what is not taken of it is to be told from what another one publishes."""
+        if self._topics:
+            self._recent.append(self.begun or Progress(publisher.id))
+            self._file.write(self._recent[0])
+
+    def knows(self, topic: str, message: Message) -> bool:
+        """Whether the subscribers have this from the node before this one."""
+        if self._answered is None or topic not in self._topics:
+            return False
+        if not isinstance(message, PoseRaw | PoseClean | PoseWorld):
+            return False
+        newest_ns, ended = self._answered.mark
+        again = message.stamp_ns < self._newest_ns - BACK_NS
+        self._newest_ns = message.stamp_ns
+        # the grid of one that begins anew may lie elsewhere between two frames
+        known = bool(ended) if message.end_of_stream else message.stamp_ns <= newest_ns + FRAME_NS / 2
+        if not known or again:
+            self._answered = None
+        return self._answered is not None
+
+    def published(self, publisher: Publisher, topic: str, mark: tuple[int, int]) -> None:
+        """Note what was just published."""
+        if topic in self._topics:
+            self._untaken.append((topic, publisher.sequence(topic) - 1, mark))
+            self._published += 1
+
+    def handled(self) -> None:
+        """Note that an input was worked on."""
+        self._inputs.append(self._published)
+
+    def settle(self, publisher: Publisher, timeout_s: float = 0.0) -> int:
+        """Note what was taken, waiting so long for the oldest; returns how many inputs are answered by that."""
+        newest: tuple[int, int] | None = None
+        while self._untaken and publisher.is_taken(*self._untaken[0][:2], timeout_s=timeout_s):
+            *_, newest = self._untaken.popleft()
+            self._taken += 1
+        if newest is not None:
+            untaken = {topic: sequence for topic, sequence, _ in reversed(self._untaken)}
+            following = [untaken.get(topic, publisher.sequence(topic)) for topic in self._topics]
+            first, second = (*following, 0)[:2]
+            self._recent.append(Progress(publisher.id, (first, second), newest))
+            self._file.write(self._recent[0])
+        answered = 0
+        while self._inputs and self._inputs[0] <= self._taken:
+            self._inputs.popleft()
+            answered += 1
+        return answered
+
+    @property
+    def settled(self) -> bool:
+        """Whether all that was published is taken."""
+        return not self._untaken
+
+    def close(self, *, finished: bool) -> None:
+        """Stop keeping the progress; one that is finished has none any more."""
+        self._file.close(finished=finished)

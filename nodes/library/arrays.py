@@ -1,0 +1,160 @@
+"""The offline commands on arrays, for a program that has no stream: what they do for an ``.npz``, the same numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import ArrayLike
+
+from steadypose.nodes.driving import NOBODY, OfflineRun
+from steadypose.nodes.graph.extras import require_extra
+from steadypose.nodes.library.inputs import Positions, SkeletonLike, compile_loops, source_of, warn
+from steadypose.nodes.library.poses import Poses
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def clean(
+    positions: Positions,
+    *,
+    fps: float | None = None,
+    stamp_ns: ArrayLike | None = None,
+    skeleton: SkeletonLike | None = None,
+    confidence: ArrayLike | None = None,
+    up: str | None = None,
+    delay: int = 4,
+    settings: Mapping[str, Mapping[str, Any]] | None = None,
+) -> Poses:
+    """Clean joints, offline: `steadypose clean` on arrays.
+
+    Args:
+        positions: (T, J, 3) metres, or (T, B, J, 3) of several bodies; NaN where a joint, or a body, is missing. Or the
+            arrays of an ``.npz``, by name, or the path of a recording, ``.npz`` or ``.csv``.
+        fps: frames a second, of a stream that is regular; else ``stamp_ns``.
+        stamp_ns: (T,) whole nanoseconds of capture.
+        skeleton: the joints' names and order, such as ``coco17`` (`steadypose.SKELETONS`), ``smpl22`` unless given; or
+            a layout of your own: a list of its joints' names, where they are those of smpl22, or a mapping with
+            ``joints`` and ``canonical`` as in a launch file (docs/sources.md).
+        confidence: (T, J) or (T, B, J) 0 to 1, where the source tells it.
+        up: the axis of the positions that points up: ``z`` (unless given), ``y`` or ``-y``.
+        delay: frames at 30 Hz that an answer may wait for, 0 to 16; more is smoother.
+        settings: ``prior`` and ``trajectory`` of a launch file, over these.
+
+    Returns:
+        The arrays of ``steadypose clean``'s ``.npz``, a row for each of ``positions``, as a dictionary and as
+        attributes: ``positions`` (T, 22, 3) metres in the input's frame, ``rotations`` (T, 22, 4) local, xyzw,
+        ``state`` (T, 22) `JointState`, ``sigma`` (T, 22) metres, ``anomaly`` and ``anomaly_flag`` (T,),
+        ``joint_anomaly`` (T, 22), ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s, ``world_positions`` (T, 22, 3)
+        metres, z up (the attribute ``world``), and ``joint_names`` (22,), among them. Of several bodies, an axis B
+        after time, and ``body_id`` (B,) with as many as were recognised.
+
+    Raises:
+        ValueError: an array has the wrong form, or neither fps nor stamp_ns is given; says what was expected.
+
+    Warns:
+        InputWarning: the numbers are probably not what they should be: unit, axes, order. Also in ``problems``.
+    """
+    compile_loops()
+    source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
+    given = settings or {}
+    prior = {"delay": delay} | dict(given.get("prior", {}))
+    run = OfflineRun(source, {"prior": prior, "trajectory": given.get("trajectory", {})})
+    arrays = run.arrays()
+    problems = run.diagnosis.texts or ([] if run.poses else [NOBODY])
+    warn(problems)
+    return Poses(arrays, problems, run.refused)
+
+
+def complete(
+    positions: Positions,
+    *,
+    fps: float | None = None,
+    stamp_ns: ArrayLike | None = None,
+    skeleton: SkeletonLike | None = None,
+    confidence: ArrayLike | None = None,
+    up: str | None = None,
+    weights: str = "default",
+) -> Poses:
+    """Complete motion, offline: `steadypose complete` on arrays.
+
+    Args:
+        positions, fps, stamp_ns, skeleton, confidence, up: as of `clean`; what is NaN, or 0 in confidence, is missing,
+            and so are frames between stamps more than 1/20 s apart.
+        weights: weight set of the completer: 'default', or a .safetensors file of your own.
+
+    Returns:
+        The arrays of `clean`, with a row every 1/30 s from the first stamp to the last.
+
+    Raises:
+        ValueError: as `clean`; or there is no body.
+    """
+    from steadypose.nodes.commands.completing import complete_source, completed_arrays, load_completer
+
+    source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
+    completion = complete_source(source, "positions", *load_completer(weights))
+    return Poses(completed_arrays(completion), refused=completion.done.refused)
+
+
+def fit(
+    positions: Positions,
+    *,
+    fps: float | None = None,
+    stamp_ns: ArrayLike | None = None,
+    skeleton: SkeletonLike | None = None,
+    confidence: ArrayLike | None = None,
+    up: str | None = None,
+    points: ArrayLike | None = None,
+    weights: str = "default",
+    delay: int = 8,
+) -> Poses:
+    """Fit a motion to joints, offline: `steadypose fit` on arrays. Takes seconds for a second of a body.
+
+    Args:
+        positions, fps, stamp_ns, skeleton, confidence, up: as of `clean`.
+        points: (T, N, 3) metres of the body's surface, in the same frame, from a depth camera; NaN where fewer.
+        weights: of the model of transitions: 'default', or a .safetensors file.
+        delay: of `clean`, which initialises the fit, frames at 30 Hz.
+
+    Returns:
+        The arrays of `clean`. Where a fit failed, those that `clean` gives, with ``anomaly_flag``, and ``problems``
+        says so.
+
+    Raises:
+        ValueError: as `clean`; nobody is seen for long enough; or torch is not installed (the extra 'train').
+    """
+    require_extra("train")
+    from steadypose.nodes.commands.fit_source import fit_source, fitted_arrays, load_transitions
+
+    source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
+    fitted = fit_source(source, "positions", points, model=load_transitions(weights), delay=delay)
+    problems = [f"body {fit.seen.id}: not explained, left as `clean` has it" for fit in fitted.fits if not fit.track]
+    warn(problems)
+    return Poses(fitted_arrays(fitted), problems)
+
+
+def plot(poses: Positions, output: str | Path | None = None, *, body: int | None = None) -> Figure:
+    """Draw what happened, as `steadypose plot` does.
+
+    Args:
+        poses: what `clean`, `complete` or `fit` gave; or the path of a recording, or of what they wrote.
+        output: picture to write as well: .png, .svg or .pdf.
+        body: number of the body to draw; the one seen the longest if left out.
+
+    Returns:
+        The figure, which a notebook shows.
+
+    Raises:
+        ValueError: there is nothing to draw, or nowhere to write to.
+        ModuleNotFoundError: matplotlib is not installed: it comes with the extra 'view'.
+    """
+    from steadypose.nodes.commands.plot.history import history_of_arrays, history_of_path
+    from steadypose.nodes.commands.plot.picture import draw, save
+
+    history = history_of_arrays(poses) if isinstance(poses, Mapping) else history_of_path(Path(str(poses)))
+    figure = draw(history, body)
+    if output is not None:
+        save(figure, Path(output))
+    return figure

@@ -1,0 +1,225 @@
+"""Frame by frame: the nodes `prior` and `trajectory` as one object, for a program that has the joints itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from steadypose.msgs.types import JOINTS, CleanBody, Pose, PoseClean, PoseRaw, RawBody, WorldBody
+from steadypose.nodes.checks.arrays import axes_hint, skeleton_hint
+from steadypose.nodes.driving import CHECKED, NOBODY, Diagnosis
+from steadypose.nodes.graph.prior_node import make_prior
+from steadypose.nodes.graph.threads import one_thread
+from steadypose.nodes.graph.trajectory_node import make_trajectory
+from steadypose.nodes.library.inputs import SkeletonLike, as_array, compile_loops, skeleton_name, warn
+from steadypose.nodes.library.poses import Poses
+from steadypose.prior.body.layouts import SKELETONS
+from steadypose.prior.clean.pipeline import load_loops
+from steadypose.prior.clean.settings import PriorSettings
+
+_OF_CLEAN = ("positions", "rotations", "state", "sigma", "anomaly", "anomaly_flag", "joint_anomaly")
+_OF_WORLD = {"world_positions": "positions", "root_velocity": "root_velocity", "contacts": "contacts"}
+_NO_WORLD = {"world_positions": np.full((22, 3), np.nan), "root_velocity": np.full(3, np.nan)}
+_NO_WORLD |= {"contacts": np.full(8, np.nan)}
+_NAMES = np.array(JOINTS)
+
+
+class FilterError(ValueError):
+    """A frame, or an argument, that cannot be used. The text says what was expected, what came, and what to do."""
+
+
+class Filter:
+    """Cleans joints as they come: ``pose = filter(joints, t)``, what the nodes do, with the same numbers.
+
+    A filter serves one camera, with all bodies in its picture, from one thread. Nothing in it reads a clock or draws a
+    random number. Poses are of a grid of 30 Hz, ``delay`` frames behind; a stream whose stamps go back, or stop for
+    longer than the prior's timeout, begins anew.
+
+    Args:
+        skeleton: the joints' names and order, or a layout of your own, as of `clean`.
+        up: the axis of the joints' frame that points up: ``z``, ``y``, or ``-y`` (a level camera: y down).
+        delay: frames at 30 Hz that an answer waits for, 0 to 16; more is smoother.
+        sensor_pose: where the sensor stands in the world, of which the floor is then at 0; instead of ``up``.
+        settings: ``prior`` and ``trajectory`` of a launch file.
+
+    Attributes:
+        problems: what is probably wrong with the input so far, in words. Each is warned of once, as `InputWarning`.
+
+    Raises:
+        ValueError: an unknown skeleton, axis or setting.
+    """
+
+    def __init__(
+        self,
+        skeleton: SkeletonLike = "smpl22",
+        up: str = "z",
+        delay: int = 4,
+        *,
+        sensor_pose: Pose | None = None,
+        settings: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> None:
+        self._skeleton = skeleton_name(skeleton)
+        if self._skeleton not in SKELETONS:
+            hint = skeleton_hint(self._skeleton, ())
+            raise FilterError(f"skeleton: expected one of {', '.join(SKELETONS)}, got {skeleton!r}{hint}")
+        self._pose, self._calibrated = sensor_pose or Pose.from_up(up), sensor_pose is not None
+        compile_loops()
+        prior = {"delay": delay} | dict((settings or {}).get("prior", {}))
+        self._prior, self._trajectory = make_prior(prior), make_trajectory((settings or {}).get("trajectory", {}))
+        one_thread()
+        load_loops(PriorSettings.from_dict(prior))  # now, and not when the first frame comes
+        self._diagnosis = Diagnosis(PriorSettings.from_dict(prior))
+        self._next_look = CHECKED
+        self._last: PoseRaw | None = None
+        self._several = False
+        self._recognised = False
+
+    def __call__(
+        self,
+        joints: ArrayLike,
+        t: float | None = None,
+        *,
+        stamp_ns: int | None = None,
+        confidence: ArrayLike | None = None,
+        ids: Sequence[int] | None = None,
+        sensor_pose: Pose | None = None,
+    ) -> Poses | None:
+        """Take a frame; the newest pose that it completes.
+
+        Args:
+            joints: (J, 3) metres of one body, NaN where a joint is missing; or (B, J, 3) of as many as there are in
+                this frame, none included.
+            t: seconds of capture, on any clock that only goes forward.
+            stamp_ns: the same in whole nanoseconds, instead of ``t``.
+            confidence: (J,) or (B, J) 0 to 1, where the source tells it.
+            ids: the B bodies' numbers, each person's own; 0, 1, … unless given.
+            sensor_pose: of this frame, where the camera moves.
+
+        Returns:
+            The pose: of one body, or with an axis of bodies where ``joints`` has one. None while the delay fills,
+            while nobody is there, and where a camera of more than 30 Hz completes none.
+
+        Raises:
+            FilterError: an array has the wrong form, or there is no time; the frame is not used.
+        """
+        found = self.update(joints, t, stamp_ns=stamp_ns, confidence=confidence, ids=ids, sensor_pose=sensor_pose)
+        return found[-1] if found else None
+
+    def update(
+        self,
+        joints: ArrayLike,
+        t: float | None = None,
+        *,
+        stamp_ns: int | None = None,
+        confidence: ArrayLike | None = None,
+        ids: Sequence[int] | None = None,
+        sensor_pose: Pose | None = None,
+    ) -> list[Poses]:
+        """Take a frame as a call does; all poses that it completes, oldest first: several of a camera below 30 Hz."""
+        stamp = _stamp(t, stamp_ns)
+        bodies, self._several = self._bodies(joints, confidence, ids)
+        if sensor_pose is not None:
+            self._pose, self._calibrated = sensor_pose, True
+        raw = PoseRaw(stamp, "sensor", "program", self._skeleton, self._pose, self._calibrated, bodies)
+        self._diagnosis.see(raw)
+        self._last = raw
+        poses = self._poses(self._prior.process(raw))
+        if self._diagnosis.frames == self._next_look:
+            self._next_look *= 2  # a look takes as long as several frames: seldom, once there was nothing to say
+            warn(self._diagnosis.look())
+        return poses
+
+    def flush(self) -> list[Poses]:
+        """The poses that the delay still holds, oldest first. The stream ends; the next frame begins another."""
+        if self._last is None:
+            return []
+        end = replace(self._last, bodies=[], end_of_stream=True)
+        poses, self._last = self._poses(self._prior.process(end)), None
+        warn(self._diagnosis.look())
+        if not self._recognised and not self.problems:
+            cause, _, text = NOBODY.partition(": ")
+            self._diagnosis.problems[cause] = text
+            warn([NOBODY])
+        return poses
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        return tuple(self._diagnosis.texts)
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Frames, bodies and joints that were not used so far, by cause."""
+        return {cause: n for cause, n in (self._prior.counters + self._trajectory.counters).items() if n}
+
+    def _poses(self, cleaned: list[PoseClean]) -> list[Poses]:
+        poses = []
+        for clean in cleaned:
+            world = {body.id: body for moment in self._trajectory.process(clean) for body in moment.bodies}
+            if clean.bodies:
+                self._recognised = True
+                poses.append(Poses(_arrays(clean, world, several=self._several), self.problems))
+        return poses
+
+    def _bodies(
+        self, joints: ArrayLike, confidence: ArrayLike | None, ids: Sequence[int] | None
+    ) -> tuple[list[RawBody], bool]:
+        """The bodies of a frame, and whether there is an axis of them."""
+        layout = SKELETONS[self._skeleton]
+        positions = as_array("joints", joints)
+        wanted = (len(layout.joints), 3)
+        several = positions.ndim == 3
+        if positions.size == 0 and positions.ndim in (1, 3):  # nobody; [] does not say of which form somebody would be
+            return [], several or self._several
+        if positions.dtype.kind not in "fiu" or positions.shape[-2:] != wanted or positions.ndim not in (2, 3):
+            hint = axes_hint((1, *positions.shape[-2:]), self._skeleton) if positions.ndim > 1 else ""
+            raise FilterError(
+                f"joints: expected ({wanted[0]}, 3) metres, or (bodies, {wanted[0]}, 3), for {self._skeleton}, got "
+                f"{positions.dtype} of shape {positions.shape}{hint}"
+            )
+        positions = positions.reshape(-1, *wanted)
+        if confidence is None:
+            sure = np.asarray(np.isfinite(positions).all(axis=-1), np.float32)
+        else:
+            sure = as_array("confidence", confidence).astype(np.float32)
+            if sure.size != positions.shape[0] * wanted[0]:
+                raise FilterError(f"confidence: expected {positions.shape[:-1]}, got {sure.shape}")
+            sure = sure.reshape(positions.shape[:-1])
+        numbers = list(range(len(positions))) if ids is None else [int(id) for id in ids]
+        if len(numbers) != len(positions) or len(set(numbers)) != len(numbers):
+            raise FilterError(f"ids: expected {len(positions)} different numbers, one a body, got {list(ids or ())}")
+        bodies = [RawBody(*parts) for parts in zip(numbers, positions, sure, strict=True)]
+        return [body for body in bodies if not (several and np.isnan(body.positions).all())], several
+
+
+def _stamp(t: float | None, stamp_ns: int | None) -> int:
+    """Nanoseconds of capture."""
+    if (t is None) == (stamp_ns is None):
+        raise FilterError("expected the time of capture: t in seconds, or stamp_ns; filter(joints, time.time())")
+    if stamp_ns is not None:
+        return int(stamp_ns)
+    if not math.isfinite(t) or t < 0:  # type: ignore[operator]  (one of the two is given)
+        raise FilterError(f"t: expected seconds of 0 or more, got {t!r}")
+    if t >= 2**31:  # type: ignore[operator]
+        raise FilterError(f"t: expected seconds, got {t!r}; say stamp_ns= of nanoseconds, divide milliseconds by 1000")
+    return round(t * 1e9)  # type: ignore[operator]
+
+
+def _arrays(clean: PoseClean, world: Mapping[int, WorldBody], *, several: bool) -> dict[str, NDArray[Any]]:
+    """As those of `NpzCollector`, of one moment."""
+    bodies = clean.bodies if several else clean.bodies[:1]
+    rows = [_row(body, world.get(body.id)) for body in bodies]
+    common: dict[str, NDArray[Any]] = {"stamp_ns": np.array(clean.stamp_ns), "joint_names": _NAMES}
+    if not several:
+        return rows[0] | common
+    stacked = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    return stacked | common | {"body_id": np.array([body.id for body in bodies], np.int32)}
+
+
+def _row(body: CleanBody, world: WorldBody | None) -> dict[str, NDArray[Any]]:
+    of_clean = {name: np.asarray(getattr(body, name)) for name in _OF_CLEAN}
+    return of_clean | ({own: getattr(world, name) for own, name in _OF_WORLD.items()} if world else _NO_WORLD)

@@ -1,0 +1,210 @@
+"""What `steadypose.Filter` and `steadypose.clean` give: arrays by name, and joints by theirs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import CONTACTS, JOINTS
+
+if TYPE_CHECKING:
+    import pandas  # pyright: ignore[reportMissingImports]
+    import xarray  # pyright: ignore[reportMissingImports]
+
+ALWAYS = ("stamp_ns", "joint_names", "body_id")
+"""arrays that have no axis of bodies"""
+BY_CONTACT, BY_JOINT = ("contacts",), ("joint_anomaly", "rotations", "sigma", "state", "positions", "world_positions")
+_NAMES = dict.fromkeys(BY_CONTACT, CONTACTS) | dict.fromkeys(BY_JOINT, JOINTS)
+_LAST = ("x", "y", "z", "w")
+
+
+class ByName(NDArray[Any] if TYPE_CHECKING else np.ndarray):
+    """An array with an axis of joints that takes their names: ``positions["left_wrist"]``, ``sigma[["neck", "head"]]``.
+
+    Indexing in any other way is numpy's own, and gives a plain array.
+    """
+
+    _names: tuple[str, ...] = ()
+    _axis = 0
+
+    @classmethod
+    def of(cls, array: NDArray[Any], names: tuple[str, ...], axis: int) -> ByName:
+        """A view of an array whose axis, counted from the end, has these names."""
+        named = np.asarray(array).view(cls)
+        named._names, named._axis = names, axis
+        return named
+
+    def __array_finalize__(self, source: Any) -> None:
+        if isinstance(source, ByName) and source.shape == self.shape:
+            self._names, self._axis = source._names, source._axis
+
+    def __getitem__(self, key: Any) -> Any:
+        plain = self.view(np.ndarray)
+        if isinstance(key, str):
+            return plain.take(self._index(key), axis=self._axis)
+        if isinstance(key, (list, tuple)) and key and all(isinstance(name, str) for name in key):
+            return plain.take([self._index(name) for name in key], axis=self._axis)
+        return plain[key]
+
+    def _index(self, name: str) -> int:
+        if name in self._names:
+            return self._names.index(name)
+        known = ", ".join(self._names) or "none: the axis of joints is gone; take the joint before computing with it"
+        raise KeyError(f"expected one of {known}; got {name!r}")
+
+
+class Poses(dict[str, NDArray[Any]]):
+    """Poses of one moment, or of T moments: the arrays that ``steadypose clean`` writes, by name and as attributes.
+
+    Shapes are those of one body at one moment. Of T moments all have an axis T before these, and where the input had
+    an axis of bodies, one of B bodies after it, in the order of ``body_id``.
+
+    Attributes:
+        problems: what is probably wrong with the input, in words, with what to do.
+        refused: frames, bodies and joints that were not used, by cause.
+    """
+
+    def __init__(
+        self,
+        arrays: Mapping[str, NDArray[Any]],
+        problems: Iterable[str] = (),
+        refused: Mapping[str, int] | None = None,
+    ) -> None:
+        super().__init__(arrays)
+        self.problems: tuple[str, ...] = tuple(problems)
+        self.refused: dict[str, int] = dict(refused or {})
+
+    @property
+    def stamp_ns(self) -> NDArray[np.int64]:
+        """Nanoseconds of capture; of one moment a number."""
+        return self["stamp_ns"][()]
+
+    @property
+    def t(self) -> NDArray[np.float64]:
+        """Seconds of capture: `stamp_ns` / 1e9."""
+        return self["stamp_ns"][()] / 1e9
+
+    @property
+    def positions(self) -> ByName:
+        """(22, 3) metres, in the input's frame; by joint."""
+        return self._by_name("positions")
+
+    @property
+    def world(self) -> ByName:
+        """(22, 3) metres in the world: z up, the floor at 0 where the sensor's place is known; by joint."""
+        return self._by_name("world_positions")
+
+    @property
+    def rotations(self) -> ByName:
+        """(22, 4) xyzw, each from the joint's to its parent's frame, the pelvis' to the input's; by joint."""
+        return self._by_name("rotations")
+
+    @property
+    def state(self) -> ByName:
+        """(22,) `JointState`: seen, refined, imputed or unknown; by joint."""
+        return self._by_name("state")
+
+    @property
+    def sigma(self) -> ByName:
+        """(22,) metres, standard deviation of a position along an axis; by joint."""
+        return self._by_name("sigma")
+
+    @property
+    def joint_anomaly(self) -> ByName:
+        """(22,) as `anomaly`, joint by joint; NaN where not seen."""
+        return self._by_name("joint_anomaly")
+
+    @property
+    def anomaly(self) -> Any:
+        """How unlike human motion: -log10 of the rate at which clean motion scores as high. NaN if not scored."""
+        return self["anomaly"][()]
+
+    @property
+    def anomaly_flag(self) -> Any:
+        """Whether the pose cannot be trusted."""
+        return self["anomaly_flag"][()]
+
+    @property
+    def contacts(self) -> ByName:
+        """(8,) probability that a knee, ankle, foot or wrist bears load; by joint (`CONTACTS`)."""
+        return self._by_name("contacts")
+
+    @property
+    def root_velocity(self) -> NDArray[np.float64]:
+        """(3,) m/s of the pelvis, world."""
+        return self["root_velocity"]
+
+    @property
+    def body_id(self) -> NDArray[np.int32]:
+        """(B,) the bodies' numbers; 0 alone where the input had no axis of bodies."""
+        return self.get("body_id", np.zeros(1, np.int32))
+
+    @property
+    def bodies(self) -> dict[int, Poses]:
+        """The poses of each body by its number, without an axis of bodies."""
+        if "body_id" not in self:
+            return {0: self}
+        axis = self["stamp_ns"].ndim
+        common = {name: self[name] for name in self if name in ALWAYS[:2]}
+        own = [name for name in self if name not in ALWAYS]
+        return {
+            int(id): Poses(common | {name: self[name].take(row, axis) for name in own}, self.problems, self.refused)
+            for row, id in enumerate(self["body_id"])
+        }
+
+    def to_dict(self) -> dict[str, NDArray[Any]]:
+        """The plain arrays by name, as in the ``.npz``."""
+        return dict(self)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """A dataset with named axes: time, body, joint, contact, axis, quaternion.
+
+        Raises:
+            ModuleNotFoundError: xarray is not installed.
+        """
+        import xarray  # pyright: ignore[reportMissingImports]
+
+        lead = [*(["time"] if self["stamp_ns"].ndim else []), *(["body"] if "body_id" in self else [])]
+        tails: dict[str, list[str]] = {"positions": ["joint", "axis"], "world_positions": ["joint", "axis"]}
+        tails |= {"rotations": ["joint", "quaternion"], "contacts": ["contact"], "root_velocity": ["axis"]}
+        tails |= {name: ["joint"] for name in ("state", "sigma", "joint_anomaly")}
+        tails |= {"anomaly": [], "anomaly_flag": []}
+        coordinates: dict[str, Any] = {"joint": list(JOINTS), "contact": list(CONTACTS), "axis": list("xyz")}
+        coordinates |= {"quaternion": list(_LAST), "stamp_ns": (lead[:1] if "time" in lead else [], self["stamp_ns"])}
+        if "time" in lead:
+            coordinates["time"] = np.asarray(self.t)
+        if "body_id" in self:
+            coordinates["body"] = self["body_id"]
+        return xarray.Dataset({name: (lead + tails[name], self[name]) for name in tails}, coords=coordinates)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """A table with a row for each moment and body, and columns such as ``left_wrist_x`` (metres, world).
+
+        Raises:
+            ModuleNotFoundError: pandas is not installed.
+        """
+        import pandas  # pyright: ignore[reportMissingImports]
+
+        tables = []
+        for id, body in self.bodies.items():
+            count = body["stamp_ns"].size
+            columns: dict[str, Any] = {"t": np.reshape(body.t, count), "body": np.full(count, id)}
+            for joint in JOINTS:
+                place = np.reshape(body.world[joint], (count, 3))
+                columns |= {f"{joint}_{axis}": place[:, number] for number, axis in enumerate("xyz")}
+                columns |= {
+                    f"{joint}_{name}": np.reshape(body._by_name(name)[joint], count) for name in ("state", "sigma")
+                }
+            columns |= {name: np.reshape(body[name], count) for name in ("anomaly", "anomaly_flag")}
+            tables.append(pandas.DataFrame(columns))
+        return pandas.concat(tables, ignore_index=True).sort_values(["t", "body"], ignore_index=True)
+
+    def __repr__(self) -> str:
+        return f"<Poses {', '.join(f'{name} {array.shape}' for name, array in self.items())}>"
+
+    def _by_name(self, name: str) -> ByName:
+        axis = -2 if name in ("positions", "world_positions", "rotations") else -1
+        return ByName.of(self[name], _NAMES[name], axis)

@@ -1,0 +1,132 @@
+"""GLB (glTF 2.0): an animated skeleton with a skin of one octahedron a bone, in metres, y up, facing +z.
+
+Joints are nodes named as in smpl22, their rotations an animation, so that Blender, Unity, Unreal and browsers have
+bones to retarget; the skin is there to be seen.
+"""
+
+from __future__ import annotations
+
+from itertools import count
+
+import numpy as np
+from numpy.typing import NDArray
+from pygltflib import (
+    ARRAY_BUFFER,
+    ELEMENT_ARRAY_BUFFER,
+    FLOAT,
+    GLTF2,
+    UNSIGNED_BYTE,
+    UNSIGNED_SHORT,
+    Accessor,
+    Animation,
+    AnimationChannel,
+    AnimationChannelTarget,
+    AnimationSampler,
+    Attributes,
+    Buffer,
+    BufferView,
+    Mesh,
+    Node,
+    Primitive,
+    Scene,
+    Skin,
+)
+
+from steadypose.nodes.sinks.files.motion import Y_UP, BodyMotion
+from steadypose.prior.body.skeleton import CHILDREN, JOINTS, PARENTS
+
+_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+_KINDS = {np.dtype(np.float32): FLOAT, np.dtype(np.uint16): UNSIGNED_SHORT, np.dtype(np.uint8): UNSIGNED_BYTE}
+
+WAIST, WIDTH = 0.2, 0.08
+"""Of a bone: where its octahedron is widest, and half how wide, as Blender draws them."""
+
+
+def to_glb(motion: BodyMotion) -> bytes:
+    """The file's contents."""
+    file = _Glb()
+    offsets = motion.offsets @ Y_UP.T
+    rest = np.zeros((22, 3))
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        rest[joint] = rest[parent] + offsets[joint]
+    root = motion.root @ Y_UP.T
+    turns = motion.rotations[..., [1, 2, 0, 3]]  # the turn of axes exchanges them, and a rotation's vector with them
+    nodes = [
+        Node(name=name, translation=at.tolist(), rotation=turn.tolist(), children=list(children))
+        for name, at, turn, children in zip(JOINTS, [root[0], *offsets[1:]], turns[0], CHILDREN, strict=True)
+    ]  # fmt: skip
+    bind = np.tile(np.eye(4), (22, 1, 1))
+    bind[:, :3, 3] = -rest
+    points, triangles, joints = _octahedra(rest)
+    attributes = Attributes(
+        POSITION=file.add(points, ARRAY_BUFFER),
+        JOINTS_0=file.add(np.pad(joints[:, None], ((0, 0), (0, 3))).astype(np.uint8), ARRAY_BUFFER),
+        WEIGHTS_0=file.add(np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)), ARRAY_BUFFER),
+    )
+    mesh = Mesh(primitives=[Primitive(attributes=attributes, indices=file.add(triangles, ELEMENT_ARRAY_BUFFER))])
+    skin = Skin(joints=list(range(22)), inverseBindMatrices=file.add(bind.swapaxes(1, 2).reshape(22, 16)), skeleton=0)
+    times = file.add((np.arange(len(root)) / motion.fps)[:, None])
+    tracks = [(0, "translation", file.add(root)), *((j, "rotation", file.add(turns[:, j])) for j in range(22))]
+    animation = Animation(
+        name="motion",
+        samplers=[AnimationSampler(input=times, output=values) for _, _, values in tracks],
+        channels=[
+            AnimationChannel(sampler=k, target=AnimationChannelTarget(node=joint, path=path))
+            for k, (joint, path, _) in enumerate(tracks)
+        ],
+    )
+    return file.finish(GLTF2(
+        scene=0, scenes=[Scene(nodes=[0, 22])], nodes=[*nodes, Node(name="body", mesh=0, skin=0)], meshes=[mesh],
+        skins=[skin], animations=[animation],
+    ))  # fmt: skip
+
+
+class _Glb:
+    """The one buffer of a file, and what lies where in it."""
+
+    def __init__(self) -> None:
+        self._views: list[BufferView] = []
+        self._accessors: list[Accessor] = []
+        self._data = bytearray()
+
+    def add(self, values: NDArray[np.generic], target: int | None = None) -> int:
+        """The accessor of an array (N, width); numbers that are no integers become float32."""
+        values = values if values.dtype in _KINDS else values.astype(np.float32)
+        self._data += bytes(-len(self._data) % 4)
+        view = BufferView(buffer=0, byteOffset=len(self._data), byteLength=values.nbytes, target=target)
+        self._data += values.tobytes()
+        self._views.append(view)
+        self._accessors.append(
+            Accessor(
+                bufferView=len(self._views) - 1,
+                componentType=_KINDS[values.dtype],
+                count=len(values),
+                type=_TYPES[values.shape[1]],
+                min=values.min(axis=0).tolist(),
+                max=values.max(axis=0).tolist(),
+            )
+        )
+        return len(self._accessors) - 1
+
+    def finish(self, file: GLTF2) -> bytes:
+        file.bufferViews, file.accessors = self._views, self._accessors
+        file.buffers = [Buffer(byteLength=len(self._data))]
+        file.set_binary_blob(bytes(self._data))
+        return b"".join(file.save_to_bytes())
+
+
+def _octahedra(rest: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.uint16], NDArray[np.uint8]]:
+    """Points (126, 3), corners (504, 1) of triangles, and (126,) the joint that each point moves with."""
+    points: list[NDArray[np.float64]] = []
+    triangles: list[list[int]] = []
+    ring = [1, 2, 3, 4]
+    for bone, (joint, parent) in zip(count(), list(enumerate(PARENTS))[1:], strict=False):
+        start, along = rest[parent], rest[joint] - rest[parent]
+        aside = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+        aside *= WIDTH * np.linalg.norm(along) / np.linalg.norm(aside)
+        over = np.cross(along, aside) / np.linalg.norm(along)
+        points += [start, *(start + WAIST * along + side for side in (aside, over, -aside, -over)), start + along]
+        for a, b in zip(ring, ring[1:] + ring[:1], strict=True):
+            triangles += [[6 * bone, 6 * bone + b, 6 * bone + a], [6 * bone + 5, 6 * bone + a, 6 * bone + b]]
+    corners = np.array(triangles, np.uint16).reshape(-1, 1)
+    return np.array(points), corners, np.repeat(np.array(PARENTS[1:], np.uint8), 6)

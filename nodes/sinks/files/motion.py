@@ -1,0 +1,144 @@
+"""One cleaned body as other programs want it: at a steady rate, in the world, on bones that keep their lengths."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_WORLD
+from steadypose.msgs.types import PoseWorld
+from steadypose.nodes.sources.npz import read_arrays, read_stamps
+from steadypose.prior.body.kinematics import forward_kinematics, global_rotations, rigid_alignment
+from steadypose.prior.body.skeleton import PARENTS
+
+Floats = NDArray[np.float64]
+
+Y_UP: Floats = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+"""From x forward, y left, z up to what animation programs have: x left, y up, z forward."""
+
+
+class ExportError(ValueError):
+    """There is no motion to export; the message says what was expected, what is there, and what to do."""
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """A body's motion.
+
+    Attributes:
+        fps: frames a second.
+        root: (T, 3) metres, world, z up: the pelvis.
+        rotations: (T, 22, 4) xyzw, local; the pelvis' to the world.
+        offsets: (22, 3) metres, each joint in its parent's frame.
+        start_s: of the first frame's stamp.
+    """
+
+    fps: float
+    root: Floats
+    rotations: Floats
+    offsets: Floats
+    start_s: float = 0.0
+
+    @property
+    def positions(self) -> Floats:
+        """(T, 22, 3) metres, world, of these bones at these rotations."""
+        matrices = Rotation.from_quat(self.rotations.reshape(-1, 4)).as_matrix()
+        return forward_kinematics(matrices.reshape(*self.rotations.shape[:2], 3, 3), self.offsets, self.root)[0]
+
+
+def read_motion(path: Path, body: int | None = None) -> BodyMotion:
+    """What ``steadypose clean`` has written, of one body.
+
+    Frames stand at the rate of the stamps; what is missing between two is interpolated.
+
+    Args:
+        path: a recording with ``pose/world``, or an ``.npz``.
+        body: its id; that which is there longest if left out.
+
+    Raises:
+        ExportError: there is no such motion.
+    """
+    stamps, positions, rotations = _from_npz(path, body) if path.suffix == ".npz" else _from_recording(path, body)
+    known = np.isfinite(positions).all(axis=(1, 2)) & np.isfinite(rotations).all(axis=(1, 2))
+    if known.sum() < 2:
+        raise ExportError(f"{path}: expected a body in two frames at least, got {known.sum()}; was anybody recognised?")
+    return steady(stamps[known], positions[known], rotations[known])
+
+
+def steady(stamps_s: Floats, positions: Floats, rotations: Floats) -> BodyMotion:
+    """A motion at a steady rate, on bones of one length.
+
+    Args:
+        stamps_s: (T,) seconds, increasing.
+        positions: (T, 22, 3) metres, world.
+        rotations: (T, 22, 4) xyzw, local.
+    """
+    fps = float(np.round(1.0 / np.median(np.diff(stamps_s)), 3))
+    at = stamps_s[0] + np.arange(int((stamps_s[-1] - stamps_s[0]) * fps + 0.01) + 1) / fps
+    at = at.clip(max=stamps_s[-1])
+    turned = np.stack([Slerp(stamps_s, Rotation.from_quat(rotations[:, j]))(at).as_quat() for j in range(22)], axis=1)
+    root = np.stack([np.interp(at, stamps_s, positions[:, 0, axis]) for axis in range(3)], axis=1)
+    return BodyMotion(fps, root, turned, _bones(positions, rotations), float(stamps_s[0]))
+
+
+def _bones(positions: Floats, rotations: Floats) -> Floats:
+    """(22, 3) with which the rotations come nearest to the positions: each bone's median in its parent's frame."""
+    matrices = Rotation.from_quat(rotations.reshape(-1, 4)).as_matrix().reshape(*rotations.shape[:2], 3, 3)
+    parents = list(PARENTS[1:])
+    bones = (positions[:, 1:] - positions[:, parents])[..., None]
+    local = global_rotations(matrices)[:, parents].swapaxes(-1, -2) @ bones
+    return np.concatenate([np.zeros((1, 3)), np.median(local[..., 0], axis=0)])
+
+
+def _from_recording(path: Path, body: int | None) -> tuple[Floats, Floats, Floats]:
+    with RecordingReader(path) as recording:
+        if not recording.count(POSE_WORLD):
+            raise ExportError(
+                f"{path}: expected messages on {POSE_WORLD}, got {', '.join(recording.topics)}; clean it first: "
+                f"steadypose clean {path} OUT"
+            )
+        frames = [m for _, _, m in recording.messages([POSE_WORLD]) if isinstance(m, PoseWorld)]
+    bodies = Counter(b.id for frame in frames for b in frame.bodies)
+    chosen = _chosen(path, bodies, body)
+    rows = {frame.stamp_ns: b for frame in frames for b in frame.bodies if b.id == chosen}
+    stamps = np.array(sorted(rows))
+    positions = np.stack([rows[s].positions for s in stamps.tolist()]).astype(np.float64)
+    rotations = np.stack([rows[s].rotations for s in stamps.tolist()]).astype(np.float64)
+    return stamps / 1e9, positions, rotations
+
+
+def _from_npz(path: Path, body: int | None) -> tuple[Floats, Floats, Floats]:
+    arrays = read_arrays(path)
+    if missing := {"positions", "world_positions", "rotations"} - arrays.keys():
+        raise ExportError(
+            f"{path}: expected what 'steadypose clean' writes, it lacks {', '.join(sorted(missing))}; clean it first: "
+            f"steadypose clean {path} OUT.npz"
+        )
+    seen, world, turned = (arrays[n].astype(np.float64) for n in ("positions", "world_positions", "rotations"))
+    if "body_id" in arrays:
+        ids = arrays["body_id"].tolist()
+        there = {id: int(np.isfinite(world[:, k]).all(axis=(1, 2)).sum()) for k, id in enumerate(ids)}
+        place = ids.index(_chosen(path, Counter(there), body))
+        seen, world, turned = seen[:, place], world[:, place], turned[:, place]
+    stamps = read_stamps(path, arrays, len(seen)) / 1e9
+    # The rotations are to the sensor's frame; what turns that to the world is one rotation in all of the file.
+    known = np.isfinite(seen).all(axis=(1, 2)) & np.isfinite(world).all(axis=(1, 2))
+    if known.any():
+        shapes = [(p[known] - p[known][:, :1]).reshape(-1, 3) for p in (seen, world)]
+        turn = Rotation.from_matrix(rigid_alignment(*shapes)[0])
+        present = np.isfinite(turned[:, 0]).all(axis=1)
+        turned[present, 0] = (turn * Rotation.from_quat(turned[present, 0])).as_quat()
+    return stamps, world, turned
+
+
+def _chosen(path: Path, bodies: Counter[int], body: int | None) -> int:
+    if not bodies or (body is not None and body not in bodies):
+        there = ", ".join(str(id) for id in bodies) or "none"
+        raise ExportError(f"{path}: expected body {'' if body is None else body}, there are {there}")
+    return bodies.most_common(1)[0][0] if body is None else body

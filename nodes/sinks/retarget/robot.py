@@ -1,0 +1,159 @@
+"""A humanoid from its URDF: joints, ranges, speeds, and which of its links play which part of a person's body.
+
+Only the kinematics are read: meshes need not be there. The floating base is put in here, as a URDF has none.
+"""
+
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+# an optional extra, which need not be installed; MuJoCo's module has no stubs
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.nodes.graph.settings import LaunchError
+
+if TYPE_CHECKING:
+    import mujoco
+
+_LIMITED = ("revolute", "prismatic")
+_SHAPES = ("visual", "collision", "transmission", "gazebo", "material")
+_SIDES = {
+    "left": r"^l(eft)?[_-]|[_-]l(eft)?([_-]|$)|^left|^L(?=[A-Z])",
+    "right": r"^r(ight)?[_-]|[_-]r(ight)?([_-]|$)|^right|^R(?=[A-Z])",
+}
+_PARTS = {
+    "hip": r"hip|thigh|upper_?leg",
+    "knee": r"knee|shin|calf|shank|lower_?leg",
+    "foot": r"ankle|foot|sole",
+    "shoulder": r"shoulder|upper_?arm",
+    "elbow": r"elbow|fore_?arm|lower_?arm",
+    "wrist": r"wrist|hand|palm",
+}
+_LAST = ("foot", "wrist")
+"""parts with several links in a row, of which the last counts; of the others the first does"""
+PARTS = ("pelvis", "torso", *(f"{side}_{part}" for side in _SIDES for part in _PARTS))
+"""the parts of a person's body that links play"""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A humanoid.
+
+    Attributes:
+        model: of MuJoCo, with a free joint under the root link.
+        joints: (N,) names of the joints that move, in the model's order.
+        lower, upper: (N,) radians or metres, as the URDF has them.
+        speed: (N,) rad/s or m/s.
+        links: the link that plays each of `PARTS`.
+    """
+
+    model: mujoco.MjModel
+    joints: tuple[str, ...]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    speed: NDArray[np.float64]
+    links: Mapping[str, str]
+
+
+def load_robot(path: Path, links: Mapping[str, str]) -> Robot:
+    """Read a URDF.
+
+    Args:
+        path: of the file.
+        links: the link that plays a part, where its name does not tell.
+
+    Raises:
+        LaunchError: it cannot be read, a joint has no limits, or no link is found for a part.
+    """
+    import mujoco
+
+    try:
+        root = ET.parse(path).getroot()
+    except OSError as error:
+        raise LaunchError(f"{path} cannot be read: {error.strerror}") from error
+    except ET.ParseError as error:
+        raise LaunchError(f"{path} is no URDF: {error}") from error
+    limits = _limits(root, path)
+    names = [link.get("name", "") for link in root.findall("link")]
+    children = {child.get("link") for child in root.iterfind("joint/child")}
+    roots = [name for name in names if name not in children]
+    if len(roots) != 1:
+        raise LaunchError(f"{path}: expected one link without a parent, got {', '.join(roots) or 'none'}")
+    _prepare(root)
+    try:
+        spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+        spec.body(roots[0]).add_freejoint()
+        model = spec.compile()
+    except ValueError as error:
+        raise LaunchError(f"{path}: {error}") from error
+    joints = tuple(model.joint(k).name for k in range(model.njnt) if model.joint(k).name in limits)
+    lower, upper, speed = np.array([limits[name] for name in joints]).T
+    bodies = [model.body(k).name for k in range(model.nbody)]
+    return Robot(model, joints, lower, upper, speed, _links(path, bodies, roots[0], links))
+
+
+def _limits(root: ET.Element, path: Path) -> dict[str, tuple[float, float, float]]:
+    found = {}
+    for joint in root.findall("joint"):
+        name, kind, limit = joint.get("name", ""), joint.get("type", ""), joint.find("limit")
+        if kind in ("fixed", "floating"):
+            continue
+        if kind not in _LIMITED or limit is None or joint.find("mimic") is not None:
+            raise LaunchError(f"{path}: joint {name}: expected revolute or prismatic with a <limit>, got {kind}")
+        try:
+            low, high, speed = (float(limit.get(key, "nan")) for key in ("lower", "upper", "velocity"))
+        except ValueError as error:
+            raise LaunchError(f"{path}: joint {name}: {error}") from error
+        if not (low < high and speed > 0):
+            raise LaunchError(
+                f"{path}: joint {name}: expected lower < upper and velocity > 0, got {low:g}, {high:g}, {speed:g}"
+            )
+        found[name] = low, high, speed
+    return found
+
+
+def _prepare(root: ET.Element) -> None:
+    """Leave nothing but the kinematics."""
+    for link in [*root, *root.findall("link")]:
+        for shape in _SHAPES:
+            for element in link.findall(shape):
+                link.remove(element)
+    for shape in _SHAPES:
+        for element in root.findall(shape):
+            root.remove(element)
+    settings = ET.SubElement(root, "mujoco")
+    # masses take no part in kinematics, and a link without one is no reason to refuse a robot
+    ET.SubElement(
+        settings, "compiler", fusestatic="false", balanceinertia="true", boundmass="0.01", boundinertia="0.0001"
+    )
+
+
+def _links(path: Path, bodies: list[str], base: str, given: Mapping[str, str]) -> dict[str, str]:
+    """The link of each part; bodies come parents first."""
+    if unknown := given.keys() - set(PARTS):
+        raise LaunchError(f"links: no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
+    found = {
+        "pelvis": base,
+        "torso": next((b for b in reversed(bodies) if re.search("torso|chest|trunk", b, re.I)), ""),
+    }
+    for side, sided in _SIDES.items():
+        own = [body for body in bodies if re.search(sided, body)]
+        for part, pattern in _PARTS.items():
+            named = [body for body in own if re.search(pattern, body, re.I)]
+            found[f"{side}_{part}"] = (named[-1] if part in _LAST else named[0]) if named else ""
+    found |= given
+    for part, link in found.items():
+        if link not in bodies:
+            raise LaunchError(
+                f"{path}: {f'no link {link!r}' if link else 'no link is named'} for {part}: "
+                f'name one with links, such as {{ {part} = "{bodies[-1]}" }}; there are {", ".join(bodies[2:])}'
+            )
+    return found

@@ -1,0 +1,238 @@
+"""Serves the page, and its WebSocket, from a thread of its own.
+
+**Who may.** The WebSocket takes a token, which the printed address has after a ``#``, so that it is in no log and no
+``Referer``. Nothing is served under a name that is not this server's, or any page in a browser could reach it by a name
+that it has pointed at this machine (DNS rebinding). The page and the script hold nothing secret.
+
+**Who is slow.** A client has room for the newest message of each stream, and for some events; what it does not take
+before the next comes is dropped, and counted. So it is never behind by more than what its connection holds.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import ipaddress
+import logging
+import mimetypes
+import socket
+import threading
+from collections import deque
+from collections.abc import Collection
+from concurrent.futures import Future
+from http import HTTPStatus
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import parse_qs, urlsplit
+
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.web.form import hello
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.http11 import Request, Response
+
+STATIC = Path(__file__).parent / "static"
+FILES = {"/": "index.html", "/kiosk": "kiosk.html"} | {
+    f"/{name}": name for name in ("page.js", "kiosk.js", "steadypose.js", "steadypose.d.ts")
+}
+"""what is served, by path; nothing else is"""
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; img-src data:; connect-src 'self' {}; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+MAX_CLIENTS = 16
+EVENTS_KEPT = 64
+"""events are not replaced by newer ones: messages of them that a client may have waiting"""
+STREAMS_KEPT = 64
+"""streams of which the newest message is kept for who connects later"""
+LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
+
+
+class WebServer:
+    """HTTP and WebSocket at one port.
+
+    Args:
+        host, port: to serve at; port 0 is any that is free.
+        names: by which it may be called, beside its host, and beside this machine's names for itself.
+        token: that a client must know.
+
+    Attributes:
+        url: of the page, with the token.
+        clients: how many are connected.
+        dropped: messages that slow clients did not take in time.
+
+    Raises:
+        LaunchError: the port cannot be opened.
+    """
+
+    def __init__(self, host: str, port: int, names: Collection[str], token: str) -> None:
+        self._token = token
+        self._clients: set[_Client] = set()
+        self._latest: dict[str, str] = {}
+        self.dropped = 0
+        self._names = {host, *names, *LOCAL_NAMES, *([socket.gethostname()] if _is_any(host) else [])}
+        started: Future[Server] = Future()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve(host, port, started)), daemon=True)
+        self._thread.start()
+        try:
+            server = started.result(20)
+        except OSError as error:
+            raise LaunchError(
+                f"[web] port {port} at {host} is not to be had ({error.strerror}): another server may be running; "
+                "close it, or set another [web] port"
+            ) from error
+        self.port = next(iter(server.sockets)).getsockname()[1]
+        shown = socket.gethostname() if _is_any(host) else _in_url(host)
+        self.url = f"http://{shown}:{self.port}/#{token}"
+
+    @property
+    def clients(self) -> int:
+        return len(self._clients)
+
+    def send(self, stream: str, text: str, *, replaces: bool) -> None:
+        """Give a message to all clients.
+
+        Args:
+            stream: what it is the newest of.
+            text: JSON.
+            replaces: whether an older one of the same stream need not be sent any more.
+        """
+        self._loop.call_soon_threadsafe(self._offer, stream, text, replaces)
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._closing.set)
+        self._thread.join(10)
+
+    def _offer(self, stream: str, text: str, replaces: bool) -> None:
+        self._latest[stream] = text
+        if len(self._latest) > STREAMS_KEPT:
+            del self._latest[next(iter(self._latest))]
+        for client in self._clients:
+            self.dropped += client.offer(stream, text, replaces)
+
+    async def _serve(self, host: str, port: int, started: Future[Server]) -> None:
+        from websockets.asyncio.server import serve
+
+        logging.getLogger("websockets").setLevel(logging.WARNING)  # it has a line for each client that comes or goes
+        self._loop, self._closing = asyncio.get_running_loop(), asyncio.Event()
+        try:
+            # nothing is expected from a client; compression would take 300 kB of each, for a connection in this machine
+            server = await serve(
+                self._talk, host, port, process_request=self._answer, compression=None, max_size=1024, max_queue=1,
+                close_timeout=1,
+            )  # fmt: skip
+        except OSError as error:
+            started.set_exception(error)
+            return
+        async with server:
+            started.set_result(server)
+            await self._closing.wait()
+
+    async def _talk(self, connection: ServerConnection) -> None:
+        client = _Client()
+        for stream, text in self._latest.items():
+            client.offer(stream, text, True)
+        self._clients.add(client)
+        feeding = asyncio.create_task(_feed(connection, client))
+        try:
+            await connection.wait_closed()
+        finally:
+            self._clients.remove(client)
+            feeding.cancel()
+            await asyncio.gather(feeding, return_exceptions=True)
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """The answer to a request; None lets it become a WebSocket."""
+        host = request.headers.get("Host", "")
+        try:
+            called, port = urlsplit(f"//{host}").hostname, urlsplit(f"//{host}").port
+        except ValueError:
+            called = port = None
+        if called is None or called not in self._names:
+            return connection.respond(
+                HTTPStatus.MISDIRECTED_REQUEST,
+                f"not served under the name {host!r}: add it to [web] names if browsers reach this machine by it\n",
+            )
+        url = urlsplit(request.path)
+        if url.path == "/ws":
+            return self._admit(connection, parse_qs(url.query).get("token", [""])[0])
+        if url.path not in FILES:
+            return connection.respond(HTTPStatus.NOT_FOUND, f"there are {', '.join(FILES)}, and the WebSocket /ws\n")
+        return _file(FILES[url.path], f"{_in_url(called)}:{port or 80}")
+
+    def _admit(self, connection: ServerConnection, token: str) -> Response | None:
+        if not hmac.compare_digest(token.encode(), self._token.encode()):
+            return connection.respond(
+                HTTPStatus.UNAUTHORIZED, "expected /ws?token=TOKEN, with the token after the # of the printed address\n"
+            )
+        if len(self._clients) >= MAX_CLIENTS:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"there are {MAX_CLIENTS} clients already\n")
+        return None
+
+
+class _Client:
+    """What waits for one client."""
+
+    def __init__(self) -> None:
+        self._newest: dict[str, str] = {}
+        self._queue: deque[str] = deque(maxlen=EVENTS_KEPT)
+        self._waiting = asyncio.Event()
+
+    def offer(self, stream: str, text: str, replaces: bool) -> int:
+        """Take a message; how many were dropped for it."""
+        if replaces:
+            dropped = int(self._newest.pop(stream, None) is not None)
+            self._newest[stream] = text
+        else:
+            dropped = int(len(self._queue) == EVENTS_KEPT)
+            self._queue.append(text)
+        self._waiting.set()
+        return dropped
+
+    async def next(self) -> str:
+        """The message that is due: events first, then of each stream the newest, in turns."""
+        while not self._queue and not self._newest:
+            self._waiting.clear()
+            await self._waiting.wait()
+        return self._queue.popleft() if self._queue else self._newest.pop(next(iter(self._newest)))
+
+
+async def _feed(connection: ServerConnection, client: _Client) -> None:
+    """Send what waits, until the connection is closed."""
+    await connection.send(hello())
+    while True:
+        await connection.send(await client.next())
+
+
+def _file(name: str, host: str) -> Response:
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    body = (STATIC / name).read_bytes()
+    kind = "text/javascript" if name.endswith(".js") else mimetypes.guess_type(name)[0] or "text/plain"
+    headers = Headers(
+        {
+            "Content-Type": f"{kind}; charset=utf-8",
+            "Content-Length": str(len(body)),
+            "Content-Security-Policy": POLICY.format(f"ws://{host}"),
+            "Cache-Control": "no-cache",
+            "Connection": "close",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+        }
+    )
+    if name.startswith("steadypose."):
+        headers["Access-Control-Allow-Origin"] = "*"  # a page of somebody's own, from elsewhere, imports it
+    return Response(HTTPStatus.OK, "OK", headers, body)
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+def _is_any(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_unspecified
+    except ValueError:
+        return False

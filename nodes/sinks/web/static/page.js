@@ -1,0 +1,171 @@
+// The page: bodies on a floor that can be turned, what they do, and how the nodes are.
+import { connect } from "./steadypose.js";
+
+const COLOURS = ["#8c8c8c", "#10a37f", "#56b4e9", "#e8710a"]; // of the states: unknown, observed, refined, inferred
+const CONTACT = "#f0c808";
+const KEPT = 40; // events in the list
+const STALE_S = 3;
+
+const canvas = document.getElementById("canvas");
+const notice = document.getElementById("notice");
+const pen = canvas.getContext("2d");
+const eye = { yaw: -0.9, pitch: 0.25, distance: 5, target: [0, 0, 0.9] };
+let world = null;
+let doing = new Map();
+let asked = false;
+
+const pose = connect();
+
+pose.on("state", (state) => {
+  notice.textContent = state === "open" ? "" : "no connection: is `steadypose run web` running, and the address its own?";
+});
+pose.on("world", (message) => {
+  world = message;
+  if (message.end) notice.textContent = "the stream has ended";
+  else if (pose.state === "open") notice.textContent = "";
+  draw();
+});
+pose.on("events", ({ events }) => {
+  doing = new Map();
+  for (const event of events) {
+    if (event.phase !== "ENDS") doing.set(event.body, [...(doing.get(event.body) ?? []), label(event)]);
+  }
+});
+pose.on("event", (event) => {
+  const list = document.getElementById("events");
+  const item = document.createElement("li");
+  item.className = event.phase;
+  item.textContent = `${event.body}: ${label(event)}${event.phase === "ENDS" ? ", no longer" : ""}`;
+  list.prepend(item);
+  while (list.children.length > KEPT) list.lastChild.remove();
+});
+
+const rows = new Map();
+pose.on("health", ({ node, level, message, values }) => {
+  const rate = Object.entries(values).find(([key]) => key.startsWith("rate."))?.[1];
+  const late = values["latency_ms.p50"];
+  const row = rows.get(node) ?? document.getElementById("health").insertRow();
+  rows.set(node, row);
+  row.className = level;
+  row.title = message;
+  row.replaceChildren();
+  const cells = [node, rate ? `${Number(rate).toFixed(0)} Hz` : values.state ?? "", late ? `${Number(late).toFixed(0)} ms` : ""];
+  for (const text of cells) row.insertCell().textContent = text;
+});
+
+function label({ kind, hand }) {
+  const words = kind.toLowerCase().replaceAll("_", " ");
+  return hand === "NONE" ? words : `${hand.toLowerCase()} ${words}`;
+}
+
+function draw() {
+  if (asked) return;
+  asked = true;
+  requestAnimationFrame(() => {
+    asked = false;
+    paint();
+  });
+}
+
+function paint() {
+  const scale = devicePixelRatio;
+  const width = canvas.clientWidth;
+  const height = canvas.clientHeight;
+  if (canvas.width !== Math.round(width * scale) || canvas.height !== Math.round(height * scale)) {
+    canvas.width = Math.round(width * scale);
+    canvas.height = Math.round(height * scale);
+  }
+  pen.setTransform(scale, 0, 0, scale, 0, 0);
+  pen.clearRect(0, 0, width, height);
+  const bodies = world?.bodies ?? [];
+  follow(bodies);
+  const project = camera(width, height);
+  floor(project);
+  for (const body of bodies) person(body, project);
+}
+
+// The eye keeps to the middle of those who are there.
+function follow(bodies) {
+  if (!bodies.length) return;
+  for (const axis of [0, 1]) {
+    const middle = bodies.reduce((sum, body) => sum + body.root[axis], 0) / bodies.length;
+    eye.target[axis] += 0.1 * (middle - eye.target[axis]);
+  }
+}
+
+function camera(width, height) {
+  const [sy, cy, sp, cp] = [Math.sin(eye.yaw), Math.cos(eye.yaw), Math.sin(eye.pitch), Math.cos(eye.pitch)];
+  const focal = 1.1 * Math.min(width, height);
+  return ([x, y, z]) => {
+    const [dx, dy, dz] = [x - eye.target[0], y - eye.target[1], z - eye.target[2]];
+    const across = cy * dx + sy * dy;
+    const along = -sy * dx + cy * dy;
+    const depth = eye.distance + cp * along - sp * dz;
+    if (depth < 0.1) return null;
+    return [width / 2 + (focal * across) / depth, height / 2 - (focal * (sp * along + cp * dz)) / depth];
+  };
+}
+
+function line(a, b, colour, thick) {
+  if (!a || !b) return;
+  pen.strokeStyle = colour;
+  pen.lineWidth = thick;
+  pen.beginPath();
+  pen.moveTo(...a);
+  pen.lineTo(...b);
+  pen.stroke();
+}
+
+function floor(project) {
+  const [cx, cy] = [Math.round(eye.target[0]), Math.round(eye.target[1])];
+  for (let k = -3; k <= 3; k += 0.5) {
+    line(project([cx + k, cy - 3, 0]), project([cx + k, cy + 3, 0]), "#2a2f3a", 1);
+    line(project([cx - 3, cy + k, 0]), project([cx + 3, cy + k, 0]), "#2a2f3a", 1);
+  }
+}
+
+function person(body, project) {
+  const points = body.positions.map((p, joint) => (body.state[joint] && !p.includes(null) ? project(p) : null));
+  pen.lineCap = "round";
+  pose.names.parents.forEach((parent, joint) => {
+    if (parent < 0) return;
+    line(points[parent], points[joint], COLOURS[Math.max(body.state[parent], body.state[joint])], 5);
+  });
+  pose.names.contacts.forEach((name, index) => {
+    const at = points[pose.names.joints.indexOf(name)];
+    if (!at || body.contacts[index] < 0.5) return;
+    pen.fillStyle = CONTACT;
+    pen.beginPath();
+    pen.arc(...at, 5, 0, 2 * Math.PI);
+    pen.fill();
+  });
+  const head = points[pose.names.joints.indexOf("head")];
+  if (!head) return;
+  pen.fillStyle = "#dde3ee";
+  pen.font = "13px system-ui, sans-serif";
+  pen.textAlign = "center";
+  pen.fillText([body.id, ...(doing.get(body.id) ?? [])].join(" · "), head[0], head[1] - 26);
+}
+
+canvas.addEventListener("pointermove", (event) => {
+  if (!event.buttons) return;
+  eye.yaw -= 0.008 * event.movementX;
+  eye.pitch = Math.min(1.5, Math.max(-0.1, eye.pitch + 0.008 * event.movementY));
+  draw();
+});
+canvas.addEventListener("wheel", (event) => {
+  event.preventDefault();
+  eye.distance = Math.min(15, Math.max(1.5, eye.distance * Math.exp(0.001 * event.deltaY)));
+  draw();
+}, { passive: false });
+addEventListener("resize", draw);
+
+let last = 0;
+let stamp = 0;
+setInterval(() => {
+  if (world && world.stamp === stamp && !world.end && pose.state === "open") {
+    if ((last += 1) >= STALE_S) notice.textContent = "no poses: nobody is seen, or the nodes are waiting";
+  } else last = 0;
+  stamp = world?.stamp;
+}, 1000);
+draw();

@@ -1,0 +1,92 @@
+// Types of steadypose.js. Lengths are metres in a right-handed world with z up; stamps are seconds of capture.
+
+export type Vector = [x: number, y: number, z: number];
+export type EventKind =
+  | "ENTERED" | "LEFT" | "NEAR" | "STANDS" | "SITS" | "LIES" | "FELL"
+  | "HAND_RAISED" | "WAVES" | "POINTS" | "FACES_SENSOR";
+
+export interface Names {
+  version: number;
+  joints: string[];
+  /** index of each joint's parent, -1 for the pelvis */
+  parents: number[];
+  contacts: string[];
+  states: ["UNKNOWN", "SEEN", "REFINED", "IMPUTED"];
+  events: EventKind[];
+}
+
+export interface Body {
+  id: number;
+  tracking: "OK" | "COASTING" | "LOST";
+  /** of the pelvis */
+  root: Vector;
+  /** quaternion xyzw, from the body (+x forward, +y left, +z up) to the world */
+  orientation: [number, number, number, number];
+  /** m/s, of the pelvis */
+  velocity: Vector;
+  /** of the joints, in the order of Names.joints; null where there is no estimate */
+  positions: ([number | null, number | null, number | null])[];
+  /** indices into Names.states */
+  state: number[];
+  /** metres, standard deviation of a position along an axis */
+  sigma: (number | null)[];
+  /** probabilities, in the order of Names.contacts */
+  contacts: number[];
+  /** position of a joint by name; null where there is no estimate */
+  joint(name: string): Vector | null;
+}
+
+export interface World {
+  topic: "pose/world";
+  stamp: number;
+  frame: string;
+  source: string;
+  end: boolean;
+  bodies: Body[];
+}
+
+export interface PoseEvent {
+  body: number;
+  kind: EventKind;
+  phase: "BEGINS" | "HOLDS" | "ENDS";
+  hand: "NONE" | "LEFT" | "RIGHT";
+  /** 0 to 1: probability of the condition, given the joints' standard deviations */
+  confidence: number | null;
+  /** of POINTS: unit vector from the head through the wrist */
+  direction: Vector | null;
+  since: number;
+}
+
+export interface PoseEvents {
+  topic: "pose/events";
+  stamp: number;
+  frame: string;
+  source: string;
+  end: boolean;
+  /** all that begins, holds or ends at this moment */
+  events: PoseEvent[];
+}
+
+export interface Health {
+  topic: "diagnostics";
+  stamp: number;
+  node: string;
+  level: "OK" | "WARN" | "ERROR" | "STALE";
+  message: string;
+  values: Record<string, string>;
+}
+
+export interface Connection {
+  readonly names: Names | null;
+  readonly state: "connecting" | "open" | "closed";
+  on(kind: "world", handler: (world: World) => void): () => void;
+  on(kind: "events", handler: (events: PoseEvents) => void): () => void;
+  /** each event that begins or ends */
+  on(kind: "event", handler: (event: PoseEvent) => void): () => void;
+  on(kind: "health", handler: (health: Health) => void): () => void;
+  on(kind: "state", handler: (state: "open" | "closed") => void): () => void;
+  close(): void;
+}
+
+/** Connect, and connect again whenever the connection is lost. The token is what the printed address has after its #. */
+export function connect(options?: { token?: string; url?: string }): Connection;

@@ -1,0 +1,105 @@
+// steadypose in a browser: poses, events and health over a WebSocket. No dependencies, no build step.
+//
+//   import { connect } from "http://127.0.0.1:8766/steadypose.js";
+//   const pose = connect({ token: "..." });
+//   pose.on("world", ({ bodies }) => bodies.forEach((body) => console.log(body.joint("left_wrist"))));
+//   pose.on("event", (event) => console.log(event.phase, event.kind, event.hand));
+//
+// All lengths are metres in a right-handed world with z up; stamps are seconds of capture.
+
+const HERE = new URL(import.meta.url);
+const SHORTEST_MS = 500;
+const LONGEST_MS = 8000;
+
+class Body {
+  constructor(data, names) {
+    Object.assign(this, data);
+    Object.defineProperty(this, "names", { value: names });
+  }
+
+  // Position [x, y, z] of a joint by name; null where there is no estimate, an error where there is no such joint.
+  joint(name) {
+    const index = this.names.joints.indexOf(name);
+    if (index < 0) throw new RangeError(`no joint ${name}: there are ${this.names.joints.join(", ")}`);
+    const position = this.positions[index];
+    return this.state[index] === 0 || position.includes(null) ? null : position;
+  }
+}
+
+class Connection {
+  #options;
+  #handlers = new Map();
+  #socket = null;
+  #retry = SHORTEST_MS;
+  #timer = 0;
+  #closed = false;
+
+  constructor(options) {
+    this.#options = options;
+    this.names = null; // { joints, parents, contacts, states, events }, once connected
+    this.state = "connecting"; // or "open", "closed"
+    this.#open();
+  }
+
+  // Call a function with each message of a kind: "world", "events", "event" (each that begins or ends), "health",
+  // "state". Returns a function that ends it.
+  on(kind, handler) {
+    if (!["world", "events", "event", "health", "state"].includes(kind)) {
+      throw new RangeError(`no messages of kind ${kind}: there are world, events, event, health, state`);
+    }
+    const handlers = this.#handlers.get(kind) ?? this.#handlers.set(kind, new Set()).get(kind);
+    handlers.add(handler);
+    return () => handlers.delete(handler);
+  }
+
+  close() {
+    this.#closed = true;
+    clearTimeout(this.#timer);
+    this.#socket?.close();
+  }
+
+  #open() {
+    const { url, token } = this.#options;
+    const socket = new WebSocket(`${url}?token=${encodeURIComponent(token)}`);
+    this.#socket = socket;
+    socket.onmessage = ({ data }) => this.#take(JSON.parse(data));
+    socket.onclose = () => {
+      this.#become("closed");
+      if (this.#closed) return;
+      this.#timer = setTimeout(() => this.#open(), this.#retry);
+      this.#retry = Math.min(2 * this.#retry, LONGEST_MS);
+    };
+  }
+
+  #become(state) {
+    if (state === this.state) return;
+    this.state = state;
+    this.#tell("state", state);
+  }
+
+  #take(message) {
+    if (message.topic === "hello") {
+      this.names = message;
+      this.#retry = SHORTEST_MS;
+      this.#become("open");
+    } else if (message.topic === "pose/world") {
+      message.bodies = message.bodies.map((body) => new Body(body, this.names));
+      this.#tell("world", message);
+    } else if (message.topic === "pose/events") {
+      for (const event of message.events) if (event.phase !== "HOLDS") this.#tell("event", event);
+      this.#tell("events", message);
+    } else if (message.topic === "diagnostics") {
+      this.#tell("health", message);
+    }
+  }
+
+  #tell(kind, value) {
+    for (const handler of this.#handlers.get(kind) ?? []) handler(value);
+  }
+}
+
+// Connect, and connect again whenever the connection is lost.
+// options: token, which the printed address has after its #; url of the WebSocket, unless it is where this file is from.
+export function connect({ token = location.hash.slice(1), url = `${HERE.origin.replace(/^http/, "ws")}/ws` } = {}) {
+  return new Connection({ token, url });
+}

@@ -1,0 +1,283 @@
+"""Skeletons of motion files, recognised by their topology: which joints of a file the canonical 22 are made of.
+
+No two programs name or cut a body alike, but all bodies are the same tree. What is needed of the names is one thing:
+which joints come in pairs. The longest two bones in a row of the lowest pair of limbs are thigh and shin, those of
+another pair upper arm and forearm; what lies between is the spine, on which the canonical joints stand at the heights
+that the rest skeleton has them, scaled to the file's neck and head. Each lies within a bone that is there and so moves
+rigidly with it; collars, which rigs place anywhere, are mixtures of their neighbours in all.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.prior.body.layouts import Skeleton
+from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, J
+
+Floats = NDArray[np.float64]
+Mixture = Mapping[str, float]
+
+UNITS: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "CMU": 0.0254 / 0.45}
+"""Metres: what files count in. CMU's is an inch, scaled by the 0.45 of its ASF files."""
+
+SHORTEST, TALLEST = 0.55, 1.35
+"""Times the rest skeleton (1.72 m): bodies of 0.95 to 2.3 m. A file whose body is none of these in any unit is not
+guessed at."""
+
+ON_THE_JOINT = 0.15
+"""Of a bone: what is nearer to its end is at its end, where the body in fact turns."""
+
+_SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), ("l", "r"))
+_INLINE = re.compile(r"twist|roll", re.IGNORECASE)
+_TIP = re.compile(r"(end|nub|tip|top)\d*$", re.IGNORECASE)
+_MIDDLE = ("pelvis", "spine1", "spine2", "spine3", "neck", "head")
+_ABOVE_HIPS: Floats = REST_POSITIONS[:, 2] - REST_POSITIONS[list(HIPS), 2].mean()
+"""(22,) metres."""
+
+
+class RigError(ValueError):
+    """A skeleton in which no body is recognised; the message says what was looked for."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """How the skeleton of a motion file becomes the canonical one.
+
+    Attributes:
+        skeleton: the file's joints that matter, and their table.
+        metres: the size of the file's unit.
+        lost_bones: joints whose OFFSET the family's converter has lost (it is zero), each with the bone's length as a
+            multiple of its parent's OFFSET, whose direction it shares.
+        up: the file's axis that points up, ``y``, ``-y`` or ``z``; empty where the motion is to tell.
+    """
+
+    skeleton: Skeleton
+    metres: float
+    lost_bones: Mapping[str, float] = field(default_factory=dict)
+    up: str = ""
+
+
+def mirror_names(names: Sequence[str]) -> dict[str, str]:
+    """Joint of the left -> its counterpart on the right: the names that stay names with the side exchanged."""
+    known, pairs = set(names), {}
+    for name in names:
+        for left, right in _SIDES:
+            for match in re.finditer(left, name):
+                other = name[: match.start()] + right + name[match.end() :]
+                if other in known:
+                    pairs[name] = other
+    return pairs
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A skeleton as a file has it.
+
+    Attributes:
+        joints: J names, parents first.
+        parents: index of each joint's parent; -1 for a root.
+        offsets: (J, 3) from the parent, in the file's unit.
+    """
+
+    joints: Sequence[str]
+    parents: Sequence[int]
+    offsets: Floats
+
+    @cached_property
+    def rest(self) -> Floats:
+        """(J, 3) with all angles zero, the root at the origin. Its limbs may point anywhere."""
+        placed = np.zeros_like(self.offsets)
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                placed[joint] = placed[parent] + self.offsets[joint]
+        return placed
+
+    def path(self, joint: int) -> list[int]:
+        """From the root to a joint."""
+        path = [joint]
+        while self.parents[path[-1]] >= 0:
+            path.append(self.parents[path[-1]])
+        return path[::-1]
+
+    def above(self, joint: int) -> int:
+        """The nearest ancestor that is elsewhere, and no helper inside a bone (which twists skin); -1 for none."""
+        parent = self.parents[joint]
+        while parent >= 0 and (
+            _INLINE.search(self.joints[parent]) or not np.linalg.norm(self.rest[joint] - self.rest[parent]) > 0
+        ):
+            parent = self.parents[parent]
+        return parent
+
+    def length(self, joint: int) -> float:
+        """Of the bone to a joint from that `above` it."""
+        above = self.above(joint)
+        return float(np.linalg.norm(self.rest[joint] - self.rest[above])) if above >= 0 else 0.0
+
+
+class _Limb(NamedTuple):
+    """The two longest bones in a row of what leaves the trunk on the left."""
+
+    trunk: int
+    joints: tuple[int, int, int]
+    length: float
+
+
+class _Spine(NamedTuple):
+    """The middle of the body, upwards: names, heights (file's unit) above the hips, and which are neck and head."""
+
+    joints: list[str]
+    heights: Floats
+    neck: int
+    head: int
+
+
+def recognise(tree: Tree, name: str = "file") -> Rig:
+    """The rig of a file's skeleton: see this module. One with the canonical names is taken at its word.
+
+    Raises:
+        RigError: there are no two pairs of limbs below a head, or the body has no size that a person has.
+    """
+    pairs = mirror_names(tree.joints)
+    legs, arms = _limbs(tree, pairs)
+    spine = _spine(tree, legs, arms, pairs)
+    scale = float(spine.heights[[spine.neck, spine.head]].sum() / _ABOVE_HIPS[[J["neck"], J["head"]]].sum())
+    metres = _metres(sum(tree.length(j) for j in legs.joints[1:]) + scale * float(_ABOVE_HIPS[J["neck"]]))
+    if set(JOINTS) <= set(tree.joints):
+        return Rig(Skeleton(name, JOINTS, {joint: joint for joint in JOINTS}), metres)
+    middle = {joint: _on_spine(spine, scale * float(_ABOVE_HIPS[J[joint]])) for joint in _MIDDLE}
+    parts = zip(("hip", "knee", "ankle", "shoulder", "elbow", "wrist"), legs.joints + arms.joints, strict=True)
+    left: dict[str, str | Mixture] = {part: tree.joints[j] for part, j in parts}
+    left["collar"] = collar(middle["spine3"], middle["neck"], left["shoulder"])
+    toes = [j for j, parent in enumerate(tree.parents) if parent == legs.joints[-1] and tree.length(j) > 0]
+    if toes:
+        left["foot"] = tree.joints[max(toes, key=tree.length)]
+    return Rig(skeleton(name, middle, left, lambda joint: pairs.get(joint, joint)), metres)
+
+
+def up_axis(bodies: Floats) -> str:
+    """The axis that points up: ``y``, ``-y`` or ``z``, that along which heads are furthest from ankles.
+
+    Args:
+        bodies: (T, 22, 3) canonical joints in a file's axes; NaN where missing.
+    """
+    upwards = bodies[:, J["head"]] - bodies[:, [J["left_ankle"], J["right_ankle"]]].mean(axis=1)
+    known = upwards[np.isfinite(upwards).all(axis=1)]
+    _, y, z = known.mean(axis=0) if len(known) else (0.0, 1.0, 0.0)
+    return max({"y": y, "-y": -y, "z": z}.items(), key=lambda axis: axis[1])[0]
+
+
+def skeleton(
+    name: str,
+    middle: Mapping[str, str | Mixture],
+    left: Mapping[str, str | Mixture],
+    to_right: Callable[[str], str],
+) -> Skeleton:
+    """A skeleton from its table.
+
+    Args:
+        name: of the skeleton.
+        middle: canonical joints of the middle.
+        left: those of the left side, named without it.
+        to_right: counterpart of a joint of the file's left; others as they are.
+    """
+    table = {joint: _weights(source) for joint, source in middle.items()}
+    for joint, source in left.items():
+        table[f"left_{joint}"] = _weights(source)
+        table[f"right_{joint}"] = {to_right(n): w for n, w in _weights(source).items()}
+    return Skeleton(name, tuple(sorted({n for weights in table.values() for n in weights})), table)
+
+
+def mix(*parts: tuple[str | Mixture, float]) -> Mixture:
+    """A mixture of mixtures."""
+    total: dict[str, float] = {}
+    for part, weight in parts:
+        named = _weights(part)
+        for name, inner in named.items():
+            total[name] = total.get(name, 0.0) + weight * inner / sum(named.values())
+    return total
+
+
+def _weights(source: str | Mixture) -> Mixture:
+    return {source: 1.0} if isinstance(source, str) else source
+
+
+def collar(spine3: str | Mixture, neck: str | Mixture, shoulder: str | Mixture) -> Mixture:
+    """The rest skeleton's collar as a mixture of its neighbours."""
+    return mix((spine3, 0.333), (neck, 0.278), (shoulder, 0.389))
+
+
+def _limbs(tree: Tree, pairs: Mapping[str, str]) -> tuple[_Limb, _Limb]:
+    """Leg and arm of the left side."""
+    longest: dict[int, _Limb] = {}
+    for joint in range(len(tree.joints)):
+        path = tree.path(joint)
+        first = next((k for k, j in enumerate(path) if tree.joints[j] in pairs), 0)
+        middle = tree.above(joint)
+        start = tree.above(middle) if middle >= 0 else -1
+        if first and start in path[first:]:
+            limb = _Limb(path[first - 1], (start, middle, joint), tree.length(joint) + tree.length(middle))
+            longest[path[first]] = max(longest.get(path[first], limb), limb, key=lambda other: other.length)
+    limbs = sorted(longest.values(), key=lambda limb: -limb.length)[:2]
+    if len(limbs) < 2:
+        raise RigError(
+            "expected a body: legs and arms of two bones each, in names that differ by left and right alone; "
+            f"got {', '.join(tree.joints[:8])}...; say with --rig which joints are which"
+        )
+    legs, arms = sorted(limbs, key=lambda limb: len(tree.path(limb.trunk)))
+    return legs, arms
+
+
+def _spine(tree: Tree, legs: _Limb, arms: _Limb, pairs: Mapping[str, str]) -> _Spine:
+    """From where the ways of legs and head part to the top of the head."""
+    sided, trunk = {*pairs, *pairs.values()}, tree.path(arms.trunk)
+    ways = (tree.path(joint) for joint in range(len(tree.joints)) if not _TIP.search(tree.joints[joint]))
+    upwards = [
+        way for way in ways if way[: len(trunk)] == trunk != way and sided.isdisjoint(tree.joints[j] for j in way)
+    ]
+    if not upwards:
+        raise RigError(f"expected neck and head above '{tree.joints[arms.trunk]}', found neither; say with --rig")
+    named = [way for way in upwards if "head" in tree.joints[way[-1]].lower()]
+    way = min(named, key=len) if named else max(upwards, key=len)
+    base = max(k for k, (a, b) in enumerate(zip(way, tree.path(legs.trunk), strict=False)) if a == b)
+    head = way[-1]
+    neck = way[len(trunk)] if way[len(trunk)] != head else arms.trunk
+    tips = [j for j, p in enumerate(tree.parents) if p == head and _TIP.search(tree.joints[j]) and tree.length(j) > 0]
+    chain = way[base:] + tips[:1]
+    # Base and hips are one bone: how far it is above them, along the way to the first joint that is elsewhere.
+    hips = tree.rest[[legs.joints[0], tree.joints.index(pairs[tree.joints[legs.joints[0]]])]].mean(axis=0)
+    out = tree.rest[chain] - hips
+    up = next((step / norm for step in out[1:] if (norm := np.linalg.norm(step)) > 0), np.zeros(3))
+    steps = [float(out[0] @ up), *(float(np.linalg.norm(tree.offsets[j])) for j in chain[1:])]
+    return _Spine([tree.joints[j] for j in chain], np.cumsum(steps), chain.index(neck), chain.index(head))
+
+
+def _on_spine(spine: _Spine, height: float) -> Mixture:
+    """The point of the spine at a height above the hips: of the bone that it lies in, or of the spine's end."""
+    above = int(np.searchsorted(spine.heights, height))
+    if above in (0, len(spine.heights)):
+        return {spine.joints[min(above, len(spine.heights) - 1)]: 1.0}
+    low, high = spine.heights[above - 1 : above + 1]
+    share = float((height - low) / (high - low))
+    share = 0.0 if share < ON_THE_JOINT else 1.0 if share > 1 - ON_THE_JOINT else round(share, 3)
+    ends = ((above - 1, 1.0 - share), (above, share))
+    return {spine.joints[k]: weight for k, weight in ends if weight > 0}
+
+
+def _metres(size: float) -> float:
+    """The unit in which a body's thigh, shin and trunk to the neck are together so long."""
+    person = -REST_OFFSETS[[J["left_knee"], J["left_ankle"]], 2].sum() + _ABOVE_HIPS[J["neck"]]
+    times = {unit: size * unit / person for unit in UNITS.values()}
+    unit = min(times, key=lambda unit: abs(np.log(max(times[unit], 1e-9))))
+    if not SHORTEST < times[unit] < TALLEST:
+        raise RigError(
+            f"expected a body of 0.95 to 2.3 m in {', '.join(UNITS)}; got one whose leg and trunk are {size:.4g} long: "
+            "say with --rig how many metres that is"
+        )
+    return unit

@@ -1,0 +1,122 @@
+"""How shoulders and hips turn about their bones: from the bend of the limb where it tells, else from before.
+
+The plane of a bent limb shows the twist of its upper bone, with an error that grows as the limb straightens: a joint's
+noise by the length of the bent part across the bone. A Kalman filter of one angle a limb weighs it so: a process that
+returns to the middle of the joint's range (Ornstein and Uhlenbeck), as no limb stays straight and twisted for long.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from steadypose.prior.body.inverse_kinematics import (
+    _HINGE,
+    _at,
+    _cross,
+    _dot,
+    _normalised,
+    _turned,
+    _turned_back,
+    write_product,
+    write_rotation,
+    write_swing,
+)
+from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENT, SHOULDERS
+from steadypose.prior.timing.rate import FPS
+
+Floats = NDArray[np.float64]
+
+RANGE, MEMORY_S = 0.3, 0.3
+"""Radians, the standard deviation of a twist that nothing shows, and seconds in which it returns to the middle."""
+_KEPT = math.exp(-1.0 / (MEMORY_S * FPS))
+UNBENT = 0.2
+"""Metres: what a perfect joint errs about the plane in which knee or elbow bends, which is no perfect hinge."""
+
+LIMBS = len(HIPS) + len(SHOULDERS)
+_BALL = np.array([*HIPS, *SHOULDERS])
+_MIDDLE = np.array([CHILDREN[joint][0] for joint in _BALL])
+_END = np.array([CHILDREN[joint][0] for joint in _MIDDLE])
+_CHAIN_END = np.array([CHILDREN[joint][0] if CHILDREN[joint] else -1 for joint in _END])
+
+
+def unknown_twist(slots: int) -> Floats:
+    """(S, 4, 2) angle and variance of each limb's twist, of which nothing is known."""
+    state = np.zeros((slots, LIMBS, 2))
+    state[..., 1] = RANGE**2
+    return state
+
+
+def follow_twist(orientations: Floats, offsets: Floats, sigma: Floats, state: Floats) -> None:
+    """One frame on: turns limbs about their bones, in place. Directions of bones, and so joints, stay.
+
+    Args:
+        orientations: (B, 22, 3, 3) of all joints in one frame of reference, as `solve_rotations` has them.
+        offsets: (B, 22, 3) metres, the bones.
+        sigma: (B, 22) metres, of the joints solved from, along an axis.
+        state: (B, 4, 2) of `unknown_twist`, updated.
+    """
+    _follow(orientations, offsets, sigma, state)
+
+
+@njit(cache=True)
+def _follow(orientations, offsets, sigma, state):
+    turn, twist, swing = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    before = np.empty((3, 3, 3))
+    for row in range(len(orientations)):
+        world, bones = orientations[row], offsets[row]
+        for limb in range(LIMBS):
+            ball, middle, end = _BALL[limb], _MIDDLE[limb], _END[limb]
+            upper = _normalised(_turned(world[ball], _at(bones, middle)))
+            lower = _normalised(_turned(world[middle], _at(bones, end)))
+            above = world[PARENT[ball]]
+            write_swing(_at(bones, middle), _turned_back(above, upper), swing)
+            write_product(above, swing, turn)
+            normal = _cross(upper, lower)
+            bent = math.sqrt(_dot(normal, normal))
+            hinge = _turned(turn, _at(_HINGE, ball))
+            shown = math.atan2(_dot(_cross(hinge, normal), upper), _dot(hinge, normal))
+            square = 0.0
+            for joint in (ball, middle, end):
+                square = max(square, min(sigma[row, joint], 1.0) ** 2)
+            across = math.sqrt(_dot(_at(bones, end), _at(bones, end))) * bent
+            noise = 2.0 * square / max(across * across, 1e-8) + (UNBENT / max(bent, 1e-3)) ** 8
+            angle, variance = state[row, limb]
+            angle, variance = _KEPT * angle, _KEPT**2 * variance + (1.0 - _KEPT**2) * RANGE**2
+            off = (shown - angle + math.pi) % (2.0 * math.pi) - math.pi
+            gain = variance / (variance + noise)
+            angle += gain * off
+            angle = (angle + math.pi) % (2.0 * math.pi) - math.pi
+            state[row, limb, 0], state[row, limb, 1] = angle, (1.0 - gain) * variance
+            for i in range(3):
+                for j in range(3):
+                    before[0, i, j], before[1, i, j] = world[ball, i, j], world[middle, i, j]
+                    before[2, i, j] = world[end, i, j]
+            write_rotation(upper, math.sin(angle), math.cos(angle), 1.0 - math.cos(angle), twist)
+            write_product(twist, turn, world[ball])
+            # knee and elbow swing from the upper bone as it is turned now, and carry what hangs on them
+            write_swing(_at(bones, end), _turned_back(world[ball], lower), swing)
+            write_product(world[ball], swing, world[middle])
+            last = _CHAIN_END[limb]
+            for i in range(3):
+                for j in range(3):
+                    turn[i, j] = 0.0
+                    for k in range(3):
+                        turn[i, j] += before[1, k, i] * before[2, k, j]
+            if last >= 0:
+                toe = _turned(before[2], _at(bones, last))
+                write_swing(_at(bones, last), _turned_back(world[middle], toe), turn)
+            write_product(world[middle], turn, world[end])
+            if last >= 0:
+                for i in range(3):
+                    for j in range(3):
+                        before[0, i, j] = 0.0
+                        for k in range(3):
+                            before[0, i, j] += before[2, k, i] * world[last, k, j]
+                write_product(world[end], before[0], swing)
+                for i in range(3):
+                    for j in range(3):
+                        world[last, i, j] = swing[i, j]

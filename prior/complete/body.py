@@ -1,0 +1,146 @@
+"""Completion of a recording: motion between key frames, and unobserved parts of a body.
+
+Known joints stay unchanged, to the last bit. The rest comes from the completer, window by window
+(`prior.complete.views`), on the person's bones. Known joints are a few millimetres off these bones, which are not quite
+constant: the residual is interpolated from one known frame to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
+from steadypose.prior.body.skeleton import PARENTS, finite_joints
+from steadypose.prior.complete.views import AROUND, LONGEST_GAP, gaps, views
+from steadypose.prior.models.completer.features import draw_line, rotations_of_6d
+
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+
+Fill = Callable[[Floats, Floats], tuple[Floats, Floats]]
+"""A completer of whole windows, such as `LiveCompleter`: positions (B, T, 22, 3), NaN where not known, and bones
+(B, 22, 3) to local rotations (B, T, 22, 3, 3) and positions of the root (B, T, 3); metres."""
+
+BENT = 0.02
+"""Metres that a known joint is off its bones from which on the unknown joints above it are solved again to reach it."""
+
+
+@dataclass(frozen=True)
+class Completed:
+    """A body's completed motion.
+
+    Attributes:
+        positions: (T, 22, 3) metres, world, z up; NaN more than `LONGEST_GAP` frames before or after all that is known.
+        rotations: (T, 22, 3, 3) local; NaN likewise.
+        known: (T, 22) which joints were given.
+        span: frames of the longest gap that was filled.
+    """
+
+    positions: Floats
+    rotations: Floats
+    known: Bools
+    span: int
+
+
+def complete(
+    fill: Fill, positions: Floats, offsets: Floats, advanced: Callable[[int], None] = lambda frames: None
+) -> Completed:
+    """Complete a body's motion.
+
+    Args:
+        fill: a completer.
+        positions: (T, 22, 3) metres, z up, at 30 Hz; NaN where not known.
+        offsets: (22, 3) metres, the person's bones.
+        advanced: called with the end of each window that is done.
+
+    Raises:
+        ValueError: no joint is known in any frame.
+    """
+    known = finite_joints(positions)
+    if not known.any():
+        raise ValueError("expected joints in at least one frame, all are missing")
+    seen = np.flatnonzero(known.any(axis=1))
+    reached = slice(max(int(seen[0]) - LONGEST_GAP, 0), int(seen[-1]) + 1 + LONGEST_GAP)
+    joints, rotations = np.full(positions.shape, np.nan), np.full((*positions.shape, 3), np.nan)
+    joints[reached], rotations[reached] = _completed(
+        fill, positions[reached], offsets, lambda frame: advanced(frame + reached.start)
+    )
+    return Completed(joints, rotations, known, max((gap.end - gap.start for gap in gaps(known)), default=0))
+
+
+def _completed(
+    fill: Fill, positions: Floats, offsets: Floats, advanced: Callable[[int], None]
+) -> tuple[Floats, Floats]:
+    """Joints (T, 22, 3) and rotations (T, 22, 3, 3) of frames that begin and end near a known one."""
+    known = finite_joints(positions)
+    bridged = _bridged(fill, positions, offsets)
+    rotations, root = _filled(fill, bridged, offsets, advanced)
+    placed = place_joints(rotations, offsets) + root[:, None]
+    missed = _faded(np.where(known[..., None], positions - placed, 0.0), known)
+    joints = np.where(known[..., None], positions, placed + missed)
+    bent = (~known).any(axis=1) & (np.linalg.norm(missed, axis=-1) > BENT).any(axis=1)
+    if bent.any():
+        joints[bent] = fit_lengths(joints[bent], offsets, np.where(known[bent], HELD, 1.0))
+        joints = np.where(known[..., None], positions, joints)
+        rotations[bent] = solve_rotations(joints[bent], offsets, rotations[bent])
+    return joints, rotations
+
+
+def _faded(missed: Floats, known: Bools) -> Floats:
+    """Residuals (T, 22, 3) of known joints interpolated in time for all; a joint never known has its parent's."""
+    line = draw_line(known[None])
+    before, after = (np.take_along_axis(missed, rows[..., None], axis=0) for rows in (line.before[0], line.after[0]))
+    weight = line.weight[0][..., None]
+    faded = (1.0 - weight) * before + weight * after
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0 and not line.ever[0, joint]:
+            faded[:, joint] = faded[:, parent]
+    return faded
+
+
+def _bridged(fill: Fill, positions: Floats, offsets: Floats) -> Floats:
+    """Positions (T, 22, 3) with key frames put into gaps longer than `LONGEST_GAP`, so that those left are shorter.
+
+    The key frames come from the completer on every n-th frame of the gap and of what is around it.
+    """
+    bridged, frames = positions.copy(), len(positions)
+    for gap in gaps(finite_joints(positions)):
+        length = gap.end - gap.start
+        if length <= LONGEST_GAP:
+            continue
+        step = -(-(length + 1) // LONGEST_GAP)
+        inside = np.linspace(gap.start - 1, gap.end, -(-(length + 1) // step) + 1).round().astype(int)
+        before, after = (edge + step * np.arange(1, AROUND) for edge in (-gap.start + 1, gap.end))
+        rows = np.concatenate([-before[::-1], inside, after])
+        rows = rows[(rows >= 0) & (rows < frames)]
+        rotations, root = fill(positions[None, rows], offsets[None])
+        placed = place_joints(rotations[0], offsets) + root[0][:, None]
+        put = (rows >= gap.start) & (rows < gap.end)
+        bridged[rows[put]] = placed[put]
+    return bridged
+
+
+def _filled(fill: Fill, positions: Floats, offsets: Floats, advanced: Callable[[int], None]) -> tuple[Floats, Floats]:
+    """Rotations (T, 22, 3, 3) and root (T, 3) of all frames.
+
+    Where windows overlap, the weighted means of their rotations' first two columns and of their roots are taken.
+    """
+    known = finite_joints(positions)
+    frames = len(positions)
+    columns, root, total = np.zeros((frames, 22, 6)), np.zeros((frames, 3)), np.zeros(frames)
+    for view in sorted(views(known), key=lambda view: view.start):
+        rows = view.frames
+        turned, placed = fill(positions[None, rows], offsets[None])
+        columns[rows] += view.weight[:, None, None] * turned[0][..., :2].swapaxes(-1, -2).reshape(-1, 22, 6)
+        root[rows] += view.weight[:, None] * placed[0]
+        total[rows] += view.weight
+        advanced(rows.stop)
+    looked_at = total > 0
+    rotations = solve_rotations(positions, offsets)
+    rotations[looked_at] = rotations_of_6d(columns[looked_at])
+    root = np.where(looked_at[:, None], root / np.maximum(total, 1e-12)[:, None], positions[:, 0])
+    return rotations, root

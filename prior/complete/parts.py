@@ -1,0 +1,104 @@
+"""The completer blended with HG-VAE's completion where parts of a body are hidden: that was trained longer on these,
+but not on gaps in time.
+
+Where some joints of a frame are known and others not, the answer lies between the two; rotations are solved anew.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
+from steadypose.prior.body.skeleton import finite_joints
+from steadypose.prior.models.completer.inference import LiveCompleter
+from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig
+from steadypose.prior.models.hgvae.features import body_size, from_tracks, hang_unseen, to_tracks
+from steadypose.prior.models.hgvae.live_completion import LiveCompletion
+from steadypose.prior.models.weights import WeightsError, load_weights, part
+
+Floats = NDArray[np.float64]
+
+SHARE = 0.8
+"""Of HG-VAE's completion in the blend, by validation (benchmarks/NOTEBOOK.md)."""
+
+SMOOTH = 3.0
+"""Frames, standard deviation of the Gaussian that smooths the difference of the two: HG-VAE's completion gives hidden
+limbs ten times the acceleration of true ones."""
+
+
+class PartsCompleter:
+    """Completes windows as `LiveCompleter` does.
+
+    Args:
+        completer: of gaps and parts.
+        weights: weight set of HG-VAE.
+
+    Raises:
+        FileNotFoundError: there are no such weights.
+        WeightsError: they have no completion network.
+    """
+
+    def __init__(self, completer: LiveCompleter, weights: str = "default") -> None:
+        arrays, config = load_weights(weights, "hgvae")
+        sizes = HGVAEConfig.from_dict(config)
+        if sizes.completion is None:
+            raise WeightsError(
+                f"weights '{weights}' of hgvae: expected some with a completion network, these have none"
+            )
+        self._completer, self._frames = completer, sizes.frames
+        self._completion = LiveCompletion(sizes.completion, part(arrays, "completion"), 1)
+        self._mean = arrays["mean"].astype(np.float64)[:, None]
+
+    @property
+    def usual(self) -> Floats:
+        """(22, 4) quaternions, xyzw, local, of the mean pose."""
+        return self._completer.usual
+
+    def __call__(self, positions: Floats, offsets: Floats) -> tuple[Floats, Floats]:
+        """As `LiveCompleter`: local rotations (B, T, 22, 3, 3) and positions of the root (B, T, 3), metres."""
+        rotations, root = self._completer(positions, offsets)
+        for row, (given, bones) in enumerate(zip(positions, offsets, strict=True)):
+            known = finite_joints(given)
+            partly = np.asarray(known.any(axis=1) & ~known.all(axis=1))
+            if not partly.any() or not known[partly, 0].all():
+                continue  # nothing but gaps; or no root to look at the body from
+            first = place_joints(rotations[row], bones) + root[row][:, None]
+            second = self._second(given, first, bones)
+            joints = first + SHARE * gaussian_filter1d(second - first, SMOOTH, axis=0, mode="nearest")
+            # in a gap, joints that are known beside it are the completer's alone
+            asked = ~known & (partly[:, None] | ~known.any(axis=0))
+            some = asked.any(axis=1)
+            joints = np.where(known[..., None], given, np.where(asked[..., None], joints, first))[some]
+            joints = fit_lengths(joints, bones, np.where(asked[some], 1.0, HELD))
+            rotations[row, some] = solve_rotations(joints, bones, rotations[row, some])
+        return rotations, root
+
+    def _second(self, given: Floats, first: Floats, bones: Floats) -> Floats:
+        """(T, 22, 3) HG-VAE's completion of a window ``given`` (T, 22, 3) metres, NaN where hidden.
+
+        In frames of which nothing is known, the joints known in other frames are given as in ``first`` (T, 22, 3).
+        """
+        known = finite_joints(given)
+        blank = ~known.any(axis=1)
+        shown = given.copy()
+        elsewhere = np.flatnonzero(known.any(axis=0))
+        shown[np.ix_(blank, elsewhere)] = first[np.ix_(blank, elsewhere)]
+        frames, size = len(given), body_size(bones)
+        starts = np.unique(
+            np.linspace(0, max(frames - self._frames, 0), -(-frames // self._frames)).round().astype(int)
+        )
+        total, weight = np.zeros_like(given), np.zeros((frames, 1, 1))
+        for start in starts:
+            rows = np.minimum(np.arange(start, start + self._frames), frames - 1)  # a short one stands still at its end
+            tracks = to_tracks(shown[rows], size)
+            deviations = ((tracks.x - self._mean) / SCALE)[None]
+            hang_unseen(deviations)
+            self._completion.complete(deviations, tracks.observed[None], np.zeros(1))
+            placed = from_tracks(deviations[0] * SCALE + self._mean, tracks, size)
+            inside = np.arange(start, start + self._frames) < frames
+            fade = np.minimum(np.arange(1, self._frames + 1), np.arange(self._frames, 0, -1))[inside, None, None]
+            total[rows[inside]] += fade * placed[inside]
+            weight[rows[inside]] += fade
+        return total / weight

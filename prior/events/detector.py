@@ -1,0 +1,178 @@
+"""What all bodies of one stream do."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import Event, EventKind, Hand, Phase, PoseWorld, Tracking, WorldBody
+from steadypose.prior.events.features import Arm, Features, features
+from steadypose.prior.events.settings import EventSettings
+from steadypose.prior.events.trigger import Trigger
+from steadypose.prior.events.wave import Wave
+
+NOWHERE: NDArray[np.float64] = np.zeros(3)
+NOWHERE.flags.writeable = False
+SPEED_NS = 100_000_000
+"""over which a speed is measured: long enough for a centimetre of jitter to be 0.1 m/s"""
+UPRIGHT = 0.5
+"""height of the neck above the pelvis, in lengths of the trunk, under which nobody sits: 30 degrees above level"""
+CERTAIN = 1e-6
+"""standard deviation of what is not computed from joints"""
+
+
+class EventDetector:
+    """Events of one stream of ``pose/world``, causal: each message's are found with the messages up to it.
+
+    Args:
+        settings: the thresholds.
+    """
+
+    def __init__(self, settings: EventSettings | None = None) -> None:
+        self._settings = settings or EventSettings()
+        self._bodies: dict[int, _Body] = {}
+        self._stamp_ns = -1
+
+    def update(self, world: PoseWorld, sensor: NDArray[np.float64] = NOWHERE) -> list[Event]:
+        """All that begins, holds or ends with the next message of the stream.
+
+        Args:
+            world: a message of ``pose/world``. One whose stamp is not after the last begins the stream anew.
+            sensor: (3,) metres, world: whom people come near to, and face. The origin unless given, over which an
+                uncalibrated sensor stands.
+        """
+        if world.end_of_stream or world.stamp_ns <= self._stamp_ns:
+            self._bodies.clear()
+        self._stamp_ns = -1 if world.end_of_stream else world.stamp_ns
+        followed = {body.id: body for body in world.bodies if body.tracking != Tracking.LOST}
+        for new in followed.keys() - self._bodies.keys():
+            self._bodies[new] = _Body(new, world.stamp_ns, self._settings)
+        events: list[Event] = []
+        for name, body in list(self._bodies.items()):
+            if name in followed:
+                events += body.update(world.stamp_ns, followed[name], sensor)
+            elif world.stamp_ns - body.stamp_ns >= self._settings.left * 1e9:
+                events += body.leave(world.stamp_ns)
+                del self._bodies[name]
+        return events
+
+
+class _Body:
+    """One body: what holds of it, and the last second and a half."""
+
+    def __init__(self, name: int, stamp_ns: int, settings: EventSettings) -> None:
+        s = self._settings = settings
+
+        def trigger(on: float, margin: float, hold_s: float = s.hold) -> Trigger:
+            return Trigger(on, margin, hold_s, s.confidence)
+
+        self._name, self._first_ns, self.stamp_ns = name, stamp_ns, stamp_ns
+        self._entered = False
+        none = Hand.NONE
+        self._triggers = {
+            (EventKind.NEAR, none): trigger(-s.near, s.near_margin),
+            (EventKind.STANDS, none): trigger(s.stands, s.stands_margin),
+            (EventKind.SITS, none): trigger(s.sits, s.sits_margin),
+            (EventKind.LIES, none): trigger(-s.lies, s.lies_margin),
+            (EventKind.FELL, none): trigger(s.fell_speed, s.fell_speed, 0.0),
+            (EventKind.FACES_SENSOR, none): trigger(-s.faces, s.faces_margin),
+        }
+        for hand in (Hand.LEFT, Hand.RIGHT):
+            self._triggers[EventKind.HAND_RAISED, hand] = trigger(s.raised, s.raised_margin)
+            self._triggers[EventKind.WAVES, hand] = trigger(0.5, 0.0, 0.0)
+            self._triggers[EventKind.POINTS, hand] = trigger(s.point_elbow, s.point_elbow_margin, s.point_hold)
+        self._waves = {hand: Wave(s.wave_swing, s.wave_within) for hand in (Hand.LEFT, Hand.RIGHT)}
+        self._heights: deque[tuple[int, float]] = deque()
+        self._falls: deque[tuple[int, float]] = deque()
+        self._wrists: deque[tuple[int, tuple[list[float], ...]]] = deque()
+        self._arms: tuple[Arm, ...] = ()
+
+    def update(self, stamp_ns: int, body: WorldBody, sensor: NDArray[np.float64]) -> Iterator[Event]:
+        """What begins, holds or ends at ``stamp_ns``."""
+        self.stamp_ns = stamp_ns
+        seen = features(body, sensor)
+        self._arms = seen.arms
+        changed = self._changed(stamp_ns, seen)
+        if not self._entered:
+            if stamp_ns - self._first_ns < self._settings.entered * 1e9:
+                return
+            self._entered = True
+            changed = {key for key, trigger in self._triggers.items() if trigger.active}
+            yield Event(self._name, EventKind.ENTERED, Phase.BEGINS, Hand.NONE, 1.0, NOWHERE, self._first_ns)
+        for key, trigger in self._triggers.items():
+            if trigger.active:
+                yield self._event(key, Phase.BEGINS if key in changed else Phase.HOLDS)
+            elif key in changed:
+                yield self._event(key, Phase.ENDS)
+
+    def leave(self, stamp_ns: int) -> Iterator[Event]:
+        """What ends with the body."""
+        if self._entered:
+            for key, trigger in self._triggers.items():
+                if trigger.active:
+                    yield self._event(key, Phase.ENDS)
+            yield Event(self._name, EventKind.LEFT, Phase.BEGINS, Hand.NONE, 1.0, NOWHERE, stamp_ns)
+
+    def _event(self, key: tuple[EventKind, Hand], phase: Phase) -> Event:
+        kind, hand = key
+        trigger = self._triggers[key]
+        direction = NOWHERE if kind != EventKind.POINTS else self._arms[hand - Hand.LEFT].direction
+        return Event(self._name, kind, phase, hand, trigger.confidence, direction, trigger.since_ns)
+
+    def _changed(self, now: int, seen: Features) -> set[tuple[EventKind, Hand]]:
+        """Update all triggers; those that have changed."""
+        s, none = self._settings, Hand.NONE
+        changed: set[tuple[EventKind, Hand]] = set()
+
+        def take(kind: EventKind, hand: Hand, value: float, sigma: float, possible: bool = True) -> bool:
+            if self._triggers[kind, hand].update(now, value, sigma, possible):
+                changed.add((kind, hand))
+            return self._triggers[kind, hand].active
+
+        lies = take(EventKind.LIES, none, -seen.extent.value, seen.extent.sigma)
+        upright = not seen.trunk < UPRIGHT  # nor if it is not known
+        sits = take(EventKind.SITS, none, *seen.thigh, possible=upright and not lies)
+        stands = take(EventKind.STANDS, none, *seen.extension, possible=not lies and not sits)
+        fastest = self._fastest_fall(now, seen.neck)
+        fallen = self._triggers[EventKind.FELL, none].active
+        take(
+            EventKind.FELL,
+            none,
+            s.fell_speed + 1.0 if fallen else fastest,
+            CERTAIN,
+            (lies or fallen) and not (stands or sits),
+        )
+        take(EventKind.NEAR, none, -seen.distance.value, seen.distance.sigma)
+        take(EventKind.FACES_SENSOR, none, -seen.turned.value, seen.turned.sigma, possible=not lies)
+        speeds = self._wrist_speeds(now, seen.arms)
+        for hand, arm, speed in zip((Hand.LEFT, Hand.RIGHT), seen.arms, speeds, strict=True):
+            take(EventKind.HAND_RAISED, hand, *arm.raised, possible=not lies)
+            waving = self._waves[hand].update(now, arm.swing, arm.upright and not lies)
+            take(EventKind.WAVES, hand, float(waving), CERTAIN)
+            still = speed < s.point_speed and arm.lift > s.point_lift
+            take(EventKind.POINTS, hand, *arm.elbow, possible=still and not lies)
+        return changed
+
+    def _fastest_fall(self, now: int, height: float) -> float:
+        """m/s: the greatest speed downwards of the neck in the time in which it counts."""
+        self._heights.append((now, height))
+        while now - self._heights[0][0] > SPEED_NS:
+            then, was = self._heights.popleft()
+            self._falls.append((now, (was - height) * 1e9 / (now - then)))
+        while self._falls and now - self._falls[0][0] > self._settings.fell_within * 1e9:
+            self._falls.popleft()
+        return max((speed for _, speed in self._falls if not math.isnan(speed)), default=0.0)
+
+    def _wrist_speeds(self, now: int, arms: tuple[Arm, Arm]) -> list[float]:
+        """m/s of both wrists."""
+        self._wrists.append((now, tuple(arm.wrist for arm in arms)))
+        while len(self._wrists) > 2 and now - self._wrists[1][0] >= SPEED_NS:
+            self._wrists.popleft()
+        then, were = self._wrists[0]
+        if then == now:
+            return [math.inf, math.inf]
+        return [math.dist(arm.wrist, was) * 1e9 / (now - then) for arm, was in zip(arms, were, strict=True)]

@@ -1,0 +1,168 @@
+"""The quantities of one pose that tell what its person does, each with its standard deviation.
+
+All are differences of joints of the same body, in the world's z-up frame: no floor is needed, and a place in the world
+that drifts moves none of them but the distance to the sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import JointState, WorldBody
+from steadypose.prior.body.skeleton import J
+
+Point = list[float]
+HAND = 0.18
+"""metres from wrist to fingertips of an adult (Drillis and Contini 1966: 0.108 of the stature)"""
+
+_EXTENT = [J[name] for name in ("head", "neck", "pelvis", "left_knee", "right_knee", "left_ankle", "right_ankle")]
+
+
+class Quantity(NamedTuple):
+    """An estimate and its standard deviation; NaN where a joint that it needs is not known."""
+
+    value: float
+    sigma: float
+
+
+class Arm(NamedTuple):
+    """One arm."""
+
+    raised: Quantity
+    """metres of the fingertips above the neck, by the forearm's direction"""
+    elbow: Quantity
+    """radians, the inner angle: pi is straight"""
+    lift: float
+    """radians between shoulder to wrist and the nearer vertical"""
+    swing: float
+    """radians of the forearm from upright, towards the body's left"""
+    upright: bool
+    """the forearm points up, and the hand is no lower than the chest"""
+    wrist: Point
+    """(3,) metres, world"""
+    direction: NDArray[np.float64]
+    """(3,) unit vector, world, from the head through the wrist: of the lines that say where somebody points, the
+    nearest to the truth (Nickel and Stiefelhagen 2007)"""
+
+
+class Features(NamedTuple):
+    """One body at one moment."""
+
+    distance: Quantity
+    """metres on the floor from sensor to pelvis"""
+    turned: Quantity
+    """radians between where hips and shoulders face, and the sensor"""
+    extension: Quantity
+    """height of the hips above the lower ankle, in lengths of the leg"""
+    thigh: Quantity
+    """radians of the more upright thigh from hanging straight down"""
+    extent: Quantity
+    """metres from the lowest to the highest of head, trunk, knees and feet"""
+    neck: float
+    """metres, its height in the world"""
+    trunk: float
+    """height of the neck above the pelvis, in lengths of the trunk"""
+    arms: tuple[Arm, Arm]
+    """left and right"""
+
+
+def features(body: WorldBody, sensor: NDArray[np.float64]) -> Features:
+    """Of one body, as seen from a sensor at (3,) metres, world."""
+    known = body.state != JointState.UNKNOWN
+    p: list[Point] = np.where(known[:, None], body.positions, np.nan).tolist()
+    s: list[float] = body.sigma.tolist()
+    hips = _middle(p[J["left_hip"]], p[J["right_hip"]])
+    ankle = min((J["left_ankle"], J["right_ankle"]), key=lambda joint: _last_if_nan(p[joint][2]))
+    leg = 0.5 * sum(
+        _distance(p[J[f"{side}_{upper}"]], p[J[f"{side}_{lower}"]])
+        for side in ("left", "right")
+        for upper, lower in (("hip", "knee"), ("knee", "ankle"))
+    )
+    extension = Quantity((hips[2] - p[ankle][2]) / leg, math.hypot(s[J["pelvis"]], s[ankle]) / leg)
+    thigh = min((_thigh(p, s, side) for side in ("left", "right")), key=lambda q: _last_if_nan(q.value))
+    heights = sorted((p[joint][2], joint) for joint in _EXTENT if not math.isnan(p[joint][2]))
+    if len(heights) > len(_EXTENT) // 2:
+        (low, lowest), (high, highest) = heights[0], heights[-1]
+        extent = Quantity(high - low, math.hypot(s[lowest], s[highest]))
+    else:
+        extent = Quantity(math.nan, math.nan)
+    left = [
+        p[J["left_hip"]][k] - p[J["right_hip"]][k] + p[J["left_shoulder"]][k] - p[J["right_shoulder"]][k]
+        for k in (0, 1)
+    ]
+    return Features(
+        *_seen_from(body, left, s, sensor),
+        extension,
+        thigh,
+        extent,
+        p[J["neck"]][2],
+        (p[J["neck"]][2] - p[J["pelvis"]][2]) / max(math.dist(p[J["neck"]], p[J["pelvis"]]), 0.1),
+        (_arm(p, s, left, "left"), _arm(p, s, left, "right")),
+    )
+
+
+def _seen_from(
+    body: WorldBody, left: list[float], s: list[float], sensor: NDArray[np.float64]
+) -> tuple[Quantity, Quantity]:
+    """Distance to the sensor, and the angle by which the body, whose left is (2,), is turned from it."""
+    x, y = (float(sensor[k] - body.root_position[k]) for k in (0, 1))
+    far = math.hypot(x, y)
+    if far < 1e-6:
+        return Quantity(0.0, 0.0), Quantity(math.nan, math.nan)
+    c = body.covariance
+    variance = float(c[0, 0] * x * x + (c[0, 1] + c[1, 0]) * x * y + c[1, 1] * y * y) / far**2
+    width = math.hypot(*left)
+    turned = math.acos(max(-1.0, min(1.0, (left[1] * x - left[0] * y) / (width * far)))) if width > 0.05 else math.nan
+    doubt = sum(s[J[f"{side}_{part}"]] ** 2 for side in ("left", "right") for part in ("hip", "shoulder"))
+    return Quantity(far, math.sqrt(max(variance, 0.0))), Quantity(turned, math.sqrt(doubt) / max(width, 0.05))
+
+
+def _thigh(p: list[Point], s: list[float], side: str) -> Quantity:
+    hip, knee = J[f"{side}_hip"], J[f"{side}_knee"]
+    length = _distance(p[hip], p[knee])
+    return Quantity(_angle_to_up(p[knee], p[hip]), math.hypot(s[hip], s[knee]) / max(length, 0.1))
+
+
+def _arm(p: list[Point], s: list[float], left: list[float], side: str) -> Arm:
+    shoulder, elbow, wrist = (J[f"{side}_{part}"] for part in ("shoulder", "elbow", "wrist"))
+    neck, head = J["neck"], J["head"]
+    upper, lower = _distance(p[shoulder], p[elbow]), _distance(p[elbow], p[wrist])
+    whole = _distance(p[shoulder], p[wrist])
+    cosine = (upper**2 + lower**2 - whole**2) / max(2.0 * upper * lower, 1e-6)
+    inner = math.nan if math.isnan(cosine) else math.acos(max(-1.0, min(1.0, cosine)))
+    from_up = _angle_to_up(p[shoulder], p[wrist])
+    forearm = [p[wrist][k] - p[elbow][k] for k in range(3)]
+    width = math.hypot(*left)
+    aside = (forearm[0] * left[0] + forearm[1] * left[1]) / max(width, 1e-6)
+    along = np.array(p[wrist]) - p[head]
+    return Arm(
+        Quantity(p[wrist][2] + HAND * forearm[2] / max(lower, 0.1) - p[neck][2], math.hypot(s[wrist], s[neck])),
+        Quantity(inner, math.hypot(s[elbow], s[wrist]) / max(min(upper, lower), 0.1)),
+        min(from_up, math.pi - from_up),
+        math.atan2(aside, forearm[2]),
+        forearm[2] > 0.5 * lower and p[wrist][2] > p[J["spine3"]][2],
+        p[wrist],
+        along / max(float(np.linalg.norm(along)), 1e-6),
+    )
+
+
+def _middle(a: Point, b: Point) -> Point:
+    return [0.5 * (a[k] + b[k]) for k in range(3)]
+
+
+def _distance(a: Point, b: Point) -> float:
+    return math.dist(a, b)
+
+
+def _angle_to_up(start: Point, end: Point) -> float:
+    """Radians between ``start`` to ``end`` and the vertical."""
+    length = math.dist(start, end)
+    return math.acos(max(-1.0, min(1.0, (end[2] - start[2]) / length))) if length > 1e-6 else math.nan
+
+
+def _last_if_nan(value: float) -> float:
+    return math.inf if math.isnan(value) else value

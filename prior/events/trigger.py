@@ -1,0 +1,64 @@
+"""A condition that begins and ends: two thresholds, a time that it must hold, and the doubt about its value."""
+
+from __future__ import annotations
+
+import math
+from statistics import NormalDist
+
+NEVER = -1
+
+
+def probability_above(value: float, sigma: float, threshold: float) -> float:
+    """That a quantity with this estimate and standard deviation is above a threshold."""
+    if math.isnan(value):
+        return 0.0
+    return 0.5 * math.erfc((threshold - value) / (max(sigma, 1e-9) * math.sqrt(2.0)))
+
+
+class Trigger:
+    """Hysteresis of one condition of one body: it begins above `on`, and ends below ``on - margin``.
+
+    Args:
+        on: the threshold.
+        margin: how far below it the condition ends.
+        hold_s: seconds that either side must last.
+        confidence: probability that a threshold is crossed, from which on it counts as such.
+
+    Attributes:
+        active: whether it holds.
+        since_ns: when it began to, by capture: the first moment of those that it was seen to hold.
+        confidence: probability that the value is above the middle between both thresholds.
+    """
+
+    def __init__(self, on: float, margin: float, hold_s: float, confidence: float) -> None:
+        self._on, self._off, self._hold_ns = on, on - margin, round(hold_s * 1e9)
+        self._sigmas = NormalDist().inv_cdf(confidence)
+        self._changing_ns = NEVER
+        self.active = False
+        self.since_ns = 0
+        self.confidence = 0.0
+
+    def update(self, stamp_ns: int, value: float, sigma: float, possible: bool = True) -> bool:
+        """Take the next value; whether the condition has begun or ended with it.
+
+        Args:
+            stamp_ns: of the value.
+            value: NaN where it is not known: nothing begins or ends then.
+            sigma: its standard deviation.
+            possible: whether all else that the condition needs holds.
+        """
+        self.confidence = probability_above(value, sigma, 0.5 * (self._on + self._off))
+        doubt = self._sigmas * sigma
+        begins, ends = possible and value - doubt > self._on, not possible or value + doubt < self._off
+        if not (ends if self.active else begins):
+            self._changing_ns = NEVER
+            return False
+        if self._changing_ns == NEVER:
+            self._changing_ns = stamp_ns
+        if stamp_ns - self._changing_ns < self._hold_ns:
+            return False
+        self.active = not self.active
+        if self.active:
+            self.since_ns = self._changing_ns
+        self._changing_ns = NEVER
+        return True

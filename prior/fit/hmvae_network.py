@@ -1,0 +1,185 @@
+"""HM-VAE: a hierarchical motion VAE over windows of local rotations (Li et al., "Task-Generic Hierarchical Human
+Motion Prior using VAEs", 3DV 2021), sections 3.1 and 3.2.
+
+Four building blocks (skeleton convolution, pooling, LeakyReLU) encode a window; the features after the first give
+the local latent z_l, those after the last the global latent z_g, one of each for every edge at that level. The
+decoder mirrors the encoder and takes z_l in before its last block. Layer plan, kernels and strides follow the
+official code for windows of 8 (and 64) frames; the pooling comes from our 22-joint graph.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.fit.skeleton_conv import EdgeLinear, SkeletonConv, SkeletonPool, SkeletonUnpool
+from steadypose.prior.fit.torch_kinematics import forward_kinematics, from_6d, to_6d
+from steadypose.prior.models.hmvae.config import CHANNELS, DEVIATION, NO_ROTATION, ROTATION_FEATURES, HMVAEConfig
+from steadypose.prior.models.layers.dense import SLOPE
+from steadypose.prior.models.layers.edge_graph import pooling_levels
+
+
+class Posterior(NamedTuple):
+    """q(z_l, z_g | x), equation 4: means and log-variances, each (B, edges at its level, latent)."""
+
+    local_mean: Tensor
+    local_log_var: Tensor
+    global_mean: Tensor
+    global_log_var: Tensor
+
+    def sample(self) -> tuple[Tensor, Tensor]:
+        """z_l and z_g by the reparametrisation trick."""
+        local = self.local_mean + torch.randn_like(self.local_mean) * (0.5 * self.local_log_var).exp()
+        deep = self.global_mean + torch.randn_like(self.global_mean) * (0.5 * self.global_log_var).exp()
+        return local, deep
+
+    def kl(self) -> tuple[Tensor, Tensor]:
+        """KL to N(0, I) of z_l and of z_g, summed over latent dimensions, mean over batch and edges.
+
+        The reduction belongs to the weight 0.003 of the official code: change both or neither.
+        """
+        return _kl(self.local_mean, self.local_log_var), _kl(self.global_mean, self.global_log_var)
+
+
+def _kl(mean: Tensor, log_var: Tensor) -> Tensor:
+    return (0.5 * (mean.square() + log_var.exp() - 1.0 - log_var).sum(dim=-1)).mean()
+
+
+class MotionVAE(nn.Module, ABC):
+    """A VAE of windows (B, T, 22, 6) of local 6D rotations (the root's is its orientation).
+
+    Args:
+        window: frames T.
+    """
+
+    def __init__(self, window: int) -> None:
+        super().__init__()
+        self.window = window
+
+    @abstractmethod
+    def encode(self, x: Tensor) -> Posterior:
+        """The posterior of windows x (B, T, 22, 6)."""
+
+    @abstractmethod
+    def decode(self, local: Tensor, deep: Tensor) -> Tensor:
+        """What `placed` makes windows of, (B, T, 22, 6), of z_l (B, edges, d) and z_g (B, edges, d)."""
+
+    def placed(self, decoded: Tensor, x: Tensor) -> Tensor:
+        """Windows (B, T, 22, 6) of `decode`'s answer, where that is about something observed in windows x."""
+        return decoded
+
+    def reconstruct(self, x: Tensor) -> Tensor:
+        """Decode the posterior's mean: what refinement does with each window (equations 10 and 11)."""
+        posterior = self.encode(x)
+        return self.placed(self.decode(posterior.local_mean, posterior.global_mean), x)
+
+
+class HMVAE(MotionVAE):
+    """The hierarchical one: skeleton convolutions, a local and a global latent."""
+
+    def __init__(self, config: HMVAEConfig) -> None:
+        super().__init__(config.window)
+        self.config = config
+        self.levels = pooling_levels(PARENTS)
+        steps = self.steps = config.steps
+        c = CHANNELS
+        seen = (config.features, *c[1:])
+        self.encoder = nn.ModuleList(
+            nn.ModuleList(
+                [
+                    SkeletonConv(seen[k], c[k + 1], level.neighbours, config.kernel, config.strides[k]),
+                    SkeletonPool(level.groups),
+                ]
+            )
+            for k, level in enumerate(self.levels)
+        )
+        self.to_local = EdgeLinear(c[1], steps[1], 2 * config.local_latent)
+        self.to_global = EdgeLinear(c[4], steps[4], 2 * config.global_latent)
+        self.from_local = nn.Linear(config.local_latent, c[1] * steps[1])
+        self.from_global = nn.Linear(config.global_latent, c[4] * steps[4])
+        self.decoder = nn.ModuleList(
+            nn.ModuleList(
+                [
+                    SkeletonUnpool(level.groups),
+                    SkeletonConv(
+                        c[k + 1] * (2 if k == 0 else 1), c[k], level.neighbours, config.kernel, bias=k in (0, 3)
+                    ),
+                ]
+            )
+            for k, level in reversed(list(enumerate(self.levels)))
+        )
+
+    def placed(self, decoded: Tensor, x: Tensor) -> Tensor:
+        """Windows (B, T, 22, 6): the deviations decoded from the mean pose of windows x, if it is about that."""
+        if not self.config.about_mean:
+            return decoded
+        return _columns(decoded * DEVIATION + decoded.new_tensor(NO_ROTATION), _mean_pose(x).mT)
+
+    def _seen(self, x: Tensor) -> Tensor:
+        """What the encoder sees of windows x: (B, T, 22, features)."""
+        if not self.config.about_mean:
+            return x
+        mean = _mean_pose(x)
+        deviation = (_columns(x, mean) - x.new_tensor(NO_ROTATION)) / DEVIATION
+        return torch.cat([deviation, to_6d(mean).expand_as(x)], dim=-1)
+
+    def encode(self, x: Tensor) -> Posterior:
+        """The posterior of windows x (B, T, 22, 6), equations 2 and 4."""
+        features = self._seen(x).flatten(2).transpose(1, 2)
+        local = features
+        for k, block in enumerate(self.encoder):
+            conv, pool = block  # type: ignore[misc]  (a ModuleList of two)
+            features = F.leaky_relu(pool(conv(features)), SLOPE)
+            if k == 0:
+                local = features
+        return Posterior(*self.to_local(local).chunk(2, dim=-1), *self.to_global(features).chunk(2, dim=-1))
+
+    def decode(self, local: Tensor, deep: Tensor) -> Tensor:
+        """What `placed` makes windows of, (B, T, 22, 6), of z_l (B, E1, d) and z_g (B, E4, d)."""
+        features = self.from_global(deep).reshape(deep.shape[0], -1, self.steps[4])
+        local_features = self.from_local(local).reshape(local.shape[0], -1, self.steps[1])
+        for k, block in zip(reversed(range(4)), self.decoder, strict=True):
+            unpool, conv = block  # type: ignore[misc]
+            if k == 0:
+                features = _join_edges(features, local_features, CHANNELS[1])
+            if self.config.strides[k] > 1:
+                features = F.interpolate(features, scale_factor=self.config.strides[k], mode="linear")
+            features = conv(unpool(features))
+            if k > 0:
+                features = F.leaky_relu(features, SLOPE)
+        return features.transpose(1, 2).reshape(features.shape[0], self.config.window, -1, ROTATION_FEATURES)
+
+
+def _mean_pose(x: Tensor) -> Tensor:
+    """(B, 1, 22, 3, 3) local rotations: the mean pose of windows x (B, T, 22, 6).
+
+    Bones' orientations in space are averaged: an error of a thigh's twist, which cannot be seen on a straight leg, is
+    taken back by the knee frame by frame, but not by the mean of the knee's own rotations.
+    """
+    rotations = from_6d(x)
+    _, orientations = forward_kinematics(rotations, rotations.new_zeros(1, 3).expand(len(PARENTS), 3))
+    mean = from_6d(to_6d(orientations).mean(dim=1, keepdim=True))
+    return torch.cat([mean[:, :, :1], mean[:, :, list(PARENTS[1:])].mT @ mean[:, :, 1:]], dim=2)
+
+
+def _columns(x: Tensor, frame: Tensor) -> Tensor:
+    """The two columns in x (..., 6), which are vectors, in these frames (..., 3, 3)."""
+    return (x.unflatten(-1, (2, 3)) @ frame).flatten(-2)
+
+
+def _join_edges(a: Tensor, b: Tensor, channels: int) -> Tensor:
+    """Concatenate the channels of each edge of two (B, E * channels, T) features."""
+    batch, features, time = a.shape
+    joined = torch.cat(
+        [
+            a.reshape(batch, features // channels, channels, time),
+            b.reshape(batch, features // channels, channels, time),
+        ],
+        dim=2,
+    )
+    return joined.reshape(batch, 2 * features, time)

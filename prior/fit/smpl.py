@@ -1,0 +1,184 @@
+"""A fitted motion as that of SMPL or SMPL-H, for the tools that read AMASS' files.
+
+Of the user's own model file only what joints follow from is read: where SMPL has them in its rest pose is linear in
+the betas, and from there on it is forward kinematics; skin and its blend shapes move no joint (Loper et al. 2015,
+equations 2 to 4 and 10). So neither the package `smplx` is needed, which is not free for products, nor a file of ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from steadypose.prior.body.inverse_kinematics import solve_rotations
+from steadypose.prior.body.skeleton import PARENT, PARENTS
+from steadypose.prior.fit.humor_state import small_exp
+from steadypose.prior.fit.motion import float_tensor
+from steadypose.prior.fit.torch_kinematics import forward_kinematics
+from steadypose.prior.npz import MotionError, open_npz
+from steadypose.prior.timing.rate import FPS
+
+Floats = NDArray[np.float64]
+
+BETAS, POSES = 16, 156
+"""Numbers that AMASS has of a shape; and of a pose, SMPL-H's 52 rotation vectors, of which hands are 0 here."""
+
+LENGTH_SIGMA, JOINT_SIGMA, TURN_SIGMA = 0.01, 0.01, 0.3
+"""Metres that SMPL's bones and joints may be off by, and radians that a joint may turn from where inverse kinematics
+has it, against betas of a standard deviation of 1: what betas cannot explain is not to be explained by monsters."""
+
+STEPS = 100
+
+_AXES = [2, 0, 1]
+"""SMPL's rest pose has left, up and forward as its axes, ours has forward, left and up."""
+
+
+@dataclass(frozen=True)
+class SmplShape:
+    """Where a model has its first 22 joints, in the rest pose.
+
+    Attributes:
+        rest: (22, 3) metres, of the mean shape; x forward, y left, z up.
+        change: (22, 3, B) metres of each beta, B up to `BETAS`.
+        gender: as the file's name says.
+    """
+
+    rest: Floats
+    change: Floats
+    gender: str
+
+    @classmethod
+    def read(cls, path: Path) -> SmplShape:
+        """From a model's ``.npz``.
+
+        Raises:
+            MotionError: it has not what SMPL's and SMPL-H's have; says what was expected.
+        """
+        with open_npz(path, "v_template", "shapedirs", "J_regressor", "kintree_table") as arrays:
+            try:
+                vertices, shapes = arrays["v_template"].astype(np.float64), arrays["shapedirs"].astype(np.float64)
+                regressor, tree = arrays["J_regressor"].astype(np.float64), np.asarray(arrays["kintree_table"])
+            except ValueError as error:  # of pickled objects, such as sparse matrices
+                raise MotionError(f"{path}: expected arrays of numbers: {error}") from error
+        joints = len(PARENTS)
+        told = f"v_template {vertices.shape}, shapedirs {shapes.shape}, J_regressor {regressor.shape}"
+        if (
+            vertices.shape[1:] != (3,) or shapes.shape[:-1] != vertices.shape or not shapes.shape[-1]
+            or regressor.ndim != 2 or regressor.shape[1] != len(vertices) or len(regressor) < joints
+        ):  # fmt: skip
+            raise MotionError(f"{path}: expected (V, 3), (V, 3, betas) and ({joints} or more, V), got {told}")
+        if tree.ndim != 2 or tree.shape[1] < joints or tuple(tree[0, 1:joints]) != PARENTS[1:]:
+            raise MotionError(f"{path}: kintree_table: expected SMPL's joints, whose first {joints} have known parents")
+        regressor = regressor[:joints]
+        name = f"{path.parent.name} {path.stem}".lower()
+        gender = next((known for known in ("female", "male") if known in name), "neutral")
+        change = np.einsum("jv,vxb->jxb", regressor, shapes[..., :BETAS])
+        return cls((regressor @ vertices)[:, _AXES], change[:, _AXES], gender)
+
+    def joints(self, betas: Floats) -> Floats:
+        """(22, 3) metres in the rest pose, of betas (B,)."""
+        return self.rest + self.change @ betas
+
+    def of_lengths(self, lengths: Floats) -> Floats:
+        """Betas (B,) whose bones are about as long as these (22,), metres; the root's is passed over."""
+
+        def residuals(betas: Floats) -> Floats:
+            placed = self.joints(betas)
+            off = np.linalg.norm(placed - placed[PARENT], axis=-1) - lengths
+            return np.concatenate([off[1:] / LENGTH_SIGMA, betas])
+
+        return least_squares(residuals, np.zeros(self.change.shape[-1])).x
+
+
+@dataclass(frozen=True)
+class SmplMotion:
+    """A motion of T frames at 30 Hz, z up.
+
+    Attributes:
+        poses: (T, `POSES`) radians, rotation vectors, the root's first.
+        betas: (`BETAS`,) 0 where the model has fewer.
+        trans: (T, 3) metres.
+        gender: of the model.
+        joints: (T, 22, 3) metres: where the model's are.
+    """
+
+    poses: Floats
+    betas: Floats
+    trans: Floats
+    gender: str
+    joints: Floats
+
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """As AMASS names them."""
+        return {
+            "poses": self.poses, "betas": self.betas, "trans": self.trans, "gender": np.array(self.gender),
+            "mocap_framerate": np.array(float(FPS)),
+        }  # fmt: skip
+
+
+def smpl_motion(shape: SmplShape, joints: Floats, lengths: Floats) -> SmplMotion:
+    """The motion of a model whose joints are nearest to these.
+
+    Args:
+        shape: of the model.
+        joints: (T, 22, 3) metres, z up, in no frame missing.
+        lengths: (22,) metres, of bones.
+    """
+    betas = shape.of_lengths(lengths)
+    rest = shape.joints(betas)
+    bones = np.where(PARENT[:, None] >= 0, rest - rest[PARENT], 0.0)
+    start = float_tensor(solve_rotations(joints, bones))
+    target, middle, change = float_tensor(joints), float_tensor(shape.rest), float_tensor(shape.change)
+    moves = [torch.zeros(values.shape) for values in (betas, joints, joints[:, 0])]
+    for move in moves:
+        move.requires_grad = True
+    scales = [0.3, 0.1, 0.01]  # of a step of 1 of the optimiser
+    first = float_tensor(betas)
+    optimiser = torch.optim.LBFGS(moves, max_iter=STEPS, line_search_fn="strong_wolfe")
+
+    def posed() -> list[torch.Tensor]:
+        beta, turns, off = (scale * move for scale, move in zip(scales, moves, strict=True))
+        rotations = small_exp(turns) @ start
+        placed = middle + change @ (first + beta)
+        offsets = torch.cat([placed[:1], placed[1:] - placed[list(PARENTS[1:])]])
+        return [first + beta, turns, rotations, forward_kinematics(rotations, offsets, target[:, 0] + off)[0]]
+
+    def closure() -> torch.Tensor:
+        optimiser.zero_grad()
+        beta, turns, _, said = posed()
+        # bones of another model are off alike in all frames: together these say of betas what one says
+        energy = len(target) * beta.square().sum() + (turns / TURN_SIGMA).square().sum()
+        energy = energy + ((said - target) / JOINT_SIGMA).square().sum()
+        energy.backward()
+        return energy
+
+    optimiser.step(closure)
+    with torch.no_grad():
+        beta, _, rotations, said = (values.double().numpy() for values in posed())
+    return SmplMotion(_poses(rotations), _padded(beta, BETAS), said[:, 0] - _own_axes(shape.joints(beta)[0]),
+                      shape.gender, said)  # fmt: skip
+
+
+def _poses(rotations: Floats) -> Floats:
+    """(T, `POSES`) of local rotations (T, 22, 3, 3) between our axes; the root's leads from SMPL's to the world."""
+    axes = np.eye(3)[_AXES]
+    local = np.concatenate([rotations[:, :1] @ axes, axes.T @ rotations[:, 1:] @ axes], axis=1)
+    vectors = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec()
+    return _padded(vectors.reshape(len(rotations), -1), POSES)
+
+
+def _own_axes(point: Floats) -> Floats:
+    """(3,) in SMPL's axes of a point in ours."""
+    return point @ np.eye(3)[_AXES]
+
+
+def _padded(values: Floats, width: int) -> Floats:
+    return np.concatenate([values, np.zeros((*values.shape[:-1], width - values.shape[-1]))], axis=-1)

@@ -1,0 +1,236 @@
+"""The three stages of test-time optimisation (HuMoR, section 4.3), by L-BFGS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from steadypose.prior.fit.energy import (
+    Anchored,
+    Bones,
+    FirstState,
+    Ground,
+    Smooth,
+    Standing,
+    Term,
+    Transitions,
+    energy,
+)
+from steadypose.prior.fit.humor_network import HumorNet
+from steadypose.prior.fit.motion import SCALES, Motion, Variables, float_tensor
+
+Floats = NDArray[np.float64]
+
+POSES = ("root", "orientation", "turns")
+
+ROUND = 10
+"""Steps of L-BFGS between two checks for convergence."""
+
+STIFFNESS = 30.0
+"""Ratio of the curvatures of the motion terms and of the observations: about the square of 4 cm over 7 mm."""
+
+TOLERANCE = 1e-4
+"""Share of the energy: a round that gains less is the last."""
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Steps of each stage and standard deviation of each term, chosen on validation people.
+
+    Attributes:
+        root_steps, pose_steps, motion_steps: of L-BFGS, of up to five evaluations each.
+        smooth_sigma: m/s², of stage 2.
+        pose_sigma: of `FirstState` as a prior of all states, in stage 2.
+        transitions: of stage 3.
+        first_sigma: of `FirstState` as a prior of all states, in stage 3.
+        motion_smooth_sigma: m/s², of stage 3: against the jitter that the model of motion allows.
+        standing: of stage 3.
+        bones_sigma: metres.
+        ground_height_sigma: metres, where the ground is not known.
+        ground_tilt_sigma: radians, likewise.
+    """
+
+    root_steps: int = 30
+    pose_steps: int = 60
+    motion_steps: int = 100
+    smooth_sigma: float = 4.0
+    pose_sigma: float = 4.0
+    transitions: Transitions = field(default_factory=Transitions)
+    first_sigma: float = 6.0
+    motion_smooth_sigma: float = 8.0
+    standing: Standing = field(default_factory=Standing)
+    bones_sigma: float = 0.01
+    ground_height_sigma: float = 0.05
+    ground_tilt_sigma: float = 0.03
+
+
+PICTURES = FitSettings(bones_sigma=0.03, pose_steps=120, motion_steps=200)
+"""For key points of a picture, which say less of how large a person is, and start farther off."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """Initial poses of T frames, in the world.
+
+    Attributes:
+        root: (T, 3) metres.
+        rotations: (T, 22, 3, 3) local.
+        offsets: (22, 3) metres, bones.
+        ground: metres, height of the floor.
+        ground_known: whether that is certain, as with a calibrated camera, or the mean of a prior.
+    """
+
+    root: Tensor
+    rotations: Tensor
+    offsets: Tensor
+    ground: float = 0.0
+    ground_known: bool = False
+
+    @classmethod
+    def of(
+        cls, root: Floats, rotations: Floats, offsets: Floats, ground: float = 0.0, *, ground_known: bool = False
+    ) -> Start:
+        """From arrays of the same shapes."""
+        return cls(float_tensor(root), float_tensor(rotations), float_tensor(offsets), ground, ground_known)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The fit of a window.
+
+    Attributes:
+        motion: of least energy, without gradients.
+        energies: (stages,) nats at the end of each stage, of that stage's terms.
+    """
+
+    motion: Motion
+    energies: tuple[float, ...]
+
+
+def fit_window(
+    model: HumorNet,
+    start: Start,
+    observed: Sequence[Term],
+    settings: FitSettings,
+    *,
+    anchor: Anchored | None = None,
+    stages: int = 3,
+    advanced: Callable[[], None] = lambda: None,
+) -> Fitted:
+    """Fit a window of some seconds, three frames at least.
+
+    Args:
+        model: of transitions, in evaluation mode.
+        start: initial poses.
+        observed: terms of the observations.
+        settings: of stages and terms.
+        anchor: the frames shared with the window before.
+        stages: how many; 2 stops before the model of motion: HuMoR's VPoser-t.
+        advanced: called after each stage.
+    """
+    model.requires_grad_(False)
+    variables = Variables.initial(start.root, start.rotations, start.offsets, start.ground, model.config.latent)
+    given = [*observed, *([anchor] if anchor else [])]
+    found: list[float] = []
+    for stage in _stages(start, given, settings)[:stages]:
+        if "latents" in stage.free:
+            variables = replace(variables, latents=Motion(model, variables).encoded_latents())
+        variables, value = minimise(model, variables, stage.free, stage.terms, stage.steps)
+        found.append(value)
+        advanced()
+    with torch.no_grad():
+        return Fitted(Motion(model, variables), tuple(found))
+
+
+class _Stage(NamedTuple):
+    """Which variables are free, under which terms, for how many steps at most."""
+
+    free: tuple[str, ...]
+    terms: list[Term]
+    steps: int
+
+
+def _stages(start: Start, given: Sequence[Term], settings: FitSettings) -> list[_Stage]:
+    """The root's pose; all poses, by smoothness; all poses and latents, by the model of motion."""
+    shape: list[Term] = [Bones(settings.bones_sigma)]
+    body: tuple[str, ...] = (*POSES, "bones")
+    if not start.ground_known:
+        shape.append(Ground(start.ground, settings.ground_height_sigma, settings.ground_tilt_sigma))
+        body = (*body, "ground")
+    smooth = Smooth(settings.smooth_sigma)
+    poses = [*given, *shape, smooth, FirstState(settings.pose_sigma, all_states=True)]
+    motion = [
+        *given, *shape, settings.transitions, FirstState(settings.first_sigma, all_states=True), settings.standing,
+        Smooth(settings.motion_smooth_sigma),
+    ]  # fmt: skip
+    return [
+        _Stage(("root", "orientation"), [*given, smooth], settings.root_steps),
+        _Stage(body, poses, settings.pose_steps),
+        _Stage((*body, "latents"), motion, settings.motion_steps),
+    ]
+
+
+def minimise(
+    model: HumorNet, variables: Variables, names: Sequence[str], terms: Sequence[Term], steps: int
+) -> tuple[Variables, float]:
+    """Minimise the energy by L-BFGS.
+
+    Args:
+        model: of transitions.
+        variables: to start from.
+        names: of the variables that are free; the others stay.
+        terms: of the energy.
+        steps: at most.
+
+    Returns:
+        The variables of least energy, and that energy, nats.
+    """
+    initial = [getattr(variables, name) for name in names]
+    conditioned = preconditioner(len(variables.root)).to(variables.root.dtype)
+    moves = [torch.zeros_like(value, requires_grad=True) for value in initial]
+    optimiser = torch.optim.LBFGS(
+        moves, max_iter=ROUND, max_eval=5 * ROUND, history_size=30, tolerance_change=1e-7, line_search_fn="strong_wolfe"
+    )
+
+    def moved() -> Variables:
+        found = {}
+        for name, value, move in zip(names, initial, moves, strict=True):
+            if name in POSES:
+                move = torch.einsum("ts,s...->t...", conditioned, move)
+            found[name] = value + SCALES[name] * move
+        return replace(variables, **found)
+
+    def closure() -> Tensor:
+        optimiser.zero_grad()
+        value = energy(Motion(model, moved()), terms)
+        value.backward()
+        return value
+
+    before = torch.inf
+    for _ in range(0, steps, ROUND):
+        now = float(optimiser.step(closure).detach())  # the energy before these steps
+        if before - now < TOLERANCE * abs(now):
+            break
+        before = now
+    with torch.no_grad():
+        last = moved()
+        return last, float(energy(Motion(model, last), terms))
+
+
+@cache
+def preconditioner(frames: int) -> Tensor:
+    """(T, T) of the poses' moves: the inverse root of 1 + `STIFFNESS` times the squared second differences.
+
+    Observations constrain each frame by itself, motion terms constrain three by their acceleration, and far more
+    firmly: the energy is ill-conditioned. Through this matrix L-BFGS takes a fraction of the steps.
+    """
+    second = torch.eye(frames, dtype=torch.float64).diff(n=2, dim=0)
+    values, vectors = torch.linalg.eigh(torch.eye(frames) + STIFFNESS * (second.mT @ second))
+    return vectors @ torch.diag(values.rsqrt()) @ vectors.mT

@@ -1,0 +1,79 @@
+"""Forward kinematics and rotations as networks have them, with gradients; without: `prior.body.kinematics`."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from steadypose.prior.body.kinematics import LEVELS
+from steadypose.prior.body.skeleton import PARENTS
+
+
+def forward_kinematics(rotations: Tensor, offsets: Tensor, root: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Joint positions from local rotations and a person's bones.
+
+    Args:
+        rotations: (..., 22, 3, 3) local rotation matrices.
+        offsets: (..., 22, 3) metres, each joint in its parent's frame; broadcasts over leading dimensions.
+        root: (..., 3) metres, position of the pelvis; the origin if left out.
+
+    Returns:
+        positions (..., 22, 3) metres and global rotations (..., 22, 3, 3), in the frame of the root's rotation.
+    """
+    batch = rotations.shape[:-3]
+    offsets = offsets.expand(*batch, *offsets.shape[-2:]).unsqueeze(-1)
+    origin = rotations.new_zeros(*batch, 3) if root is None else root
+    # Lists, not one tensor written in place: autograd needs every level's values kept.
+    positions: list[Tensor] = [origin.unsqueeze(-2)]
+    orientations: list[Tensor] = [rotations[..., :1, :, :]]
+    for above, level in pairwise(LEVELS):
+        parents = [p - above.start for p in PARENTS[level]]
+        orientation = orientations[-1][..., parents, :, :]
+        positions.append(positions[-1][..., parents, :] + (orientation @ offsets[..., level, :, :]).squeeze(-1))
+        orientations.append(orientation @ rotations[..., level, :, :])
+    return torch.cat(positions, dim=-2), torch.cat(orientations, dim=-3)
+
+
+def to_6d(rotations: Tensor) -> Tensor:
+    """(..., 3, 3) rotation matrices to (..., 6): first column, then second."""
+    return rotations[..., :2].transpose(-1, -2).flatten(-2)
+
+
+def from_6d(x: Tensor) -> Tensor:
+    """(..., 6) to rotation matrices (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019)."""
+    a, b = x[..., :3], x[..., 3:]
+    first = F.normalize(a, dim=-1)
+    second = F.normalize(b - (first * b).sum(dim=-1, keepdim=True) * first, dim=-1)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
+
+
+def remove_heading(rotations: Tensor, frame: int) -> tuple[Tensor, Tensor]:
+    """Turn windows about the vertical so that the body faces +x in ``frame``.
+
+    Args:
+        rotations: (B, T, 22, 3, 3) local, z up.
+        frame: which frame of the window defines the heading.
+
+    Returns:
+        The turned rotations, and the yaw matrices (B, 3, 3) that turn them back.
+    """
+    back = yaw_rotation(heading(rotations[:, frame, 0]))
+    turned = rotations.clone()
+    turned[:, :, 0] = back.transpose(-1, -2)[:, None] @ rotations[:, :, 0]
+    return turned, back
+
+
+def heading(root_rotation: Tensor) -> Tensor:
+    """Yaw (...) in radians of root rotations (..., 3, 3): `prior.body.kinematics.heading`, in torch."""
+    left = root_rotation[..., :, 1]
+    return torch.atan2(-left[..., 0], left[..., 1])
+
+
+def yaw_rotation(yaw: Tensor) -> Tensor:
+    """Rotations (..., 3, 3) about z by ``yaw`` (...) radians."""
+    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    c, s = yaw.cos(), yaw.sin()
+    return torch.stack([c, -s, zero, s, c, zero, zero, zero, one], dim=-1).reshape(*yaw.shape, 3, 3)

@@ -1,0 +1,159 @@
+"""Biovision Hierarchy (.bvh) files.
+
+Written here rather than taken from a package: see `benchmarks/systems/importers.py` for what was weighed. The format
+leaves open what a position channel means. By the original definition it is added to the joint's OFFSET; exporters
+that give every joint position channels write the whole offset into them, and there it replaces the OFFSET. Here
+it is added at a root, where the two differ by a constant shift of the world only, and replaces it elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from steadypose.prior.mocap.clip import MotionError, documented, forward
+
+
+@dataclass
+class _Node:
+    name: str
+    parent: int
+    offset: tuple[float, float, float]
+    channels: tuple[str, ...] = ()
+
+
+_POSITION = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
+_ROTATION = {"Xrotation": "X", "Yrotation": "Y", "Zrotation": "Z"}
+
+
+@dataclass(frozen=True)
+class Bvh:
+    """A BVH file.
+
+    Attributes:
+        joints: names, parents first. The end site of joint ``A`` is ``A_end``, and ``A_end2`` if it has another.
+        parents: index of each joint's parent; -1 for a root.
+        offsets: (J, 3) in the file's unit and axes.
+        channels: of each joint, in the file's order.
+        fps: frames a second.
+        values: (T, C) of all channels, degrees and the file's unit.
+    """
+
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: NDArray[np.float64]
+    channels: tuple[tuple[str, ...], ...]
+    fps: float
+    values: NDArray[np.float64]
+
+    @documented
+    def positions(self, lost_bones: Mapping[str, float] | None = None) -> NDArray[np.float64]:
+        """(T, J, 3) in the file's unit and axes, by forward kinematics.
+
+        Args:
+            lost_bones: see `prior.mocap.tables.Rig`; given back their length where the file has none.
+        """
+        offsets = self.offsets.copy()
+        for name, multiple in (lost_bones or {}).items():
+            joint = self.joints.index(name)
+            if not offsets[joint].any():
+                offsets[joint] = multiple * offsets[self.parents[joint]]
+        steps = np.tile(offsets, (len(self.values), 1, 1))
+        local = np.broadcast_to(np.eye(3), (*steps.shape, 3)).copy()
+        column = 0
+        for j, channels in enumerate(self.channels):
+            order = "".join(_ROTATION[c] for c in channels if c in _ROTATION)
+            if order:
+                turning = [column + i for i, c in enumerate(channels) if c in _ROTATION]
+                local[:, j] = Rotation.from_euler(order, self.values[:, turning], degrees=True).as_matrix()
+            for i, channel in enumerate(channels):
+                if channel in _POSITION:
+                    axis = _POSITION[channel]
+                    base = offsets[j, axis] if self.parents[j] < 0 else 0.0
+                    steps[:, j, axis] = base + self.values[:, column + i]
+            column += len(channels)
+        return forward(self.parents, steps, local)[0]
+
+
+@documented
+def read_bvh(text: str) -> Bvh:
+    """Read a BVH file: any rotation order, position channels on any joint, several roots and end sites.
+
+    Raises:
+        MotionError: it is not one, or its motion does not fit its hierarchy.
+    """
+    head, found, motion = text.partition("MOTION")
+    if not found:
+        raise MotionError("expected HIERARCHY and MOTION sections, found no MOTION")
+    nodes = _hierarchy(head.split())
+    values, fps = _motion(motion, sum(len(n.channels) for n in nodes))
+    return Bvh(
+        joints=tuple(n.name for n in nodes),
+        parents=tuple(n.parent for n in nodes),
+        offsets=np.array([n.offset for n in nodes]),
+        channels=tuple(n.channels for n in nodes),
+        fps=fps,
+        values=values,
+    )
+
+
+def _hierarchy(tokens: list[str]) -> list[_Node]:
+    nodes: list[_Node] = []
+    open_joints: list[int] = []
+    it = iter(tokens)
+    try:
+        if (first := next(it)) != "HIERARCHY":
+            raise MotionError(f"expected HIERARCHY at the start, found '{first}'")
+        for token in it:
+            if token in ("ROOT", "JOINT", "End"):
+                parent = open_joints[-1] if open_joints else -1
+                name = next(it)
+                if token == "End":
+                    ends = sum(n.parent == parent and not n.channels for n in nodes)
+                    name = f"{nodes[parent].name}_end{ends + 1 if ends else ''}"
+                if (brace := next(it)) != "{":
+                    raise MotionError(f"expected '{{' after {token} {name}, found '{brace}'")
+                open_joints.append(len(nodes))
+                nodes.append(_Node(name, parent, (0.0, 0.0, 0.0)))
+            elif token == "OFFSET":
+                nodes[open_joints[-1]].offset = (float(next(it)), float(next(it)), float(next(it)))
+            elif token == "CHANNELS":
+                channels = tuple(next(it) for _ in range(int(next(it))))
+                unknown = set(channels) - _POSITION.keys() - _ROTATION.keys()
+                if unknown:
+                    raise MotionError(f"joint {nodes[open_joints[-1]].name}: unknown channels {sorted(unknown)}")
+                nodes[open_joints[-1]].channels = channels
+            elif token == "}":
+                open_joints.pop()
+            else:
+                raise MotionError(f"expected ROOT, JOINT, End, OFFSET, CHANNELS or '}}', found '{token}'")
+    except (StopIteration, IndexError) as error:
+        raise MotionError("the hierarchy is cut short or its braces do not match") from error
+    except ValueError as error:
+        if isinstance(error, MotionError):
+            raise
+        raise MotionError(f"a number in the hierarchy cannot be read: {error}") from error
+    if open_joints or not nodes:
+        raise MotionError("the hierarchy is cut short or its braces do not match")
+    return nodes
+
+
+def _motion(text: str, channels: int) -> tuple[NDArray[np.float64], float]:
+    """Values (T, channels), and frames a second."""
+    words = text.split(maxsplit=5)
+    if len(words) < 5 or words[0] != "Frames:" or words[2:4] != ["Frame", "Time:"]:
+        raise MotionError(f"expected 'Frames: N' and 'Frame Time: S' after MOTION, found '{' '.join(words[:5])}'")
+    try:
+        frames, seconds = int(words[1]), float(words[4])
+        values = np.array(words[5].split() if len(words) > 5 else [], dtype=np.float64)
+    except ValueError as error:
+        raise MotionError(f"a number in the motion cannot be read: {error}") from error
+    if seconds <= 0:
+        raise MotionError(f"expected a frame time above zero, found {seconds}")
+    if len(values) != frames * channels:
+        raise MotionError(f"expected {frames} frames of {channels} numbers, found {len(values)} numbers")
+    return values.reshape(frames, channels), 1.0 / seconds

@@ -1,0 +1,203 @@
+"""One file of motion, of any kind that is read: its body as canonical joints, metres, z up.
+
+BVH and AMASS' .npz (`prior.mocap.bvh`, `prior.mocap.npz`), and named points: TRC, the text that OpenSim and
+Pose2Sim write, and C3D, that of motion capture, through ezc3d. What a file does not say, its `Description` may.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.prior.body.layouts import CANONICAL, SKELETONS, Skeleton, to_canonical
+from steadypose.prior.body.points import recognise_points
+from steadypose.prior.body.rigs import Rig, RigError, Tree, recognise, up_axis
+from steadypose.prior.body.skeleton import JOINTS
+from steadypose.prior.mocap.bvh import read_bvh
+from steadypose.prior.mocap.clip import TO_Z_UP, MotionError, documented
+from steadypose.prior.mocap.npz import read_amass
+from steadypose.prior.mocap.plug_in_gait import MARKERS, calibrate, joint_centres
+from steadypose.prior.mocap.tables import CMU_BVH
+
+Floats = NDArray[np.float64]
+
+POINT_UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "meters": 1.0, "millimeters": 0.001}
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a file of motion does not say, or says wrongly; empty where it is to be trusted or recognised.
+
+    Attributes:
+        canonical: canonical joint -> the file's joint, or several, whose middle it is.
+        metres: the size of the file's unit; 0 where it is recognised.
+        up: the axis that points up, ``z``, ``y`` or ``-y``.
+        fps: frames a second; 0 as the file says.
+        skeleton: of arrays without names, whose joints they are.
+    """
+
+    canonical: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
+    metres: float = 0.0
+    up: str = ""
+    fps: float = 0.0
+    skeleton: str = ""
+
+
+UNDESCRIBED = Description()
+
+
+class Motion(NamedTuple):
+    """What a file holds: frames a second, and (T, 22, 3) metres, z up; NaN where missing."""
+
+    fps: float
+    positions: Floats
+
+
+def describe(table: Mapping[str, Any]) -> Description:
+    """The description that a TOML file (``--rig``) gives.
+
+    Raises:
+        MotionError: it says something else, or of a joint that is none.
+    """
+    kinds = {"canonical": Mapping, "metres": (int, float), "up": str, "fps": (int, float), "skeleton": str}
+    for key, value in table.items():
+        if key not in kinds or not isinstance(value, kinds[key]):
+            raise MotionError(f"rig: expected {', '.join(kinds)} alone, each of its kind; got {key} = {value!r}")
+    described = Description(**table)
+    if strange := [joint for joint in described.canonical if joint not in JOINTS]:
+        raise MotionError(f"rig [canonical]: expected joints of smpl22 ({', '.join(JOINTS)}), got {', '.join(strange)}")
+    if described.up not in ("", *TO_Z_UP):
+        raise MotionError(f"rig: up: expected one of {', '.join(TO_Z_UP)}, got {described.up!r}")
+    if described.skeleton not in ("", *SKELETONS):
+        raise MotionError(f"rig: skeleton: expected one of {', '.join(SKELETONS)}, got {described.skeleton!r}")
+    return described
+
+
+@documented
+def read_motion(name: str, content: bytes, description: Description = UNDESCRIBED) -> Motion:
+    """Read a file of motion by its suffix, one of `SUFFIXES`.
+
+    Args:
+        name: of the file, for errors and for its suffix.
+        content: its bytes.
+        description: what it does not say.
+
+    Raises:
+        MotionError: it cannot be read, or holds no body.
+    """
+    suffix = Path(name).suffix.lower()
+    if suffix not in _READERS:
+        raise MotionError(f"{name}: expected one of {', '.join(SUFFIXES)}")
+    try:
+        fps, skeleton, positions, up = _READERS[suffix](content, description)
+    except (MotionError, RigError) as error:
+        raise MotionError(f"{name}: {error}") from error
+    body = to_canonical(skeleton, positions)[0]
+    return Motion(description.fps or fps, body @ TO_Z_UP[description.up or up or up_axis(body)].T)
+
+
+_Read = tuple[float, Skeleton, Floats, str]
+"""Frames a second, whose joints, (T, J, 3) metres, and the axis that points up, if it is known."""
+
+
+def file_rig(joints: Sequence[str], parents: Sequence[int], offsets: Floats, description: Description) -> Rig:
+    """The rig of a file: as described, as one of the tables has it, or recognised.
+
+    Raises:
+        RigError: a joint that is described is not there, or no body is recognised.
+    """
+    if description.canonical:
+        named = _described("described", joints, description.canonical)
+        if not description.metres:
+            raise RigError("rig: expected metres, the size of the file's unit, beside [canonical]")
+        return Rig(named, description.metres)
+    if set(CMU_BVH.skeleton.joints) <= set(joints):
+        return CMU_BVH
+    return recognise(Tree(joints, parents, offsets))
+
+
+def _described(name: str, joints: Sequence[str], canonical: Mapping[str, str | Sequence[str]]) -> Skeleton:
+    sources = {joint: [given] if isinstance(given, str) else list(given) for joint, given in canonical.items()}
+    if missing := [n for names in sources.values() for n in names if n not in joints]:
+        raise RigError(f"rig [canonical]: expected names of joints, the file has no {', '.join(missing)}")
+    return Skeleton(name, tuple(joints), {joint: dict.fromkeys(names, 1.0) for joint, names in sources.items()})
+
+
+def _bvh(content: bytes, description: Description) -> _Read:
+    bvh = read_bvh(content.decode("utf-8", "replace"))
+    rig = file_rig(bvh.joints, bvh.parents, bvh.offsets, description)
+    positions = bvh.positions(rig.lost_bones)[:, [bvh.joints.index(j) for j in rig.skeleton.joints]]
+    return bvh.fps, rig.skeleton, positions * (description.metres or rig.metres), rig.up
+
+
+def _amass(content: bytes, _: Description) -> _Read:
+    fps, positions = read_amass(io.BytesIO(content))
+    return fps, CANONICAL, positions, "z"
+
+
+def _array(content: bytes, description: Description) -> _Read:
+    positions = np.load(io.BytesIO(content), allow_pickle=False)
+    skeleton = SKELETONS.get(description.skeleton or CANONICAL.name, CANONICAL)
+    shape = (len(skeleton.joints), 3)
+    if positions.ndim != 3 or positions.shape[1:] != shape or not description.fps:
+        raise MotionError(
+            f"expected an array (T, {shape[0]}, 3) of {skeleton.name} and --rig with fps (and skeleton, if it is of "
+            f"another); got {positions.shape} and {description.fps or 'no'} fps"
+        )
+    return description.fps, skeleton, positions.astype(np.float64) * (description.metres or 1.0), ""
+
+
+def _trc(content: bytes, description: Description) -> _Read:
+    rows = content.decode("utf-8", "replace").splitlines()
+    if len(rows) < 6 or not rows[0].startswith("PathFileType"):
+        raise MotionError("expected a TRC file, which begins with PathFileType and has five lines before its numbers")
+    header = dict(zip(rows[1].split("\t"), rows[2].split("\t"), strict=False))
+    names = [name.strip() for name in rows[3].split("\t")[2::3]]
+    names = names[: max(k + 1 for k, name in enumerate(names) if name)]
+    cells = [row.split("\t") for row in rows[5:] if row.strip()]
+    width = 2 + 3 * len(names)
+    values = np.array([[float(c) if c.strip() else np.nan for c in (row + [""] * width)[:width]] for row in cells])
+    points = values[:, 2:].reshape(len(values), len(names), 3)
+    return _points(float(header["DataRate"]), names, points, header.get("Units", "m"), description)
+
+
+def _c3d(content: bytes, description: Description) -> _Read:
+    try:
+        import ezc3d
+    except ImportError as error:
+        raise MotionError("reading C3D needs ezc3d: install steadypose[mocap]") from error
+    with NamedTemporaryFile(suffix=".c3d") as file:  # it reads by name alone
+        file.write(content)
+        file.flush()
+        point = (read := ezc3d.c3d(file.name))["parameters"]["POINT"]
+    names = [str(name).rpartition(":")[2] for name in point["LABELS"]["value"]]
+    points = read["data"]["points"][:3].transpose(2, 1, 0)[:, : len(names)].astype(np.float64)
+    units = (point["UNITS"]["value"] or ["mm"])[0]
+    return _points(float(point["RATE"]["value"][0]), names, points, str(units), description)
+
+
+def _points(fps: float, names: Sequence[str], points: Floats, units: str, description: Description) -> _Read:
+    """Of named points: markers of the Plug-in-Gait set on the skin, or joints."""
+    metres = description.metres or POINT_UNITS.get(units.strip().lower(), 0.001)
+    if description.canonical:
+        return fps, _described("described", names, description.canonical), points * metres, ""
+    if set(MARKERS) <= set(names):
+        markers = {name: points[:, names.index(name)] * metres for name in MARKERS}
+        return fps, CANONICAL, joint_centres(markers, calibrate([markers])), ""
+    skeleton = recognise_points(names)
+    return fps, skeleton, points[:, [list(names).index(n) for n in skeleton.joints]] * metres, ""
+
+
+_READERS: Mapping[str, Callable[[bytes, Description], _Read]] = {
+    ".bvh": _bvh, ".trc": _trc, ".c3d": _c3d, ".npy": _array, ".npz": _amass,
+}  # fmt: skip
+
+SUFFIXES = tuple(_READERS)
+"""Of files of motion."""

@@ -1,0 +1,96 @@
+"""Where joints are, given how all of them lie to each other: a Gaussian of the body in its trunk's frame.
+
+Joints of a trunk are all but rigid to each other, and limbs lie by it as people hold them. What is known of a noisy
+joint is therefore the whole body's: of x ~ N(mean, S), seen as z = x + e with e ~ N(0, R), the expectation is
+z - R (S + R)^-1 (z - mean) and the covariance R - R (S + R)^-1 R (ridge regression whose ridge is the noise; Bishop
+2006, section 2.3.3). R is diagonal, each joint's own variance: a perfect joint stays, a hidden one follows the others.
+
+The frame is that of hips and shoulders, as noisy as they are: S holds a turn and a shift of it, in which no posture is
+preferred. So a body may lie, or stand on its hands.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.prior.body.skeleton import HIPS, REST_OFFSETS, SHOULDERS
+from steadypose.prior.models.weights import Arrays, load_weights
+
+Floats = NDArray[np.float64]
+
+DIMENSIONS = 66
+UNLIKE = 0.01
+"""Metres along an axis, by which any joint may differ from what training people do."""
+
+MIN_SIGMA, MAX_SIGMA = 1e-5, 0.5
+"""Metres: of what is said of a joint; one of which nothing is said has the largest."""
+
+_CORNERS = [*HIPS, *SHOULDERS]
+_REST_SIZE = float(np.linalg.norm(REST_OFFSETS, axis=-1).sum())
+
+
+class Expected(NamedTuple):
+    """Of B bodies.
+
+    Attributes:
+        positions: (B, 22, 3) metres.
+        covariance: (B, 66, 66) m² of these, in the axes of ``frame``.
+        frame: (B, 3, 3) forward, left and up of the trunk, as columns.
+    """
+
+    positions: Floats
+    covariance: Floats
+    frame: Floats
+
+
+class LivePosture:
+    """The Gaussian of `steadypose train posture`."""
+
+    def __init__(self, weights: Arrays) -> None:
+        factor = weights["factor"].astype(np.float64)
+        self._mean = weights["mean"].astype(np.float64)
+        self._covariance = factor @ factor.T + UNLIKE**2 * np.eye(DIMENSIONS)
+
+    @classmethod
+    def load(cls, weights: str) -> LivePosture:
+        """From the weights of this name.
+
+        Raises:
+            FileNotFoundError: there are none; says which there are.
+        """
+        return cls(load_weights(weights, "posture")[0])
+
+    def __call__(self, positions: Floats, sigma: Floats, offsets: Floats) -> Expected:
+        """What to expect of joints (B, 22, 3) metres, each with an error of ``sigma`` (B, 22) metres along an axis, of
+        people with bones ``offsets`` (B, 22, 3)."""
+        frame, middle, size = trunk_frame(positions), positions[:, _CORNERS].mean(axis=1), body_size(offsets)
+        scale = size[:, None, None]
+        local = (positions - middle[:, None]) @ frame / scale
+        noise = np.repeat(np.square(np.fmax(np.fmin(sigma, MAX_SIGMA), MIN_SIGMA) / size[:, None]), 3, axis=1)
+        seen = self._covariance + noise[:, :, None] * np.eye(DIMENSIONS)
+        off = local.reshape(len(local), -1) - self._mean
+        gain = np.linalg.inv(seen)
+        moved = (noise * (gain @ off[..., None])[..., 0]).reshape(local.shape)
+        left = noise[:, :, None] * (np.eye(DIMENSIONS) - gain * noise[:, None, :])
+        return Expected((local - moved) * scale @ frame.swapaxes(-1, -2) + middle[:, None], left * scale**2, frame)
+
+
+def trunk_frame(positions: Floats) -> Floats:
+    """Axes forward, left, up as columns (B, 3, 3), of hips and shoulders of joints (B, 22, 3)."""
+    left_hip, right_hip, left_shoulder, right_shoulder = positions[:, _CORNERS].swapaxes(0, 1)
+    up = _unit(left_shoulder + right_shoulder - left_hip - right_hip)
+    left = left_shoulder - right_shoulder + left_hip - right_hip
+    left = _unit(left - (left * up).sum(axis=-1, keepdims=True) * up)
+    return np.stack([np.cross(left, up), left, up], axis=-1)
+
+
+def body_size(offsets: Floats) -> Floats:
+    """(B,) the sum of bones (B, 22, 3), relative to the rest skeleton's."""
+    return np.linalg.norm(offsets, axis=-1).sum(axis=-1) / _REST_SIZE
+
+
+def _unit(vectors: Floats) -> Floats:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

@@ -1,0 +1,103 @@
+"""Weights that ship: safetensors with the configuration inside, read as arrays."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+
+from steadypose import PACKAGE
+
+Arrays: TypeAlias = Mapping[str, NDArray[np.float32]]
+"""A network's weights by name, as its state dict has them: ``blocks.0.first.weight``."""
+
+WEIGHTS = PACKAGE / "prior" / "weights"
+"""Where the weights lie: ``MODEL-SET.safetensors``, each with ``MODEL-SET.md``, its card."""
+
+LICENCES = {
+    "default": "Apache-2.0; trained only on data free for products",
+    "research": "non-commercial use only: trained on CC BY-NC 4.0 data too",
+}
+"""of each weight set, as its cards state it"""
+
+_PARTS = {
+    "body_modes": "covariance",
+    "completer": "layers norm read usual write",
+    "contacts": "head unit",
+    "correction": "layers mean scale",
+    "faults": "blocks mean read write",
+    "hgvae": "dct down encoder last_block mean read read_block start up write",
+    "hmvae": "decoder encoder from_global from_local to_global to_local",
+    "humor": "decoder encoder mean mixture_log_weights mixture_means mixture_precisions scale",
+    "mixture": "body_memory deepen deviation gather joint joint_mix mean mix own_memory read remember tell think write",
+    "occlusion": "deviation joint mean read think write",
+    "posture": "factor mean",
+    "trajectory": "blocks head",
+}
+"""Top-level names of each model's state dict, by which a file of another model is recognised."""
+
+_OPTIONAL_PARTS = {"hgvae": {"completion"}, "humor": {"prior"}}
+_OTHER_SIZES = {"hmvae64": "hmvae", "hgvae-wide": "hgvae"}
+
+
+class WeightsError(ValueError):
+    """A file of weights that cannot be used. The text says what was expected."""
+
+
+def weights_path(name: str, model: str) -> Path:
+    """Where ``model``'s weights lie, by the name of the weight set or as a path."""
+    return Path(name) if name.endswith(".safetensors") else WEIGHTS / f"{model}-{name}.safetensors"
+
+
+def load_weights(name: str, model: str) -> tuple[Arrays, dict[str, Any]]:
+    """The weights and the configuration of ``model``.
+
+    Args:
+        name: the weight set, such as ``default``, or a path to a ``.safetensors`` file.
+        model: the model's name, such as ``hmvae``.
+
+    Raises:
+        FileNotFoundError: no such weights; says which there are.
+        WeightsError: the file is damaged, was not written by `steadypose train`, or holds another model.
+    """
+    path = weights_path(name, model)
+    if not path.is_file():
+        known = sorted(p.stem.removeprefix(f"{model}-") for p in WEIGHTS.glob(f"{model}-*.safetensors"))
+        raise FileNotFoundError(
+            f"no weights '{name}' for {model}: expected {path.name}; there are {', '.join(known) or 'none'}. "
+            f"Name one of these, or make them with 'steadypose train {model}'."
+        )
+    try:
+        with safe_open(path, framework="numpy") as file:
+            config = (file.metadata() or {}).get("config")
+            names = file.keys()
+            arrays = {key: file.get_tensor(key).astype(np.float32, copy=False) for key in names}
+    except SafetensorError as error:
+        raise WeightsError(f"{path}: expected weights as .safetensors: {error}") from error
+    _check_parts(path, model, arrays)
+    if config is None:
+        raise WeightsError(f"{path}: expected weights written by 'steadypose train'; these have no configuration")
+    return arrays, json.loads(config)
+
+
+def _check_parts(path: Path, model: str, arrays: Arrays) -> None:
+    """Refuse weights of another model: HG-VAE's fault network lies beside it as ``.faults.safetensors``."""
+    kind = "faults" if ".faults" in path.suffixes else _OTHER_SIZES.get(model, model)
+    found = {key.partition(".")[0] for key in arrays}
+    expected = set(_PARTS[kind].split())
+    if expected <= found <= expected | _OPTIONAL_PARTS.get(kind, set()):
+        return
+    others = [other for other, parts in _PARTS.items() if set(parts.split()) <= found and other != kind]
+    held = f"those of {max(others, key=lambda other: len(_PARTS[other]))}" if others else ", ".join(sorted(found)[:6])
+    raise WeightsError(f"{path}: expected weights of {kind}, found {held}")
+
+
+def part(weights: Arrays, name: str) -> Arrays:
+    """The weights of the part ``name`` of a network, by their names in it; empty if it has none."""
+    prefix = f"{name}."
+    return {key.removeprefix(prefix): array for key, array in weights.items() if key.startswith(prefix)}

@@ -1,0 +1,126 @@
+"""The stages of `pose/world` in order, for all bodies of one message."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from steadypose.prior.models.contacts import Contacts
+from steadypose.prior.world.contacts import ContactMemory, ContactNetwork, Stance, stance
+from steadypose.prior.world.feet import Feet, FeetState
+from steadypose.prior.world.filter import RootFilter, RootState
+from steadypose.prior.world.floor import Floor
+from steadypose.prior.world.kalman import BodyNoise
+from steadypose.prior.world.observe import BodyObservation
+from steadypose.prior.world.settings import TrajectorySettings
+from steadypose.prior.world.velocity import MotionWindow, RootVelocity, VelocityNetwork
+
+_NO_STANCE = Stance(np.zeros(4), np.zeros(4))
+
+
+@dataclass(frozen=True)
+class BodyEstimate:
+    """What the stages estimate of one body of a message.
+
+    Attributes:
+        observed: the input.
+        velocity: of the root, as predicted; None if that is switched off.
+        contacts: as predicted.
+        stance: feet that may hold the root.
+        root: root and feet, by the filter.
+        feet: as they are to be published.
+    """
+
+    observed: BodyObservation
+    velocity: RootVelocity | None
+    contacts: Contacts
+    stance: Stance
+    root: RootState
+    feet: FeetState
+
+
+@dataclass
+class BodyStages:
+    """The stages' state of one body, made afresh for each: nothing of another can be left in it."""
+
+    observed: BodyObservation
+    window: MotionWindow
+    contacts: ContactMemory
+    filter: RootFilter
+    feet: Feet = field(default_factory=Feet)
+
+
+class Scene:
+    """What is known of one source: its floor and its bodies, which share it.
+
+    Args:
+        calibrated: whether the floor is known to be at z = 0.
+
+    Attributes:
+        stamp_ns: of its newest message; negative before the first.
+        floor: that all its bodies stand on.
+        bodies: by id.
+    """
+
+    def __init__(self, calibrated: bool) -> None:
+        self.calibrated, self.stamp_ns = calibrated, -1
+        self.floor = Floor(calibrated)
+        self.bodies: dict[int, BodyStages] = {}
+
+    def advance(self, stamp_ns: int, timeout_ns: int) -> None:
+        """Advance to a message; bodies that none of the last ``timeout_ns`` mentioned are dropped."""
+        self.stamp_ns = stamp_ns
+        self.bodies = {i: b for i, b in self.bodies.items() if stamp_ns - b.observed.stamp_ns <= timeout_ns}
+
+    @property
+    def last(self) -> dict[int, BodyObservation]:
+        """The newest observation of each body, by id."""
+        return {i: body.observed for i, body in self.bodies.items()}
+
+
+class WorldCore:
+    """From observations to estimates; keeps no state but the networks.
+
+    Raises:
+        FileNotFoundError: a weight set that does not exist; says which do.
+    """
+
+    def __init__(self, settings: TrajectorySettings) -> None:
+        self._settings = settings
+        self._velocity = VelocityNetwork(settings.weights)
+        self._contacts = ContactNetwork(settings.contact_weights)
+        self._noise = BodyNoise(settings.acceleration, network_memory_s=self._velocity.memory_s)
+
+    def step(self, scene: Scene, observations: Sequence[BodyObservation]) -> list[BodyEstimate]:
+        """What a message tells of its bodies, one after the other; without those that had no root so far."""
+        observed = [o for o in observations if o.root_known or o.body.id in scene.bodies]
+        bodies = [self._stages(scene, o) for o in observed]
+        velocities: Sequence[RootVelocity | None] = [None] * len(bodies)
+        if self._settings.network:
+            velocities = self._velocity.update([body.window for body in bodies], observed)
+        contacts = self._contacts.update([body.contacts for body in bodies], observed, scene.floor)
+        of_bodies = zip(bodies, observed, velocities, contacts, strict=True)
+        return [self._estimate(scene.floor, *of_body) for of_body in of_bodies]
+
+    def _estimate(
+        self, floor: Floor, body: BodyStages, observed: BodyObservation, velocity: RootVelocity | None,
+        contacts: Contacts,
+    ) -> BodyEstimate:  # fmt: skip
+        holding = stance(contacts, observed, body.filter.feet_off) if self._settings.contacts else _NO_STANCE
+        floor.update(observed, holding.rest)
+        root = body.filter.update(observed, velocity, holding, floor)
+        feet = body.feet.update(observed, root, holding.rest, floor)
+        return BodyEstimate(observed, velocity, contacts, holding, root, feet)
+
+    def _stages(self, scene: Scene, observed: BodyObservation) -> BodyStages:
+        """Those of a body, new ones for one that is new."""
+        body = scene.bodies.get(observed.body.id)
+        if body is None:
+            body = scene.bodies[observed.body.id] = BodyStages(
+                observed, MotionWindow(self._velocity.context), self._contacts.memory(),
+                RootFilter(observed, self._noise),
+            )  # fmt: skip
+        body.observed = observed
+        return body

@@ -1,0 +1,165 @@
+"""Bodies of a `pose/clean` message as observations in the world's frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import CleanBody, JointState
+from steadypose.prior.body.kinematics import quaternion_product, rotation_matrix
+from steadypose.prior.body.skeleton import HIPS, J
+
+Floats = NDArray[np.float64]
+
+FEET: tuple[int, ...] = tuple(J[f"{side}_{part}"] for part in ("ankle", "foot") for side in ("left", "right"))
+"""Joints that may stand: heels and toes (left, right)."""
+
+SOLE: Floats = np.array([0.07, 0.07, 0.022, 0.022])
+"""Height (4,) of `FEET` above the floor while they stand, metres: the median over labelled contacts of the training
+motion, the mean over its five sources."""
+
+MIN_SIGMA = 0.001
+"""Least standard deviation of a joint, whatever the message states, metres."""
+
+UNOBSERVED_ROOT_SIGMA = 0.05
+"""Standard deviation added to that of an unobserved root where other joints are observed, metres: the prior inferred it
+from them."""
+
+REACH_M = 2.0
+"""Distance from its own root beyond which a joint is refused, metres."""
+
+LONGEST_GAP_S = 0.3
+"""Time without a message over which motion is interpolated and feet may go on standing, seconds."""
+
+_MIN_NORM = 1e-6  # of a quaternion that is a rotation
+_PELVIS = [J["pelvis"], *HIPS]
+_FEET, _SOLE_OFFSETS = list(FEET), SOLE[:, None] * [0.0, 0.0, 1.0]
+
+
+@dataclass(frozen=True)
+class BodyObservation:
+    """A body of one message, in the world.
+
+    Attributes:
+        body: as it came.
+        stamp_ns: of the message.
+        dt: seconds since the last message with this body; 0 in its first.
+        positions: (22, 3) metres; NaN where not known.
+        orientation: (4,) xyzw of the root; where the message has no rotation, the last one.
+        observed: (22,) whether the joint was observed, not inferred.
+        sigma: (22,) metres, at least `MIN_SIGMA`; infinite where the message states none.
+        root_sigma: metres, standard deviation of the root's position; infinite if it rests on no observation.
+        pelvis_observed: whether pelvis or a hip was observed; else the prior inferred the root from other joints.
+    """
+
+    body: CleanBody
+    stamp_ns: int
+    dt: float
+    positions: Floats
+    orientation: Floats
+    observed: NDArray[np.bool_]
+    sigma: Floats
+    root_sigma: float
+    pelvis_observed: bool
+
+    @property
+    def root_known(self) -> bool:
+        """Whether the root has a position, observed or inferred."""
+        return math.isfinite(self.positions[0, 0])
+
+    @property
+    def root_observed(self) -> bool:
+        """Whether the root's position rests on observations."""
+        return math.isfinite(self.root_sigma)
+
+    @property
+    def after_gap(self) -> bool:
+        """Whether it is the body's first, or the first after a gap of more than `LONGEST_GAP_S`."""
+        return not 0.0 < self.dt <= LONGEST_GAP_S
+
+    @property
+    def yaw(self) -> float:
+        """Heading in radians: `kinematics.heading` of the orientation, where R (0, 1, 0) is the body's left."""
+        x, y, z, w = self.orientation.tolist()
+        return math.atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (x * x + z * z))
+
+    @property
+    def feet(self) -> Floats:
+        """(4, 3) metres, of `FEET`."""
+        return self.positions[_FEET]
+
+    @property
+    def feet_sigma(self) -> Floats:
+        """(4,) metres, of `FEET`."""
+        return self.sigma[_FEET]
+
+    @property
+    def feet_observed(self) -> NDArray[np.bool_]:
+        """(4,) of `FEET`."""
+        return self.observed[_FEET]
+
+    @property
+    def soles(self) -> Floats:
+        """(4, 3) metres, the points of the soles under `FEET` of a body that stands."""
+        return self.feet - _SOLE_OFFSETS
+
+
+def observe(
+    bodies: Sequence[CleanBody], stamp_ns: int, orientation: Floats, position: Floats,
+    last: Mapping[int, BodyObservation],
+) -> list[BodyObservation]:  # fmt: skip
+    """The bodies of a message in the world.
+
+    Args:
+        bodies: each id once.
+        stamp_ns: of the message.
+        orientation: (4,) a unit quaternion xyzw, the sensor's in the world.
+        position: (3,) metres, the sensor's.
+        last: observations of the same bodies in the message before, by id.
+    """
+    if not bodies:
+        return []
+    positions = np.array([body.positions for body in bodies], dtype=np.float64)
+    positions = np.where(np.isfinite(positions), positions, np.nan) @ rotation_matrix(orientation).T + position
+    state = np.array([body.state for body in bodies])
+    known = np.isfinite(positions).all(axis=-1) & (state != JointState.UNKNOWN)
+    known &= ~(np.linalg.norm(positions - positions[:, :1], axis=-1) > REACH_M)
+    positions[~known] = np.nan
+    observed = known & ((state == JointState.SEEN) | (state == JointState.REFINED))
+    sigma = np.array([body.sigma for body in bodies], dtype=np.float64)
+    sigma = np.maximum(np.where(sigma >= 0.0, sigma, math.inf), MIN_SIGMA)
+    pelvis_observed = observed[:, _PELVIS].any(axis=1)
+    root_sigma = np.where(pelvis_observed, sigma[:, 0], np.hypot(sigma[:, 0], UNOBSERVED_ROOT_SIGMA))
+    root_sigma = np.where(known[:, 0] & observed.any(axis=1), root_sigma, math.inf)
+    roots, valid = _orientations(np.array([body.rotations[0] for body in bodies], dtype=np.float64), orientation)
+    observations = []
+    for k, body in enumerate(bodies):
+        before = last.get(body.id)
+        held = np.array([0.0, 0.0, 0.0, 1.0]) if before is None else before.orientation
+        observations.append(BodyObservation(
+            body, stamp_ns, 0.0 if before is None else (stamp_ns - before.stamp_ns) * 1e-9, positions[k],
+            roots[k] if valid[k] else held, observed[k], sigma[k], float(root_sigma[k]), bool(pelvis_observed[k]),
+        ))  # fmt: skip
+    return observations
+
+
+def _orientations(quaternions: Floats, sensor: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Quaternions (N, 4) of any length turned from the sensor's frame to the world, and which of them are rotations."""
+    with np.errstate(invalid="ignore"):
+        valid = np.linalg.norm(quaternions, axis=1) >= _MIN_NORM
+        valid &= np.isfinite(quaternions).all(axis=1)
+    quaternions[~valid] = [0.0, 0.0, 0.0, 1.0]
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return quaternion_product(sensor, quaternions), valid
+
+
+def unit_quaternion(quaternion: NDArray[np.floating]) -> Floats | None:
+    """A quaternion (4,) of any length at length 1; None if it is no rotation."""
+    q = np.asarray(quaternion, dtype=np.float64)
+    if not np.isfinite(q).all() or (length := np.linalg.norm(q)) < _MIN_NORM:
+        return None
+    return q / length

@@ -1,0 +1,63 @@
+"""Means over people and their intervals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from steadypose.benchmarks.intervals import interval, people_means, ratio
+
+
+def test_no_person_counts_for_more_than_another() -> None:
+    values = [1.0] * 90 + [4.0] * 3
+    people = ["much recorded"] * 90 + ["seldom"] * 3
+    assert interval(values, people).mean == pytest.approx(2.5)
+    assert interval(values, people).people == 2
+
+
+def test_clips_of_one_person_do_not_make_the_interval_narrower() -> None:
+    rng = np.random.default_rng(0)
+    own = rng.normal(size=8)
+    people = np.array([f"p{k}" for k in range(8)])
+    few, many = interval(own, people), interval(np.repeat(own, 50), np.repeat(people, 50))
+    assert many == pytest.approx(few)
+    # Eight people of spread 1: about 2 x 1.96 / sqrt(8), a little less by the bootstrap of so few.
+    assert many.high - many.low == pytest.approx(2 * 1.96 * own.std() / np.sqrt(8), rel=0.1)
+
+
+def test_the_interval_covers_the_mean_of_all_people() -> None:
+    covered = 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        own = rng.normal(size=20)
+        clips = (own[:, None] + 0.3 * rng.normal(size=(20, 10))).ravel()
+        found = interval(clips, np.repeat([f"p{k:02}" for k in range(20)], 10))
+        covered += found.low <= 0.0 <= found.high
+    assert 0.88 <= covered / 200 <= 0.98
+
+
+def test_one_person_has_no_interval_and_nobody_no_mean() -> None:
+    alone = interval([1.0, 3.0], ["a", "a"])
+    assert (alone.mean, alone.people) == (2.0, 1)
+    assert np.isnan([alone.low, alone.high]).all()
+    nobody = interval([np.nan], ["a"])
+    assert np.isnan(nobody.mean)
+    assert nobody.people == 0
+
+
+def test_a_person_without_a_value_is_left_out() -> None:
+    np.testing.assert_array_equal(people_means([np.nan, 2.0, 4.0, np.nan], ["a", "b", "b", "b"]), [3.0])
+
+
+@given(factor=st.floats(0.1, 10.0), seed=st.integers(0, 100))
+def test_a_ratio_that_all_people_share_has_no_width(factor: float, seed: int) -> None:
+    baseline = np.random.default_rng(seed).uniform(1, 5, size=12)
+    found = ratio(factor * baseline, baseline, ["a", "b", "c"] * 4)
+    assert [found.mean, found.low, found.high] == pytest.approx([factor] * 3)
+
+
+def test_a_ratio_counts_clips_that_both_methods_have() -> None:
+    found = ratio([1.0, np.nan, 8.0], [2.0, 1.0, 2.0], ["a", "a", "b"])
+    assert found.mean == pytest.approx(np.sqrt(0.5 * 4.0))

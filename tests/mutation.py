@@ -1,0 +1,175 @@
+"""Mutation testing: ``python -m tests.mutation FOLDER_OR_FILE... --tests TESTS [--sample N] [--seed S]``.
+
+A mutant is the code with one operator, number, order or statement changed. Tests that pass on a mutant do not hold that
+place: it survived, and is printed. The checkout stays as it is, as mutants live in a copy. Exit status 0 if at least
+`GOAL` of the mutants were killed, 1 if fewer, 2 if the tests fail without any mutation.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from argparse import ArgumentParser
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+GOAL = 0.85
+ELSEWHERE = (".venv", ".git", ".uv", ".hypothesis", "build", "data", "runs", "out", "__pycache__", ".*_cache")
+
+OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.Mult, ast.Pow: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change of one file.
+
+    Attributes:
+        file: relative to the checkout.
+        line: from 1.
+        old, new: source text.
+        source: the whole file, changed.
+    """
+
+    file: Path
+    line: int
+    old: str
+    new: str
+    source: bytes
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}: {' '.join(self.old.split())[:70]} -> {' '.join(self.new.split())[:70]}"
+
+
+def mutants(file: Path, root: Path = ROOT) -> list[Mutant]:
+    """All mutants of a file, which is relative to ``root``. Annotations, strings and imports stay as they are."""
+    source = (root / file).read_bytes()
+    starts = [0]
+    for line in source.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+    found = []
+    for node in _mutable(ast.parse(source)):
+        assert node.end_lineno is not None
+        assert node.end_col_offset is not None
+        first, last = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
+        old = source[first:last].decode()
+        for changed in _changes(node):
+            new = ast.unparse(changed) if isinstance(changed, ast.stmt) else f"({ast.unparse(changed)})"
+            found.append(Mutant(file, node.lineno, old, new, source[:first] + new.encode() + source[last:]))
+    return found
+
+
+def _mutable(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
+    """Nodes of a tree, but not in annotations, imports and f-strings, whose parts have no place of their own."""
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST) and not isinstance(child, ast.JoinedStr | ast.Import | ast.ImportFrom):
+                if isinstance(child, ast.expr | ast.stmt) and not _the_same_either_way(node, child):
+                    yield child
+                yield from _mutable(child)
+
+
+def _the_same_either_way(node: ast.AST, child: ast.AST) -> bool:
+    """Of exceptions the order does not count, that of indices is no order of values, and -2 is as unknown as -1."""
+    return (isinstance(node, ast.ExceptHandler | ast.Subscript) and isinstance(child, ast.Tuple)) or (
+        isinstance(node, ast.UnaryOp) and isinstance(child, ast.Constant)
+    )
+
+
+def _changes(node: ast.AST) -> Iterator[ast.AST]:
+    changed = copy.deepcopy(node)
+    match changed:
+        case ast.Compare(ops=[op]) if type(op) in OPERATORS:
+            changed.ops = [OPERATORS[type(op)]()]  # type: ignore[list-item]
+            yield changed
+        case ast.BinOp() | ast.BoolOp() if type(changed.op) in OPERATORS:
+            changed.op = OPERATORS[type(changed.op)]()  # type: ignore[assignment]
+            yield changed
+        case ast.UnaryOp(op=ast.Not() | ast.USub(), operand=operand):
+            yield operand
+        case ast.Constant(value=bool(value)):
+            yield ast.Constant(not value)
+        case ast.Constant(value=int() | float() as value):
+            yield ast.Constant(value + 1 if isinstance(value, int) else 2 * value or 1.0)
+        case ast.List(elts=[first, *_, last], ctx=ast.Load()) | ast.Tuple(elts=[first, *_, last], ctx=ast.Load()):
+            if ast.dump(first) != ast.dump(last):
+                changed.elts[0], changed.elts[-1] = last, first
+                yield changed
+        case ast.Call(args=[first, *_, last]) if not any(isinstance(end, ast.Starred) for end in (first, last)):
+            changed.args[0], changed.args[-1] = last, first
+            yield changed
+        case ast.Expr(value=ast.Call()) | ast.AugAssign() | ast.Raise():
+            yield ast.Pass()
+        case ast.Return(value=ast.expr()):
+            yield ast.Return(ast.Constant(None))
+        case _:
+            return
+
+
+def passes(tests: Sequence[str], root: Path, limit_s: float | None = None) -> bool:
+    """Whether the tests pass on the copy of the checkout at ``root``; those that do not end in time do not.
+
+    Raises:
+        ValueError: there are no such tests.
+    """
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+    # no bytecode: two mutants of one second and one size would be taken for one another
+    environment = {**os.environ, "PYTHONPATH": str(root / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=limit_s)
+    except subprocess.TimeoutExpired:
+        return False
+    if done.returncode in (4, 5):
+        raise ValueError(f"--tests: expected tests of this checkout, got {' '.join(tests)}: {done.stdout[-300:]}")
+    return done.returncode == 0
+
+
+def main() -> int:
+    """Mutate, test, count."""
+    parser = ArgumentParser("python -m tests.mutation", description=__doc__)
+    parser.add_argument("code", nargs="+", type=Path, help="files, or folders of them")
+    parser.add_argument("--tests", nargs="+", required=True, help="what pytest is to run")
+    parser.add_argument("--sample", type=int, help="so many mutants, drawn at random; all of them if left out")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    paths = [path.resolve() for path in options.code]
+    files = [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
+    every = [mutant for file in files for mutant in mutants(file.relative_to(ROOT))]
+    drawn = random.Random(options.seed).sample(every, min(options.sample or len(every), len(every)))
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "checkout"
+        shutil.copytree(ROOT, root, symlinks=True, ignore=shutil.ignore_patterns(*ELSEWHERE))
+        started = time.monotonic()
+        if not passes(options.tests, root):
+            print("the tests fail without any mutation: nothing can be said of them")
+            return 2
+        limit_s = 10.0 + 5.0 * (time.monotonic() - started)
+        survived = 0
+        for mutant in drawn:
+            (root / mutant.file).write_bytes(mutant.source)
+            survives = passes(options.tests, root, limit_s)
+            (root / mutant.file).write_bytes((ROOT / mutant.file).read_bytes())
+            survived += survives
+            print("survived" if survives else "killed  ", mutant, flush=True)
+    killed = len(drawn) - survived
+    print(f"{killed} of {len(drawn)} mutants killed ({len(every)} in all), {100 * killed / max(len(drawn), 1):.0f} %")
+    return 0 if killed >= GOAL * len(drawn) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,203 @@
+"""`steadypose export`: what is written is read back by other programs' libraries, where the body was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bvhio
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pygltflib import GLTF2
+from scipy.spatial.transform import Rotation
+
+from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.topics import POSE_WORLD
+from steadypose.msgs.types import JOINTS, PoseRaw, PoseWorld, Tracking, WorldBody
+from steadypose.nodes.cli import main
+from steadypose.nodes.sinks.files.bvh import to_bvh
+from steadypose.nodes.sinks.files.glb import to_glb
+from steadypose.nodes.sinks.files.motion import Y_UP, BodyMotion, read_motion
+from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
+from steadypose.prior.mocap.files import read_motion as read_file
+
+Floats = NDArray[np.float64]
+
+FRAMES = 40
+
+
+@pytest.fixture
+def motion() -> BodyMotion:
+    """A body that walks along x and turns all its joints by up to half a radian about changing axes."""
+    rng = np.random.default_rng(0)
+    phases, axes = rng.uniform(0, 6, (22, 3)), rng.normal(scale=0.3, size=(22, 3))
+    time = np.arange(FRAMES)[:, None, None] / 30
+    rotations = Rotation.from_rotvec((axes * np.sin(3 * time + phases)).reshape(-1, 3)).as_quat()
+    root = np.stack([np.arange(FRAMES) * 0.03, np.sin(np.arange(FRAMES) * 0.1), np.full(FRAMES, 0.95)], axis=1)
+    return BodyMotion(30.0, root, rotations.reshape(FRAMES, 22, 4), 1.1 * REST_OFFSETS)
+
+
+def npz(path: Path, motion: BodyMotion, turn: Rotation) -> Path:
+    """What ``clean`` writes of it, from a sensor whose axes are turned."""
+    rotations = motion.rotations.copy()
+    rotations[:, 0] = (turn * Rotation.from_quat(rotations[:, 0])).as_quat()
+    world = motion.positions
+    stamps = np.round(np.arange(FRAMES) * 1e9 / 30).astype(np.int64)
+    np.savez(path, positions=world @ turn.as_matrix().T, world_positions=world, rotations=rotations, stamp_ns=stamps)
+    return path
+
+
+def recording(path: Path, motion: BodyMotion) -> Path:
+    def body(id: int, frame: int) -> WorldBody:
+        return WorldBody(
+            id=id,
+            root_position=motion.root[frame],
+            root_orientation=motion.rotations[frame, 0],
+            root_velocity=np.zeros(3),
+            covariance=np.eye(6),
+            positions=motion.positions[frame] + [10.0 * id, 0, 0],
+            rotations=motion.rotations[frame],
+            state=np.ones(22, np.uint8),
+            sigma=np.full(22, 0.01),
+            contacts=np.zeros(8),
+            tracking=Tracking.OK,
+        )
+
+    with RecordingWriter(path) as writer:
+        for frame in range(FRAMES):
+            bodies = [body(id, frame) for id in (0, 3) if id == 0 or frame > 20]
+            stamp = round(frame * 1e9 / 30)
+            writer.write(POSE_WORLD, PoseWorld(stamp, "world", "test", np.array([0.0, 0.0, 1.0, 0.0]), bodies), stamp)
+    return path
+
+
+def test_bvh_is_read_by_bvhio_and_by_ourselves(tmp_path: Path, motion: BodyMotion) -> None:
+    path = tmp_path / "take.bvh"
+    path.write_bytes(to_bvh(motion))
+    root = bvhio.readAsHierarchy(str(path))
+    expected = 100 * motion.positions @ Y_UP.T
+    for frame in (0, 17, FRAMES - 1):
+        root.loadPose(frame)
+        for joint, _, _ in root.layout():
+            if joint.Name in JOINTS:
+                at = np.array(joint.PositionWorld)
+                np.testing.assert_allclose(at, expected[frame, JOINTS.index(joint.Name)], atol=2e-3, err_msg=joint.Name)
+    fps, body = read_file("take.bvh", path.read_bytes())
+    assert fps == pytest.approx(30.0)
+    np.testing.assert_allclose(body, motion.positions[..., [1, 0, 2]] * [1, -1, 1], atol=1e-5)
+
+
+def test_glb_moves_its_joints_and_its_skin_where_the_body_is(tmp_path: Path, motion: BodyMotion) -> None:
+    path = tmp_path / "take.glb"
+    path.write_bytes(to_glb(motion))
+    file = GLTF2().load(str(path))
+    assert file is not None
+    blob = file.binary_blob()
+    assert blob is not None
+
+    def values(accessor: int | None) -> NDArray[np.generic]:
+        assert accessor is not None
+        told = file.accessors[accessor]
+        assert told.bufferView is not None
+        view = file.bufferViews[told.bufferView]
+        kind = {5126: np.float32, 5123: np.uint16, 5121: np.uint8}[told.componentType]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[told.type]
+        return np.frombuffer(blob, kind, (told.count or 0) * width, view.byteOffset or 0).reshape(-1, width)
+
+    expected = motion.positions @ Y_UP.T
+    frame = 17
+    at = {node.name: np.array(node.translation) for node in file.nodes[:22]}
+    turn = {}
+    for channel in file.animations[0].channels:
+        assert channel.sampler is not None
+        sampler = file.animations[0].samplers[channel.sampler]
+        assert channel.target.node is not None
+        node = file.nodes[channel.target.node]
+        assert values(sampler.input)[frame, 0] == pytest.approx(frame / 30)
+        if channel.target.path == "translation":
+            at[node.name] = values(sampler.output)[frame]
+        else:
+            turn[node.name] = Rotation.from_quat(values(sampler.output)[frame])
+    transforms: dict[int, Floats] = {}
+
+    def place(node: int, above: Floats) -> None:
+        local = np.eye(4)
+        name = file.nodes[node].name
+        local[:3, :3], local[:3, 3] = turn[name].as_matrix(), at[name]
+        transforms[node] = above @ local
+        for child in file.nodes[node].children or ():
+            place(child, transforms[node])
+
+    place(0, np.eye(4))
+    for node, transform in transforms.items():
+        np.testing.assert_allclose(transform[:3, 3], expected[frame, node], atol=1e-5)
+    # The skin: the tip of each bone is where its joint is.
+    skin, primitive = file.skins[0], file.meshes[0].primitives[0]
+    bind = values(skin.inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
+    points, joints = values(primitive.attributes.POSITION), values(primitive.attributes.JOINTS_0)[:, 0]
+    for bone, parent in enumerate(PARENTS[1:]):
+        tip = 6 * bone + 5
+        assert joints[tip] == parent
+        moved = transforms[parent] @ bind[parent] @ [*points[tip], 1.0]
+        np.testing.assert_allclose(moved[:3], expected[frame, bone + 1], atol=1e-5)
+    assert len(np.unique(values(primitive.indices))) == len(points)
+
+
+def test_an_npz_of_a_turned_sensor_is_exported_in_the_world(tmp_path: Path, motion: BodyMotion) -> None:
+    found = read_motion(npz(tmp_path / "clean.npz", motion, Rotation.from_euler("xyz", [1.5, 0.2, -2.0])))
+    assert found.fps == pytest.approx(30.0)
+    np.testing.assert_allclose(found.positions, motion.positions, atol=1e-6)
+
+
+def test_of_a_recording_the_body_that_is_there_longest_or_was_asked_for(tmp_path: Path, motion: BodyMotion) -> None:
+    path = recording(tmp_path / "take", motion)
+    np.testing.assert_allclose(read_motion(path).positions, motion.positions, atol=1e-5)
+    np.testing.assert_allclose(read_motion(path, 3).positions[:, 0, 0], motion.root[21:, 0] + 30.0, atol=1e-5)
+    assert main(["export", str(path), str(tmp_path / "x.bvh"), "--body", "7"]) != 0
+
+
+def test_a_gap_is_filled_and_the_rate_kept(tmp_path: Path, motion: BodyMotion) -> None:
+    path = npz(tmp_path / "clean.npz", motion, Rotation.identity())
+    with np.load(path) as file:
+        arrays = dict(file)
+    for name in ("positions", "world_positions", "rotations"):
+        arrays[name][11:14] = np.nan
+    np.savez(path, **arrays)
+    found = read_motion(path)
+    assert len(found.root) == FRAMES
+    np.testing.assert_allclose(found.positions, motion.positions, atol=0.05)
+    np.testing.assert_allclose(found.positions[14:], motion.positions[14:], atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".trc"])
+def test_tables_come_back_as_they_went(tmp_path: Path, motion: BodyMotion, suffix: str) -> None:
+    source, out = npz(tmp_path / "clean.npz", motion, Rotation.identity()), tmp_path / f"take{suffix}"
+    assert main(["export", str(source), str(out)]) == 0
+    frames = [message for _, message in open_recording(out) if isinstance(message, PoseRaw)]
+    found = np.stack([frame.bodies[0].positions for frame in frames])
+    # What is y up is turned about x to z up: its front is then -y.
+    expected = motion.positions if suffix == ".csv" else motion.positions[..., [1, 0, 2]] * [1, -1, 1]
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert frames[-1].stamp_ns == pytest.approx((FRAMES - 1) / 30 * 1e9, abs=1e6)
+    if suffix == ".csv":
+        names = out.read_text().splitlines()[2].split(",")
+        table = np.genfromtxt(out, delimiter=",", skip_header=3)
+        columns = [names.index(f"left_knee_q{axis}") for axis in "xyzw"]
+        np.testing.assert_allclose(table[:, columns], motion.rotations[:, JOINTS.index("left_knee")], atol=1e-6)
+
+
+def test_the_command_writes_each_format_and_says_what_it_cannot(
+    tmp_path: Path, motion: BodyMotion, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = npz(tmp_path / "clean.npz", motion, Rotation.identity())
+    for suffix in (".bvh", ".glb"):
+        assert main(["export", str(source), str(tmp_path / f"take{suffix}")]) == 0
+        assert main(["export", str(source), str(tmp_path / f"take{suffix}")]) == 2
+        assert "--force" in capsys.readouterr().err
+    assert main(["export", str(source), str(tmp_path / "take.fbx")]) == 2
+    assert ".bvh, .glb, .csv, .trc" in capsys.readouterr().err
+    np.savez(tmp_path / "raw.npz", positions=np.zeros((3, 22, 3)), fps=30.0)
+    assert main(["export", str(tmp_path / "raw.npz"), str(tmp_path / "raw.bvh")]) == 2
+    assert "clean it first" in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["clean.npz", "raw.npz", "take.bvh", "take.glb"]

@@ -1,0 +1,124 @@
+"""The service that is installed: what it may touch, what is refused beforehand, and what is done and undone."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from steadypose.nodes.commands import install_service as command
+from steadypose.nodes.commands.install_service import install_service
+from steadypose.nodes.commands.service_unit import Service, quoted
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError
+
+
+def service(**changed: object) -> Service:
+    of = {"name": "poses", "user": "poses", "is_new_user": True, "command": Path("/opt/sp/bin/steadypose"),
+          "launch": "/etc/poses/my launch.toml", "groups": ("video",)}  # fmt: skip
+    return Service(**(of | changed))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What would be done to this machine, in place of doing it; units go to a folder of the test's own."""
+    said: list[str] = []
+    monkeypatch.setattr(command, "UNITS", tmp_path)
+    monkeypatch.setattr(command, "BOOTED", tmp_path)
+    monkeypatch.setattr(command, "compile_missing", lambda say: None)
+    monkeypatch.setattr(command.os, "geteuid", lambda: 0)
+    monkeypatch.setattr(command.subprocess, "run", lambda words, check: said.append(" ".join(words)))
+    return said
+
+
+def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
+    text = service(user="daemon", command=Path("/bin/true")).unit()
+    assert 'ExecStart=/bin/true run "/etc/poses/my launch.toml"' in text
+    for line in (
+        "StateDirectory=poses",
+        "SupplementaryGroups=video",
+        "ProtectHome=yes",
+        "KillMode=mixed",
+        "WatchdogSec=30",
+    ):
+        assert line in text
+    if shutil.which("systemd-analyze"):
+        unit = tmp_path / "poses.service"
+        unit.write_text(text)
+        checked = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True)
+        assert "poses.service" not in checked.stderr, checked.stderr
+
+
+def test_words_are_systemds() -> None:
+    assert quoted("/a b") == '"/a b"'
+    assert quoted('100%$"') == '"100%%$$\\""'
+
+
+@pytest.mark.parametrize(
+    ("changed", "settings", "said"),
+    [
+        ({"command": Path("/home/a/.venv/bin/steadypose")}, {}, "in a home.*/opt/steadypose"),
+        ({"launch": "/home/a/my.toml"}, {}, "in a home.*copy it"),
+        ({"name": "../x"}, {}, "--name: expected small letters"),
+        ({}, {"nodes": '["recorder"]', "recorder.directory": "/data/out"}, r"\[recorder\] directory .*/var/lib/poses"),
+        ({}, {"transport.directory": "/srv/sockets"}, r"\[transport\] directory .*/run/poses"),
+    ],
+)
+def test_what_a_service_could_not_do_is_said_beforehand(
+    changed: dict[str, object], settings: dict[str, str], said: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "launch.toml"
+    file.write_text("")
+    launch = Launch.read(file, [f"{key}={value}" for key, value in settings.items()])
+    with pytest.raises(LaunchError, match=said):
+        service(**changed).check(launch)
+
+
+def test_a_user_may_run_what_lies_in_his_home(make_launch: Callable[..., Launch], tmp_path: Path) -> None:
+    file = tmp_path / "launch.toml"
+    file.write_text("")
+    own = service(is_new_user=False, user="a", command=Path("/home/a/bin/steadypose"), launch="/home/a/my.toml")
+    own.check(Launch.read(file))
+    assert "ProtectHome=read-only" in own.unit()
+
+
+def test_what_is_installed_is_removed(done: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert install_service("replay", name="poses-test", user="root") == 0
+    unit = tmp_path / "poses-test.service"
+    assert "User=root" in unit.read_text()
+    assert done == [
+        "systemctl daemon-reload",
+        f"systemctl enable {unit.name}",
+        f"systemctl restart --no-block {unit.name}",
+    ]
+    assert f"+ write {unit}" in capsys.readouterr().out
+    done.clear()
+    assert install_service(name="poses-test", uninstall=True) == 0
+    assert done[:2] == [f"systemctl disable --now {unit.name}", f"rm -f {unit}"]
+    assert "rm -rf /var/cache/poses-test" in done
+    assert not any("userdel" in line for line in done), "it was not made for the service"
+
+
+def test_a_dry_run_prints_all_and_does_nothing(
+    done: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert install_service("replay", name="poses-test", user="root", dry_run=True) == 0
+    said = capsys.readouterr().out
+    assert "[Service]" in said
+    assert "+ systemctl enable poses-test.service" in said
+    assert not done
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_unit_of_somebody_elses_is_left_alone(done: list[str], tmp_path: Path) -> None:
+    (tmp_path / "nginx.service").write_text("[Service]\n")
+    with pytest.raises(LaunchError, match="not made by this command"):
+        install_service("replay", name="nginx", user="root")
+    with pytest.raises(LaunchError, match="not made by this command"):
+        install_service(name="nginx", uninstall=True)
+    with pytest.raises(LaunchError, match="nothing to remove"):
+        install_service(name="none", uninstall=True)
+    assert not done

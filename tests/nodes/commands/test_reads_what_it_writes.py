@@ -1,0 +1,113 @@
+"""What `clean` writes, everything reads: arrays and CSV through `plot`, `info`, `complete` and `clean` itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.nodes.conftest import record, walk
+
+from steadypose.msgs.types import JointState, PoseRaw
+from steadypose.nodes.cli import main
+from steadypose.nodes.commands.complete import complete
+from steadypose.nodes.commands.plot.history import history_of_path
+from steadypose.nodes.commands.plot.video import View, write_video
+from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.body.skeleton import J
+
+FRAMES = 45
+WRIST = J["left_wrist"]
+
+
+@pytest.fixture(scope="module")
+def cleaned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a walk of which the wrist is hidden for a while, cleaned into all three formats."""
+    folder = tmp_path_factory.mktemp("cleaned")
+    frames = walk(FRAMES)
+    for frame in frames[15:30]:
+        frame.bodies[0].positions[WRIST] = np.nan
+    record(folder / "in", frames)
+    for out in ("walk", "walk.npz", "walk.csv"):
+        assert main(["clean", str(folder / "in"), str(folder / out)]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("name", ["walk.npz", "walk.csv"])
+def test_as_an_input_it_has_the_observed_joints_in_the_world(cleaned: Path, name: str) -> None:
+    with np.load(cleaned / "walk.npz") as file:
+        out = dict(file)
+    source = open_recording(cleaned / name)
+    raws = [message for _, message in source if isinstance(message, PoseRaw)]
+    assert len(source) == FRAMES
+    assert raws[0].skeleton == "smpl22"
+    np.testing.assert_allclose(raws[0].sensor_pose.orientation, [0, 0, 0, 1])
+    np.testing.assert_allclose([raw.stamp_ns for raw in raws], out["stamp_ns"], atol=500)
+    observed = np.isin(out["state"], (JointState.SEEN, JointState.REFINED))
+    assert not observed[20, WRIST]
+    sure = np.array([raw.bodies[0].confidence for raw in raws])
+    np.testing.assert_array_equal(sure, observed.astype(float))
+    joints = np.array([raw.bodies[0].positions for raw in raws])
+    np.testing.assert_allclose(joints[observed], out["world_positions"][observed], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["walk.npz", "walk.csv"])
+def test_it_is_completed_where_it_was_imputed(cleaned: Path, name: str, tmp_path: Path) -> None:
+    assert complete(cleaned / name, tmp_path / "whole.csv") == 0
+    assert complete(cleaned / name, tmp_path / "whole.npz") == 0
+    with np.load(tmp_path / "whole.npz") as whole, np.load(cleaned / "walk.npz") as out:
+        assert (whole["state"][20] == JointState.IMPUTED)[WRIST]
+        assert (whole["state"][5] == JointState.SEEN)[WRIST]
+        seen = out["state"][5] != JointState.IMPUTED
+        np.testing.assert_allclose(whole["positions"][5][seen], out["world_positions"][5][seen], atol=1e-3)
+    assert len(open_recording(tmp_path / "whole.csv")) == FRAMES
+
+
+@pytest.mark.parametrize("name", ["walk", "walk.npz", "walk.csv"])
+def test_it_is_drawn(cleaned: Path, name: str, tmp_path: Path) -> None:
+    assert main(["plot", str(cleaned / name), "-o", str(tmp_path / "picture.png")]) == 0
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+def test_info_says_what_is_in_it(cleaned: Path, capsys) -> None:
+    assert main(["info", str(cleaned / "walk.npz")]) == 0
+    told = capsys.readouterr().out
+    assert "an output of clean, complete or fit" in told
+    assert "world_positions (45, 22, 3) float32" in told
+    assert "imputed" in told
+    assert "skeleton smpl22" in told
+    assert main(["info", str(cleaned / "walk.csv")]) == 0
+    assert "45 frames" in capsys.readouterr().out
+
+
+def test_several_bodies_have_a_row_each(tmp_path: Path) -> None:
+    frames = walk(30, bodies=2)
+    for frame in frames[:10]:
+        del frame.bodies[1]
+    record(tmp_path / "in", frames)
+    assert main(["clean", str(tmp_path / "in"), str(tmp_path / "two.csv")]) == 0
+    raws = [message for _, message in open_recording(tmp_path / "two.csv") if isinstance(message, PoseRaw)]
+    assert [body.id for body in raws[-1].bodies] == [0, 1]
+    assert [body.id for body in raws[0].bodies] == [0]
+
+
+@pytest.mark.parametrize(("name", "start"), [("walk.gif", b"GIF89a"), ("walk.mp4", b"")])
+def test_a_video_has_every_second_pose(cleaned: Path, name: str, start: bytes, tmp_path: Path) -> None:
+    frames = write_video(history_of_path(cleaned / "walk"), tmp_path / name)
+    assert frames == pytest.approx(FRAMES / 2, abs=1)
+    assert (tmp_path / name).read_bytes().startswith(start)
+    assert (tmp_path / name).stat().st_size > 3_000
+
+
+def test_a_view_has_up_above_and_the_bodys_left_on_the_viewers_right() -> None:
+    """Who faces the viewer has the left hand on the viewer's right."""
+    view = View(np.array([1.0, 0.0, 0.0]))  # in canonical axes the body's left is +y
+    origin, up, left = view(np.array([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]))
+    assert up[1] > origin[1] + 0.9
+    assert left[0] > origin[0] + 0.8
+
+
+@pytest.mark.parametrize("out", ["out.json", "out.bvh", "out.npy"])
+def test_another_ending_is_answered_with_what_there_is(cleaned: Path, out: str, tmp_path: Path, capsys) -> None:
+    assert main(["clean", str(cleaned / "walk.npz"), str(tmp_path / out)]) == 2
+    assert "expected .npz or .csv for arrays, or a name without ending for a recording" in capsys.readouterr().err

@@ -1,0 +1,168 @@
+"""Under load: the newest first, fewer bodies before fewer frames, and nothing forgotten because of it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import VirtualClock, raw, walk, walking
+
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.types import Message, PoseRaw
+from steadypose.nodes.checks.stream import StreamChecks
+from steadypose.nodes.graph.inbox import DEADLINE_NS, Inbox
+from steadypose.nodes.graph.load import CALM_NS, LOOK_NS, BodyLimit
+from steadypose.prior.clean.batch import StreamBatch
+from steadypose.prior.clean.pipeline import CATCH_UP, PriorPipeline
+from steadypose.prior.clean.settings import PriorSettings
+
+FRAME_NS = 33_333_333
+SIMPLE = {stage: {"enabled": False} for stage in ("score", "impute")}
+
+
+class Line:
+    """In a subscriber's place: gives what has come by now."""
+
+    socket = 0
+
+    def __init__(self, clock: VirtualClock, messages: list[tuple[int, PoseRaw]]) -> None:
+        self._clock, self._messages = clock, messages
+
+    def receive(self, timeout_s: float, *, taken: bool = True) -> tuple[str, Message] | None:
+        if self._messages and self._messages[0][0] <= self._clock.time_ns:
+            return POSE_RAW, self._messages.pop(0)[1]
+        return None
+
+
+def camera(clock: VirtualClock, seconds: float, source: str = "test") -> Line:
+    count, start_ns = round(seconds * 30), clock.time_ns
+    frames = (dataclasses.replace(raw(k, stamp_ns=start_ns + k * FRAME_NS), source=source) for k in range(count))
+    return Line(clock, [(frame.stamp_ns, frame) for frame in frames])
+
+
+@pytest.mark.parametrize(("work_ms", "latest_ms"), [(20, 34), (60, 134), (100, 200)])
+def test_the_newest_is_worked_on_however_slow_the_work(clock: VirtualClock, work_ms: int, latest_ms: int) -> None:
+    inbox, late = Inbox([camera(clock, 10.0)], limit=8), []  # type: ignore[list-item]
+    end_ns = clock.time_ns + 10 * 10**9
+    while clock.time_ns < end_ns:
+        received = inbox.next(0)
+        if received is None:
+            clock.time_ns += 1_000_000
+            continue
+        clock.time_ns += work_ms * 1_000_000
+        late.append(clock.time_ns - received[1].stamp_ns - work_ms * 1_000_000)
+    assert max(late) <= min(latest_ms * 1_000_000, DEADLINE_NS + FRAME_NS)
+    assert len(late) + inbox.overrun >= 290, "each is worked on or counted"
+
+
+def test_kiosks_share_what_time_there_is(clock: VirtualClock) -> None:
+    names = [f"kiosk {k}" for k in range(20)]
+    inbox = Inbox([camera(clock, 20.0, name) for name in names], limit=8)  # type: ignore[misc]
+    worked, end_ns = dict.fromkeys(names, 0), clock.time_ns + 19 * 10**9
+    while clock.time_ns < end_ns:
+        _, message = inbox.next(0)  # type: ignore[misc]
+        assert isinstance(message, PoseRaw)
+        assert clock.time_ns - message.stamp_ns <= DEADLINE_NS + FRAME_NS
+        worked[message.source] += 1
+        clock.time_ns += 5_000_000
+    assert max(worked.values()) - min(worked.values()) <= 1
+
+
+def overloaded(clock: VirtualClock, limit: BodyLimit, seconds: float, ms_a_body: float, present: int) -> None:
+    """A camera at 30 Hz with so many bodies, whose frames are dropped while there is no time for them."""
+    dropped, end_ns = limit._dropped_before, clock.time_ns + seconds * 1e9
+    while clock.time_ns < end_ns:
+        worked_on = min(present, limit.bodies)
+        spent_ns = round(worked_on * ms_a_body * 1e6)
+        clock.time_ns += max(spent_ns, FRAME_NS)
+        dropped += spent_ns > FRAME_NS
+        limit.note(worked_on, spent_ns, dropped)
+
+
+def test_fewer_bodies_come_before_fewer_frames(clock: VirtualClock) -> None:
+    limit = BodyLimit(16, clock)
+    overloaded(clock, limit, 3.0, ms_a_body=1.0, present=16)
+    assert limit.bodies == 16, "there is time for all"
+    overloaded(clock, limit, 3.0, ms_a_body=4.0, present=16)
+    assert 6 <= limit.bodies <= 8, "33 ms are time for eight"
+    overloaded(clock, limit, 5 * CALM_NS / 1e9, ms_a_body=4.0, present=16)
+    assert 6 <= limit.bodies <= 8, "it does not try what it knows to take too long"
+    overloaded(clock, limit, 20.0, ms_a_body=1.0, present=16)
+    assert limit.bodies == 16, "the load is gone"
+    overloaded(clock, limit, 10.0, ms_a_body=100.0, present=16)
+    assert limit.bodies == 1, "one is always worked on"
+
+
+def test_the_nearest_bodies_stay() -> None:
+    prior = PriorPipeline(PriorSettings.from_dict(SIMPLE))
+    bodies = [walking(0, body) for body in range(4)]
+    found, placed = [], bodies
+    for index in range(10):
+        placed = [
+            dataclasses.replace(body, positions=body.positions + np.array([3.0 * (4 - body.id), 0, 0], np.float32))
+            for body in bodies
+        ]
+        if index == 5:
+            prior.most_bodies = 2
+        found = prior.process(raw(index, *placed))
+    assert {body.id for body in found[-1].bodies} == {2, 3}
+    assert (prior.bodies, prior.offered) == (2, 4)
+    assert prior.counters["body_for_load"] == 10
+    prior.most_bodies = 8
+    for index in range(10, 20):
+        found = prior.process(raw(index, *placed))
+    assert {body.id for body in found[-1].bodies} == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize("lost", [3, 10, 40])
+def test_a_gap_of_our_own_making_resets_no_body(lost: int) -> None:
+    prior = PriorPipeline(PriorSettings.from_dict(SIMPLE))
+    frames, before = walk(60 + lost + 20), []
+    for frame in frames[:60]:
+        before = prior.process(frame)
+    bones = before[-1].bodies[0].bone_lengths
+    after = prior.process(frames[60 + lost], hurry=True, gap=True)
+    assert len(after) <= CATCH_UP, "what was dropped is not computed after all"
+    for frame in frames[60 + lost + 1 :]:
+        after = prior.process(frame)
+    assert not prior.counters["stream_gap"]
+    assert after[-1].bodies[0].id == before[-1].bodies[0].id
+    np.testing.assert_allclose(after[-1].bodies[0].bone_lengths, bones, atol=0.01)
+    answered = after[-1]
+    truth = frames[-1 - round(answered.delay_frames)].bodies[0].positions
+    assert np.linalg.norm(answered.bodies[0].positions - truth, axis=1).max() < 0.1
+
+
+def test_a_server_that_is_late_skips_frames_and_not_bodies() -> None:
+    server = StreamBatch(PriorSettings.from_dict(SIMPLE), 1)
+    frames = walk(90)
+    for frame in frames[:60]:
+        server.process_at(frame, frame.stamp_ns)
+    found = server.process_at(frames[80], frames[80].stamp_ns, hurry=True, gap=True)
+    assert len(found) <= CATCH_UP + 2
+    for frame in frames[81:]:
+        found += server.process_at(frame, frame.stamp_ns)
+    assert found[-1].bodies
+    assert not server.counters["stream_gap"]
+    assert server.counters["frames_skipped"] > 10
+
+
+def test_a_tracker_whose_messages_are_dropped_here_has_not_stopped(clock: VirtualClock) -> None:
+    checks = StreamChecks(8, identified=False, streams=2)
+    for source in ("door", "desk"):
+        checks.see(dataclasses.replace(raw(0, walking(0)), source=source), clock.time_ns)
+    clock.time_ns += 3 * 10**9
+    checks.heard("door", clock.time_ns)
+    assert {problem.cause for problem in checks.problems(clock.time_ns, live=True)} == {"desk.stopped"}
+
+
+def test_the_inbox_says_whose_frames_it_dropped(clock: VirtualClock) -> None:
+    inbox = Inbox([camera(clock, 1.0)], limit=8)  # type: ignore[list-item]
+    clock.time_ns += LOOK_NS
+    received = inbox.next(0)
+    assert received
+    assert inbox.sources == {"test"}
+    assert inbox.dropped_of(received[1])
+    assert not inbox.dropped_of(received[1]), "the frame after it follows on"
+    assert not inbox.sources

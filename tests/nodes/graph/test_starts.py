@@ -1,0 +1,294 @@
+"""Starting and stopping: a second time, beside another, on a full disk, and whatever asks for the end."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import START_NS, VirtualClock, record, walk
+from test_processes import Run
+
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.types import Message
+from steadypose.nodes.graph import safe_python
+from steadypose.nodes.graph.clock import Timeline
+from steadypose.nodes.graph.health_file import NAME
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.node import Node
+from steadypose.nodes.graph.run_lock import RunLock
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.graph.startup import stop_on_signals
+from steadypose.nodes.sinks.recorder import free_directory
+
+INPUT_ALONE = ("--set", 'nodes=["pose_input"]')
+
+
+@pytest.fixture
+def begin(folder: Path) -> Iterator[Callable[..., Run]]:
+    runs: list[Run] = []
+
+    def begin(*arguments: str, beside: bool = False) -> Run:
+        where = folder
+        if beside:  # its output goes elsewhere, its sockets to the same directory
+            where = folder / "beside"
+            where.mkdir()
+            (where / "steadypose").symlink_to(folder / "steadypose")
+        runs.append(Run(where, *arguments))
+        return runs[-1]
+
+    yield begin
+    for run in runs:
+        run.close()
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    return record(tmp_path / "in", walk(90))
+
+
+def test_the_end_of_the_terminal_stops_all_in_order(begin: Any, recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run: Run = begin(
+        "--input", str(recording), "--record", str(out), "--loop", *INPUT_ALONE, "--set", "recorder.free_mb=0"
+    )
+    run.until_running("recorder")
+    run.process.send_signal(signal.SIGHUP)
+    status, output = run.wait()
+    assert status == 0, output
+    assert (out / "metadata.yaml").exists(), "the recorder was stopped, not killed"
+
+
+def test_nohup_is_obeyed() -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)}
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        stop_on_signals(signal.default_int_handler)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def test_a_launch_of_no_node_is_refused(make_launch: Callable[..., Launch]) -> None:
+    with pytest.raises(LaunchError, match="nodes: expected one or more of pose_input, prior"):
+        make_launch(nodes="[]")
+
+
+def test_a_second_run_is_refused_and_the_first_is_left_alone(begin: Any, recording: Path, folder: Path) -> None:
+    first: Run = begin("--input", str(recording), "--loop", *INPUT_ALONE)
+    first.until_running("pose_input")
+    second: Run = begin("--input", str(recording), *INPUT_ALONE, beside=True)
+    status, output = second.wait()
+    assert status == 2
+    assert f"pose_input runs already at ipc://{folder}" in output.replace("/beside", "")
+    assert f"(process {first.process.pid})" in output
+    assert len(output.strip().splitlines()) == 1, "one sentence, and nothing was started"
+    assert json.loads((folder / "steadypose" / NAME).read_text())["pid"] == first.process.pid
+    assert first.end()[0] == 0
+    assert not (folder / "steadypose" / NAME).exists()
+
+
+def test_locks_are_of_addresses_and_go_with_their_holder(
+    folder: Path, make_launch: Callable[..., Launch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder / "runtime"))
+    tcp = 'transport.endpoints={prior="tcp://127.0.0.1:7199"}'
+    source, prior = (
+        make_launch(nodes='["pose_input"]'),
+        make_launch({tcp.partition("=")[0]: tcp.partition("=")[2]}, nodes='["prior"]'),
+    )
+    elsewhere = make_launch(
+        {"transport.endpoints": '{prior="tcp://127.0.0.1:7199"}'},
+        nodes='["prior"]',
+        transport__directory=folder / "other",
+    )
+    with RunLock(source) as first:
+        assert first.has_health
+        with RunLock(prior) as beside:
+            assert not beside.has_health, "another run writes it"
+            with pytest.raises(LaunchError, match=r"prior runs already at tcp://127\.0\.0\.1:7199"):
+                RunLock(elsewhere)
+        with pytest.raises(LaunchError, match="pose_input runs already"):
+            RunLock(source)
+        with RunLock(elsewhere):
+            pass
+    with RunLock(source):
+        pass
+
+
+def test_a_damaged_recording_is_played_and_the_exit_status_says_so(begin: Any, recording: Path) -> None:
+    (file,) = recording.glob("*.mcap")
+    data = bytearray(file.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 2000] = bytes(2000)
+    file.write_bytes(data)
+    run: Run = begin("--input", str(recording), *INPUT_ALONE)
+    status, output = run.wait()
+    assert status == 1, output
+    assert "could be read of the input was played" in output.splitlines()[-1]
+
+
+def test_poses_go_on_where_the_log_cannot_be_written(begin: Any, recording: Path, tmp_path: Path, folder: Path) -> None:
+    out = tmp_path / "out"
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
+    command = [sys.executable, "-P", "-m", "steadypose.nodes.cli"] if sys.version_info >= (3, 11) else [
+        sys.executable, "-m", "steadypose.nodes.cli"
+    ]  # fmt: skip
+    arguments = ["run", "--input", recording, "--record", out, *INPUT_ALONE, "--set", "recorder.free_mb=0"]
+    with open("/dev/full", "w") as full:
+        status = subprocess.run(
+            [*command, *arguments], stdout=full, stderr=full, env=environment, timeout=240
+        ).returncode
+    assert status == 0
+    with RecordingReader(out) as reader:
+        assert reader.count(POSE_RAW) == 91
+
+
+def test_a_path_may_hold_any_character(begin: Any, tmp_path: Path) -> None:
+    strange = tmp_path / 'a 😀 "b\x7f'
+    strange.mkdir()
+    source = record(strange / "in", walk(30))
+    out = strange / "out"
+    run: Run = begin(
+        "--input", str(source), "--record", str(out), "--rate", "0", *INPUT_ALONE, "--set", "recorder.free_mb=0"
+    )
+    status, output = run.wait()
+    assert status == 0, output
+    with RecordingReader(out) as reader:
+        assert reader.count(POSE_RAW) == 31
+
+
+def test_a_recording_launch_started_again_records_on(tmp_path: Path, make_launch: Callable[..., Launch]) -> None:
+    out = tmp_path / "out"
+    live = make_launch(nodes='["recorder"]', recorder__directory=out, transport__lossless="false")
+    replay = make_launch(nodes='["recorder"]', recorder__directory=out)
+    assert free_directory(live) is None
+    record(out, walk(3))
+    assert free_directory(live) is None, "the next part of the same"
+    assert free_directory(replay) == tmp_path / "out-2", "its stamps are the same again"
+    (tmp_path / "out-2").mkdir()
+    assert free_directory(replay) == tmp_path / "out-3"
+    (out / "notes.txt").write_text("somebody's own")
+    assert free_directory(live) == tmp_path / "out-3"
+
+
+class Listener(Node):
+    """A node of the graph that only measures."""
+
+    name = "prior"
+
+    def handle(self, topic: str, message: Message) -> None: ...
+
+
+class SetClock(VirtualClock):
+    """A wall clock that can be set."""
+
+    set_ns = START_NS
+
+    def now_ns(self) -> int:
+        return self.time_ns + self.set_ns
+
+
+@pytest.mark.parametrize("step_ns", [10 * 365 * 86400 * 10**9, -(10**9)])
+@pytest.mark.parametrize("rate", [1.0, 2.0])
+def test_a_clock_that_is_set_makes_no_frame_late(make_launch: Callable[..., Launch], step_ns: int, rate: float) -> None:
+    clock = SetClock()
+    node = Listener(make_launch(nodes='["prior"]'), clock)
+    node.timeline = timeline = Timeline(1_000, clock.now_ns(), rate)
+    clock.time_ns += 1_000_000_000
+    stamp_ns = timeline.stamp_at(clock.now_ns()) - round(20_000_000 * rate)
+    assert node._late_ns(timeline, stamp_ns) == pytest.approx(20_000_000, abs=1000)
+    clock.set_ns += step_ns
+    assert node._late_ns(timeline, stamp_ns) == pytest.approx(20_000_000, abs=1000)
+
+
+HOSTILE = (
+    "asyncio ctypes json logging numba numpy pickle pip rich scipy signal socket steadypose struct subprocess tempfile "
+    "threading tyro venv zmq"
+)
+
+
+@pytest.fixture
+def hostile(tmp_path: Path) -> Path:
+    """A folder of modules that leave a trace when they are run."""
+    where = tmp_path / "hostile"
+    where.mkdir()
+    for name in HOSTILE.split():
+        (where / f"{name}.py").write_text(
+            f"open({str(tmp_path / 'was run')!r}, 'a').write({name!r})\nraise SystemExit(3)\n"
+        )
+    return where
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run", "--input", "{in}/a", *INPUT_ALONE),
+        ("clean", "{in}/a", "{out}/a.npz"),
+        ("clean", "{in}", "{out}/all", "--jobs", "2"),
+        ("info", "{in}/a"),
+        ("echo", "{in}/a"),
+        ("hz", "{in}/a"),
+        ("repair", "{in}/a", "{out}/repaired"),
+        ("plot", "{in}/a", "-o", "{out}/a.png"),
+        ("keys", "{out}/keys"),
+        ("doctor",),
+        ("install-service", "replay", "--dry-run", "--user", "root"),
+        *(
+            (name, "--help")
+            for name in ("fit", "complete", "prepare", "train", "evaluate", "simulate", "calibrate", "node")
+        ),
+    ],
+    ids=" ".join,
+)
+def test_no_command_runs_what_the_working_folder_holds(
+    arguments: tuple[str, ...], hostile: Path, tmp_path: Path, folder: Path
+) -> None:
+    (tmp_path / "recordings").mkdir()
+    (tmp_path / "out").mkdir()
+    record(tmp_path / "recordings" / "a", walk(40))
+    given = [
+        part.format_map({"in": tmp_path / "recordings", "out": tmp_path / "out"}) if "{" in part else part
+        for part in arguments
+    ]
+    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONSAFEPATH")}
+    done = subprocess.run(
+        [Path(sys.executable).with_name("steadypose"), *given],
+        cwd=hostile,
+        env=environment | {"XDG_RUNTIME_DIR": str(folder)},
+        capture_output=True,
+        text=True,
+        timeout=400,
+    )
+    assert not (tmp_path / "was run").exists(), (tmp_path / "was run").read_text()
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_process_of_our_own_does_not_even_where_python_knows_no_safe_path(
+    hostile: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = {key: value for key, value in os.environ.items() if key != "PYTHONSAFEPATH"}
+    command = safe_python.command("socket:gethostname")
+    assert subprocess.run(command, cwd=hostile, env=old, capture_output=True).returncode != 3
+    assert not (tmp_path / "was run").exists()
+    monkeypatch.setenv("PYTHONPATH", os.pathsep + "/somewhere")
+    assert safe_python.environment()["PYTHONPATH"] == "/somewhere"
+
+
+def test_the_installer_starts_python_in_isolation(hostile: Path, tmp_path: Path) -> None:
+    script = Path(__file__).parents[3] / "setup-environment.sh"
+    done = subprocess.run(["sh", "-c", f'. "{script}"; find_python'], cwd=hostile, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "was run").exists()
+    starts = [line for line in script.read_text().splitlines() if " -m " in line]
+    assert starts
+    assert all(" -I -m " in line for line in starts)

@@ -1,0 +1,203 @@
+"""A robot does as a person does, within its limits, and its feet stand; what is wrong with a URDF is said."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import repeated, running
+from numpy.typing import NDArray
+
+from steadypose import PACKAGE
+from steadypose.msgs.topics import POSE_WORLD
+from steadypose.msgs.transport import Publisher
+from steadypose.msgs.types import PoseWorld
+from steadypose.nodes.cli import main
+from steadypose.nodes.graph.launch import Launch, bundled
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.prior.sim.streams import make, read_manifest
+
+pytest.importorskip("mink", reason="the extra 'retarget' is not installed")
+
+from steadypose.nodes.sinks.retarget.follower import GONE_NS, Follower
+from steadypose.nodes.sinks.retarget.node import RetargetNode
+from steadypose.nodes.sinks.retarget.retargeter import EASE_S, SIDES, Retargeter, RobotPose
+from steadypose.nodes.sinks.retarget.robot import Robot, load_robot
+
+URDF = PACKAGE / "launch" / "robots" / "humanoid29.urdf"
+FRAME_S = 1 / 30
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return load_robot(URDF, {})
+
+
+def worlds(name: str) -> list[PoseWorld]:
+    return make(read_manifest(bundled("sim_data", "manifest.json"))[name])[1]
+
+
+def followed(robot: Robot, stream: list[PoseWorld]) -> tuple[list[RobotPose], NDArray[np.float64]]:
+    """The robot's poses, and how far a foot that stands is from where it came to stand, metres."""
+    retargeter = Retargeter(robot)
+    poses, away, stood = [], [], {}
+    for world in stream:
+        pose = retargeter.follow(world.stamp_ns, world.bodies[0])
+        assert pose is not None
+        poses.append(pose)
+        for k, side in enumerate(SIDES):
+            at = retargeter._frame(f"{side}_foot")[1]
+            if not pose.stands[k]:
+                stood.pop(side, None)
+            else:
+                away.append(float(np.linalg.norm(at - stood.setdefault(side, at))))
+    return poses, np.array(away)
+
+
+@pytest.mark.parametrize("name", ["walk_turn", "sit_rise", "wave_hidden_arm"])
+def test_limits_hold_in_every_frame_and_feet_that_stand_stay_within_2_cm(robot: Robot, name: str) -> None:
+    poses, away = followed(robot, worlds(name))
+    joints = np.array([pose.joints for pose in poses])
+    assert (joints >= robot.lower).all()
+    assert (joints <= robot.upper).all()
+    speeds = np.abs(np.diff(joints, axis=0)) / np.diff([pose.stamp_ns for pose in poses])[:, None] * 1e9
+    assert (speeds <= robot.speed * (1 + 1e-6)).all()
+    assert len(away) > len(poses)
+    assert away.max() < 0.02
+
+
+def test_a_raised_hand_is_raised_and_a_sitting_person_sits(robot: Robot) -> None:
+    retargeter = Retargeter(robot)
+    raised, lowest = 0.0, 1.0
+    for world in worlds("wave_hidden_arm")[:200]:
+        retargeter.follow(world.stamp_ns, world.bodies[0])
+        raised = max(raised, retargeter._frame("left_wrist")[1][2] - retargeter._frame("left_shoulder")[1][2])
+    retargeter.reset()
+    for world in worlds("sit_rise")[:300]:
+        retargeter.follow(world.stamp_ns, world.bodies[0])
+        lowest = min(lowest, float(retargeter._frame("pelvis")[1][2]))
+    assert raised > 0.05
+    assert lowest < 0.55
+
+
+def test_it_begins_and_stops_smoothly(robot: Robot) -> None:
+    stream = worlds("walk_turn")[60:180]
+    empty = [
+        PoseWorld(stream[-1].stamp_ns + k * 33_333_333, "world", "x", np.array([0, 0, 1, 0]), []) for k in range(1, 90)
+    ]
+    follower = Follower(Retargeter(robot))
+    poses = [pose for world in [*stream, *empty] if (pose := follower.process(world))]
+    assert len(poses) == len(stream) + len(empty)
+    speeds = np.abs(np.diff([pose.joints for pose in poses], axis=0)).max(axis=1) / FRAME_S
+    assert speeds[0] < 0.2
+    assert speeds[: round(EASE_S / FRAME_S / 4)].max() < 2.0
+    stop = speeds[len(stream) - 1 :]
+    assert (np.diff(stop) <= 1e-6).all()
+    assert stop[-1] < 1e-3
+
+
+def test_the_next_person_is_followed_when_the_first_has_gone_without_a_jump_of_the_joints(robot: Robot) -> None:
+    stream = worlds("crossing")
+    for world in stream:
+        world.bodies = [
+            body
+            for body in world.bodies
+            if (body.id == 1) == (world is stream[0] or world.stamp_ns < stream[100].stamp_ns)
+        ]
+    follower, poses = Follower(Retargeter(robot)), []
+    for world in stream:
+        bodies, world.bodies = world.bodies, []
+        if not stream[100].stamp_ns <= world.stamp_ns < stream[100].stamp_ns + GONE_NS:
+            world.bodies = bodies
+        poses.append(follower.process(world))
+    joints = np.array([pose.joints for pose in poses if pose])
+    assert (np.abs(np.diff(joints, axis=0)) <= robot.speed * FRAME_S * 1.01).all()
+
+
+def test_a_pose_that_is_not_known_moves_nothing(robot: Robot) -> None:
+    retargeter, (first, second) = Retargeter(robot), worlds("idle")[:2]
+    before = retargeter.follow(first.stamp_ns, first.bodies[0])
+    second.bodies[0].positions[4] = np.nan
+    assert retargeter.follow(second.stamp_ns, second.bodies[0]) is None
+    assert retargeter.follow(first.stamp_ns, first.bodies[0]) is None
+    after = retargeter.coast(second.stamp_ns)
+    assert before is not None
+    assert after is not None
+    np.testing.assert_array_equal(before.joints, after.joints)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("</robot>", "", "is no URDF"),
+        (
+            '<limit lower="-0.09" upper="2.88"',
+            '<limit lower="2.88" upper="-0.09"',
+            "left_knee_joint: expected lower < upper",
+        ),
+        (
+            'name="left_knee_joint" type="revolute"',
+            'name="left_knee_joint" type="continuous"',
+            "expected revolute or prismatic",
+        ),
+        ("left_knee_link", "left_middle_link", "no link is named for left_knee: name one with links"),
+        ('<child link="waist_yaw_link"/>', '<child link="waist_roll_link"/>', "expected one link without a parent"),
+    ],
+)
+def test_what_is_wrong_with_a_urdf_is_said(tmp_path: Path, old: str, new: str, said: str) -> None:
+    file = tmp_path / "robot.urdf"
+    file.write_text(URDF.read_text().replace(old, new))
+    with pytest.raises(LaunchError, match=said):
+        load_robot(file, {})
+
+
+def test_links_are_named_where_their_names_do_not_tell(tmp_path: Path) -> None:
+    file = tmp_path / "robot.urdf"
+    file.write_text(URDF.read_text().replace("left_knee_link", "left_middle_link"))
+    assert load_robot(file, {"left_knee": "left_middle_link"}).links["left_knee"] == "left_middle_link"
+    with pytest.raises(LaunchError, match="no part left_nee"):
+        load_robot(file, {"left_nee": "left_middle_link"})
+
+
+def test_the_node_sends_datagrams(make_launch: Callable[..., Launch]) -> None:
+    stream = worlds("idle")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(30)
+        launch = make_launch(
+            nodes='["trajectory", "retarget"]', transport__lossless="false", retarget__urdf=str(URDF),
+            retarget__port=str(listener.getsockname()[1]),
+        )  # fmt: skip
+        frames = iter(stream)
+        with (
+            Publisher(launch.transport.endpoint("trajectory")) as publisher,
+            running(RetargetNode(launch)),
+            repeated(lambda: publisher.publish(POSE_WORLD, next(frames, stream[-1]))),
+        ):
+            said = json.loads(listener.recv(65536))
+    assert len(said["joints"]) == 29
+    assert len(said["root"]) == 7
+    assert set(said["stands"]) == {"left", "right"}
+
+
+def test_the_command_writes_csv_and_npz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    p = np.stack([world.bodies[0].positions for world in worlds("idle")[:60]])
+    np.savez(tmp_path / "in.npz", positions=p, skeleton="smpl22", fps=30.0)
+    given = ["--urdf", str(URDF)]
+    for name in ("out.csv", "out.npz"):
+        assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / name), *given]) == 0
+    table = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)
+    arrays = np.load(tmp_path / "out.npz")
+    assert table.dtype.names
+    assert table.dtype.names[0] == "time"
+    assert list(table.dtype.names[8:]) == arrays["joint_names"].tolist()
+    np.testing.assert_allclose(table["left_knee_joint"], arrays["joints"][:, 3], atol=1e-5)
+    assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / "out.csv"), *given]) == 2
+    assert "--force to replace it" in capsys.readouterr().err
+    assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / "out.bvh"), *given]) == 2
+    assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / "out2.csv")]) == 2
+    assert "expected --urdf FILE" in capsys.readouterr().err

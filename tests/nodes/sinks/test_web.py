@@ -1,0 +1,197 @@
+"""The web sink at its socket: who is served, what is said, and what becomes of who is slow."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from conftest import repeated, running, until
+from tests.helpers.msg_strategies import diagnostics, events, raw, world
+from tests.helpers.synthetic_poses import messages
+
+from steadypose.msgs.topics import POSE_EVENTS, POSE_WORLD
+from steadypose.msgs.transport import Publisher
+from steadypose.msgs.types import EventKind, JointState
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.web.form import hello, to_json
+from steadypose.nodes.sinks.web.node import WebNode, kept_token
+from steadypose.nodes.sinks.web.server import FILES, MAX_CLIENTS, STATIC, WebServer
+from steadypose.nodes.sinks.web.settings import WebSettings
+
+pytest.importorskip("websockets", reason="the extra 'web' is not installed")
+
+TOKEN = "a-token-of-this-test"
+
+
+@pytest.fixture
+def server() -> Iterator[WebServer]:
+    server = WebServer("127.0.0.1", 0, ["kiosk.local"], TOKEN)
+    yield server
+    server.close()
+
+
+def get(server: WebServer, path: str, host: str = "127.0.0.1") -> tuple[int, dict[str, str], str]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    connection.request("GET", path, headers={"Host": host})
+    answer = connection.getresponse()
+    return answer.status, dict(answer.getheaders()), answer.read().decode()
+
+
+def client(server: WebServer, token: str = TOKEN, **options: Any) -> Any:
+    from websockets.sync.client import connect
+
+    return connect(f"ws://127.0.0.1:{server.port}/ws?token={token}", open_timeout=20, **options)
+
+
+def test_pages_are_served_and_may_load_nothing_from_elsewhere(server: WebServer) -> None:
+    for path, name in FILES.items():
+        status, headers, body = get(server, path)
+        assert (status, body) == (200, (STATIC / name).read_text())
+        assert "default-src 'none'" in headers["Content-Security-Policy"]
+        assert f"connect-src 'self' ws://127.0.0.1:{80};" in headers["Content-Security-Policy"]
+        assert "http" not in body.replace("http://127.0.0.1", "").replace("/^http/", ""), "an address of elsewhere"
+    assert get(server, "/steadypose.js")[1]["Access-Control-Allow-Origin"] == "*"
+    assert "Access-Control-Allow-Origin" not in get(server, "/")[1]
+
+
+@pytest.mark.parametrize("path", ["/../settings.py", "/static/index.html", "//etc/passwd", "/%2e%2e/form.py", "/wsx"])
+def test_nothing_else_is_served(server: WebServer, path: str) -> None:
+    assert get(server, path)[0] == 404
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost:8766", "[::1]:1", "kiosk.local"])
+def test_names_of_its_own_are_answered(server: WebServer, host: str) -> None:
+    assert get(server, "/", host)[0] == 200
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "", "localhost:x", "evil.example:80"])
+@pytest.mark.parametrize("path", ["/", f"/ws?token={TOKEN}"])
+def test_names_that_others_have_pointed_here_are_not(server: WebServer, path: str, host: str) -> None:
+    assert get(server, path, host)[0] == 421
+
+
+@pytest.mark.parametrize("token", ["", "wrong", TOKEN[:-1], TOKEN + "x", "%ff"])
+def test_without_the_token_nothing_is_told(server: WebServer, token: str) -> None:
+    from websockets.exceptions import InvalidStatus
+
+    with pytest.raises(InvalidStatus, match="401"), client(server, token):
+        pass
+    assert server.clients == 0
+
+
+def test_a_client_gets_names_first_and_then_the_newest_of_each_stream(server: WebServer) -> None:
+    server.send("a", '"old"', replaces=True)
+    server.send("a", '"new"', replaces=True)
+    server.send("b", '"b"', replaces=True)
+    with client(server) as it:
+        assert json.loads(it.recv(20))["topic"] == "hello"
+        assert {it.recv(20), it.recv(20)} == {'"new"', '"b"'}
+        server.send("a", '"newer"', replaces=True)
+        assert it.recv(20) == '"newer"'
+
+
+def test_who_is_slow_misses_frames_that_are_counted_and_holds_up_nobody(server: WebServer) -> None:
+    with client(server, max_queue=1) as slow, client(server) as fast:
+        slow.recv(20)
+        fast.recv(20)
+        filler = "x" * 200_000
+        for index in range(300):
+            server.send("a", json.dumps([index, filler]), replaces=True)
+            assert json.loads(fast.recv(20))[0] == index
+        until(lambda: server.dropped > 100)
+        last = -1
+        while last < 299:  # and what it gets in the end is the newest
+            index = json.loads(slow.recv(20))[0]
+            assert index > last
+            last = index
+
+
+def test_events_are_kept_for_who_is_slow_for_a_moment(server: WebServer) -> None:
+    with client(server) as it:
+        it.recv(20)
+        for index in range(50):
+            server.send("e", json.dumps(index), replaces=False)
+        assert [json.loads(it.recv(20)) for _ in range(50)] == list(range(50))
+
+
+def test_there_are_no_more_clients_than_there_is_room_for(server: WebServer) -> None:
+    from websockets.exceptions import InvalidStatus
+
+    with ExitStack() as stack:
+        for _ in range(MAX_CLIENTS):
+            stack.enter_context(client(server))
+        until(lambda: server.clients == MAX_CLIENTS)
+        with pytest.raises(InvalidStatus, match="503"), client(server):
+            pass
+    until(lambda: server.clients == 0)
+
+
+def test_a_port_that_is_taken_is_named(server: WebServer) -> None:
+    with pytest.raises(LaunchError, match=f"port {server.port} at 127.0.0.1 is not to be had"):
+        WebServer("127.0.0.1", server.port, [], TOKEN)
+
+
+def test_messages_as_json() -> None:
+    names = json.loads(hello())
+    assert names["states"][JointState.IMPUTED] == "IMPUTED"
+    assert names["events"][EventKind.POINTS] == "POINTS"
+    message = world(1_500_000_000)
+    message.bodies[0].positions[3] = np.nan
+    message.bodies[0].sigma[4] = np.inf
+    said = json.loads(to_json(message) or "")
+    (body,) = said["bodies"]
+    assert (said["topic"], said["stamp"], said["frame"]) == ("pose/world", 1.5, "world")
+    assert (body["id"], body["tracking"], body["positions"][2]) == (7, "COASTING", [6.0, 7.0, 8.0])
+    assert body["positions"][3] == [None] * 3
+    assert body["sigma"][4] is None
+    (event,) = json.loads(to_json(events()) or "")["events"]
+    assert (event["kind"], event["phase"], event["hand"], event["direction"]) == ("POINTS", "BEGINS", "LEFT", [1, 0, 0])
+    assert json.loads(to_json(diagnostics()) or "")["values"]["rate"] == "30.0"
+    assert to_json(raw()) is None
+
+
+def test_the_token_is_kept_where_only_this_user_reads(tmp_path: Path) -> None:
+    token = kept_token(tmp_path / "token")
+    assert len(token) >= 32
+    assert kept_token(tmp_path / "token") == token
+    assert stat.S_IMODE((tmp_path / "token").stat().st_mode) == 0o600
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"port": 65536}, {"host": ""}, {"token": "short"}, {"token": "with spaces, and so on"}]
+)
+def test_a_setting_that_cannot_be_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(LaunchError, match=rf"\[web\] {next(iter(wrong))}: expected"):
+        WebSettings(**wrong)
+
+
+def test_the_node_serves_what_the_others_publish(make_launch: Callable[..., Launch]) -> None:
+    worlds = [message for topic, message in messages(1.0) if topic == POSE_WORLD]
+    launch = make_launch(nodes='["trajectory", "events", "web"]', web__port="0", transport__lossless="false")
+    node, topics = WebNode(launch), set()
+    with (
+        Publisher(launch.transport.endpoint("trajectory")) as trajectory,
+        Publisher(launch.transport.endpoint("events")) as others,
+        running(node),
+    ):
+        until(lambda: bool(node.url))
+        assert node._server is not None
+        token = urlsplit(node.url).fragment
+
+        def publish() -> None:
+            trajectory.publish(POSE_WORLD, worlds[-1])
+            others.publish(POSE_EVENTS, events())
+
+        with repeated(publish), client(node._server, token) as it:
+            while not topics >= {"hello", POSE_WORLD, POSE_EVENTS}:
+                topics.add(json.loads(it.recv(20))["topic"])
+        assert node.status()["dropped.slow client"].isdecimal()

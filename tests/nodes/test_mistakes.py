@@ -1,0 +1,206 @@
+"""Mistakes of somebody who uses the library, or the command, for the first time: each is answered with what to do."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.nodes.conftest import walk
+
+import steadypose
+from steadypose.nodes.cli import main
+
+FRAMES = 50
+
+
+@pytest.fixture(scope="module")
+def joints() -> np.ndarray:
+    """(T, 22, 3) metres, z up: what is right."""
+    return np.array([frame.bodies[0].positions for frame in walk(FRAMES)])
+
+
+def turned(joints: np.ndarray) -> np.ndarray:
+    """As a level camera has it: y down."""
+    return np.stack([joints[..., 0], -joints[..., 2], joints[..., 1]], axis=-1)
+
+
+def seconds(count: int = FRAMES) -> np.ndarray:
+    return 1_700_000_000 + np.arange(count) / 30
+
+
+def with_none(joints: np.ndarray) -> Any:
+    """Lists, in which the third joint is no three numbers."""
+    return [[None if k == 3 else row.tolist() for k, row in enumerate(frame)] for frame in joints]
+
+
+def frame_by_frame(joints: np.ndarray, times: np.ndarray) -> None:
+    filter = steadypose.Filter()
+    for frame, t in zip(joints, times - times[0], strict=True):
+        filter(frame, t)
+
+
+REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
+    "coordinates before joints": (
+        lambda j: steadypose.clean(j.transpose(0, 2, 1), fps=30),
+        r"last two axes are exchanged: positions\.transpose\(0, 2, 1\)",
+    ),
+    "a row of numbers a frame": (
+        lambda j: steadypose.clean(j.reshape(FRAMES, -1), fps=30),
+        r"positions\.reshape\(len\(positions\), 22, 3\)",
+    ),
+    "a single frame": (lambda j: steadypose.clean(j[0], fps=30), r"positions\[None\], or steadypose\.Filter"),
+    "bodies before time": (
+        lambda j: steadypose.clean(np.stack([j, j]).transpose(1, 2, 0, 3), fps=30),
+        r"bodies come after time: positions\.transpose\(0, 2, 1, 3\)",
+    ),
+    "a confidence as the fourth number": (
+        lambda j: steadypose.clean(np.dstack([j, np.ones((FRAMES, 22))]), fps=30),
+        r"positions\[\.\.\., :3\], confidence=positions\[\.\.\., 3\]",
+    ),
+    "pixels": (lambda j: steadypose.clean(j[..., :2], fps=30), "key points of an image: steadypose fit lifts them"),
+    "33 joints without a skeleton": (
+        lambda j: steadypose.clean(np.zeros((FRAMES, 33, 3)), fps=30),
+        "33 joints: skeleton 'blazepose33'",
+    ),
+    "a skeleton by another name": (
+        lambda j: steadypose.clean(j[:, :17], fps=30, skeleton="COCO_17"),
+        "did you mean 'coco17'",
+    ),
+    "a skeleton that nobody knows": (
+        lambda j: steadypose.Filter(skeleton="thing"),
+        "expected one of smpl22, coco17",
+    ),
+    "no rate": (lambda j: steadypose.clean(j), "of a regular stream give fps, 30 for instance"),
+    "stamps in seconds": (
+        lambda j: steadypose.clean(j, stamp_ns=seconds()),
+        r"these seem to be seconds: np\.round\(stamps \* 1e\+09\)",
+    ),
+    "stamps in milliseconds, as floats": (
+        lambda j: steadypose.clean(j, stamp_ns=seconds() * 1e3),
+        r"these seem to be milliseconds: np\.round\(stamps \* 1e\+06\)",
+    ),
+    "a stamp too many": (
+        lambda j: steadypose.clean(j, stamp_ns=np.arange(FRAMES + 1) * 33_333_333),
+        "one stamp a frame: 50 frames, 51 stamps",
+    ),
+    "an axis that is none": (lambda j: steadypose.clean(j, fps=30, up="Y"), "expected one of 'z', 'y', '-y', got 'Y'"),
+    "frames of different length": (
+        lambda j: steadypose.clean([frame[: 20 + k % 2].tolist() for k, frame in enumerate(j)], fps=30),
+        "have NaN there, not fewer entries",
+    ),
+    "None for a missing joint": (
+        lambda j: steadypose.clean(with_none(j), fps=30),
+        "NaN",
+    ),
+    "a file that does not exist": (lambda j: steadypose.clean("nowhere.npz"), r"nowhere\.npz does not exist: expected"),
+    "a frame without its time": (lambda j: steadypose.Filter()(j[0]), "t in seconds, or stamp_ns"),
+    "nanoseconds as seconds": (lambda j: steadypose.Filter()(j[0], 1.7e18), "say stamp_ns= of nanoseconds"),
+    "all frames at once": (lambda j: steadypose.Filter()(j.transpose(0, 2, 1), 0.0), r"expected \(22, 3\) metres"),
+}
+
+WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
+    "millimetres": (lambda j: steadypose.clean(1000 * j, fps=30), "millimetres, expected metres; divide by 1000"),
+    "the camera's axes": (lambda j: steadypose.clean(turned(j), fps=30), "up = '-y'"),
+    "another order of joints": (
+        lambda j: steadypose.clean(j[:, np.random.default_rng(0).permutation(22)], fps=30),
+        "in the order of smpl22 these joints are no body",
+    ),
+    "left and right exchanged": (lambda j: steadypose.clean(j * [1.0, -1.0, 1.0], fps=30), "bodies are mirrored"),
+    "stamps in milliseconds": (
+        lambda j: steadypose.clean(j, stamp_ns=(seconds() * 1e3).astype(np.int64)),
+        "they seem to be milliseconds, expected nanoseconds",
+    ),
+    "milliseconds, frame by frame": (
+        lambda j: frame_by_frame(j, 1e3 * seconds()),
+        "they seem to be milliseconds taken for seconds",
+    ),
+    "nothing but NaN": (lambda j: steadypose.clean(np.full_like(j, np.nan), fps=30), "all joints .* are NaN"),
+    "nobody": (lambda j: steadypose.clean(np.full((FRAMES, 2, 22, 3), np.nan), fps=30), "no body in any frame"),
+    "confidence in per cent": (
+        lambda j: steadypose.clean(j, fps=30, confidence=np.full((FRAMES, 22), 90.0)),
+        "divide by 100",
+    ),
+}
+
+ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
+    "no such file": (["clean", "nowhere.npz", "out.npz"], {}, "nowhere.npz does not exist: expected"),
+    "no such folder": (["clean", "in.csv", "nowhere/out.npz"], {"in.csv": ""}, "to exist; make it first"),
+    "a CSV without a header": (
+        ["clean", "in.csv", "out.npz"],
+        {"in.csv": "0.0, 1.0, 2.0, 3.0\n"},
+        "expected a header with a column 'stamp', in seconds",
+    ),
+    "an output of another kind": (
+        ["clean", "in.csv", "out.json"],
+        {"in.csv": ""},
+        "expected .npz or .csv for arrays, or a name without ending for a recording",
+    ),
+    "a setting that there is not": (
+        ["clean", "in.csv", "out.npz", "--set", "delya=2"],
+        {"in.csv": ""},
+        "--set delya: no such setting, did you mean 'delay'?",
+    ),
+    "a command that there is not": (["claen"], {}, "did you mean 'clean'?"),
+}
+
+
+@pytest.mark.parametrize("mistake", REFUSED)
+def test_what_cannot_be_used_is_refused_with_what_to_do(mistake: str, joints: np.ndarray) -> None:
+    make, answer = REFUSED[mistake]
+    with pytest.raises(ValueError, match=answer):
+        make(joints)
+
+
+@pytest.mark.parametrize("mistake", WARNED)
+def test_what_can_be_used_is_warned_of(mistake: str, joints: np.ndarray) -> None:
+    make, answer = WARNED[mistake]
+    with pytest.warns(steadypose.InputWarning, match=answer) as caught:
+        poses = make(joints)
+    assert {Path(warning.filename).name for warning in caught} == {Path(__file__).name}, "the program is to blame"
+    if poses is not None:
+        assert {str(warning.message) for warning in caught} == set(poses.problems)
+
+
+@pytest.mark.parametrize("mistake", ANSWERED)
+def test_the_command_answers_with_what_to_do(mistake: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    arguments, files, answer = ANSWERED[mistake]
+    monkeypatch.chdir(tmp_path)
+    for name, text in files.items():
+        Path(name).write_text(text)
+    assert main(arguments) == 2
+    told = capsys.readouterr().err
+    assert answer in told
+    assert "Traceback" not in told
+
+
+def test_there_are_as_many_as_promised() -> None:
+    assert len(REFUSED) + len(WARNED) + len(ANSWERED) >= 22
+
+
+def test_what_is_right_is_not_warned_of(joints: np.ndarray) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        poses = steadypose.clean(joints.tolist(), fps=30)
+        frame_by_frame(joints, seconds())
+    assert poses.problems == ()
+    assert np.isfinite(poses.positions).all()
+
+
+def test_without_torch_a_fit_says_what_to_install(joints: np.ndarray, monkeypatch) -> None:
+    monkeypatch.setattr("steadypose.nodes.graph.extras.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"torch, .* extra 'train'"):
+        steadypose.fit(joints, fps=30)
+
+
+def test_a_recording_with_nobody_in_it_is_not_clean(tmp_path: Path, capsys) -> None:
+    """Alone, and in a folder: the exit status says so."""
+    (tmp_path / "in").mkdir()
+    np.savez(tmp_path / "in" / "empty.npz", positions=np.full((60, 1, 22, 3), np.nan), skeleton="smpl22", fps=30.0)
+    assert main(["clean", str(tmp_path / "in" / "empty.npz"), str(tmp_path / "out.npz")]) == 1
+    assert "nobody_recognised: no body in any frame" in capsys.readouterr().err
+    assert main(["clean", str(tmp_path / "in"), str(tmp_path / "out"), "--jobs", "1"]) == 1
+    assert "1 of them without anybody in it" in capsys.readouterr().err

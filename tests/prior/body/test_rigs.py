@@ -1,0 +1,339 @@
+"""Skeletons of motion files, recognised: each family as its program cuts a body, written and read back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.helpers.bvh_writer import Joint, write_bvh
+
+from steadypose.prior.body.rigs import UNITS, RigError, Tree, mirror_names, recognise, up_axis
+from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_POSITIONS, J
+from steadypose.prior.mocap.clip import MotionError
+from steadypose.prior.mocap.files import Description, describe, read_motion
+
+HIPS_HEIGHT = 0.90
+"""Metres above the ground, of the body that all families are given."""
+
+# Metres, x left, y up, z forward, from the middle of the hips.
+LEG = {"hip": (0.09, 0.0, 0.0), "knee": (0.09, -0.42, 0.01), "ankle": (0.09, -0.83, -0.01), "toe": (0.1, -0.88, 0.12)}
+ARM = {
+    "collar": (0.04, 0.49, 0.0), "shoulder": (0.18, 0.515, -0.02), "elbow": (0.46, 0.515, -0.02),
+    "wrist": (0.71, 0.515, -0.01),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Family:
+    """How a program names and cuts a body.
+
+    Attributes:
+        middle: names of the middle, from the root upwards, with their heights (cm) above the hips.
+        legs_on, arms_on: which of these carry the limbs.
+        leg: names of hip, knee, ankle and toe, ``{}`` for the side; where the last is missing there is an end site.
+        arm: names of collar, shoulder, elbow and wrist.
+        sides: what the left and the right are called.
+    """
+
+    middle: Sequence[tuple[str, float]]
+    legs_on: str
+    arms_on: str
+    leg: Sequence[str]
+    arm: Sequence[str]
+    sides: tuple[str, str] = ("Left", "Right")
+    unit: float = 0.01
+    up: str = "y"
+
+    def joints(self) -> list[Joint]:
+        """In the file's unit and axes, parents first."""
+        names = [name for name, _ in self.middle]
+        joints = [
+            Joint(name, names[max(k - 1, 0)] if k else None, self._placed((0.0, height / 100, 0.0)))
+            for k, (name, height) in enumerate(self.middle)
+        ]
+        for side, sign in zip(self.sides, (1, -1), strict=True):
+            for trunk, limb, points in ((self.legs_on, self.leg, LEG), (self.arms_on, self.arm, ARM)):
+                parent = trunk
+                for name, (x, y, z) in zip(limb, points.values(), strict=False):
+                    joints.append(Joint(name.format(side), parent, self._placed((sign * x, y, z))))
+                    parent = joints[-1].name
+                if len(limb) < len(points):
+                    x, y, z = points["toe"]
+                    joints[-1] = replace(joints[-1], end=self._placed((sign * x, y, z)))
+        return joints
+
+    def _placed(self, point: tuple[float, float, float]) -> NDArray[np.float64]:
+        x, y, z = point
+        return np.array([x, y, z] if self.up == "y" else [x, -z, y]) / self.unit
+
+
+USUAL_LEG = ("{}UpLeg", "{}Leg", "{}Foot", "{}ToeBase")
+USUAL_ARM = ("{}Shoulder", "{}Arm", "{}ForeArm", "{}Hand")
+BLENDER = ("thigh.{}", "shin.{}", "foot.{}", "toe.{}"), ("shoulder.{}", "upper_arm.{}", "forearm.{}", "hand.{}")
+FAMILIES = {
+    "Mixamo": Family(
+        [
+            (f"mixamorig:{n}", h)
+            for n, h in (
+                ("Hips", 5),
+                ("Spine", 15),
+                ("Spine1", 27),
+                ("Spine2", 40),
+                ("Neck", 56),
+                ("Head", 66),
+                ("HeadTop_End", 85),
+            )
+        ],
+        "mixamorig:Hips",
+        "mixamorig:Spine2",
+        [f"mixamorig:{n}" for n in USUAL_LEG],
+        [f"mixamorig:{n}" for n in USUAL_ARM],
+    ),
+    "LAFAN1": Family(
+        [("Hips", 1), ("Spine", 8), ("Spine1", 20), ("Spine2", 32), ("Neck", 58), ("Head", 69)],
+        "Hips",
+        "Spine2",
+        ("{}UpLeg", "{}Leg", "{}Foot", "{}Toe"),
+        USUAL_ARM,
+    ),
+    "DanceDB": Family(
+        [
+            ("Hips", 2),
+            ("Spine", 9),
+            ("Spine1", 16),
+            ("Spine2", 28),
+            ("Spine3", 43),
+            ("Spine4", 54),
+            ("Neck", 58),
+            ("Head", 66),
+        ],
+        "Hips",
+        "Spine4",
+        USUAL_LEG,
+        USUAL_ARM,
+    ),
+    "Xsens": Family(
+        [("Hips", 9), ("Chest", 18), ("Chest2", 28), ("Chest3", 38), ("Chest4", 48), ("Neck", 58), ("Head", 67)],
+        "Hips",
+        "Chest4",
+        ("{}Hip", "{}Knee", "{}Ankle", "{}Toe"),
+        ("{}Collar", "{}Shoulder", "{}Elbow", "{}Wrist"),
+    ),
+    "Rokoko": Family(
+        [("Hips", 4), ("Spine1", 14), ("Spine2", 24), ("Spine3", 34), ("Spine4", 45), ("Neck", 56), ("Head", 66)],
+        "Hips",
+        "Spine4",
+        ("{}Thigh", "{}Shin", "{}Foot", "{}Toe"),
+        USUAL_ARM,
+    ),
+    "OptiTrack": Family(
+        [("Hip", 8), ("Ab", 16), ("Chest", 36), ("Neck", 57), ("Head", 68)],
+        "Hip",
+        "Chest",
+        ("{}Thigh", "{}Shin", "{}Foot", "{}Toe"),
+        ("{}Shoulder", "{}UArm", "{}FArm", "{}Hand"),
+        ("L", "R"),
+        unit=1.0,
+    ),
+    "Perception Neuron": Family(
+        [("Hips", 6), ("Spine", 16), ("Spine1", 27), ("Spine2", 42), ("Neck", 57), ("Neck1", 62), ("Head", 67)],
+        "Hips",
+        "Spine2",
+        USUAL_LEG[:3],
+        USUAL_ARM,
+    ),
+    "SOMA": Family(
+        [
+            ("Root", 8),
+            ("Hips", 8),
+            ("Spine1", 18),
+            ("Spine2", 28),
+            ("Chest", 38),
+            ("Neck1", 56),
+            ("Neck2", 61),
+            ("Head", 67),
+            ("HeadEnd", 85),
+        ],
+        "Hips",
+        "Chest",
+        ("{}Leg", "{}Shin", "{}Foot", "{}ToeBase"),
+        USUAL_ARM,
+    ),
+    "Bandai": Family(
+        [("joint_Root", 2), ("Hips", 2), ("Spine", 20), ("Chest", 32), ("Neck", 56), ("Head", 66)],
+        "Hips",
+        "Chest",
+        ("UpperLeg_{}", "LowerLeg_{}", "Foot_{}", "Toes_{}"),
+        ("Shoulder_{}", "UpperArm_{}", "LowerArm_{}", "Hand_{}"),
+        ("L", "R"),
+    ),
+    "ReActIdle (Blender)": Family(
+        [("pelvis", 2), ("spine.001", 24), ("neck", 52), ("face", 70)],
+        "pelvis",
+        "spine.001",
+        BLENDER[0][:3],
+        BLENDER[1],
+        ("L", "R"),
+        unit=1.0,
+        up="z",
+    ),
+    "DAZ": Family(
+        [("hip", -2.6), ("abdomen", 18), ("chest", 31), ("neck", 57), ("head", 66)],
+        "hip",
+        "chest",
+        ("{}Thigh", "{}Shin", "{}Foot"),
+        ("{}Collar", "{}Shldr", "{}ForeArm", "{}Hand"),
+        ("l", "r"),
+    ),
+    "iClone": Family(
+        [
+            ("CC_Base_Hip", 2),
+            ("CC_Base_Waist", 10),
+            ("CC_Base_Spine01", 15),
+            ("CC_Base_Spine02", 30),
+            ("CC_Base_NeckTwist01", 57),
+            ("CC_Base_Head", 66),
+        ],
+        "CC_Base_Hip",
+        "CC_Base_Spine02",
+        ("CC_Base_{}_Thigh", "CC_Base_{}_Calf", "CC_Base_{}_Foot", "CC_Base_{}_ToeBase"),
+        ("CC_Base_{}_Clavicle", "CC_Base_{}_Upperarm", "CC_Base_{}_Forearm", "CC_Base_{}_Hand"),
+        ("L", "R"),
+    ),
+    "Unreal": Family(
+        [("pelvis", 8), ("spine_01", 18), ("spine_02", 30), ("spine_03", 42), ("neck_01", 57), ("head", 67)],
+        "pelvis",
+        "spine_03",
+        ("thigh_{}", "calf_{}", "foot_{}", "ball_{}"),
+        ("clavicle_{}", "upperarm_{}", "lowerarm_{}", "hand_{}"),
+        ("l", "r"),
+        up="z",
+    ),
+    "mocopi": Family(
+        [("root", 4), *((f"torso_{k}", 4 + 7 * k) for k in range(1, 8)), ("neck_1", 57), ("neck_2", 61), ("head", 66)],
+        "root",
+        "torso_7",
+        ("{}_up_leg", "{}_low_leg", "{}_foot", "{}_toes"),
+        ("{}_shoulder", "{}_up_arm", "{}_low_arm", "{}_hand"),
+        ("l", "r"),
+    ),
+}
+
+
+@pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES.keys())
+def test_a_family_is_read_without_a_word(family: Family) -> None:
+    root = np.array([0.5, HIPS_HEIGHT, -1.0])
+    fps, body = read_motion("take.bvh", write_bvh(family.joints(), family._placed(tuple(root)), 50.0))
+    assert fps == pytest.approx(50.0, rel=1e-4)
+    found = body[-1] - body[-1, [J["left_hip"], J["right_hip"]]].mean(axis=0)
+    # z up, left +x, facing -y.
+    for part, (x, y, z) in (LEG | ARM).items():
+        name = "foot" if part == "toe" else part
+        for side, sign in (("left", 1), ("right", -1)):
+            off = np.linalg.norm(found[J[f"{side}_{name}"]] - [sign * x, -z, y])
+            # Collars are mixtures of their neighbours, wherever a rig has its own.
+            assert off < (0.06 if part == "collar" else 1e-3), f"{side} {part}"
+    middle = ["pelvis", "spine1", "spine2", "spine3", "neck", "head"]
+    heights = found[[J[name] for name in middle], 2]
+    rest = REST_POSITIONS[:, 2] - REST_POSITIONS[J["left_hip"], 2]
+    np.testing.assert_allclose(heights, rest[[J[name] for name in middle]], atol=0.045)
+    assert (np.diff(heights) > 0).all()
+    # In the world, too: on its feet, where the file has it.
+    assert body[-1, J["left_hip"], 2] == pytest.approx(HIPS_HEIGHT - family.middle[0][1] / 100, abs=1e-3)
+
+
+def test_a_body_of_canonical_names_is_taken_as_it_is() -> None:
+    joints = [
+        Joint(name, None if k == 0 else JOINTS[parent], 100 * REST_POSITIONS[k][[1, 2, 0]])
+        for k, (name, parent) in enumerate(zip(JOINTS, PARENTS, strict=True))
+    ]
+    _, body = read_motion("own.bvh", write_bvh(joints, np.array([0.0, 90.0, 0.0]), 30.0))
+    expected = REST_POSITIONS[:, [1, 0, 2]] * [1, -1, 1]
+    np.testing.assert_allclose(body[-1] - body[-1, 0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("unit", UNITS.values(), ids=UNITS.keys())
+@pytest.mark.parametrize("size", [0.8, 1.0, 1.15])
+def test_the_unit_is_told_by_the_size_of_a_person(unit: float, size: float) -> None:
+    joints = [replace(j, at=j.at * size) for j in replace(FAMILIES["LAFAN1"], unit=unit).joints()]
+    _, body = read_motion("take.bvh", write_bvh(joints, np.zeros(3), 30.0))
+    shin = np.linalg.norm(body[0, J["left_knee"]] - body[0, J["left_ankle"]])
+    assert shin == pytest.approx(0.41 * size, rel=0.01)
+
+
+def test_a_body_of_no_size_that_a_person_has_is_not_guessed_at() -> None:
+    giant = replace(FAMILIES["LAFAN1"], unit=0.2).joints()
+    with pytest.raises(MotionError, match=r"0\.95 to 2\.3 m.*--rig"):
+        read_motion("giant.bvh", write_bvh(giant, np.zeros(3), 30.0))
+
+
+def test_helpers_inside_a_bone_are_looked_through() -> None:
+    joints = FAMILIES["Mixamo"].joints()
+    knee = next(k for k, joint in enumerate(joints) if joint.name == "mixamorig:LeftLeg")
+    for side in ("Left", "Right"):
+        hip, knee = (next(j for j in joints if j.name == f"mixamorig:{side}{n}") for n in ("UpLeg", "Leg"))
+        twist = Joint(f"mixamorig:{side}UpLegTwist", hip.name, (hip.at + knee.at) / 2)
+        joints[joints.index(knee)] = replace(knee, parent=twist.name)
+        joints.insert(joints.index(hip) + 1, twist)
+    tree = as_tree(joints)
+    table = recognise(tree).skeleton.table
+    assert (table["left_hip"], table["right_knee"]) == ({"mixamorig:LeftUpLeg": 1.0}, {"mixamorig:RightLeg": 1.0})
+
+
+def as_tree(joints: Sequence[Joint]) -> Tree:
+    names = [joint.name for joint in joints]
+    at = np.array([joint.at for joint in joints])
+    parents = [names.index(joint.parent) if joint.parent else -1 for joint in joints]
+    return Tree(names, parents, at - np.where(np.array(parents)[:, None] < 0, 0, at[parents]))
+
+
+def test_what_is_no_body_is_refused_in_words() -> None:
+    snake = [Joint(f"bone{k}", f"bone{k - 1}" if k else None, np.array([0.0, 10.0 * k, 0.0])) for k in range(12)]
+    with pytest.raises(RigError, match="legs and arms"):
+        recognise(as_tree(snake))
+    headless = [j for j in FAMILIES["LAFAN1"].joints() if j.name not in ("Neck", "Head")]
+    with pytest.raises(RigError, match="neck and head above 'Spine2'"):
+        recognise(as_tree(headless))
+
+
+def test_sides_are_told_by_names_that_stay_names() -> None:
+    names = ["LowerBack", "L_Arm", "R_Arm", "lowerleg.l", "lowerleg.r", "ball", "Left", "Right"]
+    assert mirror_names(names) == {"L_Arm": "R_Arm", "lowerleg.l": "lowerleg.r", "Left": "Right"}
+
+
+@pytest.mark.parametrize(("axis", "turn"), [("z", [0, 1, 2]), ("y", [0, 2, 1])])
+def test_up_is_from_ankles_to_head(axis: str, turn: list[int]) -> None:
+    assert up_axis(REST_POSITIONS[None][..., turn]) == axis
+    assert up_axis(-REST_POSITIONS[None][..., [0, 2, 1]]) == "-y"
+
+
+def test_a_description_says_what_a_file_does_not() -> None:
+    snake = FAMILIES["LAFAN1"].joints()
+    renamed = [replace(j, name=f"b{k}", parent=f"b{[i.name for i in snake].index(j.parent)}" if j.parent else None)
+               for k, j in enumerate(snake)]  # fmt: skip
+    content = write_bvh(renamed, np.array([0.0, 90.0, 0.0]), 30.0)
+    with pytest.raises(MotionError, match="--rig"):
+        read_motion("take.bvh", content)
+    of = {old.name: new.name for old, new in zip(snake, renamed, strict=True)}
+    table = {
+        "left_hip": of["LeftUpLeg"], "right_hip": of["RightUpLeg"], "left_shoulder": of["LeftArm"],
+        "right_shoulder": of["RightArm"], "neck": [of["LeftArm"], of["RightArm"]], "head": of["Head"],
+    }  # fmt: skip
+    _, body = read_motion("take.bvh", content, describe({"canonical": table, "metres": 0.01, "up": "y"}))
+    assert body[0, J["left_hip"], 2] == pytest.approx(0.89, abs=1e-3)
+    assert body[0, J["neck"], 0] == pytest.approx(0.0, abs=1e-6)
+    assert np.isnan(body[0, J["left_knee"]]).all()
+    with pytest.raises(MotionError, match="no b99"):
+        read_motion("take.bvh", content, Description(canonical={"head": "b99"}, metres=0.01))
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [({"unit": 1}, "unit"), ({"up": "x"}, "up"), ({"canonical": {"nose": "b"}}, "nose"), ({"metres": "cm"}, "metres")],
+)
+def test_a_description_that_says_something_else_is_refused(table: dict[str, object], said: str) -> None:
+    with pytest.raises(MotionError, match=said):
+        describe(table)

@@ -1,0 +1,58 @@
+import numpy as np
+from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import stream, waving
+
+from steadypose.msgs.types import CleanBody
+from steadypose.prior.body.inverse_kinematics import solve_rotations
+from steadypose.prior.body.skeleton import REST_OFFSETS, J
+from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.settings import PriorSettings
+
+FRAMES, SETTLED = 60, 20
+
+
+def _bodies(positions: np.ndarray, orient: bool) -> list[CleanBody]:
+    pipeline = PriorPipeline(PriorSettings.from_dict({"orient": {"enabled": orient}}))
+    answers = [c for message in stream(positions) for c in pipeline.process(message)] + pipeline.flush()
+    return [c.bodies[0] for c in answers]
+
+
+def _root(bodies: list[CleanBody]) -> Rotation:
+    return Rotation.from_quat([body.rotations[0] for body in bodies[SETTLED:]])
+
+
+def test_positions_are_those_without_it_byte_for_byte() -> None:
+    noisy = waving(FRAMES) + np.random.default_rng(0).normal(0.0, 0.02, (FRAMES, 22, 3))
+    mine, plain = _bodies(noisy, True), _bodies(noisy, False)
+    for name in ("positions", "sigma", "state", "bone_lengths"):
+        np.testing.assert_array_equal([getattr(b, name) for b in mine], [getattr(b, name) for b in plain])
+    assert mine[-1].rotations.tobytes() != plain[-1].rotations.tobytes()
+
+
+def test_a_perfect_input_keeps_its_rotations() -> None:
+    mine, plain = (np.array([b.rotations for b in _bodies(waving(FRAMES), on)][SETTLED:]) for on in (True, False))
+    off = (Rotation.from_quat(mine.reshape(-1, 4)).inv() * Rotation.from_quat(plain.reshape(-1, 4))).magnitude()
+    limbs = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("hip", "shoulder", "knee", "elbow")]
+    others = np.ones(22, dtype=bool)
+    others[limbs] = False
+    assert np.degrees(off.reshape(-1, 22)[:, others]).max() < 0.5
+
+
+def test_with_noise_the_root_is_nearer_the_true_one_and_turns_less() -> None:
+    truth = waving(FRAMES)
+    rng, noise = np.random.default_rng(0), np.zeros((FRAMES, 22, 3))
+    noise[0] = rng.normal(0.0, 0.02, (22, 3))
+    for t in range(1, FRAMES):
+        noise[t] = 0.93 * noise[t - 1] + rng.normal(0.0, 0.02 * np.sqrt(1 - 0.93**2), (22, 3))
+    true = Rotation.from_matrix(solve_rotations(truth, REST_OFFSETS)[SETTLED:, 0])
+    mine, plain = (_root(_bodies(truth + noise, on)) for on in (True, False))
+    assert np.median((mine.inv() * true).magnitude()) < 0.7 * np.median((plain.inv() * true).magnitude())
+    assert (mine[:-1].inv() * mine[1:]).magnitude().mean() < (plain[:-1].inv() * plain[1:]).magnitude().mean()
+
+
+def test_a_body_begins_anew_without_the_twist_of_the_one_before() -> None:
+    noisy = waving(FRAMES) + np.random.default_rng(0).normal(0.0, 0.02, (FRAMES, 22, 3))
+    pipeline = PriorPipeline(PriorSettings())
+    runs = [[c for m in stream(noisy) for c in pipeline.process(m)] + pipeline.flush() for _ in range(2)]
+    for first, second in zip(*runs, strict=True):
+        np.testing.assert_array_equal(first.bodies[0].rotations, second.bodies[0].rotations)

@@ -1,0 +1,108 @@
+"""One wrong stamp is dropped; a jump that lasts costs nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.helpers.bodies import raw, stream, waving
+
+from steadypose.msgs.types import PoseClean, PoseRaw
+from steadypose.prior.clean.batch import StreamBatch
+from steadypose.prior.clean.pipeline import BACKWARDS_NS, PriorPipeline
+from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.stamp_gate import LASTING, StampGate
+from steadypose.prior.timing.resample import PERIOD_NS
+
+SECOND_NS = 10**9
+START_NS = 1_700_000_000 * SECOND_NS
+YEAR_2037_NS = 2_114_380_800 * SECOND_NS
+SIMPLE = {stage: {"enabled": False} for stage in ("score", "impute")} | {"max_bodies": 2}
+
+
+def answers(messages: list[PoseRaw]) -> tuple[list[PoseClean], Counter[str]]:
+    prior = PriorPipeline(PriorSettings.from_dict(SIMPLE))
+    return [clean for message in messages for clean in prior.process(message)] + prior.flush(), prior.counters
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[PoseRaw]:
+    return stream(waving(40), START_NS)
+
+
+@pytest.mark.parametrize("wrong_ns", [0, 10, START_NS + 5 * SECOND_NS, START_NS - 5 * SECOND_NS, YEAR_2037_NS])
+def test_one_wrong_stamp_changes_nothing_but_a_count(frames: list[PoseRaw], wrong_ns: int) -> None:
+    wrong = dataclasses.replace(frames[20], stamp_ns=wrong_ns)
+    expected, _ = answers(frames)
+    found, counters = answers([*frames[:20], wrong, *frames[20:]])
+    assert found == expected
+    assert counters == {"stamp_outlier": 1}
+
+
+@pytest.mark.parametrize("shift_ns", [3 * SECOND_NS, -3 * SECOND_NS, YEAR_2037_NS - START_NS])
+def test_a_clock_that_was_set_loses_no_frame(frames: list[PoseRaw], shift_ns: int) -> None:
+    later = [dataclasses.replace(frame, stamp_ns=frame.stamp_ns + shift_ns) for frame in frames[20:]]
+    found, counters = answers([*frames[:20], *later])
+    assert [clean.stamp_ns for clean in found] == [frame.stamp_ns for frame in [*frames[:20], *later]]
+    assert all(clean.bodies for clean in found)
+    assert not counters["stamp_outlier"]
+
+
+def test_a_stream_that_ends_within_the_jump_is_answered(frames: list[PoseRaw]) -> None:
+    late = [
+        dataclasses.replace(frame, stamp_ns=frame.stamp_ns + 3 * SECOND_NS) for frame in frames[20 : 20 + LASTING - 1]
+    ]
+    assert len(answers([*frames[:20], *late])[0]) == 20 + LASTING - 1
+    end = dataclasses.replace(late[-1], bodies=[], end_of_stream=True)
+    found, _ = answers([*frames[:20], *late, end])
+    assert len(found) == 20 + LASTING
+    assert found[-1].end_of_stream
+
+
+def test_a_server_drops_a_wrong_stamp_of_one_stream_alone(frames: list[PoseRaw]) -> None:
+    server = StreamBatch(PriorSettings.from_dict(SIMPLE), 2)
+    found = []
+    for index, frame in enumerate(frames):
+        now_ns = frame.stamp_ns + 1_000_000
+        for source in ("door", "desk"):
+            message = dataclasses.replace(frame, source=source)
+            if (index, source) == (20, "door"):
+                found += server.process_at(dataclasses.replace(message, stamp_ns=YEAR_2037_NS), now_ns)
+            found += server.process_at(message, now_ns)
+    for source in ("door", "desk"):
+        stamps = [clean.stamp_ns for clean in found if clean.source == source]
+        assert np.diff(stamps) == pytest.approx(PERIOD_NS, abs=2)
+    assert +server.counters == {"stamp_outlier": 1}
+
+
+def gate(counters: Counter[str] | None = None) -> StampGate:
+    return StampGate(0.5 * SECOND_NS, BACKWARDS_NS, Counter() if counters is None else counters)
+
+
+def test_a_slow_stream_is_a_stream() -> None:
+    stamps = [START_NS + k * SECOND_NS for k in range(10)]
+    stamp_gate = gate()
+    came = [len(stamp_gate.admit(raw(stamp, {}))) for stamp in stamps]
+    assert came == [1, 0, 0, 3, 1, 1, 1, 1, 1, 1], "known for slow, it waits no more"
+
+
+@given(st.lists(st.integers(0, 2**31 * SECOND_NS - 1), max_size=30))
+def test_whatever_comes_comes_out_in_order_or_is_counted(stamps: list[int]) -> None:
+    counters: Counter[str] = Counter()
+    stamp_gate = gate(counters)
+    found = [message.stamp_ns for stamp in stamps for message, _ in stamp_gate.admit(raw(stamp, {}))]
+    found += [message.stamp_ns for message, _ in stamp_gate.release()]
+    remaining = iter(stamps)
+    assert all(stamp in remaining for stamp in found), "in the order in which they came, each once"
+    assert len(found) + counters["stamp_outlier"] == len(stamps)
+
+
+@given(st.lists(st.integers(1, SECOND_NS // 2), max_size=30))
+def test_a_stream_without_jumps_passes_at_once(steps: list[int]) -> None:
+    stamps = [START_NS + sum(steps[:k]) for k in range(len(steps))]
+    stamp_gate = gate()
+    assert all(len(stamp_gate.admit(raw(stamp, {}))) == 1 for stamp in stamps)

@@ -1,0 +1,186 @@
+"""Completing whole recordings: what is known stays, nothing is left out, and windows leave no seams."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.helpers.bodies import waving
+
+from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.prior.complete.body import complete
+from steadypose.prior.complete.parts import PartsCompleter
+from steadypose.prior.complete.root_path import bridge, is_root_centred, root_path
+from steadypose.prior.complete.sigma import Uncertainty, frames_apart
+from steadypose.prior.complete.views import LONGEST, LONGEST_GAP, gaps, views
+from steadypose.prior.models.completer.inference import LiveCompleter
+
+LEGS = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
+
+
+class Oracle:
+    """Knows how somebody moves."""
+
+    def __init__(self, positions: np.ndarray) -> None:
+        self.positions = positions
+
+    def __call__(self, seen: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        known = np.isfinite(seen[0]).all(axis=-1)
+        assert known.any(), "a window of which nothing is known tells nothing"
+        assert len(known) <= LONGEST
+        frames = np.flatnonzero(known.any(axis=1))
+        joints = known[frames].argmax(axis=1)
+        at = [
+            int(np.flatnonzero((self.positions[:, joint] == seen[0, frame, joint]).all(axis=-1))[0])
+            for frame, joint in zip(frames, joints, strict=True)
+        ]
+        ends = np.concatenate([[at[0] - frames[0]], at, [at[-1] + len(known) - 1 - frames[-1]]])
+        rows = np.interp(np.arange(len(known)), np.array([0, *frames, len(known) - 1]), ends).round().astype(int)
+        truth = self.positions[rows]
+        return solve_rotations(truth, offsets[0])[None], truth[None, :, 0]
+
+
+@given(
+    frames=st.integers(3, 400),
+    holes=st.lists(st.tuples(st.integers(0, 399), st.integers(1, LONGEST_GAP), st.booleans()), max_size=8),
+)
+@settings(max_examples=60, deadline=None)
+def test_every_frame_with_something_missing_is_in_a_window_that_sees_the_ends_of_its_gap(frames, holes) -> None:
+    known = np.ones((frames, 22), dtype=bool)
+    for start, length, whole in holes:
+        known[start : start + length, slice(None) if whole else slice(16, 22)] = False
+    if any(gap.end - gap.start > LONGEST_GAP for gap in gaps(known)) or not known.any():
+        return
+    total = np.zeros(frames)
+    for view in views(known):
+        assert len(view.weight) <= LONGEST
+        assert view.start >= 0
+        assert view.frames.stop <= frames
+        total[view.frames] += view.weight
+        for gap in gaps(known):
+            inside = slice(max(gap.start - view.start, 0), max(gap.end - view.start, 0))
+            if view.weight[inside].any():
+                assert view.start < gap.start or gap.start == 0
+                assert view.frames.stop > gap.end or gap.end == frames
+    assert (total[~known.all(axis=1)] > 0).all()
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        (slice(40, 90), slice(None)),  # a gap
+        (slice(None), LEGS),  # a part
+        (np.arange(300) % 15 > 0, slice(None)),  # key frames
+        (slice(100, 250), slice(None)),  # longer than any window
+        (slice(0, 20), slice(None)),  # the beginning
+    ],
+)
+def test_who_knows_the_motion_gives_it_back(hidden: tuple) -> None:
+    positions = waving(300)
+    seen = positions.copy()
+    seen[hidden] = np.nan
+    done = complete(Oracle(positions), seen, REST_OFFSETS)
+    known = np.isfinite(seen).all(axis=-1)
+    assert np.array_equal(done.positions[known], positions[known])
+    assert np.abs(done.positions - positions).max() < 6e-3
+    assert np.abs(done.rotations - solve_rotations(positions, REST_OFFSETS)).max() < 1e-2
+    assert np.array_equal(done.known, known)
+
+
+def test_windows_leave_no_seams() -> None:
+    positions = waving(300)
+    seen = positions.copy()
+    seen[:, LEGS] = np.nan
+    done = complete(LiveCompleter.load("default"), seen, REST_OFFSETS)
+    steps = np.linalg.norm(np.diff(done.positions[:, LEGS], axis=0), axis=-1)
+    assert steps.max() < 0.05, "1.5 m/s, of legs that stand"
+    bones = np.linalg.norm(done.positions - done.positions[:, list(PARENTS)], axis=-1)[:, 1:]
+    assert np.allclose(bones, np.linalg.norm(REST_OFFSETS, axis=-1)[1:], atol=2e-3)
+
+
+def test_a_joint_that_is_known_pulls_those_above_it_that_are_not() -> None:
+    positions = waving(60)
+    seen = positions.copy()
+    seen[:, J["left_elbow"]] = np.nan
+    done = complete(LiveCompleter.load("default"), seen, REST_OFFSETS)
+    for joint in ("left_elbow", "left_wrist"):
+        length = np.linalg.norm(done.positions[:, J[joint]] - done.positions[:, PARENTS[J[joint]]], axis=-1)
+        assert np.abs(length - np.linalg.norm(REST_OFFSETS[J[joint]])).max() < 0.025
+    assert np.array_equal(done.positions[:, J["left_wrist"]], positions[:, J["left_wrist"]])
+
+
+def test_a_second_opinion_counts_where_a_part_is_hidden_and_nowhere_else() -> None:
+    positions = waving(70)
+    completer = LiveCompleter.load("default")
+    both = PartsCompleter(completer)
+    seen = positions.copy()
+    seen[20:40] = np.nan
+    assert np.array_equal(both(seen[None], REST_OFFSETS[None])[0], completer(seen[None], REST_OFFSETS[None])[0])
+    seen[:, LEGS] = np.nan
+    rotations, root = both(seen[None], REST_OFFSETS[None])
+    alone, _ = completer(seen[None], REST_OFFSETS[None])
+    legs = [J["left_hip"], J["right_hip"], J["left_knee"], J["right_knee"]]
+    assert np.abs(rotations - alone)[0, :20][:, legs].max() > 1e-3
+    upper = [J["left_elbow"], J["right_elbow"], J["neck"]]
+    assert np.allclose(rotations[0, 20:40][:, upper], alone[0, 20:40][:, upper], atol=1e-3)
+    known = np.isfinite(seen).all(axis=-1)
+    placed = place_joints(rotations[0], REST_OFFSETS) + root[0][:, None]
+    assert np.abs(placed - positions)[known].max() < 0.01
+
+
+def test_what_is_far_from_all_that_is_known_is_not_made_up() -> None:
+    positions = waving(300)
+    seen = positions.copy()
+    seen[100:] = np.nan
+    done = complete(Oracle(positions), seen, REST_OFFSETS)
+    assert np.isfinite(done.positions[: 100 + LONGEST_GAP]).all()
+    assert np.isnan(done.positions[100 + LONGEST_GAP :]).all()
+    with pytest.raises(ValueError, match="at least one frame"):
+        complete(Oracle(positions), np.full((30, 22, 3), np.nan), REST_OFFSETS)
+
+
+def test_doubt_grows_from_what_is_known() -> None:
+    known = np.random.default_rng(0).random((40, 3)) < 0.2
+    known[:, 2] = False
+    apart = frames_apart(known)
+    for t, k in np.ndindex(known.shape):
+        rows = np.flatnonzero(known[:, k])
+        assert apart[t, k] == (np.abs(rows - t).min() if len(rows) else np.inf)
+    given_ = waving(60)
+    given_[20:40, 18], given_[:, 20] = np.nan, np.nan
+    sigma = Uncertainty((0.1,) * 22, 10.0).of(given_)
+    assert (np.diff(sigma[19:30, 18]) > 0).all()
+    assert np.allclose(sigma[:, 20], 0.1, atol=1e-3)
+    assert (sigma[:19, 18] < 0.01).all()
+
+
+class Walks:
+    """A network that says that everybody walks forward at 1 m/s."""
+
+    class config:
+        context = 5
+
+    def __call__(self, joints: np.ndarray) -> object:
+        class Said:
+            velocity = np.tile(np.array([1.0, 0.0, 0.0], np.float32), (len(joints), 1))
+
+        return Said
+
+
+def test_a_way_is_read_from_motion_and_meets_its_ends() -> None:
+    positions = waving(61)
+    centred = positions - positions[:, :1]
+    assert is_root_centred(centred)
+    assert not is_root_centred(positions)
+    assert not is_root_centred(np.repeat(centred[:1], 61, axis=0)), "nothing moves at all"
+    facing = np.tile(np.eye(3), (61, 1, 1))
+    way = root_path(Walks(), centred, facing)  # type: ignore[arg-type]
+    assert np.allclose(way[-1, :2], [2.0, 0.0], atol=1e-6)
+    assert np.allclose((centred + way[:, None])[..., 2].min(axis=1), 0.02, atol=0.06)
+    ends = np.full((61, 3), np.nan)
+    ends[0], ends[-1] = 0.0, [2.0, 1.0, 0.0]
+    met = bridge(Walks(), centred, facing, ends)  # type: ignore[arg-type]
+    assert np.allclose(met[[0, -1]], ends[[0, -1]])
+    assert np.allclose(met[30], [1.0, 0.5, 0.0])

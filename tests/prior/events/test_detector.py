@@ -1,0 +1,273 @@
+"""Each event begins when a body does that, and no sooner, no later, and not when its joints are too uncertain."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import Event, EventKind, Hand, JointState, Phase, PoseWorld, Tracking, WorldBody
+from steadypose.prior.body.skeleton import REST_POSITIONS, J
+from steadypose.prior.events.detector import EventDetector
+from steadypose.prior.events.settings import EventSettings
+from steadypose.prior.events.trigger import Trigger
+from steadypose.prior.events.wave import Wave
+
+FRAME_NS = 33_333_333
+START_NS = 1_000_000_000
+Pose = NDArray[np.float64]
+
+
+def standing(x: float = 2.5) -> Pose:
+    """(22, 3) upright at (x, 0), facing the sensor at the origin, arms hanging."""
+    p = REST_POSITIONS * [-1.0, -1.0, 1.0]
+    for side in ("left", "right"):
+        for joint, drop in (("elbow", 0.27), ("wrist", 0.52)):
+            p[J[f"{side}_{joint}"]] = p[J[f"{side}_shoulder"]] - [0.0, 0.0, drop]
+    return p + [x, 0.0, 0.96]
+
+
+def raised(p: Pose, side: str = "right", swing: float = 0.0) -> Pose:
+    """A hand up beside the head, the forearm turned to the side by ``swing`` radians."""
+    p = p.copy()
+    shoulder, out = p[J[f"{side}_shoulder"]], 1.0 if side == "right" else -1.0
+    p[J[f"{side}_elbow"]] = shoulder + [0.0, 0.2 * out, -0.05]
+    p[J[f"{side}_wrist"]] = p[J[f"{side}_elbow"]] + 0.26 * np.array([0.0, np.sin(swing), np.cos(swing)])
+    return p
+
+
+def sitting() -> Pose:
+    p = standing()
+    p[:, 2] -= 0.42
+    for side in ("left", "right"):
+        for joint, at in (("knee", (-0.41, -0.05)), ("ankle", (-0.41, -0.45)), ("foot", (-0.54, -0.5))):
+            hip = p[J[f"{side}_hip"]]
+            p[J[f"{side}_{joint}"]] = hip + [at[0], 0.0, at[1]]
+    return p
+
+
+def tipped(angle: float) -> Pose:
+    """A standing body, rotated about its feet."""
+    p = standing() - [2.5, 0.0, 0.0]
+    c, s = np.cos(angle), np.sin(angle)
+    return p @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]).T + [2.5, 0.0, 0.1 * s]
+
+
+def pointing() -> Pose:
+    p = standing()
+    shoulder = p[J["right_shoulder"]]
+    along = np.array([-1.0, 0.0, 0.0])
+    p[J["right_elbow"]], p[J["right_wrist"]] = shoulder + 0.27 * along, shoulder + 0.52 * along
+    return p
+
+
+def message(index: int, *poses: Pose, sigma: float = 0.01, tracking: Tracking = Tracking.OK) -> PoseWorld:
+    bodies = [
+        WorldBody(
+            id=k,
+            root_position=p[0],
+            root_orientation=np.array([0.0, 0.0, 1.0, 0.0]),
+            root_velocity=np.zeros(3),
+            covariance=np.eye(6) * sigma**2,
+            positions=p,
+            rotations=np.tile([0.0, 0.0, 0.0, 1.0], (22, 1)),
+            state=np.where(np.isfinite(p).all(axis=1), JointState.SEEN, JointState.UNKNOWN),
+            sigma=np.full(22, sigma),
+            contacts=np.zeros(8),
+            tracking=tracking,
+        )
+        for k, p in enumerate(poses)
+    ]
+    return PoseWorld(START_NS + index * FRAME_NS, "world", "test", np.array([0.0, 0.0, 1.0, 0.0]), bodies)
+
+
+def changes(poses: Iterable[Pose], sigma: float = 0.01) -> list[tuple[int, EventKind, Hand, Phase]]:
+    """What begins and ends, with the frame."""
+    detector = EventDetector()
+    return [
+        (index, event.kind, event.hand, event.phase)
+        for index, pose in enumerate(poses)
+        for event in detector.update(message(index, pose, sigma=sigma))
+        if event.phase != Phase.HOLDS
+    ]
+
+
+def first(found: list[tuple[int, EventKind, Hand, Phase]], kind: EventKind, phase: Phase = Phase.BEGINS) -> int | None:
+    return next((index for index, k, _, p in found if (k, p) == (kind, phase)), None)
+
+
+STILL = [standing()] * 20
+
+
+@pytest.mark.parametrize(
+    ("pose", "kind", "hand"),
+    [
+        (raised(standing()), EventKind.HAND_RAISED, Hand.RIGHT),
+        (raised(standing(), "left"), EventKind.HAND_RAISED, Hand.LEFT),
+        (sitting(), EventKind.SITS, Hand.NONE),
+        (pointing(), EventKind.POINTS, Hand.RIGHT),
+        (standing(0.9), EventKind.NEAR, Hand.NONE),
+    ],
+)
+def test_a_pose_begins_one_event_within_a_third_of_a_second_and_ends_it(
+    pose: Pose, kind: EventKind, hand: Hand
+) -> None:
+    found = changes([*STILL, *[pose] * 20, *STILL])
+    others = {EventKind.ENTERED, EventKind.STANDS, EventKind.FACES_SENSOR}
+    assert {(k, h) for _, k, h, _ in found if k not in others} == {(kind, hand)}
+    begins, ends = first(found, kind), first(found, kind, Phase.ENDS)
+    assert begins is not None
+    assert ends is not None
+    assert 20 < begins <= 30
+    assert 40 < ends <= 45
+
+
+def test_a_hand_swung_from_side_to_side_waves_and_one_that_is_only_raised_does_not() -> None:
+    swings = [raised(standing(), swing=0.5 * np.sin(2 * np.pi * 1.5 * k / 30)) for k in range(45)]
+    found = changes([*STILL, *[raised(standing())] * 5, *swings, *[raised(standing())] * 40])
+    begins, ends = first(found, EventKind.WAVES), first(found, EventKind.WAVES, Phase.ENDS)
+    assert begins is not None
+    assert begins - 25 <= 15
+    assert ends is not None
+    assert first(changes([*STILL, *[raised(standing())] * 60]), EventKind.WAVES) is None
+
+
+def test_who_topples_fell_and_who_lies_down_slowly_did_not() -> None:
+    fast = changes([*STILL, *(tipped(a) for a in np.linspace(0, np.pi / 2, 15)), *[tipped(np.pi / 2)] * 20, *STILL])
+    slow = changes([*STILL, *(tipped(a) for a in np.linspace(0, np.pi / 2, 120)), *[tipped(np.pi / 2)] * 20])
+    for found in (fast, slow):
+        assert first(found, EventKind.LIES) is not None
+        assert first(found, EventKind.STANDS, Phase.ENDS) is not None
+    assert first(fast, EventKind.FELL) is not None
+    assert first(fast, EventKind.FELL, Phase.ENDS) is not None
+    assert first(slow, EventKind.FELL) is None
+
+
+def test_one_enters_after_a_while_and_leaves_after_another() -> None:
+    detector, s = EventDetector(), EventSettings()
+    found: list[tuple[int, Event]] = []
+    for index in range(60):
+        there = [standing()] if 10 <= index < 40 else []
+        found += [(index, event) for event in detector.update(message(index, *there)) if event.phase != Phase.HOLDS]
+    kinds = [(index, event.kind) for index, event in found if event.kind in (EventKind.ENTERED, EventKind.LEFT)]
+    assert [kind for _, kind in kinds] == [EventKind.ENTERED, EventKind.LEFT]
+    assert kinds[0][0] == 10 + round(s.entered * 30 + 0.5)
+    assert kinds[1][0] == 39 + round(s.left * 30 + 1)
+    # nothing before it has entered, and nothing that holds of somebody who has left
+    assert min(index for index, _ in found) == kinds[0][0]
+    assert {e.kind for i, e in found if i == kinds[1][0] and e.phase == Phase.ENDS} == {
+        EventKind.STANDS, EventKind.FACES_SENSOR,
+    }  # fmt: skip
+
+
+def test_a_glimpse_of_a_body_is_nobody() -> None:
+    assert changes([standing()] * 3) == []
+
+
+def test_a_body_that_is_lost_has_left() -> None:
+    detector = EventDetector()
+    for index in range(20):
+        detector.update(message(index, standing()))
+    events = [e.kind for i in range(20, 40) for e in detector.update(message(i, standing(), tracking=Tracking.LOST))]
+    assert EventKind.LEFT in events
+
+
+def test_joints_that_may_be_anywhere_begin_nothing() -> None:
+    poses = [*STILL, *[raised(standing())] * 20]
+    assert first(changes(poses, sigma=0.01), EventKind.HAND_RAISED) is not None
+    assert first(changes(poses, sigma=0.5), EventKind.HAND_RAISED) is None
+
+
+def test_joints_that_are_not_known_neither_begin_nor_end_anything() -> None:
+    blind = raised(standing())
+    blind[J["right_wrist"]] = np.nan
+    found = changes([*STILL, *[raised(standing())] * 20, *[blind] * 20])
+    assert first(found, EventKind.HAND_RAISED) is not None
+    assert first(found, EventKind.HAND_RAISED, Phase.ENDS) is None
+    assert changes([*STILL, *[np.full((22, 3), np.nan)] * 10])[-1][0] < 20
+
+
+def test_who_points_points_from_the_head_through_the_wrist() -> None:
+    detector, direction = EventDetector(), None
+    for index, pose in enumerate([*STILL, *[pointing()] * 20]):
+        for event in detector.update(message(index, pose)):
+            if event.kind == EventKind.POINTS:
+                direction = event.direction
+    expected = pointing()[J["right_wrist"]] - pointing()[J["head"]]
+    assert direction is not None
+    np.testing.assert_allclose(direction, expected / np.linalg.norm(expected), atol=1e-6)
+
+
+def test_the_sensor_that_is_faced_is_where_it_is_said_to_be() -> None:
+    def faces(sensor: list[float]) -> bool:
+        detector = EventDetector()
+        events = [e for i in range(20) for e in detector.update(message(i, standing()), np.array(sensor))]
+        return any(event.kind == EventKind.FACES_SENSOR for event in events)
+
+    assert faces([0.0, 0.0, 1.0])
+    assert not faces([5.0, 0.0, 1.0])
+
+
+def test_confidence_falls_with_the_deviations() -> None:
+    def confidence(sigma: float) -> float:
+        detector = EventDetector()
+        events = [e for i in range(40) for e in detector.update(message(i, raised(standing()), sigma=sigma))]
+        return next(e.confidence for e in reversed(events) if e.kind == EventKind.HAND_RAISED)
+
+    assert 0.5 < confidence(0.06) < confidence(0.01) <= 1.0
+
+
+def test_what_holds_is_told_with_every_message_and_since_when() -> None:
+    detector = EventDetector()
+    events = [detector.update(message(i, standing())) for i in range(30)]
+    stands = [e for told in events for e in told if e.kind == EventKind.STANDS]
+    assert [e.phase for e in stands[:2]] == [Phase.BEGINS, Phase.HOLDS]
+    assert {e.since_ns for e in stands} == {START_NS}
+
+
+def test_a_stream_that_begins_anew_begins_with_nobody() -> None:
+    detector = EventDetector()
+    for index in range(20):
+        detector.update(message(index, standing()))
+    again = [[e.kind for e in detector.update(message(i, standing()))] for i in range(10)]
+    assert again[0] == []
+    assert any(EventKind.ENTERED in kinds for kinds in again)
+
+
+@given(st.lists(st.floats(-2.0, 2.0) | st.just(float("nan")), max_size=60), st.floats(0.0, 0.5))
+@settings(max_examples=100, deadline=None)
+def test_a_trigger_begins_above_its_threshold_only_and_ends_below_the_other_only(
+    values: list[float], sigma: float
+) -> None:
+    trigger = Trigger(on=0.5, margin=0.4, hold_s=0.05, confidence=0.7)
+    for index, value in enumerate(values):
+        before = trigger.active
+        if trigger.update(index * FRAME_NS, value, sigma):
+            assert trigger.active is not before
+            assert value > 0.5 if trigger.active else value < 0.1
+        else:
+            assert trigger.active is before
+        assert 0.0 <= trigger.confidence <= 1.0
+
+
+def test_a_value_between_both_thresholds_never_flickers() -> None:
+    trigger = Trigger(on=0.5, margin=0.4, hold_s=0.05, confidence=0.7)
+    values = [1.0] * 5 + [0.45, 0.3, 0.2] * 20
+    assert sum(trigger.update(i * FRAME_NS, v, 0.01) for i, v in enumerate(values)) == 1
+
+
+@pytest.mark.parametrize("course", [lambda t: 0.2 * t, lambda t: 0.1 * np.sin(9 * t), lambda t: 1.0 if t > 1 else 0.0])
+def test_a_forearm_that_does_not_swing_does_not_wave(course: Callable[[float], float]) -> None:
+    wave = Wave(0.28, 0.8)
+    assert not any(wave.update(k * FRAME_NS, course(k / 30), True) for k in range(90))
+
+
+@pytest.mark.parametrize(("name", "value"), [("near", -1.0), ("hold", 61.0), ("confidence", 0.4)])
+def test_a_threshold_that_cannot_be_is_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        dataclasses.replace(EventSettings(), **{name: value})

@@ -1,0 +1,164 @@
+"""Fits of simulated people, with the weights that ship."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from steadypose.benchmarks.motion import MotionClips, simulated_clips
+from steadypose.benchmarks.studies.humor_fits import fitted, pictures, seen_joints, start_of
+from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS, limbs
+from steadypose.prior.fit import windows
+from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
+from steadypose.prior.fit.observations import POINT_SHARE, SurfacePoints
+from steadypose.prior.fit.solve import STIFFNESS, FitSettings, fit_window, preconditioner
+from steadypose.prior.fit.torch_weights import load_network
+from steadypose.prior.fit.windows import Track, fit_track, window_bounds
+
+NOISE = 0.03
+BRIEF = FitSettings(root_steps=10, pose_steps=20, motion_steps=30)
+
+
+@pytest.fixture(scope="module")
+def model() -> HumorNet:
+    return load_network(HumorNet, HumorConfig.from_dict, "default", "humor")
+
+
+@pytest.fixture(scope="module")
+def clips() -> MotionClips:
+    return simulated_clips(45, 6, seed=3).farthest(1)
+
+
+@pytest.fixture(scope="module")
+def truth(clips: MotionClips) -> np.ndarray:
+    return clips.positions[:, 0]
+
+
+def error(said: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.linalg.norm(said - truth, axis=-1).mean())
+
+
+def test_a_simulated_motion_is_found_under_noise(model: HumorNet, truth: np.ndarray) -> None:
+    seen = truth + NOISE * np.random.default_rng(0).standard_normal(truth.shape)
+    smooth = gaussian_filter1d(seen, 3.0, axis=0, mode="nearest")
+    found = fitted(model, [start_of(smooth)], seen_joints(seen), 3, BRIEF)
+    assert error(found.joints, truth) < 0.5 * error(seen, truth)
+    assert error(found.joints, truth) < 0.9 * error(smooth, truth)
+    assert found.load is not None
+    assert found.load.shape == (len(truth), 8)
+    lengths = np.linalg.norm(found.joints[:, 4] - found.joints[:, 1], axis=-1)
+    np.testing.assert_allclose(lengths, lengths[0], atol=1e-4)
+
+
+def test_legs_that_are_hidden_for_a_while_go_on(model: HumorNet, truth: np.ndarray) -> None:
+    leg = limbs(("knee", "ankle", "foot"))[0]
+    seen, start = truth.copy(), truth.copy()
+    seen[15:30, leg] = np.nan
+    start[15:30, leg] = start[14, leg]  # as a sensor that holds what it lost
+    found = fitted(model, [start_of(start)], seen_joints(seen), 3, BRIEF)
+    assert error(found.joints[15:30, leg], truth[15:30, leg]) < 0.7 * error(start[15:30, leg], truth[15:30, leg])
+
+
+def test_key_points_and_depth_find_the_motion_again(model: HumorNet, clips: MotionClips) -> None:
+    taken = pictures(clips, 0, np.random.default_rng(0))
+    flat, deep = (fitted(model, track.starts, track.observed, 2, BRIEF) for track in (taken.flat, taken.deep))
+    assert error(flat.joints, taken.truth) < 0.3
+    assert error(deep.joints, taken.truth) < min(0.1, error(flat.joints, taken.truth))
+
+
+def test_points_do_no_harm_to_joints_that_are_seen(model: HumorNet, clips: MotionClips) -> None:
+    taken = pictures(clips, 0, np.random.default_rng(0))
+    surface = next(term for term in taken.deep.observed if isinstance(term, SurfacePoints))
+    seen = taken.truth + NOISE * np.random.default_rng(0).standard_normal(taken.truth.shape)
+    start = start_of(gaussian_filter1d(seen, 3.0, axis=0, mode="nearest"))
+
+    def off(weight: float) -> float:
+        observed = [*seen_joints(seen), replace(surface, weight=weight)]
+        return error(fitted(model, [start], observed, 2, BRIEF).joints, taken.truth)
+
+    assert off(POINT_SHARE) < 1.05 * off(0.0) < off(1.0)
+
+
+def test_each_stage_lowers_its_energy(model: HumorNet, truth: np.ndarray) -> None:
+    seen = truth + NOISE * np.random.default_rng(1).standard_normal(truth.shape)
+    start, observed = start_of(seen), seen_joints(seen)
+    idle = FitSettings(root_steps=0, pose_steps=0, motion_steps=0)
+    before = fit_window(model, start, observed, idle).energies
+    after = fit_window(model, start, observed, BRIEF).energies
+    assert all(a < b for a, b in zip(after, before, strict=True))
+
+
+@pytest.mark.parametrize("frames", [8, 90, 91, 165, 400])
+def test_windows_cover_all_and_overlap(frames: int) -> None:
+    bounds = window_bounds(frames)
+    assert bounds[0][0] == 0
+    assert bounds[-1][1] == frames
+    for (_, end), (first, last) in pairwise(bounds):
+        assert end - first >= windows.OVERLAP
+        assert last - first == windows.FRAMES
+
+
+def test_a_long_track_is_one_motion_and_done_windows_are_not_done_again(
+    model: HumorNet, truth: np.ndarray, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr(windows, "FRAMES", 20)
+    monkeypatch.setattr(windows, "OVERLAP", 5)
+    seen = truth[:35] + 0.01 * np.random.default_rng(0).standard_normal(truth[:35].shape)
+    track = Track([start_of(seen)], seen_joints(seen))
+    calls: list[int] = []
+    whole = windows.fit_window
+
+    def counted(*arguments, **options):
+        calls.append(1)
+        return whole(*arguments, **options)
+
+    monkeypatch.setattr(windows, "fit_window", counted)
+    brief = FitSettings(root_steps=0, pose_steps=10, motion_steps=10)
+    first = fit_track(model, track, brief, tmp_path)
+    assert len(calls) == len(window_bounds(35)) == len(list(tmp_path.glob("*.npz")))
+    again = fit_track(model, track, brief, tmp_path)
+    assert len(calls) == len(window_bounds(35))
+    np.testing.assert_array_equal(first.joints, again.joints)
+    assert first.joints.shape == (35, 22, 3)
+    steps = np.linalg.norm(np.diff(first.joints, axis=0), axis=-1)
+    true = np.linalg.norm(np.diff(truth[:35], axis=0), axis=-1)
+    assert steps.max() < 3 * true.max(), "windows meet without a jump"
+    sorted(tmp_path.glob("*.npz"))[-1].unlink()
+    fit_track(model, track, brief, tmp_path)
+    assert len(calls) == len(window_bounds(35)) + 1
+
+
+def test_poses_move_as_what_is_smooth_does() -> None:
+    root = preconditioner(20)
+    second = torch.eye(20, dtype=torch.float64).diff(n=2, dim=0)
+    held = torch.eye(20, dtype=torch.float64) + STIFFNESS * second.mT @ second
+    torch.testing.assert_close(root @ held @ root, torch.eye(20, dtype=torch.float64))
+    line = torch.arange(20, dtype=torch.float64)
+    torch.testing.assert_close(root @ line, line)  # what does not accelerate is not held
+
+
+def test_somebody_at_rest_stays_at_rest(model: HumorNet) -> None:
+    from steadypose.prior.body.skeleton import REST_POSITIONS
+
+    still = np.repeat((REST_POSITIONS - [0.0, 0.0, REST_POSITIONS[:, 2].min() - 0.015])[None], 20, axis=0)
+    found = fitted(model, [start_of(still)], seen_joints(still), 3, BRIEF)
+    assert error(found.joints, still) < 0.02
+    assert torch.isfinite(torch.from_numpy(found.joints)).all()
+    assert found.joints.shape[1] == len(REST_OFFSETS)
+
+
+def test_who_lies_moves_no_floor(model: HumorNet) -> None:
+    for turned, moves in ((np.pi / 2, False), (0.0, True)):
+        positions = np.tile(REST_POSITIONS, (12, 1, 1)) @ Rotation.from_rotvec([0.0, turned, 0.0]).as_matrix().T
+        positions += [0.0, 0.0, 0.05 - positions[..., 2].min()]
+        start = replace(start_of(positions), ground_known=False)
+        brief = FitSettings(root_steps=0, pose_steps=10, motion_steps=20)
+        found = fit_track(model, Track([start], seen_joints(positions)), brief)
+        assert found.ground.any() == moves

@@ -1,0 +1,121 @@
+"""Where fits to key points of a picture start."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from steadypose.prior.body.inverse_kinematics import place_joints
+from steadypose.prior.body.kinematics import yaw_matrix
+from steadypose.prior.body.skeleton import REST_OFFSETS, J
+from steadypose.prior.fit.lift import lift, starts_of_key_points
+from steadypose.prior.fit.observations import Pinhole
+from steadypose.prior.fit.solve import Start
+
+FRAMES, HEIGHT = 40, 1.3
+OPTICAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+TOES = [J["left_foot"], J["right_foot"]]
+
+
+def camera() -> Pinhole:
+    return Pinhole(
+        torch.tensor([900.0, 900.0]), torch.tensor([640.0, 360.0]), torch.from_numpy(OPTICAL).float(), torch.zeros(3)
+    )
+
+
+def person(yaw: float, size: float = 1.0) -> np.ndarray:
+    """(T, 22, 3) somebody who stands in the rest pose, 4 m away, with both feet on the floor."""
+    offsets = REST_OFFSETS * size
+    rotations = np.tile(np.eye(3), (FRAMES, 22, 1, 1))
+    rotations[:, 0] = yaw_matrix(np.full(FRAMES, yaw))
+    joints = place_joints(rotations, offsets)
+    floor = joints[0, TOES, 2].min() - 0.015
+    return joints + np.array([0.1, 4.0, -HEIGHT - floor])
+
+
+def pixels(joints: np.ndarray) -> np.ndarray:
+    return camera().project(torch.from_numpy(joints).float()).double().numpy()
+
+
+def joints_of(start: Start) -> np.ndarray:
+    placed = place_joints(start.rotations.double().numpy(), start.offsets.double().numpy())
+    return placed + start.root.double().numpy()[:, None]
+
+
+def off(start: Start, truth: np.ndarray) -> float:
+    """Metres, but for the arms, which start downwards."""
+    error = np.linalg.norm(joints_of(start) - truth, axis=-1)
+    return float(
+        np.delete(error, [J[f"{s}_{p}"] for s in ("left", "right") for p in ("elbow", "wrist")], axis=1).mean()
+    )
+
+
+@pytest.mark.parametrize("yaw", [-1.2, -0.4, 0.3, 1.3, 2.4])
+def test_toes_say_which_side_is_the_far_one(yaw: float) -> None:
+    truth = person(yaw)
+    told = pixels(truth)
+    (start,) = starts_of_key_points(told, camera(), REST_OFFSETS, -HEIGHT, floor_known=True)
+    assert off(start, truth) < 0.25
+    told[:, TOES] = np.nan
+    starts = starts_of_key_points(told, camera(), REST_OFFSETS, -HEIGHT, floor_known=True)
+    assert len(starts) == 2
+    assert min(off(start, truth) for start in starts) < 0.25
+
+
+@pytest.mark.parametrize("size", [0.7, 1.0, 1.1])
+def test_a_known_floor_says_how_large_somebody_is(size: float) -> None:
+    truth = person(0.2, size)
+    known, guessed = (
+        starts_of_key_points(pixels(truth), camera(), REST_OFFSETS, -HEIGHT, floor_known=known)[0]
+        for known in (True, False)
+    )
+    height = np.abs(known.offsets.numpy()[:, 2]).sum() / np.abs(REST_OFFSETS[:, 2]).sum()
+    assert height == pytest.approx(size, rel=0.1)
+    assert known.root[:, 1].mean() == pytest.approx(4.0, abs=0.25)
+    np.testing.assert_allclose(guessed.offsets.numpy(), REST_OFFSETS, atol=1e-6)
+
+
+@pytest.mark.parametrize("floor", [-0.4, -4.0, 0.5])
+def test_a_floor_on_which_nobody_can_stand_is_not_believed(floor: float) -> None:
+    told = pixels(person(0.2))
+    (start,) = starts_of_key_points(told, camera(), REST_OFFSETS, floor, floor_known=True)
+    np.testing.assert_allclose(start.offsets.numpy(), REST_OFFSETS, atol=1e-6)
+
+
+def test_without_feet_bones_say_how_far_somebody_is() -> None:
+    truth = person(0.2)
+    told = pixels(truth)
+    told[:, [J[f"{side}_{part}"] for side in ("left", "right") for part in ("ankle", "foot")]] = np.nan
+    starts = starts_of_key_points(told, camera(), REST_OFFSETS, -HEIGHT, floor_known=True)
+    assert min(off(start, truth) for start in starts) < 0.4
+
+
+def test_a_step_is_no_walk_to_the_horizon() -> None:
+    truth = person(0.2)
+    truth[15:20] += [0.0, 0.0, 0.4]  # a jump: rays through feet in the air meet the floor far behind
+    (start,) = starts_of_key_points(pixels(truth), camera(), REST_OFFSETS, -HEIGHT, floor_known=True)
+    assert start.root[:, 1].max() < 4.5
+
+
+def test_key_points_are_as_deep_as_the_surface_about_them() -> None:
+    truth = person(0.2)
+    rng = np.random.default_rng(0)
+    points = np.repeat(truth, 4, axis=1) + 0.01 * rng.standard_normal((FRAMES, 88, 3)) - [0.0, 0.05, 0.0]
+    points[:, ::3] = np.nan
+    points[0] = np.nan
+    told = pixels(truth)
+    told[5, 4] = np.nan
+    found = lift(told, camera(), points)
+    assert np.isnan(found[0]).all()
+    assert np.isnan(found[5, 4]).all()
+    error = np.linalg.norm(found - truth, axis=-1)
+    assert np.isfinite(error[1:]).mean() > 0.95
+    assert np.nanpercentile(error, 90) < 0.1
+
+
+def test_points_behind_the_camera_or_beside_the_body_say_nothing() -> None:
+    truth = person(0.2)
+    behind, beside = -truth[:, :3], truth[:, :3] + [1.5, 0.0, 0.0]
+    for points in (np.concatenate([behind, beside], axis=1), np.empty((FRAMES, 0, 3))):
+        assert np.isnan(lift(pixels(truth), camera(), points)).all()

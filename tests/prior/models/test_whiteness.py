@@ -1,0 +1,55 @@
+"""Whiteness of noise is read from bones, so that it is that of the sensor and not of the motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.helpers.bodies import waving
+
+from steadypose.prior.models.mixture.whiteness import FALLBACK, Whiteness
+
+FRAMES, SIGMA = 90, 0.01
+
+
+def lasting(shape: tuple[int, ...], seconds: float) -> NDArray[np.float64]:
+    noise, kept = np.random.default_rng(0).standard_normal(shape), np.exp(-1 / (30 * seconds)) if seconds else 0.0
+    for t in range(1, len(noise)):
+        noise[t] = kept * noise[t - 1] + np.sqrt(1 - kept**2) * noise[t]
+    return SIGMA * noise
+
+
+def whiteness_of(positions: NDArray[np.float64]) -> float:
+    whiteness = Whiteness(1)
+    return float([whiteness.update(frame[None]) for frame in positions][-1][0])
+
+
+@pytest.mark.parametrize(("seconds", "least", "most"), [(0.0, 0.7, 1.0), (0.5, 0.0, 0.2), (2.0, 0.0, 0.1)])
+def test_noise_that_lasts_is_told_from_noise_that_does_not(seconds: float, least: float, most: float) -> None:
+    truth = waving(FRAMES)
+    assert least < whiteness_of(truth + lasting(truth.shape, seconds)) < most
+
+
+def test_motion_without_noise_is_not_white() -> None:
+    assert whiteness_of(waving(FRAMES)) == 0.0
+
+
+def test_missing_joints_and_a_forgotten_body_count_for_nothing() -> None:
+    seen = waving(FRAMES) + lasting((FRAMES, 22, 3), 0.0)
+    seen[::3, 5:12] = np.nan
+    assert 0.6 < whiteness_of(seen) < 1.0
+    whiteness = Whiteness(2)
+    for frame in seen:
+        whiteness.update(np.stack([frame, frame]))
+    whiteness.forget(np.array([True, False]))
+    first, second = whiteness.update(np.stack([seen[0], seen[0]]))
+    assert first == 0.0
+    assert second > 0.6
+
+
+def test_the_share_rises_with_the_square_and_is_at_most_all() -> None:
+    seen = waving(FRAMES) + lasting((FRAMES, 22, 3), 0.0)
+    one, other = Whiteness(1), Whiteness(1)
+    for frame in seen:
+        white, share = one.update(frame[None])[0], other.fallback(frame[None])[0]
+        assert share == pytest.approx(min(1.0, FALLBACK * white**2))

@@ -1,0 +1,141 @@
+"""Compiled loops on disk: found again, and compiled anew whatever became of the files."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from numba.core import event
+
+from steadypose.prior import loop_cache
+from steadypose.prior.compiled import njit
+
+ADDED = 2.0
+
+
+def add(x):
+    return x + ADDED
+
+
+def add_more(x):
+    return x + ADDED + 1
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Where entries are kept for this test."""
+    loop_cache.writable.cache_clear()
+    loop_cache.announce.cache_clear()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.delenv("STEADYPOSE_UNCACHED", raising=False)
+    yield loop_cache.folders()[0]
+    loop_cache.writable.cache_clear()
+
+
+def compiles(work: Callable[[], Any]) -> int:
+    """How many functions numba compiles for this."""
+    with event.install_recorder("numba:compile") as recorded:
+        work()
+    return sum(made.is_start for _, made in recorded.buffer)
+
+
+def entry(folder: Path) -> Path:
+    (file,) = folder.iterdir()
+    return file
+
+
+def test_what_one_has_compiled_another_loads(folder: Path) -> None:
+    assert compiles(lambda: njit(cache=True)(add)(1.0)) == 1
+    again = njit(cache=True)(add)
+    assert compiles(lambda: again(1.0)) == 0
+    assert again(1.0) == 3.0
+    assert entry(folder).stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: b"",
+        lambda data: data[:-1],
+        lambda data: bytes(len(data)),
+        lambda data: data[:-9] + b"x" + data[-8:],
+    ],
+    ids=["empty", "cut off", "zeros", "a byte"],
+)
+def test_a_damaged_entry_is_compiled_anew(folder: Path, damage: Callable[[bytes], bytes]) -> None:
+    njit(cache=True)(add)(1.0)
+    whole = entry(folder).read_bytes()
+    entry(folder).write_bytes(damage(whole))
+    assert njit(cache=True)(add)(1.0) == 3.0
+    assert compiles(lambda: njit(cache=True)(add)(1.0)) == 0
+
+
+def test_the_doctor_removes_what_is_damaged_and_the_mark_that_all_is_there(folder: Path) -> None:
+    njit(cache=True)(add)(1.0)
+    loop_cache.mark_complete(folder, set())
+    assert loop_cache.is_complete()
+    assert loop_cache.remove_damaged() == 0
+    (damaged,) = (file for file in folder.iterdir() if file.name != loop_cache.COMPLETE)
+    damaged.write_bytes(b"")
+    assert loop_cache.remove_damaged() == 1
+    assert not loop_cache.is_complete()
+    assert not damaged.exists()
+
+
+def test_it_is_compiled_anew_when_anything_that_it_is_made_of_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def digest(function: Callable[..., Any], **options: Any) -> str:
+        return loop_cache.digest(njit(cache=True, **options)(function))
+
+    inner = njit(cache=True)(add)
+
+    def calls(x):
+        return inner(x)
+
+    first = digest(add), digest(calls)
+    assert first == (digest(add), digest(calls))
+    assert digest(add, fastmath=True) != first[0]
+    assert digest(add_more) != first[0]
+    monkeypatch.setitem(globals(), "ADDED", 3.0)
+    inner = njit(cache=True)(add)
+    assert digest(add) != first[0]
+    assert digest(calls) != first[1]
+
+
+def test_where_nothing_can_be_written_it_is_said_once_and_all_works(
+    tmp_path: Path, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "cache").write_text("in the way")
+    with caplog.at_level(logging.WARNING):
+        assert [njit(cache=True)(function)(1.0) for function in (add, add_more)] == [3.0, 4.0]
+    assert sum("cannot be kept" in line for line in caplog.messages) == 1
+    assert not loop_cache.is_complete()
+
+
+def test_a_folder_that_others_may_write_to_is_not_read(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    njit(cache=True)(add)(1.0)
+    folder.chmod(0o777)
+    loop_cache.writable.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        assert compiles(lambda: njit(cache=True)(add)(1.0)) == 1
+    assert "cannot be kept" in caplog.text
+
+
+def test_beside_the_package_first_then_in_the_users_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    beside, in_cache = loop_cache.folders()
+    assert beside.is_relative_to(loop_cache.PACKAGE)
+    assert in_cache.is_relative_to(tmp_path)
+
+
+def test_all_are_there_until_a_source_changes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    njit(cache=True)(add)(1.0)
+    kept = entry(folder)
+    loop_cache.mark_complete(folder, {kept.name})
+    assert loop_cache.is_complete()
+    assert kept.exists()
+    monkeypatch.setattr(loop_cache, "_sources", lambda: "others")
+    assert not loop_cache.is_complete()

@@ -1,0 +1,216 @@
+"""The body filter against a textbook Kalman filter, and what feet at rest do to it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, expm
+
+from steadypose.prior.body.kinematics import yaw_matrix
+from steadypose.prior.world.kalman import BodyFilter, BodyNoise
+
+DT = 1 / 30
+RESTS, SWINGS = np.ones(1), np.zeros(1)
+
+
+def at_origin(noise: BodyNoise, jitter: float, bias: float = 0.0) -> BodyFilter:
+    return BodyFilter(noise, np.zeros(3), jitter, bias, np.zeros(3), feet=1)
+
+
+def spring(rate: float, dt: float) -> NDArray[np.float64]:
+    """Of an error and its rate in units of ``rate``: x'' = -2 w x' - w² x."""
+    return np.asarray(expm(rate * dt * np.array([[0.0, 1.0], [-1.0, -2.0]])), dtype=np.float64)
+
+
+def diagonal(*blocks: Any) -> NDArray[np.float64]:
+    return np.asarray(block_diag(*blocks), dtype=np.float64)
+
+
+class Textbook:
+    """One axis, dense matrices."""
+
+    def __init__(self, noise: BodyNoise, position, jitter, bias, velocity, feet):
+        self.noise, self.feet = noise, feet
+        self.x = np.r_[position, velocity, np.zeros(3 + 3 * feet)]
+        self.p = np.diag([jitter**2 + bias**2, noise.first_speed**2, 1.0, 1.0, 1.0] + [0.0, 1.0, 1.0] * feet)
+        self.p[0, 2] = self.p[2, 0] = -bias
+
+    def predict(self, dt, load, rest, speed):
+        n = self.noise
+        root = spring(n.sensor_rate + speed / n.sensor_memory_m, dt)
+        foot = spring(n.sensor_rate, dt)
+        kept = np.exp(-dt / n.network_memory_s)
+        f = diagonal([[1, dt], [0, 1]], root, kept, *[diagonal(1, foot)] * self.feet)
+        a = (n.acceleration + n.acceleration_at_speed * speed) ** 2
+        q = [a * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(2) - root @ root.T, 1 - kept**2]
+        for bears, r in zip(load, rest, strict=True):
+            rolls = max(bears - r, 0.0)
+            slip = 1 + n.slip_at_speed * speed
+            walk = (slip * n.rest) ** (2 * r) * (slip * n.load) ** (2 * rolls) * n.swing ** (2 * (1 - r - rolls)) * dt
+            q += [walk, np.eye(2) - foot @ foot.T]
+        self.x, self.p = f @ self.x, f @ self.p @ f.T + diagonal(*q)
+
+    def correct(self, entries, z, sigma):
+        h = np.zeros(len(self.x))
+        h[list(entries)] = list(entries.values())
+        k = self.p @ h / (h @ self.p @ h + sigma**2)
+        self.x = self.x + k * (z - h @ self.x)
+        self.p = self.p - np.outer(k, h) @ self.p
+
+    def place(self, at, z, jitter, bias, from_root):
+        """A foot seen once is where it is seen, less two errors of its own: the limit of a vague prior."""
+        self.x[at : at + 3] = z + from_root * self.x[0], 0.0, 0.0
+        self.p[at : at + 3], self.p[:, at : at + 3] = 0.0, 0.0
+        self.p[at], self.p[:, at] = from_root * self.p[0], from_root * self.p[:, 0]
+        self.p[at, at] = from_root * self.p[0, 0] + jitter**2 + bias**2
+        self.p[at, at + 1] = self.p[at + 1, at] = -bias
+        self.p[at + 1, at + 1] = self.p[at + 2, at + 2] = 1.0
+
+
+def test_agrees_with_a_textbook_filter():
+    rng = np.random.default_rng(0)
+    start = rng.normal(size=3)
+    noise = BodyNoise(3.0, 2.0, sensor_rate=5.0, network_memory_s=0.2)
+    velocity = np.array([1.0, 0.2, 0.0])
+    ours = BodyFilter(noise, start, 0.02, 0.05, velocity, feet=2)
+    theirs = [Textbook(noise, start[a], 0.02, 0.05, velocity[a], feet=2) for a in range(3)]
+    for step in range(40):
+        load, rest = np.sort(rng.random((2, 2)), axis=0)[::-1]
+        speed = np.hypot(*ours.velocity[:2])
+        ours.predict(DT, load, rest)
+        seen, at_root, network, foot = rng.normal(size=(4, 3))
+        ours.observe_velocity(network, 0.1, 0.3)
+        if step < 20:
+            ours.observe_position(seen, 0.02, 0.05)
+        ours.observe_foot(0, foot, 0.01, 0.03, from_root=False)
+        ours.observe_foot(1, at_root, 0.01, 0.03, from_root=True)
+        for a, each in enumerate(theirs):
+            each.predict(DT, load, rest, speed)
+            each.correct({1: 1.0, 4: 0.3}, network[a], 0.1)
+            if step < 20:
+                each.correct({0: 1.0, 2: 0.05}, seen[a], 0.02)
+            if step == 0:
+                each.place(5, foot[a], 0.01, 0.03, from_root=0.0)
+                each.place(8, at_root[a], 0.01, 0.03, from_root=1.0)
+            else:
+                each.correct({5: 1.0, 6: 0.03}, foot[a], 0.01)
+                each.correct({8: 1.0, 9: 0.03, 0: -1.0}, at_root[a], 0.01)
+    for a, each in enumerate(theirs):
+        np.testing.assert_allclose([ours.position[a], ours.velocity[a]], each.x[:2], atol=1e-8)
+        np.testing.assert_allclose(ours.feet[:, a], each.x[[5, 8]], atol=1e-8)
+        np.testing.assert_allclose(ours.covariance[a::3, a::3], each.p[:2, :2], atol=1e-8)
+
+
+def test_a_slow_error_is_not_averaged_away():
+    """A root seen a hundred times is no better known than the sensor's slow error allows."""
+    f = at_origin(BodyNoise(acceleration=0.01, sensor_rate=0.02), jitter=0.02, bias=0.05)
+    for _ in range(100):
+        f.predict(DT, SWINGS, SWINGS)
+        f.observe_position(np.zeros(3), 0.02, bias=0.05)
+    assert (f.position_sigma > 0.045).all()
+
+
+def test_covariance_grows_while_nothing_is_measured():
+    f = at_origin(BodyNoise(), jitter=0.01)
+    spreads = []
+    for _ in range(30):
+        f.predict(DT, SWINGS, SWINGS)
+        spreads.append(f.position_sigma)
+    assert (np.diff(spreads, axis=0) > 0).all()
+
+
+def test_a_foot_at_rest_stays_while_the_sensor_has_it_wander():
+    f = at_origin(BodyNoise(), jitter=0.02)
+    places, seen = [], []
+    for step in range(60):
+        seen.append(np.array([0.02 * np.sin(step / 6), 0.0, 0.0]))
+        f.predict(DT, RESTS, RESTS)
+        f.observe_foot(0, seen[-1], 0.002, 0.02, from_root=False)
+        places.append(f.feet[0])
+    wandered, moved = (np.abs(np.diff(p, axis=0)).sum() for p in (seen, places))
+    assert moved < 0.4 * wandered
+
+
+def test_a_foot_in_the_air_is_where_it_is_seen():
+    """And what was learned of the sensor's error while it stood is forgotten smoothly."""
+    f = at_origin(BodyNoise(), jitter=0.02)
+    for step in range(60):
+        f.predict(DT, RESTS, RESTS)
+        f.observe_foot(0, np.array([0.02 * min(step / 20, 1.0), 0.0, 0.0]), 0.002, 0.02, from_root=False)
+    seen, off = np.array([0.02, 0.0, 0.0]), []
+    for _ in range(30):
+        seen = seen + [0.03, 0.0, 0.0]
+        f.predict(DT, SWINGS, SWINGS)
+        f.observe_foot(0, seen, 0.002, 0.02, from_root=False)
+        off.append(abs(f.feet[0, 0] - seen[0]))
+    assert off[-1] < 0.001
+    assert np.abs(np.diff(off)).max() < 0.004
+
+
+def test_what_is_seen_surely_is_not_moved():
+    f = at_origin(BodyNoise(), jitter=0.001)
+    for step in range(60):
+        seen = np.array([0.001 * step, 0.0, 0.0])
+        f.predict(DT, RESTS, RESTS)
+        f.observe_foot(0, seen, 0.0001, 0.001, from_root=False)
+        assert abs(f.feet[0, 0] - seen[0]) < 0.004
+
+
+def test_a_standing_foot_holds_the_root_and_stops_it():
+    f = at_origin(BodyNoise(acceleration=1.0, rest=0.01), jitter=0.01)
+    foot = np.array([0.1, 0.2, -0.9])
+    f.observe_foot(0, foot, 0.003, 0.003, from_root=False)
+    for _ in range(60):
+        f.predict(DT, RESTS, RESTS)
+        f.observe_velocity(np.array([0.3, 0.0, 0.0]), 0.1, bias=0.3)  # a network that is wrong
+        f.observe_foot(0, foot, 0.003, 0.003, from_root=True)
+    assert np.linalg.norm(f.position) < 0.03
+    assert np.linalg.norm(f.velocity) < 0.1
+
+
+def test_a_standing_foot_carries_the_root_over_it():
+    """The foot passes backwards under the root at 1 m/s: the root moves forward at 1 m/s."""
+    f = at_origin(BodyNoise(), jitter=0.01)
+    f.observe_foot(0, np.array([0.3, 0.0, -0.9]), 0.005, 0.005, from_root=True)
+    for step in range(1, 19):
+        f.predict(DT, RESTS, RESTS)
+        f.observe_foot(0, np.array([0.3 - step * DT, 0.0, -0.9]), 0.005, 0.005, from_root=True)
+    assert f.position[0] == pytest.approx(18 * DT, abs=0.03)
+    assert f.velocity[0] == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_foot_placed_by_a_lost_root_does_not_find_it():
+    f = at_origin(BodyNoise(), jitter=0.5)
+    for _ in range(100):
+        f.observe_foot(0, np.zeros(3), 0.01, 0.0, from_root=True)
+    assert (f.position_sigma > 0.49).all()
+
+
+def test_foot_height_tells_only_the_height():
+    f = at_origin(BodyNoise(), jitter=0.5)
+    f.observe_foot(0, np.array([0.0, 0.0, -0.9]), 0.01, 0.0, from_root=True)
+    f.observe_foot_height(0, 0.08, 0.02)
+    assert f.position[2] == pytest.approx(0.98, abs=0.01)
+    assert f.position_sigma[2] < 0.03
+    assert (f.position_sigma[:2] > 0.49).all()
+
+
+@settings(max_examples=30)
+@given(yaw=st.floats(-np.pi, np.pi), seed=st.integers(0, 1000))
+def test_turns_with_the_world(yaw: float, seed: int):
+    turn = yaw_matrix(yaw)
+    ends = []
+    for r in (np.eye(3), turn):
+        rng = np.random.default_rng(seed)
+        f = BodyFilter(BodyNoise(), r @ rng.normal(size=3), 0.1, 0.05, r @ rng.normal(size=3), feet=1)
+        for _ in range(10):
+            f.predict(DT, RESTS, 0.5 * RESTS)
+            f.observe_velocity(r @ rng.normal(size=3), 0.1, bias=np.array([0.2, 0.2, 0.1]))
+            f.observe_foot(0, r @ rng.normal(size=3), 0.02, 0.02, from_root=True)
+        ends.append(np.stack([f.position, f.velocity]))
+    np.testing.assert_allclose(ends[1], ends[0] @ turn.T, atol=1e-9)

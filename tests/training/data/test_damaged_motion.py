@@ -1,0 +1,91 @@
+"""Damaged motion capture: the reader says so in its own words, and the other recordings are prepared."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.lib import format as npy
+
+from steadypose.benchmarks.systems.motion_files import AMC, ASF, BVH, amass
+from steadypose.prior import npz
+from steadypose.prior.mocap.amc import read_amc, read_asf
+from steadypose.prior.mocap.bvh import read_bvh
+from steadypose.prior.mocap.clip import MotionError
+from steadypose.prior.mocap.npz import read_amass
+from steadypose.prior.npz import check_arrays
+
+WORDS = [b"", b"nan", b"1e999", b"-1", b"0", b"{", b"}", b"JOINT", b"CHANNELS 99999", b"\n", b"\xff\0", b"9" * 30]
+READERS: dict[str, tuple[str | bytes, Callable]] = {
+    "bvh": (BVH, lambda text: read_bvh(text).positions()),
+    "asf": (ASF, read_asf),
+    "amc": (AMC, lambda text: read_amc(text, read_asf(ASF))),
+    "amass": (amass(), lambda content: read_amass(io.BytesIO(content))),
+}
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_whole_files_are_read(kind: str) -> None:
+    content, read = READERS[kind]
+    read(content)
+
+
+@pytest.mark.parametrize("kind", READERS)
+@given(data=st.data())
+@settings(max_examples=150, deadline=None)
+def test_a_damaged_file_is_read_or_is_a_motion_error(kind: str, data: st.DataObject) -> None:
+    content, read = READERS[kind]
+    damaged = bytearray(content.encode() if isinstance(content, str) else content)
+    for _ in range(data.draw(st.integers(1, 3))):
+        start = data.draw(st.integers(0, len(damaged)))
+        end = data.draw(st.integers(start, min(start + 20, len(damaged))))
+        damaged[start:end] = data.draw(st.one_of(st.sampled_from(WORDS), st.binary(max_size=8)))
+    whole = damaged.decode("ascii", "replace") if isinstance(content, str) else bytes(damaged)
+    with contextlib.suppress(MotionError):
+        read(whole)
+
+
+def bomb(shape: tuple[int, ...]) -> io.BytesIO:
+    """An array that says to be larger than it is."""
+    header, file = io.BytesIO(), io.BytesIO()
+    npy.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("poses.npy", header.getvalue() + bytes(100))
+        archive.writestr("trans.npy", header.getvalue() + bytes(100))
+    file.seek(0)
+    return file
+
+
+def test_an_array_is_no_larger_than_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(MotionError, match=r"poses: expected \(100000, 66\) float64, found \d+ bytes"):
+        read_amass(bomb((100_000, 66)))
+    monkeypatch.setattr(npz, "MAX_BYTES", 2**22)
+    large = tmp_path / "large.npz"
+    with zipfile.ZipFile(large, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("x.npy", "w") as entry:
+        entry.write(bytes(2**22 + 1))
+    assert large.stat().st_size < 2**16
+    with pytest.raises(ValueError, match=f"x: .* bytes: expected at most {2**22}; cut it into parts"):
+        check_arrays(large)
+
+
+def test_many_arrays_are_together_no_larger_than_their_file_may_become(tmp_path: Path) -> None:
+    several, many = tmp_path / "several.npz", tmp_path / "many.npz"
+    arrays: dict[str, Any] = {f"a{n}": np.zeros(2**21) for n in range(5)}
+    np.savez_compressed(several, **arrays)  # 80 MiB in 80 kB
+    with pytest.raises(ValueError, match=r"bytes that become 83.*: expected at most 100 times as many"):
+        check_arrays(several)
+    np.savez(several, **arrays)
+    check_arrays(several)
+    with zipfile.ZipFile(many, "w") as archive:
+        for n in range(npz.MAX_ARRAYS + 1):
+            archive.writestr(f"{n}.npy", b"")
+    with pytest.raises(ValueError, match="1001 arrays: expected at most 1000"):
+        check_arrays(many)

@@ -1,0 +1,164 @@
+"""Files of motion of other kinds than BVH: points by their names, TRC, C3D, arrays; and from any folder."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import ezc3d
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.helpers.bvh_writer import write_bvh
+from tests.prior.body.test_rigs import FAMILIES
+
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.commands.prepare import prepare
+from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.body.points import recognise_points
+from steadypose.prior.body.rigs import RigError
+from steadypose.prior.body.skeleton import JOINTS, REST_POSITIONS, J
+from steadypose.prior.mocap.clip import MotionError
+from steadypose.prior.mocap.files import Description, read_motion
+from steadypose.prior.mocap.plug_in_gait import MARKERS
+
+HALPE = {
+    "Hip": "pelvis", "RHip": "right_hip", "RKnee": "right_knee", "RAnkle": "right_ankle", "RBigToe": "right_foot",
+    "LHip": "left_hip", "LKnee": "left_knee", "LAnkle": "left_ankle", "LBigToe": "left_foot", "Neck": "neck",
+    "Head": "head", "RShoulder": "right_shoulder", "RElbow": "right_elbow", "RWrist": "right_wrist",
+    "LShoulder": "left_shoulder", "LElbow": "left_elbow", "LWrist": "left_wrist",
+}  # fmt: skip
+"""As Pose2Sim names its markers."""
+
+
+def points(frames: int = 4) -> NDArray[np.float64]:
+    """(T, J, 3) metres, z up, of the names of `HALPE`."""
+    body = REST_POSITIONS[[J[joint] for joint in HALPE.values()]] + [0.0, 0.0, 0.95]
+    return body + np.arange(frames)[:, None, None] * [0.01, 0.0, 0.0]
+
+
+def trc(metres: NDArray[np.float64], unit: float = 0.001, name: str = "mm") -> bytes:
+    """Positions with y up, as OpenSim has it."""
+    values = metres[..., [1, 2, 0]] / unit
+    names = list(HALPE)
+    rows = [
+        "PathFileType\t4\t(X/Y/Z)\ttake.trc",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+        f"60\t60\t{len(values)}\t{len(names)}\t{name}\t60\t1\t{len(values)}",
+        "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t",
+        "\t\t" + "\t".join(f"{axis}{k + 1}" for k in range(len(names)) for axis in "XYZ"),
+        "",
+    ]
+    for k, frame in enumerate(values):
+        cells = ["" if np.isnan(v) else f"{v:.5f}" for v in frame.ravel()]
+        rows.append("\t".join([str(k + 1), f"{k / 60:.5f}", *cells]))
+    return "\n".join(rows).encode()
+
+
+def c3d(path: Path, names: list[str], millimetres: NDArray[np.float64]) -> bytes:
+    file = ezc3d.c3d()
+    file["parameters"]["POINT"]["RATE"]["value"] = [100]
+    file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
+    file["parameters"]["POINT"]["LABELS"]["value"] = names
+    file["data"]["points"] = np.concatenate(
+        [millimetres.transpose(2, 1, 0), np.ones((1, len(names), len(millimetres)))]
+    )
+    file.write(str(path))
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize(("unit", "name"), [(0.001, "mm"), (1.0, "m")])
+def test_a_trc_is_read_in_metres_and_z_up(unit: float, name: str) -> None:
+    truth = points()
+    holed = truth.copy()
+    holed[1, list(HALPE).index("LWrist")] = np.nan
+    fps, body = read_motion("take.trc", trc(holed, unit, name))
+    assert fps == 60
+    # y up to z up by a quarter turn about x: what was to the front (+z) is then at -y.
+    seen = body[:, [J[joint] for joint in HALPE.values()]]
+    expected = truth[..., [1, 0, 2]] * [1, -1, 1]
+    assert np.isnan(seen[1, list(HALPE).index("LWrist")]).all()
+    keep = np.isfinite(seen)
+    np.testing.assert_allclose(seen[keep], expected[keep], atol=1e-4)
+    assert np.isnan(body[:, J["spine1"]]).all()
+
+
+def test_a_c3d_of_joints_is_read(tmp_path: Path) -> None:
+    fps, body = read_motion("take.C3D", c3d(tmp_path / "x.c3d", [f"Anna:{n}" for n in HALPE], points() * 1000))
+    assert fps == 100
+    np.testing.assert_allclose(body[:, [J[joint] for joint in HALPE.values()]], points(), atol=1e-4)
+
+
+def test_a_c3d_of_markers_on_the_skin_gives_joints_inside(tmp_path: Path) -> None:
+    rest = REST_POSITIONS + [0, 0, 0.95]
+    near = {
+        "FHD": rest[J["head"]] + [0.08, 0, 0.06], "BHD": rest[J["head"]] + [-0.1, 0, 0.06], "SHO": None,
+    }  # fmt: skip
+    rng = np.random.default_rng(0)
+    at = {}
+    for name in MARKERS:
+        side, part = (name[0], name[1:]) if name[0] in "LR" and name not in ("C7",) else ("", name)
+        joint = {
+            "ASI": "hip", "PSI": "hip", "THI": "knee", "KNE": "knee", "TIB": "ankle", "ANK": "ankle", "HEE": "ankle",
+            "TOE": "foot", "SHO": "shoulder", "UPA": "elbow", "ELB": "elbow", "WRA": "wrist", "WRB": "wrist",
+        }.get(part)  # fmt: skip
+        base = rest[J[f"{'left' if side == 'L' else 'right'}_{joint}"]] if joint else rest[J["spine3"]]
+        at[name] = near.get(part) if near.get(part) is not None else base
+        at[name] = at[name] + rng.normal(scale=0.03, size=3)
+    values = np.tile(np.stack([at[name] for name in MARKERS]), (5, 1, 1))
+    _, body = read_motion("x.c3d", c3d(tmp_path / "x.c3d", list(MARKERS), values * 1000))
+    assert np.isfinite(body).all()
+    assert np.linalg.norm(body[0, J["left_wrist"]] - rest[J["left_wrist"]]) < 0.1
+
+
+def test_points_are_known_by_side_and_part_however_they_are_written() -> None:
+    for names in (
+        ["L_Hip", "R_Hip", "L_Shoulder", "R_Shoulder"],
+        ["HIP_LEFT", "HIP_RIGHT", "leftShoulder", "rightShoulder"],
+    ):
+        skeleton = recognise_points([*names, "l.ear", "r.ear", "nose"])
+        assert {"left_hip", "right_shoulder", "pelvis", "neck", "head"} == set(skeleton.table) - {
+            "right_hip",
+            "left_shoulder",
+        }
+    with pytest.raises(RigError, match=r"left_hip.*M1.*--rig"):
+        recognise_points(["M1", "M2"])
+
+
+def test_arrays_need_to_be_described(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    np.save(buffer, REST_POSITIONS[None].repeat(3, axis=0) * 100)
+    with pytest.raises(MotionError, match="fps"):
+        read_motion("x.npy", buffer.getvalue())
+    fps, body = read_motion("x.npy", buffer.getvalue(), Description(fps=25.0, metres=0.01))
+    assert fps == 25
+    np.testing.assert_allclose(body[0], REST_POSITIONS, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["x.bvh", "x.trc", "x.c3d", "x.npy", "x.npz"])
+@pytest.mark.parametrize("content", [b"", b"HIERARCHY\n", b"PathFileType\n1\n2\n3\n4\n5\nx", bytes(600)])
+def test_what_cannot_be_read_is_refused(name: str, content: bytes) -> None:
+    with pytest.raises(MotionError):
+        read_motion(name, content)
+
+
+def test_a_file_of_motion_is_a_recording(tmp_path: Path) -> None:
+    take = tmp_path / "take.bvh"
+    take.write_bytes(write_bvh(FAMILIES["Mixamo"].joints(), np.array([0.0, 95.0, 0.0]), 60.0, frames=7))
+    source = open_recording(take)
+    frames = [message for _, message in source if isinstance(message, PoseRaw)]
+    assert len(source) == len(frames) == 7
+    assert frames[0].skeleton == "smpl22"
+    assert frames[6].stamp_ns == pytest.approx(1e8, rel=1e-4)
+    assert frames[0].bodies[0].positions[J["head"], 2] == pytest.approx(1.56, abs=0.001)
+
+
+def test_a_folder_of_any_name_is_prepared_each_folder_a_person(tmp_path: Path) -> None:
+    for person in ("anna", "val/bob"):
+        (tmp_path / "takes" / person).mkdir(parents=True)
+        content = write_bvh(FAMILIES["Xsens"].joints(), np.array([0.0, 99.0, 0.0]), 60.0, frames=90)
+        (tmp_path / "takes" / person / "stand.bvh").write_bytes(content)
+    prepare(tmp_path / "takes", tmp_path / "data")
+    with np.load(tmp_path / "data" / "prepared.npz") as z:
+        assert dict(zip(z["subject"].tolist(), z["split"].tolist(), strict=True)) == {"anna": "train", "val/bob": "val"}
+        assert z["positions"].shape[1] == len(JOINTS)

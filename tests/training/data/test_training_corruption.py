@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+from tests.helpers.bodies import waving
+
+from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
+from steadypose.training.data.corruption import (
+    add_noise,
+    draw_bias_sigma,
+    exchanged,
+    hide_joints,
+    occlude,
+    vary_builds,
+    with_faults,
+    with_sensor_error,
+)
+from steadypose.training.recipes.hgvae_faults import FAULTS
+
+WINDOWS = np.stack([waving(50, speed=1.0 + 0.05 * k) for k in range(40)])
+
+
+def test_the_truth_is_left_alone() -> None:
+    rng, kept = np.random.default_rng(0), WINDOWS.copy()
+    for spoilt in (
+        occlude(WINDOWS, rng),
+        add_noise(WINDOWS, rng, draw_bias_sigma(40, rng)),
+        vary_builds(WINDOWS, 0.05, 0.2, rng),
+        with_faults(WINDOWS, FAULTS, 1.0, rng),
+        with_sensor_error(WINDOWS, 0.01, rng),
+        hide_joints(WINDOWS, 3, rng),
+    ):
+        assert spoilt.shape == WINDOWS.shape
+        assert not np.array_equal(spoilt, kept, equal_nan=True)
+    np.testing.assert_array_equal(WINDOWS, kept)
+
+
+def test_other_bones_are_as_long_on_both_sides_and_in_every_frame() -> None:
+    other = vary_builds(WINDOWS, 0.1, 0.2, np.random.default_rng(0))
+    factor = bone_lengths(other)[..., 1:] / bone_lengths(WINDOWS)[..., 1:]
+    assert 0.05 < np.log(factor).std() < 0.15
+    np.testing.assert_allclose(factor, factor[:, :1].repeat(50, axis=1))
+    np.testing.assert_allclose(factor, factor[..., np.array(MIRROR)[1:] - 1])
+
+
+def test_other_people_hold_each_bone_at_an_angle_of_its_own_throughout() -> None:
+    still = WINDOWS[:, :1].repeat(50, axis=1)
+    other = vary_builds(still, 0.0, 0.2, np.random.default_rng(0))
+    np.testing.assert_allclose(other, other[:, :1].repeat(50, axis=1), atol=1e-12)
+    bones, turned = (windows[:, 0, 1:] - windows[:, 0, list(PARENTS[1:])] for windows in (still, other))
+    cosine = (bones * turned).sum(axis=-1) / np.linalg.norm(bones, axis=-1) / np.linalg.norm(turned, axis=-1)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    assert 0.1 < np.sqrt((angle**2).mean()) < 0.25  # 0.2 about two axes, times the root of a third
+    assert (angle.std(axis=1) > 0.01).mean() > 0.8
+
+
+def test_errors_that_last_are_as_large_as_told() -> None:
+    rng = np.random.default_rng(0)
+    slow = np.repeat([0.0, 0.03], 20)
+    off = np.abs((add_noise(WINDOWS, rng, slow) - WINDOWS).mean(axis=1))
+    assert off[20:].mean() > 3 * off[:20].mean()
+    assert 0.5 < (draw_bias_sigma(4000, rng) > 0).mean() < 0.8
+
+
+def bone_lengths(windows: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(windows - windows[..., PARENTS, :], axis=-1)
+
+
+def test_gaps_are_many_and_reach_the_newest_frame() -> None:
+    hidden = np.isnan(occlude(WINDOWS, np.random.default_rng(0))[..., 0])
+    assert 0.1 < hidden.mean() < 0.7
+    assert hidden[:, -1].any(axis=1).mean() > 0.5
+
+
+def test_as_many_joints_are_hidden_as_asked_and_all_the_time() -> None:
+    hidden = np.isnan(hide_joints(WINDOWS, 5, np.random.default_rng(0))[..., 0])
+    assert (hidden.sum(axis=-1) == 5).all()
+
+
+def test_a_sensor_errs_by_what_is_said_half_of_it_for_good() -> None:
+    off = with_sensor_error(WINDOWS, 0.02, np.random.default_rng(0)) - WINDOWS
+    assert off.std() == pytest.approx(0.02, rel=0.05)
+    assert off.mean(axis=1).std() == pytest.approx(0.02 * np.sqrt(0.5 + 0.5 / 50), rel=0.05)
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
+def test_a_fault_is_where_it_is_said_to_be(fault) -> None:
+    """Joints or frames that have no part in it stay as they were, but where the fault is of the whole body."""
+    rng, joints = np.random.default_rng(3), [J["left_elbow"], J["left_wrist"]]
+    for _ in range(20):
+        window = WINDOWS[0].copy()
+        fault(window, slice(20, 40), joints, WINDOWS[9], rng)
+        off = np.linalg.norm(window - WINDOWS[0], axis=-1) > 1e-9
+        assert off.any()
+        if fault.__name__ not in ("sides_exchanged", "other_bones"):
+            assert not off[:20].any()
+            assert not off[40:].any()
+        if fault.__name__ not in ("sides_exchanged", "other_bones", "noisy"):
+            assert set(np.flatnonzero(off.any(axis=0))) <= {*joints, *MIRROR[joints]}
+
+
+def test_exchanged_limbs_are_each_others() -> None:
+    window = WINDOWS[0].copy()
+    exchanged(window, slice(10, 50), [J["left_wrist"]], WINDOWS[1], np.random.default_rng(0))
+    np.testing.assert_array_equal(window[10:, J["left_wrist"]], WINDOWS[0, 10:, J["right_wrist"]])
+    np.testing.assert_array_equal(window[10:, J["right_wrist"]], WINDOWS[0, 10:, J["left_wrist"]])
+
+
+def test_the_share_asked_for_is_spoilt() -> None:
+    spoilt = with_faults(np.tile(WINDOWS, (10, 1, 1, 1)), FAULTS, 0.6, np.random.default_rng(0))
+    off = np.linalg.norm(spoilt - np.tile(WINDOWS, (10, 1, 1, 1)), axis=-1) > 0
+    assert off.any(axis=(1, 2)).mean() == pytest.approx(0.6, abs=0.1)

@@ -1,0 +1,135 @@
+"""Training the trajectory network: it learns, resumes, and writes what the pipeline loads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from steadypose.prior.body.kinematics import yaw_matrix
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
+from steadypose.prior.fit.torch_weights import load_tensors
+from steadypose.prior.models.root_velocity import TrajectoryConfig
+from steadypose.training.data.dataset import MotionSet
+from steadypose.training.loop import TrainingOptions
+from steadypose.training.networks.root_velocity import TrajectoryNet
+from steadypose.training.recipes import root_velocity as training
+
+
+def rest_pose() -> np.ndarray:
+    pose = np.zeros((22, 3))
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        pose[joint] = pose[parent] + REST_OFFSETS[joint]
+    return pose + [0, 0, 0.9]
+
+
+@pytest.fixture
+def prepared(tmp_path: Path) -> Path:
+    """Bodies that glide in straight lines, their legs swinging at a rate that goes with their speed."""
+    rng = np.random.default_rng(0)
+    clips, count = [], 150
+    for _ in range(6):
+        t, speed = np.arange(count) / 30, rng.uniform(0.0, 1.5)
+        pose = np.repeat(rest_pose()[None], count, axis=0)
+        swing = 0.4 * speed * np.sin(2 * np.pi * t)
+        pose[:, [4, 7, 10], 0] += swing[:, None]
+        pose[:, [5, 8, 11], 0] -= swing[:, None]
+        pose[..., 0] += speed * t[:, None]
+        clips.append(pose @ yaw_matrix(rng.uniform(-3, 3)).T)
+    yaws = [np.arctan2(*(c[0, 1] - c[0, 2])[[0, 1]] * [-1, 1]) for c in clips]
+    rotations = np.zeros((6, count, 22, 4))
+    rotations[..., 3] = 1.0
+    for clip, yaw in enumerate(yaws):
+        rotations[clip, :, 0] = [0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]
+    path = tmp_path / "prepared.npz"
+    np.savez(
+        path,
+        positions=np.concatenate(clips).astype(np.float32),
+        rotations=rotations.reshape(-1, 22, 4).astype(np.float32),
+        offsets=np.repeat(REST_OFFSETS[None], 6, axis=0).astype(np.float32),
+        contacts=np.zeros((6 * count, 8), dtype=bool),
+        clip_start=np.arange(7) * count,
+        split=np.array(["train"] * 4 + ["val"] * 2),
+        set=np.array(["default"] * 6),
+        flat=np.array([True, True, True, False, True, True]),
+        subject=np.array(["somebody"] * 6),
+        source=np.array(["synthetic"] * 6),
+        action=np.array(["walking"] * 6),
+    )
+    return path
+
+
+def test_where_somebody_climbs_contacts_are_not_learned(prepared: Path):
+    everything, flat = (MotionSet.load(prepared, "default", "train", flat=flat) for flat in (False, True))
+    assert (len(everything.clip_start) - 1, len(flat.clip_start) - 1) == (4, 3)
+
+
+def test_windows_show_the_body_facing_forward(prepared: Path):
+    """Whatever way a clip goes, in the frame of the input the body moves along +x, and its left is at +y."""
+    motion = MotionSet.load(prepared, "default", "train")
+    windows = training._sample(motion, *training._chances(motion), 32, np.random.default_rng(0))
+    forward, sideways = windows.velocity[..., 0], windows.velocity[..., 1]
+    assert (forward.mean(dim=1) > 2 * sideways.mean(dim=1).abs()).all()
+    assert (windows.joints[:, :, 16, 1] > windows.joints[:, :, 17, 1]).all()
+    assert (windows.velocity.diff(dim=1).abs() < 1e-3).all()
+
+
+def test_mirroring_exchanges_left_and_right():
+    joints = torch.randn(2, 5, 22, 3)
+    contacts = (torch.rand(2, 5, 8) > 0.5).float()
+    windows = training._Windows(joints, joints[:, :, 3], torch.randn(2, 5, 8, 3), contacts)
+    mirrored = training._mirror_half(windows)
+    torch.testing.assert_close(mirrored.joints[0, :, 7], joints[0, :, 8] * torch.tensor([1.0, -1.0, 1.0]))
+    torch.testing.assert_close(mirrored.contacts[0, :, 2], contacts[0, :, 3])
+    torch.testing.assert_close(mirrored.joints[1], joints[1])
+
+
+def test_corruption_keeps_the_root_at_the_origin():
+    noisy = training._corrupt(torch.zeros(8, 20, 22, 3), np.random.default_rng(0))
+    assert (noisy[:, :, 0] == 0).all()
+    assert 0.005 < noisy[:, :, 1:].std() < 0.05
+
+
+@torch.no_grad()
+def test_calibration_finds_the_size_of_the_errors(prepared: Path, monkeypatch: pytest.MonkeyPatch):
+    """Errors of independent frames, twice as large as said, last a frame; lasting ones longer."""
+    motion = MotionSet.load(prepared, "default", "val")
+    model = TrajectoryNet(TrajectoryConfig(kernel=3))
+    said, windows = training._validate(model, motion, training.WINDOW, count=64)
+    shape = (256, *said.velocity.shape[1:])
+    noise = torch.randn(shape, generator=torch.Generator().manual_seed(0))
+    for error, lasts in ((2.0 * noise, 1 / 30), (2.0 * noise[:, :1].expand(shape), 1.0)):
+        answer = training.RootMotion(error, torch.zeros(shape), torch.zeros(*shape[:2], 8))
+        truth = training._Windows(error, torch.zeros(shape), windows.joint_velocity, windows.contacts)
+        monkeypatch.setattr(training, "_validate", lambda *_, a=answer, t=truth, **__: (a, t))
+        config = training.calibrate(model, motion)
+        assert config.sigma_scale == pytest.approx((2.0, 2.0), rel=0.1)
+        assert config.correlation_s == pytest.approx((lasts, lasts), rel=0.25)
+
+
+def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("steadypose.prior.models.weights.WEIGHTS", tmp_path / "weights")
+    monkeypatch.setattr(training, "BATCH", 4)
+    whole = training.train_trajectory(TrainingOptions(prepared, tmp_path / "a", iterations=4))
+    state, config = load_tensors(str(whole), "trajectory")
+    TrajectoryNet(TrajectoryConfig.from_dict(config)).load_state_dict(state)
+    assert (tmp_path / "a/trajectory-default/trajectory-default.md").read_text().startswith("# trajectory-default")
+    assert (tmp_path / "a/trajectory-default/trajectory-default.png").stat().st_size > 0
+
+    calls, loss = iter(range(10)), training._loss
+
+    def killed(*args):
+        if next(calls) == 2:
+            raise KeyboardInterrupt
+        return loss(*args)
+
+    monkeypatch.setattr(training, "_loss", killed)
+    options = TrainingOptions(prepared, tmp_path / "b", iterations=4)
+    with pytest.raises(KeyboardInterrupt):
+        training.train_trajectory(options)
+    resumed, _ = load_tensors(str(training.train_trajectory(options)), "trajectory")
+    assert next(calls) == 5
+    for name, tensor in state.items():
+        torch.testing.assert_close(resumed[name], tensor, rtol=0, atol=0)

@@ -1,0 +1,209 @@
+"""Windows of prepared motion for training: sampled, mirrored, resampled, heading-normalised."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import roma
+import torch
+from numpy.lib.npyio import NpzFile
+from numpy.typing import NDArray
+from torch import Tensor
+
+from steadypose.prior.body.skeleton import MIRROR
+from steadypose.prior.mocap.clip import MotionError, person_of
+from steadypose.prior.timing.rate import FPS
+from steadypose.training.data.datasets import WeightSet
+
+MIN_SPEED = 0.25
+"""m/s, added to the joints' speed, to which the probability of drawing a fast-moving window is proportional."""
+
+_ARRAYS = {"clip_start", "split", "set", "rotations", "positions", "offsets", "contacts", "subject", "action",
+           "source"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MotionSet:
+    """Prepared clips of one split, concatenated.
+
+    Attributes:
+        rotations: (N, 22, 3, 3) local, float32.
+        positions: (N, 22, 3) metres, world, z up, floor at 0.
+        offsets: (N, 22, 3) metres, the bones of the person in each frame.
+        contacts: (N, 8) labels.
+        clip_start: (C + 1,) first frame of each clip, and the end.
+        subject: (C,) who moves, as the source names people; empty where the clips' origin does not matter.
+        action: (C,) what they do, as the source names it; as well.
+        source: (C,) where each is from; as well.
+    """
+
+    rotations: Tensor
+    positions: Tensor
+    offsets: Tensor
+    contacts: Tensor
+    clip_start: NDArray[np.int64]
+    subject: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+    action: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+    source: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+
+    @classmethod
+    def load(cls, path: Path, weights: str, split: str, *, flat: bool = False) -> MotionSet:
+        """Read ``steadypose prepare``'s output.
+
+        Args:
+            path: ``prepared.npz``.
+            weights: ``default`` takes the clips free for products; ``research`` takes the others too. Those that only
+                measure validate and test both, and train neither.
+            split: ``train``, ``val`` or ``test``.
+            flat: leave out the clips in which somebody climbs onto things: contacts up there are not labelled.
+
+        Raises:
+            FileNotFoundError: no such file.
+            MotionError: it is not what `prepare` writes, has no clip of this split, or there is no such set.
+        """
+        if weights not in get_args(WeightSet):
+            raise MotionError(f"weights: expected one of {', '.join(get_args(WeightSet))}, got {weights!r}")
+        if not path.is_file():
+            raise FileNotFoundError(f"no prepared motion at {path}: make it with 'steadypose prepare MOCAP --out DIR'")
+        data = _prepared(path, _ARRAYS | {"flat"} if flat else _ARRAYS)
+        starts = data["clip_start"]
+        uses = {"default", weights} | ({"measure"} if split != "train" else set())
+        wanted = (data["split"] == split) & np.isin(data["set"], list(uses))
+        if flat:
+            wanted &= data["flat"]
+        if not wanted.any():
+            raise MotionError(f"{path} has no clip of split '{split}' for the '{weights}' weights")
+        frames = np.concatenate([np.arange(starts[c], starts[c + 1]) for c in np.flatnonzero(wanted)])
+        lengths = np.diff(starts)[wanted]
+        return cls(
+            rotations=roma.unitquat_to_rotmat(torch.from_numpy(data["rotations"][frames])),
+            positions=torch.from_numpy(data["positions"][frames]),
+            offsets=torch.from_numpy(np.repeat(data["offsets"][wanted], lengths, axis=0)),
+            contacts=torch.from_numpy(data["contacts"][frames]),
+            clip_start=np.concatenate([[0], np.cumsum(lengths)]),
+            subject=data["subject"][wanted],
+            action=data["action"][wanted],
+            source=data["source"][wanted],
+        )
+
+    @cached_property
+    def person(self) -> NDArray[np.str_]:
+        """(C,) who moves, by one name in all files of a source."""
+        return np.array([person_of(*told) for told in zip(self.source, self.subject, strict=True)], dtype=np.str_)
+
+    @property
+    def hours(self) -> float:
+        """Of motion."""
+        return len(self.rotations) / FPS / 3600
+
+    def only(self, clips: NDArray[np.bool_]) -> MotionSet:
+        """These clips (C,) alone.
+
+        Raises:
+            ValueError: there are none.
+        """
+        if not clips.any():
+            raise ValueError(f"expected at least one of {len(clips)} clips, none is wanted")
+        frames = np.concatenate([np.arange(*self.clip_start[c : c + 2]) for c in np.flatnonzero(clips)])
+        lengths = np.diff(self.clip_start)[clips]
+        return MotionSet(
+            self.rotations[frames], self.positions[frames], self.offsets[frames], self.contacts[frames],
+            np.concatenate([[0], np.cumsum(lengths)]),
+            *(told[clips] if len(told) else told for told in (self.subject, self.action, self.source)),
+        )  # fmt: skip
+
+    def sample(
+        self, count: int, window: int, strides: Sequence[int], generator: np.random.Generator
+    ) -> NDArray[np.int64]:
+        """(count, window) frame numbers: random windows inside clips, each at a random stride (a frame rate)."""
+        stride = generator.choice(np.asarray(strides), size=count)
+        lengths = np.diff(self.clip_start)
+        starts = np.empty(count, dtype=np.int64)
+        for k in np.unique(stride):
+            rows = np.flatnonzero(stride == k)
+            room = np.maximum(lengths - (window - 1) * k, 0)
+            clip = generator.choice(len(room), size=len(rows), p=room / room.sum())
+            starts[rows] = self.clip_start[clip] + (generator.random(len(rows)) * room[clip]).astype(np.int64)
+        return starts[:, None] + stride[:, None] * np.arange(window)
+
+    def all_windows(self, window: int, step: int) -> NDArray[np.int64]:
+        """(count, window) frame numbers of every ``step``-th window of every clip."""
+        starts = [
+            np.arange(a, b - window + 1, step) for a, b in zip(self.clip_start, self.clip_start[1:], strict=False)
+        ]
+        return np.concatenate(starts)[:, None] + np.arange(window)
+
+
+class LivelyWindows:
+    """Draws windows of motion, the faster the likelier, and each source by the square root of its size: a large one
+    of ten exercises would outweigh all others.
+
+    Args:
+        motion: of clips; where their sources are not told, they count as one.
+    """
+
+    def __init__(self, motion: MotionSet) -> None:
+        lengths = np.diff(motion.clip_start)
+        sources = motion.source if len(motion.source) else np.zeros(len(lengths))
+        speed = (motion.positions[1:] - motion.positions[:-1]).norm(dim=-1).mean(dim=1).double().numpy() * FPS
+        speed = np.append(speed, 0.0)
+        speed[motion.clip_start[1:] - 1] = 0.0
+        self._passed = np.concatenate([[0.0], np.cumsum(MIN_SPEED + speed)])
+        self._room = np.repeat(motion.clip_start[1:], lengths) - np.arange(lengths.sum())
+        self._source = np.repeat(np.unique(sources, return_inverse=True)[1], lengths)
+        self._chances = lru_cache(maxsize=4)(self._chances_of)
+
+    def sample(
+        self, count: int, window: int, strides: Sequence[int], generator: np.random.Generator
+    ) -> NDArray[np.int64]:
+        """As `MotionSet.sample`."""
+        stride = generator.choice(np.asarray(strides), size=count)
+        first = np.empty(count, dtype=np.int64)
+        for k in np.unique(stride):
+            starts, chances = self._chances((window - 1) * int(k) + 1)
+            rows = np.flatnonzero(stride == k)
+            chosen = np.searchsorted(chances, generator.random(len(rows)) * chances[-1])
+            first[rows] = starts[np.minimum(chosen, len(starts) - 1)]
+        return first[:, None] + stride[:, None] * np.arange(window)
+
+    def _chances_of(self, span: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Frames at which a window of so many can start, and the sum of their chances up to each."""
+        starts = np.flatnonzero(self._room >= span)
+        worth = self._passed[starts + span] - self._passed[starts]
+        source = self._source[starts]
+        return starts, np.cumsum(worth / np.sqrt(np.bincount(source, worth))[source])
+
+
+def _prepared(path: Path, needed: set[str]) -> NpzFile:
+    """The arrays of ``prepared.npz``, not yet read; those ``needed`` are among them."""
+    data = np.load(path) if zipfile.is_zipfile(path) else None
+    if not isinstance(data, NpzFile):
+        raise MotionError(f"{path}: expected the .npz that 'steadypose prepare' writes")
+    if missing := needed - set(data.files):
+        raise MotionError(f"{path}: expected what 'steadypose prepare' writes; it lacks {', '.join(sorted(missing))}")
+    return data
+
+
+def describe_data(weights: str, train: MotionSet, val: MotionSet) -> str:
+    """The data that weights were trained on, for their card."""
+    return (
+        f"the '{weights}' set of `steadypose prepare`: {train.hours:.2f} h training, {val.hours:.2f} h validation, "
+        "split by subject"
+    )
+
+
+def mirror_rotations(rotations: Tensor) -> Tensor:
+    """Exchange left and right in local rotations (..., 22, 3, 3), as a mirror across the body's xz plane does."""
+    flip = rotations.new_tensor([1.0, -1.0, 1.0])
+    return rotations[..., MIRROR.tolist(), :, :] * flip[:, None] * flip
+
+
+def mirror_offsets(offsets: Tensor) -> Tensor:
+    """Exchange left and right in bones or root-centred positions (..., 22, 3), across the xz plane."""
+    return offsets[..., MIRROR.tolist(), :] * offsets.new_tensor([1.0, -1.0, 1.0])

@@ -1,0 +1,275 @@
+"""From recordings to training data: complete bodies at 30 Hz, on a floor, checked, labelled and split."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.signal import butter, sosfiltfilt
+from scipy.spatial.transform import Rotation
+
+from steadypose.prior.body.bone_lengths import estimate_offsets
+from steadypose.prior.body.inverse_kinematics import solve_rotations
+from steadypose.prior.body.kinematics import REST_SPEED, label_contacts
+from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
+from steadypose.prior.mocap.clip import Clip, MotionError
+from steadypose.training.data.datasets import Dropped, Split, Use
+
+FPS = 30.0
+"""Frames a second of everything that is trained on."""
+
+CUTOFF = 12.0
+"""Hz, cut-off of the low pass before resampling to 30 Hz, against aliasing."""
+
+FAST_ENOUGH = 50.0
+"""Frames a second of recordings that can be played faster and still show at 30 Hz what the body did."""
+
+MAX_GAP = 0.2
+"""Seconds. A joint lost for no longer is interpolated; for longer, the recording is cut there."""
+
+MIN_SECONDS = 1.0
+"""Shorter recordings are dropped, as in HuMoR."""
+
+MAX_BONE_CHANGE = 0.10
+"""Metres that a bone may differ from its median in the recording. Bones found from skin markers vary by 1 to 3 cm
+(standard deviation); a marker mistaken for another changes them by more than this."""
+
+MAX_ACCELERATION = 200.0
+"""m/s², second difference at 30 Hz. The hardest real motion of these recordings, a kicking foot, reaches 195; a joint
+that jumps to another place and back by 15 cm reaches 270."""
+
+TOE_HEIGHT = 0.015
+"""Metres above the floor at which the forefoot's joint rests."""
+
+RAISED = 0.12
+"""Metres above the floor from which a lower toe that stands still must be standing on something else."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A recording ready for training.
+
+    Attributes:
+        clip: its joints canonical, at 30 Hz, z up, floor at z = 0.
+        weights: which weights it may train.
+        split: training, validation or test.
+        speed: factor by which it is sped up.
+        offsets: (22, 3) metres, its subject's bones.
+        rotations: (T, 22, 4) local, xyzw.
+        contacts: (T, 8).
+        flat: whether it stays on the floor; where somebody climbs onto things, contacts up there are not labelled.
+    """
+
+    clip: Clip
+    weights: Use
+    split: Split
+    offsets: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+    contacts: NDArray[np.bool_]
+    flat: bool
+    speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        if (self.weights, self.split) == ("measure", "train"):
+            raise MotionError(f"{self.clip.name}: expected what only measures to validate or test, it is to train")
+
+
+def at_speed(clip: Clip, speed: float) -> Clip | None:
+    """The clip played faster, named so; None where its frames do not suffice: those at `FAST_ENOUGH` a second do.
+
+    Faster than it was, a motion has frequencies at 30 Hz that its recording at 30 Hz has not.
+    """
+    if speed == 1.0:
+        return clip
+    return replace(clip, name=f"{clip.name} x{speed:g}", fps=clip.fps * speed) if clip.fps >= FAST_ENOUGH else None
+
+
+def prepare_clip(clip: Clip, weights: Use, split: Split, speed: float = 1.0) -> Iterator[Prepared | Dropped]:
+    """Resample, find the floor, check and label a recording.
+
+    Yields its good parts, and what is left out and why. A recording is cut where joints are lost or do what no body
+    does; a part of one is named by the second it begins at.
+
+    Args:
+        clip: as read, or `at_speed`.
+        weights: the set of weights it may train.
+        split: training, validation or test.
+        speed: factor by which it is sped up, which raises the limit of accelerations.
+    """
+    clip = clip.canonical()
+    if clip.seconds < MIN_SECONDS:
+        yield _too_short(clip.name, clip.source, clip.seconds)
+        return
+    filled = fill_gaps(clip.positions, clip.fps)
+    complete = np.asarray(finite_joints(filled).all(axis=1))
+    if not complete.all():
+        lost = [JOINTS[j] for j in np.flatnonzero(~finite_joints(filled).all(axis=0))]
+        cause = f"{(~complete).sum() / clip.fps:.2f} s of {clip.seconds:.2f} s lack {', '.join(lost)}"
+        yield Dropped(clip.name, clip.source, f"cut: joints lost for more than {MAX_GAP} s or at an end", cause)
+    for start, stop in _runs(complete):
+        seconds = (stop - start) / clip.fps
+        if seconds < MIN_SECONDS:
+            yield _too_short(f"{clip.name}@{start / clip.fps:.1f}s", clip.source, seconds)
+            continue
+        positions = resample(filled[start:stop], clip.fps)
+        positions[..., 2] -= floor_height(positions)
+        bad, fault = find_faults(positions, MAX_ACCELERATION * speed**2)
+        if fault:
+            yield Dropped(clip.name, clip.source, "cut: impossible motion", fault)
+        for first, last in _runs(~bad):
+            whole = complete.all() and not fault
+            name = clip.name if whole else f"{clip.name}@{start / clip.fps + first / FPS:.1f}s"
+            if (last - first) / FPS < MIN_SECONDS:
+                yield _too_short(name, clip.source, (last - first) / FPS)
+            else:
+                part = replace(clip, name=name, fps=FPS, positions=positions[first:last])
+                yield _label(part, weights, split, speed)
+
+
+def _too_short(name: str, source: str, seconds: float) -> Dropped:
+    return Dropped(name, source, f"shorter than {MIN_SECONDS:.0f} s", f"{seconds:.2f} s long")
+
+
+def _label(clip: Clip, weights: Use, split: Split, speed: float) -> Prepared:
+    offsets = estimate_offsets(clip.positions)
+    rotations = Rotation.from_matrix(solve_rotations(clip.positions, offsets).reshape(-1, 3, 3)).as_quat()
+    return Prepared(
+        clip=clip,
+        weights=weights,
+        split=split,
+        offsets=offsets,
+        rotations=rotations.reshape(*clip.positions.shape[:2], 4),
+        contacts=label_contacts(clip.positions, FPS),
+        flat=stays_on_floor(clip.positions),
+        speed=speed,
+    )
+
+
+def fill_gaps(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
+    """Interpolate, in a straight line, joints that are lost for at most `MAX_GAP`; longer gaps stay NaN.
+
+    Args:
+        positions: (T, J, 3), NaN where lost.
+        fps: frames a second.
+    """
+    filled = positions.copy()
+    lost = ~finite_joints(positions)
+    time = np.arange(len(positions))
+    for joint in np.flatnonzero(lost.any(axis=0)):
+        seen = ~lost[:, joint]
+        for start, stop in _runs(lost[:, joint]):
+            filled[start:stop, joint] = np.nan
+            if start > 0 and stop < len(positions) and (stop - start) / fps <= MAX_GAP:
+                for axis in range(3):
+                    filled[start:stop, joint, axis] = np.interp(
+                        time[start:stop], time[seen], positions[seen, joint, axis]
+                    )
+    return filled
+
+
+def _runs(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Starts and stops of the runs of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
+    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+
+
+def resample(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
+    """(T, J, 3) at ``fps`` to (T', J, 3) at 30 Hz, by time, the first frame staying the first.
+
+    Faster recordings pass a Butterworth filter of fourth order at 12 Hz, forwards and backwards so that nothing is
+    delayed; then all are read off a cubic spline. A blow's impact loses what it has above 12 Hz.
+    """
+    if abs(fps / FPS - 1) < 1e-4:
+        return positions.copy()
+    if fps > FPS:
+        positions = sosfiltfilt(butter(4, CUTOFF, fs=fps, output="sos"), positions, axis=0)
+    time = np.arange(len(positions)) / fps
+    frames = int(time[-1] * FPS + 1e-6) + 1
+    return CubicSpline(time, positions)(np.arange(frames) / FPS)
+
+
+def floor_height(positions: NDArray[np.float64]) -> float:
+    """Height of the floor (metres) under a recording at 30 Hz, from where toes come to rest.
+
+    HuMoR's idea: the lowest heights at which toes stand still (their fifth percentile, safe from outliers). Where
+    none ever does (a run in mid-stride), the second percentile of the lower toe.
+    """
+    toes, speed = _toes(positions)
+    still = toes[..., 2][speed < REST_SPEED]
+    resting = np.percentile(still, 5) if len(still) >= 5 else np.percentile(toes[..., 2].min(axis=1), 2)
+    return float(resting) - TOE_HEIGHT
+
+
+def stays_on_floor(positions: NDArray[np.float64]) -> bool:
+    """Whether, in a recording at 30 Hz with its floor at 0, the lower toe hardly ever rests above it."""
+    toes, speed = _toes(positions)
+    lower = toes[..., 2].argmin(axis=1)[:, None]
+    height = np.take_along_axis(toes[..., 2], lower, axis=1)
+    raised = (height > RAISED) & (np.take_along_axis(speed, lower, axis=1) < REST_SPEED)
+    return float(raised.mean()) < 0.02
+
+
+def _toes(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions (T, 2, 3) and speeds (T, 2) of both toes."""
+    toes = positions[:, [J["left_foot"], J["right_foot"]]]
+    return toes, np.linalg.norm(np.gradient(toes, 1 / FPS, axis=0), axis=-1)
+
+
+def find_faults(
+    positions: NDArray[np.float64], max_acceleration: float = MAX_ACCELERATION
+) -> tuple[NDArray[np.bool_], str]:
+    """Frames (T,) of (T, 22, 3) positions at 30 Hz in which a body does what none can, and the worst of it in words.
+
+    The words are empty where there is nothing.
+    """
+    bad = np.zeros(len(positions), dtype=bool)
+    words: list[str] = []
+    bones = np.linalg.norm(positions[:, 1:] - positions[:, list(PARENTS[1:])], axis=-1)
+    change = np.abs(bones - np.median(bones, axis=0))
+    if change.max() > MAX_BONE_CHANGE:
+        frame, bone = np.unravel_index(change.argmax(), change.shape)
+        off = f"{change[frame, bone] * 100:.0f} cm off its length at {frame / FPS:.1f} s"
+        words.append(f"the bone to {JOINTS[bone + 1]} is {off}")
+        bad |= (change > MAX_BONE_CHANGE).any(axis=1)
+    acceleration = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=-1) * FPS**2
+    if acceleration.max() > max_acceleration:
+        frame, joint = np.unravel_index(acceleration.argmax(), acceleration.shape)
+        words.append(f"{JOINTS[joint]} accelerates by {acceleration[frame, joint]:.0f} m/s² at {frame / FPS:.1f} s")
+        jerked = (acceleration > max_acceleration).any(axis=1)
+        for shift in range(3):
+            bad[shift : shift + len(jerked)] |= jerked
+    return bad, "; ".join(words)
+
+
+def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:
+    """Write ``prepared.npz``: whole, or not at all.
+
+    Arrays: ``positions`` (N, 22, 3) float32 metres, z up, floor 0, all recordings in a row at 30 Hz; ``rotations``
+    (N, 22, 4) float32 local, xyzw; ``contacts`` (N, 8) bool; ``offsets`` (C, 22, 3) float32 metres; ``clip_start``
+    (C + 1,) int64; and for each of the C recordings ``name``, ``source``, ``licence``, ``subject``, ``action``,
+    ``split``, ``set``, ``flat`` and ``speed`` (see `Prepared`).
+    """
+    frames = [len(p.clip.positions) for p in prepared]
+    arrays = {
+        "positions": np.concatenate([p.clip.positions for p in prepared], dtype=np.float32),
+        "rotations": np.concatenate([p.rotations for p in prepared], dtype=np.float32),
+        "contacts": np.concatenate([p.contacts for p in prepared]),
+        "offsets": np.stack([p.offsets for p in prepared]).astype(np.float32),
+        "clip_start": np.concatenate([[0], np.cumsum(frames)]).astype(np.int64),
+        "split": np.array([p.split for p in prepared]),
+        "set": np.array([p.weights for p in prepared]),
+        "flat": np.array([p.flat for p in prepared]),
+        "speed": np.array([p.speed for p in prepared]),
+        **{k: np.array([getattr(p.clip, k) for p in prepared]) for k in _TEXTS},
+    }
+    partial = path.with_name(f"{path.stem}.partial.npz")
+    np.savez(partial, **arrays)
+    os.replace(partial, path)
+
+
+_TEXTS = ("name", "source", "licence", "subject", "action")

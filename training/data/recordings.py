@@ -1,0 +1,195 @@
+"""Motion to train and validate the mixture on, at several speeds, and the real Kinect beside Vicon, as plain arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from steadypose.prior.body.kinematics import rigid_alignment
+from steadypose.prior.body.layouts import KINECT22, to_canonical
+from steadypose.prior.body.skeleton import J, finite_joints
+from steadypose.prior.mocap.clip import Clip, MotionError
+from steadypose.training.data.datasets import DATA_SETS, DataSet, Split
+from steadypose.training.data.prepare import FPS, fill_gaps, find_faults, resample
+from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, load_pairs
+
+Floats = NDArray[np.float64]
+
+SPEEDS = (1.0, 1.4, 1.9, 2.5)
+"""Factors by which training motion is sped up: people of the test split move faster than those recorded for
+training."""
+
+_FREE = ("CMU (AMC)", "CMU (BVH)", "CMU (expmap)", "CMU (dance)", "CMU (more)", "ReActIdle", "UI-PRMD (Vicon)")
+_TRUNK = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
+_ALIGNED = [
+    J["head"],
+    *(J[f"{side}_{n}"] for n in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in ("left", "right")),
+]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Recordings in a row, at 30 Hz.
+
+    Attributes:
+        positions: (N, 22, 3) float32 metres, z up.
+        start: (C + 1,) of each recording.
+        source: (C,) the data set's name.
+        speed: (C,) how many times faster than recorded.
+    """
+
+    positions: NDArray[np.float32]
+    start: NDArray[np.int64]
+    source: NDArray[np.str_]
+    speed: Floats
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Recordings of a real Kinect and its ground truth, concatenated, at 30 Hz.
+
+    Attributes:
+        seen: (N, 22, 3) float32 metres, z up; NaN where the Kinect has no such joint.
+        truth: (N, 22, 3) metres, of the Vicon, by the Kinect's definition of the joints; NaN where not known.
+        start: (C + 1,) of each recording.
+        subject: (C,).
+    """
+
+    seen: NDArray[np.float32]
+    truth: NDArray[np.float32]
+    start: NDArray[np.int64]
+    subject: NDArray[np.str_]
+
+    def of(self, subjects: Collection[str]) -> Pairs:
+        """The recordings of these subjects."""
+        clips = np.flatnonzero(np.isin(self.subject, list(subjects)))
+        rows = np.concatenate([np.arange(*self.start[c : c + 2]) for c in clips])
+        lengths = np.diff(self.start)[clips]
+        start = np.concatenate([[0], np.cumsum(lengths)])
+        return Pairs(self.seen[rows], self.truth[rows], start, self.subject[clips])
+
+
+def write_arrays(mocap: Path, out: Path) -> None:
+    """Read the recordings under ``mocap`` that are free for products, and write ``motion-SPLIT.npz`` and ``pairs.npz``.
+
+    Recordings of the test split are left out.
+
+    Raises:
+        MotionError: there are none of one split, or no pairs of Kinect and Vicon (``ui_prmd.npz``).
+    """
+    found: dict[str, list[tuple[str, float, NDArray[np.float32]]]] = {"train": [], "val": []}
+    for data in DATA_SETS:
+        if data.name not in _FREE:
+            continue
+        for path in sorted(path for path in mocap.iterdir() if data.matches(path)):
+            for clip in track(list(data.read(path, lambda _: None)), description=data.name):
+                if not isinstance(clip, Clip):
+                    continue
+                split = _split(clip, data)
+                if split in found:
+                    found[split] += [(data.name, *one) for one in _at_speeds(clip, SPEEDS)]
+    for split, clips in found.items():
+        if not clips:
+            raise MotionError(f"{mocap}: expected motion capture of {', '.join(sorted(_FREE))}; none is for '{split}'")
+    out.mkdir(parents=True, exist_ok=True)
+    for split, clips in found.items():
+        lengths = [len(positions) for _, _, positions in clips]
+        np.savez(
+            out / f"motion-{split}.npz",
+            positions=np.concatenate([positions for _, _, positions in clips]),
+            start=np.concatenate([[0], np.cumsum(lengths)]),
+            source=np.array([source for source, _, _ in clips]),
+            speed=np.array([speed for _, speed, _ in clips]),
+        )
+    _write_pairs(mocap / "ui_prmd.npz", out / "pairs.npz")
+
+
+def _split(clip: Clip, data: DataSet) -> Split:
+    """The split of `training.data.datasets`, except that a person must be in one split only: all of CMU's 02 is for
+    validation, and clips of unknown subjects, which other splits may contain, are for training."""
+    if data.name == "CMU (AMC)":
+        return "val" if clip.subject == "02" else "train"
+    return "train" if data.name == "CMU (expmap)" else data.split(clip)
+
+
+def load_motion(path: Path) -> Motion:
+    """Read ``motion-SPLIT.npz``."""
+    with np.load(path) as data:
+        return Motion(data["positions"], data["start"], data["source"], data["speed"])
+
+
+def load_kinect(path: Path) -> Pairs:
+    """Read ``pairs.npz``."""
+    with np.load(path) as data:
+        return Pairs(data["seen"], data["truth"], data["start"], data["subject"])
+
+
+def _at_speeds(clip: Clip, speeds: tuple[float, ...]) -> Iterator[tuple[float, NDArray[np.float32]]]:
+    """The parts of a recording without faults, sped up and resampled to 30 Hz."""
+    clip = clip.canonical()
+    if clip.seconds < 1.0:
+        return
+    filled = fill_gaps(clip.positions, clip.fps)
+    for first, last in _runs(np.asarray(finite_joints(filled).all(axis=1))):
+        if (last - first) / clip.fps < 1.0:
+            continue
+        slow = resample(filled[first:last], clip.fps)
+        bad, _ = find_faults(slow)
+        for speed in speeds:
+            fast = resample(filled[first:last], clip.fps * speed)
+            spoilt = bad[np.minimum((np.arange(len(fast)) * speed).astype(int), len(bad) - 1)]
+            for a, b in _runs(~spoilt):
+                if b - a >= FPS:
+                    yield speed, fast[a:b].astype(np.float32)
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _write_pairs(path: Path, out: Path) -> None:
+    subjects = (*TRAIN_SUBJECTS, "s07", "s08")
+    seen, truth, names = [], [], []
+    for subject in subjects:
+        clips = [pair for pair in load_pairs(path, [subject]) if pair.fps == FPS and len(pair.kinect) >= FPS]
+        aligned = []
+        for pair in clips:
+            kinect = to_canonical(KINECT22, pair.kinect)[0]
+            rotation, translation = rigid_alignment(kinect[:, _ALIGNED], pair.vicon[:, _ALIGNED])
+            aligned.append(kinect @ rotation.T + translation)
+        frames = [trunk_frame(pair.vicon) for pair in clips]
+        apart = [
+            np.einsum("tba,tjb->tja", frame, kinect - pair.vicon)
+            for frame, kinect, pair in zip(frames, aligned, clips, strict=True)
+        ]
+        offset = np.nanmedian(np.concatenate(apart), axis=0)
+        for frame, kinect, pair in zip(frames, aligned, clips, strict=True):
+            seen.append(kinect.astype(np.float32))
+            truth.append((pair.vicon + np.einsum("tab,jb->tja", frame, offset)).astype(np.float32))
+            names.append(subject)
+    part = out.with_suffix(".part.npz")
+    np.savez(
+        part,
+        seen=np.concatenate(seen),
+        truth=np.concatenate(truth),
+        start=np.concatenate([[0], np.cumsum([len(s) for s in seen])]),
+        subject=np.array(names),
+    )
+    part.replace(out)  # whole or not at all: its presence says that all arrays are written
+
+
+def trunk_frame(positions: Floats) -> Floats:
+    """Axes forward, left, up of the trunk as columns (..., 3, 3), of joints (..., 22, 3)."""
+    left_hip, right_hip, left_shoulder, right_shoulder = (positions[..., J[name], :] for name in _TRUNK)
+    up = left_shoulder + right_shoulder - left_hip - right_hip
+    up = up / np.linalg.norm(up, axis=-1, keepdims=True)
+    left = left_shoulder - right_shoulder + left_hip - right_hip
+    left = left - (left * up).sum(axis=-1, keepdims=True) * up
+    left = left / np.linalg.norm(left, axis=-1, keepdims=True)
+    return np.stack([np.cross(left, up), left, up], axis=-1)

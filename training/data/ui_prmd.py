@@ -1,0 +1,97 @@
+"""UI-PRMD: a Kinect and a Vicon system on the same movements, the one source of real noise with its truth.
+
+Vakanski et al. 2018, "A data set of human body movements for physical rehabilitation exercises", Data 3(1):2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.prior.mocap.clip import Y_UP_TO_Z_UP, MotionError
+from steadypose.prior.mocap.plug_in_gait import calibrate, joint_centres
+from steadypose.prior.npz import open_npz
+
+TRAIN_SUBJECTS = ("s01", "s02", "s03", "s04", "s05", "s06")
+VALIDATION_SUBJECTS = ("s07", "s08")
+
+_METRES_PER_COUNT = 1e-4
+_MISSING = -32768
+
+
+@dataclass(frozen=True)
+class KinectPair:
+    """One repetition of a movement, seen by both systems at the same instants.
+
+    They agree in time but not in space: align them with one rotation and translation a clip.
+
+    Attributes:
+        name: as in the file, such as ``m01_s01_e01``; ``_inc``: done wrongly on purpose.
+        subject: ``s01`` to ``s08``.
+        movement: ``m01`` to ``m10``.
+        fps: frames a second.
+        kinect: (T, 22, 3) metres, skeleton ``kinect22``. z up, the camera at the origin looking along +y.
+        vicon: (T, 22, 3) metres, canonical joint centres, z up; NaN where markers were lost.
+        markers: (T, 39, 3) metres, the Plug-in-Gait markers, z up; NaN where lost.
+    """
+
+    name: str
+    subject: str
+    movement: str
+    fps: float
+    kinect: NDArray[np.float64]
+    vicon: NDArray[np.float64]
+    markers: NDArray[np.float64]
+
+
+def _metres(counts: NDArray[np.int16]) -> NDArray[np.float64]:
+    return np.where(counts == _MISSING, np.nan, counts * _METRES_PER_COUNT)
+
+
+def load_pairs(path: Path, subjects: Collection[str]) -> list[KinectPair]:
+    """Read some subjects' recordings from ``ui_prmd.npz``, ordered by subject, movement, repetition.
+
+    Args:
+        path: the archive.
+        subjects: such as `TRAIN_SUBJECTS`.
+
+    Raises:
+        MotionError: the file is not this archive, or lacks a subject.
+    """
+    with open_npz(path, "fps", "vicon_names") as archive:
+        marker_names = [str(n) for n in archive["vicon_names"]]
+        fps = float(archive["fps"])
+        names = (name.removesuffix("/kinect") for name in archive.files if name.endswith("/kinect"))
+        split = sorted(((n.split("_")[1], n) for n in names), key=lambda pair: pair)
+        missing = set(subjects) - {s for s, _ in split}
+        if missing:
+            raise MotionError(f"{path}: no recordings of {', '.join(sorted(missing))}")
+        pairs: list[KinectPair] = []
+        for subject, group in groupby((p for p in split if p[0] in subjects), key=lambda pair: pair[0]):
+            recordings = {
+                name: (_metres(archive[f"{name}/kinect"]) @ Y_UP_TO_Z_UP.T, _metres(archive[f"{name}/vicon_markers"]))
+                for _, name in group
+            }
+            named = {
+                name: {m: markers[:, i] for i, m in enumerate(marker_names)}
+                for name, (_, markers) in recordings.items()
+            }
+            calibration = calibrate(named.values())
+            pairs += [
+                KinectPair(
+                    name=name,
+                    subject=subject,
+                    movement=name.split("_")[0],
+                    fps=fps,
+                    kinect=kinect,
+                    vicon=joint_centres(named[name], calibration),
+                    markers=markers,
+                )
+                for name, (kinect, markers) in recordings.items()
+            ]
+    return pairs

@@ -1,0 +1,188 @@
+"""The training loop of every model: it minimises a loss, resumably, with a progress bar and curves drawn as it goes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import Tensor, nn
+from torch.optim.lr_scheduler import LRScheduler
+
+from steadypose.training.distributed import average_gradients, from_first, processes, rank, share, writes
+from steadypose.training.weights import save_weights
+
+Loss = Callable[[int, float, np.random.Generator], tuple[Tensor, dict[str, float]]]
+"""The loss of a random batch, and terms to plot; called with the number of samples, the progress of the training in
+[0, 1), and a random generator, which differs between torchrun's processes."""
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Options of ``steadypose train``, common to all models.
+
+    Attributes:
+        data: ``prepared.npz``, or what a model is trained on instead.
+        runs: folder of training runs; a killed run of the same name resumes there.
+        weights: the weight set, ``default`` or ``research``; for a sensor's correction, the sensor's name.
+        iterations: optimiser steps, at least 1; None for the model's default.
+        seed: of initial weights and of sampling.
+        start: weights to start from: a set or a path.
+    """
+
+    data: Path
+    runs: Path
+    weights: str = "default"
+    iterations: int | None = None
+    seed: int = 0
+    start: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.iterations is not None and self.iterations < 1:
+            raise ValueError(f"iterations: expected 1 or more, got {self.iterations}")
+
+    def path(self, model: str) -> Path:
+        """Where the weights of ``model`` go, in the folder of its run: ``RUNS/MODEL-SET/MODEL-SET.safetensors``."""
+        name = f"{model}-{self.weights}"
+        return self.runs / name / f"{name}.safetensors"
+
+
+class TrainingRun:
+    """A training that can be resumed: its state is in ``directory/checkpoint.pt``.
+
+    Under torchrun, all processes start from the state of the first, which alone writes and evaluates; each draws its
+    share of a batch, and gradients are averaged before the optimiser steps.
+
+    Args:
+        directory: where checkpoints, ``curves.json`` and ``curves.png`` go; a checkpoint there is resumed.
+        model: all that the checkpoint must hold: the network, or an `nn.ModuleDict` of it and, say, averaged weights
+            that a post-step hook of the optimiser updates.
+        schedule: of the learning rate, stepped after each optimiser step.
+        iterations: steps of the whole training.
+        evaluations: number of evaluations and checkpoints.
+    """
+
+    def __init__(
+        self, directory: Path, model: nn.Module, schedule: LRScheduler, iterations: int, evaluations: int
+    ) -> None:
+        self.directory, self.iterations, self.every = directory, iterations, max(iterations // evaluations, 1)
+        self._model, self._schedule, self._optimiser = model, schedule, schedule.optimizer
+        self._state = {"model": model, "optimiser": self._optimiser, "schedule": schedule}
+        self.step = 0
+        self.curves: list[dict[str, float]] = []
+        self._checkpoint = directory / "checkpoint.pt"
+        directory.mkdir(parents=True, exist_ok=True)
+        saved = torch.load(self._checkpoint, weights_only=True) if writes() and self._checkpoint.exists() else None
+        if processes() > 1:
+            saved = from_first(saved or self._states())
+        if saved:
+            for name, part in self._state.items():
+                part.load_state_dict(saved[name])
+            self.step, self.curves = saved["step"], saved["curves"]
+            torch.set_rng_state(saved["rng"])
+        if rank():
+            # the same noise on every process would be noise that does not average out
+            torch.manual_seed(torch.initial_seed() + rank() + processes() * self.step)
+        average_gradients(self._optimiser)
+
+    def minimise(
+        self, loss: Loss, evaluate: Callable[[], dict[str, float]], batch: int, seed: int, clip: float = math.inf
+    ) -> None:
+        """Run the remaining steps, with evaluations, checkpoints and curves at intervals and at the end.
+
+        Args:
+            loss: called with the model in training mode.
+            evaluate: quantities to plot beside the loss' terms; called in evaluation mode, without gradients.
+            batch: samples a step, of all processes together.
+            seed: of the batches.
+            clip: maximum norm of the gradient.
+        """
+        parameters = [parameter for group in self._optimiser.param_groups for parameter in group["params"]]
+        columns = (
+            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+            TimeRemainingColumn(), TextColumn("{task.fields[result]}"),
+        )  # fmt: skip
+        with Progress(*columns, disable=not writes()) as progress:
+            task = progress.add_task(
+                self.directory.name, total=self.iterations, completed=self.step, result=self._latest()
+            )
+            while self.step < self.iterations:
+                self._model.train()
+                rng = np.random.default_rng((seed, self.step, rank()))
+                value, terms = loss(share(batch), self.step / self.iterations, rng)
+                self._optimiser.zero_grad()
+                value.backward()
+                nn.utils.clip_grad_norm_(parameters, clip)
+                self._optimiser.step()
+                self._schedule.step()
+                self.step += 1
+                if self.step % self.every == 0 or self.step == self.iterations:
+                    self._evaluate(terms, evaluate)
+                progress.update(task, completed=self.step, result=self._latest())
+        self._model.eval()
+
+    def save(self, path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, str]) -> Path:
+        """Write the trained model, its card and its curves.
+
+        Args:
+            path: ``MODEL-SET.safetensors`` in the run's folder; `torch_weights.install` puts it where nodes read it.
+            model: trained.
+            config: what rebuilds it.
+            card: heading to content: model, data, licence and training; the last evaluation is added here.
+
+        Returns:
+            ``path``.
+        """
+        curves = path.with_suffix(".png")
+        found = {
+            "Validation": ", ".join(f"{k} {v:.4g}" for k, v in self.curves[-1].items()),
+            "Curves": f"`{curves.name}`",
+        }
+        save_weights(path, model, config, {**card, **found})
+        draw_curves(self.curves, curves)
+        return path
+
+    @torch.no_grad()
+    def _evaluate(self, terms: dict[str, float], evaluate: Callable[[], dict[str, float]]) -> None:
+        self._model.eval()
+        self.curves.append(from_first({"step": self.step, **({**terms, **evaluate()} if writes() else {})}))
+        if writes():
+            self._save()
+
+    def _latest(self) -> str:
+        return "  ".join(f"{k} {v:.4g}" for k, v in (self.curves[-1] if self.curves else {}).items() if k != "step")
+
+    def _save(self) -> None:
+        part = self._checkpoint.with_suffix(".part")
+        torch.save(self._states(), part)
+        os.replace(part, self._checkpoint)
+        (self.directory / "curves.json").write_text(json.dumps(self.curves, indent=1))
+        draw_curves(self.curves, self.directory / "curves.png")
+
+    def _states(self) -> dict[str, Any]:
+        states = {name: part.state_dict() for name, part in self._state.items()}
+        return {**states, "step": self.step, "curves": self.curves, "rng": torch.get_rng_state()}
+
+
+def draw_curves(curves: list[dict[str, float]], path: Path) -> None:
+    """Draw every quantity of ``curves`` against the step, one panel each, on the first process of torchrun."""
+    if not writes():
+        return
+    from matplotlib.figure import Figure
+
+    names = [name for name in curves[-1] if name != "step"]
+    figure = Figure(figsize=(3.2 * len(names), 2.6), layout="constrained")
+    for axis, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+        axis.plot([c["step"] for c in curves], [c[name] for c in curves], lw=1.2)
+        axis.set(title=name, xlabel="step")
+        axis.grid(alpha=0.3)
+        if min(c[name] for c in curves) > 0:
+            axis.set_yscale("log")
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,199 @@
+"""The network of the mixture: weights of a bank of filters, for every joint, from features of the whole body.
+
+A mixture of experts (Jacobs et al. 1991) over linear filters. A layer shared by all joints encodes each joint's
+features, a second one the whole body's, and each joint's output is computed from both. The estimate is
+
+    sum of w_m x_m  +  (1 - w_raw) (sum of b_m x_m + scale r),   w >= 0, sum of w = 1, sum of b = 0, b and r bounded
+
+``x`` being the experts' positions. The second term extrapolates beyond filters that lag, and corrects a joint from the
+context of the whole body, by an amount bounded by the estimated noise ``scale``; it vanishes where the raw joint has
+all the weight, so that a perfect input stays unchanged. Live, a share of the way from there to the multiple-model
+estimate is added, as far as the noise is white (`prior.models.mixture.whiteness`).
+
+Outputs are smoothed over time by gates that the network computes (as in gated recurrent units, Cho et al. 2014):
+weights that fluctuate would add noise of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from steadypose.prior.models.mixture.bank import EXPERTS, MULTIPLE_MODEL, RAW
+from steadypose.prior.models.mixture.features import FEATURES
+from steadypose.prior.models.mixture.form import (
+    COASTING,
+    CORRECTION,
+    GATES,
+    MAX_LOG_SIGMA,
+    MIN_LOG_SIGMA,
+    OUTPUTS,
+    REACH,
+)
+from steadypose.prior.timing.rate import FPS
+
+JOINTS = 22
+
+FIRST_GATE = -4.0
+"""Initial bias of the gates: next to no weight on the previous output."""
+
+
+@dataclass(frozen=True)
+class MixtureConfig:
+    """Layer widths.
+
+    Attributes:
+        own: features of each joint.
+        body: features of the whole body.
+        told: features of the body passed to each joint.
+        head: features of the layers that compute a joint's output.
+    """
+
+    own: int = 32
+    body: int = 384
+    told: int = 24
+    head: int = 64
+
+
+class Memory(nn.Module):
+    """Running means of features, each with a learned time constant: a diagonal linear recurrence, which is stable.
+
+    They are normalised from the first frame on: the initial state has no weight.
+    """
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        frames = torch.logspace(0.2, 1.7, features)[torch.randperm(features)]
+        self.decay = nn.Parameter(torch.logit(1.0 - 1.0 / frames))
+
+    def forward(self, values: Tensor, present: Tensor) -> Tensor:
+        """Means (C, T, ..., F) of values up to each frame; frames that are not ``present`` (C, T) do not count."""
+        inner = (1,) * (values.ndim - 3)
+        kept = torch.where(present[..., None], torch.sigmoid(self.decay), 1.0)
+        kept = kept.reshape(*present.shape, *inner, -1)
+        total = _faded(kept, (1.0 - kept) * values)
+        return total / _faded(kept, 1.0 - kept).clamp(min=1e-6)
+
+
+def _faded(kept: Tensor, added: Tensor) -> Tensor:
+    """The recurrence y[t] = kept[t] y[t - 1] + added[t], of (C, T, ...) from y[-1] = 0."""
+    total, out = torch.zeros_like(added[:, 0]), []
+    for keep, new in zip(kept.unbind(1), added.unbind(1), strict=True):
+        total = torch.addcmul(new, keep, total)
+        out.append(total)
+    return torch.stack(out, dim=1)
+
+
+class MixtureNet(nn.Module):
+    """From features of the joints of a body, frame by frame, to weights, corrections and standard deviations."""
+
+    def __init__(self, config: MixtureConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.register_buffer("mean", torch.zeros(FEATURES))
+        self.register_buffer("deviation", torch.ones(FEATURES))
+        self.read = nn.Linear(FEATURES, config.own)
+        self.joint = nn.Parameter(torch.zeros(JOINTS, config.own))
+        self.own_memory = Memory(config.own)
+        self.gather = nn.Linear(JOINTS * config.own, config.body)
+        self.body_memory = Memory(config.body)
+        self.remember = nn.Linear(config.body, config.body)
+        self.think = nn.Linear(config.body, config.body)
+        self.tell = nn.Linear(config.body, JOINTS * config.told)
+        self.mix = nn.Linear(FEATURES + config.own + config.told, config.head)
+        self.joint_mix = nn.Parameter(torch.zeros(JOINTS, config.head))
+        self.deepen = nn.Linear(config.head, config.head)
+        self.write = nn.Linear(config.head, OUTPUTS + GATES)
+        with torch.no_grad():
+            self.write.weight.mul_(0.1)
+            self.write.bias[OUTPUTS:] = FIRST_GATE
+
+    mean: Tensor
+    deviation: Tensor
+
+    def forward(self, features: Tensor, present: Tensor) -> Tensor:
+        """(C, T, 22, OUTPUTS) from features (C, T, 22, FEATURES), from a clip's first frame on, and whether a body is
+        ``present`` (C, T)."""
+        written, gates = self.layers(
+            features, lambda own: self.own_memory(own, present), lambda body: self.body_memory(body, present)
+        )
+        kept = kept_of(gates, F.pad(present[:, :-1], (1, 0))[..., None, None])
+        return _faded(kept, (1.0 - kept) * written)
+
+    def layers(
+        self, features: Tensor, own_memory: Callable[[Tensor], Tensor], body_memory: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """New outputs (..., 22, OUTPUTS) before gating, and their gates (..., 22, GATES).
+
+        Args:
+            features: (..., 22, FEATURES).
+            own_memory: from joints' features (..., 22, own) to their means so far.
+            body_memory: from bodies' features (..., body) to theirs.
+        """
+        normalised = (features - self.mean) / self.deviation
+        own = F.relu(self.read(normalised) + self.joint)
+        before = own_memory(own)
+        body = F.relu(self.gather(own.flatten(-2)))
+        body = body + F.relu(self.remember(body_memory(body)))
+        body = body + F.relu(self.think(body))
+        context = self.tell(body).unflatten(-1, (JOINTS, self.config.told))
+        mixed = F.relu(self.mix(torch.cat([normalised, before, context], dim=-1)) + self.joint_mix)
+        written, gates = self.write(mixed + F.relu(self.deepen(mixed))).split([OUTPUTS, GATES], dim=-1)
+        return written, gates
+
+
+def kept_of(gates: Tensor, before: Tensor) -> Tensor:
+    """Weight (..., 22, OUTPUTS) of the previous frame's outputs; 0 where there is no frame ``before``."""
+    kept = torch.where(before, torch.sigmoid(gates), 0.0)
+    return kept.repeat_interleave(torch.tensor([2 * EXPERTS, 3, 1]), dim=-1)
+
+
+def answer(
+    outputs: Tensor,
+    experts: Tensor,
+    heading: Tensor,
+    scale: Tensor,
+    gap: Tensor,
+    between: Tensor,
+    fallback: Tensor | float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """Positions (..., 22, 3) metres, and their variances along an axis (..., 22) mm².
+
+    In a gap between two observations, the multiple-model estimate is used.
+
+    Args:
+        outputs: (..., 22, OUTPUTS) of the network.
+        experts: (..., 22, EXPERTS, 3) metres; this and the following as `features.describe` writes them.
+        heading: (..., 2) cosine and sine of the body's heading.
+        scale: (...) metres along an axis, estimated noise.
+        gap: (..., 22) frames to the nearest observation of each joint.
+        between: (..., 22) metres along an axis, deviation of the multiple-model estimate in gaps between two
+            sightings; otherwise 0.
+        fallback: (..., 1, 1) share of the multiple-model estimate in what is not the raw joint's.
+    """
+    logits, reach, correction, log_sigma = outputs.split([EXPERTS, EXPERTS, 3, 1], dim=-1)
+    weights = logits.softmax(dim=-1)
+    free = 1.0 - weights[..., RAW:]
+    reach = REACH * torch.tanh(reach)
+    reach = reach - reach.mean(dim=-1, keepdim=True)
+    weights = weights + free * reach
+    moved = CORRECTION * torch.tanh(correction / CORRECTION) * free * scale[..., None, None]
+    cos, sin = heading[..., None, 0], heading[..., None, 1]
+    moved = torch.stack(
+        [cos * moved[..., 0] - sin * moved[..., 1], sin * moved[..., 0] + cos * moved[..., 1], moved[..., 2]], dim=-1
+    )
+    # from the joint as it came, so that rounding does not move it
+    came = experts[..., RAW, :]
+    places = came + (weights[..., None] * (experts - came[..., None, :])).sum(dim=-2) + moved
+    places = places + fallback * free * (experts[..., MULTIPLE_MODEL, :] - places)
+    coasted = 1e3 * COASTING / FPS * gap
+    variance = (2.0 * log_sigma[..., 0].clamp(MIN_LOG_SIGMA, MAX_LOG_SIGMA)).exp() + coasted.square()
+    inside = between > 0.0
+    return (
+        torch.where(inside[..., None], experts[..., MULTIPLE_MODEL, :], places),
+        torch.where(inside, (1e3 * between).square(), variance),
+    )

@@ -1,0 +1,313 @@
+"""Training of the completer: ``steadypose train completer``.
+
+Windows of true motion lose what `complete` is asked for: all frames between two ends, frames between key frames, parts
+of the body, and combinations of these; the known joints of some have a little noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import roma
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from steadypose.prior.body.inverse_kinematics import place_joints
+from steadypose.prior.body.skeleton import J, limbs
+from steadypose.prior.fit.torch_kinematics import forward_kinematics, from_6d, to_6d
+from steadypose.prior.models.completer.config import BENDS, CompleterConfig
+from steadypose.prior.models.completer.features import Bools, Line, Window, correction_share, read_window
+from steadypose.prior.models.weights import LICENCES
+from steadypose.training.data.dataset import LivelyWindows, MotionSet, describe_data, mirror_offsets, mirror_rotations
+from steadypose.training.loop import TrainingOptions, TrainingRun
+from steadypose.training.networks.completer import Completer
+from steadypose.training.weights import started
+
+Rng = np.random.Generator
+
+ITERATIONS, BATCH, LEARNING_RATE = 20_000, 1536, 8e-4
+"""Frames a step; AdamW's rate at its highest, from where it falls along a cosine."""
+
+GAPS = (5, 64)
+"""Range of frames of a gap."""
+
+CONTEXT = (2, 14)
+"""Range of frames that are known around it, before and after together."""
+
+STRIDES = (1, 1, 1, 2)
+"""Frame rates, as frames from one to the next."""
+
+SCALES = (0.85, 1.15)
+"""Range of factors on people's sizes."""
+
+NOISY, NOISE = 0.3, 0.015
+"""Share of windows whose known joints are noisy, and its largest standard deviation, metres along an axis."""
+
+POSE_WEIGHT, PATH_WEIGHT, ROTATION_WEIGHT, VELOCITY_WEIGHT = 4.0, 4.0, 1.0, 10.0
+"""Of joints about the root and the root itself, metres; global rotation matrices; metres a frame of joints."""
+
+EASY = 0.05
+"""Metres: a window's loss is divided by this plus the interpolation's error, so that the relative error counts and fast
+motion does not dominate."""
+
+_ARMS = limbs(("elbow", "wrist"), ("shoulder", "elbow", "wrist"))
+_LEGS = limbs(("knee", "ankle", "foot"), ("ankle", "foot"))
+_LOWER = sorted(_LEGS[0] + _LEGS[2])
+_BOTH_ARMS = sorted(_ARMS[1] + _ARMS[3])
+_PARTS = (*_ARMS, *_LEGS, _LOWER, _LOWER, _BOTH_ARMS, [*_BOTH_ARMS, J["head"], J["neck"]], [J["pelvis"], *_LOWER])
+_ENDS = [J[name] for name in ("pelvis", "spine3", "head", "left_wrist", "right_wrist", "left_ankle", "right_ankle")]
+
+
+def train_completer(options: TrainingOptions, config: CompleterConfig | None = None) -> Path:
+    """Train the completer, of these sizes, on prepared motion; the path of the weights."""
+    iterations, weights, seed = options.iterations or ITERATIONS, options.weights, options.seed
+    path = options.path("completer")
+    torch.manual_seed(seed)
+    train, val = (MotionSet.load(options.data, weights, split) for split in ("train", "val"))
+    model = Completer(config or CompleterConfig())
+    model.usual.copy_(roma.rotmat_to_unitquat(roma.special_procrustes(train.rotations.mean(dim=0))))
+    origin = started(model, "completer", options.start)
+    optimiser = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=0.01)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, LEARNING_RATE, total_steps=iterations + 1, pct_start=0.05, final_div_factor=40
+    )
+    run = TrainingRun(path.parent, model, schedule, iterations, evaluations=40)
+    lively = LivelyWindows(train)
+
+    def loss_of(count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        gap, context = int(rng.integers(GAPS[0], GAPS[1] + 1)), int(rng.integers(CONTEXT[0], CONTEXT[1] + 1))
+        frames = gap + context
+        rows = lively.sample(max(count // frames, 1), frames, STRIDES, rng)
+        return loss(model, Truth.of(train, rows, rng), masks(len(rows), gap, context, rng), rng)
+
+    run.minimise(loss_of, lambda: evaluate_completer(model, val), BATCH, seed, clip=1.0)
+    return run.save(path, model, asdict(calibrate(model, val)), {
+        "Model": f"a transformer of {model.config.layers} layers, {model.config.width} wide, over a window's frames",
+        "Data": describe_data(weights, train, val),
+        "Licence": LICENCES[weights],
+        "Training": f"`steadypose train completer --weights {weights} --iterations {iterations}`: {BATCH} frames a "
+        f"step in windows of {GAPS[0] + CONTEXT[0]} to {GAPS[1] + CONTEXT[1]}, AdamW {LEARNING_RATE:g}, "
+        f"seed {seed}{origin}",
+    })  # fmt: skip
+
+
+class Truth:
+    """Windows of true motion.
+
+    Attributes:
+        rotations: (B, T, 22, 3, 3) local.
+        root: (B, T, 3) metres, world.
+        offsets: (B, 22, 3) metres, bones.
+    """
+
+    def __init__(self, rotations: Tensor, root: Tensor, offsets: Tensor) -> None:
+        self.rotations, self.root, self.offsets = rotations, root, offsets
+
+    @classmethod
+    def of(cls, motion: MotionSet, rows: NDArray[np.int64], rng: Rng | None = None) -> Truth:
+        """These frames (B, T); with ``rng``, half of the windows mirrored and all scaled at random."""
+        rotations, root, offsets = motion.rotations[rows], motion.positions[rows, 0], motion.offsets[rows[:, 0]]
+        if rng is not None:
+            half = len(rows) // 2
+            # across the world's xz plane, which is as good as any
+            flip = torch.tensor([1.0, -1.0, 1.0])
+            rotations = torch.cat([mirror_rotations(rotations[:half]), rotations[half:]])
+            root = torch.cat([root[:half] * flip, root[half:]])
+            offsets = torch.cat([mirror_offsets(offsets[:half]), offsets[half:]])
+            scale = torch.from_numpy(rng.uniform(*SCALES, (len(rows), 1, 1))).float()
+            root, offsets = root * scale, offsets * scale
+        return cls(rotations, root, offsets)
+
+    def seen(self, known: Bools, usual: Tensor, rng: Rng | None = None) -> Window:
+        """The completer's input where these joints (B, T, 22) are known; with ``rng``, some are noisy."""
+        joints = forward_kinematics(self.rotations, self.offsets[:, None], self.root)[0].double().numpy()
+        if rng is not None:
+            sigma = rng.uniform(0.0, NOISE, (len(joints), 1, 1, 1)) * (rng.random((len(joints), 1, 1, 1)) < NOISY)
+            joints += sigma * rng.standard_normal(joints.shape)
+        joints[~known] = np.nan
+        return read_window(joints, self.offsets.double().numpy(), usual.double().numpy())
+
+    def in_frame_of(self, window: Window) -> tuple[Tensor, Tensor]:
+        """Rotations (B, T, 22, 3, 3) and root (B, T, 3), turned and moved as the window is."""
+        turn, origin = torch.from_numpy(window.turn).float(), torch.from_numpy(window.origin).float()
+        rotations = self.rotations.clone()
+        rotations[:, :, 0] = turn.mT[:, None] @ rotations[:, :, 0]
+        return rotations, (self.root - origin[:, None]) @ turn
+
+
+def masks(count: int, gap: int, context: int, rng: Rng) -> Bools:
+    """(count, gap + context, 22) which joints are known, in tasks of completion.
+
+    By chance 52 % a gap, 10 % key frames, 30 % parts of the body hidden, 8 % both a gap and parts.
+    """
+    frames = gap + context
+    known = np.ones((count, frames, 22), dtype=bool)
+    for row in known:
+        kind = rng.random()
+        if kind < 0.52 or kind > 0.92:
+            if rng.random() < 0.03:
+                before = context
+            else:
+                before = context - 1 if rng.random() < 0.5 else int(rng.integers(1, context))
+            row[before : before + gap] = False
+        elif kind < 0.62:
+            step = int(rng.integers(3, 31))
+            row[np.arange(frames) % step != int(rng.integers(0, step))] = False
+            row[0] = True
+        if kind > 0.62:
+            span = slice(None)
+            if rng.random() < 0.4:
+                length = int(rng.integers(1, frames + 1))
+                start = int(rng.integers(0, frames - length + 1))
+                span = slice(start, start + length)
+            if rng.random() < 0.75:
+                hidden = _PARTS[int(rng.integers(len(_PARTS)))]
+            elif rng.random() < 0.5:
+                hidden = np.flatnonzero(rng.random(22) < rng.uniform(0.05, 0.6))
+            else:
+                hidden = np.setdiff1d(np.arange(22), _ENDS)
+            row[span, hidden] = False
+    return known
+
+
+def _anchored(values: Tensor, line: Line, tracks: slice) -> Tensor:
+    """`features.anchored`, with gradients."""
+
+    def at(frames: NDArray[np.int64]) -> Tensor:
+        index = torch.from_numpy(frames[..., tracks, None]).expand_as(values)
+        return values.gather(1, index)
+
+    weight = torch.from_numpy(line.weight[..., tracks, None])
+    ever = torch.from_numpy(line.ever[:, None, tracks, None])
+    return values - torch.where(ever, torch.lerp(at(line.before), at(line.after), weight), 0.0)
+
+
+def answer(model: Completer, window: Window) -> tuple[Tensor, Tensor]:
+    """Local rotations (B, T, 22, 3, 3) and root (B, T, 3), metres, in the window's frame, with gradients."""
+    line = window.line
+    with torch.autocast("cpu", torch.bfloat16, enabled=model.training):
+        output = model(torch.from_numpy(window.features))
+    rotations, root, gates = output.float().split([BENDS - 3, 3, 23], dim=-1)
+    share = torch.from_numpy(correction_share(line))
+    bend = torch.from_numpy(window.bend) * (1.0 - share * torch.sigmoid(-gates)[..., None])
+    rotations = _anchored(rotations.unflatten(-1, (22, 6)), line, slice(0, 22))
+    root = _anchored(root.unflatten(-1, (1, 3)), line, slice(22, 23))[:, :, 0]
+    base = torch.from_numpy(window.rotations).float()
+    rotations, root = share[:, :, :22] * rotations + bend[:, :, :22], share[:, :, 22] * root + bend[:, :, 22, :3]
+    return from_6d(to_6d(base) + rotations), torch.from_numpy(window.root).float() + root
+
+
+def loss(model: Completer, truth: Truth, known: Bools, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+    """Absolute errors where something was hidden, weighted by window (`EASY`); and its terms by name."""
+    window = truth.seen(known, model.usual, rng)
+    rotations, root = answer(model, window)
+    true, true_root = truth.in_frame_of(window)
+    joints, turned = forward_kinematics(torch.stack([rotations, true]), truth.offsets[:, None])
+    hidden = torch.from_numpy(~known)
+    frames = hidden.any(dim=-1)
+    rotations_hidden = torch.from_numpy(~window.line.known[..., :22])[..., None, None]
+    missed = joints[0] - joints[1]
+    world = missed + (root - true_root)[:, :, None]
+    line = place_joints(window.rotations, truth.offsets[:, None].double().numpy()) + window.root[:, :, None]
+    off = torch.from_numpy(line).float() - joints[1].detach() - true_root[:, :, None]
+    per = frames.sum(dim=1).clamp(min=1)[:, None]
+    worth = 1.0 / ((off.norm(dim=-1).mean(dim=-1) * frames).sum(dim=1, keepdim=True) / per + EASY)
+    worth = worth / worth.mean() * frames.float()
+
+    def mean(values: Tensor) -> Tensor:
+        return (values * worth[:, :, None, None]).sum() / worth.sum().clamp(min=1.0) / values[0, 0].numel()
+
+    l_pose, l_path = mean(missed.abs()), mean((root - true_root).abs()[:, :, None] * hidden[..., :1, None])
+    l_rotation = mean((turned[0] - turned[1]).abs().flatten(3)) + mean(
+        ((rotations - true).abs() * rotations_hidden).flatten(3)
+    )
+    l_velocity = mean(F.pad(world.diff(dim=1).abs(), (0, 0, 0, 0, 1, 0)))
+    total = (
+        POSE_WEIGHT * l_pose + PATH_WEIGHT * l_path + ROTATION_WEIGHT * l_rotation + VELOCITY_WEIGHT * l_velocity
+    )  # fmt: skip
+    return total, {"loss": total.item(), "pose mm": 1e3 * l_pose.item(), "path mm": 1e3 * l_path.item()}
+
+
+PROTOCOL = (10, 1)
+"""Frames known before a gap and after it, in the protocol of LAFAN1 (Harvey et al. 2020)."""
+
+
+@torch.no_grad()
+def evaluate_completer(model: Completer, motion: MotionSet, windows: int = 192) -> dict[str, float]:
+    """Errors on unseen people.
+
+    Returns:
+        for gaps of 15 and 30 frames, ``val 15 of line`` the error of joints as a share of slerp's and lerp's; ``val
+        legs mm`` that of knees, ankles and feet never seen.
+    """
+    found = {}
+    for gap in (15, 30):
+        frames = sum(PROTOCOL) + gap
+        known = np.ones((frames, 22), dtype=bool)
+        known[PROTOCOL[0] : PROTOCOL[0] + gap] = False
+        ours, line = _errors(model, motion, known, windows)
+        found[f"val {gap} of line"] = float(ours[~known].mean() / line[~known].mean())
+    known = np.ones((40, 22), dtype=bool)
+    known[:, _LOWER] = False
+    found["val legs mm"] = float(_errors(model, motion, known, windows)[0][~known].mean() * 1e3)
+    return found
+
+
+HIDDEN_PARTS = (
+    _ARMS[1],
+    _ARMS[3],
+    _LEGS[0],
+    _LEGS[2],
+    [J["head"], J["neck"]],
+    np.setdiff1d(np.arange(22), _ENDS).tolist(),
+)
+"""What is hidden to see how far off joints are that are never known; by the first in which a joint is."""
+
+
+@torch.no_grad()
+def calibrate(model: Completer, motion: MotionSet, windows: int = 128) -> CompleterConfig:
+    """The configuration with the model's RMS errors along an axis, measured on validation motion.
+
+    The time constant, in frames, is the one that best fits the growth of the error from the ends of a gap.
+    """
+    never = np.full(22, np.nan)
+    for part in (*HIDDEN_PARTS, [J["pelvis"]], [J["spine3"]]):
+        known = np.ones((50, 22), dtype=bool)
+        known[:, part] = False
+        off = _errors(model, motion, known, windows, squared=True)[0].mean(dim=0).sqrt().numpy() / np.sqrt(3)
+        never = np.where(np.isnan(never) & ~known[0], off, never)
+    gap = 60
+    known = np.ones((gap + 14, 22), dtype=bool)
+    known[7:-7] = False
+    off = _errors(model, motion, known, windows, squared=True)[0][7:-7].sqrt().numpy() / np.sqrt(3)
+    apart = np.minimum(np.arange(1, gap + 1), np.arange(gap, 0, -1))[:, None]
+    halves = np.arange(1.0, 61.0)
+    fits = [np.abs(np.log(never * apart / (apart + half)) - np.log(np.maximum(off, 1e-4))).mean() for half in halves]
+    return replace(
+        model.config,
+        never_sigma=tuple(round(float(v), 4) for v in never),
+        half_frames=float(halves[int(np.argmin(fits))]),
+    )
+
+
+def _errors(
+    model: Completer, motion: MotionSet, known: Bools, windows: int, *, squared: bool = False
+) -> tuple[Tensor, Tensor]:
+    """(T, 22) mean distances of joints from the truth, metres, or their mean squares: of the answer, and the line."""
+    rows = motion.all_windows(len(known), step=5)
+    rows = rows[np.linspace(0, len(rows) - 1, windows).astype(int)]
+    truth = Truth.of(motion, rows)
+    window = truth.seen(np.broadcast_to(known, (windows, *known.shape)).copy(), model.usual)
+    rotations, root = truth.in_frame_of(window)
+    aim, _ = forward_kinematics(rotations, truth.offsets[:, None], root)
+
+    def error(rotations: Tensor, root: Tensor) -> Tensor:
+        off = (forward_kinematics(rotations, truth.offsets[:, None], root)[0] - aim).norm(dim=-1)
+        return (off.square() if squared else off).mean(dim=0)
+
+    base = torch.from_numpy(window.rotations).float(), torch.from_numpy(window.root).float()
+    return error(*answer(model, window)), error(*base)

@@ -1,0 +1,230 @@
+"""Training of the contact network: ``steadypose train contacts``.
+
+Clips of true motion go through simulated sensors and the smoother that the live node runs, once; then windows of what
+it leaves are drawn, turned, and stripped of what a sensor may not tell: the root, the ground, joints.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.progress import track
+from torch import Tensor
+from torch.nn import functional as F
+
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, REST_SPEED, heading, label_contacts
+from steadypose.prior.body.skeleton import MIRROR, J
+from steadypose.prior.models.contacts import FEATURES, contact_features
+from steadypose.prior.models.mixture.inference import MixtureSmoother
+from steadypose.prior.models.weights import LICENCES
+from steadypose.prior.timing.rate import FPS
+from steadypose.training.data.dataset import MotionSet, describe_data
+from steadypose.training.loop import TrainingOptions, TrainingRun
+from steadypose.training.networks.contacts import ContactConfig, ContactNet
+from steadypose.training.weights import started
+
+Floats = NDArray[np.float64]
+Rng = np.random.Generator
+
+ITERATIONS, BATCH, LEARNING_RATE = 3_000, 64, 4e-3
+"""Clips a step; Adam's rate at the start, which falls along a cosine."""
+
+FRAMES = 90
+"""Of a clip, from its first: the start of a stream is a part of it."""
+
+CLIPS = {"train": 3072, "val": 384}
+"""Clips of each split that are smoothed."""
+
+SIDE_BY_SIDE = 64
+"""Clips smoothed as the bodies of one stream."""
+
+DELAYS = (0, 2, 4, 4, 8)
+"""Frames, of the smoother."""
+
+MIN_SPEED = 0.1
+"""m/s: a clip is drawn as often as its feet are fast, and one that stands still as if they were this fast."""
+
+SCALES = (0.8, 1.15)
+"""Range of factors on people's sizes."""
+
+SOLE_SD = 0.01
+"""Metres: how far joints lie off where the training motion has them, by rig and shoe, and the ground off its place."""
+
+YAW_SD = math.radians(15.0)
+"""How well the heading is known."""
+
+ROOT_UNSEEN, GROUND_UNKNOWN, FEET_ALONE = 0.25, 0.25, 0.15
+"""Shares of windows: against the root alone; on a ground that nobody knows; of which only the feet are known."""
+
+_HANDS_KNEES_ROOT = [0, *(J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "wrist"))]
+_FEET = slice(2, 6)
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Clips as the smoother leaves them, (C, T, ...).
+
+    Attributes:
+        positions: (C, T, 22, 3) metres, world, float32.
+        sigma: (C, T, 22) metres.
+        yaw: (C, T) radians.
+        load: (C, T, 8) labels.
+        rest: (C, T, 8).
+    """
+
+    positions: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    yaw: NDArray[np.float32]
+    load: NDArray[np.bool_]
+    rest: NDArray[np.bool_]
+
+
+def smoothed_clips(motion: MotionSet, count: int, seed: int) -> Pool:
+    """``count`` clips, the faster the likelier, as people of several sizes through several sensors."""
+    rng = np.random.default_rng(seed)
+    starts = motion.all_windows(FRAMES, 5)[:, 0]
+    feet = motion.positions[:, [J["left_ankle"], J["right_ankle"]]].numpy()
+    moved = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(feet, axis=0), axis=-1).mean(axis=1) * FPS)])
+    chances = MIN_SPEED + (moved[starts + FRAMES - 1] - moved[starts]) / FRAMES
+    first = rng.choice(starts, count, p=chances / chances.sum())
+    parts = [
+        _smoothed(motion, first[k : k + SIDE_BY_SIDE], rng)
+        for k in track(range(0, count, SIDE_BY_SIDE), description="smoothing")
+    ]
+    return Pool(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def _smoothed(motion: MotionSet, first: NDArray[np.int64], rng: Rng) -> tuple[NDArray, ...]:
+    rows = first[:, None] + np.arange(FRAMES)
+    truth = motion.positions[rows].numpy().astype(np.float64)
+    yaw = heading(motion.rotations[rows, 0].numpy())
+    mirrored = rng.random(len(rows)) < 0.5
+    truth[mirrored] = truth[mirrored][:, :, MIRROR] * (1.0, -1.0, 1.0)
+    yaw[mirrored] *= -1.0
+    truth *= rng.uniform(*SCALES, (len(rows), 1, 1, 1))
+    delay = int(rng.choice(DELAYS))
+    smoother, seen = MixtureSmoother(delay, len(rows)), truth + _errors(truth.shape, rng)
+    answers = [smoother.update(seen[:, t], t / FPS) for t in range(FRAMES)]
+    kept = [answer for answer in answers if answer is not None]
+    positions = np.stack([answer.positions for answer in kept], axis=1)
+    sigma = np.stack([answer.sigma for answer in kept], axis=1)
+    positions, sigma = (_to_length(values) for values in (positions, sigma))
+    load, rest = (np.stack([label_contacts(clip, FPS, speed) for clip in truth]) for speed in (LOAD_SPEED, REST_SPEED))
+    return positions.astype(np.float32), sigma.astype(np.float32), yaw.astype(np.float32), load, rest
+
+
+def _to_length(values: Floats) -> Floats:
+    """(C, `FRAMES`, ...), NaN after the last frame of (C, T, ...)."""
+    missing = FRAMES - values.shape[1]
+    return np.concatenate([values, np.full((len(values), missing, *values.shape[2:]), np.nan)], axis=1)
+
+
+def _errors(shape: tuple[int, ...], rng: Rng) -> Floats:
+    """(C, T, 22, 3) metres, of as many sensors as clips: from frame to frame, lasting, and of the whole body."""
+    count, frames, joints, _ = shape
+    of_clip = (count, 1, 1, 1)
+    by_joint = np.exp(0.4 * rng.standard_normal((count, 1, joints, 1)))
+    fast = 10 ** rng.uniform(-3.0, -1.3, of_clip) * by_joint * (rng.random(of_clip) < 0.75)
+    slow = 10 ** rng.uniform(-3.0, -1.5, of_clip) * by_joint * (rng.random(of_clip) < 0.6)
+    whole = 10 ** rng.uniform(-3.0, -1.7, of_clip) * (rng.random(of_clip) < 0.4)
+    memory = rng.uniform(0.8, 0.98, of_clip[:1])[:, None, None]
+    lasting = rng.standard_normal(shape) * slow + rng.standard_normal((count, frames, 1, 3)) * whole
+    for t in range(1, frames):
+        lasting[:, t] = memory * lasting[:, t - 1] + np.sqrt(1.0 - memory**2) * lasting[:, t]
+    return lasting + fast * rng.standard_normal(shape)
+
+
+def draw(pool: Pool, clips: NDArray[np.int64], rng: Rng) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Features (C, T - 1, F), labels of load and rest (C, T - 1, 8), and which frames count (C, T - 1, 1)."""
+    positions = pool.positions[clips].astype(np.float64)
+    count, frames = positions.shape[:2]
+    alone = rng.random(count) < FEET_ALONE
+    positions[np.ix_(alone, np.arange(frames), _HANDS_KNEES_ROOT)] = np.nan
+    positions[..., 2] += rng.normal(0.0, SOLE_SD, (count, 1, 1)) + rng.normal(0.0, SOLE_SD / 2, (count, 1, 22))
+    root_seen = (alone | (rng.random(count) >= ROOT_UNSEEN)).astype(float)
+    known = rng.random(count) >= GROUND_UNKNOWN
+    ground = np.where(known[:, None], np.zeros((count, len(CONTACT_JOINTS))), np.nan)
+    yaw = pool.yaw[clips] + np.where(alone, rng.uniform(-np.pi, np.pi, count), rng.normal(0.0, YAW_SD, count))[:, None]
+
+    def rows(values: NDArray[Any]) -> NDArray[Any]:
+        return values.reshape(-1, *values.shape[2:])
+
+    def of_frames(values: Floats) -> Floats:
+        return np.repeat(values, frames - 1, axis=0)
+
+    features = contact_features(
+        rows(positions[:, 1:]), rows(positions[:, :-1]), 1.0 / FPS, rows(yaw[:, 1:]), rows(pool.sigma[clips][:, 1:]),
+        of_frames(root_seen), of_frames(ground),
+    )  # fmt: skip
+    answered = np.isfinite(pool.sigma[clips][:, 1:, :1])
+    load, rest, counts = pool.load[clips][:, 1:], pool.rest[clips][:, 1:], answered
+    counts = np.repeat(counts, load.shape[-1], axis=-1)
+    counts[alone, :, : _FEET.start] = counts[alone, :, _FEET.stop :] = False
+    told = torch.from_numpy(np.nan_to_num(features)).reshape(count, frames - 1, FEATURES)
+    return told, _tensor(load), _tensor(rest), _tensor(counts)
+
+
+def _tensor(values: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(values.astype(np.float32))
+
+
+def train_contacts(options: TrainingOptions) -> Path:
+    """Train the contact network on prepared motion at several speeds; the path of the weights."""
+    iterations, weights, seed = options.iterations or ITERATIONS, options.weights, options.seed
+    path = options.path("contacts")
+    sets = {split: MotionSet.load(options.data, weights, split, flat=True) for split in CLIPS}
+    train, val = (_pool(path.parent, sets[split], split, seed) for split in CLIPS)
+    torch.manual_seed(seed)
+    model = ContactNet(ContactConfig())
+    origin = started(model, "contacts", options.start)
+    optimiser = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=LEARNING_RATE / 100)
+    run = TrainingRun(path.parent, model, schedule, iterations, evaluations=40)
+
+    def loss_of(count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        features, load, rest, counts = draw(train, rng.integers(len(train.yaw), size=count), rng)
+        said_load, said_rest = model(features)
+        losses = [
+            (F.binary_cross_entropy_with_logits(said, label, reduction="none") * counts).sum() / counts.sum()
+            for said, label in ((said_load, load), (said_rest, rest))
+        ]
+        return losses[0] + losses[1], {"L_load": losses[0].item(), "L_rest": losses[1].item()}
+
+    run.minimise(loss_of, lambda: evaluate_contacts(model, val), BATCH, seed, clip=1.0)
+    return run.save(path, model, asdict(model.config), {
+        "Model": f"load and rest of {len(CONTACT_JOINTS)} joints, a recurrent network of {model.config.hidden} units",
+        "Data": describe_data(weights, sets["train"], sets["val"]),
+        "Licence": LICENCES[weights],
+        "Training": f"`steadypose train contacts --weights {weights} --iterations {iterations}`: "
+        f"{BATCH} clips of {FRAMES} frames a step, of {CLIPS['train']} through simulated sensors and the smoother, "
+        f"Adam {LEARNING_RATE:g}, seed {seed}{origin}",
+    })  # fmt: skip
+
+
+def _pool(directory: Path, motion: MotionSet, split: str, seed: int) -> Pool:
+    """Smoothed clips of a split, made once."""
+    path = directory / f"clips-{split}.npz"
+    if not path.is_file():
+        directory.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(".part.npz")
+        np.savez(part, **vars(smoothed_clips(motion, CLIPS[split], seed + (split == "val"))))
+        part.replace(path)
+    with np.load(path) as arrays:
+        return Pool(**arrays)
+
+
+def evaluate_contacts(model: ContactNet, pool: Pool) -> dict[str, float]:
+    """F1 of the feet, of load and of rest, over all clips."""
+    features, *labels, counts = draw(pool, np.arange(len(pool.yaw)), np.random.default_rng(0))
+    counted = counts[..., _FEET] > 0
+    found = {}
+    for name, said, label in zip(("load", "rest"), model(features), labels, strict=True):
+        yes, true = said[..., _FEET][counted] > 0, label[..., _FEET][counted] > 0.5
+        found[f"val {name} F1"] = float(2 * (yes & true).sum() / (yes.sum() + true.sum()))
+    return found

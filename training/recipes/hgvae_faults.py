@@ -1,0 +1,231 @@
+"""What the score stage is made of: the fault network, and what clean motion of people it has not seen scores.
+
+Everything is as the live node sees it: a sensor of a given error, half of it slow, and some joints missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.progress import track
+from torch import Tensor
+from torch.nn import functional as F
+
+from steadypose.prior.fit.torch_weights import load_network
+from steadypose.prior.models.hgvae.anomaly import (
+    MISSING,
+    PACE_EDGES,
+    PACES,
+    RATES,
+    SENSOR_SIGMAS,
+    Calibration,
+    joint_odds,
+    pace,
+)
+from steadypose.prior.models.hgvae.config import SCALE, FaultNetConfig, HGVAEConfig
+from steadypose.prior.models.hgvae.features import to_tracks
+from steadypose.prior.models.hgvae.live_faults import RECENT, fault_features
+from steadypose.prior.models.weights import LICENCES
+from steadypose.prior.timing.frozen_joints import MIN_NOISE, frozen_joints
+from steadypose.training.data.corruption import (
+    JITTER_SHARE,
+    displaced,
+    exchanged,
+    hide_joints,
+    jumps,
+    noisy,
+    occlude,
+    of_another_person,
+    other_bones,
+    repeats,
+    sides_exchanged,
+    stands_still,
+    vary_builds,
+    with_drifting_error,
+    with_faults,
+)
+from steadypose.training.data.dataset import MotionSet
+from steadypose.training.data.hgvae_windows import STRIDES, Windows, standardise
+from steadypose.training.loop import TrainingOptions, TrainingRun
+from steadypose.training.networks.hgvae import HGVAE
+from steadypose.training.networks.hgvae_faults import FaultNet
+from steadypose.training.weights import started
+
+Floats = NDArray[np.float64]
+
+WINDOWS = 2000
+"""for each error, number of joints missing and pace, of which the rarest rate leaves a few"""
+
+FASTER, MAX_DRAWS = (1, 2, 3), 12
+"""strides of the windows among which each pace is looked for, and how often as many are drawn: what is fast is rare"""
+
+BATCH = 64
+"""windows in each step of the fault network's optimiser"""
+
+MIN_FAULT = 0.015
+"""Metres along an axis, over the frames that are scored: a joint less off than that, or than the sensor's own error, is
+no fault worth the name, and one less off than a fifth of it is none."""
+
+FAULTS = (stands_still, exchanged, sides_exchanged, displaced, of_another_person, other_bones, noisy, jumps)
+BONE_SIGMA, TURN_SIGMA = 0.05, 0.1
+"""By how much each bone of a window is longer or shorter, and turned, radians (`vary_builds`): how
+somebody is built or holds a limb is no fault."""
+
+FAULT_SHARE = 0.6
+"""share of the windows that has a fault"""
+REPEATED = 0.15
+"""share of the windows in which a tracker repeats its last answer for some joints"""
+
+
+def train_anomaly(path: Path, iterations: int, options: TrainingOptions) -> None:
+    """Train the fault network of an HG-VAE, and measure its scale on validation motion; both go beside its weights.
+
+    Args:
+        path: of HG-VAE's weights, ``.safetensors``.
+        iterations: optimiser steps.
+        options: as HG-VAE was trained with, but to start from weights of a fault network.
+    """
+    weights, seed = options.weights, options.seed
+    model = _model(path)
+    train, val = (Windows(MotionSet.load(options.data, weights, split)) for split in ("train", "val"))
+    torch.manual_seed(seed)
+    network = FaultNet(FaultNetConfig(frames=model.config.frames))
+    network.mean.copy_(model.mean)
+    origin = started(network, "hgvae", options.start)
+    run = fit(network, model, train, val, options.runs / f"{path.stem}-faults", iterations, seed)
+    run.save(path.with_suffix(".faults.safetensors"), network, asdict(network.config), {
+        "Model": f"fault network beside {path.name}, training/networks/hgvae_faults.py",
+        "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, spoilt as in train_faults.py",
+        "Licence": LICENCES[weights],
+        "Training": f"with the HG-VAE, by `steadypose train`: {iterations} steps of {BATCH} windows, seed {seed}"
+        f"{origin}",
+    })  # fmt: skip
+    note = "what validation people score; made with the weights by 'steadypose train'"
+    calibrate(network, model, val, WINDOWS, seed=0).save(path.with_suffix(".anomaly.json"), note)
+
+
+def _model(path: Path) -> HGVAE:
+    return load_network(HGVAE, HGVAEConfig.from_dict, str(path), "hgvae")
+
+
+def fit(
+    network: FaultNet, model: HGVAE, train: Windows, val: Windows, directory: Path, iterations: int, seed: int
+) -> TrainingRun:
+    """Train ``network``; see `train_anomaly`."""
+    optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
+    run = TrainingRun(directory, network, schedule, iterations, evaluations=10)
+
+    def loss_of(count: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+        loss = _loss(network, model, train, count, rng)
+        return loss, {"loss": loss.item()}
+
+    def evaluate() -> dict[str, float]:
+        return {"val loss": _loss(network, model, val, 1024, np.random.default_rng(1)).item()}
+
+    run.minimise(loss_of, evaluate, BATCH, seed)
+    return run
+
+
+def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np.random.Generator) -> Tensor:
+    """Binary cross-entropy over the joints seen of which it is clear whether they are off."""
+    clean, sizes = windows.draw(count, model.config.frames, rng, STRIDES)
+    clean = vary_builds(clean, BONE_SIGMA, TURN_SIGMA, rng)
+    sigma = np.exp(rng.uniform(np.log(SENSOR_SIGMAS[0]), np.log(SENSOR_SIGMAS[-1]), count))
+    spoilt = with_faults(clean, FAULTS, FAULT_SHARE, rng)
+    fast = rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.8)  # some sensors smooth what they say
+    answered = with_drifting_error(spoilt, sigma, rng, fast)
+    seen = with_faults(answered, (repeats,), REPEATED, rng)
+    astray = np.sqrt(((spoilt - clean + seen - answered)[:, -RECENT:] ** 2).mean(axis=(1, 3)))
+    repeated = (seen != answered)[:, -RECENT:].any(axis=-1).mean(axis=1)
+    lost = (repeated > 0.5) & (sigma * np.sqrt(fast) > MIN_NOISE)[:, None]
+    lacking = rng.random(count)
+    for k in np.flatnonzero(lacking < 0.7):
+        alone, few = seen[k : k + 1], lacking[k] < 0.4
+        alone[:] = hide_joints(alone, int(rng.integers(1, MISSING[-1])), rng) if few else occlude(alone, rng)
+    limit = np.maximum(MIN_FAULT, sigma)[:, None]
+    shown = np.isfinite(seen[:, -RECENT:, :, 0]).any(axis=1)
+    off = (astray > limit) | lost
+    clear = torch.from_numpy(shown & (off | (astray < 0.2 * limit) & (repeated == 0))).float()
+    reconstructed = _reconstruct(model, seen, sizes, sigma * np.sqrt(1.0 - fast))
+    logits = network(torch.from_numpy(fault_features(*reconstructed, sigma, network.mean.numpy())))
+    faulty = torch.from_numpy(off).float()
+    return (F.binary_cross_entropy_with_logits(logits, faulty, reduction="none") * clear).sum() / clear.sum()
+
+
+@torch.no_grad()
+def _reconstruct(
+    model: HGVAE, seen: Floats, sizes: Floats, bias_sigma: Floats | float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Tracks of windows (B, T, 22, 3) of bodies of sizes (B,), what HG-VAE makes of them and how sure it is, all
+    (B, 66, T) metres, and what was observed; ``bias_sigma`` (B,) metres, the errors of the sensor that last."""
+    tracks = to_tracks(seen, sizes)
+    observed = torch.from_numpy(tracks.observed).float()
+    found = model(*model.completed(standardise(model, tracks.x), observed, bias_sigma)).tracks
+    mean = found.mean.double() * SCALE + model.mean[:, None]
+    return tracks.x, mean.numpy(), (0.5 * found.log_var.double()).exp().numpy() * SCALE, tracks.observed
+
+
+class Scored(NamedTuple):
+    """Windows, as `score_windows` has them.
+
+    Attributes:
+        odds: (B, 22) of `joint_odds`.
+        pace: (B,) m/s, of `pace`.
+    """
+
+    odds: Floats
+    pace: Floats
+
+
+@torch.inference_mode()
+def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Scored:
+    """Score windows (B, T, 22, 3) of bodies of sizes (B,), by a sensor of ``sensor_sigma`` metres along an axis."""
+    bias_sigma, mean, parts = sensor_sigma * np.sqrt(1.0 - JITTER_SHARE), network.mean.numpy(), []
+    for start in range(0, len(seen), 256):
+        some = slice(start, start + 256)
+        reconstructed = _reconstruct(model, seen[some], sizes[some], bias_sigma)
+        odds = network(torch.from_numpy(fault_features(*reconstructed, sensor_sigma, mean)))
+        joints = joint_odds(odds.double().numpy(), reconstructed[-1], frozen_joints(seen[some]))
+        parts.append(Scored(joints, pace(reconstructed[1])))
+    return Scored(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# The scale
+
+
+def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, seed: int) -> Calibration:
+    """The scale, from about ``count`` windows for each condition; where there is none so fast, from all."""
+    rng = np.random.default_rng(seed)
+    conditions = [(m, s) for m in range(len(MISSING)) for s in range(len(SENSOR_SIGMAS))]
+    quantiles = np.zeros((len(MISSING), len(SENSOR_SIGMAS), len(PACES), len(RATES)))
+    for m, s in track(conditions, "calibrating"):
+        positions, sizes = _at_paces(windows, model.config.frames, count, rng)
+        sigma, fast = np.full(len(positions), SENSOR_SIGMAS[s]), rng.uniform(0.0, 1.0, len(positions))
+        seen = hide_joints(with_drifting_error(positions, sigma, rng, fast), MISSING[m], rng)
+        found = score_windows(network, model, seen, sizes, SENSOR_SIGMAS[s])
+        of_class = np.digitize(found.pace, PACE_EDGES)
+        odds = found.odds.max(axis=1)
+        for p in range(len(PACES)):
+            own = odds[of_class == p]
+            quantiles[m, s, p] = np.quantile(own if len(own) else odds, 1 - np.array(RATES))
+    return Calibration(quantiles)
+
+
+def _at_paces(windows: Windows, frames: int, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Windows (B, T, 22, 3), up to ``count`` of each class of `PACES`, and body sizes."""
+    kept: list[tuple[Floats, Floats]] = []
+    wanted = np.full(len(PACES), count)
+    for _ in range(MAX_DRAWS):
+        positions, sizes = windows.draw(count, frames, rng, FASTER)
+        of_class = np.digitize(pace(positions.reshape(count, frames, -1).swapaxes(1, 2)), PACE_EDGES)
+        rows = np.concatenate([np.flatnonzero(of_class == p)[:most] for p, most in enumerate(wanted)])
+        kept.append((positions[rows], sizes[rows]))
+        wanted -= np.bincount(of_class[rows], minlength=len(PACES))
+    return np.concatenate([positions for positions, _ in kept]), np.concatenate([sizes for _, sizes in kept])

@@ -1,0 +1,292 @@
+"""Training of the transition model: ``steadypose train humor`` (HuMoR, section 3.2 and appendix B.2)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, REST_SPEED, label_contacts
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.fit.humor_initial import fit_initial
+from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
+from steadypose.prior.fit.humor_rollout import roll_out, sample, transitions
+from steadypose.prior.fit.humor_state import State, canonical, choose, features, stack, states_of
+from steadypose.prior.models.weights import LICENCES
+from steadypose.prior.timing.rate import FPS
+from steadypose.training.data.dataset import MotionSet, describe_data, mirror_offsets, mirror_rotations
+from steadypose.training.loop import TrainingOptions, TrainingRun
+from steadypose.training.weights import started
+
+Rng = np.random.Generator
+
+ITERATIONS, BATCH, LEARNING_RATE = 6_000, 128, 7e-4
+"""Sequences a step; Adam's rate at the start, which falls along a cosine."""
+
+STEPS = 10
+"""Steps of a training sequence."""
+
+SCALES = (0.9, 1.1)
+"""Range of factors on people's sizes."""
+
+MIN_SPEED = 0.1
+"""m/s, added to the speed of the feet, to which the probability of drawing a sequence is proportional."""
+
+KL_WEIGHT, KL_SHARE = 4e-4, 0.25
+"""As the official code: nats are summed over the latent, all other terms are means. The share of the training in which
+it grows from 0."""
+
+JOINTS_WEIGHT, ROTATIONS_WEIGHT = 100.0, 10.0
+"""Weights of squared joint errors (m²) and of squared entries of rotation matrices, relative to 1 of velocities
+((m/s)²). Velocities are differences here, 30 times an error of a joint: with the paper's weights of 1, whose decoder
+predicts velocities separately, a rollout would need half a minute to recover from an error; so it needs a third of a
+second."""
+
+CONTACT_WEIGHT, STILL_WEIGHT = 0.01, 0.01
+"""Of the contacts' cross-entropy, and of the square velocity of what rests."""
+
+TRUE_UNTIL, OWN_FROM = 0.15, 0.35
+"""Scheduled sampling: shares of the training before which each step starts from the true state, and after which each
+starts from what the step before made; between, from either by chance."""
+
+MIN_SCALE = 0.02
+"""Lower bound of a feature's standard deviation: some are constant, such as the root's place in its own frame"""
+
+_MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
+_STATES_OF_MIXTURE = 40_000
+
+
+@dataclass(frozen=True)
+class Sequences:
+    """Sequences of states, drawn from motion.
+
+    Attributes:
+        motion: N frames, as prepared.
+        load: (N, 8) whether `CONTACT_JOINTS` bear load.
+        rest: (N, 8) whether they rest.
+        starts: (M,) frames at which a sequence may start.
+        chances: (M,) the probability that it does.
+    """
+
+    motion: MotionSet
+    load: Tensor
+    rest: Tensor
+    starts: np.ndarray
+    chances: np.ndarray
+
+    @classmethod
+    def of(cls, motion: MotionSet) -> Sequences:
+        """All sequences of a motion."""
+        ends = zip(motion.clip_start, motion.clip_start[1:], strict=False)
+        clips = [motion.positions[a:b].numpy() for a, b in ends]
+        load, rest = (
+            torch.from_numpy(np.concatenate([label_contacts(clip, FPS, speed) for clip in clips]))
+            for speed in (LOAD_SPEED, REST_SPEED)
+        )
+        rows = motion.all_windows(STEPS + 2, 1)
+        feet = motion.positions[:, [J["left_ankle"], J["right_ankle"]]]
+        moved = np.concatenate([[0.0], feet.diff(dim=0).norm(dim=-1).mean(dim=1).double().cumsum(0).numpy()])
+        chances = MIN_SPEED + (moved[rows[:, -1]] - moved[rows[:, 0]]) * FPS / (STEPS + 1)
+        return cls(motion, load, rest, rows[:, 0], chances / chances.sum())
+
+    def draw(self, count: int, steps: int, rng: Rng) -> Batch:
+        """Random sequences of ``steps + 1`` states: as other builds, half of them mirrored."""
+        first = rng.choice(self.starts, size=count, p=self.chances)
+        return self.at(first[:, None] + np.arange(steps + 2), rng)
+
+    def at(self, rows: np.ndarray, rng: Rng | None = None) -> Batch:
+        """The sequences of these frames (B, T), changed at random if ``rng`` is given."""
+        motion = self.motion
+        root, rotations = motion.positions[rows, 0], motion.rotations[rows]
+        offsets, load, rest = motion.offsets[rows[:, 0]], self.load[rows], self.rest[rows]
+        if rng is not None:
+            half = len(rows) // 2
+            size = torch.from_numpy(rng.uniform(*SCALES, (len(rows), 1, 1))).float()
+            root, offsets = root * size, offsets * size
+            root[:half] *= root.new_tensor([1.0, -1.0, 1.0])
+            rotations[:half], offsets[:half] = mirror_rotations(rotations[:half]), mirror_offsets(offsets[:half])
+            for labels in (load, rest):
+                labels[:half] = labels[:half][..., _MIRRORED_CONTACTS]
+        contacts = torch.cat([load, rest], dim=-1).float()
+        return Batch(states_of(root, rotations, offsets), offsets, contacts[:, 2:])
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B sequences of T steps.
+
+    Attributes:
+        states: (B, T + 1).
+        offsets: (B, 22, 3) metres.
+        contacts: (B, T, 16) labels of load, then of rest, after each step.
+    """
+
+    states: State
+    offsets: Tensor
+    contacts: Tensor
+
+
+def train_humor(options: TrainingOptions) -> Path:
+    """Train the transition model on prepared motion; the path of the weights."""
+    iterations, weights = options.iterations or ITERATIONS, options.weights
+    train, val = (MotionSet.load(options.data, weights, split, flat=True) for split in ("train", "val"))
+    config = HumorConfig()
+    card = {
+        "Model": f"transitions of HuMoR: latent of {config.latent}, layers of {config.hidden}, "
+        f"{config.components} Gaussians of initial states",
+        "Data": describe_data(weights, train, val),
+        "Licence": LICENCES[weights],
+        "Training": f"`steadypose train humor --weights {weights} --iterations {iterations}`: {BATCH} sequences of "
+        f"{STEPS} steps a step, Adam {LEARNING_RATE:g}, seed {options.seed}",
+    }  # fmt: skip
+    return fit_transitions(
+        config, train, val, options.path("humor"), card, iterations, BATCH, LEARNING_RATE, options.seed, options.start
+    )
+
+
+def fit_transitions(
+    config: HumorConfig,
+    train: MotionSet,
+    val: MotionSet,
+    path: Path,
+    card: dict[str, str],
+    iterations: int,
+    batch: int,
+    learning_rate: float,
+    seed: int,
+    start: str | None = None,
+    known: HumorNet | None = None,
+    evaluations: int = 40,
+) -> Path:
+    """Train any configuration on any motion, as the ablations are.
+
+    Args:
+        config: sizes, and what is left out.
+        train: motion to learn.
+        val: motion of other people, evaluated on as it goes.
+        path: of the weights; its folder is the run's.
+        card: as of `TrainingRun.save`; what training started from is added to its "Training".
+        iterations: optimiser steps.
+        batch: sequences of `STEPS` steps.
+        learning_rate: of Adam at the start; it falls along a cosine.
+        seed: of weights and of sampling.
+        start: weights to go on from: a set or a path.
+        known: a model whose statistics of states are taken over: to fit them takes a minute.
+        evaluations: as of `TrainingRun`.
+
+    Returns:
+        ``path``.
+    """
+    sequences, unseen = Sequences.of(train), Sequences.of(val)
+    torch.manual_seed(seed)
+    model = HumorNet(config)
+    origin = started(model, "humor", start)
+    if known is not None:
+        model.load_state_dict(dict(known.named_buffers()), strict=False)
+    elif start is None and not (path.parent / "checkpoint.pt").exists():
+        _fit_statistics(model, sequences, seed)
+    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=learning_rate / 100)
+    run = TrainingRun(path.parent, model, schedule, iterations, evaluations)
+
+    def loss_of(count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        return transition_loss(model, sequences.draw(count, STEPS, rng), done, rng)
+
+    run.minimise(loss_of, lambda: evaluate_humor(model, unseen), batch, seed, clip=1.0)
+    return run.save(path, model, asdict(config), {**card, "Training": card["Training"] + origin})
+
+
+@torch.no_grad()
+def _fit_statistics(model: HumorNet, sequences: Sequences, seed: int) -> None:
+    """Fit what gradients do not: the mean and scale of features, and the mixture of initial states."""
+    rng = np.random.default_rng(seed)
+    states = sequences.draw(_STATES_OF_MIXTURE, 0, rng).states[:, 0]
+    inputs = features(canonical(states, states))
+    model.mean.copy_(inputs.mean(dim=0))
+    model.scale.copy_(inputs.std(dim=0).clamp(min=MIN_SCALE))
+    fit_initial(model, model.standardise(inputs), seed)
+
+
+def transition_loss(model: HumorNet, batch: Batch, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+    """Equation 7: reconstruction, KL divergence and regularisers, of steps from states by scheduled sampling.
+
+    Args:
+        model: in training.
+        batch: of sequences.
+        done: share of the training, 0 to 1.
+        rng: of which steps start from the true state.
+
+    Returns:
+        The loss, and its terms by name.
+    """
+    own = float(np.clip((done - TRUE_UNTIL) / (OWN_FROM - TRUE_UNTIL), 0.0, 1.0))
+    true = batch.states[:, :-1]
+    before = _own_states(model, batch, own, rng) if own > 0.0 else true
+    origin, target = canonical(before, before), canonical(batch.states[:, 1:], true)
+    inputs, next_inputs = model.standardise(features(origin)), model.standardise(features(target))
+    prior, posterior = model.prior_latent(inputs), model.posterior_latent(inputs, next_inputs)
+    predicted, logits = model.decode(origin, inputs, posterior.sample(), batch.offsets.unsqueeze(1))
+    l_root = (predicted.root - target.root).square().mean()
+    l_rotation = (predicted.rotations - target.rotations).square().mean()
+    l_joint = (predicted.joints - target.joints).square().mean()
+    l_velocity = (predicted.velocity - target.velocity).square().mean()
+    l_kl = posterior.kl(prior).mean()
+    kl_weight = KL_WEIGHT * min(done / KL_SHARE, 1.0)
+    loss = JOINTS_WEIGHT * (l_joint + l_root) + ROTATIONS_WEIGHT * l_rotation + l_velocity + kl_weight * l_kl
+    terms = {"L_velocity": l_velocity.item(), "KL, nats": l_kl.item()}
+    if model.config.contacts:
+        l_contact = F.binary_cross_entropy_with_logits(logits, batch.contacts)
+        resting = torch.sigmoid(logits[..., len(CONTACT_JOINTS) :])
+        still = (resting * predicted.velocity[..., list(CONTACT_JOINTS), :].square().sum(dim=-1)).mean()
+        loss = loss + CONTACT_WEIGHT * l_contact + STILL_WEIGHT * still
+        terms["L_contact"] = l_contact.item()
+    return loss, terms
+
+
+@torch.no_grad()
+def _own_states(model: HumorNet, batch: Batch, own: float, rng: Rng) -> State:
+    """The states (B, T) that steps start from: each with probability ``own`` the model's own, of the step before."""
+    states = [batch.states[:, 0]]
+    count, steps = batch.contacts.shape[:2]
+    for t in range(steps - 1):
+        before, true = states[-1], batch.states[:, t]
+        origin = canonical(before, before)
+        inputs = model.standardise(features(origin))
+        next_inputs = model.standardise(features(canonical(batch.states[:, t + 1], true)))
+        made = model.step(before, model.posterior_latent(inputs, next_inputs).sample(), batch.offsets)[0]
+        states.append(choose(torch.from_numpy(rng.random(count) < own), made, batch.states[:, t + 1]))
+    return stack(states, 1)
+
+
+def evaluate_humor(model: HumorNet, unseen: Sequences) -> dict[str, float]:
+    """On unseen people, over the seconds that travel farthest: errors of reconstruction and of prediction.
+
+    Returns:
+        ``val reconstruction mm``, the mean error of joints at the end of a second rolled out by the posterior's means;
+        ``val prediction mm``, after half a second, by the prior's; ``val rest F1`` of heels and toes along the former.
+    """
+    steps = int(FPS)
+    rows = unseen.motion.all_windows(steps + 2, steps)
+    path = unseen.motion.positions[rows[:, -1], 0] - unseen.motion.positions[rows[:, 0], 0]
+    batch = unseen.at(rows[np.argsort(-path.norm(dim=-1).numpy(), kind="stable")[:128]])
+    posterior, _ = transitions(model, batch.states)
+    first = batch.states[:, 0]
+    reconstructed = roll_out(model, first, posterior.mean, batch.offsets)
+    future = sample(model, first, steps // 2, batch.offsets, None)
+
+    def error(predicted: State, step: int) -> float:
+        return float((predicted.joints[:, step - 1] - batch.states.joints[:, step]).norm(dim=-1).mean()) * 1e3
+
+    found = {
+        "val reconstruction mm": error(reconstructed.states, steps),
+        "val prediction mm": error(future.states, steps // 2),
+    }
+    if model.config.contacts:
+        feet = slice(len(CONTACT_JOINTS) + 2, len(CONTACT_JOINTS) + 6)
+        predicted, true = reconstructed.contacts[..., feet] > 0, batch.contacts[..., feet] > 0.5
+        found["val rest F1"] = float(2 * (predicted & true).sum() / (predicted.sum() + true.sum()).clamp(min=1))
+    return found

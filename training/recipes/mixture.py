@@ -1,0 +1,284 @@
+"""Training of the mixture: ``steadypose train mixture --data MOCAP``, resumable.
+
+Clips of true motion pass through simulated sensors and the live node's own bank. The loss is the benchmark's position
+error (mm) and acceleration error (mm/frame²), of each clip relative to those of the multiple-model estimate, so that no
+kind of sensor or motion dominates. Errors above that estimate's own count several times, joint by joint and frame by
+frame: what nobody in training did must not be worse than without a network. The standard deviation is trained by its
+likelihood.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from steadypose.prior.models.mixture.bank import (
+    DENSITIES,
+    EXPERTS,
+    MEASUREMENT_SIGMA,
+    MULTIPLE_MODEL,
+    advance,
+    new_bank,
+)
+from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
+from steadypose.prior.models.mixture.modes import body_covariance
+from steadypose.prior.models.weights import LICENCES
+from steadypose.prior.timing.rate import FPS
+from steadypose.training.data.recordings import load_kinect, load_motion, write_arrays
+from steadypose.training.data.sensors import Sensed, Sensors
+from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS
+from steadypose.training.loop import TrainingOptions, TrainingRun
+from steadypose.training.networks.mixture import MixtureConfig, MixtureNet, answer
+from steadypose.training.weights import started
+
+RATE = 2e-3
+"""Initial learning rate."""
+
+FRAMES = 90
+"""Frames of a clip, which begins as a stream begins"""
+
+CLIPS, DELAYS_A_STEP = 16, 2
+"""Clips of each delay, and delays, in an optimiser step"""
+
+DELAYS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16])
+DELAY_SHARES = np.array([0.22, 0.08, 0.12, 0.05, 0.17, 0.03, 0.04, 0.13, 0.03, 0.03, 0.10])
+
+MIN_MM = 1.0
+"""Added to that estimate's position error in the denominator, so that a perfect input does not dominate."""
+
+SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.15, 0.2, 0.25, 0.3, 0.4)
+"""Weight of the acceleration error, by delay in frames: without delay, smoothness costs lag."""
+
+MIN_SMOOTH_MM = 0.5
+"""mm/frame², the same of the acceleration error."""
+
+SPEED_WEIGHT, MAX_SPEED_WEIGHT = 1.0, 10.0
+"""Weight of a joint's position error: 1 + (speed / SPEED_WEIGHT m/s)², at most MAX_SPEED_WEIGHT. Joints are fast in few
+frames, in which filters lag most. Acceleration errors are weighted by the inverse of its root."""
+
+HARM = 4.0
+"""Weight of what a joint's position error exceeds the multiple-model estimate's by, in the mean over frames, relative
+to that estimate's error and `MIN_HARM_MM`."""
+
+MIN_HARM_MM = 0.5
+
+LAG = 0.5
+"""Weight of a clip's position error above that of the expert nearest to the truth, relative to it: where a sensor's
+errors last, smoothness must not be bought by lag."""
+
+DEVIATION = 0.3
+"""Weight of the negative log-likelihood in the loss."""
+
+AVERAGE = 0.999
+"""Decay of the exponential moving average of the weights, which is what is saved."""
+
+
+class Batch(NamedTuple):
+    """Clips (C, T, ...): arguments of `answer`, ground truth, and weights ``counts`` of the position errors."""
+
+    features: Tensor
+    experts: Tensor
+    heading: Tensor
+    scale: Tensor
+    gap: Tensor
+    between: Tensor
+    truth: Tensor
+    counts: Tensor
+
+
+def through_bank(sensed: Sensed, delay: int) -> Batch:
+    """Clips with features as the live node computes them; the last ``delay`` frames are left out."""
+    clips, frames = sensed.seen.shape[:2]
+    kept = frames - delay
+    features = np.empty((kept, clips, 22, FEATURES), dtype=np.float32)
+    experts = np.empty((kept, clips, 22, EXPERTS, 3))
+    heading, scale = np.empty((kept, clips, 2)), np.empty((kept, clips))
+    gap, between = np.empty((2, kept, clips, 22))
+    bank, covariance = new_bank(clips, delay), body_covariance()
+    for t in range(frames):
+        advance(bank, t, 1 / FPS, sensed.seen[:, t], sensed.confidence[:, t], DENSITIES, MEASUREMENT_SIGMA, covariance)
+        at = t - delay
+        if at >= 0:
+            describe(bank, t + 1, delay, PARENT, experts[at], features[at], scale[at], gap[at], between[at])
+            heading[at] = bank.heading
+    middle = sensed.truth[:, :1, :1]
+    middle = np.where(np.isfinite(middle), middle, 0.0)  # so that single precision is enough
+    arrays = (
+        features, experts - middle.swapaxes(0, 1)[:, :, :, None], heading, scale, gap, between,
+        (sensed.truth - middle)[:, :kept].swapaxes(0, 1), _counts(sensed.truth)[:, :kept].swapaxes(0, 1),
+    )  # fmt: skip
+    return Batch(*(torch.from_numpy(a.astype(np.float32)).transpose(0, 1) for a in arrays))
+
+
+def _counts(truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(C, T, 22) weight of each joint's position error, by its true speed; see `SPEED_WEIGHT`."""
+    speed = np.linalg.norm(np.gradient(truth, axis=1), axis=-1) * FPS
+    return np.minimum(1.0 + np.square(np.nan_to_num(speed) / SPEED_WEIGHT), MAX_SPEED_WEIGHT)
+
+
+class Errors(NamedTuple):
+    """Errors of each clip, (C,) or (C, experts)."""
+
+    position: Tensor  # mm
+    acceleration: Tensor  # mm/frame²
+
+
+def errors(places: Tensor, truth: Tensor, weight: Tensor, counts: Tensor) -> Errors:
+    """Weighted mean errors of each clip.
+
+    Args:
+        places: (C, T, 22, 3) metres, estimates; may be NaN where the weight is 0.
+        truth: (C, T, 22, 3) metres.
+        weight: (C, T, 22) of all errors.
+        counts: (C, T, 22) further weight of position errors; acceleration errors are divided by its root.
+    """
+    off = torch.where(weight[..., None] > 0, places - truth, 0.0) * 1e3
+    bent = off[:, 2:] - 2 * off[:, 1:-1] + off[:, :-2]
+    seen = (weight[:, 2:] >= 1) & (weight[:, 1:-1] >= 1) & (weight[:, :-2] >= 1)
+    counted, smooth = weight * counts, seen / counts[:, 1:-1].sqrt()
+    return Errors(
+        (counted * _length(off)).sum(dim=(1, 2)) / counted.sum(dim=(1, 2)).clamp(min=1),
+        (smooth * _length(bent)).sum(dim=(1, 2)) / smooth.sum(dim=(1, 2)).clamp(min=1),
+    )
+
+
+def _off(places: Tensor, truth: Tensor, known: Tensor) -> Tensor:
+    """(C, T, 22) mm, distances to the truth, where it is known."""
+    return _length(torch.where(known[..., None], places - truth, 0.0) * 1e3)
+
+
+def _length(vectors: Tensor) -> Tensor:
+    return (vectors.square().sum(dim=-1) + 1e-4).sqrt()
+
+
+@dataclass(frozen=True)
+class Loss:
+    """The loss of a batch, and its terms for each clip."""
+
+    total: Tensor
+    relative: Tensor
+    own: Errors
+    likelihood: Tensor
+
+
+def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
+    """The loss of clips of one delay."""
+    smooth = float(np.interp(delay, SMOOTH_DELAYS, SMOOTH))
+    outputs = network(batch.features, (batch.gap >= 0).any(dim=-1))
+    known = batch.truth.isfinite().all(dim=-1) & batch.experts.isfinite().all(dim=(-1, -2))
+    experts = torch.where(known[..., None, None], batch.experts, 0.0)
+    places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.gap, batch.between)
+    weight = known / (1.0 + batch.gap.clamp(min=0))  # far from any sighting nothing can be learned
+    seen = known * (batch.gap == 0).float()
+    own = errors(places, batch.truth, weight, batch.counts)
+    when_seen = errors(places, batch.truth, seen, batch.counts).position
+    with torch.no_grad():
+        each = [errors(experts[:, :, :, m], batch.truth, seen, batch.counts) for m in range(EXPERTS)]
+        nearest = torch.stack([one.position for one in each]).amin(dim=0)
+        position, acceleration = each[MULTIPLE_MODEL]
+        bound = _off(experts[..., MULTIPLE_MODEL, :], batch.truth, known)
+    harm = ((_off(places, batch.truth, known) - bound).relu() * seen).sum(dim=(1, 2)) / seen.sum(dim=(1, 2)).clamp(
+        min=1
+    )
+    relative = own.position / (position + MIN_MM) + smooth * own.acceleration / (acceleration + MIN_SMOOTH_MM)
+    relative = relative + HARM * harm / (position + MIN_HARM_MM)
+    relative = relative + LAG * (when_seen / (nearest + MIN_MM) - 1.0).relu()
+    square = torch.where(known[..., None], places - batch.truth, 0.0).square().mean(dim=-1).detach() * 1e6
+    density = 0.5 * (variance.log() + square / variance)
+    likelihood = (density * known).sum(dim=(1, 2)) / known.sum(dim=(1, 2)).clamp(min=1)
+    total = relative.mean() + DEVIATION * likelihood.mean()
+    return Loss(total, relative, own, likelihood)
+
+
+def train(
+    network: MixtureNet,
+    sensors: Sensors,
+    val: Sensors,
+    directory: Path,
+    steps: int,
+    seed: int,
+    rate: float = 2e-3,
+    fresh: bool = True,
+) -> TrainingRun:
+    """Train ``network`` (unless ``fresh``, from its present weights), and load the moving average of its weights into
+    it."""
+    mean = MixtureNet(network.config)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimiser,
+        lambda s: min(1.0, (s + 1) / 100) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(s / steps, 1.0)))),
+    )
+    both = nn.ModuleDict({"network": network, "mean": mean})
+    run = TrainingRun(directory, both, schedule, steps, evaluations=20)
+    if run.step == 0:
+        if fresh:
+            _measure_features(network, sensors, seed)
+        mean.load_state_dict(network.state_dict())
+    watched = [(delay, through_bank(val.draw(40, np.random.default_rng((1, delay))), delay)) for delay in (0, 4)]
+    recent = {"loss": 0.0}
+
+    @torch.no_grad()
+    def average(*_: object) -> None:
+        keep = min(AVERAGE, (run.step + 1) / (run.step + 10))
+        for kept, new in zip(mean.parameters(), network.parameters(), strict=True):
+            kept.lerp_(new, 1 - keep)
+
+    def loss_of_step(clips: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+        delays = [int(delay) for delay in rng.choice(DELAYS, DELAYS_A_STEP, p=DELAY_SHARES)]
+        batches = [(through_bank(sensors.draw(clips, rng), delay), delay) for delay in delays]
+        total = torch.stack([loss_of(network, batch, delay).total for batch, delay in batches]).mean()
+        recent["loss"] += 0.02 * (total.item() - recent["loss"]) if run.step else total.item()
+        return total, recent
+
+    def evaluate() -> dict[str, float]:
+        return {f"val, delay {delay}": loss_of(mean, batch, delay).relative.mean().item() for delay, batch in watched}
+
+    optimiser.register_step_post_hook(average)
+    run.minimise(loss_of_step, evaluate, CLIPS, seed, clip=1.0)
+    network.load_state_dict(mean.state_dict())
+    return run
+
+
+def _measure_features(network: MixtureNet, sensors: Sensors, seed: int) -> None:
+    """Set the mean and standard deviation by which features are normalised."""
+    rng = np.random.default_rng((seed, 7))
+    rows = torch.cat([through_bank(sensors.draw(32, rng), int(d)).features.reshape(-1, FEATURES) for d in DELAYS])
+    network.mean.copy_(rows.mean(dim=0))
+    network.deviation.copy_(rows.std(dim=0).clamp(min=0.05))
+
+
+def train_mixture(options: TrainingOptions) -> Path:
+    """Train on the recordings in the folder ``options.data`` that are free for products; the path of the weights.
+
+    Prepared arrays, at several speeds, lie in the run's folder. From ``options.start`` the rate is half.
+    """
+    iterations, seed, start = options.iterations or 6000, options.seed, options.start
+    path = options.path("mixture")
+    directory = path.parent
+    arrays = directory / "arrays"
+    if not (arrays / "pairs.npz").is_file():
+        write_arrays(options.data, arrays)
+    torch.manual_seed(seed)
+    pairs = load_kinect(arrays / "pairs.npz")
+    sensors = Sensors(load_motion(arrays / "motion-train.npz"), pairs.of(TRAIN_SUBJECTS), FRAMES)
+    val = Sensors(load_motion(arrays / "motion-val.npz"), pairs.of(("s07", "s08")), FRAMES)
+    network = MixtureNet(MixtureConfig())
+    began = started(network, "mixture", start)
+    rate = RATE if start is None else RATE / 2
+    run = train(network, sensors, val, directory, iterations, seed, rate, fresh=start is None)
+    card = {
+        "Model": "weights that a network gives to a bank of fixed-lag smoothers, joint by joint",
+        "Data": "CMU (AMC 01; BVH 06, 07; expmap; salsa), ReActIdle, UI-PRMD s01-s06 (Vicon, and Kinect beside it), at "
+        "1 to 2.5 times its speed, through simulated sensors; validated on CMU 02, ReActIdle 013-015, UI-PRMD s07, s08",
+        "Licence": LICENCES["default"],
+        "Seed": str(seed),
+        "Training": f"`steadypose train mixture --iterations {iterations} --seed {seed}`{began}",
+    }
+    return run.save(path, network, asdict(network.config), card)

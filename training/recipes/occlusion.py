@@ -1,0 +1,230 @@
+"""Training of the occlusion network: ``steadypose train occlusion --data MOCAP``, resumable.
+
+Clips of true motion go through simulated sensors, lose joints, and go through the pipeline itself. The candidates and
+features of its occluded joints, with the truth, are the training data.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.progress import track
+from torch import Tensor
+
+from steadypose.prior.body.skeleton import J, limbs
+from steadypose.prior.clean.core import CleanCore
+from steadypose.prior.clean.frame import Observation
+from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.models.occlusion.inference import Occluded, Weighed
+from steadypose.prior.models.weights import LICENCES
+from steadypose.prior.timing.rate import FPS
+from steadypose.training.data.recordings import load_kinect, load_motion, write_arrays
+from steadypose.training.data.sensors import Sensors
+from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS
+from steadypose.training.loop import TrainingOptions, TrainingRun
+from steadypose.training.networks.occlusion import OcclusionConfig, OcclusionNet
+from steadypose.training.weights import save_weights, started
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Rng = np.random.Generator
+
+ITERATIONS, BATCH, LEARNING_RATE = 3_000, 4096, 3e-3
+"""Occluded joints a step; AdamW's rate at the start, which falls along a cosine."""
+
+FRAMES, CLIPS = 120, 64
+"""Frames of a clip, and clips of a run, side by side as bodies."""
+
+RECORDED = {"train": 40, "val": 8}
+"""Runs of the pipeline for each split."""
+
+ROWS = 40_000
+"""Occluded joints kept of a run, at most."""
+
+SEEN_FIRST = 8, 40
+"""Range of the frames before anything is hidden, of clips that lose what is below or on one side."""
+
+DELAYS = (0, 0, 2, 4, 4, 8, 16)
+
+MIN_MM, DEVIATION = 30.0, 0.02
+"""Added to the best candidate's error, by which errors are divided; and weight of the likelihood."""
+
+_ARMS, _LEGS = limbs(("shoulder", "elbow", "wrist")), limbs(("knee", "ankle", "foot"))
+_OCCLUSIONS: tuple[tuple[float, list[int]], ...] = (
+    *((3.0, limb) for limb in (*_ARMS, *_LEGS, *(arm[1:] for arm in _ARMS))),
+    *((2.0, leg[1:]) for leg in _LEGS),
+    (4.0, _LEGS[0] + _LEGS[1]),
+    (3.0, [J["left_hip"], J["right_hip"], *_LEGS[0], *_LEGS[1]]),
+    (2.0, _ARMS[0] + _ARMS[1]),
+    *((2.0, [J[f"{side}_collar"], J[f"{side}_hip"], *arm, *leg])
+      for side, arm, leg in zip(("left", "right"), _ARMS, _LEGS, strict=True)),
+    (1.0, [J["neck"], J["head"]]),
+    (1.0, [J["left_wrist"]]),
+    (1.0, [joint for name, joint in J.items() if joint > J["spine2"] or name == "spine2"]),
+)  # fmt: skip
+"""Joints that are hidden together, with their relative frequency."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """N occluded joints.
+
+    Attributes:
+        features: (N, `FEATURES`).
+        joint: (N,) its index.
+        candidates: (N, 3, 3) metres from the first candidate.
+        truth: (N, 3) metres, likewise.
+    """
+
+    features: NDArray[np.float32]
+    joint: NDArray[np.int64]
+    candidates: NDArray[np.float32]
+    truth: NDArray[np.float32]
+
+
+def occlusions(truth: Floats, rng: Rng) -> Bools:
+    """(T, C, 22) which joints of clips (T, C, 22, 3) metres are hidden.
+
+    By chance 25 % of clips lose what is low, 15 % what is on one side, the others limbs for 2 to 100 frames.
+    """
+    frames, clips = truth.shape[:2]
+    hidden = np.zeros(truth.shape[:3], dtype=bool)
+    shares = np.array([share for share, _ in _OCCLUSIONS])
+    for clip in range(clips):
+        place, kind = np.nan_to_num(truth[:, clip]), rng.random()
+        if kind < 0.4:
+            if kind < 0.25:
+                height = place[..., 2] - place[..., 2].min()
+                gone = height < rng.uniform(0.25, 0.7) * height[0].max()
+            else:
+                across = place[..., :2] @ (np.cos(angle := rng.uniform(0, 2 * np.pi)), np.sin(angle))
+                middle = across[:, :1] if rng.random() < 0.5 else across[:, 0].mean()
+                gone = across > middle + rng.uniform(-0.1, 0.25)
+            hidden[:, clip] = gone
+            hidden[: int(rng.integers(*SEEN_FIRST)), clip] = False
+            continue
+        at = int(rng.integers(10, 40))
+        while at < frames:
+            length = int(np.exp(rng.uniform(np.log(2), np.log(100))))
+            for which in rng.choice(len(_OCCLUSIONS), 1 + (rng.random() < 0.25), p=shares / shares.sum()):
+                hidden[at : at + length, clip, _OCCLUSIONS[which][1]] = True
+            at += length + int(rng.integers(8, 40))
+    return hidden
+
+
+class _Recorder:
+    """Takes the network's place and records its inputs by frame; nothing reads its answers."""
+
+    def __init__(self) -> None:
+        self.frame = 0
+        self.rows: list[tuple[int, Occluded]] = []
+
+    def __call__(self, rows: Occluded) -> Weighed:
+        self.rows.append((self.frame, rows))
+        return Weighed(rows.candidates.mean(axis=1), np.ones(len(rows.joint)))
+
+
+def record(sensors: Sensors, settings: PriorSettings, runs: int, seed: int, split: str) -> Rows:
+    """Occluded joints of the pipeline, over so many ``runs`` of `CLIPS` clips."""
+    found: list[tuple[Any, ...]] = []
+    for run in track(range(runs), description=f"occlusions, {split}"):
+        rng = np.random.default_rng((seed, run, split == "val"))
+        sensed, delay = sensors.draw(CLIPS, rng), int(rng.choice(DELAYS))
+        truth = sensed.truth.swapaxes(0, 1)
+        seen = np.where(occlusions(truth, rng)[..., None], np.nan, sensed.seen.swapaxes(0, 1))
+        recorder = _Recorder()
+        core = CleanCore(replace(settings, delay=delay, max_bodies=CLIPS), Counter())
+        assert core.fuse.occluded
+        core.fuse.occluded.weigher = recorder
+        present = np.ones(CLIPS, dtype=bool)
+        for t, (frame, confidence) in enumerate(zip(seen, sensed.confidence.swapaxes(0, 1), strict=True)):
+            recorder.frame = t - delay
+            confidence = np.where(np.isfinite(frame[..., 0]), confidence, 0.0)
+            core.step(Observation(t / FPS, frame, confidence, present, np.zeros(3)))
+        at = np.concatenate([np.full(len(rows.joint), frame) for frame, rows in recorder.rows])
+        body, joint, candidates, features = (
+            np.concatenate(parts) for parts in zip(*(rows for _, rows in recorder.rows), strict=True)
+        )
+        first = candidates[:, :1]
+        off = truth[at, body, joint] - first[:, 0]
+        known = np.flatnonzero(np.isfinite(off[:, 0]))
+        kept = rng.choice(known, min(len(known), ROWS), replace=False)
+        found.append((features[kept], joint[kept], (candidates - first)[kept], off[kept]))
+    features, joint, candidates, off = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return Rows(features, joint.astype(np.int64), candidates.astype(np.float32), off.astype(np.float32))
+
+
+def loss_of(network: OcclusionNet, rows: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """The loss of `Rows`; the error (N,) of each, and of the best of its candidates, mm."""
+    weights, log_sigma = network(rows["features"], rows["joint"])
+    off = 1e3 * ((weights[..., None] * rows["candidates"]).sum(dim=1) - rows["truth"])
+    error = (off.square().sum(dim=-1) + 1.0).sqrt()
+    best = 1e3 * (rows["candidates"] - rows["truth"][:, None]).norm(dim=-1).min(dim=-1).values
+    square = off.detach().square().sum(dim=-1)
+    likelihood = 3.0 * log_sigma + 0.5 * square * torch.exp(-2.0 * log_sigma)
+    return (error / (MIN_MM + best)).mean() + DEVIATION * likelihood.mean(), error, best
+
+
+def train_occlusion(options: TrainingOptions) -> Path:
+    """Train the occlusion network on the recordings in the folder ``options.data``; the path of the weights.
+
+    They are those of the mixture that are free for products; its prepared arrays serve too.
+    """
+    iterations, seed, path = options.iterations or ITERATIONS, options.seed, options.path("occlusion")
+    directory = path.parent
+    arrays = directory / "arrays"
+    if not (arrays / "pairs.npz").is_file():
+        write_arrays(options.data, arrays)
+    torch.manual_seed(seed)
+    model = OcclusionNet(OcclusionConfig())
+    origin = started(model, "occlusion", options.start)
+    rows = {split: _rows(directory, model, split, seed) for split in RECORDED}
+    train, val = ({key: torch.from_numpy(value) for key, value in vars(rows[split]).items()} for split in RECORDED)
+    if options.start is None:
+        model.mean.copy_(train["features"].mean(dim=0))
+        model.deviation.copy_(train["features"].std(dim=0).clamp(min=0.05))
+    optimiser = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=LEARNING_RATE / 100)
+    run = TrainingRun(directory, model, schedule, iterations, evaluations=20)
+
+    def loss_of_step(count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        drawn = torch.from_numpy(rng.integers(len(train["joint"]), size=count))
+        total, error, best = loss_of(model, {key: value[drawn] for key, value in train.items()})
+        return total, {"loss": total.item(), "mm": error.mean().item(), "best of three": best.mean().item()}
+
+    def evaluate() -> dict[str, float]:
+        total, error, best = loss_of(model, val)
+        return {"val": total.item(), "val mm": error.mean().item(), "val best of three": best.mean().item()}
+
+    run.minimise(loss_of_step, evaluate, BATCH, seed, clip=1.0)
+    return run.save(path, model, asdict(model.config), {
+        "Model": "weights of three candidates for an occluded joint's position, and its standard deviation",
+        "Data": "as the mixture's, through simulated sensors, occlusions and the pipeline itself",
+        "Licence": LICENCES[options.weights],
+        "Training": f"`steadypose train occlusion --iterations {iterations}`: {BATCH} of {len(train['joint'])} "
+        f"occluded joints a step, AdamW {LEARNING_RATE:g}, seed {seed}{origin}",
+    })  # fmt: skip
+
+
+def _rows(directory: Path, untrained: OcclusionNet, split: str, seed: int) -> Rows:
+    """Those of a split, recorded once, whatever the weights of the network under training."""
+    path, weights = directory / f"rows-{split}.npz", directory / "untrained.safetensors"
+    if not path.is_file():
+        save_weights(weights, untrained, asdict(untrained.config), {})
+        settings = PriorSettings()
+        settings = replace(settings, fuse=replace(settings.fuse, weights=str(weights)))
+        pairs = load_kinect(directory / "arrays" / "pairs.npz").of(
+            TRAIN_SUBJECTS if split == "train" else ("s07", "s08")
+        )
+        sensors = Sensors(load_motion(directory / "arrays" / f"motion-{split}.npz"), pairs, FRAMES)
+        part = path.with_suffix(".part.npz")
+        np.savez(part, **vars(record(sensors, settings, RECORDED[split], seed, split)))
+        part.replace(path)
+    with np.load(path) as arrays:
+        return Rows(**arrays)

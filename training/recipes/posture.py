@@ -1,0 +1,70 @@
+"""The Gaussian of postures, of prepared motion: ``steadypose train posture``, in seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor, nn
+
+from steadypose.prior.body.skeleton import HIPS, MIRROR, SHOULDERS
+from steadypose.prior.models.posture.inference import DIMENSIONS, body_size, trunk_frame
+from steadypose.prior.models.weights import LICENCES
+from steadypose.training.data.dataset import MotionSet
+from steadypose.training.loop import TrainingOptions
+from steadypose.training.weights import save_weights
+
+FRAMES = 150_000
+"""Bodies, of each source in proportion to the root of its length: dance is short and unlike the rest."""
+
+TURN, SHIFT = 0.12, 0.02
+"""Radians and metres: what the frame of a noisy trunk is off, along an axis."""
+
+
+class Posture(nn.Module):
+    """Mean (66,) and Cholesky factor (66, 66) of the covariance, metres of a body of the rest skeleton's size."""
+
+    mean: Tensor
+    factor: Tensor
+
+    def __init__(self, postures: NDArray[np.float64]) -> None:
+        """Of postures (N, 66)."""
+        super().__init__()
+        factor = np.linalg.cholesky(np.cov(postures.T) + 1e-8 * np.eye(DIMENSIONS))
+        self.register_buffer("mean", torch.from_numpy(postures.mean(axis=0)))
+        self.register_buffer("factor", torch.from_numpy(factor))
+
+
+def train_posture(options: TrainingOptions) -> Path:
+    """Fit the Gaussian to the training split of ``options.data``; the path of the weights."""
+    path, rng = options.path("posture"), np.random.default_rng(options.seed)
+    motion = MotionSet.load(options.data, options.weights, "train")
+    lengths = np.diff(motion.clip_start)
+    of_source = {source: lengths[motion.source == source].sum() for source in np.unique(motion.source)}
+    weight = np.repeat([of_source[source] ** -0.5 for source in motion.source], lengths)
+    rows = np.sort(rng.choice(len(weight), min(FRAMES, len(weight)), replace=False, p=weight / weight.sum()))
+    positions, offsets = (values[rows].numpy().astype(np.float64) for values in (motion.positions, motion.offsets))
+    save_weights(path, Posture(postures(positions, offsets, rng)), {}, {
+        "Model": "a Gaussian of the 22 joints in the trunk's frame",
+        "Data": f"prepared motion, training split: {len(rows)} frames, of {', '.join(sorted(of_source))}, each by "
+        "the root of its length; mirrored by chance",
+        "Licence": LICENCES[options.weights],
+        "Training": f"`steadypose train posture`: moments; frame off by {TURN} rad and {SHIFT} m; seed {options.seed}",
+    })  # fmt: skip
+    return path
+
+
+def postures(
+    positions: NDArray[np.float64], offsets: NDArray[np.float64], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """(N, 66) of bodies (N, 22, 3), in their trunks' frames, which are off by chance."""
+    mirrored = rng.random(len(positions)) < 0.5
+    positions[mirrored] = positions[mirrored][:, MIRROR] * (1.0, -1.0, 1.0)
+    centred = positions - positions[:, [*HIPS, *SHOULDERS]].mean(axis=1, keepdims=True)
+    local = centred @ trunk_frame(positions) / body_size(offsets)[:, None, None]
+    turn = Rotation.from_rotvec(rng.normal(0.0, TURN, (len(local), 3))).as_matrix()
+    local = local @ turn.swapaxes(-1, -2) + rng.normal(0.0, SHIFT, (len(local), 1, 3))
+    return local.reshape(len(local), -1)

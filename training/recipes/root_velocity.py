@@ -1,0 +1,253 @@
+"""Training of the trajectory network: root velocity (HM-VAE, section 3.3) and contacts (HuMoR, section 3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import roma
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from steadypose.prior.body.kinematics import CONTACT_JOINTS
+from steadypose.prior.body.skeleton import MIRROR, limbs
+from steadypose.prior.fit.torch_kinematics import heading, yaw_rotation
+from steadypose.prior.models.root_velocity import FRAME_S, TrajectoryConfig
+from steadypose.prior.models.weights import LICENCES
+from steadypose.training.data.dataset import MotionSet, describe_data
+from steadypose.training.loop import TrainingOptions, TrainingRun
+from steadypose.training.networks.root_velocity import RootMotion, TrajectoryNet
+from steadypose.training.weights import started
+
+ITERATIONS, BATCH, LEARNING_RATE = 2_000, 64, 2e-3
+"""Windows a step; Adam's rate at the start, which falls along a cosine."""
+
+WINDOW = 48
+"""Frames of a training window, 1.6 s."""
+
+WARM_UP = 8
+"""Frames of a window before which the trajectory is not accumulated: there is not yet motion enough to read."""
+
+RATES = (0.75, 1.3)
+"""Range of speeds at which motion is replayed in training."""
+
+SCALES = (0.85, 1.15)
+"""Range of factors on people's sizes in training."""
+
+MIN_SPEED = 0.1
+"""m/s: a window is drawn as often as its root is fast, and one that stands still as if it were this fast."""
+
+TILT_SD, YAW_SD = np.deg2rad(3.0), np.deg2rad(10.0)
+"""How well gravity and heading are known."""
+
+NOISE_SD = 0.02
+"""Metres: the most noise a window's joints get, half of it on average: what a prior leaves of a sensor's."""
+
+OFFSET_SD = 0.015
+"""Metres: how far a sensor's idea of a joint lies from that of the motion capture, for a whole window."""
+
+IMPUTED_SHARE = 0.3
+"""Of windows, one limb of which is hidden for a while and stays where it was."""
+
+NLL_WEIGHT, CONTACT_WEIGHT, STILL_WEIGHT = 0.05, 0.1, 0.01
+"""Of the standard deviation's likelihood, the contacts' cross-entropy, and their consistency with the velocity."""
+
+_LIMBS = limbs(("elbow", "wrist"), ("shoulder", "elbow", "wrist"), ("knee", "ankle", "foot"))
+_MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """What the network is given and should say, in the frame of its input.
+
+    Attributes:
+        joints: (B, T, 22, 3) metres from the root, as the prior would leave them.
+        velocity: (B, T, 3) m/s of the root.
+        joint_velocity: (B, T, 8, 3) m/s of the contact joints against the root, true.
+        contacts: (B, T, 8) labels.
+    """
+
+    joints: Tensor
+    velocity: Tensor
+    joint_velocity: Tensor
+    contacts: Tensor
+
+
+def train_trajectory(options: TrainingOptions) -> Path:
+    """Train the trajectory network on prepared motion; the path of the weights."""
+    iterations, weights, seed = options.iterations or ITERATIONS, options.weights, options.seed
+    path = options.path("trajectory")
+    torch.manual_seed(seed)
+    train = MotionSet.load(options.data, weights, "train", flat=True)
+    val = MotionSet.load(options.data, weights, "val", flat=True)
+    starts, chances = _chances(train)
+    model = TrajectoryNet(TrajectoryConfig())
+    origin = started(model, "trajectory", options.start)
+    optimiser = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=LEARNING_RATE / 100)
+    run = TrainingRun(path.parent, model, schedule, iterations, evaluations=50)
+
+    def loss_of(count: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+        windows = _sample(train, starts, chances, count, rng)
+        return _loss(model(windows.joints), windows)
+
+    run.minimise(loss_of, lambda: evaluate_trajectory(model, val), BATCH, seed)
+    config = calibrate(model, val)
+    return run.save(path, model, asdict(config), {
+        "Model": f"root velocity and contacts, {config.context} frames of context, 22 joints",
+        "Data": describe_data(weights, train, val),
+        "Licence": LICENCES[weights],
+        "Training": f"`steadypose train trajectory --weights {weights} --iterations {iterations}`: "
+        f"{BATCH} windows a step, Adam {LEARNING_RATE:g}, seed {seed}{origin}",
+        "Calibration": f"standard deviations times {config.sigma_scale}, errors last {config.correlation_s} s "
+        "(horizontal, vertical)",
+    })  # fmt: skip
+
+
+_SPAN = int(np.ceil((WINDOW + 1) * RATES[1])) + 2
+
+
+def _chances(motion: MotionSet) -> tuple[np.ndarray, np.ndarray]:
+    """Where windows may start, and the chance of each: the faster the root, the likelier, for people mostly stand."""
+    rows = motion.all_windows(_SPAN, step=2)
+    path = motion.positions[rows, 0].diff(dim=1)[..., :2].norm(dim=-1).mean(dim=1).numpy() / FRAME_S
+    weights = MIN_SPEED + path
+    return rows[:, 0], weights / weights.sum()
+
+
+def _sample(
+    motion: MotionSet, starts: np.ndarray, chances: np.ndarray, count: int, rng: np.random.Generator
+) -> _Windows:
+    """Random windows: replayed faster or slower, scaled, tilted, mirrored, and seen as a prior would leave them."""
+    rows = rng.choice(starts, size=count, p=chances)[:, None] + np.arange(_SPAN)
+    # One frame more at each end, for central differences.
+    times = rng.uniform(*RATES, (count, 1)) * np.arange(WINDOW + 2)
+    frames = torch.from_numpy(np.take_along_axis(rows, times.astype(np.int64), axis=1))
+    positions = torch.lerp(
+        motion.positions[frames], motion.positions[frames + 1], _tensor(times % 1.0)[..., None, None]
+    )
+    positions = positions * _tensor(rng.uniform(*SCALES, (count, 1, 1, 1)))
+    facing = frames[torch.arange(count), rng.integers(0, WINDOW, count) + 1]
+    yaw = heading(motion.rotations[facing, 0]) + _tensor(rng.normal(0.0, YAW_SD, count))
+    tilt = roma.rotvec_to_rotmat(_tensor(rng.normal(0.0, TILT_SD, (count, 3)) * [1.0, 1.0, 0.0]))
+    windows = _mirror_half(_windows(positions, motion.contacts[frames], tilt.mT @ yaw_rotation(yaw)))
+    return replace(windows, joints=_corrupt(windows.joints, rng))
+
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(values).float()
+
+
+def _windows(positions: Tensor, contacts: Tensor, turn: Tensor) -> _Windows:
+    """Windows of T frames from T + 2 frames of positions (B, T + 2, 22, 3), turned by (B, 3, 3) from the right."""
+    joints = positions - positions[:, :, :1]
+    moved = torch.cat([positions[:, :, :1], joints[:, :, list(CONTACT_JOINTS)]], dim=2)
+    velocity = (moved[:, 2:] - moved[:, :-2]) / (2 * FRAME_S) @ turn[:, None]
+    return _Windows(joints[:, 1:-1] @ turn[:, None], velocity[:, :, 0], velocity[:, :, 1:], contacts[:, 1:-1].float())
+
+
+def _mirror_half(windows: _Windows) -> _Windows:
+    """Exchange left and right, across the body's xz plane, in the first half of the windows."""
+    half = len(windows.joints) // 2
+    flip = torch.tensor([1.0, -1.0, 1.0])
+
+    def mirror(x: Tensor, order: list[int] | None = None, flip: Tensor | float = flip) -> Tensor:
+        mirrored = x[:half] if order is None else x[:half][:, :, order]
+        return torch.cat([mirrored * flip, x[half:]])
+
+    return _Windows(
+        joints=mirror(windows.joints, MIRROR.tolist()),
+        velocity=mirror(windows.velocity),
+        joint_velocity=mirror(windows.joint_velocity, _MIRRORED_CONTACTS),
+        contacts=mirror(windows.contacts, _MIRRORED_CONTACTS, flip=1.0),
+    )
+
+
+def _corrupt(joints: Tensor, rng: np.random.Generator, noise_sd: float | None = None) -> Tensor:
+    """Add noise that lasts (AR(1)) to joints (B, T, 22, 3), the root's too, and hold a limb still in some windows.
+
+    Args:
+        joints: metres from the root.
+        rng: random numbers.
+        noise_sd: metres, of every window; random up to `NOISE_SD` if left out.
+    """
+    count, time = joints.shape[:2]
+    sd = rng.uniform(0.0, NOISE_SD, (count, 1, 1, 1)) if noise_sd is None else np.full((count, 1, 1, 1), noise_sd)
+    memory = rng.uniform(0.7, 0.95, (count, 1, 1))
+    noise = rng.normal(0.0, 1.0, joints.shape)
+    for t in range(1, time):
+        noise[:, t] = memory * noise[:, t - 1] + np.sqrt(1.0 - memory**2) * noise[:, t]
+    offset = rng.normal(0.0, OFFSET_SD, (count, 1, *joints.shape[2:]))
+    noisy = joints + _tensor(sd * noise + offset)
+    noisy = noisy - noisy[:, :, :1]
+    for row in np.flatnonzero(rng.random(count) < IMPUTED_SHARE):
+        limb = _LIMBS[rng.integers(len(_LIMBS))]
+        start = int(rng.integers(1, time))
+        end = start + int(rng.integers(3, 30))
+        noisy[row, start:end, limb] = noisy[row, start - 1, limb]
+    return noisy
+
+
+def _loss(said: RootMotion, windows: _Windows) -> tuple[Tensor, dict[str, float]]:
+    """Equation 9, the likelihood of its error, and HuMoR's two terms of contacts; every term a mean."""
+    error = said.velocity - windows.velocity
+    l_velocity = error.square().mean()
+    l_trajectory = (error[:, WARM_UP:].cumsum(dim=1) * FRAME_S).square().mean()
+    l_nll = (0.5 * (error.detach().square() * torch.exp(-2.0 * said.log_sigma)) + said.log_sigma).mean()
+    l_contact = F.binary_cross_entropy_with_logits(said.contact_logits, windows.contacts)
+    joint_velocity = said.velocity[:, :, None] + windows.joint_velocity
+    l_still = (torch.sigmoid(said.contact_logits) * joint_velocity.square().sum(dim=-1)).mean()
+    loss = l_velocity + l_trajectory + NLL_WEIGHT * l_nll + CONTACT_WEIGHT * l_contact + STILL_WEIGHT * l_still
+    return loss, {
+        "L_velocity": l_velocity.item(), "L_trajectory": l_trajectory.item(), "L_contact": l_contact.item(),
+    }  # fmt: skip
+
+
+@torch.no_grad()
+def _validate(model: TrajectoryNet, motion: MotionSet, length: int, count: int) -> tuple[RootMotion, _Windows]:
+    """What the network says of about ``count`` windows of ``length`` frames of unseen people with 1 cm of noise."""
+    rows = motion.all_windows(length + 2, step=length)
+    rows = rows[:: max(len(rows) // count, 1)]
+    turn = yaw_rotation(heading(motion.rotations[rows[:, length // 2], 0]))
+    windows = _windows(motion.positions[rows], motion.contacts[rows], turn)
+    joints = _corrupt(windows.joints, np.random.default_rng(0), noise_sd=0.01)
+    windows = replace(windows, joints=joints)
+    return model(joints), windows
+
+
+def evaluate_trajectory(model: TrajectoryNet, motion: MotionSet) -> dict[str, float]:
+    """Errors on unseen people.
+
+    Returns:
+        ``val velocity m/s``, the root mean square of the velocity's error along an axis; ``val 1 s drift cm``, that of
+        the horizontal trajectory after one second; ``val feet F1`` of the contacts of heels and toes.
+    """
+    said, windows = _validate(model, motion, WINDOW, count=512)
+    error = (said.velocity - windows.velocity)[:, WARM_UP:]
+    drift = error[:, :30, :2].sum(dim=1).norm(dim=-1) * FRAME_S * 100
+    predicted, true = said.contact_logits[..., 2:6] > 0, windows.contacts[..., 2:6] > 0.5
+    hits = (predicted & true).sum()
+    return {
+        "val velocity m/s": float(error.square().mean().sqrt()),
+        "val 1 s drift cm": float(drift.square().mean().sqrt()),
+        "val feet F1": float(2 * hits / (predicted.sum() + true.sum())),
+    }
+
+
+def calibrate(model: TrajectoryNet, motion: MotionSet) -> TrajectoryConfig:
+    """The network's configuration with the errors that validation finds: how large they are, and how long they last.
+
+    A second of accumulated velocity strays by sigma² · correlation_s if an error of size sigma lasts correlation_s.
+    """
+    said, windows = _validate(model, motion, WINDOW, count=2048)
+    error = ((said.velocity - windows.velocity) * torch.exp(-said.log_sigma))[:, WARM_UP:]
+    size = error.square().mean(dim=(0, 1))
+    strayed = (error[:, :30].sum(dim=1) * FRAME_S).square().mean(dim=0)
+    axes = [slice(0, 2), slice(2, 3)]
+    return replace(
+        model.config,
+        sigma_scale=tuple(float(size[a].mean().sqrt()) for a in axes),
+        correlation_s=tuple(float(strayed[a].mean() / size[a].mean()) for a in axes),
+    )

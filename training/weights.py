@@ -1,0 +1,105 @@
+"""Weights as training writes them: with a card that says how they were made, and put where nodes look for them."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors.torch import save
+from torch import nn
+
+from steadypose.prior.fit.torch_weights import load_tensors
+from steadypose.prior.models import weights as weights_io
+from steadypose.prior.models.weights import Arrays, WeightsError
+from steadypose.training.distributed import writes
+
+
+def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, Any]) -> None:
+    """Write weights, in half precision, with their configuration, and the card; on the first process of torchrun.
+
+    Args:
+        path: ends in ``.safetensors``; the card is written beside it as ``.md``.
+        model: its state dict is saved.
+        config: what rebuilds the model, as JSON in the file's metadata.
+        card: heading to content: data, licence, seed, training command, results.
+    """
+    if not writes():
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tensors = {name: tensor.detach().half().contiguous() for name, tensor in model.state_dict().items()}
+    _write_whole(path, save(tensors, metadata={"config": json.dumps(dict(config), sort_keys=True)}))
+    lines = [f"# {path.stem}", ""]
+    for heading, content in {**card, "Commit": _commit(), "Made on": f"{platform.machine()}, torch on CPU"}.items():
+        lines += [f"- **{heading}**: {content}"]
+    _write_whole(path.with_suffix(".md"), ("\n".join(lines) + "\n").encode())
+
+
+def install(path: Path) -> Path:
+    """Copy weights, and the files that belong to them, to where nodes look for a weight set.
+
+    Files that they replace move to the folder ``previous`` there.
+
+    Args:
+        path: ``MODEL-SET.safetensors`` in the folder of a training run.
+
+    Returns:
+        Their new path.
+    """
+    folder = weights_io.WEIGHTS
+    (folder / "previous").mkdir(parents=True, exist_ok=True)
+    for old in _belonging(folder / path.name):
+        os.replace(old, folder / "previous" / old.name)
+    for new in _belonging(path):
+        _write_whole(folder / new.name, new.read_bytes())
+    return folder / path.name
+
+
+def arrays_of(network: nn.Module) -> Arrays:
+    """A network's weights as its live form takes them; copies."""
+    return {name: tensor.detach().float().numpy().copy() for name, tensor in network.state_dict().items()}
+
+
+def started(model: nn.Module, name: str, start: str | None) -> str:
+    """Load into ``model`` the weights ``start`` of the model ``name``, if there are to be any; what a card says of it.
+
+    Raises:
+        FileNotFoundError: no such weights.
+        WeightsError: weights of another model, or of another size.
+    """
+    if start is None:
+        return ""
+    try:
+        model.load_state_dict(load_tensors(start, name)[0])
+    except RuntimeError as error:
+        raise WeightsError(f"start: expected weights of {name}, of this size, got '{start}': {error}") from error
+    return f", started from the weights '{Path(start).stem}'"
+
+
+def _belonging(path: Path) -> list[Path]:
+    """The files of these weights: themselves, card, curves, and what else goes by their name."""
+    return [file for file in path.parent.glob(f"{path.stem}.*") if file.is_file()]
+
+
+def _write_whole(path: Path, content: bytes) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(content)
+    os.replace(part, path)
+
+
+def _commit() -> str:
+    try:
+        found = subprocess.run(
+            ["git", "describe", "--always", "--dirty"],
+            cwd=weights_io.WEIGHTS.parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return found.stdout.strip()
