@@ -3,11 +3,14 @@
 UV_VERSION=0.13.8
 
 # A Python to install with: 3.11 first, for most was measured on it; where ROS is sourced its own, for rclpy runs on no
-# other. A name on the PATH may be a stub that cannot run.
+# other. A name on the PATH may be a stub that cannot run, or a shim: uv knows the environment by the real path, and makes
+# it anew for another.
 find_python() {
     for name in ${ROS_DISTRO:+python3} python3.11 python3.12 python3.13 python3.10 python3; do
-        if "$name" -I -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then
-            command -v "$name"
+        if "$name" -I -c 'import sys
+if not (3, 10) <= sys.version_info[:2] <= (3, 13):
+    sys.exit(1)
+print(sys.executable)' 2>/dev/null; then
             return
         fi
     done
