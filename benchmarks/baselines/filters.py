@@ -40,12 +40,14 @@ class Peer:
         run: (seen, stamps_s, delay, **parameters) to answers of seen's shape.
         delays: those that it has; None for any.
         space: lowest and highest of each parameter, searched evenly in its logarithm.
+        whole_body: it takes the 22 canonical joints, and no choice of them.
     """
 
     name: str
     run: Callable[..., Floats]
     delays: tuple[int, ...] | None = None
     space: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    whole_body: bool = False
 
 
 def missing(seen: Floats) -> NDArray[np.bool_]:
@@ -133,7 +135,7 @@ PEERS: tuple[Peer, ...] = (
     Peer("Kalman, constant acceleration", constant_acceleration, None, {"density": (0.05, 5e4)}),
     Peer("Gaussian + Hampel", gaussian_hampel, None, {"sigma_s": (0.01, 0.4), "threshold": (2.0, 12.0)}),
     Peer("bank of smoothers", bank),
-    Peer("whole-body bank", whole_body_bank),
+    Peer("whole-body bank", whole_body_bank, whole_body=True),
     Peer("Butterworth, offline", butterworth, (OFFLINE,), {"cutoff_hz": (0.5, 12.0)}),
 )
 """Those without training. With a delay, a Kalman filter is the fixed-lag RTS smoother of its model."""

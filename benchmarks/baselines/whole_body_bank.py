@@ -34,7 +34,12 @@ def whole_body_bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
         seen: (T, ..., 22, 3) metres, canonical joints of a body, NaN where missing.
         stamps_s: (T,) seconds.
         delay: frames.
+
+    Raises:
+        ValueError: other joints; the compiled loops would write past the ends of their arrays.
     """
+    if seen.shape[-2:] != (len(PARENT), 3):
+        raise ValueError(f"expected (..., {len(PARENT)}, 3) canonical joints of a body, got {seen.shape}")
     frames = np.ascontiguousarray(seen.reshape(len(seen), -1, *seen.shape[-2:]))
     bodies, joints = frames.shape[1:3]
     bank, sure, answers = new_bank(bodies, delay), np.ones((bodies, joints)), np.full(frames.shape, np.nan)

@@ -20,6 +20,7 @@ from steadypose.benchmarks.motion import digest
 from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED, Clip, Floats, side_by_side
 from steadypose.benchmarks.studies.kinect_scoring import quick_score
 from steadypose.benchmarks.tuning import Tuned, loss
+from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.correct import CorrectSettings
 from steadypose.prior.clean.settings import PriorSettings
@@ -58,10 +59,17 @@ class Method:
     parameters: Mapping[str, float] = field(default_factory=dict)
 
 
-def run_filter(clips: Sequence[Clip], run: Callable[[Floats, Floats], Floats]) -> list[Floats]:
-    """A filter's answers for each clip, (T, 13, 3) metres. All clips go through it at once, side by side."""
-    batch = side_by_side([clip.raw for clip in clips])
+def run_filter(
+    clips: Sequence[Clip], run: Callable[[Floats, Floats], Floats], whole_body: bool = False
+) -> list[Floats]:
+    """A filter's answers for each clip, (T, 13, 3) metres. All clips go through it at once, side by side.
+
+    Most take the scored joints alone, in two thirds of the time; others need the ``whole_body``.
+    """
+    batch = side_by_side([to_canonical(KINECT22, clip.kinect)[0] if whole_body else clip.raw for clip in clips])
     answers = run(batch, np.arange(len(batch)) / FPS)
+    if whole_body:
+        answers = answers[:, :, [J[name] for name in SCORED]]
     return [answers[: len(clip.raw), number] for number, clip in enumerate(clips)]
 
 
@@ -104,7 +112,9 @@ class Kinect:
         groups = {subject: [c for c in on if c.subject == subject] for subject in dict.fromkeys(c.subject for c in on)}
 
         def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
-            answers = dict(zip((c.name for c in on), run_filter(on, _at(peer, delay, parameters)), strict=True))
+            answers = dict(
+                zip((c.name for c in on), run_filter(on, _at(peer, delay, parameters), peer.whole_body), strict=True)
+            )
             found = {s: quick_score(some, [answers[c.name] for c in some]) for s, some in groups.items()}
             figures = {f"{s} {key}": value for s, some in found.items() for key, value in some.items()}
             return {**figures, **{key: _mean(found, key) for key in ("position_mm", "acceleration_mm")}}
@@ -119,7 +129,8 @@ class Kinect:
             parameters = best_without(left_out, search, peer)
             if name == "Kalman, constant velocity":
                 densities[delay] = parameters["density"]
-            yield Method(name, delay, partial(_filtered, run=_at(peer, delay, parameters)), parameters)
+            run = partial(_filtered, run=_at(peer, delay, parameters), whole_body=peer.whole_body)
+            yield Method(name, delay, run, parameters)
         for delay in self.bench.delays:
             for net in self.bench.smoothnets:
                 one = partial(_filtered, run=partial(_by_network, net=net, delay=delay))
@@ -213,8 +224,10 @@ def _by_network(seen: Floats, stamps_s: Floats, net: smoothnet.SmoothNet, delay:
     return smoothnet.smooth(net, seen, (delay,))[0]
 
 
-def _filtered(clips: Sequence[Clip], run: Callable[[Floats, Floats], Floats]) -> tuple[list[Floats], None]:
-    return run_filter(clips, run), None
+def _filtered(
+    clips: Sequence[Clip], run: Callable[[Floats, Floats], Floats], whole_body: bool = False
+) -> tuple[list[Floats], None]:
+    return run_filter(clips, run, whole_body), None
 
 
 def _mean(found: Mapping[str, Mapping[str, float]], key: str) -> float:

@@ -16,6 +16,7 @@ from steadypose.benchmarks.baselines.filters import (
     interpolate,
 )
 from steadypose.benchmarks.baselines.kalman import fixed_lag, process_noise, transition
+from steadypose.benchmarks.baselines.whole_body_bank import whole_body_bank
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
 
@@ -175,3 +176,8 @@ def test_a_hidden_joint_stays_beside_the_nearest_seen_one_and_turns_with_the_tru
     np.testing.assert_allclose(answer[39, 0, 1:15], truth[9, 0, 1:15])
     gone[:] = np.nan
     assert np.isnan(beside(gone, STAMPS, 0)).all()
+
+
+def test_the_whole_body_bank_refuses_a_choice_of_joints() -> None:
+    with pytest.raises(ValueError, match=r"expected \(\.\.\., 22, 3\) canonical joints"):
+        whole_body_bank(np.zeros((5, 13, 3)), np.arange(5) / 30, 0)
