@@ -28,12 +28,13 @@ def node(arguments: Sequence[str]) -> None:
         help="any setting of the launch file, over what it says; may be given again",
     )
     given = parser.parse_args(arguments)
+    launch = Launch.read(given.launch, given.set)
     if given.name not in NODES:
         raise LaunchError(f"no node {given.name!r}{nearest(given.name, NODES)}; there are {', '.join(NODES)}")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if given.name in COMPILED and not supervisor_id():  # else the run has done it
         compile_missing(logging.info)
     with startup():
-        process = load(NODES[given.name].node)(Launch.read(given.launch, given.set))
+        process = load(NODES[given.name].node)(launch)
     stop_on_signals(lambda *_: process.stop())
     process.run()

@@ -18,8 +18,8 @@ from typing import Any, TypeVar
 from steadypose import PACKAGE
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.nodes.graph.access import ServerSettings, TransportSettings
-from steadypose.nodes.graph.settings import LaunchError, resolve_paths
-from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, load
+from steadypose.nodes.graph.settings import LaunchError, load_plugin, resolve_paths
+from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, NodeDeclaration, add_node, load
 from steadypose.prior.body.own_layouts import add_layouts
 from steadypose.prior.settings import build_settings, nearest
 
@@ -42,6 +42,8 @@ class _EveryLaunch:
     server: ServerSettings = field(default_factory=ServerSettings)
     skeletons: dict[str, Any] = field(default_factory=dict)
     """joint layouts of the user's own (`prior.body.own_layouts`)"""
+    plugins: dict[str, Any] = field(default_factory=dict)
+    """nodes of other packages: to each name the ``module:name`` of its `NodeDeclaration`"""
 
 
 @dataclass(frozen=True)
@@ -80,11 +82,12 @@ class Launch(_EveryLaunch):
         resolve_paths(_layout(table), table, file.parent)
         for override in overrides:
             apply_override(table, override)
+        _add_plugins(table.get("plugins", {}))
         try:
             whole = build_settings(_layout(table), table, file.name)
             sections = {name: getattr(whole, name) for name in table.keys() & _sections().keys()}
             add_layouts(whole.skeletons)
-            return cls(whole.nodes, whole.transport, whole.server, whole.skeletons, sections)
+            return cls(whole.nodes, whole.transport, whole.server, whole.skeletons, whole.plugins, sections)
         except LaunchError:
             raise
         except ValueError as error:
@@ -117,6 +120,16 @@ class Launch(_EveryLaunch):
             if NODES[name].delivery is not Delivery.BEST_EFFORT
             and any(topic != DIAGNOSTICS for topic in NODES[name].subscribes.get(node, ()))
         )
+
+
+def _add_plugins(table: Any) -> None:
+    for name, reference in table.items() if isinstance(table, dict) else ():
+        declared = load_plugin(f"[plugins] {name}", reference)
+        if not isinstance(declared, NodeDeclaration):
+            raise LaunchError(f"[plugins] {name}: expected a NodeDeclaration, got {type(declared).__name__}")
+        if NODES.get(name, declared) is not declared:
+            raise LaunchError(f"[plugins] {name}: there is a node of that name already")
+        add_node(name, declared)
 
 
 def _sections() -> dict[str, str]:

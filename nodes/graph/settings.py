@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import field, fields, is_dataclass
 from pathlib import Path
@@ -43,3 +44,20 @@ def check_addresses(setting: str, addresses: list[str]) -> None:
     for address in addresses:
         if not isinstance(address, str):
             raise LaunchError(f"{setting}: expected addresses such as tcp://192.168.1.21:7111, got {address!r}")
+
+
+def load_plugin(setting: str, reference: Any) -> Any:
+    """What a launch file names as ``module:name`` of an installed package.
+
+    Raises:
+        LaunchError: it is no such name, or cannot be imported.
+    """
+    module, separator, name = reference.partition(":") if isinstance(reference, str) else ("", "", "")
+    if not (module and separator and name):
+        raise LaunchError(f"{setting}: expected module:name, got {reference!r}")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise LaunchError(
+            f"{setting}: {reference} cannot be imported: {error}; install its package beside steadypose"
+        ) from error

@@ -29,8 +29,6 @@ STOP_S = 5.0
 """between SIGTERM and SIGKILL"""
 USAGE_ERROR = 2
 """exit status of a node that cannot do what its launch file says: if it never could, it never will"""
-ORDER = tuple(NODES)
-"""of stopping"""
 COMMAND = (*safe_python.command("steadypose.nodes.cli:main"), "node")
 
 
@@ -185,7 +183,7 @@ class Supervisor:
         self._polled_ns = clock.monotonic_ns()
         self.children = {
             name: Child(name, [*COMMAND, name, *arguments], clock, log, run)
-            for name in sorted(nodes, key=ORDER.index, reverse=True)
+            for name in sorted(nodes, key=list(NODES).index, reverse=True)
         }
 
     def poll(self) -> None:
@@ -204,7 +202,7 @@ class Supervisor:
 
     def stop(self) -> None:
         """Stop all nodes, the first of the stream first."""
-        for name in sorted(self.children, key=ORDER.index):
+        for name in sorted(self.children, key=list(NODES).index):
             self.children[name].stop()
 
     def __enter__(self) -> Supervisor:

@@ -10,6 +10,7 @@ import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from types import MappingProxyType
 from typing import Any
 
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_TRUTH, POSE_WORLD
@@ -64,7 +65,7 @@ _ALL_STREAMS = {
     "trajectory": (POSE_WORLD, DIAGNOSTICS),
 }
 
-NODES: Mapping[str, NodeDeclaration] = {
+_NODES: dict[str, NodeDeclaration] = {
     "pose_input": NodeDeclaration(
         node="steadypose.nodes.sources.pose_input:PoseInputNode",
         publishes=(POSE_RAW, POSE_TRUTH),
@@ -157,11 +158,17 @@ NODES: Mapping[str, NodeDeclaration] = {
         preflight="steadypose.nodes.sinks.recorder:check_recorder",
     ),
 }
+NODES: Mapping[str, NodeDeclaration] = MappingProxyType(_NODES)
 """by name, in the order in which they are stopped: with the stream, so that what is on its way arrives, and the
-recorder has it"""
+recorder has it; then those of other packages"""
 
 POSE_NODES = tuple(name for name, declared in NODES.items() if declared.publishes and not declared.optional)
 """the publishers of poses, which run unless a launch file says otherwise"""
+
+
+def add_node(name: str, declared: NodeDeclaration) -> None:
+    """Make a node of another package known, to all of this process."""
+    _NODES[name] = declared
 
 
 def publishers(topic: str) -> list[str]:

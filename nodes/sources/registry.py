@@ -11,7 +11,7 @@ from steadypose.msgs.keys import Keys
 from steadypose.nodes.graph.clock import Clock, SystemClock
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError, path_setting
+from steadypose.nodes.graph.settings import LaunchError, load_plugin, path_setting
 from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera_settings import OakSettings, WebcamSettings
 from steadypose.nodes.sources.merge import MergeSettings, MergeSource
@@ -53,7 +53,10 @@ class InputSettings:
     """``[input]``: where skeletons come from."""
 
     source: str = "recording"
-    """name of a source: one of the fields declared below"""
+    """name of a source: one of the fields declared below, or ``module:name`` of another package's, a function of its
+    ``options`` and a `SourceContext`"""
+    options: dict[str, Any] = field(default_factory=dict)
+    """settings of another package's source"""
     rate: float = 1.0
     """times real time; 0 is as fast as the subscribers take it"""
     loop: bool = False
@@ -69,7 +72,7 @@ class InputSettings:
     merge: MergeSettings = field(default_factory=MergeSettings, metadata=_declare(MergeSource))
 
     def __post_init__(self) -> None:
-        if self.source not in SOURCES:
+        if self.source not in SOURCES and ":" not in self.source:
             *others, last = SOURCES
             raise LaunchError(
                 f"[input] source: expected {', '.join(others)} or {last}, got {self.source!r}"
@@ -99,12 +102,13 @@ def open_input(
     Raises:
         LaunchError, RecordingError, NpzError, CsvError: a setting, or the recording, cannot be used.
     """
-    declared = SOURCES[settings.source]
+    if ":" in settings.source:
+        declared, own = SourceDeclaration(load_plugin("[input] source", settings.source), ""), settings.options
+    else:
+        declared, own = SOURCES[settings.source], getattr(settings, settings.source)
     if declared.extra:
         require_extra(declared.extra)
-    source = declared.opens(
-        getattr(settings, settings.source), SourceContext(clock, settings.calibration, keys, clear_text)
-    )
+    source = declared.opens(own, SourceContext(clock, settings.calibration, keys, clear_text))
     if not settings.tf.fixed_frame:
         return source
     if not isinstance(source, LiveSource):
