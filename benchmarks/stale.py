@@ -1,6 +1,7 @@
 """Results that stand although the code, weights or settings have changed since, each with the reason."""
 
 BEFORE = "measured before results recorded the code that ran"
+TOUCHED = "code that it imports was touched since"
 FROZEN = "a finished study, whose code is gone"
 
 STALE = {
@@ -10,6 +11,7 @@ STALE = {
     "contacts": BEFORE,
     "depth_lifting": FROZEN,
     "events": BEFORE,
+    "fidelity": TOUCHED,
     "fuzz": BEFORE,
     "hgvae": BEFORE,
     "hidden_joints": BEFORE,

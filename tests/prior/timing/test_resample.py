@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from steadypose.prior.timing.resample import LOOK_AHEAD_NS, MAX_GAP_NS, PERIOD_NS, Resampler
@@ -16,10 +16,12 @@ def line(stamp_ns: int) -> np.ndarray:
 
 def feed(stamps: list[int]) -> list[tuple[int, np.ndarray, np.ndarray]]:
     resampler = Resampler(SLOTS)
-    return [frame for s in stamps for frame in resampler.update(s, line(s), np.full((SLOTS, 22), 0.7))]
+    frames = [frame for s in stamps for frame in resampler.update(s, line(s), np.full((SLOTS, 22), 0.7))]
+    return frames + resampler.drain()
 
 
 @given(st.lists(st.integers(20_000_000, 60_000_000), min_size=3, max_size=60), st.integers(0, 2**60))
+@example([20_000_000] * 7, 0)  # faster than the grid: the newest frame waits for its successor
 @settings(max_examples=60)
 def test_any_stamps_give_the_whole_grid_once_in_order_and_in_place(steps: list[int], start: int) -> None:
     stamps = (start + np.concatenate([[0], np.cumsum(steps)])).tolist()
