@@ -147,24 +147,24 @@ class _Result:
         }
 
     def hours_table(self) -> Table:
-        table = Table(title="Prepared: recordings and hours at 30 Hz")
-        for name in ("source", "licence", "weights"):
+        table = Table(title="Prepared: recordings and hours at 30 Hz", box=None, pad_edge=False)
+        for name in ("source", "weights"):
             table.add_column(name)
         for split in SPLITS:
             table.add_column(split, justify="right")
             table.add_column("hours", justify="right")
         sums: dict[str, list[float]] = defaultdict(lambda: [0.0] * 2 * len(SPLITS))
-        for (source, licence, weights), splits in self.hours().items():
+        for (source, _, weights), splits in self.hours().items():
             row = [value for split in SPLITS for value in splits.get(split, (0, 0.0))]
-            table.add_row(source, licence, weights, *_cells(row))
+            table.add_row(source, weights, *_cells(row))
             sums[weights] = [a + b for a, b in zip(sums[weights], row, strict=True)]
         table.add_section()
         for weights, row in sums.items():
-            table.add_row("total", "", weights, *_cells(row))
+            table.add_row("total", weights, *_cells(row))
         return table
 
     def dropped_table(self) -> Table:
-        table = Table(title=f"Dropped: {len(self.dropped)}, each with its cause in prepare-report.json")
+        table = Table(title=f"Dropped: {len(self.dropped)}, each with its cause in prepare-report.json", box=None)
         for name in ("source", "cause"):
             table.add_column(name)
         table.add_column("recordings", justify="right")

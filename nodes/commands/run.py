@@ -44,6 +44,8 @@ REPORT_NS = 1_000_000_000
 """between two times the health file is written"""
 REPLAY = "replay"
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
+LEAST = ("in", "queue", "MB", "delay\nms", "compute ms\np50/p99", "joints\ngated", "bodies", "frames")
+"""of the table's columns: the first to go where they do not fit"""
 STALL_NS = 15_000_000_000
 """without progress after the source has ended, until the run is given up: a message was lost on the way"""
 
@@ -59,8 +61,8 @@ def run(
 ) -> int:
     """Start the nodes of a launch file, watch them and show how they do, until the stream ends or Ctrl-C.
 
-    A node that crashes, or is not heard any more, is started again. With `view` on a terminal, the picture stays when
-    the stream has ended.
+    A node that crashes, or is not heard any more, is started again. On a terminal, the picture in the browser stays
+    when the stream has ended.
 
     Args:
         launch: a launch file, or the name of one of the project's own, such as replay, oak, ros2 or server.
@@ -190,7 +192,8 @@ class _Run:
             values = diagnostics.values | self._ledger.away(name, self._diagnostics)
             self._diagnostics[name] = dataclasses.replace(diagnostics, values=values)
         with suppress(OSError):
-            self._console.print(table(self._launch.nodes, self._diagnostics, supervisor, summary=True))
+            width = self._console.width
+            self._console.print(table(self._launch.nodes, self._diagnostics, supervisor, width, summary=True))
         if unread := self._not_read():
             self._print(f"{unread}: what could be read of the input was played")
             status = status or 1
@@ -250,7 +253,7 @@ class _Run:
     def _show(self, supervisor: Supervisor, live: Live | None) -> None:
         if live:
             with suppress(OSError):
-                live.update(table(self._launch.nodes, self._diagnostics, supervisor), refresh=True)
+                live.update(table(self._launch.nodes, self._diagnostics, supervisor, self._console.width), refresh=True)
         elif self._clock.monotonic_ns() - self._printed_ns >= LINE_NS:
             self._printed_ns = self._clock.monotonic_ns()
             self._print(line(self._launch.nodes, self._diagnostics, supervisor))
@@ -268,7 +271,7 @@ class _Run:
             self._progress_ns = self._progress_ns if source else self._clock.monotonic_ns()
             return None
         if self._drained():
-            if "viewer" not in self._launch.nodes or not self._console.is_terminal:
+            if not {"viewer", "web"} & {*self._launch.nodes} or not self._console.is_terminal:
                 return 0
             if not self._over:
                 self._over = True
@@ -325,11 +328,12 @@ def _counts(diagnostics: Diagnostics) -> list[str]:
 
 
 def table(
-    nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supervisor, *, summary: bool = False
+    nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supervisor, width: int, *, summary: bool = False
 ) -> Group:
     """A row for each node: how fast, how late, what went wrong, what it weighs.
 
-    A column in which there is nothing to say is left out. The rates of a ``summary`` are over all the run.
+    A column in which there is nothing to say is left out, and of the others those that fit no more into ``width``
+    characters. The rates of a ``summary`` are over all the run.
     """
     rows, notes = [], []
     for name in nodes:
@@ -370,9 +374,16 @@ def table(
         if latest and causes and (summary or latest.level != Level.OK):
             notes.append(Text(printable(f"{name}: {', '.join(causes)}"), style="yellow"))
     grid = Table(box=None, header_style="bold", pad_edge=False)
-    for heading in rows[0]:
-        if any(row[heading] not in ("", "0") for row in rows):
-            grid.add_column(heading, justify="left" if heading in ("node", "state") else "right", no_wrap=True)
+    told = [heading for heading in rows[0] if any(row[heading] not in ("", "0") for row in rows)]
+    for least in LEAST:
+        wide = (
+            max(len(line) for cell in (key, *(row[key] for row in rows)) for line in cell.split("\n")) for key in told
+        )
+        if sum(wide) + 2 * len(told) <= width:
+            break
+        told = [heading for heading in told if heading != least]
+    for heading in told:
+        grid.add_column(heading, justify="left" if heading in ("node", "state") else "right", no_wrap=True)
     for row in rows:
         grid.add_row(*(row[str(column.header)] for column in grid.columns))
     return Group(grid, *notes)

@@ -22,6 +22,12 @@ WORLD_COLOUR = "#c98500"
 TRUTH_COLOUR = "#7f7f7f"
 CONTACT_COLOUR = "#f0c808"
 ALARM_COLOUR = "#d81b60"
+LEFT_COLOUR, RIGHT_COLOUR, MIDDLE_COLOUR = "#0072b2", "#d55e00", "#3c3c3c"
+"""of a body's sides on white"""
+DARK, ON_DARK = "#12141a", ("#56b4e9", "#f08c2e", "#d7dbe4")
+"""a dark background, and left, right and middle on it"""
+FAINT = 0.3
+"""opacity of what was not observed"""
 
 CONTACT_INDICES: NDArray[np.intp] = np.array([J[name] for name in CONTACTS])
 """(8,) canonical joints that the contact probabilities of ``pose/world`` are of."""
@@ -51,6 +57,10 @@ def bones(observable: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 ALL_BONES: NDArray[np.intp] = bones(np.ones(len(JOINTS), dtype=bool))
 """(21, 2) parent and child of each canonical bone."""
+
+
+SIDES: NDArray[np.intp] = np.array([0 if "left" in name else 1 if "right" in name else 2 for name in JOINTS])
+"""(22,) of each canonical joint: left, right, middle"""
 
 
 def bone_states(state: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -13,11 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.types import JOINTS, JointState
+from steadypose.msgs.types import JointState
 from steadypose.nodes.commands.plot.history import History, Track
 from steadypose.nodes.commands.plot.picture import PlotError, body_of
 from steadypose.nodes.graph.extras import how_to_install
-from steadypose.nodes.sinks.drawing import ALL_BONES, CONTACT_COLOUR, CONTACT_INDICES, bones, facing
+from steadypose.nodes.sinks.drawing import (
+    ALL_BONES,
+    CONTACT_COLOUR,
+    CONTACT_INDICES,
+    FAINT,
+    LEFT_COLOUR,
+    MIDDLE_COLOUR,
+    RIGHT_COLOUR,
+    SIDES,
+    bones,
+    facing,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,9 +38,8 @@ FPS = 15
 """of the video: half of the poses', which is smooth enough"""
 PANEL_INCHES, STAGE_WIDTH, DPI = (2.3, 3.4), 1.6, 80
 """of a panel; how much wider that of the world is"""
-LEFT, RIGHT, MIDDLE, GHOST, FLOOR = "#0072b2", "#d55e00", "#3c3c3c", "#cfcfcf", "#e6e6e6"
-FAINT = 0.3
-"""opacity of what was not observed"""
+GHOST, FLOOR = "#cfcfcf", "#e6e6e6"
+SIDE_COLOURS = (LEFT_COLOUR, RIGHT_COLOUR, MIDDLE_COLOUR)
 ELEVATION = 0.22
 """radians that the view looks down"""
 TURNED = 0.5
@@ -110,8 +120,9 @@ def _frames(history: History, body: int, lead: Track, step: int) -> Iterator[NDA
     canvas = FigureCanvasAgg(figure)
     figure.legend(
         handles=[
-            *(Line2D([], [], color=c, lw=3, label=name) for name, c in (("left", LEFT), ("right", RIGHT))),
-            Line2D([], [], color=MIDDLE, lw=3, alpha=FAINT, label="faint: not observed"),
+            Line2D([], [], color=LEFT_COLOUR, lw=3, label="left"),
+            Line2D([], [], color=RIGHT_COLOUR, lw=3, label="right"),
+            Line2D([], [], color=MIDDLE_COLOUR, lw=3, alpha=FAINT, label="faint: not observed"),
         ],
         loc="lower center", ncols=3, frameon=False, fontsize=9, borderaxespad=0.1,
     )  # fmt: skip
@@ -160,7 +171,7 @@ def _stage(world: Track, at: NDArray[np.intp], view: View) -> Callable[[Axes, in
 
         here = int(at[row])
         ax.add_collection(LineCollection([view(line) for line in lines], colors=FLOOR, linewidths=0.8))
-        ax.plot(*view(root[max(here - PATH_FRAMES, 0) : here + 1]).T, color=MIDDLE, lw=1.2, alpha=FAINT)
+        ax.plot(*view(root[max(here - PATH_FRAMES, 0) : here + 1]).T, color=MIDDLE_COLOUR, lw=1.2, alpha=FAINT)
         _sticks(ax, view, world, here)
         loaded = world.positions[here, CONTACT_INDICES[world.contacts[here] > 0.5]]
         ax.plot(*view(loaded).T, "o", color=CONTACT_COLOUR, markersize=4, markeredgewidth=0)
@@ -173,7 +184,7 @@ def _stage(world: Track, at: NDArray[np.intp], view: View) -> Callable[[Axes, in
 def _raw(ax: Axes, view: View, clean: Track, row: int, shown: NDArray[np.intp]) -> None:
     """What went in, over what came out of it."""
     _lines(ax, view(clean.positions[row]), ALL_BONES, [GHOST] * len(ALL_BONES), 2.0, np.ones(len(ALL_BONES)))
-    _lines(ax, view(clean.raw[row]), shown, [_side(child) for _, child in shown], 3.0, np.ones(len(shown)))
+    _lines(ax, view(clean.raw[row]), shown, _sides(shown), 3.0, np.ones(len(shown)))
 
 
 def _sticks(ax: Axes, view: View, track: Track, row: int, shown: NDArray[np.intp] = ALL_BONES) -> None:
@@ -181,7 +192,11 @@ def _sticks(ax: Axes, view: View, track: Track, row: int, shown: NDArray[np.intp
     if track.state.size:
         observed = np.isin(track.state[row], (JointState.SEEN, JointState.REFINED))
         opacity = np.where(observed[shown].all(axis=1), 1.0, FAINT)
-    _lines(ax, view(track.positions[row]), shown, [_side(child) for _, child in shown], 3.0, opacity)
+    _lines(ax, view(track.positions[row]), shown, _sides(shown), 3.0, opacity)
+
+
+def _sides(shown: NDArray[np.intp]) -> list[str]:
+    return [SIDE_COLOURS[side] for side in SIDES[shown[:, 1]]]
 
 
 def _lines(ax: Axes, flat: Floats, pairs: NDArray[np.intp], colours: list[str], width: float, opacity: Floats) -> None:
@@ -199,11 +214,6 @@ def _lines(ax: Axes, flat: Floats, pairs: NDArray[np.intp], colours: list[str], 
     )
 
 
-def _side(joint: int) -> str:
-    name = JOINTS[joint]
-    return LEFT if name.startswith("left_") else RIGHT if name.startswith("right_") else MIDDLE
-
-
 def _smooth(path: Floats, frames: int = 15) -> Floats:
     """(T, 3), gaps filled, averaged over so many frames, so that a view that follows it does not shake."""
     rows = np.arange(len(path))
@@ -219,7 +229,7 @@ def _palette() -> list[int]:
     """Red, green and blue, 0 to 255, of each colour in turn."""
     from matplotlib.colors import to_rgb
 
-    colours = [np.array(to_rgb(name)) for name in (LEFT, RIGHT, MIDDLE, CONTACT_COLOUR, "black")]
+    colours = [np.array(to_rgb(name)) for name in (*SIDE_COLOURS, CONTACT_COLOUR, "black")]
     shades = [1.0 - shade * (1.0 - colour) for colour in colours for shade in SHADES]
     return np.round(255 * np.array([np.ones(3), *shades])).astype(int).ravel().tolist()
 

@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JointState
-from steadypose.nodes.sinks.drawing import ALARM_COLOUR, CONTACT_COLOUR, RAW_COLOUR, STATE_COLOURS, TRUTH_COLOUR
+from steadypose.nodes.sinks.drawing import (
+    ALARM_COLOUR,
+    CONTACT_COLOUR,
+    DARK,
+    FAINT,
+    ON_DARK,
+    RAW_COLOUR,
+    STATE_COLOURS,
+    TRUTH_COLOUR,
+)
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -22,6 +31,11 @@ def _rgb(colour: str) -> list[int]:
     return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
 
 
+DARK_RGB = _rgb(DARK)
+SIDE_RGB = np.array([_rgb(colour) for colour in ON_DARK], np.uint8)
+"""(3, 3) of left, right and middle"""
+FAINT_RGB = (FAINT * SIDE_RGB + (1.0 - FAINT) * np.array(DARK_RGB)).astype(np.uint8)
+"""the same of what was not observed, for lines here have no opacity"""
 STATE_RGB = np.array([_rgb(STATE_COLOURS[state]) for state in JointState], np.uint8)
 RAW_RGB, TRUTH_RGB, CONTACT_RGB, ALARM_RGB = map(_rgb, (RAW_COLOUR, TRUTH_COLOUR, CONTACT_COLOUR, ALARM_COLOUR))
 PATH_RGB = [235, 235, 235]
@@ -29,14 +43,12 @@ RATE_RGB = {POSE_RAW: RAW_RGB, POSE_CLEAN: _rgb(STATE_COLOURS[JointState.REFINED
 
 
 LEGEND = """
-| | |
-|---|---|
-| green, blue | seen; seen and corrected |
-| orange | imputed; the sphere is its standard deviation |
-| grey | raw: the whiter, the surer; world: the truth |
-| discs, arrow | contacts; velocity, 1 m/s is 1 m |
-| axes, grid | 0.5 m: x red, y green, z blue |
-| red | flagged; the score from which on |
+- **blue** left, **orange** right
+- **faint** not observed: inferred; the sphere is its standard deviation
+- **points** of raw: the whiter, the surer
+- **yellow** contact; **arrow** velocity, 1 m/s is 1 m; **grey** the truth
+- **grid, axes** 0.5 m: x red, y green, z blue
+- **red** flagged as an anomaly
 """
 
 
@@ -90,7 +102,7 @@ def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool) -> rrb.Bluepri
             origin="/",
             contents=f"/{origin}/**",
             name=name,
-            background=[18, 20, 26],
+            background=DARK_RGB,
             line_grid=rrb.LineGrid3D(visible=floor, spacing=0.5, color=[120, 130, 150, 90]),
             eye_controls=_eye_controls(eye, origin, distance, height),
         )
@@ -107,16 +119,17 @@ def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool) -> rrb.Bluepri
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
-                scene("raw", "raw: what the sensor says", distance=2.05, height=0.4, floor=calibrated),
-                scene("clean", "clean: seen, refined, imputed", distance=2.05, height=0.4, floor=calibrated),
-                scene("world", "world: path and contacts", distance=2.8, height=1.1, floor=True),
+                scene("raw", "raw: as the sensor gives it", distance=1.78, height=0.3, floor=calibrated),
+                scene("clean", "clean: faint is inferred", distance=1.78, height=0.3, floor=calibrated),
+                scene("world", "world: path and contacts", distance=2.3, height=0.8, floor=True),
             ),
             rrb.Horizontal(
                 *([plot("anomaly", "anomaly score")] if scored else []),
-                plot("correction", "mean correction of a joint, cm"),
+                plot("correction", "correction, cm"),
                 plot("joints", "joints by state"),
                 plot("rates", "messages a second", (0.0, 40.0)),
                 rrb.TextDocumentView(origin="/legend", name="legend"),
+                column_shares=[2] * (4 if scored else 3) + [3],
             ),
             row_shares=[5, 2],
         ),

@@ -24,13 +24,13 @@ from steadypose.msgs.types import (
     Tracking,
     WorldBody,
 )
-from steadypose.nodes.sinks.drawing import ALL_BONES, CONTACT_INDICES, bone_states, bones, facing, to_world
+from steadypose.nodes.sinks.drawing import ALL_BONES, CONTACT_INDICES, SIDES, bone_states, bones, facing, to_world
 from steadypose.nodes.sinks.viewer.layout import (
     CONTACT_RGB,
+    FAINT_RGB,
     PATH_RGB,
     RATE_RGB,
-    RAW_RGB,
-    STATE_RGB,
+    SIDE_RGB,
     TIMELINE,
     TRUTH_RGB,
     Eye,
@@ -54,6 +54,8 @@ BELOW_TRUNK = 0.25
 """metres from the middle of the trunk down to the middle of a standing body"""
 BACK_JUMP_NS = 1_000_000_000
 """a stamp so far behind the last one is a stream that starts again"""
+
+OBSERVED = (JointState.SEEN, JointState.REFINED)
 
 _TRUNK = [J["pelvis"], *HIPS, *SHOULDERS]
 
@@ -129,7 +131,7 @@ class PoseView:
             canonical, _ = to_canonical(skeleton, positions, body.confidence)
             seen = np.isfinite(positions).all(axis=1)
             self._log(f"{path}/joints", rr.Points3D(positions[seen], radii=0.016, colors=_grey(body.confidence[seen])))
-            self._bones(f"{path}/bones", canonical, pairs, RAW_RGB)
+            self._bones(f"{path}/bones", canonical, pairs, SIDE_RGB[SIDES[pairs[:, 1]]])
             yield path, canonical
 
     def _draw_clean(self, message: PoseClean) -> Iterator[tuple[str, NDArray[np.float64]]]:
@@ -188,17 +190,20 @@ class PoseView:
             yield path, positions
 
     def _body(self, path: str, positions: NDArray, state: NDArray[np.uint8], sigma: NDArray[np.floating]) -> None:
-        """A body in the colours of its joints' states; around each imputed joint a sphere of one sigma."""
+        """A body in the colours of its sides, faint if not observed; around an imputed joint a sphere of one sigma."""
         import rerun as rr
 
-        self._bones(f"{path}/bones", positions, ALL_BONES, STATE_RGB[bone_states(state)])
+        observed = np.isin(bone_states(state), OBSERVED)[:, None]
+        sides = SIDES[ALL_BONES[:, 1]]
+        self._bones(f"{path}/bones", positions, ALL_BONES, np.where(observed, SIDE_RGB[sides], FAINT_RGB[sides]))
         shown = (state != JointState.UNKNOWN) & np.isfinite(positions).all(axis=1)
-        self._log(f"{path}/joints", rr.Points3D(positions[shown], radii=0.018, colors=STATE_RGB[state[shown]]))
+        colours = np.where(np.isin(state, OBSERVED)[:, None], SIDE_RGB[SIDES], FAINT_RGB[SIDES])
+        self._log(f"{path}/joints", rr.Points3D(positions[shown], radii=0.018, colors=colours[shown]))
         guessed = shown & (state == JointState.IMPUTED)
         spheres = rr.Ellipsoids3D(
             centers=positions[guessed],
             radii=sigma[guessed],
-            colors=STATE_RGB[state[guessed]],
+            colors=colours[guessed],
             line_radii=0.0008,
             fill_mode="majorwireframe",
         )

@@ -61,7 +61,7 @@ class ViewerServer:
         inner, unused, token = _free_port(), _free_port(), secrets.token_urlsafe(24)
         at = f"http://{shown}:{port}"
         self.data_url = f"{at}/{token}/{DRAWINGS}"
-        self.url = f"{at}/?url={quote(self.data_url, safe='')}"
+        self.url = f"{at}/?theme=dark&url={quote(self.data_url, safe='')}"
         binary = Path(next(iter(rerun_cli.__path__)), "rerun")
         # The server must not outlive a node that is killed.
         self._process = subprocess.Popen(

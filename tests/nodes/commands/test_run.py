@@ -259,12 +259,28 @@ def test_the_table_and_the_line_show_what_there_is_to_see() -> None:
     console = Console(width=140, record=True, quiet=True)
     console.quiet = False
     with console.capture() as capture:
-        console.print(table(NODES, latest, processes))
+        console.print(table(NODES, latest, processes, console.width))
     shown = capture.get()
     for text in ("30.0", "3.1/9.9", "133", "unknown_skeleton 5", "flagged", "starting"):
         assert text in shown
     assert "restarts" not in shown, "nothing to say there"
     assert "pose/clean 30.0 Hz, latency p50/p99 3.1/9.9 ms, 0 dropped, 5 refused" in line(NODES, latest, processes)
+
+
+def test_the_table_leaves_out_what_does_not_fit_into_a_terminal() -> None:
+    keys = ("latency_ms__p50", "latency_ms__p99", "compute_ms__p50", "compute_ms__p99", "delay_frames", "bodies")
+    values = dict.fromkeys((*keys, "queue", "memory_mb", "rate__pose__clean", "count__pose__clean"), "123456.7")
+    values |= {"in__pose__raw": "7654321", "dropped__late": "321", "refused__units": "123", "delay_frames": "4"}
+    latest = {message.node: message for _, message in [news("prior", **values)]}
+    processes: Supervisor = Processes(*NODES)  # type: ignore[assignment]
+    for width, left_out in ((200, ()), (80, ("queue", "MB"))):
+        console = Console(width=width)
+        with console.capture() as capture:
+            console.print(table(NODES, latest, processes, width))
+        shown = capture.get()
+        assert "\u2026" not in shown, "nothing is cut"
+        for column in ("in", "queue", "MB", "latency", "dropped", "refused"):
+            assert (column in shown.split()) == (column not in left_out + ("in",) * (width == 80))
 
 
 def test_what_goes_wrong_is_printed_when_it_does(make_launch: Callable[..., Launch], clock: VirtualClock) -> None:

@@ -28,10 +28,10 @@ from steadypose.nodes.graph import extras
 from steadypose.nodes.graph.access import TransportSettings
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.drawing import STATE_COLOURS
 from steadypose.nodes.sinks.viewer import drawings
 from steadypose.nodes.sinks.viewer import node as viewer_node
 from steadypose.nodes.sinks.viewer.drawings import Drawings
+from steadypose.nodes.sinks.viewer.layout import FAINT_RGB, SIDE_RGB
 from steadypose.nodes.sinks.viewer.node import ViewerNode
 from steadypose.nodes.sinks.viewer.page import is_own_name
 from steadypose.nodes.sinks.viewer.scene import PATH_SECONDS, PoseView
@@ -103,16 +103,13 @@ def test_raw_and_clean_stand_upright_at_the_same_place(view: PoseView, log: Log)
     assert np.linalg.norm(raw.mean(axis=0) - clean.mean(axis=0)) < 0.4
 
 
-def test_bones_have_the_colours_of_their_states(view: PoseView, log: Log) -> None:
-    for topic, message in messages(1.0):
-        view.log(topic, message)
-    before = colours(log.last("clean/made-up/0/bones"))
+def test_bones_have_the_colours_of_their_sides_and_are_faint_where_not_observed(view: PoseView, log: Log) -> None:
     (_, message), *_ = only(messages(0.5), POSE_CLEAN)
     assert isinstance(message, PoseClean)
-    message.bodies[0].state[:] = JointState.IMPUTED
-    view.log(POSE_CLEAN, message)
-    assert {STATE_COLOURS[JointState.SEEN], STATE_COLOURS[JointState.REFINED]} <= before
-    assert colours(log.last("clean/made-up/0/bones")) == {STATE_COLOURS[JointState.IMPUTED]}
+    for state, sides in ((JointState.REFINED, SIDE_RGB), (JointState.IMPUTED, FAINT_RGB)):
+        message.bodies[0].state[:] = state
+        view.log(POSE_CLEAN, message)
+        assert colours(log.last("clean/made-up/0/bones")) == {"#{:02x}{:02x}{:02x}".format(*rgb) for rgb in sides}
     assert len(log.last("clean/made-up/0/sigma").half_sizes.as_arrow_array()) == 22
 
 

@@ -13,8 +13,7 @@ from PIL import Image
 from tests.helpers.synthetic_poses import messages
 from tests.nodes.sinks.test_viewer import free_port
 
-from steadypose.msgs.types import JointState
-from steadypose.nodes.sinks.viewer.layout import CONTACT_RGB, RAW_RGB, STATE_RGB
+from steadypose.nodes.sinks.viewer.layout import CONTACT_RGB, SIDE_RGB
 from steadypose.nodes.sinks.viewer.node import connect
 from steadypose.nodes.sinks.viewer.scene import PoseView
 from steadypose.nodes.sinks.viewer.server import ViewerServer
@@ -38,13 +37,8 @@ def pixels(screenshot: bytes, panel: int, colour: np.ndarray | list[int]) -> int
 
 
 def is_drawn(screenshot: bytes) -> bool:
-    refined = STATE_RGB[JointState.REFINED]
-    return (
-        pixels(screenshot, 0, RAW_RGB) > 50
-        and pixels(screenshot, 1, refined) > 200
-        and pixels(screenshot, 2, refined) > 200
-        and pixels(screenshot, 2, CONTACT_RGB) > 10
-    )
+    sides = all(pixels(screenshot, panel, colour) > 100 for panel in range(3) for colour in SIDE_RGB[:2])
+    return sides and pixels(screenshot, 2, CONTACT_RGB) > 10
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; on Debian: apt-get install chromium")

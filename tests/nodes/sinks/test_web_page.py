@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import shutil
 from collections.abc import Iterator
@@ -25,7 +26,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="the extra 'dev' 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; on Debian: apt-get install chromium")
-REFINED, BACKGROUND = (0x56, 0xB4, 0xE9), (0x12, 0x14, 0x1A)
+LEFT, RIGHT, BACKGROUND = (0x56, 0xB4, 0xE9), (0xF0, 0x8C, 0x2E), (0x12, 0x14, 0x1A)
 SOON_S = 60.0
 
 
@@ -85,8 +86,30 @@ def test_the_page_draws_bodies_and_says_what_they_do_and_how_the_nodes_are(serve
     send(server, "diagnostics", diagnostics())
     until(lambda: page.text_content("#events") == "7: left hand raised", timeout_s=SOON_S)
     until(lambda: "prior" in page.text_content("#health"), timeout_s=SOON_S)
-    until(lambda: pixels(page, REFINED) > 150)
+    until(lambda: min(pixels(page, LEFT), pixels(page, RIGHT)) > 500)
     assert pixels(page, BACKGROUND) > 100_000
+
+
+def test_the_last_poses_stay_when_the_stream_has_ended_and_the_server_with_it(browser: Any) -> None:
+    server = WebServer("127.0.0.1", 0, [], "a-token-of-this-test")
+    page = browser.new_page(viewport={"width": 1000, "height": 600})
+    page.goto(server.url)
+    last = worlds()[-1]
+    send(server, POSE_WORLD, last)
+    until(lambda: pixels(page, LEFT) > 500, timeout_s=SOON_S)
+    send(server, POSE_WORLD, dataclasses.replace(last, bodies=[], end_of_stream=True))
+    until(lambda: page.text_content("#notice").startswith("the stream has ended"), timeout_s=SOON_S)
+    page.evaluate(
+        """async () => {
+          const { connect } = await import("/steadypose.js");
+          connect().on("state", (state) => { globalThis.state = state; });
+        }"""
+    )
+    server.close()
+    page.wait_for_function("globalThis.state === 'closed'")
+    assert page.text_content("#notice").startswith("the stream has ended")
+    assert pixels(page, LEFT) > 500
+    page.close()
 
 
 def test_four_bodies_are_drawn_thirty_times_a_second_in_bounded_memory(server: WebServer, opened: Any) -> None:

@@ -1,28 +1,31 @@
 // The page: bodies on a floor that can be turned, what they do, and how the nodes are.
 import { connect } from "./steadypose.js";
 
-const COLOURS = ["#8c8c8c", "#10a37f", "#56b4e9", "#e8710a"]; // of the states: unknown, observed, refined, inferred
-const CONTACT = "#f0c808";
+const [LEFT, RIGHT, MIDDLE, CONTACT] = ["#56b4e9", "#f08c2e", "#d7dbe4", "#f0c808"];
+const [INFERRED, FAINT] = [3, 0.3]; // the state of a joint that was not observed, and its opacity
+const TALL = 2.1; // metres of room above the floor
 const KEPT = 40; // events in the list
 const STALE_S = 3;
 
 const canvas = document.getElementById("canvas");
 const notice = document.getElementById("notice");
 const pen = canvas.getContext("2d");
-const eye = { yaw: -0.9, pitch: 0.25, distance: 5, target: [0, 0, 0.9] };
+const eye = { yaw: -0.9, pitch: 0.25, distance: 2.6, zoom: 1, target: [0, 0, 0.9] };
 let world = null;
 let doing = new Map();
 let asked = false;
+let ended = false;
 
 const pose = connect();
 
 pose.on("state", (state) => {
+  if (ended) return; // the last poses stay
   notice.textContent = state === "open" ? "" : "no connection: is `steadypose run web` running, and the address its own?";
 });
 pose.on("world", (message) => {
-  world = message;
-  if (message.end) notice.textContent = "the stream has ended";
-  else if (pose.state === "open") notice.textContent = "";
+  ended = message.end;
+  notice.textContent = ended ? "the stream has ended: these are its last poses" : "";
+  if (!ended) world = message;
   draw();
 });
 pose.on("events", ({ events }) => {
@@ -84,13 +87,16 @@ function paint() {
   for (const body of bodies) person(body, project);
 }
 
-// The eye keeps to the middle of those who are there.
+// The eye keeps to the middle of those who are there, as near as all are in view.
 function follow(bodies) {
   if (!bodies.length) return;
+  let spread = 0;
   for (const axis of [0, 1]) {
     const middle = bodies.reduce((sum, body) => sum + body.root[axis], 0) / bodies.length;
     eye.target[axis] += 0.1 * (middle - eye.target[axis]);
+    spread = Math.max(spread, ...bodies.map((body) => Math.abs(body.root[axis] - middle)));
   }
+  eye.distance += 0.1 * ((1.1 * TALL + 1.6 * spread) * eye.zoom - eye.distance);
 }
 
 function camera(width, height) {
@@ -129,8 +135,11 @@ function person(body, project) {
   pen.lineCap = "round";
   pose.names.parents.forEach((parent, joint) => {
     if (parent < 0) return;
-    line(points[parent], points[joint], COLOURS[Math.max(body.state[parent], body.state[joint])], 5);
+    const name = pose.names.joints[joint];
+    pen.globalAlpha = body.state[parent] === INFERRED || body.state[joint] === INFERRED ? FAINT : 1;
+    line(points[parent], points[joint], name.startsWith("left") ? LEFT : name.startsWith("right") ? RIGHT : MIDDLE, 6);
   });
+  pen.globalAlpha = 1;
   pose.names.contacts.forEach((name, index) => {
     const at = points[pose.names.joints.indexOf(name)];
     if (!at || body.contacts[index] < 0.5) return;
@@ -155,7 +164,9 @@ canvas.addEventListener("pointermove", (event) => {
 });
 canvas.addEventListener("wheel", (event) => {
   event.preventDefault();
-  eye.distance = Math.min(15, Math.max(1.5, eye.distance * Math.exp(0.001 * event.deltaY)));
+  const zoom = Math.min(6, Math.max(0.5, eye.zoom * Math.exp(0.001 * event.deltaY)));
+  eye.distance *= zoom / eye.zoom;
+  eye.zoom = zoom;
   draw();
 }, { passive: false });
 addEventListener("resize", draw);
@@ -163,7 +174,7 @@ addEventListener("resize", draw);
 let last = 0;
 let stamp = 0;
 setInterval(() => {
-  if (world && world.stamp === stamp && !world.end && pose.state === "open") {
+  if (world && world.stamp === stamp && !ended && pose.state === "open") {
     if ((last += 1) >= STALE_S) notice.textContent = "no poses: nobody is seen, or the nodes are waiting";
   } else last = 0;
   stamp = world?.stamp;
