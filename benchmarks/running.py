@@ -16,6 +16,7 @@ from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.graph.clock import POLL_S, SystemClock
 from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.node import WATCHER
 from steadypose.nodes.graph.supervisor import Supervisor
 from steadypose.nodes.graph.topology import POSE_NODES
 
@@ -34,12 +35,14 @@ class Running(NamedTuple):
         subscriber: where ``messages`` come from, for who does not want to wait for them.
         supervisor: of their processes.
         clock: theirs.
+        endpoints: where they publish.
     """
 
     messages: Iterator[tuple[str, Message]]
     subscriber: Subscriber
     supervisor: Supervisor
     clock: SystemClock
+    endpoints: list[str]
 
 
 @contextmanager
@@ -78,10 +81,10 @@ def running_nodes(nodes: Sequence[str], settings: Sequence[str]) -> Iterator[Run
         transport = Launch.read("replay", settings).transport
         endpoints = [transport.endpoint(name) for name in nodes]
         with (
-            Subscriber(endpoints, [POSE_WORLD, DIAGNOSTICS]) as subscriber,
+            Subscriber(endpoints, [POSE_WORLD, DIAGNOSTICS], name=WATCHER) as subscriber,
             Supervisor(nodes, arguments, clock, lambda line: console.print(line, markup=False)) as supervisor,
         ):
-            yield Running(_received(subscriber, supervisor), subscriber, supervisor, clock)
+            yield Running(_received(subscriber, supervisor), subscriber, supervisor, clock, endpoints)
 
 
 def _received(subscriber: Subscriber, supervisor: Supervisor) -> Iterator[tuple[str, Message]]:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 CHUNK_NS = 500_000_000
 CHUNK_BYTES = 2**18
+TAIL_NS = 10_000_000_000
+"""of the last part: what may be given again to a recorder that was killed before it could say that it has it"""
 METADATA = "metadata.yaml"
 
 
@@ -74,7 +76,8 @@ class RecordingWriter:
         """Make `directory`, and its parents where they are missing.
 
         Args:
-            go_on: if a recording is there already, write its next part.
+            go_on: if a recording is there already, write its next part; what the end of its last one holds is not
+                written again.
             split_bytes: begin the next part when one has so many; 0: never.
             split_ns: begin the next part when one spans so much, in stamps; 0: never.
             keep_bytes: remove the oldest parts so that all together have no more; 0: never.
@@ -87,11 +90,13 @@ class RecordingWriter:
         typestore()
         number = 0
         self._done: list[PartInfo] = []
+        self._tail: set[tuple[str, bytes]] = set()
         try:
             if go_on and self.directory.is_dir():
                 parts = recorded_parts(self.directory)
                 number = 1 + max(parts, default=-1)
                 self._done = [PartInfo.of(parts[n]) for n in sorted(parts)]
+                self._tail = _tail(parts[number - 1]) if parts else set()
             else:
                 self.directory.mkdir(parents=True)
             self._part = _Part(self.directory, number)
@@ -109,9 +114,21 @@ class RecordingWriter:
         if stamp_ns < 0:
             raise ValueError(f"stamp_ns: expected 0 or more, got {stamp_ns}")
         payload = encode(message)
+        if (topic, payload) in self._tail:
+            return
         if self._part.broken or self._is_full(stamp_ns):
             self.split()
         self._part.write(topic, payload, stamp_ns)
+
+    @property
+    def pending(self) -> bool:
+        """Whether something that was written would be lost with this process."""
+        return self._part.pending
+
+    def flush(self) -> None:
+        """Hand what was written to the operating system."""
+        if self.pending:
+            self._part.flush()
 
     def sync(self) -> None:
         """Have what was written reach the disk itself, so that it outlasts a power failure."""
@@ -212,11 +229,15 @@ class _Part:
         self._written: dict[str, int] = {}
         self._flushed: dict[str, int] = {}
         self._pending = 0
-        self._flush()
+        self.flush()
 
     @property
     def closed(self) -> bool:
         return self._file.closed
+
+    @property
+    def pending(self) -> bool:
+        return self._pending > 0 and not self.broken and not self.closed
 
     def write(self, topic: str, payload: bytes, stamp_ns: int) -> None:
         info = self.info
@@ -235,7 +256,7 @@ class _Part:
             # because a clock may be set back
             flushed = self._flushed.get(topic)
             if flushed is None or abs(stamp_ns - flushed) >= CHUNK_NS or self._pending >= CHUNK_BYTES:
-                self._flush()
+                self.flush()
         except OSError:
             self.broken = True
             raise
@@ -255,8 +276,12 @@ class _Part:
             self._channels[topic] = channel
         return self._channels[topic]
 
-    def _flush(self) -> None:
-        self._writer.flush()
+    def flush(self) -> None:
+        try:
+            self._writer.flush()
+        except OSError:
+            self.broken = True
+            raise
         self._flushed = dict(self._written)
         self._pending = 0
 
@@ -292,6 +317,17 @@ def recorded_parts(directory: Path) -> dict[int, Path]:
         elif path.name not in (METADATA, f"{METADATA}.tmp"):
             raise RecordingError(f"{directory} holds {path.name}: expected a new directory, or a recording")
     return parts
+
+
+def _tail(part: Path) -> set[tuple[str, bytes]]:
+    """The last messages of a part, encoded, with their topics; none, if it cannot be read."""
+    tail: set[tuple[str, bytes]] = set()
+    with part.open("rb") as file, suppress(*BROKEN):
+        mcap = McapFile(file, part.stat().st_size)
+        names = {channel.topic for channel in mcap.channels.values()}
+        for logged in mcap.messages(names, mcap.end_ns - TAIL_NS):
+            tail.add((logged.channel.topic.removeprefix("/"), bytes(logged.data)))
+    return tail
 
 
 def definition(name: str) -> str:

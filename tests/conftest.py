@@ -30,8 +30,8 @@ settings.register_profile("steadypose", deadline=None)
 settings.load_profile("steadypose")
 
 
-# what a shell starts in the background ignores Ctrl-C, and with nohup the terminal's end; so would all processes that the
-# tests start and interrupt
+# what a shell starts in the background ignores Ctrl-C, and with nohup the terminal's end; so would all processes that
+# the tests start and interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 

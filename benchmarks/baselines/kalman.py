@@ -74,7 +74,7 @@ def smooth(seen: Floats, stamps_s: Floats, delay: int, order: int, density: floa
     return Smoothed(answers, likelihood)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _smooth(z, variance, forward, added, unknown, delay, answers, likelihood):  # pragma: no cover
     frames, joints, _ = z.shape
     n, lags = len(unknown), delay + 1

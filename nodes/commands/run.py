@@ -29,7 +29,7 @@ from steadypose.nodes.graph.health_file import write_health
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.ledger import LOSSES, Ledger, losses
 from steadypose.nodes.graph.loops import COMPILED, compile_missing
-from steadypose.nodes.graph.node import RUN
+from steadypose.nodes.graph.node import RUN, WATCHER
 from steadypose.nodes.graph.run_lock import RunLock
 from steadypose.nodes.graph.startup import stop_on_signals
 from steadypose.nodes.graph.supervisor import Supervisor
@@ -166,7 +166,7 @@ class _Run:
         terminal = self._console.is_terminal
         with (
             Supervisor(self._launch.nodes, self._arguments, self._clock, self._print, self._id) as supervisor,
-            Subscriber(endpoints, DIAGNOSTICS, keys=keys, clear_text=transport.clear_text) as subscriber,
+            Subscriber(endpoints, DIAGNOSTICS, keys=keys, clear_text=transport.clear_text, name=WATCHER) as subscriber,
             Live(console=self._console, auto_refresh=False, transient=True) if terminal else nullcontext() as live,
         ):
             status, interrupted = None, False

@@ -36,7 +36,10 @@ def compile_from_the_beginning() -> None:
 
 
 def compile_from_the_end() -> None:
-    """Ask each network and the pose solver, then import the trajectory, whose loops are compiled as that is done."""
+    """Describe, ask the pose solver and each network, and import the trajectory, whose loops are compiled by that.
+
+    In an order in which the other process, whose first great loop is the bank of smoothers, finds each done.
+    """
     import numpy as np
 
     from steadypose.prior.body.inverse_kinematics import fit_lengths, solve_pose
@@ -45,7 +48,13 @@ def compile_from_the_end() -> None:
     from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tracks
     from steadypose.prior.models.hgvae.inference import LiveHGVAE
     from steadypose.prior.models.hgvae.live_faults import LiveFaultNet
+    from steadypose.prior.models.mixture.inference import MixtureSmoother
 
+    smoother = MixtureSmoother(delay=1, slots=1)
+    smoother.skip(0.0)
+    smoother.flush()
+    _, placed = solve_pose(REST_POSITIONS, REST_OFFSETS)
+    fit_lengths(placed, REST_OFFSETS, np.ones(22))
     size, sigma = body_size(REST_OFFSETS[None]), np.array([JITTER_SIGMA])
     hgvae = LiveHGVAE.load("default", JITTER_SIGMA, max_batch=1)
     windows = np.tile(REST_POSITIONS, (1, hgvae.frames, 1, 1))
@@ -54,8 +63,6 @@ def compile_from_the_end() -> None:
     found = hgvae.reconstruct(tracks.x, tracks.observed, sigma)
     LiveFaultNet.load("default", max_batch=1)(tracks.x, found.mean, found.sigma, tracks.observed, sigma)
     from_tracks(found.mean, tracks, size)
-    _, placed = solve_pose(REST_POSITIONS, REST_OFFSETS)
-    fit_lengths(placed, REST_OFFSETS, np.ones(22))
     import steadypose.nodes.graph.trajectory_node  # noqa: F401
 
 

@@ -47,6 +47,10 @@ WAITING = "waiting for"
 """begins the state of a node that waits for its listeners"""
 SUPERVISOR = "STEADYPOSE_SUPERVISOR"
 """environment: the process that started this node; without it, the node stops"""
+WATCHER = "run"
+"""the name under which that process subscribes"""
+LAST_WORD_S = 5.0
+"""for how long a node that is done waits until that process listens: a short stream can be over before"""
 RUN = "STEADYPOSE_RUN"
 """environment, and a value of diagnostics: which run the node is of"""
 
@@ -205,6 +209,8 @@ class Node(ABC):
             self.report()
             notify(READY)
             self.work()
+            if self._supervisor and not self._stopping:
+                self._publisher.wait_for_subscribers({WATCHER}, timeout_s=LAST_WORD_S)
             self.health.state = "stopped"
             self.report()
 

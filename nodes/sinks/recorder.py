@@ -157,6 +157,20 @@ class RecorderNode(Node):
             except OSError as error:
                 self._no_room(error.strerror or str(error))
 
+    def take_next(self, timeout_s: float) -> bool:
+        took = super().take_next(timeout_s)
+        if not took:
+            try:
+                self._writer.flush()
+            except OSError as error:
+                self._no_room(error.strerror or str(error))
+            self.settle()
+        return took
+
+    def settle(self, timeout_s: float = 0.0) -> bool:
+        """As of every node; but only what would outlast this process counts as taken."""
+        return False if self._writer.pending else super().settle(timeout_s)
+
     def handle(self, topic: str, message: Message) -> None:
         if topic not in self._topics:
             return

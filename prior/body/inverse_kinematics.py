@@ -189,7 +189,7 @@ def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _normalised(v):
     length = max(math.sqrt(_dot(v, v)), 1e-9)
     return v[0] / length, v[1] / length, v[2] / length
@@ -247,7 +247,7 @@ def write_rotation(axis, sine, cosine, rest, out):
     out[2, 1] += sine * axis[0]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def write_swing(a, b, out):
     """Write the smallest rotation (3, 3) that turns direction ``a`` into ``b``."""
     a, b = _normalised(a), _normalised(b)

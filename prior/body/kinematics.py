@@ -110,7 +110,7 @@ def quaternions(rotations: NDArray[np.floating]) -> Floats:
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _write_quaternions(rotations, out):
     for row in range(len(rotations)):
         m, q = rotations[row], out[row]

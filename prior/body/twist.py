@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from steadypose.prior.body.inverse_kinematics import (
@@ -26,6 +25,7 @@ from steadypose.prior.body.inverse_kinematics import (
     write_swing,
 )
 from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENT, SHOULDERS
+from steadypose.prior.compiled import njit
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float64]

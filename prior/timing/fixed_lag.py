@@ -223,7 +223,7 @@ def _predict(slot, last, step, density, position, variance, with_position, with_
         velocity_variance[joint] += growth
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _correct(
     slot, measured, sigma, initial_velocity_variance, position, variance, with_position, with_velocity, velocity,
     velocity_variance, known,

@@ -61,8 +61,9 @@ def _fit(positions, variance, lengths):
                 continue
             step = -(length - lengths[joint] + compliance * force[k]) / total
             force[k] += step
-            positions[joint] += variance[joint] * step / length * bone
-            positions[parent] -= variance[parent] * step / length * bone
+            for axis in range(3):
+                positions[joint, axis] += variance[joint] * step / length * bone[axis]
+                positions[parent, axis] -= variance[parent] * step / length * bone[axis]
 
 
 @njit(cache=True)
@@ -108,5 +109,7 @@ def _turn(rotations, before, after):
                 child = leg[k + 1]
                 turned = _product(_shortest(before[child] - before[joint], after[child] - after[joint]), own)
             local = _product(_inverse(above_turned), turned)
-            rotations[joint] = local / np.sqrt((local**2).sum())
+            norm = np.sqrt((local**2).sum())
+            for i in range(4):
+                rotations[joint, i] = local[i] / norm
             above, above_turned = own, turned

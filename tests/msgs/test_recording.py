@@ -506,6 +506,20 @@ def test_a_recording_goes_on_in_the_next_part(tmp_path: Path):
     assert f"message_count: {len(found)}\n" in metadata
 
 
+def test_what_the_last_part_holds_is_not_written_again(tmp_path: Path):
+    frames = [raw(i) for i in range(60)]
+    killed = RecordingWriter(tmp_path / "out")
+    for message in frames[:40]:
+        killed.write(POSE_RAW, message, message.stamp_ns)
+    killed.flush()
+    assert not killed.pending
+    with RecordingWriter(tmp_path / "out", go_on=True) as writer:
+        for message in frames[30:]:
+            writer.write(POSE_RAW, message, message.stamp_ns)
+    with RecordingReader(tmp_path / "out") as reader:
+        assert [message.stamp_ns for _, _, message in reader] == [message.stamp_ns for message in frames]
+
+
 def test_nothing_is_added_to_what_is_no_recording_of_that_name(tmp_path: Path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(RecordingError, match=r"holds notes.txt: expected a new directory, or a recording"):

@@ -199,7 +199,7 @@ _LOG_VAR_MIN, _LOG_VAR_MAX = (np.float32(end) for end in LOG_VAR_RANGE)
 _HALF, _ONE = np.float32(0.5), np.float32(1)
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True)
 def _gelu(values, out):
     """``x * Phi(x)`` of a row, Phi being the normal distribution's."""
     half, one = np.float32(0.5), np.float32(1)
@@ -214,7 +214,7 @@ def _gelu(values, out):
         out[k] = half * (x + abs(x) * (one - q * q))
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True)
 def _by_gelu(values, factor, by_out, by_values):
     """Add ``factor`` times the gradient by the row that went into `_gelu`: that of the same approximation."""
     zero, half, one, eight = np.float32(0), np.float32(0.5), np.float32(1), np.float32(8)

@@ -162,7 +162,7 @@ def forget(bank: Bank, slot: NDArray[np.bool_]) -> None:
     bank.heading[slot] = (1.0, 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def advance(bank, count, step, positions, confidence, densities, sigma, covariance):
     """Take in a frame: predict and update all filters and smoothers.
 
@@ -205,7 +205,7 @@ def advance(bank, count, step, positions, confidence, densities, sigma, covarian
         _track(bank, s, slot, last, step, positions[s], confidence[s], seen, known, members, densities, sigma)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _change_body(bank, s, members, covariance):
     """Let these joints (J,) form the body, if they do not yet."""
     changed = False
@@ -215,19 +215,19 @@ def _change_body(bank, s, members, covariance):
     if not changed:
         return
     by = regroup(members, covariance, bank.modes[s], bank.eigenvalue[s])
-    squared = by * by
-    turn(bank.position[s], by)
-    turn(bank.velocity[s], by)
-    turn(bank.variance[s], squared)
-    turn(bank.with_position[s], squared)
-    turn(bank.with_velocity[s], squared)
+    squared, joints = by * by, len(members)
+    turn(bank.position[s].reshape(joints, -1), by)
+    turn(bank.velocity[s].reshape(joints, -1), by)
+    turn(bank.variance[s].reshape(joints, -1), squared)
+    turn(bank.with_position[s].reshape(joints, -1), squared)
+    turn(bank.with_velocity[s].reshape(joints, -1), squared)
     turn(bank.velocity_variance[s], squared)
     turn(bank.squared_innovations[s], squared)
     turn(bank.log_variances[s], squared)
-    turn(bank.sightings[s], squared)
+    turn(bank.sightings[s].reshape(joints, -1), squared)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _track(bank, s, slot, last, step, positions, confidence, seen, known, members, densities, sigma):
     """Predict and update all filters of a body. A track of a single joint has that joint's number."""
     joints, modes = len(seen), bank.modes[s]
@@ -252,7 +252,9 @@ def _track(bank, s, slot, last, step, positions, confidence, seen, known, member
             if updated[t]:
                 bank.sightings[s, t] = (1.0 - 1.0 / MEMORY) * bank.sightings[s, t] + 1.0
     for m in range(len(densities)):
-        filled[:] = measured
+        for t in range(joints):
+            for axis in range(3):
+                filled[t, axis] = measured[t, axis]
         for j in range(joints):
             if members[j] and weight[j] < 1.0:
                 fill_in(filled, modes, j, 1.0 - weight[j], bank.position[s, :, m, slot])
@@ -266,7 +268,7 @@ def _track(bank, s, slot, last, step, positions, confidence, seen, known, member
                 )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _measure_differences(recent, sizes, age):
     """Update the running means of the logarithms of `LAGS`' differences of raw positions (7, 3)."""
     n = _HISTORY - 1
@@ -287,7 +289,7 @@ def _measure_differences(recent, sizes, age):
                 sizes[k] = 0.5 * np.log(squares[1] + LOG_FLOOR**2)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def multiple_model_weights(squared_innovations, log_variances, sightings, weights):
     """Write the smoothers' weights in the multiple-model estimate of one joint: their normalised likelihoods.
 

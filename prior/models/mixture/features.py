@@ -55,13 +55,13 @@ FEATURES = _DELAY + len(_DELAYS) + 1
 """Features of each joint."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _log(square):
     """Natural logarithm of the root of a square (m²), in centimetres."""
     return 0.5 * np.log(square + LOG_FLOOR**2) + _CENTIMETRES
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def describe(bank, count, back, parents, experts, features, scale, gap, between):
     """Write the experts and features of a frame, and update the running means. Frames must come once, in order.
 
@@ -131,7 +131,7 @@ def describe(bank, count, back, parents, experts, features, scale, gap, between)
                 bank.place[s, j, axis] = experts[s, j, POSE_EXPERT, axis]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _write_experts(tracks, modes, squared_innovations, log_variances, sightings, raw, unseen, experts, weights, noise):
     """Write the joints' experts (J, EXPERTS, 3), their smoothers' weights (J, M) and noise (J,)."""
     joints = len(tracks)
@@ -164,7 +164,7 @@ def _write_experts(tracks, modes, squared_innovations, log_variances, sightings,
                 experts[j, MULTIPLE_MODEL, axis] += share * mean[t, axis]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _deviation(experts, weights, variance, scales):
     """Standard deviation of the multiple-model estimate, along an axis: of a mixture of normal distributions, the
     weighted mean of the smoothers' variances, scaled by their innovations, and of their squared distances from the
@@ -181,13 +181,13 @@ def _neighbour(m):
     return m + 1 if m + 1 < _SMOOTHERS else RAW
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _square(a, b):
     """Squared distance between two positions (3,)."""
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _update_heading(experts, heading):
     """Update the heading from hips and shoulders, as far as they are known."""
     x, y = 0.0, 0.0
@@ -202,7 +202,7 @@ def _update_heading(experts, heading):
         heading[0], heading[1] = y / length, -x / length
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _write_vector(heading, x, y, z, unit, features, at):
     """Write a vector in the body's frame, as asinh of multiples of ``unit``."""
     features[at] = np.arcsinh((heading[0] * x + heading[1] * y) / unit)
@@ -214,7 +214,7 @@ def _write_vector(heading, x, y, z, unit, features, at):
 # second.
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _describe_sighting(unseen, gap, confidence, age, back, scale, features):
     """Observation and delay; all else is set to 0."""
     for k in range(FEATURES):
@@ -232,7 +232,7 @@ def _describe_sighting(unseen, gap, confidence, age, back, scale, features):
     features[_SIGHTING + 5] = np.log(1.0 + gap)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _describe_experts(own, distances, heading, scale, features):
     """Distances between neighbouring experts (M + 1, 3), now and their running means, and the vectors between them."""
     for m in range(_SMOOTHERS):
@@ -243,7 +243,7 @@ def _describe_experts(own, distances, heading, scale, features):
         _write_vector(heading, x, y, z, scale, features, _VECTORS + 3 * m)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _describe_multiple_model(own, weights, noise, heading, scale, features):
     """Multiple-model estimate: relative to `POSE_EXPERT`, its mean log-density, and the noise that it estimates."""
     features[_MULTIPLE_MODEL] = _log(_square(own[MULTIPLE_MODEL], own[POSE_EXPERT]))
@@ -256,7 +256,7 @@ def _describe_multiple_model(own, weights, noise, heading, scale, features):
     _write_vector(heading, x, y, z, scale, features, _MULTIPLE_MODEL + 3)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _describe_pose(j, unseen_root, experts, place, heading, features):
     """Position relative to the root, and displacement since the last frame."""
     x, y, z = experts[j, POSE_EXPERT, 0], experts[j, POSE_EXPERT, 1], experts[j, POSE_EXPERT, 2]
@@ -267,7 +267,7 @@ def _describe_pose(j, unseen_root, experts, place, heading, features):
         _write_vector(heading, x - place[0], y - place[1], z - place[2], SPEED_UNIT / FPS, features, _POSE + 3)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _describe_bone(j, parent, unseen, length, age, experts, heading, scale, features):
     """The bone to the joint's parent: variance of its length, and its current deviation from the mean length."""
     if parent == j or unseen[parent] < 0.0:

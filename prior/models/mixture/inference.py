@@ -182,7 +182,7 @@ def _network(name: str) -> _Network:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _outputs(features, net, memory, slot):
     """`MixtureNet` for one body and frame: (22, OUTPUTS) from features (22, FEATURES)."""
     joints, zero, one = len(features), np.float32(0), np.float32(1)
@@ -240,7 +240,7 @@ def _add(values, out):
             out[i, k] += values[i, k]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _remember(values, decay, total, weight, mean):
     """One step of `Memory`: update the sums (N, F) of values and of their weights, and write the mean."""
     one = np.float32(1)
@@ -265,7 +265,7 @@ def _concatenated(a, b, c):
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _mixed(outputs, experts, heading, scale, gap, between, fallback, places, sigma):
     """`training.networks.mixture.answer` for one body; joints never seen are not written."""
     cos, sin = heading

@@ -15,7 +15,8 @@ only the diagonal is kept through such a change.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from steadypose.prior.compiled import njit
 
 MEMORY = 9
 """Time constant of the likelihoods' exponential forgetting, in sightings: 5 to 15 differ by 3 % at most
@@ -40,7 +41,7 @@ def clipped(confidence):
     return min(max(confidence, 0.1), 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def weigh(confidence, seen, members, weight):
     """Write the weights (J,) of the joints' measurements, inverse to their variances, the largest in a body 1; return
     the greatest confidence in it."""
@@ -54,7 +55,7 @@ def weigh(confidence, seen, members, weight):
     return most
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def fill_in(filled, modes, joint, share, tracks):
     """Add to the tracks' measurements (J, 3) this share of where they (J, 3) predict a joint: so much of it is not
     measured."""
@@ -66,7 +67,7 @@ def fill_in(filled, modes, joint, share, tracks):
             filled[t, axis] += modes[joint, t] * share * ahead
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def regroup(members, covariance, modes, eigenvalues):
     """Let these joints form the body, and track all others by themselves.
 
@@ -98,12 +99,14 @@ def regroup(members, covariance, modes, eigenvalues):
 
 @njit(cache=True)
 def turn(values, by):
-    """Multiply tracks' values (J, ...), in place, by a matrix (J, J)."""
-    flat = values.reshape(len(values), -1)
-    flat[:] = np.dot(by, flat)
+    """Multiply tracks' values (J, N), in place, by a matrix (J, J)."""
+    turned = np.dot(by, values)
+    for j in range(len(values)):
+        for k in range(values.shape[1]):
+            values[j, k] = turned[j, k]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def predict(
     position, own_variance, with_position, with_velocity, velocity, velocity_variance, slot, last, step, densities
 ):  # fmt: skip
@@ -121,7 +124,7 @@ def predict(
         velocity_variance[m] = own + growth
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def update(
     position, own_variance, with_position, with_velocity, velocity, velocity_variance, squared_innovations,
     log_variances, slot, known, measured, variance,

@@ -81,16 +81,17 @@ def _weigh(features, joint, candidates, read, of_joint, think, think_bias, write
     hidden, zero = read.shape[1], np.float32(0)
     first, second, out = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(CANDIDATES + 1)
     for row in range(len(features)):
-        first[:] = of_joint[joint[row]]
+        for h in range(hidden):
+            first[h], second[h] = of_joint[joint[row], h], think_bias[h]
         for k in range(len(read)):
             for h in range(hidden):
                 first[h] += features[row, k] * read[k, h]
-        second[:] = think_bias
         for k in range(hidden):
             first[k] = max(first[k], zero)
             for h in range(hidden):
                 second[h] += first[k] * think[k, h]
-        out[:] = write_bias
+        for c in range(CANDIDATES + 1):
+            out[c] = write_bias[c]
         for k in range(hidden):
             added = max(second[k], zero) + first[k]
             for c in range(CANDIDATES + 1):

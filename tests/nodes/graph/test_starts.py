@@ -12,21 +12,23 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import START_NS, VirtualClock, record, walk
+from conftest import START_NS, VirtualClock, record, running, until, walk
 from test_processes import Run
 
 from steadypose.msgs.recording import RecordingReader
-from steadypose.msgs.topics import POSE_RAW
-from steadypose.msgs.types import Message
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
+from steadypose.msgs.transport import Subscriber
+from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.graph import safe_python
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.health_file import NAME
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.node import Node
+from steadypose.nodes.graph.node import SUPERVISOR, WATCHER, Node
 from steadypose.nodes.graph.run_lock import RunLock
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.startup import stop_on_signals
 from steadypose.nodes.sinks.recorder import free_directory
+from steadypose.nodes.sources.pose_input import PoseInputNode
 
 INPUT_ALONE = ("--set", 'nodes=["pose_input"]')
 
@@ -165,6 +167,23 @@ def test_a_path_may_hold_any_character(begin: Any, tmp_path: Path) -> None:
     assert status == 0, output
     with RecordingReader(out) as reader:
         assert reader.count(POSE_RAW) == 31
+
+
+def test_who_watches_hears_the_end_of_a_stream_that_was_over_before(
+    recording: Path, make_launch: Callable[..., Launch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(SUPERVISOR, str(os.getppid()))
+    launch = make_launch(nodes='["pose_input"]', input__recording=recording, input__rate=0)
+    node, heard = PoseInputNode(launch), set()
+    with running(node):
+        until(lambda: bool(node.health.ended))
+        with Subscriber(launch.transport.endpoint("pose_input"), DIAGNOSTICS, name=WATCHER) as watcher:
+            while received := watcher.receive(10.0):
+                assert isinstance(received[1], Diagnostics)
+                heard.add((received[1].values["state"], received[1].values["ended"]))
+                if ("stopped", POSE_RAW) in heard:
+                    return
+    raise AssertionError(f"heard only {heard}")
 
 
 def test_a_recording_launch_started_again_records_on(tmp_path: Path, make_launch: Callable[..., Launch]) -> None:

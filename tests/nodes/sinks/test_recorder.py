@@ -77,3 +77,17 @@ def test_a_disk_that_is_full_before_it_was_noticed(
 def test_limits_that_cannot_be(settings: dict[str, str], said: str, make_launch: Callable[..., Launch]) -> None:
     with pytest.raises(LaunchError, match=said):
         make_launch(**settings)
+
+
+def test_what_a_killed_recorder_had_not_written_was_not_taken(
+    tmp_path: Path, make_launch: Callable[..., Launch], clock: VirtualClock, free: SimpleNamespace
+) -> None:
+    node = RecorderNode(make_launch(recorder__directory=tmp_path / "out"), clock)
+    node._writer = node._settings.writer()
+    settled = []
+    for frame in walk(40):
+        node.handle(POSE_RAW, frame)
+        settled.append(node.settle())
+        with RecordingReader(tmp_path / "out") as reader:
+            assert not settled[-1] or reader.count(POSE_RAW) == len(settled)
+    assert settled.count(True) == 3, "as often as the writer gives what it has to the system"
