@@ -30,6 +30,11 @@ class Interval(NamedTuple):
     high: float
     people: int
 
+    def text(self, digits: int, scale: float = 1.0) -> str:
+        """For a table: the mean, and in brackets the interval where there is one."""
+        mean, low, high = (f"{scale * value:.{digits}f}" for value in self[:3])
+        return f"{mean} ({low}–{high})" if np.isfinite(self.low) else mean
+
 
 def people_means(values: ArrayLike, people: Sequence[str] | NDArray[np.str_]) -> NDArray[np.float64]:
     """(P,) the mean of each person's clips, people in alphabetical order; those of whom nothing is known are left out.

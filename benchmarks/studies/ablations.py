@@ -33,6 +33,7 @@ from steadypose.prior.clean.denoise import DenoiseSettings
 from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.gate import GateSettings
 from steadypose.prior.clean.impute import ImputeSettings
+from steadypose.prior.clean.orient import OrientSettings
 from steadypose.prior.clean.person import PersonSettings
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.refine import RefineSettings
@@ -60,6 +61,7 @@ PARTS: Mapping[str, PriorSettings] = {
     "without the score": PriorSettings(score=ScoreSettings(enabled=False)),
     "without completion": PriorSettings(impute=ImputeSettings(enabled=False)),
     "without fusion": PriorSettings(fuse=FuseSettings(enabled=False)),
+    "without orientations by the whole body": PriorSettings(orient=OrientSettings(enabled=False)),
     "with HM-VAE, which is off": PriorSettings(refine=RefineSettings(enabled=True)),
 }
 """Each part by what is measured without it."""

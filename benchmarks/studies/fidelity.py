@@ -19,7 +19,9 @@ from steadypose.benchmarks import figures as pictures
 from steadypose.benchmarks.baselines.filters import FILTERS, Peer
 from steadypose.benchmarks.bench import Answer, Bench, Methods, Result, answers, tune, tuning_log
 from steadypose.benchmarks.corruption import along_sight, gaussian
+from steadypose.benchmarks.intervals import interval, ratio
 from steadypose.benchmarks.metrics import acceleration_error, position_error, sigma_ratio
+from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Table
@@ -98,13 +100,16 @@ def run(bench: Bench) -> Result:
     compared, records, tried = methods(bench), [], {}
     for number, (name, spoil) in enumerate(conditions(bench.quick).items()):
         answered, tried[name] = _answered(bench, compared, truth, spoil, number, name)
-        records += [{"condition": name, **_by_speed(answer, truth, speed)} for answer in answered]
+        records += [
+            {"condition": name, **_by_speed(answer, truth, speed), **_by_clip(answer, truth)} for answer in answered
+        ]
     swung, swings_tried = _swings(bench, compared)
     data = {
-        "data": clips.source, "records": records, "tuning": tried, "swings": swung, "swings tuning": swings_tried,
+        "data": clips.source, "person": clips.person.tolist(), "data_set": clips.data_set.tolist(),
+        "records": records, "tuning": tried, "swings": swung, "swings tuning": swings_tried,
         "speeds": {name: round(float(mask.mean()), 4) for name, mask in _bins(speed).items()},
     }  # fmt: skip
-    return Result(_tables(records, swung, bench, truth.shape[1]), data, _pictures(records, swung))
+    return Result(_tables(records, swung, bench, clips), data, _pictures(records, swung))
 
 
 def _answered(
@@ -166,6 +171,14 @@ def _by_speed(answer: Answer, truth: Floats, speed: Floats) -> dict[str, Any]:
     return record
 
 
+def _by_clip(answer: Answer, truth: Floats) -> dict[str, list[float]]:
+    """Mean error of each clip, of what stands in the table of sources."""
+    if answer.method not in UNTUNED or answer.delay not in SUMMARISED:
+        return {}
+    error = position_error(answer.positions, truth)
+    return {"clips_mm": [_mm(error[:, clip]) for clip in range(error.shape[1])]}
+
+
 def swinging(swing: Swing, frequency_hz: float) -> Floats:
     """(T, 22, 3) metres: the rest skeleton standing before the camera, arms hanging and bent, one limb swinging."""
     turns = np.tile(np.eye(3), (SWING_FRAMES, len(PARENTS), 1, 1))
@@ -213,13 +226,16 @@ def _swings(bench: Bench, compared: Methods) -> tuple[list[dict[str, Any]], dict
     return records, tried
 
 
-def _tables(records: list[dict[str, Any]], swings: list[dict[str, Any]], bench: Bench, clips: int) -> list[Table]:
+def _tables(
+    records: list[dict[str, Any]], swings: list[dict[str, Any]], bench: Bench, clips: MotionClips
+) -> list[Table]:
     note = (
-        f"{clips} clips of {FRAMES} frames of the {bench.split} split, by the true speed of the joint. Peers tuned for "
-        "each noise and delay on every third of these clips with other noise; the banks have no setting. Best filter: "
-        "the tuned one of the least error in that very cell, of at most that delay."
+        f"{len(clips.offsets)} clips of {FRAMES} frames of the {bench.split} split, by the true speed of the joint. "
+        "Peers tuned for each noise and delay on every third of these clips with other noise; the banks have no "
+        "setting. Best filter: the tuned one of the least error in that very cell, of at most that delay."
     )
-    tables = [_summary_table(records, note), *(_speed_table(records, delay, note) for delay in (4, 0))]
+    tables = [_summary_table(records, note), *(_source_table(records, delay, clips) for delay in SUMMARISED)]
+    tables += [*(_speed_table(records, delay, note) for delay in (4, 0))]
     sums = ("fidelity", "Fidelity: MPJPE by noise, mm", "position_mm", 1), (
         "fidelity-acceleration", "Fidelity: acceleration error by noise, mm/frame²", "acceleration_mm", 2
     )  # fmt: skip
@@ -263,6 +279,31 @@ def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
             rows.append([f"delay {delay}: {name}", *cells])
     title = "Fidelity: MPJPE, mm / acceleration error, mm/frame², by independent noise along each axis"
     return Table("fidelity-summary", title, ["method", *noises], rows, note)
+
+
+def _source_table(records: Sequence[Mapping[str, Any]], delay: int, clips: MotionClips) -> Table:
+    """The banks and steadypose by source, the mean over people, and the ratio to the whole-body bank."""
+    sources = list(dict.fromkeys(clips.data_set.tolist()))
+    mine = {
+        (r["condition"], r["method"]): np.array(r["clips_mm"])
+        for r in records
+        if r["method"] in UNTUNED[1:] and r["delay"] == delay
+    }
+    rows = []
+    for (condition, method), errors in mine.items():
+        bank = mine[condition, "whole-body bank"]
+        by_source = [interval(errors[clips.data_set == s], clips.person[clips.data_set == s]).mean for s in sources]
+        of_all, of_bank = interval(errors, clips.person), ratio(np.maximum(errors, 1e-3), bank, clips.person)
+        rows.append([
+            f"{condition}: {method}", *(f"{mean:.1f}" for mean in by_source),
+            of_all.text(1), of_bank.text(2),
+        ])  # fmt: skip
+    note = (
+        f"{len(clips.offsets)} clips of {len(set(clips.person.tolist()))} people, each of whom counts once; in "
+        "brackets, the 95 % interval over people."
+    )
+    columns = ["noise: method", *sources, "mean over people", "of the whole-body bank"]
+    return Table(f"fidelity-sources-{delay}", f"Fidelity: MPJPE by source, mm, delay {delay}", columns, rows, note)
 
 
 def _speed_table(records: Sequence[Mapping[str, Any]], delay: int, note: str) -> Table:

@@ -83,6 +83,13 @@ def test_the_protocol_gives_tables_and_pictures(monkeypatch: pytest.MonkeyPatch)
         "none: raw", "none: best filter", "none: bank of smoothers", "none: whole-body bank", "none: steadypose",
     ]  # fmt: skip
     assert table.rows[0][1:] == ["0.0"] * (len(table.columns) - 1)
+    sources = next(t for t in result.tables if t.name == "fidelity-sources-0")
+    assert sources.columns[-2:] == ["mean over people", "of the whole-body bank"]
+    ours_, bank_ = (
+        next(row for row in sources.rows if row[0] == f"1 cm: {m}") for m in ("steadypose", "whole-body bank")
+    )
+    assert bank_[-1].startswith("1.00")
+    assert float(ours_[-1].split()[0]) == pytest.approx(float(ours_[1]) / float(bank_[1]), abs=0.02)
     assert all(isinstance(figure, Figure) for figure in result.figures.values())
     swings = {(s["swing"], s["noise"], s["method"]): s["left_percent"] for s in result.data["swings"]}
     assert swings["forearm 3 Hz", "none", "raw"] == 100.0
