@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.benchmarks.metrics import acceleration_error, bootstrap, length_variation, position_error, procrustes
+from steadypose.benchmarks.intervals import interval
+from steadypose.benchmarks.metrics import acceleration_error, length_variation, position_error, procrustes
 from steadypose.benchmarks.results import Table
 from steadypose.prior.body.skeleton import JOINTS, PARENTS
 from steadypose.prior.timing.rate import FPS
@@ -62,30 +63,35 @@ def score(answer: Floats, truth: Floats, hidden: NDArray[np.bool_], align: bool 
     )  # fmt: skip
 
 
-def figures(scores: Scores) -> dict[str, Any]:
-    """Means over clips, and the 95 % intervals of those that decide: mm, mm/frame², m/s², per cent."""
+def figures(scores: Scores, people: NDArray[np.str_] | None = None) -> dict[str, Any]:
+    """Means over clips: mm, mm/frame², m/s², per cent.
+
+    Args:
+        scores: of C clips.
+        people: (C,) who moves, for the 95 % intervals over people of those that decide.
+    """
+    deciding = {"position": scores.position, "hidden": scores.hidden, "acceleration": scores.acceleration_error}
+    intervals = {} if people is None else {f"{name}_ci_mm": ends_mm(v, people) for name, v in deciding.items()}
     result: dict[str, Any] = {
         "position_mm": _mm(scores.position),
-        "position_ci_mm": interval(scores.position),
         "seen_mm": _mm(scores.seen),
         "hidden_mm": _mm(scores.hidden),
-        "hidden_ci_mm": interval(scores.hidden),
         "hidden_answered_percent": _percent(scores.answered),
         "pa_mm": _mm(scores.aligned),
         "acceleration_mm": _mm(scores.acceleration_error),
-        "acceleration_ci_mm": interval(scores.acceleration_error),
         "acceleration_m_s2": round(_mm(scores.acceleration_error) * MPS2, 3),
         "own_acceleration_mm": _mm(scores.acceleration),
         "bone_variation_percent": _percent(scores.variation),
         "limbs_mm": {limb: _mm(values) for limb, values in scores.limbs.items()},
+        **intervals,
     }
     return {name: value for name, value in result.items() if not (isinstance(value, float) and np.isnan(value))}
 
 
-def interval(values: Floats) -> list[float] | None:
-    """95 % interval of the mean over clips, mm."""
-    known = values[np.isfinite(values)]
-    return [round(v * 1e3, 3) for v in bootstrap(known)] if len(known) else None
+def ends_mm(values: Floats, people: NDArray[np.str_]) -> list[float] | None:
+    """95 % interval over people of the mean of (C,) metres, mm; None where nothing is known."""
+    found = interval(values, people)
+    return [round(end * 1e3, 3) for end in (found.low, found.high)] if found.people else None
 
 
 def pivot(

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from steadypose.benchmarks.baselines.conditional_gaussian import ConditionalGaussian
 from steadypose.benchmarks.baselines.inbetween import NearestPose
 from steadypose.benchmarks.bench import Bench, Result
-from steadypose.benchmarks.metrics import bootstrap_ratio
+from steadypose.benchmarks.intervals import ratio
 from steadypose.benchmarks.motion import as_set, prepared_set
 from steadypose.benchmarks.results import Table
-from steadypose.benchmarks.scores import interval
+from steadypose.benchmarks.scores import ends_mm
 from steadypose.prior.body.kinematics import heading
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.complete.body import Fill, complete
@@ -95,14 +95,15 @@ def run(bench: Bench) -> Result:
             records.append(
                 {
                     "hidden": part, "method": name, "hidden_mm": round(float(error.mean()) * 1e3, 2),
-                    "hidden_ci_mm": interval(error), "acceleration_of_true": round(float(bends[0] / bends[1]), 3),
+                    "hidden_ci_mm": ends_mm(error, clips.person),
+                    "acceleration_of_true": round(float(bends[0] / bends[1]), 3),
                 }
             )  # fmt: skip
     ratios = [
         {
             "hidden": part,
             "peer": peer,
-            "ratio": [round(v, 3) for v in bootstrap_ratio(errors[part, _NETWORK], errors[part, peer])],
+            "ratio": [round(v, 3) for v in ratio(errors[part, _NETWORK], errors[part, peer], clips.person)[:3]],
         }
         for part in HIDDEN
         for peer in methods

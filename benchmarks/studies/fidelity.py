@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from steadypose.benchmarks import figures as pictures
 from steadypose.benchmarks.baselines.filters import FILTERS, Peer
 from steadypose.benchmarks.bench import Answer, Bench, Methods, Result, answers, tune, tuning_log
+from steadypose.benchmarks.by_source import source_table
 from steadypose.benchmarks.corruption import along_sight, gaussian
-from steadypose.benchmarks.intervals import interval, ratio
 from steadypose.benchmarks.metrics import acceleration_error, position_error, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.ours import OURS
@@ -282,28 +282,14 @@ def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
 
 
 def _source_table(records: Sequence[Mapping[str, Any]], delay: int, clips: MotionClips) -> Table:
-    """The banks and steadypose by source, the mean over people, and the ratio to the whole-body bank."""
-    sources = list(dict.fromkeys(clips.data_set.tolist()))
-    mine = {
-        (r["condition"], r["method"]): np.array(r["clips_mm"])
+    """The banks and steadypose."""
+    errors = {
+        (r["condition"], r["method"]): 1e-3 * np.array(r["clips_mm"])
         for r in records
         if r["method"] in UNTUNED[1:] and r["delay"] == delay
     }
-    rows = []
-    for (condition, method), errors in mine.items():
-        bank = mine[condition, "whole-body bank"]
-        by_source = [interval(errors[clips.data_set == s], clips.person[clips.data_set == s]).mean for s in sources]
-        of_all, of_bank = interval(errors, clips.person), ratio(np.maximum(errors, 1e-3), bank, clips.person)
-        rows.append([
-            f"{condition}: {method}", *(f"{mean:.1f}" for mean in by_source),
-            of_all.text(1), of_bank.text(2),
-        ])  # fmt: skip
-    note = (
-        f"{len(clips.offsets)} clips of {len(set(clips.person.tolist()))} people, each of whom counts once; in "
-        "brackets, the 95 % interval over people."
-    )
-    columns = ["noise: method", *sources, "mean over people", "of the whole-body bank"]
-    return Table(f"fidelity-sources-{delay}", f"Fidelity: MPJPE by source, mm, delay {delay}", columns, rows, note)
+    title = f"Fidelity: MPJPE by source, mm, delay {delay}"
+    return source_table(f"fidelity-sources-{delay}", title, errors, clips, "whole-body bank")
 
 
 def _speed_table(records: Sequence[Mapping[str, Any]], delay: int, note: str) -> Table:

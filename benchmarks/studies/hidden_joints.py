@@ -24,7 +24,14 @@ from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.provenance import VARIANTS
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import pivot
-from steadypose.benchmarks.studies.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
+from steadypose.benchmarks.studies.spoiled import (
+    HOW,
+    Condition,
+    by_source,
+    calibration_table,
+    reliability_bins,
+    run_conditions,
+)
 from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.timing.rate import FPS
 
@@ -90,8 +97,9 @@ def run(bench: Bench) -> Result:
         f"long. Never: knees and all below them, or an arm, in no frame of a clip. {GAUSSIAN}: the mean of what is "
         f"hidden given what is seen, of one Gaussian over training poses; without hips and shoulders, {BESIDE}. {HOW}"
     )
+    sources = by_source(records, "hidden", 4, clips, "hidden_joints-sources", "Hidden joints: their error")
     groups = (("hidden", "hidden joints"), ("seen", "seen joints"))
-    tables: list[Table] = [_summary_table(records, note)]
+    tables: list[Table] = [_summary_table(records, note), sources]
     tables += [
         pivot(records, "condition", f"{group}_mm", "hidden_joints" if group == "hidden" else "hidden_joints-seen",
               f"Hidden joints: error of {text}, mm", note)

@@ -22,7 +22,6 @@ from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.metrics import contact_speed, npss, quaternion_distance
 from steadypose.benchmarks.motion import MotionClips, as_set, prepared_set
 from steadypose.benchmarks.results import Table
-from steadypose.benchmarks.scores import interval
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, global_rotations, heading, quaternions, yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, J
@@ -171,7 +170,6 @@ def measure(truth: Truth, rotations: Floats, root: Floats, deviation: Floats) ->
         "l2p": round(float(l2p.mean()), 4),
         "npss": round(npss((sign * turned[0]).reshape(shape), turned[1].reshape(shape)), 4),
         "position_mm": round(float(error.mean()) * 1e3, 2),
-        "position_ci_mm": interval(error),
         "local_mm": round(float(local.mean()) * 1e3, 2),
         "own_acceleration_mm": round(float(bends[0].mean()) * 1e3, 3),
         "acceleration_mm": round(float(missed.mean()) * 1e3, 3),

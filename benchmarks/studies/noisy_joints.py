@@ -17,7 +17,14 @@ from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.corruption import correlated, gaussian, spiked, swapped
 from steadypose.benchmarks.provenance import VARIANTS
 from steadypose.benchmarks.scores import pivot
-from steadypose.benchmarks.studies.spoiled import HOW, Condition, calibration_table, reliability_bins, run_conditions
+from steadypose.benchmarks.studies.spoiled import (
+    HOW,
+    Condition,
+    by_source,
+    calibration_table,
+    reliability_bins,
+    run_conditions,
+)
 
 Floats = NDArray[np.float64]
 
@@ -68,6 +75,10 @@ def run(bench: Bench) -> Result:
         pivot(records, "condition", "acceleration_mm", "noisy_joints-acceleration",
               "Noisy joints: acceleration error, mm/frame² (times 0.9: m/s²)", note, digits=2),
     ]  # fmt: skip
+    tables += [
+        by_source(records, "position", delay, clips, f"noisy_joints-sources-{delay}", "Noisy joints: MPJPE")
+        for delay in (4, 0)
+    ]
     tables.append(calibration_table(data["calibration"], "noisy_joints-calibration"))
     levels = [
         {**record, "level": level}

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from steadypose.benchmarks.baselines.filters import OFFLINE, PEERS, Peer, missing
 from steadypose.benchmarks.bench import Answer, Bench, Methods, answers, over_seeds, tune, tuning_log
-from steadypose.benchmarks.metrics import bootstrap_ratio, position_error, reliability, sigma_ratio
+from steadypose.benchmarks.by_source import source_table
+from steadypose.benchmarks.intervals import ratio
+from steadypose.benchmarks.metrics import position_error, reliability, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.results import Table
@@ -28,6 +30,23 @@ HOW = (
     "for the least sum of position error (mm) and acceleration error (mm/frame²); steadypose runs as it ships. A "
     "delayed Kalman filter is a fixed-lag RTS smoother. SmoothNet-style: mean over seeds."
 )
+
+
+WHOLE_BODY = "whole-body bank"
+BY_SOURCE = ("bank of smoothers", WHOLE_BODY, "conditional Gaussian", "steadypose")
+"""what stands in the tables by source, as far as a study has it"""
+
+
+def by_source(
+    records: Sequence[Mapping[str, Any]], error: str, delay: int, clips: MotionClips, name: str, title: str
+) -> Table:
+    """Of `run_conditions`, a table by source of motion: ``error`` is ``position`` or ``hidden``."""
+    found = {
+        (r["condition"], r["method"]): 1e-3 * np.array(r["clips_mm"][error], dtype=float)
+        for r in records
+        if r["method"] in BY_SOURCE and r["delay"] in (delay, 0)
+    }
+    return source_table(name, f"{title}, by source, mm, delay {delay}", found, clips, WHOLE_BODY)
 
 
 def run_conditions(
@@ -67,25 +86,36 @@ def run_conditions(
                 error = position_error(answer.positions, clips.positions)
                 row = {"condition": name, "method": answer.method, "delay": answer.delay}
                 calibration.append({**row, **_calibration(error, answer.sigma, hidden)})
-        records += over_seeds([_record(name, *one, scored) for one in scored])
+        records += over_seeds([_record(name, *one, scored, clips.person) for one in scored])
     return {"records": records, "calibration": calibration, "tuning": tried}
 
 
-def _record(condition: str, answer: Answer, scores: Scores, scored: Sequence[tuple[Answer, Scores]]) -> dict[str, Any]:
+def _record(
+    condition: str,
+    answer: Answer,
+    scores: Scores,
+    scored: Sequence[tuple[Answer, Scores]],
+    people: NDArray[np.str_],
+) -> dict[str, Any]:
     record: dict[str, Any] = {
         "condition": condition,
         "method": answer.method,
         "delay": answer.delay,
         "parameters": dict(answer.parameters),
-        **figures(scores),
+        **figures(scores, people),
     }
+    if answer.method in BY_SOURCE:
+        by_clip = {"position": scores.position, "hidden": scores.hidden}
+        record["clips_mm"] = {key: np.round(1e3 * values, 3).tolist() for key, values in by_clip.items()}
     if answer.method in OURS:
-        record["against_best_peer"] = against_best(answer, scores, scored)
+        record["against_best_peer"] = against_best(answer, scores, scored, people)
     return record
 
 
-def against_best(answer: Answer, scores: Scores, scored: Sequence[tuple[Answer, Scores]]) -> dict[str, Any]:
-    """Ratios of errors, with their 95 % intervals over clips, to the best peer that needs no longer delay.
+def against_best(
+    answer: Answer, scores: Scores, scored: Sequence[tuple[Answer, Scores]], people: NDArray[np.str_]
+) -> dict[str, Any]:
+    """Ratios of errors, with their 95 % intervals over people, to the best peer that needs no longer delay.
 
     Best is the one with the least of that very error, so that it may be another peer for each.
     """
@@ -99,8 +129,8 @@ def against_best(answer: Answer, scores: Scores, scored: Sequence[tuple[Answer, 
         usable = [(a, theirs) for a, theirs in usable if known.any() and np.isfinite(theirs[known]).all()]
         if usable:
             rival, theirs = min(usable, key=lambda pair: float(pair[1][known].mean()))
-            ratio = bootstrap_ratio(mine[known], theirs[known])
-            ratios[name] = {"peer": f"{rival.method}, delay {rival.delay}", "ratio": [round(v, 4) for v in ratio]}
+            found = ratio(mine, theirs, people)[:3]
+            ratios[name] = {"peer": f"{rival.method}, delay {rival.delay}", "ratio": [round(v, 4) for v in found]}
     return ratios
 
 

@@ -98,7 +98,7 @@ def _record(answer: Answer, condition: str, truth_at: CubicSpline, hidden: NDArr
         "condition": condition,
         "method": answer.method,
         "delay": answer.delay,
-        **{key: found[key] for key in ("position_mm", "position_ci_mm", "acceleration_mm", "own_acceleration_mm")},
+        **{key: found[key] for key in ("position_mm", "acceleration_mm", "own_acceleration_mm")},
     }
     if condition == "steady":
         behind = found_delay(positions, truth, MAX_LAG)

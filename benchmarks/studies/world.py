@@ -27,7 +27,7 @@ from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.provenance import WORLD
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.root_drift import METHODS, Clip, Method, evaluate_fusion
-from steadypose.benchmarks.scores import figures, interval, score
+from steadypose.benchmarks.scores import ends_mm, figures, score
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.body.skeleton import JOINTS, limbs
 from steadypose.prior.clean.pipeline import PriorPipeline
@@ -174,11 +174,11 @@ def _honest(error: Floats, spread: Floats) -> float:
 def measure(clips: MotionClips, answer: Floats) -> dict[str, Any]:
     """Place and pose in the world (mm), and the feet: mean speed in contact (m/s), share of frames that skate, and of
     those in which a sole is under the floor (%)."""
-    found = figures(score(answer, clips.positions, missing(clips.positions), align=False))
+    found = figures(score(answer, clips.positions, missing(clips.positions), align=False), clips.person)
     root = position_error(answer[:, :, 0], clips.positions[:, :, 0])
     result = {key: found[key] for key in ("position_mm", "position_ci_mm", "acceleration_mm")}
     result["root_mm"] = round(float(np.nanmean(root)) * 1e3, 2)
-    result["root_ci_mm"] = interval(np.nanmean(root, axis=0))
+    result["root_ci_mm"] = ends_mm(np.nanmean(root, axis=0), clips.person)
     legs = np.ravel(limbs(("hip", "knee", "ankle", "foot")))
     own = position_error(answer[:, :, legs], clips.positions[:, :, legs])
     result["legs_mm"] = round(float(np.nanmean(own)) * 1e3, 2)

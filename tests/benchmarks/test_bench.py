@@ -135,10 +135,15 @@ def test_conditions_give_records_that_tables_and_pictures_are_made_of(clips: Mot
         bench = Bench(quick=True, mocap=None, data=Path("nowhere.npz"), progress=progress)
         monkeypatch.setitem(bench.__dict__, "smoothnets", [smoothnet.SmoothNet()])
         peers = (Peer("raw", lambda seen, _, delay: seen, (0,)),)
-        data = run_conditions(bench, clips, {"4 cm": lambda truth, rng: gaussian(truth, 0.04, rng)}, peers)
+        three = replace(clips, person=np.repeat(["a", "b", "c"], 2))
+        data = run_conditions(bench, three, {"4 cm": lambda truth, rng: gaussian(truth, 0.04, rng)}, peers)
     records = {(r["method"], r["delay"]): r for r in data["records"]}
     assert set(records) == {("raw", 0), *((m, k) for m in ("SmoothNet-style", "steadypose") for k in (0, 4))}
     assert records["raw", 0]["position_mm"] == pytest.approx(40 * np.sqrt(8 / np.pi), rel=0.02)
+    record = records["steadypose", 4]
+    assert np.mean(record["clips_mm"]["position"]) == pytest.approx(record["position_mm"], abs=1e-3)
+    low, high = record["position_ci_mm"]
+    assert low < record["position_mm"] < high
     ratio, low, high = records["steadypose", 4]["against_best_peer"]["position"]["ratio"]
     assert low < ratio < high
     assert ratio < 0.95
@@ -165,7 +170,7 @@ def test_the_best_peer_is_another_for_each_error(clips: MotionClips) -> None:
     }
     mine = Answer("steadypose", 4, clips.stamps_s, clips.positions + [0.02, 0.0, 0.0], {})
     scored = [(a, score(a.positions, clips.positions, hidden)) for a in (*answers.values(), mine)]
-    found = against_best(mine, scored[-1][1], scored)
+    found = against_best(mine, scored[-1][1], scored, clips.person)
     assert found["position"]["peer"] == "shaking, delay 0"
     assert found["acceleration_error"]["peer"] == "still, delay 0"
 

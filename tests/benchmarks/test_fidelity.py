@@ -84,7 +84,7 @@ def test_the_protocol_gives_tables_and_pictures(monkeypatch: pytest.MonkeyPatch)
     ]  # fmt: skip
     assert table.rows[0][1:] == ["0.0"] * (len(table.columns) - 1)
     sources = next(t for t in result.tables if t.name == "fidelity-sources-0")
-    assert sources.columns[-2:] == ["mean over people", "of the whole-body bank"]
+    assert sources.columns[-2:] == ["mean over people", "of: whole-body bank"]
     ours_, bank_ = (
         next(row for row in sources.rows if row[0] == f"1 cm: {m}") for m in ("steadypose", "whole-body bank")
     )
