@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from steadypose.benchmarks import ours
-from steadypose.benchmarks.baselines import smoothnet, window_vaes
+from steadypose.benchmarks.baselines import recurrent, smoothnet, window_vaes
 from steadypose.benchmarks.baselines.filters import PEERS, Peer
 from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_clips, prepared_set, simulated_clips
@@ -32,6 +32,7 @@ DELAYS = (0, 2, 4, 8)
 """Frames at 30 Hz at which methods are compared."""
 SEEDS = (0, 1, 2)
 """Seeds of networks trained here, and of random sampling."""
+RECURRENT = "GRU of the whole body"
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,12 @@ class Bench:
             for seed in self.seeds
         ]
 
+    @cached_property
+    def recurrent(self) -> recurrent.RecurrentDenoiser:
+        """The whole-body denoiser, trained here and now."""
+        track = partial(self.progress.track, description="recurrent denoiser")
+        return recurrent.train(self.training_clips(), self.delays, 50 if self.quick else 3000, 0, track)
+
 
 @dataclass(frozen=True)
 class Result:
@@ -136,7 +143,7 @@ class Methods(NamedTuple):
         peers: those without training.
         ours: steadypose's variants.
         delays: frames.
-        networks: whether the peer that is trained here takes part.
+        networks: whether the peers that are trained here take part.
     """
 
     peers: Sequence[Peer]
@@ -180,12 +187,17 @@ def answers(
             for delay, positions in zip(delays, found, strict=True)
         ]
 
+    def by_recurrent() -> list[Answer]:
+        found = zip(delays, recurrent.smooth(bench.recurrent, seen), strict=True)
+        return [Answer(RECURRENT, delay, stamps_s, positions, {}) for delay, positions in found]
+
     def by_us(name: str, delay: int) -> list[Answer]:
         cleaned = ours.run(methods.ours[name], seen, stamps_s, delay)
         return [Answer(name, delay, cleaned.stamps_s, cleaned.positions, {}, cleaned.sigma)]
 
     jobs: list[Callable[[], list[Answer]]] = [partial(by_peer, *one) for one in peers_of(methods.peers, delays)]
-    jobs += [partial(by_network, number) for number in range(len(bench.seeds) if methods.networks else 0)]
+    if methods.networks:
+        jobs += [*(partial(by_network, number) for number in range(len(bench.seeds))), by_recurrent]
     jobs += [
         partial(by_us, name, delay)
         for name, settings in methods.ours.items()

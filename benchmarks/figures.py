@@ -20,6 +20,7 @@ COLOURS = {
     "whole-body bank": "#0b3d91",
     "Butterworth, offline": "#9d755d",
     "SmoothNet-style": "#f58518",
+    "GRU of the whole body": "#a0522d",
     "ridge regression": "#eeca3b",
     "temporal convolution": "#ff9da6",
     "HM-VAE": "#f2a5a5",

@@ -16,8 +16,9 @@ from scipy.signal import butter, sosfiltfilt
 
 from steadypose.benchmarks.baselines.bank import bank
 from steadypose.benchmarks.baselines.beside import beside
-from steadypose.benchmarks.baselines.kalman import fixed_lag
+from steadypose.benchmarks.baselines.kalman import fixed_lag, smooth
 from steadypose.benchmarks.baselines.whole_body_bank import whole_body_bank
+from steadypose.prior.models.mixture.modes import body_covariance
 from steadypose.prior.timing.fixed_lag import OneEuroFilter
 from steadypose.prior.timing.rate import FPS
 
@@ -29,6 +30,7 @@ OFFLINE = -1
 _HAMPEL_HALF = 5  # frames to either side, as far as they are known by then
 _HAMPEL_FLOOR = 0.005  # metres: in a still body, a spread of nothing would make every observation an outlier
 _GAUSSIAN_PAST = 12  # frames
+_MEASUREMENT_SIGMA = 0.02  # metres, as `fixed_lag` has it
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,13 @@ def constant_velocity(seen: Floats, stamps_s: Floats, delay: int, density: float
     return fixed_lag(seen, stamps_s, delay, 2, density)
 
 
+def constant_velocity_by_joint(seen: Floats, stamps_s: Floats, delay: int, density: float) -> Floats:
+    """The same with a density for each joint, as joints' accelerations differ in training motion; the mean is set."""
+    sigma = _MEASUREMENT_SIGMA / np.sqrt(np.diag(body_covariance()))  # the ratio of density and noise is what counts
+    noise = np.broadcast_to(sigma, seen.shape[:-1])
+    return smooth(seen, stamps_s, delay, 2, density, noise).positions.reshape(seen.shape)
+
+
 def constant_acceleration(seen: Floats, stamps_s: Floats, delay: int, density: float) -> Floats:
     """Kalman filter of constant acceleration; with a delay, its fixed-lag RTS smoother."""
     return fixed_lag(seen, stamps_s, delay, 3, density)
@@ -132,6 +141,7 @@ PEERS: tuple[Peer, ...] = (
     Peer("linear interpolation", interpolate),
     Peer("One-Euro", one_euro, (0,), {"min_cutoff_hz": (0.1, 10.0), "beta": (0.05, 30.0)}),
     Peer("Kalman, constant velocity", constant_velocity, None, {"density": (0.002, 50.0)}),
+    Peer("Kalman, a density a joint", constant_velocity_by_joint, None, {"density": (0.002, 50.0)}, whole_body=True),
     Peer("Kalman, constant acceleration", constant_acceleration, None, {"density": (0.05, 5e4)}),
     Peer("Gaussian + Hampel", gaussian_hampel, None, {"sigma_s": (0.01, 0.4), "threshold": (2.0, 12.0)}),
     Peer("bank of smoothers", bank),

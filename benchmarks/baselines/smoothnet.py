@@ -61,7 +61,7 @@ def train(
     for _ in track(range(steps)):
         rows = rng.integers(frames - WINDOW, endpoint=True, size=_BATCH) + np.arange(WINDOW)[:, None]
         truth = motion.positions[rows, rng.integers(clips, size=_BATCH)]
-        held, gone = _inputs(_spoil(truth, rng))
+        held, gone = _inputs(spoil(truth, rng))
         wanted = torch.from_numpy(np.moveaxis(truth, 0, -1)).float()
         answer = net(held, gone)
         position = (answer - wanted).abs().mean()
@@ -96,7 +96,7 @@ def _inputs(seen: Floats) -> tuple[Tensor, Tensor]:
     return tuple(torch.from_numpy(np.moveaxis(x, 0, -1)).float().contiguous() for x in (held, gone))  # type: ignore[return-value]
 
 
-def _spoil(truth: Floats, rng: np.random.Generator) -> Floats:
+def spoil(truth: Floats, rng: np.random.Generator) -> Floats:
     """Each window with a noise of its own, (T, B, 22, 3): 0.5 to 8 cm, independent or correlated; spikes in a third
     of them; in half, a limb away, but never from the start."""
     size = np.exp(rng.uniform(np.log(0.005), np.log(0.08), truth.shape[1]))[:, None, None]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.benchmarks.baselines.filters import OFFLINE, PEERS, Peer, missing
-from steadypose.benchmarks.bench import Answer, Bench, Methods, answers, over_seeds, tune, tuning_log
+from steadypose.benchmarks.bench import RECURRENT, Answer, Bench, Methods, answers, over_seeds, tune, tuning_log
 from steadypose.benchmarks.by_source import source_table
 from steadypose.benchmarks.intervals import ratio
 from steadypose.benchmarks.metrics import position_error, reliability, sigma_ratio
@@ -28,12 +28,13 @@ TUNED_ON = 3
 HOW = (
     "Peers are tuned on every third of these very clips with other noise, each with the same number of evaluations, "
     "for the least sum of position error (mm) and acceleration error (mm/frame²); steadypose runs as it ships. A "
-    "delayed Kalman filter is a fixed-lag RTS smoother. SmoothNet-style: mean over seeds."
+    "delayed Kalman filter is a fixed-lag RTS smoother. SmoothNet-style and GRU: trained on motion that steadypose is "
+    "trained on, spoiled in these ways; the first a mean over seeds."
 )
 
 
 WHOLE_BODY = "whole-body bank"
-BY_SOURCE = ("bank of smoothers", WHOLE_BODY, "conditional Gaussian", "steadypose")
+BY_SOURCE = ("bank of smoothers", WHOLE_BODY, RECURRENT, "conditional Gaussian", "steadypose")
 """what stands in the tables by source, as far as a study has it"""
 
 

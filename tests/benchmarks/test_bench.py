@@ -138,7 +138,10 @@ def test_conditions_give_records_that_tables_and_pictures_are_made_of(clips: Mot
         three = replace(clips, person=np.repeat(["a", "b", "c"], 2))
         data = run_conditions(bench, three, {"4 cm": lambda truth, rng: gaussian(truth, 0.04, rng)}, peers)
     records = {(r["method"], r["delay"]): r for r in data["records"]}
-    assert set(records) == {("raw", 0), *((m, k) for m in ("SmoothNet-style", "steadypose") for k in (0, 4))}
+    assert set(records) == {
+        ("raw", 0),
+        *((m, k) for m in ("SmoothNet-style", "GRU of the whole body", "steadypose") for k in (0, 4)),
+    }
     assert records["raw", 0]["position_mm"] == pytest.approx(40 * np.sqrt(8 / np.pi), rel=0.02)
     record = records["steadypose", 4]
     assert np.mean(record["clips_mm"]["position"]) == pytest.approx(record["position_mm"], abs=1e-3)

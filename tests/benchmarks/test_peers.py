@@ -11,6 +11,7 @@ from steadypose.benchmarks.baselines.filters import (
     PEERS,
     butterworth,
     constant_velocity,
+    constant_velocity_by_joint,
     gaussian_hampel,
     hold_last,
     interpolate,
@@ -181,3 +182,12 @@ def test_a_hidden_joint_stays_beside_the_nearest_seen_one_and_turns_with_the_tru
 def test_the_whole_body_bank_refuses_a_choice_of_joints() -> None:
     with pytest.raises(ValueError, match=r"expected \(\.\.\., 22, 3\) canonical joints"):
         whole_body_bank(np.zeros((5, 13, 3)), np.arange(5) / 30, 0)
+
+
+def test_a_density_a_joint_follows_a_wrist_more_closely_than_a_hip() -> None:
+    seen = np.zeros((12, 1, 22, 3))
+    seen[-1] = 0.1  # all joints jump alike
+    moved = constant_velocity_by_joint(seen, np.arange(12) / 30, 0, 0.5)[-1, 0, :, 0]
+    assert moved[J["left_wrist"]] > moved[J["left_hip"]] > 0.0
+    same = constant_velocity(seen, np.arange(12) / 30, 0, 0.5)[-1, 0, 0, 0]
+    assert moved.min() < same < moved.max()

@@ -1,0 +1,122 @@
+"""A whole-body denoiser as a peer: a recurrent network over all joints at once, causal, trained like the others.
+
+A GRU of 256 units sees the joints about the last pelvis, in the frame of the last hips, those missing held; which are
+missing; and what each moved since the frame before. It gives what to add to the held joint of each frame that a delay
+asks for. Spoiled motion is that of the SmoothNet-style peer, turned about the vertical at random, and mirrored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from steadypose.benchmarks.baselines.filters import hold_last, missing
+from steadypose.benchmarks.baselines.smoothnet import spoil
+from steadypose.benchmarks.motion import MotionClips
+from steadypose.prior.body.skeleton import MIRROR, J
+
+Floats = NDArray[np.float64]
+
+_WIDTH = 256
+_SCALE = 5.0  # a metre in the network's unit
+_BATCH, _FRAMES = 32, 60
+_JOINTS = len(MIRROR)
+
+
+class RecurrentDenoiser(nn.Module):
+    """(N, T, 22, 3) held joints and (N, T, 22) which are missing, to (N, T, D, 22, 3) of D delays."""
+
+    def __init__(self, delays: Sequence[int]) -> None:
+        super().__init__()
+        self.delays = tuple(delays)
+        self.gru = nn.GRU(7 * _JOINTS, _WIDTH, batch_first=True)
+        self.decode = nn.Linear(_WIDTH, len(self.delays) * 3 * _JOINTS)
+
+    def forward(self, held: Tensor, gone: Tensor) -> Tensor:
+        moved = torch.diff(held, dim=1, prepend=held[:, :1])
+        origin, turn = held[:, :, J["pelvis"], None], _headings(held)
+        x = torch.cat([_SCALE * (held - origin) @ turn, 10 * _SCALE * moved @ turn, gone[..., None]], dim=-1)
+        added = self.decode(self.gru(x.flatten(2))[0]).unflatten(-1, (len(self.delays), _JOINTS, 3)) / _SCALE
+        return self.at_delay(held) + added @ turn[:, :, None].transpose(-1, -2)
+
+    def at_delay(self, values: Tensor) -> Tensor:
+        """(N, T, D, ...) of (N, T, ...): as they were so many frames before, or at the start."""
+        frames = torch.arange(values.shape[1])[:, None] - torch.tensor(self.delays)
+        return values[:, frames.clamp(min=0)]
+
+
+def train(
+    motion: MotionClips,
+    delays: Sequence[int],
+    steps: int,
+    seed: int,
+    track: Callable[[Iterable[int]], Iterable[int]] = lambda x: x,
+) -> RecurrentDenoiser:
+    """Train on clips spoiled anew in every step."""
+    torch.manual_seed(seed)
+    rng = np.random.default_rng((seed, 1))
+    net = RecurrentDenoiser(delays)
+    optimiser = torch.optim.Adam(net.parameters())
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
+    frames, clips = motion.positions.shape[:2]
+    length = min(_FRAMES, frames)
+    for _ in track(range(steps)):
+        rows = rng.integers(frames - length, endpoint=True, size=_BATCH) + np.arange(length)[:, None]
+        truth = _turned(motion.positions[rows, rng.integers(clips, size=_BATCH)], rng)
+        wanted = net.at_delay(_batch_first(truth))
+        error = net(*_inputs(spoil(truth, rng))) - wanted
+        loss = error.abs().mean() + error.diff(n=2, dim=1).abs().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+    return net.eval()
+
+
+@torch.inference_mode()
+def smooth(net: RecurrentDenoiser, seen: Floats) -> list[Floats]:
+    """Answers (T, C, 22, 3) of clips (T, C, 22, 3) at each of the network's delays; the last frames of a clip are those
+    of the least delay that has them."""
+    found = net(*_inputs(seen)).numpy().swapaxes(0, 1).astype(np.float64)
+    answers = []
+    for number, delay in enumerate(net.delays):
+        answer = np.empty(seen.shape)
+        answer[: len(seen) - delay] = found[delay:, :, number]
+        for back in range(delay):
+            nearest = max(n for n, d in enumerate(net.delays) if d <= back)
+            answer[len(seen) - 1 - back] = found[len(seen) - 1 - back + net.delays[nearest], :, nearest]
+        answers.append(answer)
+    return answers
+
+
+def _headings(held: Tensor) -> Tensor:
+    """(N, T, 3, 3) frames whose second axis is that from right to left hip, level, as columns."""
+    left = held[:, :, J["left_hip"]] - held[:, :, J["right_hip"]]
+    left = nn.functional.normalize(left * torch.tensor([1.0, 1.0, 0.0]), dim=-1, eps=1e-3)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand_as(left)
+    return torch.stack([torch.linalg.cross(left, up), left, up], dim=-1)
+
+
+def _turned(truth: Floats, rng: np.random.Generator) -> Floats:
+    """(T, B, 22, 3): each clip turned about the vertical, half of them mirrored."""
+    angle = rng.uniform(0, 2 * np.pi, truth.shape[1])
+    turn = np.zeros((truth.shape[1], 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
+    turn[:, 1, 0], turn[:, 0, 1], turn[:, 2, 2] = np.sin(angle), -np.sin(angle), 1.0
+    mirrored = (rng.random(truth.shape[1]) < 0.5)[:, None, None]
+    truth = np.where(mirrored, truth[:, :, MIRROR] * (1.0, -1.0, 1.0), truth)
+    return np.einsum("bij,tbkj->tbki", turn, truth)
+
+
+def _inputs(seen: Floats) -> tuple[Tensor, Tensor]:
+    held = np.nan_to_num(hold_last(seen, np.arange(len(seen), dtype=np.float64), 0))
+    return _batch_first(held), _batch_first(missing(seen).astype(float))
+
+
+def _batch_first(values: Floats) -> Tensor:
+    return torch.from_numpy(values.swapaxes(0, 1)).float()
