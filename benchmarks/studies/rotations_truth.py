@@ -83,31 +83,34 @@ class Clips(NamedTuple):
         positions: (T, C, 22, 3) metres, z up.
         orientations: (T, C, 17, 3, 3) of `SCORED`, world from the file's joint.
         source: (C,) names.
+        person: (C,) marks of their people.
     """
 
     positions: Floats
     orientations: Floats
     source: NDArray[np.str_]
+    person: NDArray[np.str_]
 
 
 def read(mocap: Path, split: str, most: int) -> Clips:
     """At most ``most`` clips of `FRAMES` frames of each source, spread evenly over its recordings."""
     found = [(source.name, *clip) for source in SOURCES for clip in _spread(list(_clips(mocap, source, split)), most)]
-    names, positions, orientations = zip(*found, strict=True)
-    return Clips(np.stack(positions, axis=1), np.stack(orientations, axis=1), np.array(names))
+    names, people, positions, orientations = zip(*found, strict=True)
+    return Clips(np.stack(positions, axis=1), np.stack(orientations, axis=1), np.array(names), np.array(people))
 
 
-def _spread(clips: list[tuple[Floats, Floats]], most: int) -> list[tuple[Floats, Floats]]:
+def _spread(clips: list[tuple[str, Floats, Floats]], most: int) -> list[tuple[str, Floats, Floats]]:
     rows = np.linspace(0, len(clips) - 1, min(most, len(clips))).round().astype(int)
     return [clips[row] for row in rows]
 
 
-def _clips(mocap: Path, source: _Source, split: str) -> Iterator[tuple[Floats, Floats]]:
-    """Every clip of a source's people of this split that has no fault: positions and orientations."""
+def _clips(mocap: Path, source: _Source, split: str) -> Iterator[tuple[str, Floats, Floats]]:
+    """Every clip of a source's people of this split that has no fault: who, positions and orientations."""
     if not (marks := source.people[split]):
         return
     for name, content in sorted(members(mocap / source.archive, (".bvh",), lambda _: None)):
-        if not any(mark in name for mark in marks):
+        person = next((mark for mark in marks if mark in name), None)
+        if person is None:
             continue
         bvh, skeleton, places = bvh_motion(content.decode("ascii", "replace"))
         joints, _ = to_canonical(skeleton, places)
@@ -117,7 +120,7 @@ def _clips(mocap: Path, source: _Source, split: str) -> Iterator[tuple[Floats, F
         bad, _ = find_faults(positions)
         for first in range(0, len(positions) - FRAMES + 1, FRAMES):
             if not bad[rows := slice(first, first + FRAMES)].any():
-                yield positions[rows], orientations[rows]
+                yield person, positions[rows], orientations[rows]
 
 
 def _orientations(bvh: Bvh, turns: Mapping[str, str]) -> Floats:

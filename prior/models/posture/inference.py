@@ -4,6 +4,7 @@ Joints of a trunk are all but rigid to each other, and limbs lie by it as people
 joint is therefore the whole body's: of x ~ N(mean, S), seen as z = x + e with e ~ N(0, R), the expectation is
 z - R (S + R)^-1 (z - mean) and the covariance R - R (S + R)^-1 R (ridge regression whose ridge is the noise; Bishop
 2006, section 2.3.3). R is diagonal, each joint's own variance: a perfect joint stays, a hidden one follows the others.
+Then come the lengths of the person's bones.
 
 The frame is that of hips and shoulders, as noisy as they are: S holds a turn and a shift of it, in which no posture is
 preferred. So a body may lie, or stand on its hands.
@@ -16,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import HIPS, REST_OFFSETS, SHOULDERS
+from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, SHOULDERS
 from steadypose.prior.models.weights import Arrays, load_weights
 
 Floats = NDArray[np.float64]
@@ -27,6 +28,11 @@ UNLIKE = 0.01
 
 MIN_SIGMA, MAX_SIGMA = 1e-5, 0.5
 """Metres: of what is said of a joint; one of which nothing is said has the largest."""
+
+LENGTH_SIGMA = 0.01
+"""Metres: what is taken for the error of a person's bone lengths."""
+_ROUNDS = 2
+_ENDS = np.arange(1, len(PARENT))
 
 _CORNERS = [*HIPS, *SHOULDERS]
 _REST_SIZE = float(np.linalg.norm(REST_OFFSETS, axis=-1).sum())
@@ -75,7 +81,37 @@ class LivePosture:
         gain = np.linalg.inv(seen)
         moved = (noise * (gain @ off[..., None])[..., 0]).reshape(local.shape)
         left = noise[:, :, None] * (np.eye(DIMENSIONS) - gain * noise[:, None, :])
-        return Expected((local - moved) * scale @ frame.swapaxes(-1, -2) + middle[:, None], left * scale**2, frame)
+        expected, left = on_bones((local - moved) * scale, left * scale**2, np.linalg.norm(offsets[:, 1:], axis=-1))
+        return Expected(expected @ frame.swapaxes(-1, -2) + middle[:, None], left, frame)
+
+
+def on_bones(mean: Floats, covariance: Floats, lengths: Floats) -> tuple[Floats, Floats]:
+    """Joints given the lengths of bones, by an extended Kalman filter's update, iterated (Bell and Cathey 1993).
+
+    A length says nothing across its bone, but a joint's error across one bone lies along another.
+
+    Args:
+        mean: (B, 22, 3) metres.
+        covariance: (B, 66, 66) m².
+        lengths: (B, 21) metres, of each joint's bone but the root's, known to `LENGTH_SIGMA`.
+
+    Returns:
+        Mean and covariance, given these.
+    """
+    prior = mean.reshape(len(mean), DIMENSIONS)
+    slope = np.zeros((len(mean), len(_ENDS), *mean.shape[1:]))
+    for _ in range(_ROUNDS):
+        bone = mean[:, 1:] - mean[:, PARENT[1:]]
+        length = np.maximum(np.linalg.norm(bone, axis=-1), 1e-6)
+        slope[:, _ENDS - 1, _ENDS] = bone / length[..., None]
+        slope[:, _ENDS - 1, PARENT[1:]] = -bone / length[..., None]
+        flat = slope.reshape(len(mean), -1, DIMENSIONS)
+        across = flat @ covariance
+        told = across @ flat.swapaxes(-1, -2) + LENGTH_SIGMA**2 * np.eye(len(_ENDS))
+        gain = np.linalg.solve(told, across).swapaxes(-1, -2)
+        off = lengths - length + (flat @ (mean.reshape(prior.shape) - prior)[..., None])[..., 0]
+        mean = (prior + (gain @ off[..., None])[..., 0]).reshape(mean.shape)
+    return mean, covariance - gain @ across
 
 
 def trunk_frame(positions: Floats) -> Floats:

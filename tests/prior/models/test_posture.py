@@ -4,8 +4,8 @@ from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import fk, random_pose
 
 from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.skeleton import REST_OFFSETS, J
-from steadypose.prior.models.posture.inference import LivePosture
+from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, J
+from steadypose.prior.models.posture.inference import LENGTH_SIGMA, LivePosture, on_bones
 from steadypose.prior.models.posture.root import LEAST_SIGMA, RootCovariance
 
 BODIES = 60
@@ -35,6 +35,25 @@ def test_a_joint_of_which_nothing_is_said_follows_the_others(posture: LivePostur
     off[:, J["spine3"]] += 0.3
     expected = posture(off, sigma, OFFSETS).positions
     assert np.median(np.linalg.norm(expected - joints, axis=-1)[:, J["spine3"]]) < 0.05
+
+
+def test_bones_keep_the_persons_lengths(posture: LivePosture, joints: np.ndarray) -> None:
+    noisy = joints + np.random.default_rng(4).normal(0.0, 0.03, joints.shape)
+    expected = posture(noisy, np.full((BODIES, 22), 0.03), OFFSETS).positions
+    off = np.linalg.norm(expected[:, 1:] - expected[:, PARENT[1:]], axis=-1) - np.linalg.norm(OFFSETS[:, 1:], axis=-1)
+    assert np.sqrt(np.square(off).mean()) < 0.5 * LENGTH_SIGMA
+
+
+def test_lengths_of_bones_bring_joints_nearer_and_the_covariance_says_by_how_much(joints: np.ndarray) -> None:
+    rng, sigma = np.random.default_rng(3), 0.03
+    noisy = joints + rng.normal(0.0, sigma, joints.shape)
+    lengths = np.linalg.norm(OFFSETS[:, 1:], axis=-1) + rng.normal(0.0, LENGTH_SIGMA, (BODIES, 21))
+    covariance = np.broadcast_to(sigma**2 * np.eye(66), (BODIES, 66, 66))
+    mean, left = on_bones(noisy, covariance, lengths)
+    error = np.square(mean - joints).sum()
+    assert error < 0.8 * np.square(noisy - joints).sum()
+    assert 0.9 < error / np.trace(left, axis1=1, axis2=2).sum() < 1.1
+    np.testing.assert_allclose(left, left.swapaxes(-1, -2), atol=1e-12)
 
 
 def test_the_answer_turns_with_the_body_however_it_lies(posture: LivePosture, joints: np.ndarray) -> None:
