@@ -98,7 +98,7 @@ def on_bones(mean: Floats, covariance: Floats, lengths: Floats) -> tuple[Floats,
     Returns:
         Mean and covariance, given these.
     """
-    prior = mean.reshape(len(mean), DIMENSIONS)
+    prior, left = mean.reshape(len(mean), DIMENSIONS), covariance
     slope = np.zeros((len(mean), len(_ENDS), *mean.shape[1:]))
     for _ in range(_ROUNDS):
         bone = mean[:, 1:] - mean[:, PARENT[1:]]
@@ -111,7 +111,8 @@ def on_bones(mean: Floats, covariance: Floats, lengths: Floats) -> tuple[Floats,
         gain = np.linalg.solve(told, across).swapaxes(-1, -2)
         off = lengths - length + (flat @ (mean.reshape(prior.shape) - prior)[..., None])[..., 0]
         mean = (prior + (gain @ off[..., None])[..., 0]).reshape(mean.shape)
-    return mean, covariance - gain @ across
+        left = covariance - gain @ across
+    return mean, left
 
 
 def trunk_frame(positions: Floats) -> Floats:
