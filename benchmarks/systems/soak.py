@@ -1,0 +1,413 @@
+"""Faults, one after the other, into nodes at work: killed, stopped and hung, on a full disk, among malformed clients,
+with a sensor's clock that is set.
+
+Half of the time a replay that is to lose nothing, each time recorded and compared with one that nothing befell; half of
+the time a live stream, whose every frame must be counted as worked on or as dropped, for a cause.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.provenance import WORLD, require_committed
+from steadypose.benchmarks.results import RESULTS, Table, save, show
+from steadypose.benchmarks.running import Running, running_nodes
+from steadypose.benchmarks.systems.latency import crowd
+from steadypose.msgs.recording import RecordingReader, RecordingWriter
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.types import Diagnostics, PoseRaw
+from steadypose.nodes.graph.clock import FRAME_NS
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.ledger import LOSSES, Ledger
+from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery
+from steadypose.prior.timing.rate import FPS
+
+DEPENDS_ON = WORLD
+
+FRAMES = 1200
+"""of a replay: 40 s"""
+BETWEEN_S = 6.0
+"""faults"""
+BACK_S = 30.0
+"""limit: without poses after a fault"""
+HUNG_S = 14.0
+"""for longer than a supervisor waits"""
+UNSAID = 40
+"""messages of a stream that a node works on between two reports: what it did since its last, a killed one never says"""
+DISK = "size=24m"
+POSES = (POSE_RAW, POSE_CLEAN, POSE_WORLD)
+CAUSES = {"in": "in.", "lost": "dropped.lost", "expired": "dropped.expired", "away": "dropped.away"}
+"""what becomes of a message, and how that is called in diagnostics"""
+SAME_M = 1e-6
+"""metres; positions are float32"""
+CLOCK_STEPS_S = (3600.0, -1800.0, 60.0, -60.0)
+GARBAGE = (
+    b"GET / HTTP/1.1\r\n\r\n",
+    b"\0" * 4096,
+    b"\xff\0\0\0\0\0\0\x7f" + b"A" * 70000,
+    b"{" * 5000,
+    b"RTPS\2\3" * 99,
+)
+
+
+@dataclass(frozen=True)
+class Args:
+    """Faults into nodes at work, and what comes of each frame. Exit status 1 if one is lost without a cause."""
+
+    minutes: float = 60.0
+    """of both halves together; a replay is finished"""
+    seed: int = 0
+    """of the faults and their order"""
+    quick: bool = False
+    """two minutes, to see that it works; nothing is written unless --out says where"""
+    out: Path | None = None
+    """folder for the JSON file; benchmarks/results unless --quick"""
+
+
+@dataclass
+class Replayed:
+    """What is different in replays with faults, of one topic, added up.
+
+    Attributes:
+        lost, twice, deviating: frames.
+        furthest_m: of any joint.
+        longest_s: that frames in a row deviate.
+    """
+
+    frames: int = 0
+    lost: int = 0
+    twice: int = 0
+    deviating: int = 0
+    furthest_m: float = 0.0
+    longest_s: float = 0.0
+
+
+def main(args: Args) -> None:
+    """Break, compare, print, write."""
+    written = bool(args.out) or not args.quick
+    if written:
+        require_committed(args.out or RESULTS)
+    console, random_ = Console(), random.Random(args.seed)
+    half_s = 30.0 * (2.0 if args.quick else args.minutes)
+    with tempfile.TemporaryDirectory(prefix="steadypose-") as folder:
+        replayed, kills = replays(Path(folder), half_s, random_)
+        gaps, counts, wrong = live(Path(folder), half_s, random_)
+    tables = [_replays_table(replayed, kills), _live_table(gaps, counts)]
+    for table in tables:
+        show(table, console)
+    wrong += [f"{topic}: {each.lost} lost, {each.twice} twice" for topic, each in replayed.items() if each.lost]
+    wrong += [f"{fault}: no poses for {max(found):.1f} s" for fault, found in gaps.items() if max(found) > BACK_S]
+    if written:
+        data: dict[str, Any] = {
+            "replays": {topic: dataclasses.asdict(each) for topic, each in replayed.items()},
+            "kills": kills, "seconds without pose/world": gaps, "live": counts, "wrong": wrong,
+        }  # fmt: skip
+        console.print(f"wrote {save('soak', sys.argv[1:], tables, data, DEPENDS_ON, args.out or RESULTS)}")
+    if wrong:
+        console.print("\n".join(wrong), markup=False)
+        sys.exit(1)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# What must not lose anything
+
+
+def replays(folder: Path, seconds: float, random_: random.Random) -> tuple[dict[str, Replayed], dict[str, int]]:
+    """Replays with kills and stops against one without; and how many of them there were."""
+    frames = list(islice(crowd(_frames(), 1), FRAMES))
+    _write(folder / "in", frames)
+    expected = _played(folder)
+    found = {topic: Replayed() for topic in expected}
+    kills: dict[str, int] = defaultdict(int)
+    ended = time.monotonic() + seconds
+    while time.monotonic() < ended:
+        for topic, poses in _played(folder, random_, kills).items():
+            _compare(expected[topic], poses, found[topic])
+    return found, dict(kills)
+
+
+def _played(
+    folder: Path, random_: random.Random | None = None, kills: dict[str, int] | None = None
+) -> dict[str, dict[int, list[Any]]]:
+    """The positions that a replay recorded, by topic and number of the frame; with faults, counted in ``kills``, where
+    there is chance."""
+    out = folder / "out"
+    shutil.rmtree(out, ignore_errors=True)
+    settings = _settings(folder / "in", out, lossless=True)
+    with running_nodes([*POSE_NODES, "recorder"], settings) as nodes:
+        due = time.monotonic() + BETWEEN_S
+        for topic, message in nodes.messages:
+            if topic == POSE_WORLD and not isinstance(message, Diagnostics) and message.end_of_stream:
+                break
+            if random_ and kills is not None and time.monotonic() > due:
+                name = random_.choice([*POSE_NODES, "recorder", "prior and trajectory"])
+                with_ = random_.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGSTOP])
+                for each in name.split(" and "):
+                    _send(nodes, each, with_)
+                if with_ == signal.SIGSTOP:
+                    time.sleep(1.0)
+                    for each in name.split(" and "):
+                        _send(nodes, each, signal.SIGCONT)
+                kills[f"{name} {'killed' if with_ == signal.SIGKILL else 'stopped'}"] += 1
+                due = time.monotonic() + BETWEEN_S
+        _until_recorded(nodes)
+    found: dict[str, dict[int, list[Any]]] = {topic: defaultdict(list) for topic in POSES}
+    with RecordingReader(out) as reader:
+        for topic, _, message in reader.messages(found):
+            assert not isinstance(message, Diagnostics)
+            if not message.end_of_stream:
+                # who begins anew has another first stamp, and a grid that is a nanosecond off
+                number = round((message.stamp_ns - reader.start_ns) / FRAME_NS)
+                found[topic][number].append([body.positions for body in message.bodies])  # type: ignore[union-attr]
+    return found
+
+
+def _until_recorded(nodes: Running) -> None:
+    """Until the recorder has seen the end of all streams."""
+    for _, message in nodes.messages:
+        ended = message.values.get("ended", "") if isinstance(message, Diagnostics) else ""
+        if isinstance(message, Diagnostics) and message.node == "recorder" and ended.count("pose/") == 3:
+            return
+
+
+def _compare(expected: dict[int, list[Any]], got: dict[int, list[Any]], found: Replayed) -> None:
+    found.frames += len(expected)
+    found.twice += sum(len(each) - 1 for each in got.values())
+    since: int | None = None
+    for number in sorted(expected):
+        if number not in got:
+            found.lost += 1
+            continue
+        one, other = np.array(expected[number][0]), np.array(got[number][0])
+        off_m = float(np.nan_to_num(np.abs(one - other)).max(initial=0.0)) if one.shape == other.shape else np.inf
+        if off_m > SAME_M:
+            found.deviating += 1
+            found.furthest_m = max(found.furthest_m, off_m)
+            since = number if since is None else since
+            found.longest_s = max(found.longest_s, (number + 1 - since) / FPS)
+        else:
+            since = None
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# What must account for everything
+
+
+def live(
+    folder: Path, seconds: float, random_: random.Random
+) -> tuple[dict[str, list[float]], dict[str, dict[str, int]], list[str]]:
+    """A live stream with faults.
+
+    Returns:
+        Seconds without poses after each fault; of each node what became of its frames; and what does not add up.
+    """
+    _write(folder / "stepping", _stepping(list(islice(crowd(_frames(), 1), FRAMES))))
+    gaps: dict[str, list[float]] = defaultdict(list)
+    names = [*POSE_NODES, "recorder", *(["foxglove"] if find_spec("foxglove") else [])]
+    with _small_disk(folder / "disk") as disk, _free_port() as port:
+        settings = [*_settings(folder / "stepping", disk / "out", lossless=False), f"foxglove.port={port}"]
+        with running_nodes(names, settings) as nodes:
+            ledger, reports = Ledger(Launch.read("replay", settings)), {}
+            faults = _faults(nodes, disk, port, random_)
+            ended, due, fault, last_s = time.monotonic() + seconds, time.monotonic() + 2 * BETWEEN_S, "", 0.0
+            for topic, message in nodes.messages:
+                now = time.monotonic()
+                if isinstance(message, Diagnostics):
+                    restarts = nodes.supervisor.children[message.node].restarts
+                    reports[message.node] = ledger.note(message, restarts)
+                elif topic == POSE_WORLD:
+                    if fault:
+                        gaps[fault][-1] = max(gaps[fault][-1], round(now - last_s, 3))
+                    last_s = now
+                if now > due:
+                    if now > ended:
+                        break
+                    fault = random_.choice(list(faults))
+                    gaps[fault].append(0.0)
+                    faults[fault]()
+                    due = time.monotonic() + BETWEEN_S + (HUNG_S if fault.startswith("hang") else 0.0)
+            deaths = {name: child.restarts for name, child in nodes.supervisor.children.items()}
+            counts, wrong = _accounts(ledger, reports, deaths)
+            failed = nodes.supervisor.failed
+    return dict(gaps), counts, wrong + [f"{name} has failed" for name in failed]
+
+
+def _faults(nodes: Running, disk: Path, port: int, random_: random.Random) -> dict[str, Callable[[], None]]:
+    def stop(name: str) -> None:
+        _send(nodes, name, signal.SIGSTOP)
+        time.sleep(random_.uniform(0.5, 2.0))
+        _send(nodes, name, signal.SIGCONT)
+
+    def fill() -> None:
+        with suppress(OSError), open(disk / "filler", "wb") as file:
+            while True:
+                file.write(bytes(2**20))
+        time.sleep(2.0)
+        (disk / "filler").unlink()
+
+    def disturb() -> None:
+        for garbage in GARBAGE:
+            with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0) as client:
+                client.sendall(garbage)
+            for endpoint in nodes.endpoints:
+                with suppress(OSError), socket.socket(socket.AF_UNIX) as client:
+                    client.settimeout(1.0)
+                    client.connect(endpoint.removeprefix("ipc://"))
+                    client.sendall(garbage)
+
+    faults: dict[str, Callable[[], None]] = {"malformed clients": disturb}
+    for name in nodes.supervisor.children:
+        faults[f"kill {name}"] = lambda name=name: _send(nodes, name, signal.SIGKILL)
+        faults[f"stop {name}"] = lambda name=name: stop(name)
+    faults["hang prior"] = lambda: _send(nodes, "prior", signal.SIGSTOP)
+    if disk.is_mount():
+        faults["full disk"] = fill
+    return faults
+
+
+def _accounts(
+    ledger: Ledger, reports: dict[str, Diagnostics], restarts: dict[str, int]
+) -> tuple[dict[str, dict[str, int]], list[str]]:
+    """Of each node: published for it, worked on, dropped by cause; and where that does not add up."""
+    counts: dict[str, dict[str, int]] = {}
+    wrong = []
+    for name, report in reports.items():
+        if NODES[name].delivery is Delivery.BEST_EFFORT or not NODES[name].subscribes:
+            continue  # may miss anything; or is given nothing
+        values = {k: int(v) for k, v in report.values.items() if k.startswith((*LOSSES, "in."))}
+        values |= {k: int(v) for k, v in ledger.away(name, reports).items()}
+        streams = [
+            (p, t) for p, topics in NODES[name].subscribes.items() for t in topics if p in reports and t in POSES
+        ]
+        counts[name] = {"published": sum(int(reports[p].values.get(f"count.{t}", 0)) for p, t in streams)}
+        for cause, key in CAUSES.items():
+            counts[name][cause] = sum(values.get(f"{key} {t}".replace(". ", "."), 0) for _, t in streams)
+        counts[name]["late"] = values.get("dropped.late", 0)
+        unexplained = 2 * counts[name]["published"] - sum(counts[name].values())
+        deaths = sum(restarts[each] for each in (name, *NODES[name].subscribes) if each in restarts)
+        if abs(unexplained) > UNSAID * len(streams) * (1 + deaths):
+            wrong.append(f"{name}: {unexplained} of {counts[name]['published']} messages are not accounted for")
+    return counts, wrong
+
+
+@contextmanager
+def _small_disk(folder: Path) -> Iterator[Path]:
+    """A file system of a few megabytes, if this user may mount one; else a folder."""
+    folder.mkdir()
+    mounted = (
+        not os.getuid()
+        and not subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", DISK, "tmpfs", folder], capture_output=True, timeout=30
+        ).returncode
+    )
+    try:
+        yield folder
+    finally:
+        if mounted:
+            subprocess.run(["umount", "--lazy", folder], check=True, timeout=30)
+
+
+@contextmanager
+def _free_port() -> Iterator[int]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    yield port
+
+
+def _settings(played: Path, out: Path, *, lossless: bool) -> list[str]:
+    return [
+        f"input.recording={json.dumps(str(played))}", "input.rate=1.0", f"input.loop={json.dumps(not lossless)}",
+        f"transport.lossless={json.dumps(lossless)}", f"recorder.directory={json.dumps(str(out))}",
+        "recorder.free_mb=1.0", "recorder.split_mb=4.0", f"recorder.keep_mb={0.0 if lossless else 12.0}",
+    ]  # fmt: skip
+
+
+def _frames() -> list[PoseRaw]:
+    with RecordingReader(ROOT / "sim_data" / "walk_turn") as reader:
+        return [message for _, _, message in reader.messages([POSE_RAW]) if isinstance(message, PoseRaw)]
+
+
+def _stepping(frames: Sequence[PoseRaw]) -> list[PoseRaw]:
+    """The frames of a sensor whose clock is set a few times, for good or for one frame."""
+    stepped, shift_s, span = [], 0.0, len(frames) // (len(CLOCK_STEPS_S) + 1)
+    for index, frame in enumerate(frames):
+        if index and index % span == 0:
+            shift_s += CLOCK_STEPS_S[(index // span - 1) % len(CLOCK_STEPS_S)]
+        once_s = 60.0 if index % span == span // 2 else 0.0
+        stepped.append(dataclasses.replace(frame, stamp_ns=frame.stamp_ns + round(1e9 * (shift_s + once_s))))
+    return stepped
+
+
+def _write(directory: Path, frames: Sequence[PoseRaw]) -> None:
+    with RecordingWriter(directory) as writer:
+        for index, frame in enumerate(frames):  # filed in their order, whatever their stamps
+            writer.write(POSE_RAW, frame, frames[0].stamp_ns + index)
+
+
+def _send(nodes: Running, name: str, with_: signal.Signals) -> None:
+    with suppress(ProcessLookupError):
+        os.kill(nodes.supervisor.children[name].pid, with_)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+
+
+def _replays_table(found: dict[str, Replayed], kills: dict[str, int]) -> Table:
+    return Table(
+        name="soak-replays",
+        title="A replay that is to lose nothing, with faults",
+        columns=["topic", "frames", "lost", "twice", "deviating", "furthest, mm", "longest, s"],
+        rows=[
+            [
+                topic, *map(str, (f.frames, f.lost, f.twice, f.deviating)),
+                f"{1e3 * f.furthest_m:.1f}", f"{f.longest_s:.1f}",
+            ]
+            for topic, f in found.items()
+        ],
+        note=f"Against a replay without: {', '.join(f'{name} {n} times' for name, n in sorted(kills.items()))}.",
+    )  # fmt: skip
+
+
+def _live_table(gaps: dict[str, list[float]], counts: dict[str, dict[str, int]]) -> Table:
+    published = sum(row["published"] for row in counts.values())
+    causes = {cause: sum(row[cause] for row in counts.values()) for cause in ("in", "lost", "expired", "late", "away")}
+    return Table(
+        name="soak-live",
+        title="A live stream with faults: seconds without pose/world",
+        columns=["fault", "p50", "p95", "longest", "times"],
+        rows=[
+            [fault, *(f"{q:.2f}" for q in np.percentile(found, (50, 95, 100))), str(len(found))]
+            for fault, found in sorted(gaps.items())
+        ],
+        note=f"Of {published:,} messages published to the nodes, {', '.join(f'{n:,} {c}' for c, n in causes.items())}: "
+        "worked on, lost in a full queue, older than they may be, dropped for a newer one, and published while nobody "
+        "of that name was there.",
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
