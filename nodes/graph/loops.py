@@ -14,13 +14,17 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import TextIO
 
 from steadypose.nodes.graph.safe_python import command, environment
 from steadypose.prior import loop_cache
 
 COMPILED = {"prior", "trajectory"}
 """the nodes that need them"""
+WAIT_S = 600.0
+"""for another process that compiles; it may have been stopped"""
 SAY_S = 5.0
 """between two lines that say how far it is"""
 _GARBAGE = 20_000
@@ -94,9 +98,21 @@ def compile_missing(say: Callable[[str], None]) -> None:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             say("waiting for another process that compiles the loops")
-            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not _locked(lock, WAIT_S):
+                say(f"another process compiles the loops for more than {WAIT_S / 60:g} minutes: going on without")
+                return
         if not loop_cache.is_complete():
             _compile(folder, say)
+
+
+def _locked(file: TextIO, within_s: float) -> bool:
+    ends = time.monotonic() + within_s
+    while time.monotonic() < ends:
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        time.sleep(0.1)
+    return False
 
 
 def _compile(folder: Path, say: Callable[[str], None]) -> None:

@@ -134,7 +134,8 @@ def another_python(script: str, folder: Path, *arguments: str) -> Iterator[subpr
 @contextmanager
 def running(*nodes: Node) -> Iterator[list[threading.Thread]]:
     """The nodes, each in a thread, stopped in the order given."""
-    threads = [threading.Thread(target=node.run) for node in nodes]
+    # one that hangs is a failure below, and not to keep the tests from ending
+    threads = [threading.Thread(target=node.run, daemon=True) for node in nodes]
     for thread in threads:
         thread.start()
     try:
@@ -160,13 +161,13 @@ def repeated(act: Callable[[], object]) -> Iterator[None]:
         while not over.wait(0.02):
             act()
 
-    thread = threading.Thread(target=go_on)
+    thread = threading.Thread(target=go_on, daemon=True)
     thread.start()
     try:
         yield
     finally:
         over.set()
-        thread.join()
+        thread.join(20)
 
 
 def until(condition: Callable[[], bool], *, timeout_s: float = 30.0) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 from numba.core.dispatcher import Dispatcher
 
 from steadypose.nodes.graph import trajectory_node
-from steadypose.nodes.graph.loops import compile_from_the_beginning, compile_from_the_end
+from steadypose.nodes.graph.loops import _locked, compile_from_the_beginning, compile_from_the_end
 
 
 def kinds() -> dict[str, int]:
@@ -23,3 +24,11 @@ def test_the_second_process_compiles_nothing_that_the_first_would_not() -> None:
     loaded = kinds()
     compile_from_the_end()
     assert {name: number for name, number in kinds().items() if number != loaded.get(name)} == {}
+
+
+def test_one_that_compiles_for_ever_is_not_waited_for(tmp_path: Path) -> None:
+    with open(tmp_path / "lock", "w") as theirs, open(tmp_path / "lock", "w") as ours:
+        assert _locked(theirs, 0.2)
+        assert not _locked(ours, 0.2)
+    with open(tmp_path / "lock", "w") as ours:
+        assert _locked(ours, 0.2)
