@@ -7,6 +7,7 @@ going.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -16,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import EventKind, Hand
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.events.features import HAND
+from steadypose.prior.events.features import EXTENT, HAND
 from steadypose.prior.events.settings import EventSettings
-from steadypose.prior.sim.body import random_offsets
+from steadypose.prior.sim.body import TOE_HEIGHT, random_offsets
 from steadypose.prior.sim.gait import RATE, Stand, Turn, Walk, plan
 from steadypose.prior.sim.motion import SIGN, ArmAction, Intent, Motion, perform
 from steadypose.prior.sim.scripts import SCRIPTS
@@ -30,6 +31,7 @@ DOUBT = 0.05
 SHORTEST_S = 0.25
 """what lasts less need not be told, and may be"""
 GRAVITY = 9.81
+LEG = [J[f"left_{joint}"] for joint in ("hip", "knee", "ankle", "foot")]
 
 
 class Label(NamedTuple):
@@ -42,6 +44,8 @@ class Label(NamedTuple):
     end_s: float
     required: bool = True
     """whether it has to be told; if not, as between a threshold and its margin, it may be"""
+    nearly_s: float = math.inf
+    """from when it may be told already, if that is before its start"""
 
 
 class Scene(NamedTuple):
@@ -76,7 +80,7 @@ def gestures(rng: np.random.Generator) -> Scene:
         intent.arms[side].append(ArmAction(weight, goal, pole, "shoulder"))
         at += lasts + rng.uniform(0.8, 1.4)
     motion = perform(intent, _person(rng), rng)
-    return Scene([motion], [*labels, *_common(0, motion)])
+    return Scene([motion], [*labels, *common(0, motion)])
 
 
 def _goal(rng: np.random.Generator, act: str, sign: float) -> Floats:
@@ -98,7 +102,7 @@ def comes_and_goes(rng: np.random.Generator) -> Scene:
         Walk([(2.2, -0.6 * side), (2.6, -3.2 * side)], rng.uniform(0.9, 1.3)), Stand(2.0),
     ]  # fmt: skip
     motion = perform(Intent(plan((2.8, 3.2 * side), -side * np.pi / 2, parts)), _person(rng), rng)
-    return Scene([motion], _common(0, motion))
+    return Scene([motion], common(0, motion))
 
 
 def falls(rng: np.random.Generator) -> Scene:
@@ -137,7 +141,7 @@ def _tips(rng: np.random.Generator, tilt: Callable[[Floats], Floats]) -> Scene:
     contacts = standing.contacts & (angle < 0.2)[:, None]
     motion = Motion(standing.times, standing.offsets, root, rotations, contacts)
     down = float(standing.times[np.argmax(motion.positions[:, J["neck"], 2] < 0.4)])
-    labels = [*_common(0, motion), Label(0, EventKind.LIES, Hand.NONE, down, float(standing.times[-1]))]
+    labels = [*common(0, motion), Label(0, EventKind.LIES, Hand.NONE, down, float(standing.times[-1]))]
     if tilt is _toppling:
         labels.append(Label(0, EventKind.FELL, Hand.NONE, down, float(standing.times[-1])))
     return Scene([motion], labels)
@@ -146,7 +150,7 @@ def _tips(rng: np.random.Generator, tilt: Callable[[Floats], Floats]) -> Scene:
 def _of_script(name: str, *undecided: EventKind) -> Callable[[np.random.Generator], Scene]:
     def scene(rng: np.random.Generator) -> Scene:
         motions = SCRIPTS[name](rng)
-        labels = [label for person, motion in enumerate(motions) for label in _common(person, motion)]
+        labels = [label for person, motion in enumerate(motions) for label in common(person, motion)]
         return Scene(motions, labels, frozenset(undecided))
 
     return scene
@@ -155,16 +159,8 @@ def _of_script(name: str, *undecided: EventKind) -> Callable[[np.random.Generato
 def sits(rng: np.random.Generator) -> Scene:
     """Sit down on a chair twice, and rise."""
     (motion,) = SCRIPTS["sit_rise"](rng)
-    height = motion.root[:, 2]
-    low, high = float(height.min()), float(np.median(height[:60]))
-    labels = [label for label in _common(0, motion) if label.kind != EventKind.STANDS]
-    labels += _while(
-        0, EventKind.SITS, Hand.NONE, motion.times, height < low + 0.15 * (high - low), height < 0.5 * (low + high)
-    )
-    labels += _while(
-        0, EventKind.STANDS, Hand.NONE, motion.times, height > high - 0.2 * (high - low), height > 0.5 * (high + low)
-    )
-    return Scene([motion], labels)
+    labels = [label for label in common(0, motion) if label.kind != EventKind.STANDS]
+    return Scene([motion], [*labels, *seated(0, motion)])
 
 
 SCENES: Mapping[str, Callable[[np.random.Generator], Scene]] = {
@@ -185,7 +181,7 @@ def _person(rng: np.random.Generator) -> Floats:
     return random_offsets(rng, rng.uniform(1.55, 1.90))
 
 
-def _common(person: int, motion: Motion) -> list[Label]:
+def common(person: int, motion: Motion) -> list[Label]:
     """What the true joints of any scene tell: near, facing the camera, upright, hands above the neck."""
     s, p, t = EventSettings(), motion.positions, motion.times
     left = p[:, J["left_hip"]] - p[:, J["right_hip"]] + p[:, J["left_shoulder"]] - p[:, J["right_shoulder"]]
@@ -194,7 +190,8 @@ def _common(person: int, motion: Motion) -> list[Label]:
     toward = np.arctan2(-motion.root[:, 1], -motion.root[:, 0])
     turned = np.abs(np.angle(np.exp(1j * (facing - toward))))
     hips = motion.root[:, 2]
-    up = hips > 0.5 * hips[0]
+    tall = -float(motion.offsets[LEG, 2].sum()) + TOE_HEIGHT
+    up = hips > 0.5 * tall
     upright = p[:, J["neck"], 2] - p[:, J["pelvis"], 2] > 0.3
     labels = [
         *_while(person, EventKind.NEAR, Hand.NONE, t, away < s.near - DOUBT, away < s.near + s.near_margin),
@@ -206,7 +203,7 @@ def _common(person: int, motion: Motion) -> list[Label]:
             (turned < s.faces - DOUBT) & up,
             (turned < s.faces + s.faces_margin) & up,
         ),
-        *_while(person, EventKind.STANDS, Hand.NONE, t, hips > 0.85 * hips[0], hips > 0.65 * hips[0]),
+        *_while(person, EventKind.STANDS, Hand.NONE, t, hips > 0.85 * tall, hips > 0.65 * tall),
     ]
     for side, hand in (("left", Hand.LEFT), ("right", Hand.RIGHT)):
         forearm = p[:, J[f"{side}_wrist"]] - p[:, J[f"{side}_elbow"]]
@@ -217,6 +214,24 @@ def _common(person: int, motion: Motion) -> list[Label]:
     return labels
 
 
+def seated(person: int, motion: Motion) -> Iterator[Label]:
+    """Of one who sits down on a chair and rises: when the pelvis is down, or up."""
+    height = motion.root[:, 2]
+    low, high = float(height.min()), float(np.quantile(height, 0.9))
+    down, middle, up = low + 0.15 * (high - low), 0.5 * (low + high), high - 0.2 * (high - low)
+    yield from _while(person, EventKind.SITS, Hand.NONE, motion.times, height < down, height < middle)
+    yield from _while(person, EventKind.STANDS, Hand.NONE, motion.times, height > up, height > middle)
+
+
+def lying(person: int, motion: Motion) -> Iterator[Label]:
+    """When all of head, trunk, knees and feet are low."""
+    s, heights = EventSettings(), motion.positions[:, EXTENT, 2]
+    extent = heights.max(axis=1) - heights.min(axis=1)
+    yield from _while(
+        person, EventKind.LIES, Hand.NONE, motion.times, extent < s.lies - DOUBT, extent < s.lies + s.lies_margin
+    )
+
+
 def _while(
     person: int, kind: EventKind, hand: Hand, t: Floats, holds: NDArray[np.bool_], nearly: NDArray[np.bool_]
 ) -> Iterator[Label]:
@@ -224,7 +239,7 @@ def _while(
     for begin, end in runs(nearly):
         held = np.flatnonzero(holds[begin:end])
         start = begin + int(held[0]) if len(held) else begin
-        yield Label(person, kind, hand, float(t[start]), float(t[end - 1]), len(held) > 0)
+        yield Label(person, kind, hand, float(t[start]), float(t[end - 1]), len(held) > 0, float(t[begin]))
 
 
 def in_view(labels: Sequence[Label], person: int, t: Floats, seen: NDArray[np.bool_]) -> Iterator[Label]:

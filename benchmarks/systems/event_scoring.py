@@ -62,9 +62,8 @@ def score(told: Sequence[Told], labels: Sequence[Label], undecided: Iterable[Eve
         if label.kind in undecided:
             continue
         last_s = label.start_s + LATE_S if label.required else label.end_s
-        close = [
-            t for t in left if (t.person, t.kind, t.hand) == label[:3] and label.start_s - EARLY_S <= t.at_s <= last_s
-        ]
+        first_s = min(label.start_s, label.nearly_s) - EARLY_S
+        close = [t for t in left if (t.person, t.kind, t.hand) == label[:3] and first_s <= t.at_s <= last_s]
         if close:
             first = min(close, key=lambda t: t.at_s)
             left.remove(first)

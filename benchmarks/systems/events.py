@@ -1,8 +1,7 @@
 """How well `prior.events` tells what people do: precision, recall and delay, behind the whole pipeline.
 
-Simulated people are filmed with a Kinect's errors; motion capture whose name says what is done, if its folder is given,
-gets noise as of a tracker. Both go through the nodes' own pipelines. The thresholds were chosen on other seeds, and on
-other people: on the session of Bandai-Namco that validates, and on LAFAN1's subject 1.
+Simulated people are filmed with a Kinect's errors, and go through the nodes' own pipelines; `event_mocap` does the same
+with motion capture. The thresholds were chosen on other seeds and people.
 """
 
 from __future__ import annotations
@@ -28,6 +27,7 @@ from steadypose.msgs.types import EventKind, Phase, PoseClean, PoseRaw, PoseWorl
 from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.events_node import EventStream
 from steadypose.nodes.graph.prior_node import make_prior
+from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.graph.trajectory_node import make_trajectory
 from steadypose.prior.events.settings import EventSettings
 from steadypose.prior.sim.camera import Camera, film
@@ -36,6 +36,10 @@ from steadypose.prior.sim.streams import START_NS
 
 CAMERA = Camera(position=(0.0, 0.0, 1.4), look_at=(2.6, 0.0, 0.95), fps=30.0, skeleton="kinect22")
 GRID_HZ = 30.0
+DELAYS = (
+    "Delays are between stamps of capture, from the onset in the true motion: the prior's own delay, which holds up "
+    "every pose, comes on top."
+)
 IN_VIEW = 0.5
 """share of a body's joints in the camera's view, from which on it is there"""
 
@@ -99,6 +103,7 @@ def simulated(name: str, seed: int) -> tuple[Scene, list[PoseRaw]]:
 def main(args: Args) -> None:
     """Measure, print, write."""
     require_committed(args.out)
+    one_thread()
     totals: dict[EventKind, Score] = defaultdict(Score)
     by_scene: list[dict[str, Any]] = []
     runs = [(name, seed) for name in SCENES for seed in range(args.first, args.first + args.seeds)]
@@ -110,32 +115,34 @@ def main(args: Args) -> None:
             counts = {"met": found.met, "missed": found.missed, "false": found.false}
             by_scene.append({"scene": name, "seed": seed, "kind": kind.name, "delays_s": found.delays_s} | counts)
     console = Console()
-    table = _table(totals)
+    table = table_of(
+        "events", "Events of simulated people, filmed with a Kinect's errors, behind the whole pipeline", totals, DELAYS
+    )
     show(table, console)
     path = save("events", sys.argv[1:], [table], {"scenes": by_scene}, (*WORLD, "events settings"), args.out)
     console.print(f"wrote {path}")
 
 
-def _table(totals: Mapping[EventKind, Score]) -> Table:
+def table_of(name: str, title: str, totals: Mapping[EventKind, Score], note: str) -> Table:
+    """A row for each kind, and one for all."""
     whole = Score()
     for found in totals.values():
         whole.add(found)
     rows = [(kind.name.lower().replace("_", " "), totals[kind]) for kind in EventKind if kind in totals]
     return Table(
-        name="events",
-        title="Events of simulated people, filmed with a Kinect's errors, behind the whole pipeline",
+        name=name,
+        title=title,
         columns=["event", "labels", "precision", "recall", "F1", "delay p50, ms", "delay p95, ms"],
         rows=[
             [
-                name,
+                kind,
                 str(found.met + found.missed),
                 *(f"{share:.3f}" for share in (found.precision, found.recall, found.f1)),
                 *(f"{quantile_ms(found.delays_s, share):.0f}" for share in (0.5, 0.95)),
             ]
-            for name, found in [*rows, ("all", whole)]
+            for kind, found in [*rows, ("all", whole)]
         ],
-        note="Delays are between stamps of capture, from the onset in the true motion: the prior's own delay, which "
-        "holds up every pose, comes on top.",
+        note=note,
     )
 
 

@@ -151,7 +151,7 @@ class _Body:
         speeds = self._wrist_speeds(now, seen.arms)
         for hand, arm, speed in zip((Hand.LEFT, Hand.RIGHT), seen.arms, speeds, strict=True):
             take(EventKind.HAND_RAISED, hand, *arm.raised, possible=not lies)
-            waving = self._waves[hand].update(now, arm.swing, arm.upright and not lies)
+            waving = self._waves[hand].update(now, arm.swing, arm.upright and not lies, arm.up and not lies)
             take(EventKind.WAVES, hand, float(waving), CERTAIN)
             still = speed < s.point_speed and arm.lift > s.point_lift
             take(EventKind.POINTS, hand, *arm.elbow, possible=still and not lies)

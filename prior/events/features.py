@@ -19,7 +19,7 @@ Point = list[float]
 HAND = 0.18
 """metres from wrist to fingertips of an adult (Drillis and Contini 1966: 0.108 of the stature)"""
 
-_EXTENT = [J[name] for name in ("head", "neck", "pelvis", "left_knee", "right_knee", "left_ankle", "right_ankle")]
+EXTENT = [J[name] for name in ("head", "neck", "pelvis", "left_knee", "right_knee", "left_ankle", "right_ankle")]
 
 
 class Quantity(NamedTuple):
@@ -40,8 +40,10 @@ class Arm(NamedTuple):
     """radians between shoulder to wrist and the nearer vertical"""
     swing: float
     """radians of the forearm from upright, towards the body's left"""
+    up: bool
+    """the hand is no lower than the chest"""
     upright: bool
-    """the forearm points up, and the hand is no lower than the chest"""
+    """the same, and the forearm points up"""
     wrist: Point
     """(3,) metres, world"""
     direction: NDArray[np.float64]
@@ -84,8 +86,8 @@ def features(body: WorldBody, sensor: NDArray[np.float64]) -> Features:
     )
     extension = Quantity((hips[2] - p[ankle][2]) / leg, math.hypot(s[J["pelvis"]], s[ankle]) / leg)
     thigh = min((_thigh(p, s, side) for side in ("left", "right")), key=lambda q: _last_if_nan(q.value))
-    heights = sorted((p[joint][2], joint) for joint in _EXTENT if not math.isnan(p[joint][2]))
-    if len(heights) > len(_EXTENT) // 2:
+    heights = sorted((p[joint][2], joint) for joint in EXTENT if not math.isnan(p[joint][2]))
+    if len(heights) > len(EXTENT) // 2:
         (low, lowest), (high, highest) = heights[0], heights[-1]
         extent = Quantity(high - low, math.hypot(s[lowest], s[highest]))
     else:
@@ -144,6 +146,7 @@ def _arm(p: list[Point], s: list[float], left: list[float], side: str) -> Arm:
         Quantity(inner, math.hypot(s[elbow], s[wrist]) / max(min(upper, lower), 0.1)),
         min(from_up, math.pi - from_up),
         math.atan2(aside, forearm[2]),
+        p[wrist][2] > p[J["spine3"]][2],
         forearm[2] > 0.5 * lower and p[wrist][2] > p[J["spine3"]][2],
         p[wrist],
         along / max(float(np.linalg.norm(along)), 1e-6),

@@ -51,7 +51,7 @@ class EventSettings:
     """metres of the fingertips above the neck from which on that hand is raised"""
     raised_margin: float = 0.08
     """metres less, at which it no longer is"""
-    wave_swing: float = 0.28
+    wave_swing: float = 0.45
     """radians of the forearm, from side to side, that are a swing of a wave"""
     wave_within: float = 0.8
     """seconds in which the next swing comes; without it, the wave is over"""

@@ -24,9 +24,13 @@ class Wave:
         self._low, self._high = math.inf, -math.inf
         self._side = self._turns = self._turned_ns = 0
 
-    def update(self, stamp_ns: int, angle: float, upright: bool) -> bool:
-        """Whether it waves, with the forearm's next angle in radians to one side of upright."""
-        if not upright or math.isnan(angle):
+    def update(self, stamp_ns: int, angle: float, upright: bool, up: bool) -> bool:
+        """Whether it waves, with the forearm's next angle in radians to one side of upright.
+
+        It begins while the forearm is ``upright``, and goes on while the hand is ``up``: who waves with the whole arm
+        comes near level at each end.
+        """
+        if not (up if self._turns else upright) or math.isnan(angle):
             self._reset()
             return False
         if self._turns and stamp_ns - self._turned_ns > self._within_ns:

@@ -264,7 +264,17 @@ def test_a_value_between_both_thresholds_never_flickers() -> None:
 @pytest.mark.parametrize("course", [lambda t: 0.2 * t, lambda t: 0.1 * np.sin(9 * t), lambda t: 1.0 if t > 1 else 0.0])
 def test_a_forearm_that_does_not_swing_does_not_wave(course: Callable[[float], float]) -> None:
     wave = Wave(0.28, 0.8)
-    assert not any(wave.update(k * FRAME_NS, course(k / 30), True) for k in range(90))
+    assert not any(wave.update(k * FRAME_NS, course(k / 30), True, True) for k in range(90))
+
+
+def test_who_waves_with_the_whole_arm_begins_to_wave_once() -> None:
+    wave = Wave(0.36, 0.8)
+    angles = [1.3 * np.sin(9 * k / 30) for k in range(120)]
+    waves = [wave.update(k * FRAME_NS, angle, abs(angle) < 1.0, True) for k, angle in enumerate(angles)]
+    begun = waves.index(True)
+    assert begun < 60
+    assert all(waves[begun:])
+    assert not wave.update(120 * FRAME_NS, 0.0, False, False), "the hand is down"
 
 
 @pytest.mark.parametrize(("name", "value"), [("near", -1.0), ("hold", 61.0), ("confidence", 0.4)])

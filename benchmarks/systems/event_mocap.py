@@ -1,0 +1,244 @@
+"""How well `prior.events` tells what people do in motion capture whose names say it.
+
+A camera with a Kinect's errors films prepared clips, and the nodes' own pipelines clean what it gives.
+
+A name says what a clip holds and so what it does not: who is named as walking waves at nobody. When something begins
+is of the true motion, by the measures of `event_scenes`. What neither name nor measure decides is left out.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from scipy.spatial.transform import Rotation
+
+from steadypose.benchmarks.motion import spread
+from steadypose.benchmarks.provenance import WORLD, require_committed
+from steadypose.benchmarks.results import RESULTS, save, show
+from steadypose.benchmarks.systems.event_scenes import Label, Scene, common, lying, runs, seated
+from steadypose.benchmarks.systems.event_scoring import Score, score
+from steadypose.benchmarks.systems.events import CAMERA, DELAYS, labels_of, table_of, told_of, worlds_of
+from steadypose.msgs.types import EventKind, Hand
+from steadypose.nodes.graph.threads import one_thread
+from steadypose.prior.body.kinematics import heading
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.events.settings import EventSettings
+from steadypose.prior.mocap.clip import person_of
+from steadypose.prior.sim.camera import film
+from steadypose.prior.sim.motion import Motion
+from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
+from steadypose.prior.sim.streams import START_NS
+from steadypose.prior.timing.rate import FPS
+
+Floats = NDArray[np.float64]
+SEED, ALL = 7, "all"
+LONGEST, SHORTEST = round(15.0 * FPS), round(1.5 * FPS)
+"""frames: longer takes are cut, for people walk out of a camera's view"""
+NEAREST, FARTHEST = 2.8, 4.0
+"""metres from the camera to the middle of a scene"""
+AT_END_S = 0.5
+"""What begins so shortly before the end of a clip need not be told."""
+UP, FALL_S = 0.7, 2.0
+"""of the hips' greatest height, and seconds: who falls was up so shortly before lying"""
+ALWAYS_OPEN = {EventKind.ENTERED, EventKind.LEFT, EventKind.NEAR, EventKind.POINTS}
+"""kinds of which no name tells"""
+ACTIONS = {
+    "Bandai-Namco": (),
+    "UI-PRMD (Vicon)": (),
+    "LAFAN1": ("fallAndGetUp", "ground", "pushAndFall", "walk"),
+}
+"""that are taken of each data set; all, if none is named"""
+OPEN = {"Bandai-Namco": {EventKind.SITS}, "LAFAN1": {EventKind.SITS, EventKind.WAVES}}
+"""kinds that a data set does not decide"""
+SQUATS = ("m01", "m02", "m03", "m04")
+WAVERS = ("wave", "bye")
+QUIET = ("walk", "run", "dash", "raise")
+"""of Bandai-Namco's actions those that wave, and those that surely do not"""
+WAVE = 0.41
+"""radians out and back, that a wave is which these joints show"""
+FALLERS = ("fallAndGetUp", "pushAndFall")
+
+
+class Clip(NamedTuple):
+    """One recording, or a part of one."""
+
+    source: str
+    action: str
+    person: str
+    motion: Motion
+
+
+def mocap_clips(path: Path, measured: bool, most: int) -> list[Clip]:
+    """Clips of ``prepared.npz``: those that chose the thresholds, or the others, which measure them.
+
+    Bandai-Namco's session and LAFAN1's actor that validate the networks, and UI-PRMD's s07, chose.
+
+    Args:
+        path: of the file.
+        measured: the people that measure.
+        most: clips of each action of a data set, as many of each person.
+    """
+    with np.load(path) as data:
+        source, action, subject, split = (data[key] for key in ("source", "action", "subject", "split"))
+        start, positions, rotations, offsets = (data[k] for k in ("clip_start", "positions", "rotations", "offsets"))
+    person = np.array([person_of(*told) for told in zip(source, subject, strict=True)])
+    held = np.where(source == "UI-PRMD (Vicon)", subject == "s07", split == "val")
+    wanted = np.isin(source, list(ACTIONS)) & (held != measured)
+    # UI-PRMD's others train the networks
+    wanted &= (source != "UI-PRMD (Vicon)") | (split == "val")
+    what = np.array([told.partition(" ")[0] for told in action])
+    clips = []
+    for name, acts in ACTIONS.items():
+        for act in np.unique(what[wanted & (source == name)]):
+            if acts and act not in acts:
+                continue
+            parts = [
+                (k, slice(first, min(first + LONGEST, start[k + 1])))
+                for k in np.flatnonzero(wanted & (source == name) & (what == act))
+                for first in range(start[k], start[k + 1], LONGEST)
+                if start[k + 1] - first > SHORTEST
+            ]
+            for chosen in spread(person[[k for k, _ in parts]], most):
+                k, rows = parts[chosen]
+                turned = Rotation.from_quat(rotations[rows].reshape(-1, 4)).as_matrix().reshape(-1, 22, 3, 3)
+                contacts = np.zeros((len(turned), 8), dtype=bool)
+                root = positions[rows, 0].astype(np.float64)
+                motion = Motion(np.arange(len(turned)) / FPS, offsets[k].astype(np.float64), root, turned, contacts)
+                clips.append(Clip(name, str(act), str(person[k]), motion))
+    return clips
+
+
+def scene_of(clip: Clip, rng: np.random.Generator) -> Scene:
+    """A clip before the camera: its middle faces it about, as far off as all of it is in view."""
+    motion = _before_camera(clip.motion, rng)
+    labels = [*common(0, motion), *lying(0, motion)]
+    undecided = ALWAYS_OPEN | OPEN.get(clip.source, set())
+    if clip.action == "m05":
+        labels = [*(label for label in labels if label.kind != EventKind.STANDS), *seated(0, motion)]
+    elif clip.action in SQUATS:
+        undecided |= {EventKind.SITS, EventKind.STANDS}
+    if clip.source == "Bandai-Namco":
+        if clip.action.startswith(WAVERS):
+            labels += _waves(motion)
+        elif not clip.action.startswith(QUIET):
+            undecided |= {EventKind.WAVES}
+    if clip.action.startswith(FALLERS):
+        labels += _falls(motion)
+    last_s = float(motion.times[-1]) - AT_END_S
+    labels = [label._replace(required=label.required and label.start_s < last_s) for label in labels]
+    return Scene([motion], labels, frozenset(undecided))
+
+
+def _before_camera(motion: Motion, rng: np.random.Generator) -> Motion:
+    root = motion.root
+    low, high = root[:, :2].min(axis=0), root[:, :2].max(axis=0)
+    middle = np.append((low + high) / 2, 0.0)
+    yaw = np.pi + rng.uniform(-0.5, 0.5) - float(heading(motion.rotations[len(root) // 2, 0]))
+    turn = Rotation.from_euler("z", yaw).as_matrix()
+    rotations = motion.rotations.copy()
+    rotations[:, 0] = turn @ rotations[:, 0]
+    away = min(NEAREST + 0.3 * float(np.linalg.norm(high - low)), FARTHEST)
+    return Motion(motion.times, motion.offsets, (root - middle) @ turn.T + [away, 0.0, 0.0], rotations, motion.contacts)
+
+
+def _waves(motion: Motion) -> Iterator[Label]:
+    """Who is named as waving waves while a hand is up: from where its forearm, having come up, first turns, if it then
+    swings by as much as counts, twice. A wave of the wrist alone is none of these joints', and need not be told."""
+    p, t = motion.positions, motion.times
+    chest = p[:, J["spine3"], 2]
+    for side, hand in (("left", Hand.LEFT), ("right", Hand.RIGHT)):
+        for begin, end in runs(p[:, J[f"{side}_wrist"], 2] > chest):
+            turns = _turns(_swing(p[begin:end], side), WAVE)
+            start = begin + (turns[0] if len(turns) > 1 else 0)
+            yield Label(0, EventKind.WAVES, hand, float(t[start]), float(t[end - 1]), len(turns) > 1)
+
+
+def _swing(p: Floats, side: str) -> Floats:
+    """(T,) radians of a forearm from upright, towards the body's left, without jumps."""
+    across = [p[:, J[f"left_{joint}"], :2] - p[:, J[f"right_{joint}"], :2] for joint in ("hip", "shoulder")]
+    left = across[0] + across[1]
+    forearm = p[:, J[f"{side}_wrist"]] - p[:, J[f"{side}_elbow"]]
+    aside = (forearm[:, :2] * left).sum(axis=1) / np.linalg.norm(left, axis=1)
+    return np.unwrap(np.arctan2(aside, forearm[:, 2]))
+
+
+def _turns(angle: Floats, swing: float) -> list[int]:
+    """The extremes of (T,) from which it goes away by ``swing``, and comes to from another: not the first and last."""
+    turns, side, low, high = [], 0, 0, 0
+    for k in range(len(angle)):
+        low, high = (k if angle[k] < angle[low] else low), (k if angle[k] > angle[high] else high)
+        if side <= 0 and angle[k] > angle[low] + swing:
+            turns += [low] if side else []
+            side, low, high = 1, k, k
+        elif side >= 0 and angle[k] < angle[high] - swing:
+            turns += [high] if side else []
+            side, low, high = -1, k, k
+    return turns
+
+
+def _falls(motion: Motion) -> Iterator[Label]:
+    """Who is named as falling, and comes to lie, fell if they were on their feet shortly before."""
+    hips, t = motion.root[:, 2], motion.times
+    for label in lying(0, motion):
+        before = (t >= label.start_s - FALL_S) & (t <= label.start_s)
+        # one who lies from the start, or from soon after, may have fallen before
+        if label.start_s < FALL_S:
+            yield label._replace(kind=EventKind.FELL, required=False)
+        elif hips[before].max() > UP * hips.max():
+            yield label._replace(kind=EventKind.FELL)
+
+
+@dataclass(frozen=True)
+class Args:
+    """Events of people in motion capture."""
+
+    data: Path = Path("data/prepared.npz")
+    """as `steadypose prepare` wrote it"""
+    clips: int = 3
+    """of each action of a data set, at most"""
+    chose: bool = False
+    """the people that chose the thresholds, in place of those that measure"""
+    out: Path = RESULTS
+    """folder for the JSON file"""
+
+
+def main(args: Args) -> None:
+    """Measure, print, write."""
+    require_committed(args.out)
+    one_thread()
+    totals: dict[str, dict[EventKind, Score]] = defaultdict(lambda: defaultdict(Score))
+    by_clip: list[dict[str, Any]] = []
+    clips, noise = mocap_clips(args.data, not args.chose, args.clips), NoiseModel.load(KINECT_NOISE)
+    for number, clip in enumerate(track(clips, description="clips")):
+        placing, filming = (np.random.default_rng(s) for s in np.random.SeedSequence([SEED, number]).spawn(2))
+        scene = scene_of(clip, placing)
+        raw = film(scene.motions, CAMERA, noise, filming, clip.action, START_NS)
+        told = told_of(worlds_of(raw), scene, EventSettings())
+        for kind, found in score(told, labels_of(scene), scene.undecided).items():
+            for group in (clip.source, ALL):
+                totals[group][kind].add(found)
+            counts = {"met": found.met, "missed": found.missed, "false": found.false}
+            told_of_clip = {"action": clip.action, "person": clip.person, "kind": kind.name}
+            by_clip.append(told_of_clip | counts | {"delays_s": found.delays_s})
+    people = len({clip.person for clip in clips})
+    title = f"Events in motion capture, filmed with a Kinect's errors: {len(clips)} clips of {people} people"
+    tables = [table_of("event-mocap", title, totals[ALL], DELAYS)]
+    tables += [table_of(f"event-mocap-{name}", name, of, "") for name, of in totals.items() if name != ALL]
+    for table in tables:
+        show(table, Console())
+    depends_on = (*WORLD, "events settings")
+    print(f"wrote {save('event_mocap', sys.argv[1:], tables, {'clips': by_clip}, depends_on, args.out)}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
