@@ -158,11 +158,13 @@ def _played(
     shutil.rmtree(out, ignore_errors=True)
     settings = _settings(folder / "in", out, lossless=True)
     with running_nodes([*POSE_NODES, "recorder"], settings) as nodes:
-        due = time.monotonic() + BETWEEN_S
+        due, left_s = time.monotonic() + BETWEEN_S, FRAMES / FPS
         for topic, message in nodes.messages:
+            if topic == POSE_WORLD:
+                left_s -= 1.0 / FPS
             if topic == POSE_WORLD and not isinstance(message, Diagnostics) and message.end_of_stream:
                 break
-            if random_ and kills is not None and time.monotonic() > due:
+            if random_ and kills is not None and time.monotonic() > due and left_s > BETWEEN_S:
                 name = random_.choice([*POSE_NODES, "recorder", "prior and trajectory"])
                 with_ = random_.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGSTOP])
                 for each in name.split(" and "):
@@ -186,10 +188,12 @@ def _played(
 
 
 def _until_recorded(nodes: Running) -> None:
-    """Until the recorder has seen the end of all streams."""
+    """Until the recorder has seen the end of the last stream, or for `BACK_S`."""
+    ends = time.monotonic() + BACK_S
     for _, message in nodes.messages:
-        ended = message.values.get("ended", "") if isinstance(message, Diagnostics) else ""
-        if isinstance(message, Diagnostics) and message.node == "recorder" and ended.count("pose/") == 3:
+        if time.monotonic() > ends:
+            return
+        if isinstance(message, Diagnostics) and message.node == "recorder" and POSE_WORLD in message.values["ended"]:
             return
 
 
