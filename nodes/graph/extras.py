@@ -27,7 +27,7 @@ class Extra:
 EXTRAS: Mapping[str, Extra] = {
     "dev": Extra("the tests", ("pytest",)),
     "docs": Extra("the documentation as a site", ("mkdocs",)),
-    "export": Extra("steadypose export to .glb", ("pygltflib",)),
+    "export": Extra("steadypose export to .glb and .vrma", ("pygltflib",)),
     "foxglove": Extra("poses live in Foxglove", ("foxglove",)),
     "mocap": Extra("reading .c3d", ("ezc3d",)),
     "oak": Extra("an OAK camera as the source, and calibrating any camera", ("depthai", "cv2")),
@@ -36,6 +36,7 @@ EXTRAS: Mapping[str, Extra] = {
     "ros2-test": Extra("the tests of ROS 2", ("rclpy",)),
     "train": Extra("steadypose train, fit and evaluate", ("torch", "roma", "sklearn"), "5 GB, torch with CUDA"),
     "retarget": Extra("steadypose retarget: motion for a robot or an avatar", ("mink", "mujoco", "daqp")),
+    "vmc": Extra("avatars by the VMC protocol: steadypose run vmc", ("pythonosc",)),
     "view": Extra("the picture in the browser, and steadypose plot", ("rerun", "matplotlib")),
     "web": Extra("poses in the browser: steadypose run web", ("websockets",)),
     "webcam": Extra("a webcam as the source", ("mediapipe",)),

@@ -139,6 +139,14 @@ _NODES: dict[str, NodeDeclaration] = {
         delivery=Delivery.BEST_EFFORT,
         preflight="steadypose.nodes.sinks.retarget.settings:check_retarget",
     ),
+    "vmc": NodeDeclaration(
+        node="steadypose.nodes.sinks.vmc:VmcNode",
+        subscribes={"trajectory": (POSE_WORLD, DIAGNOSTICS), "pose_input": (DIAGNOSTICS,)},
+        section="vmc",
+        settings="steadypose.nodes.sinks.vmc:VmcSettings",
+        delivery=Delivery.BEST_EFFORT,
+        preflight="steadypose.nodes.sinks.vmc:check_vmc",
+    ),
     "viewer": NodeDeclaration(
         node="steadypose.nodes.sinks.viewer.node:ViewerNode",
         subscribes=_ALL_STREAMS,

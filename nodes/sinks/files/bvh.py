@@ -1,6 +1,8 @@
-"""BVH: centimetres, y up, the rest pose a T that faces +z, joints named as in smpl22."""
+"""BVH: centimetres, y up, the rest pose a T that faces +z."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,8 +22,8 @@ ENDS = {
 """Centimetres, x left, y up, z forward: how far head, feet and hands reach beyond their joints, of a generic adult."""
 
 
-def to_bvh(motion: BodyMotion) -> bytes:
-    """The file's contents."""
+def to_bvh(motion: BodyMotion, names: Sequence[str] = JOINTS) -> bytes:
+    """The file's contents; ``names`` of the 22 joints."""
     lines = ["HIERARCHY"]
     order: list[int] = []
 
@@ -30,7 +32,7 @@ def to_bvh(motion: BodyMotion) -> bytes:
         offset = CENTIMETRES * Y_UP @ motion.offsets[joint]
         channels = " ".join(f"{axis}rotation" for axis in ORDER)
         rows = [
-            f"{'JOINT' if joint else 'ROOT'} {JOINTS[joint]}",
+            f"{'JOINT' if joint else 'ROOT'} {names[joint]}",
             "{",
             f"\tOFFSET {_row(offset)}",
             f"\tCHANNELS 3 {channels}" if joint else f"\tCHANNELS 6 Xposition Yposition Zposition {channels}",

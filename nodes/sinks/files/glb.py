@@ -1,12 +1,15 @@
 """GLB (glTF 2.0): an animated skeleton with a skin of one octahedron a bone, in metres, y up, facing +z.
 
-Joints are nodes named as in smpl22, their rotations an animation, so that Blender, Unity, Unreal and browsers have
-bones to retarget; the skin is there to be seen.
+Joints are nodes, their rotations an animation, so that Blender, Unity, Unreal and browsers have bones to retarget; the
+skin is there to be seen. A VRM animation (.vrma) is the same file with the pose at rest in its nodes, and an extension
+that says which node is which bone of a humanoid (VRMC_vrm_animation 1.0).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import count
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +36,7 @@ from pygltflib import (
 )
 
 from steadypose.nodes.sinks.files.motion import Y_UP, BodyMotion
+from steadypose.prior.body.avatars import VRM
 from steadypose.prior.body.skeleton import CHILDREN, JOINTS, PARENTS
 
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
@@ -42,8 +46,17 @@ WAIST, WIDTH = 0.2, 0.08
 """Of a bone: where its octahedron is widest, and half how wide, as Blender draws them."""
 
 
-def to_glb(motion: BodyMotion) -> bytes:
-    """The file's contents."""
+def to_glb(motion: BodyMotion, names: Sequence[str] = JOINTS) -> bytes:
+    """The file's contents; ``names`` of the 22 joints."""
+    return _file(motion, names, at_rest=False)
+
+
+def to_vrma(motion: BodyMotion) -> bytes:
+    """The contents of a VRM animation, which plays on any VRM avatar."""
+    return _file(motion, VRM, at_rest=True)
+
+
+def _file(motion: BodyMotion, names: Sequence[str], at_rest: bool) -> bytes:
     file = _Glb()
     offsets = motion.offsets @ Y_UP.T
     rest = np.zeros((22, 3))
@@ -51,9 +64,11 @@ def to_glb(motion: BodyMotion) -> bytes:
         rest[joint] = rest[parent] + offsets[joint]
     root = motion.root @ Y_UP.T
     turns = motion.rotations[..., [1, 2, 0, 3]]  # the turn of axes exchanges them, and a rotation's vector with them
+    start = np.tile([0.0, 0.0, 0.0, 1.0], (22, 1)) if at_rest else turns[0]
+    place = np.array([0.0, -rest[:, 1].min(), 0.0]) if at_rest else root[0]
     nodes = [
         Node(name=name, translation=at.tolist(), rotation=turn.tolist(), children=list(children))
-        for name, at, turn, children in zip(JOINTS, [root[0], *offsets[1:]], turns[0], CHILDREN, strict=True)
+        for name, at, turn, children in zip(names, [place, *offsets[1:]], start, CHILDREN, strict=True)
     ]  # fmt: skip
     bind = np.tile(np.eye(4), (22, 1, 1))
     bind[:, :3, 3] = -rest
@@ -77,8 +92,14 @@ def to_glb(motion: BodyMotion) -> bytes:
     )
     return file.finish(GLTF2(
         scene=0, scenes=[Scene(nodes=[0, 22])], nodes=[*nodes, Node(name="body", mesh=0, skin=0)], meshes=[mesh],
-        skins=[skin], animations=[animation],
+        skins=[skin], animations=[animation], **(_humanoid(names) if at_rest else {}),
     ))  # fmt: skip
+
+
+def _humanoid(names: Sequence[str]) -> dict[str, Any]:
+    bones = {name: {"node": joint} for joint, name in enumerate(names)}
+    vrma = {"specVersion": "1.0", "humanoid": {"humanBones": bones}}
+    return {"extensionsUsed": ["VRMC_vrm_animation"], "extensions": {"VRMC_vrm_animation": vrma}}
 
 
 class _Glb:

@@ -196,8 +196,53 @@ def test_the_command_writes_each_format_and_says_what_it_cannot(
         assert main(["export", str(source), str(tmp_path / f"take{suffix}")]) == 2
         assert "--force" in capsys.readouterr().err
     assert main(["export", str(source), str(tmp_path / "take.fbx")]) == 2
-    assert ".bvh, .glb, .csv, .trc" in capsys.readouterr().err
+    assert ".bvh, .glb, .vrma, .csv, .trc" in capsys.readouterr().err
     np.savez(tmp_path / "raw.npz", positions=np.zeros((3, 22, 3)), fps=30.0)
     assert main(["export", str(tmp_path / "raw.npz"), str(tmp_path / "raw.bvh")]) == 2
     assert "clean it first" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["clean.npz", "raw.npz", "take.bvh", "take.glb"]
+
+
+def test_a_vrm_animation_rests_in_a_t_and_names_its_humanoid(tmp_path: Path, motion: BodyMotion) -> None:
+    source = npz(tmp_path / "in.npz", motion, Rotation.identity())
+    assert main(["export", str(source), str(tmp_path / "take.vrma")]) == 0
+    file = GLTF2().load_binary(str(tmp_path / "take.vrma"))
+    assert file is not None
+    assert file.extensions is not None
+    bones = file.extensions["VRMC_vrm_animation"]["humanoid"]["humanBones"]
+    assert file.extensionsUsed == ["VRMC_vrm_animation"]
+    required = {"hips", "spine", "head", "leftUpperArm", "leftLowerArm", "leftHand", "rightUpperLeg", "rightFoot"}
+    assert required < bones.keys()
+    assert file.nodes[bones["leftLowerArm"]["node"]].name == "leftLowerArm"
+    assert all(file.nodes[bone["node"]].rotation == [0.0, 0.0, 0.0, 1.0] for bone in bones.values())
+    upper, lower = (file.nodes[bones[name]["node"]].translation for name in ("leftUpperArm", "leftLowerArm"))
+    assert upper[0] > 0.05, "the left is at +x, for a body that faces +z"
+    assert lower[0] > 5 * abs(lower[1]), "arms are stretched out sideways"
+    assert file.nodes[bones["hips"]["node"]].translation[1] == pytest.approx(0.95, abs=0.15)
+
+
+@pytest.mark.parametrize(("names", "elbow"), [("vrm", "leftLowerArm"), ("mixamo", "mixamorig:LeftForeArm")])
+def test_joints_have_the_names_of_the_rig_that_is_asked_for(
+    tmp_path: Path, motion: BodyMotion, names: str, elbow: str
+) -> None:
+    source = npz(tmp_path / "in.npz", motion, Rotation.identity())
+    for out in ("take.bvh", "take.glb"):
+        assert main(["export", str(source), str(tmp_path / out), "--names", names]) == 0
+    found = bvhio.readAsHierarchy(str(tmp_path / "take.bvh"))
+    assert elbow in {joint.Name for joint, _, _ in found.layout()}
+    file = GLTF2().load_binary(str(tmp_path / "take.glb"))
+    assert file is not None
+    assert elbow in {node.name for node in file.nodes}
+    if names == "mixamo":  # and they are read again, as any rig of that kind
+        read = read_file("take.bvh", (tmp_path / "take.bvh").read_bytes())
+        ahead_is_y = motion.positions[..., [1, 0, 2]] * (1.0, -1.0, 1.0)
+        off = np.linalg.norm(read.positions - ahead_is_y, axis=-1).max(axis=0)
+        assert {JOINTS[joint] for joint in np.flatnonzero(off > 1e-6)} <= {"left_collar", "right_collar"}, (
+            "whose place in other rigs is that of SMPL"
+        )
+
+
+def test_names_are_for_skeletons_alone(tmp_path: Path, motion: BodyMotion, capsys: pytest.CaptureFixture[str]) -> None:
+    source = npz(tmp_path / "in.npz", motion, Rotation.identity())
+    assert main(["export", str(source), str(tmp_path / "take.csv"), "--names", "vrm"]) == 2
+    assert "expected OUT to end in .bvh or .glb, got .csv" in capsys.readouterr().err

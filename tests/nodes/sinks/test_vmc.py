@@ -1,0 +1,85 @@
+"""The VMC sink: what a program that plays an avatar receives, decoded by the OSC library, gives the body back."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from conftest import repeated, running
+from scipy.spatial.transform import Rotation
+
+from steadypose.msgs.topics import POSE_WORLD
+from steadypose.msgs.transport import Publisher
+from steadypose.msgs.types import PoseWorld
+from steadypose.nodes.graph.launch import Launch, bundled
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.prior.body.skeleton import PARENTS, J
+from steadypose.prior.sim.streams import make, read_manifest
+
+pytest.importorskip("pythonosc", reason="the extra 'vmc' is not installed")
+
+from pythonosc.osc_bundle import OscBundle
+from pythonosc.osc_message import OscMessage
+
+from steadypose.nodes.sinks.vmc import BONES, VmcNode, VmcSettings, datagrams
+
+
+def worlds(name: str) -> list[PoseWorld]:
+    return make(read_manifest(bundled("sim_data", "manifest.json"))[name])[1]
+
+
+def messages(bundles: list[bytes]) -> list[tuple[str, list[object]]]:
+    contents = [content for data in bundles for content in OscBundle(data)]
+    assert all(isinstance(content, OscMessage) for content in contents)
+    return [(content.address, list(content.params)) for content in contents if isinstance(content, OscMessage)]
+
+
+def test_the_bones_give_the_body_back_in_unitys_axes() -> None:
+    body = worlds("walk_turn")[40].bodies[0]
+    bundles = datagrams(1.5, body)
+    assert all(len(data) < 1400 for data in bundles)
+    said = messages(bundles)
+    assert said[:3] == [
+        ("/VMC/Ext/OK", [1]), ("/VMC/Ext/T", [1.5]), ("/VMC/Ext/Root/Pos", ["root", 0, 0, 0, 0, 0, 0, 1]),
+    ]  # fmt: skip
+    bones = {params[0]: np.array(params[1:], dtype=float) for address, params in said if address.endswith("Bone/Pos")}
+    assert tuple(bones) == BONES
+    assert BONES[J["left_elbow"]] == "LeftLowerArm"
+    # as Unity places them: in left-handed axes a quaternion's product is the same
+    placed, turned = np.zeros((22, 3)), [Rotation.identity()] * 22
+    for joint, parent in enumerate(PARENTS):
+        place, turn = bones[BONES[joint]][:3], Rotation.from_quat(bones[BONES[joint]][3:])
+        placed[joint] = place if parent < 0 else placed[parent] + turned[parent].apply(place)
+        turned[joint] = turn if parent < 0 else turned[parent] * turn
+    right, up, forward = placed.T
+    np.testing.assert_allclose(np.stack([forward, -right, up], axis=1), body.positions, atol=1e-4)
+
+
+def test_nobody_is_said_too() -> None:
+    assert messages(datagrams(0.0, None)) == [("/VMC/Ext/OK", [0]), ("/VMC/Ext/T", [0.0])]
+
+
+def test_the_node_sends_to_where_it_is_told(make_launch: Callable[..., Launch]) -> None:
+    stream = worlds("idle")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(30)
+        launch = make_launch(
+            nodes='["trajectory", "vmc"]', transport__lossless="false", vmc__port=str(listener.getsockname()[1])
+        )
+        frames = iter(stream)
+        with (
+            Publisher(launch.transport.endpoint("trajectory")) as publisher,
+            running(VmcNode(launch)),
+            repeated(lambda: publisher.publish(POSE_WORLD, next(frames, stream[-1]))),
+        ):
+            said = messages([listener.recv(65536)])
+    assert said[0] == ("/VMC/Ext/OK", [1])
+
+
+@pytest.mark.parametrize(("settings", "said"), [({"host": ""}, "host"), ({"port": 0}, "1 to 65535, got 0")])
+def test_settings_that_cannot_be_are_refused(settings: dict[str, object], said: str) -> None:
+    with pytest.raises(LaunchError, match=said):
+        VmcSettings(**settings)  # pyright: ignore[reportArgumentType]
