@@ -34,13 +34,17 @@ class RecurrentDenoiser(nn.Module):
         super().__init__()
         self.delays = tuple(delays)
         self.gru = nn.GRU(7 * _JOINTS, _WIDTH, batch_first=True)
-        self.decode = nn.Linear(_WIDTH, len(self.delays) * 3 * _JOINTS)
+        seen, asked = 7 * _JOINTS * len(self.delays), 3 * _JOINTS * len(self.delays)
+        self.decode = nn.Linear(_WIDTH + seen, asked)
 
     def forward(self, held: Tensor, gone: Tensor) -> Tensor:
         moved = torch.diff(held, dim=1, prepend=held[:, :1])
         origin, turn = held[:, :, J["pelvis"], None], _headings(held)
         x = torch.cat([_SCALE * (held - origin) @ turn, 10 * _SCALE * moved @ turn, gone[..., None]], dim=-1)
-        added = self.decode(self.gru(x.flatten(2))[0]).unflatten(-1, (len(self.delays), _JOINTS, 3)) / _SCALE
+        x = x.flatten(2)
+        # the noise of a frame long seen is not for the state to remember
+        known = torch.cat([self.gru(x)[0], self.at_delay(x).flatten(2)], dim=-1)
+        added = self.decode(known).unflatten(-1, (len(self.delays), _JOINTS, 3)) / _SCALE
         return self.at_delay(held) + added @ turn[:, :, None].transpose(-1, -2)
 
     def at_delay(self, values: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from steadypose.benchmarks.motion import simulated_clips
 
 def test_it_learns_to_take_noise_off_and_no_answer_knows_more_than_its_delay() -> None:
     motion = simulated_clips(frames=45, most=20, seed=1)
-    net = recurrent.train(motion, (0, 4), steps=60, seed=0)
+    net = recurrent.train(motion, (0, 4), steps=80, seed=0)
     seen = gaussian(motion.positions[:, :3], 0.08, np.random.default_rng(0))
     newest, late = recurrent.smooth(net, seen)
     wrong = np.linalg.norm(seen - motion.positions[:, :3], axis=-1).mean()

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from conftest import VirtualClock, record, until, walk
@@ -269,7 +270,7 @@ def test_the_table_and_the_line_show_what_there_is_to_see() -> None:
 
 def test_the_table_leaves_out_what_does_not_fit_into_a_terminal() -> None:
     keys = ("latency_ms__p50", "latency_ms__p99", "compute_ms__p50", "compute_ms__p99", "delay_frames", "bodies")
-    values = dict.fromkeys((*keys, "queue", "memory_mb", "rate__pose__clean", "count__pose__clean"), "123456.7")
+    values: Any = dict.fromkeys((*keys, "queue", "memory_mb", "rate__pose__clean", "count__pose__clean"), "123456.7")
     values |= {"in__pose__raw": "7654321", "dropped__late": "321", "refused__units": "123", "delay_frames": "4"}
     latest = {message.node: message for _, message in [news("prior", **values)]}
     processes: Supervisor = Processes(*NODES)  # type: ignore[assignment]
