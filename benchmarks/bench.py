@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import Progress
 
 from steadypose.benchmarks import ours
@@ -20,13 +19,13 @@ from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_clips, prepared_set, simulated_clips
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.tuning import Tuned, search
+from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.fit.hmvae_network import MotionVAE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
 
 DELAYS = (0, 2, 4, 8)
 """Frames at 30 Hz at which methods are compared."""

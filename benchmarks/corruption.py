@@ -11,10 +11,10 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, J
 from steadypose.prior.sim.camera import segment_gap
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LIMBS: tuple[NDArray[np.intp], ...] = tuple(

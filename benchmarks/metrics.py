@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
+from steadypose.prior.arrays import Floats
 
 
 def position_error(estimate: Floats, truth: Floats) -> Floats:

@@ -13,12 +13,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.sim.motion import Motion
 from steadypose.prior.sim.scripts import SCRIPTS
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.dataset import MotionSet
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.models.root_velocity import FRAME_S
 from steadypose.prior.world.observe import FEET
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
-
-Floats = NDArray[np.float64]
 
 SEEN_FRAMES, HIDDEN_FRAMES = 36, 60
 """Frames for which the root is seen, and then hidden, in turn."""

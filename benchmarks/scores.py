@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from steadypose.benchmarks.intervals import interval
 from steadypose.benchmarks.metrics import acceleration_error, length_variation, position_error, procrustes
 from steadypose.benchmarks.results import Table
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import JOINTS, PARENTS
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 LIMBS: Mapping[str, NDArray[np.intp]] = {
     limb: np.array([j for j, name in enumerate(JOINTS) if name.rpartition("_")[2] in parts])

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from steadypose.benchmarks.baselines.kalman import smooth
-
-Floats = NDArray[np.float64]
+from steadypose.prior.arrays import Floats
 
 DENSITIES = (0.05, 0.3, 1.8, 10.0, 60.0)
 """m²/s³"""

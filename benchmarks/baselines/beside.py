@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import BONES_BETWEEN, REST_POSITIONS, J
-
-Floats = NDArray[np.float64]
 
 _ACROSS = tuple((J[f"left_{part}"], J[f"right_{part}"]) for part in ("hip", "shoulder"))
 

@@ -8,12 +8,10 @@ frame by itself: what linear correlation alone knows of a body.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import J
-
-Floats = NDArray[np.float64]
 
 RIDGE = 1e-6
 """m², added to variances along each axis: 1 mm, so that joints that a bone ties to each other can be solved for."""

@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, F
-from numpy.typing import NDArray
 
 from steadypose.benchmarks.root_drift import Way
 from steadypose.msgs.types import PoseClean
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.world.core import BodyEstimate, Scene, WorldCore
 from steadypose.prior.world.filter import JITTER_SHARE
@@ -30,8 +30,6 @@ from steadypose.prior.world.kalman import BodyNoise
 from steadypose.prior.world.observe import FEET, observe
 from steadypose.prior.world.settings import TrajectorySettings
 from steadypose.prior.world.velocity import VelocityNetwork
-
-Floats = NDArray[np.float64]
 
 LAG = 16
 """Frames."""

@@ -18,11 +18,10 @@ from steadypose.benchmarks.baselines.bank import bank
 from steadypose.benchmarks.baselines.beside import beside
 from steadypose.benchmarks.baselines.kalman import fixed_lag, smooth
 from steadypose.benchmarks.baselines.whole_body_bank import whole_body_bank
+from steadypose.prior.arrays import Floats
 from steadypose.prior.models.mixture.modes import body_covariance
 from steadypose.prior.timing.fixed_lag import OneEuroFilter
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 OFFLINE = -1
 """The delay of a method that needs the whole recording."""

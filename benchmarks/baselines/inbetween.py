@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import heading, yaw_matrix
 from steadypose.training.data.dataset import MotionSet
-
-Floats = NDArray[np.float64]
 
 InBetween = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
 """Clips (C, T, 22, 3) metres, NaN in the gap; their rotations (C, T, 22, 3, 3) and bones (C, 22, 3); to the rotations

@@ -11,11 +11,9 @@ from math import factorial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
-
-Floats = NDArray[np.float64]
 
 _UNKNOWN = (1e3, 1.0, 5.0)
 """Standard deviations of a joint never seen: metres, m/s, m/s²."""

@@ -12,18 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from sklearn.linear_model import Ridge
 from torch import Tensor, nn
 
 from steadypose.benchmarks.baselines.kalman import fixed_lag
 from steadypose.benchmarks.metrics import body_frame
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 _FRAMES, _MAX_AHEAD = 24, 4
 _BATCH = 128

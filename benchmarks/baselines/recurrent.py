@@ -11,15 +11,13 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from steadypose.benchmarks.baselines.filters import hold_last, missing
 from steadypose.benchmarks.baselines.smoothnet import spoil
 from steadypose.benchmarks.motion import MotionClips
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, J
-
-Floats = NDArray[np.float64]
 
 _WIDTH = 256
 _SCALE = 5.0  # a metre in the network's unit

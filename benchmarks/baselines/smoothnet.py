@@ -12,14 +12,12 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from steadypose.benchmarks.baselines.filters import hold_last, missing
 from steadypose.benchmarks.corruption import LIMBS, correlated, gaussian, hide, spiked
 from steadypose.benchmarks.motion import MotionClips
-
-Floats = NDArray[np.float64]
+from steadypose.prior.arrays import Floats
 
 WINDOW = 32
 """Frames."""

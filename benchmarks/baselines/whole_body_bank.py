@@ -10,8 +10,8 @@ the product falls back to.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
     EXPERTS,
@@ -23,8 +23,6 @@ from steadypose.prior.models.mixture.bank import (
 from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
 from steadypose.prior.models.mixture.modes import body_covariance
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 
 def whole_body_bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:

@@ -15,7 +15,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.benchmarks import ours
 from steadypose.benchmarks.baselines.filters import missing
@@ -29,6 +28,7 @@ from steadypose.benchmarks.scores import score
 from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 from steadypose.benchmarks.studies.spoiled import Condition
 from steadypose.benchmarks.studies.world import chain, measure
+from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.denoise import DenoiseSettings
 from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.gate import GateSettings
@@ -41,8 +41,6 @@ from steadypose.prior.clean.score import ScoreSettings
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = tuple(dict.fromkeys((*VARIANTS, *WORLD)))
 

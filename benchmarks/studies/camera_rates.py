@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from steadypose.benchmarks.baselines.filters import FILTERS, OFFLINE, Peer, missing
@@ -20,9 +19,8 @@ from steadypose.benchmarks.corruption import gaussian
 from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.scores import figures, pivot, score
+from steadypose.prior.arrays import Floats
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = CLEAN
 

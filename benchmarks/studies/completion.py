@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from steadypose.benchmarks.baselines.conditional_gaussian import ConditionalGaussian
 from steadypose.benchmarks.baselines.inbetween import NearestPose
@@ -21,6 +20,7 @@ from steadypose.benchmarks.intervals import ratio
 from steadypose.benchmarks.motion import as_set, prepared_set
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import ends_mm
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import heading
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.complete.body import Fill, complete
@@ -32,8 +32,6 @@ from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig
 from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tracks
 from steadypose.training.data.hgvae_windows import standardise
 from steadypose.training.networks.hgvae import HGVAE
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = ("completer weights", "hgvae weights")
 

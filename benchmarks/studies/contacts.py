@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 
 from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.results import Table
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, REST_HEIGHT, REST_SPEED, label_contacts
 from steadypose.prior.body.skeleton import J, finite_joints
 from steadypose.prior.models.contacts import LiveContacts, contact_features
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 DEPENDS_ON = ("mixture weights", "contacts weights")
 

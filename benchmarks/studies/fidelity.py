@@ -26,10 +26,9 @@ from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import pivot
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = CLEAN
 

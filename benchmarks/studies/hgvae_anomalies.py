@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from matplotlib import color_sequences
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score, roc_curve
 
 from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.studies.hgvae_common import Data
 from steadypose.benchmarks.studies.hgvae_faults import FAULTS, HELD, held
+from steadypose.prior.arrays import Floats
 from steadypose.prior.models.hgvae.anomaly import Calibration, decimals
 from steadypose.prior.models.hgvae.features import to_tracks
 from steadypose.training.data.corruption import with_sensor_error
@@ -23,8 +23,6 @@ from steadypose.training.data.hgvae_windows import Windows, standardise
 from steadypose.training.networks.hgvae import HGVAE
 from steadypose.training.networks.hgvae_faults import FaultNet, load_fault_net
 from steadypose.training.recipes.hgvae_faults import Scored, score_windows
-
-Floats = NDArray[np.float64]
 
 SENSORS = {"motion capture, 3 mm": 0.003, "camera, 20 mm": 0.02}
 RATES = (0.05, 0.01)

@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, limbs
 
-Floats = NDArray[np.float64]
 Fault = Callable[[Floats, np.random.Generator], tuple[Floats, NDArray[np.bool_]]]
 """From clean windows (B, T, 22, 3) to corrupted ones, and which of them (B,) contain the fault."""
 

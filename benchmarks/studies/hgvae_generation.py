@@ -16,14 +16,13 @@ from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.studies import hgvae_models as models
 from steadypose.benchmarks.studies.hgvae_common import Data
 from steadypose.msgs.types import JOINTS
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.features import to_tracks
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.data.hgvae_windows import Windows, standardise
 from steadypose.training.networks.hgvae import HGVAE
-
-Floats = NDArray[np.float64]
 
 
 def generation(bench: Bench, data: Data) -> Result:

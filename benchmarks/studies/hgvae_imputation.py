@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from steadypose.benchmarks.corruption import LIMBS
+from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.frame import BodyWindows
 from steadypose.prior.clean.impute import ImputeSettings, LatentAscent, completed_tracks
 from steadypose.prior.models.hgvae.config import SCALE
@@ -26,7 +27,6 @@ from steadypose.training.data.hgvae_windows import Batch, Windows, standardise
 from steadypose.training.networks.hgvae import HGVAE
 from steadypose.training.weights import arrays_of
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FEATURES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.5)

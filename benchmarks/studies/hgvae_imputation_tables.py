@@ -9,7 +9,6 @@ import torch
 from cycler import cycler
 from matplotlib import color_sequences
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.results import Table
@@ -18,8 +17,6 @@ from steadypose.benchmarks.studies.hgvae_common import NAMES, Data
 from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.training.data.hgvae_windows import Windows, standardise
 from steadypose.training.networks.hgvae import HGVAE
-
-Floats = NDArray[np.float64]
 
 
 def sweep(bench: Bench, found: dict[str, HGVAE], data: Data) -> Result:

@@ -32,10 +32,9 @@ from steadypose.benchmarks.studies.spoiled import (
     reliability_bins,
     run_conditions,
 )
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = VARIANTS
 

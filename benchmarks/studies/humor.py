@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.benchmarks import figures, ours
 from steadypose.benchmarks.baselines.bank import bank
@@ -34,12 +33,12 @@ from steadypose.benchmarks.studies.humor_fits import (
 )
 from steadypose.benchmarks.studies.humor_models import MVAE, SHIPS, VARIANTS, model_of
 from steadypose.benchmarks.studies.humor_prediction import SAMPLES, predict, stand_still
+from steadypose.prior.arrays import Floats
 from steadypose.prior.fit.solve import FitSettings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = (*CLEAN, "humor weights", "offline settings")
 

@@ -15,6 +15,7 @@ from steadypose.benchmarks.metrics import acceleration_error, position_error
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.nodes.commands.fitting import noise_of
 from steadypose.nodes.commands.key_points import track_of_picture
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import LOAD_SPEED, REST_HEIGHT, label_contacts
@@ -26,8 +27,6 @@ from steadypose.prior.fit.solve import PICTURES, FitSettings, Start, fit_window
 from steadypose.prior.fit.windows import Track, load_of
 from steadypose.prior.sim.depth import Stereo, render, spoil
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 NOISE, HIDDEN_BELOW = 0.04, 0.9
 """Metres: HuMoR's noise of joints, and the height below which nothing is seen."""

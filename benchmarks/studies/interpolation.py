@@ -22,6 +22,7 @@ from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.metrics import contact_speed, npss, quaternion_distance
 from steadypose.benchmarks.motion import MotionClips, as_set, prepared_set
 from steadypose.benchmarks.results import Table
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, global_rotations, heading, quaternions, yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, J
@@ -32,8 +33,6 @@ from steadypose.prior.fit.optimise import Optimiser
 from steadypose.prior.models.completer.inference import LiveCompleter
 from steadypose.prior.models.root_velocity import LiveRootVelocity
 from steadypose.training.data.dataset import MotionSet
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = ("completer weights", "trajectory weights", "hmvae64 weights")
 

@@ -17,9 +17,10 @@ from steadypose.benchmarks.baselines.filters import FILTERS, Peer
 from steadypose.benchmarks.bench import Bench, tune
 from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.motion import digest
-from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED, Clip, Floats, side_by_side
+from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED, Clip, side_by_side
 from steadypose.benchmarks.studies.kinect_scoring import quick_score
 from steadypose.benchmarks.tuning import Tuned, loss
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.correct import CorrectSettings

@@ -23,7 +23,8 @@ from steadypose.benchmarks.metrics import (
     position_error,
     sigma_ratio,
 )
-from steadypose.benchmarks.studies.kinect_clips import BONES, OUT_OF_STEP, SCORED, Clip, Floats
+from steadypose.benchmarks.studies.kinect_clips import BONES, OUT_OF_STEP, SCORED, Clip
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 
 OFF = 0.10

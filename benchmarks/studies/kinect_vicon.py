@@ -30,7 +30,7 @@ from steadypose.benchmarks.bench import Bench, Result, over_seeds, tuning_log
 from steadypose.benchmarks.metrics import bootstrap_ratio, length_variation, position_error, reliability
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Table
-from steadypose.benchmarks.studies.kinect_clips import BONES, OUT_OF_STEP, SCORED, SUBJECTS, Clip, Floats, read_clips
+from steadypose.benchmarks.studies.kinect_clips import BONES, OUT_OF_STEP, SCORED, SUBJECTS, Clip, read_clips
 from steadypose.benchmarks.studies.kinect_methods import KNOWN, TCN, UNKNOWN, Kinect, Method, Stated
 from steadypose.benchmarks.studies.kinect_scoring import (
     Scores,
@@ -43,6 +43,7 @@ from steadypose.benchmarks.studies.kinect_scoring import (
     summary,
 )
 from steadypose.benchmarks.tuning import loss
+from steadypose.prior.arrays import Floats
 from steadypose.prior.timing.rate import FPS
 
 DEPENDS_ON = CLEAN

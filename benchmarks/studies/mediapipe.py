@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.benchmarks.baselines.filters import FILTERS, Peer
 from steadypose.benchmarks.bench import Answer, Bench, Methods, Result, answers, tune, tuning_log
@@ -22,12 +21,11 @@ from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.scores import pivot
 from steadypose.benchmarks.studies.kinect_clips import side_by_side
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import BLAZEPOSE33, to_canonical
 from steadypose.prior.body.skeleton import HIPS
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = CLEAN
 

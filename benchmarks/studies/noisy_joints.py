@@ -9,7 +9,6 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.benchmarks import figures
 from steadypose.benchmarks.baselines.filters import FILTERS
@@ -25,8 +24,7 @@ from steadypose.benchmarks.studies.spoiled import (
     reliability_bins,
     run_conditions,
 )
-
-Floats = NDArray[np.float64]
+from steadypose.prior.arrays import Floats
 
 DEPENDS_ON = VARIANTS
 

@@ -15,18 +15,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from steadypose.benchmarks.baselines import window_vaes
 from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import figures, score
+from steadypose.prior.arrays import Floats
 from steadypose.prior.fit.hmvae_network import HMVAE, MotionVAE
 from steadypose.prior.fit.torch_kinematics import forward_kinematics, from_6d, remove_heading, to_6d
 from steadypose.prior.fit.torch_weights import load_network
 from steadypose.prior.models.hmvae.config import HMVAEConfig
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = ("hmvae weights", "hmvae64 weights")
 

@@ -18,7 +18,6 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks import ours
@@ -32,6 +31,7 @@ from steadypose.benchmarks.studies.rotations_baselines import Baseline, baseline
 from steadypose.benchmarks.studies.rotations_bundled import root_errors
 from steadypose.benchmarks.studies.rotations_scoring import align, angle, score, spread, wrapped
 from steadypose.benchmarks.studies.rotations_truth import SCORED, SKIPPED, read
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import global_rotations, heading, rotation_matrices
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.orient import OrientSettings
@@ -39,8 +39,6 @@ from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.models.posture.root import RootCovariance
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.ui_prmd import VALIDATION_SUBJECTS, load_pairs
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = VARIANTS
 

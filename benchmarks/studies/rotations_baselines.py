@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.corruption import gaussian
 from steadypose.benchmarks.motion import MotionClips
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import REST_POSITIONS, TRUNK
 from steadypose.prior.models.posture.inference import trunk_frame
-
-Floats = NDArray[np.float64]
 
 RIDGE, NOISE = 1e-3, 0.02
 """Of standardised features, a frame; and metres along an axis, of the noise that the ridge regression is fitted in."""

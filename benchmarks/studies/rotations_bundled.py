@@ -6,18 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.studies.rotations_scoring import angle, spread, tilt_between, wrapped
 from steadypose.msgs.types import PoseRaw, PoseWorld
 from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import heading, quaternion_product, rotation_matrix
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 STREAMS = ROOT / "sim_data"
 

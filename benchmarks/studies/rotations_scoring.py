@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.benchmarks.studies.rotations_truth import SCORED
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import heading
 from steadypose.prior.body.skeleton import CHILDREN, JOINTS, REST_OFFSETS, J
-
-Floats = NDArray[np.float64]
 
 _BALLS = [SCORED.index(J[name]) for name in ("left_hip", "right_hip", "left_shoulder", "right_shoulder")]
 STRAIGHT, BENT = np.radians((10.0, 30.0))

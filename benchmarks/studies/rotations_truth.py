@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import to_canonical
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.mocap.bvh import Bvh
@@ -17,8 +18,6 @@ from steadypose.prior.mocap.clip import Y_UP_TO_Z_UP, forward
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.datasets import bvh_motion, members
 from steadypose.training.data.prepare import find_faults, resample
-
-Floats = NDArray[np.float64]
 
 FRAMES, SKIPPED = 240, 60
 """Frames of a clip, and how many of them, at its start, are not scored: a filter is not judged by how it begins."""

@@ -17,8 +17,8 @@ from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import Scores, figures, pivot, score
+from steadypose.prior.arrays import Floats
 
-Floats = NDArray[np.float64]
 Condition = Callable[[Floats, np.random.Generator], Floats]
 """Truth (T, C, 22, 3) to what is seen of it."""
 

@@ -24,9 +24,8 @@ from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.provenance import VARIANTS
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import figures, score
+from steadypose.prior.arrays import Floats
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = VARIANTS
 

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import roma
 import torch
-from numpy.typing import NDArray
 
 from steadypose.benchmarks import ours
 from steadypose.benchmarks.baselines.filters import FILTERS, OFFLINE, Peer, missing
@@ -28,6 +27,7 @@ from steadypose.benchmarks.provenance import WORLD
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.root_drift import METHODS, Clip, Method, evaluate_fusion
 from steadypose.benchmarks.scores import ends_mm, figures, score
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.body.skeleton import JOINTS, limbs
 from steadypose.prior.clean.pipeline import PriorPipeline
@@ -35,8 +35,6 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.prior.world.observe import FEET, SOLE
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = (*WORLD, "hmvae weights")
 

@@ -15,7 +15,6 @@ from typing import Any
 import cv2
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from scipy.spatial.transform import Rotation
@@ -23,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from steadypose.benchmarks.provenance import require_committed
 from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.msgs.types import Pose
+from steadypose.prior.arrays import Floats
 from steadypose.prior.camera.calibration import (
     Board,
     Corners,
@@ -32,8 +32,6 @@ from steadypose.prior.camera.calibration import (
     find_corners,
     floor_pose,
 )
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = ()
 

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from scipy.spatial.transform import Rotation
@@ -30,6 +29,7 @@ from steadypose.benchmarks.systems.event_scoring import Score, score
 from steadypose.benchmarks.systems.events import CAMERA, DELAYS, labels_of, table_of, told_of, worlds_of
 from steadypose.msgs.types import EventKind, Hand
 from steadypose.nodes.graph.threads import one_thread
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import heading
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.events.settings import EventSettings
@@ -40,7 +40,6 @@ from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.streams import START_NS
 from steadypose.prior.timing.rate import FPS
 
-Floats = NDArray[np.float64]
 SEED, ALL = 7, "all"
 LONGEST, SHORTEST = round(15.0 * FPS), round(1.5 * FPS)
 """frames: longer takes are cut, for people walk out of a camera's view"""

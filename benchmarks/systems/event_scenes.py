@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import EventKind, Hand
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.events.features import EXTENT, HAND
 from steadypose.prior.events.settings import EventSettings
@@ -25,7 +26,6 @@ from steadypose.prior.sim.motion import SIGN, ArmAction, Intent, Motion, perform
 from steadypose.prior.sim.scripts import SCRIPTS
 from steadypose.prior.sim.timing import minimum_jerk
 
-Floats = NDArray[np.float64]
 DOUBT = 0.05
 """metres, or radians, beyond a threshold, up to which it need not be told that it was crossed"""
 SHORTEST_S = 0.25

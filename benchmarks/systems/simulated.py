@@ -30,6 +30,7 @@ from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sources.recording import RecordingSource
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import PARENTS, J
@@ -38,8 +39,6 @@ from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
-
-Floats = NDArray[np.float64]
 
 DEPENDS_ON = WORLD
 

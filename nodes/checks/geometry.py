@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.checks.window import tracks
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.likeness import Likeness, Stance, likeness, likenesses, medians, stance
 from steadypose.prior.body.skeleton import J
@@ -30,8 +31,6 @@ FASTEST = 8.0
 AT_ORIGIN_M = 1e-3
 FLOOR_M = (-0.4, 0.7)
 """height of the lowest joint of a leg: a pit, or a stage, is more"""
-
-Floats = NDArray[np.float64]
 
 
 def check_geometry(messages: Sequence[PoseRaw]) -> Iterator[Problem]:

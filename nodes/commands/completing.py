@@ -28,6 +28,7 @@ from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sources.recording import NO_RIG, open_recording, with_end
 from steadypose.nodes.sources.source import RecordedSource
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.kinematics import quaternions, rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
@@ -41,8 +42,6 @@ from steadypose.prior.models.root_velocity import LiveRootVelocity
 from steadypose.prior.timing.resample import PERIOD_NS
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
-
-Floats = NDArray[np.float64]
 
 APART_NS = 8_000_000_000
 """A longer gap without any observation of a body is not filled: a new stretch begins."""

@@ -32,11 +32,10 @@ from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.npz import NpzError, read_arrays
 from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.arrays import Floats
 
 if TYPE_CHECKING:
     from steadypose.prior.fit.windows import FittedTrack
-
-Floats = NDArray[np.float64]
 
 
 def fit(

@@ -18,13 +18,12 @@ from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sources.npz import NpzError
 from steadypose.nodes.sources.source import RecordedSource
+from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.adapt import SensorFrame
 
 if TYPE_CHECKING:
     from steadypose.prior.fit.humor_network import HumorNet
     from steadypose.prior.fit.windows import FittedTrack
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import CleanBody, JointState, Message, PoseClean, PoseWorld, WorldBody
 from steadypose.nodes.graph.clock import FRAME_NS
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import REST_HEIGHT, quaternions
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from steadypose.prior.fit.solve import FitSettings
     from steadypose.prior.fit.windows import FittedTrack, Track
 
-Floats = NDArray[np.float64]
 
 MIN_SIGMA = 0.01
 """Metres: no sensor means the joints that our bones end in to less."""

@@ -21,6 +21,7 @@ from steadypose.msgs.types import JOINTS, JointState, Pose
 from steadypose.nodes.driving import clean_arrays
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.sources.npz import ArraySource, NpzError, read_arrays, read_stamps
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import quaternions, rotation_matrix
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from steadypose.prior.fit.solve import FitSettings, Start
     from steadypose.prior.fit.windows import FittedTrack, Track
 
-Floats = NDArray[np.float64]
 
 PIXEL_SIGMA = 0.01
 """Of the focal length: what a key point is off by in the picture."""

@@ -7,16 +7,15 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.nodes.ros2.definitions import stamp_ns
+from steadypose.prior.arrays import Floats
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 CACHE_NS = 10_000_000_000
 """for how long transforms are kept, as tf2 does"""
-Floats = NDArray[np.float64]
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 Moment = tuple[int, Floats, Floats]
 """stamp, translation (3,) metres and quaternion (4,) xyzw, from the child's frame to the parent's"""

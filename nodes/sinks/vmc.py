@@ -6,7 +6,6 @@ import socket
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.msgs.types import Message, PoseWorld, Tracking, WorldBody
 from steadypose.nodes.graph.clock import Clock
@@ -14,11 +13,10 @@ from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.settings import LaunchError
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.avatars import VRM
 from steadypose.prior.body.kinematics import global_rotations, rotation_matrices
 from steadypose.prior.body.skeleton import PARENTS
-
-Floats = NDArray[np.float64]
 
 BONES = tuple(name[0].upper() + name[1:] for name in VRM)
 """(22,) as the protocol and Unity call them"""

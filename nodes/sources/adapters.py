@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import AZURE_KINECT32, BLAZEPOSE33, COCO17, ZED38, Skeleton
 from steadypose.prior.body.skeleton import finite_joints
-
-Floats = NDArray[np.float64]
 
 ZED_BODY_38 = 2
 """``body_format`` of ZED's ROS message for the skeleton of 38 key points"""

@@ -15,17 +15,15 @@ from pathlib import Path
 
 import depthai as dai
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.msgs.types import PoseRaw, RawBody
 from steadypose.nodes.graph.clock import POLL_S, Clock
 from steadypose.nodes.sources.camera import CameraError, count_failure
 from steadypose.nodes.sources.camera_settings import OakSettings
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.camera.depth_lifting import lift
 from steadypose.prior.camera.gravity import GravityEstimator
-
-Floats = NDArray[np.float64]
 
 FRAME_ID = "oak_rgb_camera_optical_frame"
 MODELS = {

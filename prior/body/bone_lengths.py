@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import global_rotations
 from steadypose.prior.body.skeleton import (
@@ -20,8 +21,6 @@ from steadypose.prior.body.skeleton import (
     J,
     finite_joints,
 )
-
-Floats = NDArray[np.float64]
 
 STATURE_SPREAD = 0.1
 """Standard deviation of the log of a person's size against the generic adult's."""

@@ -11,10 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import CHILDREN, COLLARS, HIPS, PARENT, PARENTS, SHOULDERS, J, finite_joints
 from steadypose.prior.compiled import njit
-
-Floats = NDArray[np.float64]
 
 # What shows the frame of pelvis and chest, best first: a left-right pair, and a place above, the middle of two joints.
 _RIGID_PARTS = np.array([J["pelvis"], J["spine3"]])

@@ -12,10 +12,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
 from steadypose.prior.compiled import njit
-
-Floats = NDArray[np.float64]
 
 
 def _levels() -> list[slice]:

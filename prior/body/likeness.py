@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.skeleton import REST_POSITIONS, J, finite_joints
-
-Floats = NDArray[np.float64]
 
 _SIDE = ("shoulder-elbow", "elbow-wrist", "hip-knee", "knee-ankle")
 _SPANS = (

@@ -16,12 +16,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import Skeleton
 from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, J
 
-Floats = NDArray[np.float64]
 Mixture = Mapping[str, float]
 
 UNITS: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "CMU": 0.0254 / 0.45}

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import (
     _HINGE,
     _at,
@@ -27,8 +27,6 @@ from steadypose.prior.body.inverse_kinematics import (
 from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENT, SHOULDERS
 from steadypose.prior.compiled import njit
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 RANGE, MEMORY_S = 0.3, 0.3
 """Radians, the standard deviation of a twist that nothing shows, and seconds in which it returns to the middle."""

@@ -21,9 +21,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
+from steadypose.prior.arrays import Floats
 from steadypose.prior.camera.gravity import level_pose
 
-Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 MIN_CORNERS = 6

@@ -27,10 +27,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.compiled import njit
-
-Floats = NDArray[np.float64]
 
 MIN_CONFIDENCE = 0.3
 """of a key point that is used; below it, detectors guess"""

@@ -7,12 +7,10 @@ world's +y, as `msgs.types.Pose.from_up` has it.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
-
-Floats = NDArray[np.float64]
+from steadypose.prior.arrays import Floats
 
 GRAVITY = 9.81
 """m/s²"""

@@ -11,16 +11,14 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 PERIOD_NS = round(1e9 / FPS)
 SOURCE, FRAME_ID = "merged", "world"

@@ -11,10 +11,11 @@ import numpy as np
 
 from steadypose.msgs.contract import broken
 from steadypose.msgs.types import CleanBody, Pose, PoseClean, PoseRaw, RawBody
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import quaternions, rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, finite_joints
-from steadypose.prior.clean.frame import CleanFrame, Floats
+from steadypose.prior.clean.frame import CleanFrame
 
 MAX_DISTANCE = 30.0
 """Metres from the sensor beyond which a joint is no observation."""

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from steadypose.msgs.types import PoseClean, PoseRaw
+from steadypose.prior.arrays import Bools
 from steadypose.prior.body.layouts import Skeleton
 from steadypose.prior.clean.adapt import (
     SensorFrame,
@@ -30,7 +31,7 @@ from steadypose.prior.clean.adapt import (
     stacked,
 )
 from steadypose.prior.clean.core import CleanCore
-from steadypose.prior.clean.frame import Bools, CleanFrame, Observation, SensorNoise
+from steadypose.prior.clean.frame import CleanFrame, Observation, SensorNoise
 from steadypose.prior.clean.identify import Identify
 from steadypose.prior.clean.pipeline import BACKWARDS_NS, CATCH_UP
 from steadypose.prior.clean.sensor_pose import SensorPoseGate, Verdict

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import CHILDREN, PARENT, limbs
-from steadypose.prior.clean.frame import Bools, Floats
 from steadypose.prior.compiled import njit
 
 MIN_SHARE, MIN_DIFFERENCE, DEVIATIONS = 0.5, 0.1, 6.0

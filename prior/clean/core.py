@@ -8,19 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.clean.correct import Correct
 from steadypose.prior.clean.denoise import Denoise
-from steadypose.prior.clean.frame import (
-    Bools,
-    CleanFrame,
-    Floats,
-    Gated,
-    Imputed,
-    Observation,
-    Person,
-    Score,
-    SensorNoise,
-)
+from steadypose.prior.clean.frame import CleanFrame, Gated, Imputed, Observation, Person, Score, SensorNoise
 from steadypose.prior.clean.fuse import Fuse
 from steadypose.prior.clean.gate import Gate
 from steadypose.prior.clean.history import History

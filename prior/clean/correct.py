@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from steadypose.prior.arrays import Bools
 from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.clean.frame import Bools, Gated
+from steadypose.prior.clean.frame import Gated
 from steadypose.prior.models.sensor_bias import HISTORY, SMOOTHER_DENSITY, LiveCorrection, features, recall, trunk_frame
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
 from steadypose.prior.timing.ring import Ring

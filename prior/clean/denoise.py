@@ -14,8 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import HIPS, J
-from steadypose.prior.clean.frame import BodyWindows, Bools, Floats
+from steadypose.prior.clean.frame import BodyWindows
 from steadypose.prior.clean.history import BRIEF_S, History
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.hgvae.features import from_tracks

@@ -11,12 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.models.hgvae.features import Tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE, Reconstruction
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

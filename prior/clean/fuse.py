@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import JointState
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import RIGID, fit_lengths, place_joints, solve_pose
 from steadypose.prior.body.skeleton import BONES_BETWEEN, PARENT
-from steadypose.prior.clean.frame import Bools, Estimate, Floats, Imputed, Person
+from steadypose.prior.clean.frame import Estimate, Imputed, Person
 from steadypose.prior.clean.history import BRIEF_S
 from steadypose.prior.clean.occluded import OccludedJoints
 from steadypose.prior.clean.slow_error import SlowError

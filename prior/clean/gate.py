@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import MIRROR, limbs
 from steadypose.prior.clean.bone_outliers import BoneOutliers
-from steadypose.prior.clean.frame import Bools, Floats, Gated, Observation
+from steadypose.prior.clean.frame import Gated, Observation
 from steadypose.prior.compiled import median, njit
 from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
 from steadypose.prior.timing.frozen_joints import RECENT, frozen_joints

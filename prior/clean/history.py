@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from steadypose.prior.clean.frame import Bools, Floats, Gated
+from steadypose.prior.arrays import Bools, Floats
+from steadypose.prior.clean.frame import Gated
 from steadypose.prior.timing.rate import FPS
 from steadypose.prior.timing.ring import Ring
 

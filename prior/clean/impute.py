@@ -18,7 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from steadypose.prior.clean.frame import BodyWindows, Bools, Floats, Imputed
+from steadypose.prior.arrays import Bools, Floats
+from steadypose.prior.clean.frame import BodyWindows, Imputed
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.hgvae.features import Tracks, from_tracks
 from steadypose.prior.models.hgvae.inference import Reconstruction

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import limbs
-from steadypose.prior.clean.frame import Bools, Floats
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.occlusion.candidates import FEATURES, average, describe, forget, new_past, observe
 from steadypose.prior.models.occlusion.inference import LiveOcclusion, Occluded, Weighed

@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from steadypose.prior.arrays import Bools
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import global_rotations
 from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.body.twist import follow_twist, unknown_twist
-from steadypose.prior.clean.frame import Bools, Estimate
+from steadypose.prior.clean.frame import Estimate
 from steadypose.prior.models.posture.inference import LivePosture
 
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.bone_lengths import estimate_bones
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.clean.frame import Bools, Floats, Person
+from steadypose.prior.clean.frame import Person
 from steadypose.prior.timing.fixed_lag import Smoothed
 
 

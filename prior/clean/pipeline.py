@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 
 from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
+from steadypose.prior.arrays import Bools
 from steadypose.prior.body.layouts import CANONICAL, Skeleton
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.clean.adapt import (
@@ -21,7 +22,7 @@ from steadypose.prior.clean.adapt import (
     stacked,
 )
 from steadypose.prior.clean.core import CleanCore
-from steadypose.prior.clean.frame import Bools, CleanFrame, Observation, SensorNoise
+from steadypose.prior.clean.frame import CleanFrame, Observation, SensorNoise
 from steadypose.prior.clean.identify import Identify
 from steadypose.prior.clean.sensor_pose import SensorPoseGate, Verdict
 from steadypose.prior.clean.settings import PriorSettings

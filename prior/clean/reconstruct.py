@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from steadypose.prior.clean.frame import BodyWindows, Bools, Floats, Person, SensorNoise
+from steadypose.prior.arrays import Bools, Floats
+from steadypose.prior.clean.frame import BodyWindows, Person, SensorNoise
 from steadypose.prior.clean.history import History
 from steadypose.prior.models.hgvae.features import body_size, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import heading, yaw_matrix
-from steadypose.prior.clean.frame import Bools, Floats, Gated, Person
+from steadypose.prior.clean.frame import Gated, Person
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.hmvae.inference import LiveHMVAE
 from steadypose.prior.timing.ring import Ring

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.clean.frame import BodyWindows, Bools, Floats, Score
+from steadypose.prior.arrays import Bools, Floats
+from steadypose.prior.clean.frame import BodyWindows, Score
 from steadypose.prior.models.hgvae.anomaly import SENSOR_SIGMAS, Calibration, decimals, joint_odds, pace
 from steadypose.prior.models.hgvae.live_faults import LiveFaultNet
 from steadypose.prior.timing.rate import FPS

@@ -8,9 +8,9 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.clean.adapt import Sighting
-from steadypose.prior.clean.frame import Bools, Floats
 
 MIN_JOINTS = 6
 """Least number of visible canonical joints of a new body."""

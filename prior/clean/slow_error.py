@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import RIGID
 from steadypose.prior.body.skeleton import PARENT
-from steadypose.prior.clean.frame import Bools, Floats
 from steadypose.prior.compiled import median, njit
 from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS

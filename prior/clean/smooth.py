@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from steadypose.prior.clean.frame import Bools, Gated
+from steadypose.prior.arrays import Bools
+from steadypose.prior.clean.frame import Gated
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.timing.fixed_lag import Smoothed
 

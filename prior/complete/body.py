@@ -11,15 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
 from steadypose.prior.body.skeleton import PARENTS, finite_joints
 from steadypose.prior.complete.views import AROUND, LONGEST_GAP, gaps, views
 from steadypose.prior.models.completer.features import draw_line, rotations_of_6d
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 Fill = Callable[[Floats, Floats], tuple[Floats, Floats]]
 """A completer of whole windows, such as `LiveCompleter`: positions (B, T, 22, 3), NaN where not known, and bones

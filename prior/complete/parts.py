@@ -7,9 +7,9 @@ Where some joints of a frame are known and others not, the answer lies between t
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.models.completer.inference import LiveCompleter
@@ -17,8 +17,6 @@ from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig
 from steadypose.prior.models.hgvae.features import body_size, from_tracks, hang_unseen, to_tracks
 from steadypose.prior.models.hgvae.live_completion import LiveCompletion
 from steadypose.prior.models.weights import WeightsError, load_weights, part
-
-Floats = NDArray[np.float64]
 
 SHARE = 0.8
 """Of HG-VAE's completion in the blend, by validation (benchmarks/NOTEBOOK.md)."""

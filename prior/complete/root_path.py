@@ -4,14 +4,12 @@ integrated (HM-VAE, section 3.3 and Figure 5)."""
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, heading, yaw_matrix
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 STILL_M, MOVING_M = 1e-3, 0.03
 """Metres: extent of a root below which it is the origin of its coordinates, if another joint's is above the second."""

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import finite_joints
-
-Floats = NDArray[np.float64]
 
 MIN_SIGMA = 0.002
 """Metres along an axis: the least of a joint that was given."""

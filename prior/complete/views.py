@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
+from steadypose.prior.arrays import Bools, Floats
 
 LONGEST_GAP = 64
 """Frames of the longest gap that the completer was trained on."""

@@ -9,17 +9,15 @@ point. Where no toes are seen there are two starts, of which the fit of less ene
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter, percentile_filter
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, yaw_matrix
 from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_POSITIONS, SHOULDERS, J
 from steadypose.prior.fit.observations import Pinhole
 from steadypose.prior.fit.solve import Start
 from steadypose.prior.sim.body import CAPSULES
-
-Floats = NDArray[np.float64]
 
 _BONES = [(J[a], J[b]) for side in ("left", "right") for a, b in (
     (f"{side}_hip", f"{side}_knee"), (f"{side}_knee", f"{side}_ankle"), (f"{side}_shoulder", f"{side}_elbow"),

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rotation_matrices
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.complete.parts import PartsCompleter
@@ -28,8 +29,6 @@ from steadypose.prior.models.completer.features import (
     solved_rotations,
 )
 from steadypose.prior.models.hmvae.config import HMVAEConfig
-
-Floats = NDArray[np.float64]
 
 MODEL = "hmvae64"
 """Its weights' name."""

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import PARENT, PARENTS
 from steadypose.prior.fit.humor_state import small_exp
@@ -24,8 +24,6 @@ from steadypose.prior.fit.motion import float_tensor
 from steadypose.prior.fit.torch_kinematics import forward_kinematics
 from steadypose.prior.npz import MotionError, open_npz
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 BETAS, POSES = 16, 156
 """Numbers that AMASS has of a shape; and of a pose, SMPL-H's 52 rotation vectors, of which hands are 0 here."""

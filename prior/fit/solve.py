@@ -7,11 +7,10 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.fit.energy import (
     Anchored,
     Bones,
@@ -25,8 +24,6 @@ from steadypose.prior.fit.energy import (
 )
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.motion import SCALES, Motion, Variables, float_tensor
-
-Floats = NDArray[np.float64]
 
 POSES = ("root", "orientation", "turns")
 

@@ -11,18 +11,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.fit.energy import Anchored
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.motion import Motion
 from steadypose.prior.fit.observations import Observed
 from steadypose.prior.fit.solve import FitSettings, Fitted, Start, fit_window
-
-Floats = NDArray[np.float64]
 
 FRAMES, OVERLAP = 90, 15
 """Of a window, as in the paper; and how many of them the next one begins with."""

@@ -14,8 +14,8 @@ from tempfile import NamedTemporaryFile
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.points import recognise_points
 from steadypose.prior.body.rigs import Rig, RigError, Tree, recognise, up_axis
@@ -25,8 +25,6 @@ from steadypose.prior.mocap.clip import TO_Z_UP, MotionError, documented
 from steadypose.prior.mocap.npz import read_amass
 from steadypose.prior.mocap.plug_in_gait import MARKERS, calibrate, joint_centres
 from steadypose.prior.mocap.tables import CMU_BVH
-
-Floats = NDArray[np.float64]
 
 POINT_UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "meters": 1.0, "millimeters": 0.001}
 

@@ -7,13 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.models.layers.dense import Floats as Floats32
 from steadypose.prior.models.layers.dense import dense
 from steadypose.prior.models.weights import Arrays, load_weights
-
-Floats = NDArray[np.float64]
 
 OF_JOINT = 12
 """Features of a joint: from the root (3), velocity against the root (3), height, velocity (3), deviation, known."""

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import HIPS, SHOULDERS, finite_joints
 from steadypose.prior.models.layers.compiled_graph import Network, Program
 from steadypose.prior.models.weights import Arrays, load_weights, part
-
-Floats = NDArray[np.float64]
 
 SMOOTHER_DENSITY = 1.0
 """m²/s³, of the causal smoother before the network: its answer must not jitter with its input."""

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, REST_OFFSETS, J
-
-Floats = NDArray[np.float64]
 
 REST_HEIGHT = 1.72
 """Metres: the stature that `REST_OFFSETS` stands for."""

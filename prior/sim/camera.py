@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import COLLARS, JOINTS, TRUNK, J
 from steadypose.prior.sim.body import CAPSULES, REST_HEIGHT, stature
 from steadypose.prior.sim.motion import Motion
@@ -30,8 +31,6 @@ from steadypose.prior.sim.noise import (
     travelled,
 )
 from steadypose.prior.sim.sensors import Mount, mount
-
-Floats = NDArray[np.float64]
 
 REFERENCE_RANGE = 2.6
 """Metres: the median distance at which the noise was measured."""

@@ -15,10 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.sim.body import CAPSULES, REST_HEIGHT, stature
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.sim.body import TOE_HEIGHT
 from steadypose.prior.sim.timing import minimum_jerk
-
-Floats = NDArray[np.float64]
 
 RATE = 120
 """Frames a second at which motions are made."""

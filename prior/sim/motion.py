@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, heading, yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.sim.body import TOE_HEIGHT
 from steadypose.prior.sim.gait import RATE, FootTrack, Plan, foot_track
 from steadypose.prior.sim.timing import drift
 
-Floats = NDArray[np.float64]
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 SIGN: Mapping[Side, float] = {"left": 1.0, "right": -1.0}

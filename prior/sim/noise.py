@@ -26,9 +26,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, J
-
-Floats = NDArray[np.float64]
 
 KINECT_NOISE = Path(__file__).with_name("kinect_noise.json")
 """The parameters fitted to UI-PRMD's Kinect, with their provenance."""

@@ -9,15 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.sim.body import random_offsets
 from steadypose.prior.sim.gait import RATE, Plan, Stand, Turn, Walk, plan
 from steadypose.prior.sim.motion import SIDES, SIGN, ArmAction, Intent, Motion, Side, perform
 from steadypose.prior.sim.timing import Key, minimum_jerk, track
-
-Floats = NDArray[np.float64]
 
 _FACING_CAMERA = np.pi
 

@@ -9,10 +9,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import get_skeleton
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J
-
-Floats = NDArray[np.float64]
 
 # What the canonical skeleton lacks: the joint it rides on, and metres in the rest frame (x forward, y left, z up) of
 # a person of 1.72 m. The left side and the middle; the right is the mirror image.

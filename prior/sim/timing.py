@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from steadypose.prior.arrays import Floats
 
 
 def minimum_jerk(progress: ArrayLike) -> Floats:

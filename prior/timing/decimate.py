@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 PERIODS = 7
 """Periods of which the median is a stream's."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.timing.decimate import DecimationFilter, Frame
 from steadypose.prior.timing.rate import FPS
 from steadypose.prior.timing.republished import Republished
-
-Floats = NDArray[np.float64]
 
 PERIOD_NS = round(1e9 / FPS)
 MAX_GAP_NS = 150_000_000

@@ -10,15 +10,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.msgs.contract import are_unit
 from steadypose.msgs.types import JointState, Tracking, WorldBody
+from steadypose.prior.arrays import Floats
 from steadypose.prior.world.core import BodyEstimate
 from steadypose.prior.world.legs import fit_legs, turn_legs
 from steadypose.prior.world.observe import FEET
-
-Floats = NDArray[np.float64]
 
 SWAY, MOVES = 0.015, 0.1
 """Standard deviations along an axis of the velocity of a root that sways over both feet, as in half of the training

@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.models.contacts import Contacts, LiveContacts, contact_features
 from steadypose.prior.models.root_velocity import FRAME_S
 from steadypose.prior.world.floor import Floor
 from steadypose.prior.world.observe import FEET, BodyObservation
-
-Floats = NDArray[np.float64]
 
 MOVED_SIGMAS = 3.0
 """Distance between a standing foot and where it is observed from which on it has evidently moved, standard

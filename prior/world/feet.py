@@ -14,15 +14,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.root_velocity import FRAME_S
 from steadypose.prior.world.filter import RootState
 from steadypose.prior.world.floor import UPRIGHT_M, Floor
 from steadypose.prior.world.observe import SOLE, BodyObservation
-
-Floats = NDArray[np.float64]
 
 SOLE_SIGMA: Floats = np.array([0.013, 0.006])
 """Standard deviation (2,) of the height of heels and of toes that stand, between the people of the training motion,

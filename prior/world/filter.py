@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.world.contacts import Stance
 from steadypose.prior.world.floor import SOLE_SIGMA, STANDING, Floor
@@ -16,7 +17,6 @@ from steadypose.prior.world.kalman import BodyFilter, BodyNoise
 from steadypose.prior.world.observe import FEET, SOLE, BodyObservation
 from steadypose.prior.world.velocity import RootVelocity
 
-Floats = NDArray[np.float64]
 Sigma = TypeVar("Sigma", float, NDArray[np.float64])
 
 EASE_S = 0.1

@@ -10,12 +10,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.models.root_velocity import FRAME_S
 from steadypose.prior.world.observe import BodyObservation
-
-Floats = NDArray[np.float64]
 
 SOLE_SIGMA = 0.02
 """Standard deviation of a standing foot's height above the floor, between sources and people and from stand to stand,

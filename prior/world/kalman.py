@@ -23,9 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
-
-Floats = NDArray[np.float64]
 
 _POSITION, _VELOCITY, _SENSOR, _SENSOR_RATE, _NETWORK, _FEET = 0, 1, 2, 3, 4, 5
 """Of the state. Errors are in units of their present standard deviations, their rates in those times their w."""

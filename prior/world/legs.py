@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, limbs
 from steadypose.prior.compiled import njit
-
-Floats = NDArray[np.float64]
 
 LENGTH_SIGMA = 0.025
 """Metres, how well a bone of the legs is known: measured through a sensor's slow error, or a generic adult's."""

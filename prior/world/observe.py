@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import CleanBody, JointState
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import quaternion_product, rotation_matrix
 from steadypose.prior.body.skeleton import HIPS, J
-
-Floats = NDArray[np.float64]
 
 FEET: tuple[int, ...] = tuple(J[f"{side}_{part}"] for part in ("ankle", "foot") for side in ("left", "right"))
 """Joints that may stand: heels and toes (left, right)."""

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import REST_POSITIONS
 from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity
 from steadypose.prior.world.observe import BodyObservation
-
-Floats = NDArray[np.float64]
 
 CAMERA_ERROR, CAMERA_MEMORY_S = 2.0, 0.3
 """Ratio of the velocity's error on poses from a camera to validation's on motion capture, and the least time constant

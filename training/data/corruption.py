@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J, limbs
 from steadypose.prior.timing.rate import FPS
 
-Floats = NDArray[np.float64]
 Rng = np.random.Generator
 Fault = Callable[[Floats, slice, list[int], Floats, Rng], None]
 """Puts a tracking fault into a window (T, 22, 3), in place: into some joints, in a slice of its frames. The other

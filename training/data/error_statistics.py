@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import median_filter
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR
 from steadypose.prior.sim.noise import travelled
-from steadypose.training.data.kinect_errors import SEEN, Clip, Floats, errors
+from steadypose.training.data.kinect_errors import SEEN, Clip, errors
 
 SPEED_FLOOR = 0.03
 """m/s: below it the Vicon's own noise dominates a joint's speed (UI-PRMD, training subjects)"""

@@ -10,12 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.features import body_size, hang_unseen, in_frame_of, to_tracks
 from steadypose.training.data.dataset import MotionSet, mirror_offsets
 from steadypose.training.networks.hgvae import HGVAE
-
-Floats = NDArray[np.float64]
 
 STRIDES = (1, 1, 1, 2)
 """Frame strides of training windows: every fourth is played at twice the speed, as most recordings are slow."""

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import global_rotations
@@ -21,7 +21,6 @@ from steadypose.prior.body.skeleton import JOINTS, PARENTS
 from steadypose.prior.sim.noise import NoiseModel, draw_errors, ray_axes, travelled
 from steadypose.training.data.ui_prmd import KinectPair
 
-Floats = NDArray[np.float64]
 SEEN = np.flatnonzero(KINECT22.observable)
 """(S,) the canonical joints that this Kinect gives"""
 _FAILED = ("m03", "s01")

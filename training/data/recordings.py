@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J, finite_joints
@@ -17,8 +18,6 @@ from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.training.data.datasets import DATA_SETS, DataSet, Split
 from steadypose.training.data.prepare import FPS, fill_gaps, find_faults, resample
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, load_pairs
-
-Floats = NDArray[np.float64]
 
 SPEEDS = (1.0, 1.4, 1.9, 2.5)
 """Factors by which training motion is sped up: people of the test split move faster than those recorded for

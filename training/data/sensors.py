@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.corruption import occlude
 from steadypose.training.data.recordings import Motion, Pairs
 
-Floats = NDArray[np.float64]
 Rng = np.random.Generator
 
 GATED = 0.18

@@ -18,6 +18,7 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, REST_SPEED, heading, label_contacts
 from steadypose.prior.body.skeleton import MIRROR, J
 from steadypose.prior.models.contacts import FEATURES, contact_features
@@ -29,7 +30,6 @@ from steadypose.training.loop import TrainingOptions, TrainingRun
 from steadypose.training.networks.contacts import ContactConfig, ContactNet
 from steadypose.training.weights import started
 
-Floats = NDArray[np.float64]
 Rng = np.random.Generator
 
 ITERATIONS, BATCH, LEARNING_RATE = 3_000, 64, 4e-3

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, CompletionConfig, HGVAEConfig, Level
@@ -28,8 +27,6 @@ from steadypose.training.networks.hgvae import HGVAE, HGVAEOutput
 from steadypose.training.recipes.hgvae_completion import BATCH, BONE_SIGMA, FAULTS, TURN_SIGMA, train_completion
 from steadypose.training.recipes.hgvae_faults import train_anomaly
 from steadypose.training.weights import started
-
-Floats = NDArray[np.float64]
 
 MODELS: dict[str, HGVAEConfig] = {
     "hgvae": HGVAEConfig(

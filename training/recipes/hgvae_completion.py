@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.training.data.corruption import (
     add_noise,
@@ -29,8 +29,6 @@ from steadypose.training.data.hgvae_windows import STRIDES, Batch, Windows
 from steadypose.training.loop import TrainingRun
 from steadypose.training.networks.hgvae import HGVAE
 from steadypose.training.networks.hgvae_completion import CompletionNet
-
-Floats = NDArray[np.float64]
 
 BATCH = 128
 """windows a step"""

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.fit.torch_weights import load_network
 from steadypose.prior.models.hgvae.anomaly import (
     MISSING,
@@ -55,8 +55,6 @@ from steadypose.training.loop import TrainingOptions, TrainingRun
 from steadypose.training.networks.hgvae import HGVAE
 from steadypose.training.networks.hgvae_faults import FaultNet
 from steadypose.training.weights import started
-
-Floats = NDArray[np.float64]
 
 WINDOWS = 2000
 """for each error, number of joints missing and pace, of which the rarest rate leaves a few"""

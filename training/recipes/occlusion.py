@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 from torch import Tensor
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import J, limbs
 from steadypose.prior.clean.core import CleanCore
 from steadypose.prior.clean.frame import Observation
@@ -31,8 +32,6 @@ from steadypose.training.loop import TrainingOptions, TrainingRun
 from steadypose.training.networks.occlusion import OcclusionConfig, OcclusionNet
 from steadypose.training.weights import save_weights, started
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Rng = np.random.Generator
 
 ITERATIONS, BATCH, LEARNING_RATE = 3_000, 4096, 3e-3

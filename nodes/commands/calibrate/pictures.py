@@ -13,6 +13,7 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
+from steadypose.prior.arrays import Floats
 from steadypose.prior.camera.calibration import (
     CalibrationError,
     Intrinsics,
@@ -24,7 +25,6 @@ VIDEO_STEP_S = 0.5
 """between the pictures taken from a video: nearer ones show the same again"""
 MAX_PICTURES = 60
 AXIS_PX = 4
-Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 

@@ -29,6 +29,7 @@ from steadypose.nodes.sinks.drawing import (
     bones,
     facing,
 )
+from steadypose.prior.arrays import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,8 +51,6 @@ PATH_FRAMES = 150
 """of the way over the floor that are shown"""
 SHADES = (1.0, 0.8, 0.6, 0.45, 0.3, 0.15)
 """of each colour on white, which a GIF has: few, and the same in all frames, or colours flicker"""
-
-Floats = NDArray[np.float64]
 
 
 def write_video(history: History, path: Path, body: int | None = None) -> int:

@@ -7,17 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import PoseWorld
 from steadypose.nodes.sources.npz import read_arrays, read_stamps
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import forward_kinematics, global_rotations, rigid_alignment
 from steadypose.prior.body.skeleton import PARENTS
-
-Floats = NDArray[np.float64]
 
 Y_UP: Floats = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 """From x forward, y left, z up to what animation programs have: x left, y up, z forward."""

@@ -14,15 +14,13 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.msgs.types import CONTACTS, WorldBody
 from steadypose.nodes.sinks.retarget.robot import Robot
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import global_rotations, rotation_matrices, rotation_matrix, yaw_matrix
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.sim.timing import minimum_jerk
-
-Floats = NDArray[np.float64]
 
 SIDES = ("left", "right")
 ANKLE = 0.07

@@ -16,13 +16,12 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import WorldBody
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, J
 
-Floats = NDArray[np.float64]
 Links = Mapping[str, tuple[Floats, Floats]]
 """position (3,) metres and rotation (3, 3) in the world of each link, by name"""
 

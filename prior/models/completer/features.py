@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.kinematics import heading, quaternions, rotation_matrices, yaw_matrix
 from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENTS, J, finite_joints
@@ -21,8 +22,6 @@ from steadypose.prior.compiled import njit
 from steadypose.prior.models.completer.config import BENDS, FEATURES
 from steadypose.prior.timing.rate import FPS
 
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
 NEAR = 8.0

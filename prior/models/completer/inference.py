@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.models.completer.config import BENDS, CompleterConfig
 from steadypose.prior.models.completer.features import anchored, correction_share, read_window, rotations_of_6d
 from steadypose.prior.models.layers.dense import Floats as Floats32
 from steadypose.prior.models.weights import Arrays, load_weights, part
-
-Floats = NDArray[np.float64]
 
 
 class LiveCompleter:

@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.hgvae.live_faults import RECENT
 from steadypose.prior.models.weights import weights_path
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 MISSING = (0, 4, 8, 14)
 """Joints missing at which the scale was measured; between them it is interpolated."""

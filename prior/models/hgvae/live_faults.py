@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, FaultNetConfig
 from steadypose.prior.models.layers.compiled_graph import Network, Program
@@ -76,9 +77,6 @@ def _write_features(x, reconstructed, sigma, observed, mean, features):
                     square += (x[b, track, t] - 2 * x[b, track, t - 1] + x[b, track, t - 2]) ** 2
                     shown += 1
             row[4 * frames] = 0.5 * math.log(square / max(shown, 1) / ROUGH_SCALE**2 + 1e-3)
-
-
-Floats = NDArray[np.float64]
 
 
 class LiveFaultNet:

@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import BONES_BETWEEN, MIRROR, PARENT, J
 from steadypose.prior.compiled import njit
 from steadypose.prior.timing.rate import FPS
-
-Floats = NDArray[np.float64]
 
 CANDIDATES = 3
 """Coasting by the smoother, completed by the network, held in the body frame."""

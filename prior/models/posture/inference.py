@@ -15,12 +15,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, SHOULDERS
 from steadypose.prior.models.weights import Arrays, load_weights
-
-Floats = NDArray[np.float64]
 
 DIMENSIONS = 66
 UNLIKE = 0.01

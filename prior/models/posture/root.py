@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import HIPS, PARENT, J
 from steadypose.prior.models.posture.inference import LivePosture
-
-Floats = NDArray[np.float64]
 
 LEAST_SIGMA = math.radians(0.5)
 """Radians about an axis: no root is said to be better known, whatever the sensor."""

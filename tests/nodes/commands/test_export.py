@@ -19,10 +19,9 @@ from steadypose.nodes.sinks.files.bvh import to_bvh
 from steadypose.nodes.sinks.files.glb import to_glb
 from steadypose.nodes.sinks.files.motion import Y_UP, BodyMotion, read_motion
 from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
 from steadypose.prior.mocap.files import read_motion as read_file
-
-Floats = NDArray[np.float64]
 
 FRAMES = 40
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import save_file
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
@@ -30,8 +30,6 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.sensors import Sensed
 from steadypose.training.networks.mixture import MixtureConfig, MixtureNet, answer
 from steadypose.training.recipes.mixture import through_bank
-
-Floats = NDArray[np.float64]
 
 DELAYS = (0, 1, 4, 16)
 

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from tests.helpers.bodies import waving
 
 from steadypose.benchmarks.baselines.beside import beside
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.occluded import OccludedJoints
 from steadypose.prior.models.occlusion.candidates import FEATURES
 from steadypose.prior.models.occlusion.inference import SIGMA_SCALE, LiveOcclusion, Occluded, Weighed
 from steadypose.training.networks.occlusion import OcclusionConfig, OcclusionNet
 from steadypose.training.weights import arrays_of
-
-Floats = NDArray[np.float64]
 
 FRAMES, ARM = 40, [J["left_elbow"], J["left_wrist"]]
 

@@ -1,0 +1,7 @@
+"""Types of arrays that hints name."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
