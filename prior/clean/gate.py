@@ -54,8 +54,9 @@ _BODY_JUMP = 0.5  # if a larger share of the joints jumps at once, the body did 
 class Gate:
     """Outlier rejection: a refused joint becomes unobserved, exchanged limbs are put back.
 
-    Predictions are those of a constant-velocity Kalman filter, updated with what passes. No jump is refused for longer
-    than ``patience``: then the prediction is wrong, not the sensor. Bone lengths are tested by `BoneOutliers`.
+    Predictions are those of a constant-velocity Kalman filter, updated with what passes. A joint far from its own that
+    kept the lengths of its bones moved, where lengths tell. No jump is refused for longer than ``patience``: then the
+    prediction is wrong, not the sensor. Bone lengths are tested by `BoneOutliers`.
     """
 
     def __init__(self, settings: GateSettings, slots: int, counters: Counter[str]) -> None:
@@ -123,7 +124,7 @@ class Gate:
         jumped = seen & known & (distance > least + speed * self._lost / FPS + 3 * expected.sigma)
         everywhere = jumped.sum(axis=1) > _BODY_JUMP * np.maximum((seen & known).sum(axis=1), 1)
         self._restart(everywhere[:, None] & jumped)
-        jumped &= ~everywhere[:, None]
+        jumped &= ~everywhere[:, None] & ~self._bones.intact(positions, distance)
         self._refused = np.where(jumped, self._refused + 1, 0)
         overruled = self._refused > s.patience * FPS
         self._restart(overruled)

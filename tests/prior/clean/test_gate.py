@@ -40,6 +40,30 @@ def test_a_spike_becomes_unobserved_and_the_next_frame_passes() -> None:
     assert counters["joints_refused"] == 1
 
 
+def struck(frames: int = 90) -> np.ndarray:
+    """Somebody whose forearm turns over by two radians in one frame and back, about an elbow that rests."""
+    positions = np.repeat(waving(1), frames, axis=0)
+    turn = Rotation.from_rotvec([0.0, 2.0, 0.0]).as_matrix()
+    positions[50, WRIST] = positions[50, ARM[1]] + turn @ (positions[50, WRIST] - positions[50, ARM[1]])
+    return positions
+
+
+def test_of_a_perfect_sensor_a_joint_that_kept_its_bones_is_believed_however_fast() -> None:
+    positions = struck()
+    assert np.linalg.norm(positions[50, WRIST] - positions[49, WRIST]) > 0.2
+    passed, counters = run(positions)
+    assert np.array_equal(passed, positions)
+    assert not counters
+
+
+def test_of_a_sensor_whose_bones_vary_their_lengths_excuse_nothing() -> None:
+    positions = struck()
+    noise = np.random.default_rng(0).normal(size=positions.shape) * 0.02
+    noise[50, ARM] = 0.0
+    passed, _ = run(positions + noise)
+    assert np.isnan(passed[50, WRIST]).all()
+
+
 def test_a_joint_that_stays_where_it_jumped_is_believed_before_long() -> None:
     positions = noisy()
     positions[40:, WRIST] += [0.0, 0.0, 0.4]
