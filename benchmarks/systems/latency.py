@@ -118,7 +118,7 @@ def live(recording: Path, warm_up_s: float, seconds: float, progress: Progress, 
     bar = progress.add_task(title, total=seconds)
     bodies: list[int] = []
     most = f"prior.max_bodies={max(LIVE_CROWDS)}"
-    with running(recording, lossless=False, settings=[most]) as (messages, _, _, clock):
+    with running(recording, lossless=False, settings=[most]) as (messages, _, _, clock, _):
         for topic, message in messages:
             now = clock.now_ns()
             if isinstance(message, Diagnostics):

@@ -63,7 +63,7 @@ def memory(recording: Path, hours: float, occupied: float, progress: Progress) -
         if occupied < 1:
             recording = visits(recording, occupied, Path(folder, "visits"))
         with (
-            running(recording, lossless=True, rate=0, loop=True, record=Path(folder, "soak")) as (messages, _, _, _),
+            running(recording, lossless=True, rate=0, loop=True, record=Path(folder, "soak")) as (messages, *_),
             suppress(KeyboardInterrupt),
         ):
             for _, message in messages:

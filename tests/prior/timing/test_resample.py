@@ -3,6 +3,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from steadypose.prior.timing.decimate import Frame
 from steadypose.prior.timing.resample import LOOK_AHEAD_NS, MAX_GAP_NS, PERIOD_NS, Resampler
 
 SLOTS = 2
@@ -14,7 +15,7 @@ def line(stamp_ns: int) -> np.ndarray:
     return np.broadcast_to(np.array([t, -2 * t, 0.5 + t]), (SLOTS, 22, 3)).copy()
 
 
-def feed(stamps: list[int]) -> list[tuple[int, np.ndarray, np.ndarray]]:
+def feed(stamps: list[int]) -> list[Frame]:
     resampler = Resampler(SLOTS)
     frames = [frame for s in stamps for frame in resampler.update(s, line(s), np.full((SLOTS, 22), 0.7))]
     return frames + resampler.drain()

@@ -84,7 +84,8 @@ def test_many_arrays_are_together_no_larger_than_their_file_may_become(tmp_path:
         check_arrays(several)
     np.savez(several, **arrays)
     check_arrays(several)
-    np.savez(many, **{f"a{n}": np.zeros(1) for n in range(4000)})  # as many clips as data sets come with
+    clips: dict[str, Any] = {f"a{n}": np.zeros(1) for n in range(4000)}
+    np.savez(many, **clips)  # as many clips as data sets come with
     check_arrays(many)
     with zipfile.ZipFile(many, "w") as archive:
         for n in range(npz.MAX_ARRAYS + 1):
