@@ -32,6 +32,7 @@ from steadypose.training.recipes.sensor_bias import train_correction
 RIDGE, RIDGE_PENALTY = "ridge regression", 2200.0
 """The penalty is what a search on s07 and s08 found, the same at every delay."""
 TCN = "temporal convolution"
+SMOOTHNET = "SmoothNet-style"
 UNKNOWN, KNOWN = "steadypose", "steadypose, sensor known"
 
 
@@ -106,7 +107,7 @@ class Kinect:
     data: Path
     clips: Sequence[Clip]
     taught: Sequence[Clip]
-    _answers: dict[tuple[str, int, str], tuple[Floats, Stated]] = field(default_factory=dict)
+    _answers: dict[tuple[str | float, ...], dict[str, tuple[Floats, Stated | None]]] = field(default_factory=dict)
 
     def tuned(self, on: Sequence[Clip]) -> dict[tuple[str, int], Tuned]:
         """One parameter search for each filter and delay on the clips of all people, with figures for each subject."""
@@ -131,11 +132,13 @@ class Kinect:
             if name == "Kalman, constant velocity":
                 densities[delay] = parameters["density"]
             run = partial(_filtered, run=_at(peer, delay, parameters), whole_body=peer.whole_body)
-            yield Method(name, delay, run, parameters)
+            yield Method(
+                name, delay, partial(self._once, name=(name, delay, *parameters.values()), run=run), parameters
+            )
         for delay in self.bench.delays:
-            for net in self.bench.smoothnets:
-                one = partial(_filtered, run=partial(_by_network, net=net, delay=delay))
-                yield Method("SmoothNet-style", delay, one)
+            for seed, net in enumerate(self.bench.smoothnets):
+                run = partial(_filtered, run=partial(_by_network, net=net, delay=delay))
+                yield Method(SMOOTHNET, delay, partial(self._once, name=(SMOOTHNET, delay, seed), run=run))
         learners = Learners(
             [c for c in self.taught if c.subject != left_out], densities, 60 if self.bench.quick else 1000
         )
@@ -144,7 +147,8 @@ class Kinect:
             yield learners.convolution(delay)
         known = PriorSettings(correct=CorrectSettings(sensor=str(self.correction(left_out))))
         for delay in self.bench.delays:
-            yield Method(UNKNOWN, delay, partial(self._once, name=UNKNOWN, settings=PriorSettings(), delay=delay))
+            run = partial(run_ours, settings=PriorSettings(), delay=delay)
+            yield Method(UNKNOWN, delay, partial(self._once, name=(UNKNOWN, delay), run=run))
             yield Method(KNOWN, delay, partial(run_ours, settings=known, delay=delay))
 
     def correction(self, left_out: str) -> Path:
@@ -161,15 +165,19 @@ class Kinect:
         return path
 
     def _once(
-        self, clips: Sequence[Clip], name: str, settings: PriorSettings, delay: int
-    ) -> tuple[list[Floats], list[Stated]]:
-        """`run_ours` over the clips of all people, cached."""
-        if (name, delay, clips[0].name) not in self._answers:
-            positions, stated = run_ours(self.clips, settings, delay)
-            for clip, own, sigma in zip(self.clips, positions, stated, strict=True):
-                self._answers[name, delay, clip.name] = own, sigma
-        found = [self._answers[name, delay, clip.name] for clip in clips]
-        return [own for own, _ in found], [sigma for _, sigma in found]
+        self,
+        clips: Sequence[Clip],
+        name: tuple[str | float, ...],
+        run: Callable[[Sequence[Clip]], tuple[list[Floats], list[Stated] | None]],
+    ) -> tuple[list[Floats], list[Stated] | None]:
+        """What is the same whoever is left out: run over the clips of all people once, and kept by ``name``."""
+        if name not in self._answers:
+            positions, stated = run(self.clips)
+            every = zip(self.clips, positions, stated or [None] * len(positions), strict=True)
+            self._answers[name] = {clip.name: (own, told) for clip, own, told in every}
+        found = [self._answers[name][clip.name] for clip in clips]
+        told = [of_clip for _, of_clip in found if of_clip is not None]
+        return [own for own, _ in found], told or None
 
 
 def best_without(left_out: str, search: Tuned, peer: Peer) -> dict[str, float]:

@@ -99,8 +99,8 @@ def learned(bench: Bench, left_out: str, spoiled: str) -> dict[tuple[str, int], 
     assert bench.mocap is not None
     data = bench.mocap / f"{spoiled}.npz"
     data.write_text(spoiled)
-    kinect = Kinect(bench, data, clips(spoiled), clips(spoiled))
     asked = [clip("s09", 0, "")]
+    kinect = Kinect(bench, data, [*clips(spoiled), *asked], clips(spoiled))
     found: dict[tuple[str, int], bytes] = {}
     for method in kinect.methods(left_out, tuned(spoiled)):
         if method.name == UNKNOWN:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -233,6 +235,20 @@ def test_the_command_prepares_what_it_finds_and_lists_what_it_leaves_out(
     printed = capsys.readouterr().out
     assert "ReActIdle" in printed
     assert "Dropped: 2" in printed
+
+
+def test_preparing_twice_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On another day, from folders that list their files in another order: results name the data by digest."""
+    listed = Path.rglob
+    files = {f"{who}/{take}.bvh": idle_bvh(48 + number) for number, (who, take) in enumerate(product("abc", "xy"))}
+    files["a/short.bvh"] = idle_bvh(12)
+    for day, step in enumerate((1, -1)):
+        unpack(tmp_path / f"mocap {day}" / "own", files)
+        monkeypatch.setattr(Path, "rglob", lambda path, pattern, step=step: sorted(listed(path, pattern))[::step])
+        monkeypatch.setattr(time, "time", lambda day=day: 1.6e9 + 86400.0 * day)
+        prepare(tmp_path / f"mocap {day}", tmp_path / f"data {day}")
+    for name in ("prepared.npz", "prepare-report.json"):
+        assert (tmp_path / "data 0" / name).read_bytes() == (tmp_path / "data 1" / name).read_bytes(), name
 
 
 def test_nothing_to_prepare_says_what_was_looked_for(tmp_path: Path) -> None:
