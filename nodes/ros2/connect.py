@@ -26,8 +26,12 @@ def has_sourced_ros() -> bool:
     return all(find_spec(package) is not None for package in ("rclpy", "tf2_msgs"))
 
 
-def connect(name: str) -> Connection:
+def connect(name: str, namespace: str = "") -> Connection:
     """Join the ROS domain: through the rclpy of a ROS that is sourced, or else over plain DDS.
+
+    Args:
+        name: of the node, which only rclpy's are seen to have.
+        namespace: of the node; topics are named in full.
 
     Raises:
         LaunchError: nothing that can do so is installed.
@@ -47,7 +51,7 @@ def connect(name: str) -> Connection:
                 ) from error
             print(f"ROS 2 over plain DDS: {why}", flush=True)
         else:
-            return RclpyConnection(name)
+            return RclpyConnection(name, namespace)
     from steadypose.nodes.ros2.dds import DdsConnection
 
     return DdsConnection()

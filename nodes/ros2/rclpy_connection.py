@@ -22,12 +22,16 @@ from steadypose.nodes.ros2.connection import DEPTH, Publish
 class RclpyConnection:
     """A ROS 2 node that sends and gets serialised messages; implements `Connection`."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, namespace: str = "") -> None:
         self._context = Context()
         # Ctrl-C is this process's business, not rclpy's
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._node: Any = rclpy.create_node(
-            name, context=self._context, start_parameter_services=False, enable_rosout=False
+            name,
+            namespace=namespace or None,
+            context=self._context,
+            start_parameter_services=False,
+            enable_rosout=False,
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -36,7 +40,7 @@ class RclpyConnection:
     def publisher(self, topic: str, kind: str, *, latched: bool = False) -> Publish:
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         qos = QoSProfile(depth=1 if latched else DEPTH, durability=durability)
-        publisher = self._node.create_publisher(_compiled(kind), topic, qos)
+        publisher = self._node.create_publisher(_compiled(kind), f"/{topic}", qos)
 
         def publish(cdr: bytes) -> None:
             publisher.publish(cdr)
@@ -52,7 +56,7 @@ class RclpyConnection:
             reliability=ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        self._node.create_subscription(_compiled(kind), topic, heard, qos, raw=True)
+        self._node.create_subscription(_compiled(kind), f"/{topic}", heard, qos, raw=True)
 
     def spin(self, timeout_s: float) -> None:
         self._executor.spin_once(timeout_sec=timeout_s)

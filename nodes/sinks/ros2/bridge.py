@@ -17,6 +17,8 @@ from steadypose.nodes.sinks.ros2.settings import Ros2BridgeSettings
 from steadypose.nodes.sinks.ros2.topics import BodyTopics
 
 RVIZ = PACKAGE / "launch/views/steadypose.rviz"
+GLOBAL = ("tf", "tf_static", "clock", "diagnostics")
+"""topics that are in no namespace, by ROS's convention"""
 
 
 def check_ros2(launch: Launch) -> None:
@@ -27,10 +29,11 @@ def check_ros2(launch: Launch) -> None:
 
 
 class RosOutput:
-    """Publishes each topic from its first message on."""
+    """Publishes each topic from its first message on, in a namespace."""
 
-    def __init__(self, connection: Connection) -> None:
+    def __init__(self, connection: Connection, namespace: str = "") -> None:
         self._connection = connection
+        self._prefix = f"{namespace}/" if namespace else ""
         self._publish: dict[str, Publish] = {}
         self.missing: dict[str, str] = {}
         """topics whose types are not to be had, and what to do about it"""
@@ -40,7 +43,8 @@ class RosOutput:
             return
         if topic not in self._publish:
             try:
-                self._publish[topic] = self._connection.publisher(topic, kind, latched=latched)
+                full = topic if topic in GLOBAL else self._prefix + topic
+                self._publish[topic] = self._connection.publisher(full, kind, latched=latched)
             except LaunchError as error:
                 self.missing[topic] = str(error)
                 return
@@ -64,9 +68,9 @@ class Ros2BridgeNode(Node):
         self._missing: Counter[str] = Counter()
 
     def work(self) -> None:
-        connection = connect("steadypose")
+        connection = connect("steadypose_bridge", self._settings.namespace)
         try:
-            self._output = RosOutput(connection)
+            self._output = RosOutput(connection, self._settings.namespace)
             self._topics = BodyTopics(self._output, self._settings)
             print(f"RViz: rviz2 -d {RVIZ.resolve()} -f {self._settings.world_frame}", flush=True)
             super().work()

@@ -1,0 +1,38 @@
+"""Starts steadypose: ros2 launch steadypose_ros steadypose.launch.py launch:=oak.toml namespace:=robot"""
+
+# pyright: reportMissingImports=false
+# comes with ROS
+
+from pathlib import Path
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+ARGUMENTS = {
+    "launch": ("ros2", "a launch file of steadypose with ros2_bridge among its nodes, or the name of one of its own"),
+    "command": ("steadypose", "the program: its path, where it is not on PATH"),
+    "namespace": ("", "of the node and its topics, but for /tf, /tf_static, /clock and /diagnostics"),
+    "params_file": (
+        str(Path(__file__).parents[1] / "config/steadypose.yaml"),
+        "parameters: any setting of the launch file",
+    ),
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    given = {name: LaunchConfiguration(name) for name in ARGUMENTS}
+    node = Node(
+        package="steadypose_ros",
+        executable="steadypose",
+        name="steadypose",
+        namespace=given["namespace"],
+        parameters=[{name: given[name] for name in ("launch", "command")}, given["params_file"]],
+        output="screen",
+        sigterm_timeout="20",  # the program ends its recording first
+    )
+    arguments = [
+        DeclareLaunchArgument(name, default_value=it, description=what) for name, (it, what) in ARGUMENTS.items()
+    ]
+    return LaunchDescription([*arguments, node])
