@@ -1,0 +1,40 @@
+"""Sentences that quote a figure quote the committed result: its cell, rounded as the sentence has it."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.results import load
+
+Cell = tuple[str, str, str, str]
+FIT, CLEAN = "HuMoR, as it ships", "steadypose live, delay 8"
+SENTENCES: list[tuple[str, str, list[Cell]]] = [
+    (
+        "docs/fit.md",
+        r"in 4 cm of noise is (\S+) mm, of `clean` with 8 frames of delay ([\d.]+); of what is hidden below 0.9 m\s"
+        r"(\d+) mm, of `clean` (\d+),",
+        [("humor", f"humor-{table}", method, column)
+         for table, column in (("noisy", "all, mm"), ("hidden", "hidden, mm")) for method in (FIT, CLEAN)],
+    ),
+    (
+        "docs/fit.md",
+        r"joints to (\d+) mm, with points of a depth camera to (\d+)\.",
+        [("humor", "humor-detector", FIT, "all, mm"), ("humor", "humor-depth", FIT, "all, mm")],
+    ),
+]  # fmt: skip
+"""Page, sentence with a group for each figure, and where each is: result, table, first cell of the row, column."""
+
+
+@pytest.mark.parametrize(("page", "sentence", "cells"), SENTENCES)
+def test_a_sentence_quotes_the_result(page: str, sentence: str, cells: list[Cell]) -> None:
+    found = re.search(sentence, (ROOT / page).read_text())
+    assert found, f"{page}: expected a sentence like {sentence}; if it was rewritten, so must this list be"
+    for quoted, (result, table, method, column) in zip(found.groups(), cells, strict=True):
+        measured = next(t for t in load()[result]["tables"] if t["name"] == table)
+        row = next(r for r in measured["rows"] if r[0] == method)
+        value = float(row[measured["columns"].index(column)])
+        digits = len(quoted.partition(".")[2])
+        assert abs(value - float(quoted)) <= 0.5 * 10**-digits + 1e-9, f"{page}: {quoted}, {result}.json has {value}"
