@@ -18,6 +18,7 @@ from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.studies.humor_credit import credit, credit_table, spoiled
 from steadypose.benchmarks.studies.humor_fits import (
     CAMERA_HEIGHT,
     HIDDEN_BELOW,
@@ -45,8 +46,9 @@ DEPENDS_ON = (*CLEAN, "humor weights", "offline settings")
 FRAMES = 90
 DELAY = 8
 """Frames: of the live answer that fits start from."""
-CLIPS, PICTURES, FUTURES, LEVELS = 4, 8, 12, 2
-"""Clips of Table 2, of Tables 3 and 4, of Table 1, and of figure 8, taken evenly from all sources of the split."""
+CLIPS, PICTURES, FUTURES, LEVELS, CREDIT = 4, 8, 12, 2, 16
+"""Clips of Table 2, of Tables 3 and 4, of Table 1, of figure 8, and of
+`humor_credit`, taken evenly from all sources of the split."""
 
 HEIGHTS = (0.0, 0.3, 0.6, 0.9, 1.2)
 """Metres below which joints are hidden, of figure 8."""
@@ -74,10 +76,19 @@ def run(bench: Bench) -> Result:
     clips = bench.clips(FRAMES, 1 if bench.quick else PICTURES)
     detector = _pictures(bench, clips, models, depth=False)
     depth = _pictures(bench, clips, models, depth=True)
-    records = {"futures": futures, "noisy": noisy, "hidden": hidden, "detector": detector, "depth": depth}
     few = len(clips.offsets)
+    clips = bench.clips(FRAMES, 2 if bench.quick else CREDIT)
+    owed = credit(bench, models[SHIPS], clips)
+    records = {
+        "credit": owed,
+        "futures": futures,
+        "noisy": noisy,
+        "hidden": hidden,
+        "detector": detector,
+        "depth": depth,
+    }
     return Result(
-        [_futures_table(futures, count), *_fit_tables(records, few)],
+        [_futures_table(futures, count), credit_table(owed, len(clips.offsets)), *_fit_tables(records, few)],
         {"data": clips.source, "records": records | {"levels": levels}},
         _figure_8(levels, drawn),
     )
@@ -86,7 +97,7 @@ def run(bench: Bench) -> Result:
 def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hide: bool) -> list[dict[str, Any]]:
     """Table 2: all joints with noise; or with ``hide``, without noise, those below `HIDDEN_BELOW` hidden."""
     truth = clips.positions
-    seen = _seen(truth, *((0.0, HIDDEN_BELOW) if hide else (NOISE, 0.0)))
+    seen = spoiled(truth, *((0.0, HIDDEN_BELOW) if hide else (NOISE, 0.0)), seed=0)
     live = {delay: _live(clips, seen, delay) for delay in (4, DELAY)}
     answers: dict[str, list[Answer]] = {
         _TRUTH: _each(truth),
@@ -108,7 +119,7 @@ def _levels(bench: Bench, clips: MotionClips, models: dict[str, Any]) -> list[di
     levels = [(0.0, below) for below in HEIGHTS] + [(noise, 0.0) for noise in NOISES if noise]
     records = []
     for noise, below in bench.progress.track(levels[4:6] if bench.quick else levels, description="figure 8"):
-        seen = _seen(truth, noise, below)
+        seen = spoiled(truth, noise, below, seed=0)
         live = _live(clips, seen, DELAY)
         answers = {name: _fits(models, name, live, seen) for name in (_PER_FRAME, MVAE, SHIPS)}
         answers = {_TRUTH: _each(truth), f"steadypose live, delay {DELAY}": _each(live)} | answers
@@ -116,13 +127,6 @@ def _levels(bench: Bench, clips: MotionClips, models: dict[str, Any]) -> list[di
             told = scores(found, truth, np.isnan(seen[..., 0]), load)
             records.append({"method": name, "noise_cm": 100 * noise, "below_m": below, **told})
     return records
-
-
-def _seen(truth: Floats, noise: float, below: float) -> Floats:
-    """(T, C, 22, 3) with noise, metres, and NaN where truth is lower than ``below``, metres."""
-    seen = truth + noise * np.random.default_rng(0).standard_normal(truth.shape)
-    seen[truth[..., 2] < below] = np.nan
-    return seen
 
 
 def _live(clips: MotionClips, seen: Floats, delay: int) -> Floats:
