@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from steadypose.prior.world.floor import FORGOTTEN_S, GUESS_SIGMA, PATIENCE_S, Floor
+from steadypose.prior.world.floor import CALIBRATED_SIGMA, CREEP, FORGOTTEN_S, GUESS_SIGMA, PATIENCE_S, Floor
 
 DT = 1 / 30
 
@@ -109,3 +109,18 @@ def test_a_level_that_nobody_stands_on_is_forgotten():
     stand(floor, 0.3, seconds=2)
     stand(floor, 0.0, seconds=FORGOTTEN_S + 1, at=ELSEWHERE)
     assert floor.levels == []
+
+
+def test_when_the_floor_moves_up_the_levels_above_it_stay():
+    floor = Floor(calibrated=False)
+    stand(floor, 0.0, seconds=10)
+    stand(floor, 0.6, seconds=1)
+    stand(floor, 0.3, seconds=PATIENCE_S + 1, at=ELSEWHERE)
+    assert floor.height == pytest.approx(0.3, abs=0.02)
+    assert floor.levels == pytest.approx([0.6], abs=0.02)
+
+
+def test_a_floor_that_nothing_tells_of_grows_uncertain_by_its_creep():
+    floor = Floor(calibrated=True)
+    floor.observe(np.array([*HERE, 0.0]), 1e6, 100.0)
+    assert floor.sigma**2 == pytest.approx(CALIBRATED_SIGMA**2 + CREEP**2 * 100.0)
