@@ -26,7 +26,7 @@ from steadypose.prior.fit.solve import FitSettings
 
 Floats = NDArray[np.float64]
 
-SMOOTH = (4.0, 8.0, 16.0)
+SMOOTH = (4.0, 8.0, 16.0, 32.0, 64.0)
 """m/s², of stage 2."""
 DELAY = 8
 CONDITIONS = {"4 cm of noise": (NOISE, 0.0), "hidden below 0.9 m": (0.0, HIDDEN_BELOW)}
