@@ -36,14 +36,13 @@ from steadypose.nodes.graph.supervisor import Supervisor
 from steadypose.nodes.graph.systemd import ALIVE, READY, STOPPING, notify
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, load
 from steadypose.nodes.sinks.recorder import RecorderSettings, free_directory
-from steadypose.nodes.sources.recording import DAMAGE
+from steadypose.nodes.sources.recording import DAMAGE, VIDEOS
 
 LINE_NS = 5_000_000_000
 """between lines where there is no terminal for a table"""
 REPORT_NS = 1_000_000_000
 """between two times the health file is written"""
 REPLAY = "replay"
-VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
 LEAST = ("in", "queue", "MB", "delay\nms", "compute ms\np50/p99", "joints\ngated", "bodies", "frames")
 """of the table's columns: the first to go where they do not fit"""
 STALL_NS = 15_000_000_000

@@ -1,4 +1,4 @@
-"""Recorded skeletons: a rosbag2 directory, an ``.mcap``, an ``.npz``, a ``.csv``, or a file of motion."""
+"""Recorded skeletons: a rosbag2 directory, an ``.mcap``, an ``.npz``, a ``.csv``, a file of motion, or a film."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from typing import Any
 from steadypose.msgs.recording import RecordingError, RecordingReader
 from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Diagnostics, Message, PoseRaw
+from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sources.calibration import CalibrationSettings
+from steadypose.nodes.sources.camera_settings import WebcamSettings
 from steadypose.nodes.sources.csv import CsvSource
 from steadypose.nodes.sources.motion import MotionSource, holds_motion
 from steadypose.nodes.sources.npz import NpzSource
@@ -20,6 +23,8 @@ from steadypose.nodes.sources.source import RecordedSource
 
 NO_RIG: Mapping[str, Any] = MappingProxyType({})
 _FILES = ".csv, .npz, .bvh, .trc, .c3d or .npy"
+VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
+"""films, in which MediaPipe finds the skeletons"""
 
 LOST, BROKEN, UNDECODABLE = "bytes of a damaged recording", "damaged recording", "undecodable"
 DAMAGE = (LOST, BROKEN, UNDECODABLE)
@@ -59,14 +64,14 @@ class RecordingSource:
 
 
 def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG) -> RecordedSource:
-    """The recording at ``path``: a rosbag2 directory, an ``.mcap``, an ``.npz``, a ``.csv``, or a file of motion.
+    """The recording at ``path``: a rosbag2 directory, ``.mcap``, ``.npz`` or ``.csv``, a file of motion, or a film.
 
     Args:
         path: of the recording.
         rig: what a file of motion does not say (`prior.mocap.files.Description`).
 
     Raises:
-        LaunchError: there is nothing at the path.
+        LaunchError: there is nothing at the path, or it is a film and MediaPipe is not installed.
         RecordingError, NpzError, CsvError, MotionError: the file holds no skeletons. All are ValueErrors that say what
             to do.
     """
@@ -75,10 +80,19 @@ def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG) -> Recorde
     path = Path(path)
     if not path.exists():
         raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, or {_FILES}")
+    if path.suffix.lower() in VIDEOS:
+        return _open_film(path)
     if holds_motion(path):
         return MotionSource(path, rig)
     formats: Mapping[str, Callable[[Path], RecordedSource]] = {".npz": NpzSource, ".csv": CsvSource}
     return formats.get(path.suffix, RecordingSource)(path)
+
+
+def _open_film(path: Path) -> RecordedSource:
+    require_extra("webcam")
+    from steadypose.nodes.sources.webcam_video import VideoSource  # OpenCV
+
+    return VideoSource(WebcamSettings(video=str(path)), CalibrationSettings())
 
 
 def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:

@@ -23,6 +23,7 @@ from steadypose.nodes.sources import webcam, webcam_device
 from steadypose.nodes.sources.calibration import CalibrationSettings
 from steadypose.nodes.sources.camera import PAUSES_S
 from steadypose.nodes.sources.camera_settings import WebcamSettings
+from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import SourceContext
 from steadypose.nodes.sources.webcam import WebcamSource
@@ -134,6 +135,14 @@ def test_a_film_gives_every_picture_at_its_own_time(video: Path, model: str) -> 
     colours = [int(colour[2]) for colour, _ in seen.pictures[:FRAMES]]
     assert colours == sorted(set(colours)), "each picture, and each once"
     assert not source.refused
+
+
+def test_a_film_is_a_recording_to_clean(video: Path) -> None:
+    source = open_recording(video)
+    assert isinstance(source, VideoSource)
+    frames = [message for _, message in source if isinstance(message, PoseRaw)]
+    assert len(frames) == FRAMES
+    assert not any(frame.bodies for frame in frames), "MediaPipe sees nobody in an empty picture"
 
 
 def test_a_film_that_cannot_be_read_says_so(model: str, tmp_path: Path) -> None:
