@@ -14,7 +14,6 @@ STALE = {
     "events": BEFORE,
     "fuzz": BEFORE,
     "hgvae": BEFORE,
-    "hidden_joints": BEFORE,
     "humor": BEFORE,
     "identity": BEFORE,
     "importers": FROZEN,
