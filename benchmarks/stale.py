@@ -24,6 +24,7 @@ STALE = {
     "memory": BEFORE,
     "reconstruction": BEFORE,
     "restart": BEFORE,
+    "rotations": "since then films are opened too, by a module that opened its streams; they are opened as before",
     "scale": BEFORE,
     "simulated": BEFORE,
     "streaming": BEFORE,
