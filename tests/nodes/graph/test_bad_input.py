@@ -155,6 +155,7 @@ def test_no_node_goes_down(weights: dict[str, str], make_launch: Callable[..., L
         running(prior, trajectory) as threads,
     ):
         assert source.wait_for_subscribers({"prior"}, timeout_s=30)
+        until(lambda: listener.receive(0.1) is not None)  # diagnostics: it is connected, and will miss no end
         ends = 0
         for frames in EVIL.values():
             for frame in frames:
