@@ -11,7 +11,10 @@ from hypothesis import settings
 from steadypose.prior.body import layouts
 
 NEEDS_TORCH = re.compile(r"^\s*(?:from|import) (?:torch|steadypose\.(?:training|benchmarks|prior\.fit))\b", re.M)
-SLOW = ("test_docs.py", "test_packaging.py")
+SLOW = (
+    "test_batch.py", "test_docs.py", "test_packaging.py", "test_processes.py", "test_run.py", "test_starts.py",
+    "test_tf2.py", "test_warm_up.py",
+)  # fmt: skip
 """of the whole suite alone: they start many processes, or take seconds each"""
 
 
