@@ -13,6 +13,7 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
+from steadypose.nodes.sources.recording import VIDEOS
 from steadypose.prior.arrays import Floats
 from steadypose.prior.camera.calibration import (
     CalibrationError,
@@ -20,7 +21,6 @@ from steadypose.prior.camera.calibration import (
 )
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 VIDEO_STEP_S = 0.5
 """between the pictures taken from a video: nearer ones show the same again"""
 MAX_PICTURES = 60
