@@ -1,18 +1,20 @@
-"""Ablations: what each part of the default is worth, and what it costs, each switched off by its own setting.
+"""Ablations: what each part of the default is worth, and what it costs, each switched off by itself.
 
-Three conditions: 2 cm of independent noise on every joint; noise of 2 cm that lasts, with spikes and exchanged limbs;
-and 1 cm with one lower arm or leg away for half a second. The world's parts are ablated behind the default prior, in
-noise of 2 cm that lasts, with the floor known. Errors are means over people (`benchmarks.intervals`), by source and of
-all. Cost: of one body of which an arm is hidden, a frame at a time, so that every part has work.
+A part that has a setting is switched off by it; the whole-body experts and the share that white noise leaves to the
+multiple-model estimate have none, and are replaced in place. The world's parts are ablated behind the default prior, in
+noise of 2 cm that lasts, with the floor known. Errors are means over people, in units of what ships, paired by clip
+(`benchmarks.intervals`). Cost: of one body of which an arm is hidden, a frame at a time, so that every part has work.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
+from unittest import mock
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from steadypose.benchmarks import ours
 from steadypose.benchmarks.baselines.filters import missing
 from steadypose.benchmarks.bench import Bench, Result
 from steadypose.benchmarks.corruption import correlated
-from steadypose.benchmarks.intervals import interval
+from steadypose.benchmarks.intervals import interval, ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.provenance import VARIANTS, WORLD
 from steadypose.benchmarks.results import Table
@@ -39,6 +41,7 @@ from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.refine import RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
 from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.models.mixture import inference, whiteness
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
@@ -47,22 +50,35 @@ DEPENDS_ON = tuple(dict.fromkeys((*VARIANTS, *WORLD)))
 AS_IT_SHIPS = "as it ships"
 DELAY = 4
 CLIPS, FRAMES = 48, 90
-ROUNDS = 4
-"""Times that the cost of each variant is measured, in turn; the least counts, as other work only adds to it."""
+ROUNDS = 6
+"""Times that every variant is timed, in turn; of each frame the least counts, as other work only adds to it."""
 
-PARTS: Mapping[str, PriorSettings] = {
-    AS_IT_SHIPS: PriorSettings(),
-    "without the gate": PriorSettings(gate=GateSettings(enabled=False)),
-    "without slow error": PriorSettings(bias_sigma=0.0),
-    "without HG-VAE's denoising": PriorSettings(denoise=DenoiseSettings(enabled=False)),
-    "without the person's bones": PriorSettings(bones=PersonSettings(enabled=False)),
-    "without the score": PriorSettings(score=ScoreSettings(enabled=False)),
-    "without completion": PriorSettings(impute=ImputeSettings(enabled=False)),
-    "without fusion": PriorSettings(fuse=FuseSettings(enabled=False)),
-    "without orientations by the whole body": PriorSettings(orient=OrientSettings(enabled=False)),
-    "with HM-VAE, which is off": PriorSettings(refine=RefineSettings(enabled=True)),
+
+class Part(NamedTuple):
+    """What is measured: settings, and what is replaced while they run."""
+
+    settings: PriorSettings
+    replaced: Callable[[], AbstractContextManager[Any]] = nullcontext
+
+
+PARTS: Mapping[str, Part] = {
+    AS_IT_SHIPS: Part(PriorSettings()),
+    "without the gate": Part(PriorSettings(gate=GateSettings(enabled=False))),
+    "without the whole-body experts": Part(
+        PriorSettings(), lambda: mock.patch.object(inference, "body_covariance", lambda: np.eye(22))
+    ),
+    "without the share of white noise": Part(PriorSettings(), lambda: mock.patch.object(whiteness, "FALLBACK", 0.0)),
+    "without slow error": Part(PriorSettings(bias_sigma=0.0)),
+    "without HG-VAE's denoising": Part(PriorSettings(denoise=DenoiseSettings(enabled=False))),
+    "without the person's bones": Part(PriorSettings(bones=PersonSettings(enabled=False))),
+    "without the score": Part(PriorSettings(score=ScoreSettings(enabled=False))),
+    "without completion": Part(PriorSettings(impute=ImputeSettings(enabled=False))),
+    "without fusion": Part(PriorSettings(fuse=FuseSettings(enabled=False))),
+    "without orientations by the whole body": Part(PriorSettings(orient=OrientSettings(enabled=False))),
+    "with HM-VAE, which is off": Part(PriorSettings(refine=RefineSettings(enabled=True))),
 }
-"""Each part by what is measured without it."""
+"""Each part by what is measured without it. Whole-body experts: joints are smoothed each by itself, by the same
+network."""
 
 PARTS_OF_THE_WORLD: Mapping[str, TrajectorySettings] = {
     AS_IT_SHIPS: TrajectorySettings(),
@@ -72,46 +88,47 @@ PARTS_OF_THE_WORLD: Mapping[str, TrajectorySettings] = {
 }
 
 CONDITIONS: Mapping[str, Condition] = {
-    **{name: noisy_joints.CONDITIONS[name] for name in ("2 cm", "lasting 2 cm, spikes, swaps")},
-    "0.5 s": hidden_joints.CONDITIONS["0.5 s"],
+    **{
+        name: noisy_joints.CONDITIONS[name]
+        for name in ("1 cm", "2 cm", "4 cm", "lasting 2 cm", "lasting 2 cm, spikes, swaps")
+    },
+    **{name: hidden_joints.CONDITIONS[name] for name in ("0.5 s", "legs never")},
 }
+"""Where joints are hidden, their error is measured, else that of all joints."""
 
 
 def run(bench: Bench) -> Result:
     """Every part off, in every condition; then the world's."""
     clips = bench.clips(FRAMES, 4 if bench.quick else CLIPS)
-    records: list[dict[str, Any]] = []
     cost = costs(clips)
+    records: list[dict[str, Any]] = []
     for number, (condition, spoil) in enumerate(CONDITIONS.items()):
         seen = spoil(clips.positions, np.random.default_rng(number))
         hidden = missing(seen)
-        for name, settings in bench.progress.track(PARTS.items(), description=condition):
-            found = score(
-                ours.run(settings, seen, clips.stamps_s, DELAY).positions, clips.positions, hidden, align=False
-            )
+        for name, part in bench.progress.track(PARTS.items(), description=condition):
+            with part.replaced():
+                answer = ours.run(part.settings, seen, clips.stamps_s, DELAY).positions
+            found = score(answer, clips.positions, hidden, align=False)
             errors = found.hidden if hidden.any() else found.position
-            acceleration = interval(found.acceleration_error, clips.person).mean
-            records.append(_record(condition, name, clips, errors, acceleration, cost[name]))
-    world = _world(bench, clips)
+            records.append(_record(condition, name, errors, found.acceleration_error))
+    world, world_cost = _world(bench, clips), world_costs(clips)
     tables = [
-        _table("ablations", "What each part is worth in 2 cm of noise: error of joints, mm", records, "2 cm", clips),
-        _table("ablations-faults", "The same with spikes and swaps, mm", records, "lasting 2 cm, spikes, swaps", clips),
-        _table("ablations-hidden", "The same of joints hidden for 0.5 s, mm", records, "0.5 s", clips),
-        _table("ablations-world", "The world's parts, in 2 cm of noise that lasts: joints, mm", world, "world", clips),
+        _table("ablations", "What each part is worth: error of joints", "mm", records, cost, clips),
+        _table("ablations-acceleration", "The same of acceleration error", "acceleration_mm", records, cost, clips),
+        _table("ablations-world", "The world's parts: joints and standing feet", "mm", world, world_cost, clips),
     ]
-    return Result(tables, {"data": clips.source, "records": records, "world": world})
+    data = {"person": clips.person.tolist(), "data_set": clips.data_set.tolist(), "records": records, "world": world}
+    return Result(tables, {"data": clips.source, **data, "ms": cost, "world ms": world_cost})
 
 
 def _world(bench: Bench, clips: MotionClips) -> list[dict[str, Any]]:
     """The same of `pose/world`, with the speed of feet that stand."""
     seen = correlated(clips.positions, 0.02, np.random.default_rng(0))
-    cost = world_costs(clips)
     records = []
     for name, settings in bench.progress.track(PARTS_OF_THE_WORLD.items(), description="world"):
         answer = chain(PriorSettings(), seen, clips.stamps_s, settings)[1]
         found = score(answer, clips.positions, missing(seen), align=False)
-        acceleration = interval(found.acceleration_error, clips.person).mean
-        record = _record("world", name, clips, found.position, acceleration, cost[name])
+        record = _record("lasting 2 cm", name, found.position, found.acceleration_error)
         feet = measure(clips, answer)
         record["standing_feet_m_s"] = round(0.5 * (feet["left_skate_m_s"] + feet["right_skate_m_s"]), 4)
         records.append(record)
@@ -122,11 +139,11 @@ def costs(clips: MotionClips) -> dict[str, float]:
     """Milliseconds a frame of one body, of each of `PARTS`: the mean over a clip."""
     seen = hidden_joints.CONDITIONS["arm never"](clips.positions[:, :1], np.random.default_rng(0))
 
-    def frames(settings: PriorSettings) -> Floats:
-        prior = PriorPipeline(replace(settings, delay=DELAY))
-        return _laps(ours.stream(prior, seen, clips.stamps_s))
+    def frames(part: Part) -> Floats:
+        with part.replaced():
+            return _laps(ours.stream(PriorPipeline(replace(part.settings, delay=DELAY)), seen, clips.stamps_s))
 
-    return _least({name: partial(frames, settings) for name, settings in PARTS.items()})
+    return _least({name: partial(frames, part) for name, part in PARTS.items()})
 
 
 def world_costs(clips: MotionClips) -> dict[str, float]:
@@ -149,47 +166,50 @@ def _laps(answers: Iterable[object]) -> Floats:
 
 
 def _least(variants: Mapping[str, Callable[[], Floats]]) -> dict[str, float]:
-    """The least of the means of `ROUNDS`, all variants in turn; a round before them compiles and loads."""
-    means = [{name: float(np.mean(run())) for name, run in variants.items()} for _ in range(1 + ROUNDS)][1:]
-    return {name: min(found[name] for found in means) for name in variants}
+    """The mean over frames of the least of `ROUNDS`, all variants in turn; a round before them compiles and loads."""
+    rounds = [{name: run() for name, run in variants.items()} for _ in range(1 + ROUNDS)][1:]
+    return {name: round(float(np.mean(np.min([laps[name] for laps in rounds], axis=0))), 3) for name in variants}
 
 
-def _record(
-    condition: str, name: str, clips: MotionClips, errors: Floats, acceleration: float, ms: float
-) -> dict[str, Any]:
-    of_all = interval(errors, clips.person)
-    by_source = {
-        source: interval(errors[clips.data_set == source], clips.person[clips.data_set == source]).mean
-        for source in dict.fromkeys(clips.data_set.tolist())
-    }
+def _record(condition: str, name: str, errors: Floats, acceleration: Floats) -> dict[str, Any]:
+    """Of each clip; metres in, mm out."""
+    by_clip = {"mm": errors, "acceleration_mm": acceleration}
     return {
-        "condition": condition, "method": name, "ms": round(ms, 3),
-        "by_source_mm": {source: round(1e3 * mean, 3) for source, mean in by_source.items()},
-        "mm": round(1e3 * of_all.mean, 3), "ci_mm": [round(1e3 * end, 3) for end in (of_all.low, of_all.high)],
-        "people": of_all.people, "acceleration_mm": round(1e3 * acceleration, 3),
+        "condition": condition, "method": name,
+        **{key: np.round(1e3 * values, 3).tolist() for key, values in by_clip.items()},
     }  # fmt: skip
 
 
-def _table(name: str, title: str, records: Sequence[Mapping[str, Any]], condition: str, clips: MotionClips) -> Table:
-    """A row a part, a column a source, then the mean over people."""
-    mine = [record for record in records if record["condition"] == condition]
-    feet = "standing_feet_m_s" in mine[0]
-    rows = [
-        [
-            record["method"],
-            *(f"{value:.1f}" for value in record["by_source_mm"].values()),
-            f"{record['mm']:.2f}" + (f" ({low:.1f}–{high:.1f})" if np.isfinite(low) else ""),
-            f"{record['acceleration_mm']:.2f}",
-            *([f"{record['standing_feet_m_s']:.3f}"] if feet else []),
-            f"{record['ms']:.2f}",
-        ]
-        for record in mine
-        for low, high in (record["ci_mm"],)
-    ]
-    columns = ["", *mine[0]["by_source_mm"], "mean over people", "acceleration error, mm/frame²"]
+def _table(
+    name: str,
+    title: str,
+    figure: str,
+    records: Sequence[Mapping[str, Any]],
+    cost: Mapping[str, float],
+    clips: MotionClips,
+) -> Table:
+    """A row a part: in each condition the error in units of what ships, whose row has millimetres; milliseconds."""
+    conditions = list(dict.fromkeys(record["condition"] for record in records))
+    by_key = {(record["method"], record["condition"]): record for record in records}
+    rows = []
+    for part in dict.fromkeys(record["method"] for record in records):
+        mine = [by_key[part, condition] for condition in conditions]
+        cells = []
+        for record, shipped in zip(mine, (by_key[AS_IT_SHIPS, c] for c in conditions), strict=True):
+            errors, baseline = (np.array(r[figure], dtype=float) for r in (record, shipped))
+            if part == AS_IT_SHIPS:
+                cells.append(f"{interval(errors, clips.person).text(1)} mm")
+            else:
+                cells.append(ratio(errors, baseline, clips.person).text(3))
+        feet = [f"{record['standing_feet_m_s']:.3f}" for record in mine if "standing_feet_m_s" in record]
+        spent = cost[part] - cost[AS_IT_SHIPS] * (part != AS_IT_SHIPS)
+        rows.append([part, *cells, *feet, f"{spent:+.2f}" if part != AS_IT_SHIPS else f"{spent:.2f}"])
+    feet = ["standing feet, m/s"] if "standing_feet_m_s" in records[0] else []
+    people = len(set(clips.person.tolist()))
     note = (
-        f"{len(clips.offsets)} clips of {FRAMES} frames, {mine[0]['people']} people, delay {DELAY}; in brackets, the "
-        f"95 % interval over people. ms: one body and one frame, the least of {ROUNDS} means"
+        f"{len(clips.offsets)} clips of {FRAMES} frames, {people} people, delay {DELAY}. What ships: mean over people; "
+        "below it ratios to what ships: above 1 the part helps. In brackets the 95 % interval over people. ms: one "
+        f"body and one frame, the mean of the least of {ROUNDS} rounds; below what ships, the difference to it"
         + (", without the prior." if feet else ".")
     )
-    return Table(name, title, [*columns, *(["standing feet, m/s"] if feet else []), "ms a frame"], rows, note)
+    return Table(name, f"{title}, delay {DELAY}", ["", *conditions, *feet, "ms a frame"], rows, note)

@@ -2,20 +2,37 @@ from dataclasses import asdict, fields, is_dataclass, replace
 
 import numpy as np
 
+from steadypose.benchmarks import ours
 from steadypose.benchmarks.motion import simulated_clips
 from steadypose.benchmarks.studies.ablations import AS_IT_SHIPS, PARTS, PARTS_OF_THE_WORLD, _record, _table
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.world.settings import TrajectorySettings
 
+REPLACED = {"without the whole-body experts", "without the share of white noise"}
+
 
 def test_each_row_changes_one_setting_and_every_stage_that_is_on_has_a_row() -> None:
     default = PriorSettings()
-    changed = {name: _changed(default, settings) for name, settings in PARTS.items()}
-    assert changed.pop(AS_IT_SHIPS) == set()
-    assert all(len(change) == 1 for change in changed.values())
+    changed = {name: _changed(default, part.settings) for name, part in PARTS.items()}
+    assert {name for name, change in changed.items() if not change} == {AS_IT_SHIPS, *REPLACED}
+    assert all(len(change) <= 1 for change in changed.values())
     stages = {f.name for f in fields(default) if is_dataclass(getattr(default, f.name))}
     switches = {f"{stage}.enabled" for stage in stages if getattr(getattr(default, stage), "enabled", False)}
     assert set.union(*changed.values()) == {"bias_sigma", "refine.enabled", *switches}
+
+
+def test_what_has_no_setting_is_replaced_only_while_it_is_measured() -> None:
+    clips = simulated_clips(40, 1, seed=0)
+    seen = clips.positions + np.random.default_rng(0).normal(0.0, 0.02, clips.positions.shape)
+
+    def positions() -> np.ndarray:
+        return ours.run(PriorSettings(), seen, clips.stamps_s, 4).positions
+
+    shipped = positions()
+    for name in REPLACED:
+        with PARTS[name].replaced():
+            assert np.nanmax(np.abs(positions() - shipped)) > 1e-4
+    np.testing.assert_array_equal(positions(), shipped)
 
 
 def test_the_worlds_switches_are_each_off_alone_and_both() -> None:
@@ -23,19 +40,16 @@ def test_the_worlds_switches_are_each_off_alone_and_both() -> None:
     assert changed == [set(), {"contacts"}, {"network"}, {"contacts", "network"}]
 
 
-def test_a_row_has_each_source_and_a_mean_in_which_every_person_counts_once() -> None:
-    clips = simulated_clips(30, 3, seed=0)
-    clips = replace(clips, person=np.array(["a", "a", "b"]), data_set=np.array(["x", "x", "y"]))  # fmt: skip
-    record = _record("2 cm", "as it ships", clips, np.array([0.010, 0.020, 0.045]), 0.002, 1.5)
-    assert record["by_source_mm"] == {"x": 15.0, "y": 45.0}
-    assert (record["mm"], record["people"]) == (30.0, 2)
-    table = _table("t", "title", [record], "2 cm", clips)
-    low, high = record["ci_mm"]
-    assert low < 30.0 < high
-    assert table.columns == ["", "x", "y", "mean over people", "acceleration error, mm/frame²", "ms a frame"]
-    assert table.rows == [["as it ships", "15.0", "45.0", f"30.00 ({low:.1f}–{high:.1f})", "2.00", "1.50"]]
-    alone = {**record, "ci_mm": [float("nan")] * 2}
-    assert _table("t", "title", [alone], "2 cm", clips).rows[0][3] == "30.00"
+def test_a_row_is_in_units_of_what_ships_and_every_person_counts_once() -> None:
+    clips = replace(simulated_clips(30, 3, seed=0), person=np.array(["a", "a", "b"]))
+    acceleration = np.full(3, 1e-3)
+    records = [
+        _record("2 cm", AS_IT_SHIPS, np.array([0.010, 0.020, 0.045]), acceleration),
+        _record("2 cm", "without it", np.array([0.020, 0.040, 0.045]), acceleration),
+    ]
+    rows = _table("t", "title", "mm", records, {AS_IT_SHIPS: 2.0, "without it": 1.5}, clips).rows
+    assert rows[0][1].startswith("30.0 (") and rows[0][2] == "2.00"
+    assert rows[1][1].startswith("1.414 (1.000–2.000)") and rows[1][2] == "-0.50"
 
 
 def _changed(default: PriorSettings | TrajectorySettings, settings: PriorSettings | TrajectorySettings) -> set[str]:
