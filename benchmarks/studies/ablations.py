@@ -65,7 +65,7 @@ PARTS: Mapping[str, Part] = {
     AS_IT_SHIPS: Part(PriorSettings()),
     "without the gate": Part(PriorSettings(gate=GateSettings(enabled=False))),
     "without the whole-body experts": Part(
-        PriorSettings(), lambda: mock.patch.object(inference, "body_covariance", lambda: np.eye(22))
+        PriorSettings(), lambda: mock.patch.object(inference, "body_covariance", return_value=np.eye(22))
     ),
     "without the share of white noise": Part(PriorSettings(), lambda: mock.patch.object(whiteness, "FALLBACK", 0.0)),
     "without slow error": Part(PriorSettings(bias_sigma=0.0)),
