@@ -132,7 +132,7 @@ class TrainingRun:
         """Write the trained model, its card and its curves.
 
         Args:
-            path: ``MODEL-SET.safetensors`` in the run's folder; `torch_weights.install` puts it where nodes read it.
+            path: ``MODEL-SET.safetensors`` in the run's folder; `training.weights.install` puts it where nodes read it.
             model: trained.
             config: what rebuilds it.
             card: heading to content: model, data, licence and training; the last evaluation is added here.

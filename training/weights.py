@@ -13,7 +13,7 @@ from typing import Any
 from safetensors.torch import save
 from torch import nn
 
-from steadypose.prior.fit.torch_weights import load_tensors
+from steadypose.prior.fit.tensors import load_tensors
 from steadypose.prior.models import weights as weights_io
 from steadypose.prior.models.weights import Arrays, WeightsError
 from steadypose.training.distributed import writes

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from steadypose.prior.fit.hmvae_network import HMVAE, MotionVAE, Posterior
-from steadypose.prior.fit.skeleton_conv import EdgeLinear, SkeletonConv
+from steadypose.prior.fit.hmvae_network import HMVAE, EdgeLinear, MotionVAE, Posterior, SkeletonConv
 from steadypose.prior.models.hmvae.config import CHANNELS, ROTATION_FEATURES, HMVAEConfig
 from steadypose.prior.models.layers.dense import SLOPE
 from steadypose.training.data.dataset import MotionSet

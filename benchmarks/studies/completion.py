@@ -25,7 +25,7 @@ from steadypose.prior.body.kinematics import heading
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.complete.body import Fill, complete
 from steadypose.prior.complete.parts import PartsCompleter
-from steadypose.prior.fit.torch_weights import load_network
+from steadypose.prior.fit.tensors import load_network
 from steadypose.prior.models.completer.features import read_window
 from steadypose.prior.models.completer.inference import LiveCompleter
 from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig

@@ -15,7 +15,7 @@ from steadypose.benchmarks.studies.hgvae_anomalies import anomalies
 from steadypose.benchmarks.studies.hgvae_common import NAMES, Data
 from steadypose.benchmarks.studies.hgvae_generation import generation
 from steadypose.benchmarks.studies.hgvae_imputation_tables import prediction, sweep, whole_joints
-from steadypose.prior.fit.torch_weights import load_network
+from steadypose.prior.fit.tensors import load_network
 from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig
 from steadypose.prior.models.weights import WEIGHTS
 from steadypose.training.data.hgvae_windows import Batch, Windows

@@ -10,7 +10,7 @@ from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.motion import as_set, digest, prepared_set
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
-from steadypose.prior.fit.torch_weights import load_network
+from steadypose.prior.fit.tensors import load_network
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.recipes.humor import fit_transitions
 

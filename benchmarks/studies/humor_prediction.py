@@ -10,8 +10,7 @@ from torch import Tensor
 
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
-from steadypose.prior.fit.humor_network import HumorNet
-from steadypose.prior.fit.humor_rollout import Rollout, sample
+from steadypose.prior.fit.humor_network import HumorNet, Rollout, sample
 from steadypose.prior.fit.humor_state import State, states_of
 
 SAMPLES, LONG_S = 50, 5.0

@@ -22,8 +22,7 @@ from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import figures, score
 from steadypose.prior.arrays import Floats
 from steadypose.prior.fit.hmvae_network import HMVAE, MotionVAE
-from steadypose.prior.fit.torch_kinematics import forward_kinematics, from_6d, remove_heading, to_6d
-from steadypose.prior.fit.torch_weights import load_network
+from steadypose.prior.fit.tensors import forward_kinematics, from_6d, load_network, remove_heading, to_6d
 from steadypose.prior.models.hmvae.config import HMVAEConfig
 
 DEPENDS_ON = ("hmvae weights", "hmvae64 weights")

@@ -21,10 +21,9 @@ from steadypose.prior.body.skeleton import J
 from steadypose.prior.events.features import EXTENT, HAND
 from steadypose.prior.events.settings import EventSettings
 from steadypose.prior.sim.body import TOE_HEIGHT, random_offsets
-from steadypose.prior.sim.gait import RATE, Stand, Turn, Walk, plan
+from steadypose.prior.sim.gait import RATE, Stand, Turn, Walk, minimum_jerk, plan
 from steadypose.prior.sim.motion import SIGN, ArmAction, Intent, Motion, perform
 from steadypose.prior.sim.scripts import SCRIPTS
-from steadypose.prior.sim.timing import minimum_jerk
 
 DOUBT = 0.05
 """metres, or radians, beyond a threshold, up to which it need not be told that it was crossed"""

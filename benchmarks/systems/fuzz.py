@@ -40,7 +40,7 @@ from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.mocap.amc import read_amc, read_asf
 from steadypose.prior.mocap.bvh import read_bvh
 from steadypose.prior.mocap.clip import MotionError
-from steadypose.prior.mocap.npz import read_amass
+from steadypose.prior.mocap.files import read_amass
 
 DEPENDS_ON = ()
 

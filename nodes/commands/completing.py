@@ -33,10 +33,9 @@ from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.kinematics import quaternions, rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, finite_joints
-from steadypose.prior.complete.body import Completed, Fill, complete
+from steadypose.prior.complete.body import Completed, Fill, Uncertainty, complete
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.root_path import is_root_centred, root_path
-from steadypose.prior.complete.sigma import Uncertainty
 from steadypose.prior.models.completer.inference import LiveCompleter
 from steadypose.prior.models.root_velocity import LiveRootVelocity
 from steadypose.prior.timing.resample import PERIOD_NS

@@ -44,7 +44,7 @@ class Fitted:
 def load_transitions(weights: str) -> HumorNet:
     """The model of transitions of a weight set."""
     from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
-    from steadypose.prior.fit.torch_weights import load_network
+    from steadypose.prior.fit.tensors import load_network
 
     return load_network(HumorNet, HumorConfig.from_dict, weights, "humor")
 

@@ -48,7 +48,7 @@ REST_HEIGHT: Floats = np.array(
 
 
 def forward_kinematics(rotations: Floats, offsets: Floats, root: Floats) -> tuple[Floats, Floats]:
-    """Joint positions from local rotations and bones; with gradients: `prior.fit.torch_kinematics`.
+    """Joint positions from local rotations and bones; with gradients: `prior.fit.tensors`.
 
     Args:
         rotations: (..., 22, 3, 3) local rotation matrices.

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.types import Event, EventKind, Hand, Phase, PoseWorld, Tracking, WorldBody
 from steadypose.prior.events.features import Arm, Features, features
 from steadypose.prior.events.settings import EventSettings
-from steadypose.prior.events.trigger import Trigger
-from steadypose.prior.events.wave import Wave
+from steadypose.prior.events.trigger import Trigger, Wave
 
 NOWHERE: NDArray[np.float64] = np.zeros(3)
 NOWHERE.flags.writeable = False

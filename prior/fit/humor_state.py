@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from steadypose.prior.body.skeleton import PARENTS
-from steadypose.prior.fit.torch_kinematics import forward_kinematics
+from steadypose.prior.fit.tensors import forward_kinematics
 from steadypose.prior.timing.rate import FPS
 
 JOINT_COUNT = len(PARENTS)

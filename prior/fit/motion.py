@@ -18,8 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from steadypose.prior.fit.humor_network import HumorNet
-from steadypose.prior.fit.humor_rollout import transitions
+from steadypose.prior.fit.humor_network import HumorNet, transitions
 from steadypose.prior.fit.humor_state import JOINT_COUNT, State, canonical, features, placed, small_exp, states_of
 
 SCALES: Mapping[str, float] = {

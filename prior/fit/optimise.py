@@ -20,8 +20,7 @@ from steadypose.prior.body.kinematics import rotation_matrices
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.fit.hmvae_network import HMVAE
-from steadypose.prior.fit.torch_kinematics import forward_kinematics, from_6d, remove_heading, to_6d
-from steadypose.prior.fit.torch_weights import load_network
+from steadypose.prior.fit.tensors import forward_kinematics, from_6d, load_network, remove_heading, to_6d
 from steadypose.prior.models.completer.features import (
     anchored,
     draw_line,

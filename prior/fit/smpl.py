@@ -21,7 +21,7 @@ from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import PARENT, PARENTS
 from steadypose.prior.fit.humor_state import small_exp
 from steadypose.prior.fit.motion import float_tensor
-from steadypose.prior.fit.torch_kinematics import forward_kinematics
+from steadypose.prior.fit.tensors import forward_kinematics
 from steadypose.prior.npz import MotionError, open_npz
 from steadypose.prior.timing.rate import FPS
 

@@ -55,7 +55,7 @@ class Bvh:
         """(T, J, 3) in the file's unit and axes, by forward kinematics.
 
         Args:
-            lost_bones: see `prior.mocap.tables.Rig`; given back their length where the file has none.
+            lost_bones: see `prior.mocap.cmu.Rig`; given back their length where the file has none.
         """
         offsets = self.offsets.copy()
         for name, multiple in (lost_bones or {}).items():

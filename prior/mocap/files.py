@@ -1,6 +1,6 @@
 """One file of motion, of any kind that is read: its body as canonical joints, metres, z up.
 
-BVH and AMASS' .npz (`prior.mocap.bvh`, `prior.mocap.npz`), and named points: TRC, the text that OpenSim and
+BVH (`prior.mocap.bvh`), AMASS' .npz, and named points: TRC, the text that OpenSim and
 Pose2Sim write, and C3D, that of motion capture, through ezc3d. What a file does not say, its `Description` may.
 """
 
@@ -11,20 +11,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.points import recognise_points
 from steadypose.prior.body.rigs import Rig, RigError, Tree, recognise, up_axis
-from steadypose.prior.body.skeleton import JOINTS
+from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS
 from steadypose.prior.mocap.bvh import read_bvh
-from steadypose.prior.mocap.clip import TO_Z_UP, MotionError, documented
-from steadypose.prior.mocap.npz import read_amass
+from steadypose.prior.mocap.clip import TO_Z_UP, MotionError, documented, forward
+from steadypose.prior.mocap.cmu import CMU_BVH
 from steadypose.prior.mocap.plug_in_gait import MARKERS, calibrate, joint_centres
-from steadypose.prior.mocap.tables import CMU_BVH
+from steadypose.prior.npz import open_npz
 
 POINT_UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "meters": 1.0, "millimeters": 0.001}
 
@@ -133,6 +134,36 @@ def _bvh(content: bytes, description: Description) -> _Read:
     rig = file_rig(bvh.joints, bvh.parents, bvh.offsets, description)
     positions = bvh.positions(rig.lost_bones)[:, [bvh.joints.index(j) for j in rig.skeleton.joints]]
     return bvh.fps, rig.skeleton, positions * (description.metres or rig.metres), rig.up
+
+
+@documented
+def read_amass(file: IO[bytes]) -> tuple[float, Floats]:
+    """SMPL, SMPL-H or SMPL-X poses as AMASS stores them: ``poses``, ``trans`` and the frame rate.
+
+    No body model is used, so that its licence binds nobody: the rotations move the rest skeleton of
+    `prior.body.skeleton`, a generic adult, whatever the subject's shape. Joint angles are the recording's own, bone
+    lengths and the height of the root above the floor are not.
+
+    Returns:
+        frames a second, and (T, 22, 3) metres, canonical joints, z up.
+
+    Raises:
+        MotionError: an array is missing or has another shape.
+    """
+    with open_npz(file, "poses", "trans") as archive:
+        rate = next((k for k in ("mocap_framerate", "mocap_frame_rate") if k in archive), None)
+        if rate is None:
+            raise MotionError("expected an array mocap_framerate (or mocap_frame_rate, as SMPL-X' files name it)")
+        fps, poses = float(archive[rate]), archive["poses"].astype(np.float64)
+        trans = archive["trans"].astype(np.float64)
+    if poses.ndim != 2 or poses.shape[1] < 3 * len(PARENTS) or trans.shape != (len(poses), 3):
+        raise MotionError(f"expected poses (T, 66 or more) and trans (T, 3), got {poses.shape} and {trans.shape}")
+    maps = poses[:, : 3 * len(PARENTS)].reshape(-1, 3)
+    local = Rotation.from_rotvec(maps).as_matrix().reshape(len(poses), len(PARENTS), 3, 3)
+    # SMPL's rest pose faces +z with y up; ours faces +x with z up.
+    steps = np.tile(REST_OFFSETS[:, [1, 2, 0]], (len(poses), 1, 1))
+    steps[:, 0] = trans
+    return fps, forward(PARENTS, steps, local)[0]
 
 
 def _amass(content: bytes, _: Description) -> _Read:

@@ -1,11 +1,19 @@
-"""A person's measures: bones for the kinematics, flesh for what hides what."""
+"""A simulated person's measures: bones for the kinematics, capsules for what hides what, and where a sensor's joints
+lie: each is held in the frame of a canonical joint.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
 import numpy as np
+from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.skeleton import JOINTS, MIRROR, REST_OFFSETS, J
+from steadypose.prior.body.layouts import get_skeleton
+from steadypose.prior.body.skeleton import JOINTS, MIRROR, REST_OFFSETS, REST_POSITIONS, J
 
 REST_HEIGHT = 1.72
 """Metres: the stature that `REST_OFFSETS` stands for."""
@@ -63,3 +71,82 @@ def random_offsets(rng: np.random.Generator, height: float) -> Floats:
 def stature(offsets: Floats) -> float:
     """Metres of height of a person with bones (22, 3)."""
     return REST_HEIGHT * float(np.abs(offsets[_STATURE, 2]).sum() / np.abs(REST_OFFSETS[_STATURE, 2]).sum())
+
+
+# What the canonical skeleton lacks: the joint it rides on, and metres in the rest frame (x forward, y left, z up) of
+# a person of 1.72 m. The left side and the middle; the right is the mirror image.
+_RIDES: Mapping[str, Mapping[str, tuple[str, tuple[float, float, float]]]] = {
+    "smpl22": {},
+    "coco17": {
+        "nose": ("head", (0.105, 0.0, 0.0)),
+        "left_eye": ("head", (0.085, 0.032, 0.035)),
+        "left_ear": ("head", (0.0, 0.075, 0.0)),
+    },
+    "blazepose33": {
+        "nose": ("head", (0.105, 0.0, 0.0)),
+        "left_eye_inner": ("head", (0.088, 0.018, 0.035)),
+        "left_eye": ("head", (0.085, 0.032, 0.035)),
+        "left_eye_outer": ("head", (0.080, 0.046, 0.035)),
+        "left_ear": ("head", (0.0, 0.075, 0.0)),
+        "mouth_left": ("head", (0.090, 0.025, -0.045)),
+        "left_pinky": ("left_wrist", (-0.030, 0.085, 0.0)),
+        "left_index": ("left_wrist", (0.030, 0.095, 0.0)),
+        "left_thumb": ("left_wrist", (0.050, 0.035, -0.01)),
+        "left_heel": ("left_ankle", (-0.055, 0.0, -0.045)),
+    },
+    "kinect22": {
+        "Chest": ("neck", (0.0, 0.0, -0.01)),
+        "LCollar": ("neck", (0.0, 0.012, -0.01)),
+        "Head": ("head", (-0.015, 0.0, -0.06)),
+        "HeadTip": ("head", (0.015, 0.0, 0.06)),
+    },
+}
+_RIGHT_NAME: Mapping[str, str] = {"mouth_left": "mouth_right", "LCollar": "RCollar"}
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A sensor's J joints on the canonical body.
+
+    Attributes:
+        joint: (J,) index of the canonical joint each rides on.
+        place: (J, 3) metres in that joint's frame, for a stature of 1.72 m.
+        mirror: (J,) each joint's counterpart on the other side.
+    """
+
+    joint: NDArray[np.intp]
+    place: Floats
+    mirror: NDArray[np.intp]
+
+    def positions(self, joints: Floats, orientations: Floats, scale: float) -> Floats:
+        """(..., J, 3) metres from canonical joints (..., 22, 3), their world orientations, and the stature / 1.72 m."""
+        turned = np.einsum("...jab,jb->...ja", orientations[..., self.joint, :, :], scale * self.place)
+        return joints[..., self.joint, :] + turned
+
+
+@cache
+def mount(skeleton: str) -> Mount:
+    """How a sensor's skeleton sits on the body.
+
+    Raises:
+        ValueError: a skeleton that the simulator cannot place.
+    """
+    if skeleton not in _RIDES:
+        raise ValueError(f"cannot simulate skeleton '{skeleton}': expected one of {', '.join(_RIDES)}")
+    names = get_skeleton(skeleton).joints
+    rides: dict[str, tuple[str, tuple[float, float, float]]] = {}
+    for canonical, source in get_skeleton(skeleton).table.items():
+        direct = [source] if isinstance(source, str) else list(source)
+        if len(direct) == 1:
+            rides[direct[0]] = (canonical, (0.0, 0.0, 0.0))
+    for name, (canonical, (x, y, z)) in _RIDES[skeleton].items():
+        rides[name] = (canonical, (x, y, z))
+        other = _RIGHT_NAME.get(name, name.replace("left", "right"))
+        if other != name:
+            rides[other] = (JOINTS[MIRROR[J[canonical]]], (x, -y, z))
+    joint = np.array([J[rides[name][0]] for name in names])
+    place = np.array([rides[name][1] for name in names])
+    rest = REST_POSITIONS[joint] + place
+    # In the rest pose a joint's counterpart is the one nearest to its mirror image.
+    apart = np.linalg.norm(rest[:, None] * [1.0, -1.0, 1.0] - rest[None], axis=-1)
+    return Mount(joint, place, apart.argmin(axis=1))

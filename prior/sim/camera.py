@@ -18,7 +18,7 @@ from scipy.special import ndtri
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import COLLARS, JOINTS, TRUNK, J
-from steadypose.prior.sim.body import CAPSULES, REST_HEIGHT, stature
+from steadypose.prior.sim.body import CAPSULES, REST_HEIGHT, Mount, mount, stature
 from steadypose.prior.sim.motion import Motion
 from steadypose.prior.sim.noise import (
     SWAP_GROUPS,
@@ -30,7 +30,6 @@ from steadypose.prior.sim.noise import (
     swapped,
     travelled,
 )
-from steadypose.prior.sim.sensors import Mount, mount
 
 REFERENCE_RANGE = 2.6
 """Metres: the median distance at which the noise was measured."""

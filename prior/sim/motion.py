@@ -16,8 +16,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, heading, yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.sim.body import TOE_HEIGHT
-from steadypose.prior.sim.gait import RATE, FootTrack, Plan, foot_track
-from steadypose.prior.sim.timing import drift
+from steadypose.prior.sim.gait import RATE, FootTrack, Plan, drift, foot_track
 
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")

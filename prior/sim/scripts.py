@@ -13,9 +13,8 @@ import numpy as np
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.sim.body import random_offsets
-from steadypose.prior.sim.gait import RATE, Plan, Stand, Turn, Walk, plan
+from steadypose.prior.sim.gait import RATE, Key, Plan, Stand, Turn, Walk, minimum_jerk, plan, track
 from steadypose.prior.sim.motion import SIDES, SIGN, ArmAction, Intent, Motion, Side, perform
-from steadypose.prior.sim.timing import Key, minimum_jerk, track
 
 _FACING_CAMERA = np.pi
 

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import JointState, PoseRaw, PoseWorld, Tracking, WorldBody
+from steadypose.prior.sim.body import mount
 from steadypose.prior.sim.camera import Camera, as_tracked, film, sight
 from steadypose.prior.sim.motion import Motion
 from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.scripts import SCRIPTS
-from steadypose.prior.sim.sensors import mount
 from steadypose.prior.timing.resample import PERIOD_NS
 
 START_NS = 1_750_000_000_000_000_000

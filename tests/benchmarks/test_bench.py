@@ -22,7 +22,7 @@ from steadypose.benchmarks.studies.spoiled import against_best, calibration_tabl
 from steadypose.benchmarks.studies.streaming import recovery
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.fit.hmvae_network import HMVAE
-from steadypose.prior.fit.torch_weights import load_tensors
+from steadypose.prior.fit.tensors import load_tensors
 from steadypose.prior.models.hmvae.config import HMVAEConfig
 
 

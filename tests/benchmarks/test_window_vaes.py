@@ -3,9 +3,8 @@ import torch
 
 from steadypose.benchmarks.baselines.window_vaes import CONFIGS, MVAE, TCNVAE, trained
 from steadypose.benchmarks.motion import as_set, simulated_clips
-from steadypose.prior.fit.hmvae_network import HMVAE
-from steadypose.prior.fit.skeleton_conv import SkeletonConv
-from steadypose.prior.fit.torch_kinematics import forward_kinematics
+from steadypose.prior.fit.hmvae_network import HMVAE, SkeletonConv
+from steadypose.prior.fit.tensors import forward_kinematics
 
 
 def in_use(model: torch.nn.Module) -> int:

@@ -77,17 +77,16 @@ def _batch() -> Iterator[Message]:
             yield from batch.process_at(message, 10**9 + k * 33_333_333, hurry=False)
 
 
-def main(verb: str, file: str) -> int:
-    """0 if every digest is as written."""
-    found = dict(outcomes())
+def compare(verb: str, file: Path, found: dict[str, str]) -> int:
+    """Write the digests ``found``, or say which are not as they were written: 0 if all are."""
     if verb == "write":
-        Path(file).write_text(json.dumps(found, indent=1) + "\n")
+        file.write_text(json.dumps(found, indent=1) + "\n")
         return 0
-    before = json.loads(Path(file).read_text())
+    before = json.loads(file.read_text())
     changed = [name for name in before if found.get(name) != before[name]]
     print("\n".join(f"changed: {name}" for name in changed) or f"all {len(before)} as they were")
     return bool(changed)
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    sys.exit(compare(sys.argv[1], Path(sys.argv[2]), dict(outcomes())))

@@ -10,12 +10,12 @@ import torch
 
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
-from steadypose.prior.fit.torch_weights import load_tensors
+from steadypose.prior.fit.tensors import load_tensors
 from steadypose.prior.models.root_velocity import TrajectoryConfig
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.loop import TrainingOptions
-from steadypose.training.networks.root_velocity import TrajectoryNet
 from steadypose.training.recipes import root_velocity as training
+from steadypose.training.recipes.root_velocity import TrajectoryNet
 
 
 def rest_pose() -> np.ndarray:

@@ -23,9 +23,8 @@ from steadypose.prior.body.rigs import Rig, RigError, up_axis
 from steadypose.prior.mocap.amc import Asf, read_amc, read_asf
 from steadypose.prior.mocap.bvh import Bvh, read_bvh
 from steadypose.prior.mocap.clip import TO_Z_UP, Clip, MotionError
+from steadypose.prior.mocap.cmu import CMU_AMC, CMU_BVH, read_expmap
 from steadypose.prior.mocap.files import SUFFIXES, UNDESCRIBED, Description, file_rig, read_motion
-from steadypose.prior.mocap.npz import read_expmap
-from steadypose.prior.mocap.tables import CMU_AMC, CMU_BVH
 from steadypose.training.data.cmu import CMU_ACTIONS, NORMALISED, REPEATS
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from steadypose.prior.fit.torch_weights import load_network
+from steadypose.prior.fit.tensors import load_network
 from steadypose.prior.models.hgvae.config import JOINT_NODES, FaultNetConfig
 from steadypose.prior.models.weights import weights_path
 from steadypose.training.networks.graph import GraphBlock, GraphLinear

@@ -1,4 +1,10 @@
-"""Training of the completer: ``steadypose train completer``.
+"""The completer, a transformer that corrects slerp and lerp between what is known of a motion, and its training:
+``steadypose train completer``.
+
+One encoder over the frames of a window, hidden and known alike, as the transformers for in-betweening have it (Duan et
+al. 2022; Qin et al. 2022, "Motion In-betweening via Two-stage Transformers"), whose output is added to an interpolation
+(Oreshkin et al. 2023, "Motion In-betweening via Deep Delta-Interpolator"). Theirs know whole frames or nothing; here
+any joint may be known in any frame, and the network gates cubics, which theirs do without.
 
 Windows of true motion lose what `complete` is asked for: all frames between two ends, frames between key frames, parts
 of the body, and combinations of these; the known joints of some have a little noise.
@@ -6,6 +12,7 @@ of the body, and combinations of these; the known joints of some have a little n
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -13,19 +20,68 @@ import numpy as np
 import roma
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.skeleton import J, limbs
-from steadypose.prior.fit.torch_kinematics import forward_kinematics, from_6d, to_6d
-from steadypose.prior.models.completer.config import BENDS, CompleterConfig
+from steadypose.prior.fit.tensors import forward_kinematics, from_6d, to_6d
+from steadypose.prior.models.completer.config import BENDS, FEATURES, OUTPUTS, CompleterConfig
 from steadypose.prior.models.completer.features import Bools, Line, Window, correction_share, read_window
 from steadypose.prior.models.weights import LICENCES
 from steadypose.training.data.dataset import LivelyWindows, MotionSet, describe_data, mirror_offsets, mirror_rotations
 from steadypose.training.loop import TrainingOptions, TrainingRun
-from steadypose.training.networks.completer import Completer
 from steadypose.training.weights import started
+
+
+class Completer(nn.Module):
+    """Correction of the line, before it is anchored (`features.anchored`), and gates of the bend."""
+
+    def __init__(self, config: CompleterConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.read = nn.Linear(FEATURES, config.width)
+        self.layers = nn.ModuleList(_Layer(config) for _ in range(config.layers))
+        self.norm = nn.LayerNorm(config.width)
+        self.write = nn.Linear(config.width, OUTPUTS)
+        # (22, 4) quaternions, xyzw, local, of the mean pose
+        self.register_buffer("usual", torch.tensor([0.0, 0.0, 0.0, 1.0]).repeat(22, 1))
+        self.usual: Tensor
+        with torch.no_grad():
+            self.write.weight.mul_(0.05)  # begins near the line
+            self.write.bias.zero_()
+            self.write.bias[BENDS:] = 1.0
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, T, OUTPUTS) of features (B, T, FEATURES)."""
+        frames, reach = features.shape[1], self.config.reach
+        at = torch.arange(frames)
+        apart = (at[None] - at[:, None]).clamp(-reach, reach) + reach
+        x = self.read(features)
+        for layer in self.layers:
+            x = layer(x, apart)
+        return self.write(self.norm(x))
+
+
+class _Layer(nn.Module):
+    """Pre-norm attention with biases of relative position, and a feed-forward network."""
+
+    def __init__(self, config: CompleterConfig) -> None:
+        super().__init__()
+        self.heads = config.heads
+        self.norm1, self.norm2 = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
+        self.attend = nn.Linear(config.width, 3 * config.width)
+        self.join = nn.Linear(config.width, config.width)
+        self.bias = nn.Parameter(torch.zeros(config.heads, 2 * config.reach + 1))
+        self.widen = nn.Linear(config.width, 4 * config.width)
+        self.narrow = nn.Linear(4 * config.width, config.width)
+
+    def forward(self, x: Tensor, apart: Tensor) -> Tensor:
+        query, key, value = self.attend(self.norm1(x)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        scores = query @ key.mT / math.sqrt(query.shape[-1]) + self.bias[:, apart]
+        x = x + self.join((scores.softmax(dim=-1) @ value).transpose(1, 2).flatten(2))
+        return x + self.narrow(F.gelu(self.widen(self.norm2(x)), approximate="tanh"))
+
 
 Rng = np.random.Generator
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.fit.torch_weights import load_network
+from steadypose.prior.fit.tensors import load_network
 from steadypose.prior.models.hgvae.anomaly import (
     MISSING,
     PACE_EDGES,

@@ -15,7 +15,7 @@ from torch import Tensor
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.fit.hmvae_network import HMVAE, MotionVAE
-from steadypose.prior.fit.torch_kinematics import forward_kinematics, from_6d, remove_heading, to_6d
+from steadypose.prior.fit.tensors import forward_kinematics, from_6d, remove_heading, to_6d
 from steadypose.prior.models.hmvae.config import HMVAEConfig
 from steadypose.prior.models.weights import LICENCES
 from steadypose.training.data.dataset import LivelyWindows, MotionSet, describe_data, mirror_offsets, mirror_rotations

@@ -12,10 +12,8 @@ from torch.nn import functional as F
 
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, REST_SPEED, label_contacts
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.fit.humor_initial import fit_initial
-from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
-from steadypose.prior.fit.humor_rollout import roll_out, sample, transitions
-from steadypose.prior.fit.humor_state import State, canonical, choose, features, stack, states_of
+from steadypose.prior.fit.humor_network import HumorConfig, HumorNet, roll_out, sample, transitions
+from steadypose.prior.fit.humor_state import State, canonical, choose, features, pose_features, stack, states_of
 from steadypose.prior.models.weights import LICENCES
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.dataset import MotionSet, describe_data, mirror_offsets, mirror_rotations
@@ -58,6 +56,10 @@ MIN_SCALE = 0.02
 
 _MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
 _STATES_OF_MIXTURE = 40_000
+
+MIN_VARIANCE, MIXTURE_ITERATIONS = 1e-3, 100
+"""Variance added to each standardised feature's in the mixture of initial states, for joints on rigid bones have fewer
+degrees of freedom than coordinates; and the most iterations of expectation-maximisation."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +211,24 @@ def _fit_statistics(model: HumorNet, sequences: Sequences, seed: int) -> None:
     model.mean.copy_(inputs.mean(dim=0))
     model.scale.copy_(inputs.std(dim=0).clamp(min=MIN_SCALE))
     fit_initial(model, model.standardise(inputs), seed)
+
+
+def fit_initial(model: HumorNet, inputs: Tensor, seed: int) -> None:
+    """Fit the model's mixture of initial states (HuMoR, section 3) by expectation-maximisation.
+
+    Args:
+        model: whose buffers are filled.
+        inputs: (N, `FEATURES`) standardised features of states in their canonical frames.
+        seed: of the initial responsibilities.
+    """
+    from sklearn.mixture import GaussianMixture  # of the extra `train`, and slow to import
+
+    mixture = GaussianMixture(
+        model.config.components, reg_covar=MIN_VARIANCE, max_iter=MIXTURE_ITERATIONS, random_state=seed
+    ).fit(pose_features(inputs).double().numpy())
+    model.mixture_log_weights.copy_(torch.from_numpy(np.log(np.asarray(mixture.weights_))))
+    model.mixture_means.copy_(torch.from_numpy(mixture.means_))
+    model.mixture_precisions.copy_(torch.from_numpy(mixture.precisions_cholesky_))
 
 
 def transition_loss(model: HumorNet, batch: Batch, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:

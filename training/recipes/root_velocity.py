@@ -1,25 +1,96 @@
-"""Training of the trajectory network: root velocity (HM-VAE, section 3.3) and contacts (HuMoR, section 3.2)."""
+"""The trajectory network and its training: root velocity (HM-VAE, section 3.3) and contacts (HuMoR, section 3.2).
+
+Four skeleton convolutions with pooling over the skeleton and none over time, then a linear layer, as in the paper.
+Unlike there, the convolutions see no future, so that no delay is added; the input is turned to the body's heading,
+which the official code leaves to the network to learn; velocities are in m/s; and beside them the network predicts
+their standard deviation and the probability of each contact (HuMoR's eight), which keeps the velocity consistent with
+the feet in training.
+"""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import roma
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
-from steadypose.prior.body.skeleton import MIRROR, limbs
-from steadypose.prior.fit.torch_kinematics import heading, yaw_rotation
-from steadypose.prior.models.root_velocity import FRAME_S, TrajectoryConfig
+from steadypose.prior.body.skeleton import MIRROR, PARENTS, limbs
+from steadypose.prior.fit.hmvae_network import SkeletonConv, SkeletonPool
+from steadypose.prior.fit.tensors import heading, yaw_rotation
+from steadypose.prior.models.layers.dense import SLOPE
+from steadypose.prior.models.layers.edge_graph import Level, pooling_levels
+from steadypose.prior.models.root_velocity import CHANNELS, FRAME_S, TrajectoryConfig
 from steadypose.prior.models.weights import LICENCES
 from steadypose.training.data.dataset import MotionSet, describe_data
 from steadypose.training.loop import TrainingOptions, TrainingRun
-from steadypose.training.networks.root_velocity import RootMotion, TrajectoryNet
 from steadypose.training.weights import started
+
+
+class RootMotion(NamedTuple):
+    """What the network says of each frame, in the frame of its input."""
+
+    velocity: Tensor
+    """(B, T, 3) m/s, of the root"""
+    log_sigma: Tensor
+    """(B, T, 3) log of the standard deviation of that along each axis, m/s"""
+    contact_logits: Tensor
+    """(B, T, 8) of `CONTACT_JOINTS`"""
+
+
+class _Block(nn.Module):
+    """Convolution, pooling over the skeleton, activation."""
+
+    def __init__(self, in_channels: int, out_channels: int, level: Level, kernel: int) -> None:
+        super().__init__()
+        self.conv = SkeletonConv(in_channels, out_channels, level.neighbours, kernel, padding="causal")
+        self.pool = SkeletonPool(level.groups)
+
+    def forward(self, features: Tensor) -> Tensor:
+        return F.leaky_relu(self.pool(self.conv(features)), SLOPE)
+
+
+class TrajectoryNet(nn.Module):
+    """Root velocity and contacts from joint positions, causal in time."""
+
+    def __init__(self, config: TrajectoryConfig) -> None:
+        super().__init__()
+        self.config = config
+        levels = pooling_levels(PARENTS)
+        c = CHANNELS
+        self.blocks = nn.ModuleList(_Block(c[k], c[k + 1], level, config.kernel) for k, level in enumerate(levels))
+        self.head = nn.Linear(c[-1] * len(levels[-1].groups), 3 + 3 + len(CONTACT_JOINTS))
+
+    def forward(self, joints: Tensor) -> RootMotion:
+        """Every frame of joints (B, T, 22, 3): metres from the root, turned so that the body faces about +x.
+
+        Before its first frame a window is taken to have stood still; the standard deviations know that.
+        """
+        features = _features(joints)
+        for block in self.blocks:
+            features = block(features)
+        return _read(self.head(features.transpose(1, 2)))
+
+
+def _read(outputs: Tensor) -> RootMotion:
+    return RootMotion(*outputs.split([3, 3, len(CONTACT_JOINTS)], dim=-1))
+
+
+def _features(joints: Tensor) -> Tensor:
+    """(B, 22 * 6, T) of joints (B, T, 22, 3): position in metres, and velocity in m/s against the frame before.
+
+    The paper feeds positions alone. A step of a few centimetres is then a small difference of large numbers, and
+    training spends itself on learning to differentiate.
+    """
+    before = torch.cat([joints[:, :1], joints[:, :-1]], dim=1)
+    velocity = (joints - before) / FRAME_S
+    return torch.cat([joints, velocity], dim=-1).flatten(2).transpose(1, 2)
+
 
 ITERATIONS, BATCH, LEARNING_RATE = 2_000, 64, 2e-3
 """Windows a step; Adam's rate at the start, which falls along a cosine."""

@@ -20,8 +20,19 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import KINECT22
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
-from steadypose.training.data.error_statistics import SPEED_FLOOR, Statistics, autocorrelation, statistics, summary
-from steadypose.training.data.kinect_errors import SEEN, Clip, errors, prepare, simulate, usable
+from steadypose.training.data.kinect_errors import (
+    SEEN,
+    SPEED_FLOOR,
+    Clip,
+    Statistics,
+    autocorrelation,
+    errors,
+    prepare,
+    simulate,
+    statistics,
+    summary,
+    usable,
+)
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, load_pairs
 
 _ITERATIONS = 20

@@ -20,7 +20,7 @@ from steadypose.nodes.sinks.retarget.robot import Robot
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import global_rotations, rotation_matrices, rotation_matrix, yaw_matrix
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.sim.timing import minimum_jerk
+from steadypose.prior.sim.gait import minimum_jerk
 
 SIDES = ("left", "right")
 ANKLE = 0.07

@@ -34,7 +34,7 @@ from steadypose.prior.fit import solve
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.observations import SeenJoints
 from steadypose.prior.fit.solve import FitSettings
-from steadypose.prior.mocap.npz import read_amass
+from steadypose.prior.mocap.files import read_amass
 
 FRAMES = 24
 

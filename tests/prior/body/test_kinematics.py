@@ -13,7 +13,7 @@ from steadypose.prior.body.kinematics import (
     rotation_matrix,
 )
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
-from steadypose.prior.fit import torch_kinematics
+from steadypose.prior.fit import tensors
 
 
 def naive_fk(rotations: np.ndarray, offsets: np.ndarray, root: np.ndarray) -> np.ndarray:
@@ -33,8 +33,8 @@ def test_forward_kinematics_agrees_with_a_walk_down_the_tree() -> None:
     offsets = rng.normal(size=(2, 3, 22, 3))
     root = rng.normal(size=(2, 3, 3))
     got, orientations = forward_kinematics(rotations, offsets, root)
-    tensors = torch_kinematics.forward_kinematics(*(torch.from_numpy(a) for a in (rotations, offsets, root)))
-    assert all(np.allclose(ours, theirs) for ours, theirs in zip((got, orientations), tensors, strict=True))
+    in_torch = tensors.forward_kinematics(*(torch.from_numpy(a) for a in (rotations, offsets, root)))
+    assert all(np.allclose(ours, theirs) for ours, theirs in zip((got, orientations), in_torch, strict=True))
     for index in np.ndindex(2, 3):
         assert np.allclose(got[index], naive_fk(rotations[index], offsets[index], root[index]))
 
@@ -42,7 +42,7 @@ def test_forward_kinematics_agrees_with_a_walk_down_the_tree() -> None:
 def test_forward_kinematics_is_differentiable() -> None:
     rotations = torch.eye(3, dtype=torch.float64).repeat(1, 22, 1, 1).requires_grad_()
     offsets = torch.from_numpy(REST_OFFSETS).requires_grad_()
-    assert torch.autograd.gradcheck(lambda r, o: torch_kinematics.forward_kinematics(r, o)[0], (rotations, offsets))
+    assert torch.autograd.gradcheck(lambda r, o: tensors.forward_kinematics(r, o)[0], (rotations, offsets))
 
 
 def test_the_rest_pose_stands_in_a_t_and_faces_x() -> None:

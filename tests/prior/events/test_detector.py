@@ -15,8 +15,7 @@ from steadypose.msgs.types import Event, EventKind, Hand, JointState, Phase, Pos
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.events.detector import EventDetector
 from steadypose.prior.events.settings import EventSettings
-from steadypose.prior.events.trigger import Trigger
-from steadypose.prior.events.wave import Wave
+from steadypose.prior.events.trigger import Trigger, Wave
 
 FRAME_NS = 33_333_333
 START_NS = 1_000_000_000

@@ -19,7 +19,7 @@ from steadypose.prior.fit import windows
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
 from steadypose.prior.fit.observations import POINT_SHARE, SurfacePoints
 from steadypose.prior.fit.solve import STIFFNESS, FitSettings, fit_window, preconditioner
-from steadypose.prior.fit.torch_weights import load_network
+from steadypose.prior.fit.tensors import load_network
 from steadypose.prior.fit.windows import Track, fit_track, window_bounds
 
 NOISE = 0.03

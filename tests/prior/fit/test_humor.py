@@ -18,9 +18,7 @@ from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, heading, yaw_matrix
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.fit.humor_initial import fit_initial
-from steadypose.prior.fit.humor_network import Gaussian, HumorConfig, HumorNet
-from steadypose.prior.fit.humor_rollout import roll_out, sample, transitions
+from steadypose.prior.fit.humor_network import Gaussian, HumorConfig, HumorNet, roll_out, sample, transitions
 from steadypose.prior.fit.humor_state import (
     CHANGE,
     FEATURES,
@@ -35,9 +33,9 @@ from steadypose.prior.fit.humor_state import (
     small_log,
     states_of,
 )
-from steadypose.prior.fit.torch_weights import load_network
+from steadypose.prior.fit.tensors import load_network
 from steadypose.prior.timing.rate import FPS
-from steadypose.training.recipes.humor import Sequences, fit_transitions, transition_loss
+from steadypose.training.recipes.humor import Sequences, fit_initial, fit_transitions, transition_loss
 
 TOLD_MM, NATS = 68.0, 27.0
 """Of the weights that ship, on simulated people."""

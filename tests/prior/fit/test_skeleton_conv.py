@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from steadypose.prior.body.skeleton import PARENTS
-from steadypose.prior.fit.skeleton_conv import SkeletonConv, SkeletonPool, SkeletonUnpool
+from steadypose.prior.fit.hmvae_network import SkeletonConv, SkeletonPool, SkeletonUnpool
 from steadypose.prior.models.layers.edge_graph import pooling_levels
 
 SMPL24 = (*PARENTS, 20, 21)  # with hands, as the official code has it

@@ -15,7 +15,7 @@ from steadypose.benchmarks.motion import simulated_clips
 from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.fit.smpl import BETAS, POSES, SmplShape, smpl_motion
 from steadypose.prior.mocap.clip import MotionError
-from steadypose.prior.mocap.npz import read_amass
+from steadypose.prior.mocap.files import read_amass
 
 
 @pytest.fixture(scope="module")

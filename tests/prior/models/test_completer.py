@@ -28,8 +28,7 @@ from steadypose.prior.models.completer.features import (
 from steadypose.prior.models.completer.inference import LiveCompleter
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.loop import TrainingOptions
-from steadypose.training.networks.completer import Completer
-from steadypose.training.recipes.completer import Truth, answer, masks, train_completer
+from steadypose.training.recipes.completer import Completer, Truth, answer, masks, train_completer
 from steadypose.training.weights import arrays_of
 
 SMALL = CompleterConfig(width=16, heads=2, layers=2)

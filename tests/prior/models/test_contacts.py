@@ -11,7 +11,7 @@ import torch
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, label_contacts, yaw_matrix
 from steadypose.prior.models.contacts import FEATURES, OF_JOINT, LiveContacts, contact_features
 from steadypose.prior.sim.scripts import walk_turn
-from steadypose.training.networks.contacts import ContactConfig, ContactNet
+from steadypose.training.recipes.contacts import ContactConfig, ContactNet
 from steadypose.training.weights import arrays_of
 
 DT = 1 / 30

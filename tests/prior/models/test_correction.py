@@ -15,7 +15,7 @@ from steadypose.prior.models.sensor_bias import (
     recall,
     trunk_frame,
 )
-from steadypose.training.networks.sensor_bias import CorrectionNet, mirror_features
+from steadypose.training.recipes.sensor_bias import CorrectionNet, mirror_features
 
 CAMERA = np.array([-3.0, 0.5, 1.2])
 

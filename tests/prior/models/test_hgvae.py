@@ -11,7 +11,7 @@ from tests.helpers.bodies import waving
 from tests.prior.models.test_hmvae import prepared
 
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.fit.torch_weights import load_tensors
+from steadypose.prior.fit.tensors import load_tensors
 from steadypose.prior.models.hgvae.config import CompletionConfig, HGVAEConfig, Level
 from steadypose.prior.models.hgvae.features import from_tracks, hang_unseen, in_frame_of, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE

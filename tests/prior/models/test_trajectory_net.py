@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from steadypose.prior.models.root_velocity import LiveRootVelocity, TrajectoryConfig
-from steadypose.training.networks.root_velocity import RootMotion, TrajectoryNet
+from steadypose.training.recipes.root_velocity import RootMotion, TrajectoryNet
 from steadypose.training.weights import arrays_of
 
 

@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.prior.body.layouts import CANONICAL, get_skeleton, to_canonical
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
+from steadypose.prior.sim.body import mount
 from steadypose.prior.sim.camera import FRAME_ID, Camera, film, segment_gap, sight
 from steadypose.prior.sim.gait import Stand, Turn, Walk, plan
 from steadypose.prior.sim.motion import Intent, Motion, perform
 from steadypose.prior.sim.noise import NoiseModel
 from steadypose.prior.sim.scripts import SCRIPTS
-from steadypose.prior.sim.sensors import mount
 
 SILENT = replace(
     NoiseModel.load(), offset=np.zeros((22, 3)), bias=np.zeros((22, 3)), fast=np.zeros((22, 3)), jump_rate=np.zeros(22)

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, label_contacts
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, REST_OFFSETS, J
 from steadypose.prior.sim.body import TOE_HEIGHT, random_offsets, stature
-from steadypose.prior.sim.gait import RATE, Stand, Turn, Walk, plan
+from steadypose.prior.sim.gait import RATE, Key, Stand, Turn, Walk, minimum_jerk, plan, track
 from steadypose.prior.sim.motion import Intent, Motion, perform, two_bone
 from steadypose.prior.sim.scripts import SCRIPTS
-from steadypose.prior.sim.timing import Key, minimum_jerk, track
 
 SEED = 5
 FEET = list(CONTACT_JOINTS[2:6])

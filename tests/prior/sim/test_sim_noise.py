@@ -24,8 +24,7 @@ from steadypose.prior.sim.noise import (
     travelled,
 )
 from steadypose.prior.sim.scripts import SCRIPTS
-from steadypose.training.data.error_statistics import statistics
-from steadypose.training.data.kinect_errors import Clip, align, errors
+from steadypose.training.data.kinect_errors import Clip, align, errors, statistics
 from steadypose.training.data.kinect_errors import simulate as simulate_clips
 
 MODEL = NoiseModel.load()

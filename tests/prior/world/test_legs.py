@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
-from steadypose.prior.world.legs import fit_legs, turn_legs
+from steadypose.prior.world.compose import fit_legs, turn_legs
 
 LENGTHS = np.linalg.norm(REST_OFFSETS, axis=1)
 LEGS = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("hip", "knee", "ankle", "foot")]

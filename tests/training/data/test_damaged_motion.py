@@ -20,7 +20,7 @@ from steadypose.prior import npz
 from steadypose.prior.mocap.amc import read_amc, read_asf
 from steadypose.prior.mocap.bvh import read_bvh
 from steadypose.prior.mocap.clip import MotionError
-from steadypose.prior.mocap.npz import read_amass
+from steadypose.prior.mocap.files import read_amass
 from steadypose.prior.npz import check_arrays
 
 WORDS = [b"", b"nan", b"1e999", b"-1", b"0", b"{", b"}", b"JOINT", b"CHANNELS 99999", b"\n", b"\xff\0", b"9" * 30]

@@ -14,7 +14,7 @@ from tests.training.data.test_motion_amc import AMC, ASF
 from steadypose.prior.body.layouts import CANONICAL
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.mocap.clip import Clip, MotionError
-from steadypose.prior.mocap.tables import CMU_AMC, CMU_BVH
+from steadypose.prior.mocap.cmu import CMU_AMC, CMU_BVH
 from steadypose.training.data.cmu import REPEATS
 from steadypose.training.data.datasets import DATA_SETS, Dropped, amc_motions, bvh_motion, members
 

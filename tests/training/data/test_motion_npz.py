@@ -11,8 +11,8 @@ from tests.training.data.test_motion_bvh import turn
 
 from steadypose.prior.body.skeleton import JOINTS, REST_OFFSETS, J
 from steadypose.prior.mocap.clip import MotionError
-from steadypose.prior.mocap.npz import read_amass, read_expmap
-from steadypose.prior.mocap.tables import CMU_BVH
+from steadypose.prior.mocap.cmu import CMU_BVH, read_expmap
+from steadypose.prior.mocap.files import read_amass
 
 # Enough of CMU's tree to reach every joint that the rig wants: name, parent, offset in metres.
 TREE = [

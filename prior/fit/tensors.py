@@ -1,15 +1,18 @@
-"""Forward kinematics and rotations as networks have them, with gradients; without: `prior.body.kinematics`."""
+"""What torch needs of the live code: kinematics and rotations with gradients, and networks loaded from weights."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
+from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from steadypose.prior.body.kinematics import LEVELS
 from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.models.weights import load_weights
 
 
 def forward_kinematics(rotations: Tensor, offsets: Tensor, root: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -77,3 +80,34 @@ def yaw_rotation(yaw: Tensor) -> Tensor:
     zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
     c, s = yaw.cos(), yaw.sin()
     return torch.stack([c, -s, zero, s, c, zero, zero, zero, one], dim=-1).reshape(*yaw.shape, 3, 3)
+
+
+Config = TypeVar("Config")
+N = TypeVar("N", bound=nn.Module)
+
+
+def load_tensors(name: str, model: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """As `weights_io.load_weights`: the state dict and the configuration of ``model``."""
+    weights, config = load_weights(name, model)
+    return {key: torch.from_numpy(array) for key, array in weights.items()}, config
+
+
+def load_network(
+    network: Callable[[Config], N], config: Callable[[dict[str, Any]], Config], name: str, model: str
+) -> N:
+    """A trained network, in evaluation.
+
+    Args:
+        network: its class, such as `HGVAE`.
+        config: what makes that class's configuration of the JSON of a weights file, such as `HGVAEConfig.from_dict`.
+        name: the weight set, such as ``default``, or a path to a ``.safetensors`` file.
+        model: the model's name, such as ``hgvae``.
+
+    Raises:
+        FileNotFoundError: no such weights; says which there are.
+        WeightsError: the file is not one of this model's.
+    """
+    state, stored = load_tensors(name, model)
+    loaded = network(config(stored))
+    loaded.load_state_dict(state)
+    return loaded.eval()
