@@ -12,7 +12,6 @@ import os
 import sys
 from importlib.metadata import version
 
-from steadypose.nodes.commands.user_errors import is_for_user
 from steadypose.nodes.graph.extras import extra_of, how_to_install
 
 #: name: (where, what it does)
@@ -21,7 +20,7 @@ COMMANDS = {
     "node": ("steadypose.nodes.commands.node:node", "one node, for another machine or a supervisor such as systemd"),
     "clean": ("steadypose.nodes.commands.clean:clean", "clean a recording or .npz offline, with the nodes' own code"),
     "retarget": (
-        "steadypose.nodes.commands.retarget:retarget",
+        "steadypose.nodes.commands.export:retarget",
         "a recording's person as a robot's motion, by its URDF",
     ),
     "fit": (
@@ -33,11 +32,11 @@ COMMANDS = {
         "key frames to motion, a part of a body to all of it, offline",
     ),
     "export": ("steadypose.nodes.commands.export:export", "cleaned motion as BVH, GLB, CSV or TRC, for other programs"),
-    "echo": ("steadypose.nodes.commands.inspect.echo:echo", "print the messages of a topic or recording"),
-    "hz": ("steadypose.nodes.commands.inspect.hz:hz", "measure the rate of a topic or recording"),
-    "info": ("steadypose.nodes.commands.inspect.info:info", "what is in a recording, or on a topic"),
-    "repair": ("steadypose.nodes.commands.repair:repair", "what can be read of a damaged recording, as a whole one"),
-    "plot": ("steadypose.nodes.commands.plot.command:plot", "what happened in a recording, as pictures"),
+    "echo": ("steadypose.nodes.commands.inspect:echo", "print the messages of a topic or recording"),
+    "hz": ("steadypose.nodes.commands.inspect:hz", "measure the rate of a topic or recording"),
+    "info": ("steadypose.nodes.commands.info:info", "what is in a recording, or on a topic"),
+    "repair": ("steadypose.nodes.commands.small:repair", "what can be read of a damaged recording, as a whole one"),
+    "plot": ("steadypose.nodes.commands.plot:plot", "what happened in a recording, as pictures"),
     "prepare": ("steadypose.nodes.commands.prepare:prepare", "motion capture into training data"),
     "train": ("steadypose.nodes.commands.train:train", "train a model of the prior"),
     "evaluate": (
@@ -45,19 +44,19 @@ COMMANDS = {
         "measure steadypose beside tuned baselines, study by study (in a checkout)",
     ),
     "simulate": (
-        "steadypose.nodes.commands.simulate:simulate",
+        "steadypose.nodes.commands.small:simulate",
         "make streams as a depth camera would see them, with their truth",
     ),
     "calibrate": (
-        "steadypose.nodes.commands.calibrate.command:calibrate",
+        "steadypose.nodes.commands.calibrate:calibrate",
         "a camera's lens and place in the world, into its launch file",
     ),
-    "doctor": ("steadypose.nodes.commands.doctor.command:doctor", "what is missing on this machine, and how to get it"),
+    "doctor": ("steadypose.nodes.commands.doctor:doctor", "what is missing on this machine, and how to get it"),
     "install-service": (
         "steadypose.nodes.commands.install_service:install_service",
         "run a launch file at every boot, under systemd",
     ),
-    "keys": ("steadypose.nodes.commands.keys:keys", "make CurveZMQ keys, for messages that leave this machine"),
+    "keys": ("steadypose.nodes.commands.small:keys", "make CurveZMQ keys, for messages that leave this machine"),
 }
 
 USAGE_ERROR = 2
@@ -128,6 +127,11 @@ def _run(name: str, arguments: list[str]) -> object:
         args=arguments,
         config=(tyro.conf.PositionalRequiredArgs, tyro.conf.UseAppendAction, tyro.conf.FlagCreatePairsOff),
     )
+
+
+def is_for_user(error: Exception) -> bool:
+    """Whether an error says what to do: the project's own, and those of files. Others are bugs."""
+    return isinstance(error, OSError) or type(error).__module__.startswith("steadypose.")
 
 
 def usage() -> str:

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
-from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
+from steadypose.msgs.types import Message, PoseClean, PoseRaw
 from steadypose.nodes.checks.stream import StreamCheck
+from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sources.npz import ArraySource
 from steadypose.nodes.sources.recording import with_end
 from steadypose.nodes.sources.source import RecordedSource
+from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.settings import PriorSettings
+
+if TYPE_CHECKING:
+    from steadypose.prior.clean.batch import StreamBatch
+    from steadypose.prior.clean.pipeline import PriorPipeline
+    from steadypose.prior.world.pipeline import TrajectoryPipeline
 
 CHECKED, CHECKED_NS = 45, 1_500_000_000
 """frames between two looks at whether the input can be right, and the time in which they count as having come"""
@@ -27,20 +36,8 @@ NOBODY = "nobody_recognised: no body in any frame; is the skeleton right, are th
 Settings = Mapping[str, Mapping[str, Any]]
 
 
-class Cleaner(Protocol):
-    """What `stream` needs of a `PriorPipeline`."""
-
-    def process(self, raw: PoseRaw) -> list[PoseClean]: ...
-
-
-class Placer(Protocol):
-    """What `stream` needs of a `TrajectoryPipeline`."""
-
-    def process(self, clean: PoseClean) -> list[PoseWorld]: ...
-
-
 def stream(
-    messages: Iterable[tuple[str, Message]], prior: Cleaner, trajectory: Placer
+    messages: Iterable[tuple[str, Message]], prior: PriorPipeline | StreamBatch, trajectory: TrajectoryPipeline
 ) -> Iterator[tuple[str, Message]]:
     """All that the nodes publish when the input node publishes ``messages``: these, and the answers to each.
 
@@ -152,6 +149,8 @@ class OfflineRun:
         return collector.arrays(self.stamps_ns)
 
 
-def clean_arrays(source: RecordedSource, settings: Settings) -> dict[str, NDArray[Any]]:
-    """The arrays of `OfflineRun`, where nothing else of it is wanted."""
-    return OfflineRun(source, settings).arrays()
+def clean_joints(joints: Floats, delay: int = 8) -> Floats:
+    """What `steadypose clean` makes of joints (T, 22, 3) metres, z up, at 30 Hz; NaN where it finds nobody."""
+    stamps = np.round(np.arange(len(joints)) * FRAME_NS).astype(np.int64)
+    source = ArraySource(Path("joints"), {"positions": joints, "stamp_ns": stamps, "skeleton": np.array("smpl22")})
+    return OfflineRun(source, {"prior": {"delay": delay}, "trajectory": {}}).arrays()["positions"].astype(float)

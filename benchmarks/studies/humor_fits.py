@@ -13,16 +13,17 @@ from numpy.typing import NDArray
 
 from steadypose.benchmarks.metrics import acceleration_error, position_error
 from steadypose.benchmarks.motion import MotionClips
-from steadypose.nodes.commands.fitting import noise_of
-from steadypose.nodes.commands.key_points import track_of_picture
+from steadypose.nodes.driving import clean_joints
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import LOAD_SPEED, REST_HEIGHT, label_contacts
 from steadypose.prior.body.skeleton import J
+from steadypose.prior.fit.bodies import noise_of
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.motion import float_tensor
 from steadypose.prior.fit.observations import Observed, Pinhole, SeenJoints
+from steadypose.prior.fit.picture import track_of_picture
 from steadypose.prior.fit.solve import PICTURES, FitSettings, Start, fit_window
 from steadypose.prior.fit.windows import Track, load_of
 from steadypose.prior.sim.depth import Stereo, render, spoil
@@ -131,7 +132,7 @@ def pictures(clips: MotionClips, clip: int, rng: np.random.Generator) -> Picture
             @ rotation.T
         )
     flat, deep = (
-        track_of_picture(pixels, confidence, camera, -CAMERA_HEIGHT, floor_known=True, points=told)
+        track_of_picture(pixels, confidence, camera, -CAMERA_HEIGHT, floor_known=True, points=told, clean=clean_joints)
         for told in (None, points)
     )
     return Pictures(truth, np.asarray(np.isfinite(pixels).all(axis=-1)), flat, deep)

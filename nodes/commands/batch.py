@@ -26,8 +26,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
+from steadypose.nodes.cli import is_for_user
 from steadypose.nodes.commands.cleaning import clean_recording
-from steadypose.nodes.commands.user_errors import is_for_user
 from steadypose.nodes.driving import NOBODY
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.safe_python import command, environment

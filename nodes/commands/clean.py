@@ -11,8 +11,7 @@ from rich.progress import Progress
 
 from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
 from steadypose.nodes.commands.cleaning import clean_recording
-from steadypose.nodes.commands.output import check_format, check_output
-from steadypose.nodes.commands.printable import printable
+from steadypose.nodes.commands.output import check_format, check_output, printable
 from steadypose.nodes.commands.setting_names import check_settings, full_key, pipeline_sections
 from steadypose.nodes.driving import NOBODY
 from steadypose.nodes.graph.launch import apply_override, read_toml

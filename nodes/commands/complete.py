@@ -2,19 +2,53 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import tyro
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
-from steadypose.nodes.commands.output import check_format, check_output
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.types import JOINTS, JointState, Message, PoseClean, PoseRaw
+from steadypose.nodes.commands.output import (
+    ARRAY_FILES,
+    check_format,
+    check_output,
+    check_replaceable,
+    put_in_place,
+    unfinished,
+    write_arrays,
+    write_recording,
+)
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
-from steadypose.nodes.sources.recording import NO_RIG
+from steadypose.nodes.sinks.drawing import ALL_BONES, STATE_COLOURS, facing
+from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sources.recording import NO_RIG, open_recording, with_end
+from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.body.own_layouts import add_layouts
+from steadypose.prior.body.skeleton import finite_joints
+from steadypose.prior.complete.body import Completed, Fill, Uncertainty
+from steadypose.prior.complete.body import complete as fill_in
+from steadypose.prior.complete.parts import PartsCompleter
+from steadypose.prior.complete.root_path import is_root_centred
+from steadypose.prior.complete.stream import Stretch, clean_messages, moved, root_steps, stretches_of
+from steadypose.prior.models.completer.inference import LiveCompleter
+from steadypose.prior.timing.rate import FPS
+from steadypose.prior.world.pipeline import TrajectoryPipeline
+from steadypose.prior.world.settings import TrajectorySettings
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FIGURES = 16
+_GIVEN, _COMPLETED = STATE_COLOURS[JointState.SEEN], STATE_COLOURS[JointState.IMPUTED]
 
 
 def complete(
@@ -63,9 +97,6 @@ def complete(
     if picture is not None and picture.suffix not in (".png", ".svg", ".pdf"):
         raise LaunchError(f"--picture: expected a name ending in .png, .svg or .pdf, got {picture}")
     one_thread()
-    # these compile and load: not before it is known that there is something to do
-    from steadypose.nodes.commands.completing import complete_recording, load_completer
-
     fill, uncertainty = load_completer(weights)
     if optimise:
         from steadypose.prior.fit.optimise import Optimiser
@@ -99,8 +130,196 @@ def complete(
     for cause, count in done.refused.items():
         console.print(f"  refused or dropped, {cause}: {count}", highlight=False)
     if picture is not None:
-        from steadypose.nodes.commands.complete_picture import draw
-
         draw(done, source.name, picture)
         console.print(f"wrote {picture}", highlight=False)
     return 0
+
+
+@dataclass(frozen=True)
+class Done:
+    """Summary of the completion of one recording.
+
+    Attributes:
+        frames: given out.
+        bodies: how many.
+        given: share of the joints of these that the recording knew.
+        longest_gap: frames of which nothing was known, at most.
+        unreached: joints too far from all that is known.
+        stretches: what came in, and what came out.
+        refused: what was refused or dropped, by cause.
+        centred: bodies whose root stands still, whose way was read from their motion.
+    """
+
+    frames: int
+    bodies: int
+    given: float
+    longest_gap: int
+    unreached: int
+    stretches: list[tuple[Stretch, Completed]]
+    refused: dict[str, int]
+    centred: list[int]
+
+
+@dataclass(frozen=True)
+class Completion:
+    """What came of a recording.
+
+    Attributes:
+        raws: ``pose/raw`` as it was, with its end.
+        answers: ``pose/clean`` and ``pose/world`` with their topics, in order.
+        done: the summary.
+    """
+
+    raws: list[PoseRaw]
+    answers: list[tuple[str, Message]]
+    done: Done
+
+
+def complete_recording(
+    source: Path,
+    out: Path,
+    fill: Fill,
+    uncertainty: Uncertainty,
+    *,
+    rig: Mapping[str, Any] = NO_RIG,
+    replace: bool = False,
+    began: Callable[[int], None] = lambda frames: None,
+    advanced: Callable[[int], None] = lambda frame: None,
+) -> Done:
+    """Complete one recording. The output is there whole, or not at all.
+
+    Args:
+        source: a recording or file of poses.
+        out: the recording to make, or .npz or .csv.
+        fill: a completer.
+        uncertainty: standard deviations of its output.
+        rig: what a file of motion does not say.
+        replace: whether what is at ``out`` may be replaced, if it is a recording or an .npz.
+        began: called with the number of frames of all bodies together.
+        advanced: called with how many of them are done.
+
+    Raises:
+        LaunchError, RecordingError, NpzError: the input cannot be used, or the output not be made.
+    """
+    check_replaceable(out, replace=replace)
+    completion = complete_source(open_recording(source, rig), str(source), fill, uncertainty, began, advanced)
+    with unfinished(out) as part:
+        if out.suffix in ARRAY_FILES:
+            write_arrays(part, completed_arrays(completion))
+        else:
+            every = [*((POSE_RAW, message) for message in completion.raws), *completion.answers]
+            write_recording(part, sorted(every, key=lambda pair: pair[1].stamp_ns))
+        put_in_place(part, out)
+    return completion.done
+
+
+def load_completer(weights: str) -> tuple[PartsCompleter, Uncertainty]:
+    """The completer of a weight set, and the standard deviations of its output."""
+    completer = LiveCompleter.load(weights)
+    return PartsCompleter(completer), Uncertainty(completer.config.never_sigma, completer.config.half_frames)
+
+
+def complete_source(
+    frames: RecordedSource,
+    name: str,
+    fill: Fill,
+    uncertainty: Uncertainty,
+    began: Callable[[int], None] = lambda frames: None,
+    advanced: Callable[[int], None] = lambda frame: None,
+) -> Completion:
+    """Complete what a source has; ``name`` is what errors call it, the rest as of `complete_recording`.
+
+    Raises:
+        LaunchError: it has no frame.
+        CompletionError: it shows nobody.
+    """
+    messages = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
+    raws = [message for message in messages if not message.end_of_stream]
+    if not raws:
+        raise LaunchError(f"{name}: expected frames, but none of {len(frames)} could be read")
+    anchor = min(message.stamp_ns for message in raws)
+    stretches = stretches_of(name, raws, anchor)
+    began(sum(len(stretch.given) for stretch in stretches))
+    done: list[tuple[Stretch, Completed]] = []
+    before = 0
+    for stretch in stretches:
+        completed = fill_in(fill, stretch.given, stretch.offsets, lambda k, at=before: advanced(at + k))
+        done.append((stretch, completed))
+        before += len(stretch.given)
+        advanced(before)
+    centred = sorted({s.body for s, _ in done if is_root_centred(s.given)})
+    clean = clean_messages(raws, done, uncertainty, anchor)
+    settings = TrajectorySettings()
+    world, steps = TrajectoryPipeline(settings), root_steps(done, centred, settings.weights)
+    answers: list[tuple[str, Message]] = []
+    for message in clean:
+        answers.append((POSE_CLEAN, message))
+        answers += [(POSE_WORLD, answer) for answer in world.process(moved(message, steps, anchor))]
+    summary = Done(
+        frames=len(clean) - 1,
+        bodies=len({stretch.body for stretch, _ in done}),
+        given=float(np.average([c.known.mean() for _, c in done], weights=[len(s.given) for s, _ in done])),
+        longest_gap=max(completed.span for _, completed in done),
+        unreached=sum(int((~finite_joints(completed.positions)).sum()) for _, completed in done),
+        stretches=done,
+        refused={cause: n for cause, n in (frames.refused + world.counters).items() if n},
+        centred=centred,
+    )
+    return Completion(messages, answers, summary)
+
+
+def completed_arrays(completion: Completion) -> dict[str, NDArray[Any]]:
+    """The arrays of ``clean``, with a row for each frame of the grid on which there is a body."""
+    collector = NpzCollector()
+    stamps = []
+    for _, message in completion.answers:
+        collector.add(message)
+        if isinstance(message, PoseClean) and not message.end_of_stream:
+            stamps.append(message.stamp_ns)
+    return collector.arrays(np.array(stamps, np.int64))
+
+
+def draw(done: Done, title: str, path: Path) -> None:
+    """Write the picture of the longest stretch that was completed: joints given when, stick figures, the trajectory."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+
+    stretch, completed = max(done.stretches, key=lambda pair: len(pair[0].given))
+    joints, known = completed.positions, completed.known
+    there = np.flatnonzero(np.isfinite(joints).all(axis=(1, 2)))
+    figure = Figure(figsize=(15, 9), layout="constrained")
+    figure.suptitle(f"{title} · body {stretch.body} · given in green, completed in orange", fontsize=13, weight="bold")
+    grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.2], width_ratios=[2.2, 1])
+    sticks = figure.add_subplot(grid[0, :])
+    chosen = there[np.linspace(0, len(there) - 1, min(FIGURES, len(there))).round().astype(int)]
+    front = next((f for row in chosen if (f := facing(joints[row])) is not None), np.array([1.0, 0.0, 0.0]))
+    across = np.array([-front[1], front[0], 0.0])
+    for place, row in enumerate(chosen):
+        beside = joints[row] - joints[row, 0]
+        flat = np.stack([place + beside @ across, beside[:, 2]], axis=1)
+        colours = [_GIVEN if known[row, list(ends)].all() else _COMPLETED for ends in ALL_BONES]
+        sticks.add_collection(LineCollection(list(flat[ALL_BONES]), colors=colours, linewidths=2.0))
+        sticks.text(place, -1.13, f"{row / FPS:.1f} s", ha="center", fontsize=8)
+    sticks.set(aspect="equal", xlim=(-0.6, FIGURES - 0.4), ylim=(-1.2, 0.85))
+    sticks.axis("off")
+    which = figure.add_subplot(grid[1, 0])
+    shown = np.where(np.isfinite(joints[..., 0]), np.where(known, 1, 2), 0)
+    which.imshow(
+        shown.T, aspect="auto", interpolation="nearest", vmin=0, vmax=2,
+        cmap=ListedColormap(["white", _GIVEN, _COMPLETED]), extent=(0.0, len(shown) / FPS, 21.5, -0.5),
+    )  # fmt: skip
+    which.set_yticks(range(len(JOINTS)), JOINTS, fontsize=7)
+    which.set(title="which joints were given when", xlabel="seconds")
+    _draw_trajectory(figure.add_subplot(grid[1, 1]), joints[:, 0], known[:, 0])
+    figure.savefig(path, dpi=110)
+
+
+def _draw_trajectory(axis: Axes, root: NDArray[np.float64], given: NDArray[np.bool_]) -> None:
+    for mask, colour in ((given, _GIVEN), (~given, _COMPLETED)):
+        axis.plot(root[mask, 0], root[mask, 1], ".", color=colour, markersize=3)
+    axis.set(title="the pelvis from above, m", aspect="equal")
+    axis.grid(alpha=0.25)

@@ -5,20 +5,19 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 from rich.progress import Progress
 
-from steadypose.msgs.types import JOINTS
-from steadypose.nodes.commands.fit_source import Fitted, fit_source, fitted_arrays, load_transitions, with_bones
-from steadypose.nodes.commands.fitting import Fit
-from steadypose.nodes.commands.key_points import arrays_of_fit, fit_key_points, has_key_points, read_key_points
+from steadypose.msgs.types import JOINTS, Message, PoseRaw
+from steadypose.nodes.commands.key_points import has_key_points, read_key_points
 from steadypose.nodes.commands.output import (
     ARRAY_FILES,
     check_format,
@@ -28,13 +27,20 @@ from steadypose.nodes.commands.output import (
     write_arrays,
     write_recording,
 )
+from steadypose.nodes.driving import clean_joints, stream
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sources.npz import NpzError, read_arrays
 from steadypose.nodes.sources.recording import open_recording
+from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.arrays import Floats
+from steadypose.prior.clean.adapt import SensorFrame
+from steadypose.prior.fit.picture import in_sight
 
 if TYPE_CHECKING:
+    from steadypose.prior.fit.bodies import Fit, Seen
+    from steadypose.prior.fit.humor_network import HumorNet
     from steadypose.prior.fit.windows import FittedTrack
 
 
@@ -137,6 +143,7 @@ def _fit_picture(
     source: Path, out: Path, model: Any, folder: Path, progress: Progress
 ) -> tuple[int, list[FittedTrack | None], list[str]]:
     """Fit key points of one camera; returns as `_fit_poses`."""
+    from steadypose.prior.fit.picture import arrays_of_fit, fit_key_points
     from steadypose.prior.fit.solve import PICTURES
     from steadypose.prior.fit.windows import MIN_FRAMES, window_bounds
 
@@ -145,7 +152,7 @@ def _fit_picture(
     if frames < MIN_FRAMES:
         raise NpzError(f"{source}: expected {MIN_FRAMES} frames at 30 Hz or more, got {frames}")
     bar = progress.add_task(source.name, total=len(window_bounds(frames)))
-    track = fit_key_points(model, recording, PICTURES, folder, lambda: progress.advance(bar))
+    track = fit_key_points(model, recording, PICTURES, folder, clean_joints, lambda: progress.advance(bar))
     part = folder / out.name
     arrays: dict[str, Any] = with_bones(arrays_of_fit(recording, track), track)
     np.savez(part, **arrays)
@@ -214,3 +221,117 @@ def _picture(path: Path, fits: Sequence[tuple[int, NDArray[np.int64], Floats, An
         axis.set(title=f"body {body}: how far joints lie from where they were seen, {unit}", xlabel="seconds")
         figure.colorbar(image, ax=axis)
     figure.savefig(path, dpi=110)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What came of a source.
+
+    Attributes:
+        messages: of all topics, with poses replaced by the fitted ones.
+        stamps_ns: (T,) of its frames.
+        fits: of each body, for as long as it was seen.
+    """
+
+    messages: list[tuple[str, Message]]
+    stamps_ns: NDArray[np.int64]
+    fits: list[Fit]
+
+
+def load_transitions(weights: str) -> HumorNet:
+    """The model of transitions of a weight set."""
+    from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
+    from steadypose.prior.fit.tensors import load_network
+
+    return load_network(HumorNet, HumorConfig.from_dict, weights, "humor")
+
+
+def fit_source(
+    frames: RecordedSource,
+    name: str,
+    points: ArrayLike | None,
+    *,
+    model: HumorNet,
+    delay: int,
+    folder: Path | None = None,
+    began: Callable[[Sequence[Seen]], None] = lambda bodies: None,
+    advanced: Callable[[], None] = lambda: None,
+) -> Fitted:
+    """Fit 3D joints, initialised by the nodes' own pipelines.
+
+    Args:
+        frames: the source.
+        name: what errors call it.
+        points: (T, N, 3) metres of the body's surface, in the sensor's frame, NaN where there are fewer.
+        model: of transitions.
+        delay: of the initialisation, frames at 30 Hz.
+        folder: for finished windows, so that the same call goes on where it was stopped.
+        began: called with the bodies.
+        advanced: called after each window.
+
+    Raises:
+        LaunchError: nobody is seen for long enough.
+        NpzError: points of the wrong form.
+    """
+    from steadypose.nodes.graph.prior_node import make_prior
+    from steadypose.nodes.graph.trajectory_node import make_trajectory
+    from steadypose.prior.fit.bodies import bodies_seen, fit_body, rewritten
+    from steadypose.prior.fit.solve import FitSettings
+    from steadypose.prior.fit.windows import MIN_FRAMES
+
+    surface = _surface(name, points, len(frames))
+    messages = list(stream(frames, make_prior({"delay": delay}), make_trajectory({})))
+    bodies = bodies_seen(messages, MIN_FRAMES)
+    if not bodies:
+        raise LaunchError(
+            f"{name}: expected somebody who is seen for {MIN_FRAMES} frames or more, found nobody; is the skeleton "
+            "right, are the units metres? `steadypose info` says what it holds"
+        )
+    stamps = np.array([m.stamp_ns for _, m in messages if isinstance(m, PoseRaw) and not m.end_of_stream], np.int64)
+    began(bodies)
+    fits = []
+    for number, seen in enumerate(bodies):
+        own = None
+        if folder is not None:
+            own = folder / f"{number:04d}"
+            own.mkdir(exist_ok=True)
+        near = None
+        if surface is not None:
+            nearest = np.abs(stamps[None] - seen.stamps_ns[:, None]).argmin(axis=1)
+            near = np.stack([
+                SensorFrame.of(message.sensor_pose).to_world(frame)
+                for message, frame in zip(seen.clean, surface[nearest], strict=True)
+            ])  # fmt: skip
+        fits.append(fit_body(model, seen, near, FitSettings(), own, advanced))
+    return Fitted(rewritten(messages, fits), stamps, fits)
+
+
+def fitted_arrays(fitted: Fitted) -> dict[str, NDArray[Any]]:
+    """The arrays of ``clean``, a row for each frame; of one body that was fitted, with its bones and the ground."""
+    collector = NpzCollector()
+    for _, message in fitted.messages:
+        collector.add(message)
+    arrays = collector.arrays(fitted.stamps_ns)
+    tracks = {fit.seen.id: fit.track for fit in fitted.fits if fit.track is not None}
+    return with_bones(arrays, next(iter(tracks.values()))) if len(tracks) == 1 else arrays
+
+
+def with_bones(arrays: dict[str, NDArray[Any]], track: FittedTrack) -> dict[str, NDArray[Any]]:
+    """With bones and ground, where there is one person; of several, .misfit.npz has them for each."""
+    from steadypose.prior.fit.bodies import ground_plane
+
+    bones = np.linalg.norm(track.offsets.mean(axis=0), axis=-1)
+    return arrays | {"bone_lengths": bones, "ground_plane": ground_plane(track.ground.mean(axis=0))}
+
+
+def _surface(name: str, points: ArrayLike | None, frames: int) -> Floats | None:
+    """(T, N, 3) metres, points that a camera can see."""
+    if points is None:
+        return None
+    points = np.asarray(points)
+    if points.dtype.kind not in "fiu" or points.ndim != 3 or len(points) != frames or points.shape[-1] != 3:
+        raise NpzError(
+            f"{name}: points: expected ({frames}, N, 3) metres, NaN for what is missing, got {points.dtype} "
+            f"{points.shape}"
+        )
+    return in_sight(points.astype(np.float64))

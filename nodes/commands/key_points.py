@@ -9,43 +9,27 @@ the camera that points up (``-y``, a level camera, unless given), ``camera_heigh
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import JOINTS, JointState, Pose
-from steadypose.nodes.driving import clean_arrays
+from steadypose.msgs.types import Pose
 from steadypose.nodes.graph.clock import FRAME_NS
-from steadypose.nodes.sources.npz import ArraySource, NpzError, read_arrays, read_stamps
+from steadypose.nodes.sources.npz import NpzError, read_arrays, read_stamps
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.bone_lengths import estimate_offsets
-from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.kinematics import quaternions, rotation_matrix
+from steadypose.prior.body.kinematics import rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS
-from steadypose.prior.body.skeleton import REST_OFFSETS
+from steadypose.prior.fit.picture import KeyPointRecording, in_sight
 
 if TYPE_CHECKING:
-    from steadypose.prior.fit.humor_network import HumorNet
-    from steadypose.prior.fit.observations import Pinhole
-    from steadypose.prior.fit.solve import FitSettings, Start
-    from steadypose.prior.fit.windows import FittedTrack, Track
+    pass
 
 
-PIXEL_SIGMA = 0.01
-"""Of the focal length: what a key point is off by in the picture."""
-
-CAMERA_HEIGHT, CAMERA_HEIGHT_SIGMA = 1.3, 0.3
-"""Metres above the floor at which a camera hangs of which that is not known."""
-
-HIGHEST, NEAREST, FARTHEST = 100.0, 0.05, 100.0
-"""Metres: of a camera above the floor, and of a point from it."""
-
-LIFTED_DELAY, LIFTED_SIGMA = 8, 0.08
-"""Of key points as deep as the surface about them: frames, of `clean`; metres that they are off along an axis."""
+HIGHEST = 100.0
+"""Height in metres of a camera above the floor, at most."""
 
 LONGEST_GAP_NS = 200_000_000
 """over which key points are interpolated"""
@@ -54,31 +38,6 @@ LONGEST_NS = 24 * 3600 * 10**9
 """of a recording: one wrong stamp must not make a grid of years"""
 
 _NUMBERS = {"keypoints", "confidence", "focal", "centre", "camera_height", "points"}
-
-
-@dataclass(frozen=True)
-class KeyPointRecording:
-    """One person's key points at the times of a 30 Hz grid, in canonical joints.
-
-    Attributes:
-        stamps_ns: (T,) of the grid.
-        pixels: (T, 22, 2); NaN where not found.
-        confidence: (T, 22).
-        focal: (2,) pixels.
-        centre: (2,) pixels.
-        rotation: (3, 3) from the camera's frame to one that is z up.
-        camera_height: metres; None where not known.
-        points: (T, N, 3) metres, in the camera's frame; None where there are none.
-    """
-
-    stamps_ns: NDArray[np.int64]
-    pixels: Floats
-    confidence: Floats
-    focal: Floats
-    centre: Floats
-    rotation: Floats
-    camera_height: float | None
-    points: Floats | None
 
 
 def has_key_points(path: Path) -> bool:
@@ -159,13 +118,6 @@ def read_key_points(path: Path) -> KeyPointRecording:
     )  # fmt: skip
 
 
-def in_sight(points: Floats) -> Floats:
-    """Points (T, N, 3) metres from a depth camera, NaN where none can see them: at its place, where many put what they
-    have no depth of, or too far away."""
-    away = np.linalg.norm(np.where(np.isfinite(points), points, np.inf), axis=-1, keepdims=True)
-    return np.where((away > NEAREST) & (away < FARTHEST), points, np.nan)
-
-
 def _stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:
     stamps = read_stamps(path, arrays, frames)
     if (np.diff(stamps) <= 0).any() or stamps[-1] - stamps[0] > LONGEST_NS:
@@ -183,120 +135,3 @@ def _on_grid(
     mixed = (1 - share) * pixels[after - 1] + share * pixels[after]
     mixed[span > LONGEST_GAP_NS] = np.nan
     return np.where(np.isfinite(mixed), mixed, pixels[nearest]), sure[nearest]
-
-
-def track_of_picture(
-    pixels: Floats,
-    confidence: Floats,
-    camera: Pinhole,
-    floor: float,
-    *,
-    floor_known: bool = False,
-    points: Floats | None = None,
-) -> Track:
-    """What is to be fitted of a person in a picture, and the motions to start from.
-
-    With points, the start is what `clean` says of the key points as deep as the surface about them, which are observed
-    too; without, or if it finds nobody, it is that of `starts_of_key_points`.
-
-    Args:
-        pixels: (T, 22, 2) at 30 Hz, NaN where not found.
-        confidence: (T, 22) 0 to 1.
-        camera: that took it.
-        floor: metres, world, its height, or a guess.
-        floor_known: which of the two.
-        points: (T, N, 3) metres, world, of the body's surface, NaN where there are fewer; None if there are none.
-    """
-    import torch
-
-    from steadypose.prior.fit.lift import lift, starts_of_key_points
-    from steadypose.prior.fit.motion import float_tensor
-    from steadypose.prior.fit.observations import KeyPoints, Observed, SeenJoints, SurfacePoints, thinned
-    from steadypose.prior.fit.windows import Track
-
-    sigma = PIXEL_SIGMA * float(camera.focal.mean())
-    observed: list[Observed] = [KeyPoints(float_tensor(pixels), float_tensor(confidence), camera, sigma)]
-    starts = starts_of_key_points(pixels, camera, REST_OFFSETS, floor, floor_known=floor_known)
-    if points is not None:
-        lifted = lift(pixels, camera, points)
-        observed.append(SurfacePoints(float_tensor(thinned(points)), camera.position))
-        observed.append(SeenJoints(float_tensor(lifted), torch.full(lifted.shape[:-1], LIFTED_SIGMA)))
-        starts = _start_of_joints(lifted, floor) or starts
-    return Track(starts, observed)
-
-
-def _start_of_joints(joints: Floats, floor: float) -> list[Start]:
-    """The motion that `clean` makes of joints (T, 22, 3) metres, world; none where it finds nobody in half of it."""
-    from steadypose.prior.fit.solve import Start
-
-    stamps = np.round(np.arange(len(joints)) * FRAME_NS).astype(np.int64)
-    told = {"positions": joints, "stamp_ns": stamps, "skeleton": np.array("smpl22")}
-    settings = {"prior": {"delay": LIFTED_DELAY}, "trajectory": {}}
-    found = clean_arrays(ArraySource(Path("key points"), told), settings)["positions"].astype(float)
-    known = np.flatnonzero(np.isfinite(found).all(axis=(1, 2)))
-    if 2 * len(known) < len(found):
-        return []
-    nearest = known[np.abs(np.arange(len(found))[:, None] - known).argmin(axis=1)]
-    positions = found[nearest]
-    offsets = estimate_offsets(positions)
-    return [Start.of(positions[:, 0], solve_rotations(positions, offsets), offsets, floor)]
-
-
-def track_of_key_points(recording: KeyPointRecording) -> Track:
-    """What is to be fitted of a recording; the camera is at the origin of the world."""
-    import torch
-
-    from steadypose.prior.fit.motion import float_tensor
-    from steadypose.prior.fit.observations import Pinhole
-
-    camera = Pinhole(
-        float_tensor(recording.focal),
-        float_tensor(recording.centre),
-        float_tensor(recording.rotation),
-        position=torch.zeros(3),
-    )
-    return track_of_picture(
-        recording.pixels,
-        recording.confidence,
-        camera,
-        -(recording.camera_height or CAMERA_HEIGHT),
-        floor_known=recording.camera_height is not None,
-        points=None if recording.points is None else recording.points @ recording.rotation.T,
-    )
-
-
-def fit_key_points(
-    model: HumorNet,
-    recording: KeyPointRecording,
-    settings: FitSettings,
-    folder: Path | None,
-    advanced: Callable[[], None] = lambda: None,
-) -> FittedTrack:
-    """Fit one person."""
-    from steadypose.prior.fit.windows import fit_track
-
-    if recording.camera_height is None:
-        settings = replace(settings, ground_height_sigma=CAMERA_HEIGHT_SIGMA)
-    return fit_track(model, track_of_key_points(recording), settings, folder, advanced=advanced)
-
-
-def arrays_of_fit(recording: KeyPointRecording, track: FittedTrack) -> dict[str, NDArray[Any]]:
-    """As ``steadypose clean`` writes them, in the camera's frame, at 30 Hz; of deviations and anomalies, none."""
-    rotations = track.rotations.copy()
-    rotations[:, 0] = recording.rotation.T @ rotations[:, 0]
-    seen = np.asarray(np.isfinite(recording.pixels).all(axis=-1))
-    unknown = np.full(seen.shape, np.nan, dtype=np.float32)
-    return {
-        "stamp_ns": recording.stamps_ns,
-        "positions": (track.joints @ recording.rotation).astype(np.float32),
-        "rotations": quaternions(rotations).astype(np.float32),
-        "state": np.where(seen, JointState.REFINED, JointState.IMPUTED).astype(np.uint8),
-        "sigma": unknown,
-        "anomaly": unknown[:, 0].astype(np.float64),
-        "anomaly_flag": np.zeros(len(seen), dtype=bool),
-        "joint_anomaly": unknown,
-        "contacts": track.load.astype(np.float32),
-        "root_velocity": np.gradient(track.joints[:, 0], FRAME_NS * 1e-9, axis=0),
-        "world_positions": track.joints.astype(np.float32),
-        "joint_names": np.array(JOINTS),
-    }

@@ -1,4 +1,4 @@
-"""Where the offline commands write: never over their input, and whole or not at all."""
+"""What commands put out: files, never over their input, and whole or not at all; and text of others on a terminal."""
 
 from __future__ import annotations
 
@@ -108,3 +108,8 @@ def put_in_place(part: Path, out: Path) -> None:
     if out.suffix not in ARRAY_FILES and out.exists():
         shutil.rmtree(out)
     part.replace(out)
+
+
+def printable(text: str) -> str:
+    """The text, with what a terminal would obey instead of showing it made visible."""
+    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)

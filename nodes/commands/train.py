@@ -3,33 +3,43 @@
 from __future__ import annotations
 
 import sys
+import zipfile
+from importlib import import_module
 from pathlib import Path
 from typing import Literal, get_args
 
-from steadypose.nodes.commands.training_data import little_data
+import numpy as np
+
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.training.data.datasets import WeightSet
 from steadypose.training.distributed import join, set_threads, writes
 from steadypose.training.loop import TrainingOptions
 from steadypose.training.weights import install as install_weights
 
+RECIPES = {
+    "hmvae": ("hmvae", "train_hmvae"),
+    "hmvae64": ("hmvae", "train_long_hmvae"),
+    "hgvae": ("hgvae", "train_hgvae"),
+    "hgvae-wide": ("hgvae", "train_hgvae_wide"),
+    "trajectory": ("root_velocity", "train_trajectory"),
+    "contacts": ("contacts", "train_contacts"),
+    "completer": ("completer", "train_completer"),
+    "humor": ("humor", "train_humor"),
+    "correction": ("sensor_bias", "train_correction"),
+    "mixture": ("mixture", "train_mixture"),
+    "body_modes": ("body_modes", "train_modes"),
+    "occlusion": ("occlusion", "train_occlusion"),
+    "posture": ("posture", "train_posture"),
+}
+"""of each model: the module of `training.recipes`, and its function"""
+Model = Literal[tuple(RECIPES)]  # pyright: ignore[reportInvalidTypeForm]
+RATE_HZ = 30.0
+LEAST_MIN, ENOUGH_MIN = 0.5, 30.0
+"""minutes of motion: below the one no batch is like another, below the other a model knows these movements alone"""
+
 
 def train(
-    model: Literal[
-        "hmvae",
-        "hmvae64",
-        "hgvae",
-        "hgvae-wide",
-        "trajectory",
-        "contacts",
-        "completer",
-        "humor",
-        "correction",
-        "mixture",
-        "body_modes",
-        "occlusion",
-        "posture",
-    ],
+    model: Model,
     data: Path = Path("data/prepared.npz"),
     weights: Literal["default", "research", "kinect_v2"] | None = None,
     runs: Path = Path("runs"),
@@ -68,32 +78,6 @@ def train(
     """
     join()
     set_threads(threads)
-    if model == "hmvae":
-        from steadypose.training.recipes.hmvae import train_hmvae as train_model
-    elif model == "hmvae64":
-        from steadypose.training.recipes.hmvae import train_long_hmvae as train_model
-    elif model == "hgvae":
-        from steadypose.training.recipes.hgvae import train_hgvae as train_model
-    elif model == "hgvae-wide":
-        from steadypose.training.recipes.hgvae import train_hgvae_wide as train_model
-    elif model == "mixture":
-        from steadypose.training.recipes.mixture import train_mixture as train_model
-    elif model == "body_modes":
-        from steadypose.training.recipes.body_modes import train_modes as train_model
-    elif model == "trajectory":
-        from steadypose.training.recipes.root_velocity import train_trajectory as train_model
-    elif model == "completer":
-        from steadypose.training.recipes.completer import train_completer as train_model
-    elif model == "contacts":
-        from steadypose.training.recipes.contacts import train_contacts as train_model
-    elif model == "occlusion":
-        from steadypose.training.recipes.occlusion import train_occlusion as train_model
-    elif model == "posture":
-        from steadypose.training.recipes.posture import train_posture as train_model
-    elif model == "humor":
-        from steadypose.training.recipes.humor import train_humor as train_model
-    else:
-        from steadypose.training.recipes.sensor_bias import train_correction as train_model
     name = weights or ("kinect_v2" if model == "correction" else "default")
     if name not in (sets := _weight_sets(model)):
         raise LaunchError(f"--weights: expected {' or '.join(sets)} for {model}, got {name}")
@@ -105,7 +89,8 @@ def train(
         raise LaunchError(f"--{error}") from error
     if warning := little_data(data, name):
         print(warning, file=sys.stderr)
-    path = train_model(options)
+    recipe, function = RECIPES[model]
+    path = getattr(import_module(f"steadypose.training.recipes.{recipe}"), function)(options)
     if writes():
         print(f"weights: {install_weights(path) if install else path}")
 
@@ -115,3 +100,27 @@ def _weight_sets(model: str) -> tuple[str, ...]:
     if model == "correction":
         return ("kinect_v2",)
     return ("default",) if model in ("mixture", "body_modes", "occlusion") else get_args(WeightSet)
+
+
+def little_data(path: Path, weights: str) -> str:
+    """What to say of prepared motion that is little; empty if it is enough, or no prepared motion.
+
+    Args:
+        path: what `steadypose prepare` wrote, or what a model is trained on instead.
+        weights: ``default`` trains on the clips free for products, ``research`` on all.
+
+    Raises:
+        LaunchError: it is too little to begin with.
+    """
+    if not zipfile.is_zipfile(path):
+        return ""
+    with np.load(path, allow_pickle=False) as arrays:
+        if not {"clip_start", "split", "set"} <= set(arrays.files):
+            return ""
+        taken = (arrays["split"] == "train") & ((arrays["set"] == "default") | (weights == "research"))
+        minutes = float(np.diff(arrays["clip_start"])[taken].sum()) / RATE_HZ / 60.0
+    had = f"{path} has {minutes:.1f} minutes of motion to train the {weights!r} weights on"
+    more = "prepare more recordings, or go on from weights that ship with --start default"
+    if minutes < LEAST_MIN:
+        raise LaunchError(f"{had}: expected {ENOUGH_MIN:g} or more; {more}")
+    return f"{had}, which is little: expected {ENOUGH_MIN:g} or more; {more}" if minutes < ENOUGH_MIN else ""

@@ -8,9 +8,8 @@ from typing import Any
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW
 from steadypose.msgs.types import Message, PoseRaw
-from steadypose.nodes.checks.answers import Answers
 from steadypose.nodes.checks.problem import Problem, error, warning
-from steadypose.nodes.checks.stream import StreamChecks
+from steadypose.nodes.checks.stream import Answers, StreamChecks
 from steadypose.nodes.graph.clock import FRAME_NS, Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.load import BodyLimit

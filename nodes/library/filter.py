@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from steadypose.msgs.types import JOINTS, CleanBody, Pose, PoseClean, PoseRaw, RawBody, WorldBody
-from steadypose.nodes.checks.arrays import axes_hint, skeleton_hint
+from steadypose.nodes.checks.layout import axes_hint, skeleton_hint
 from steadypose.nodes.driving import CHECKED, NOBODY, Diagnosis
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.graph.trajectory_node import make_trajectory
-from steadypose.nodes.library.inputs import SkeletonLike, as_array, compile_loops, skeleton_name, warn
+from steadypose.nodes.library.arrays import SkeletonLike, as_array, compile_loops, skeleton_name, warn
 from steadypose.nodes.library.poses import Poses
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.clean.pipeline import load_loops

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Message, Pose, PoseRaw, RawBody
-from steadypose.nodes.checks.arrays import axes_hint, count_hint, frames_hint, skeleton_hint, stamps_hint
+from steadypose.nodes.checks.layout import axes_hint, count_hint, frames_hint, skeleton_hint, stamps_hint
 from steadypose.nodes.sources.cleaned import CLEANED, as_input
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.npz import check_arrays

@@ -29,9 +29,8 @@ if TYPE_CHECKING:
         Tracking,
         WorldBody,
     )
-    from steadypose.nodes.library.arrays import clean, complete, fit, plot
+    from steadypose.nodes.library.arrays import InputWarning, clean, complete, fit, plot
     from steadypose.nodes.library.filter import Filter
-    from steadypose.nodes.library.inputs import InputWarning
     from steadypose.nodes.library.poses import Poses
     from steadypose.nodes.library.sample import sample
     from steadypose.prior.body.layouts import SKELETONS

@@ -23,11 +23,11 @@ class NoTorch(MetaPathFinder):
 
 
 sys.meta_path.insert(0, NoTorch())
-import steadypose.nodes.commands.completing
-import steadypose.nodes.commands.doctor.command
+import steadypose.nodes.commands.complete
+import steadypose.nodes.commands.doctor
 import steadypose.nodes.commands.plot
 import steadypose.nodes.commands.run
-import steadypose.nodes.commands.simulate
+import steadypose.nodes.commands.small
 import steadypose.nodes.graph.prior_node
 import steadypose.nodes.graph.trajectory_node
 from steadypose.nodes.cli import main

@@ -20,9 +20,8 @@ from tests.helpers.synthetic_poses import walker
 from steadypose import PACKAGE
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import CleanBody, Diagnostics, Level, Pose, PoseClean, PoseRaw, RawBody
-from steadypose.nodes.checks.answers import Answers
 from steadypose.nodes.checks.problem import from_values
-from steadypose.nodes.checks.stream import StreamCheck
+from steadypose.nodes.checks.stream import Answers, StreamCheck
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode

@@ -119,7 +119,7 @@ def test_files_that_are_something_else_are_refused_in_a_line(
 
 
 def test_a_bug_keeps_its_traceback(monkeypatch) -> None:
-    monkeypatch.setattr("steadypose.nodes.commands.keys.create_keys", lambda _: 1 / 0)
+    monkeypatch.setattr("steadypose.nodes.commands.small.create_keys", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(["keys", "somewhere"])
 

@@ -14,6 +14,7 @@ from steadypose.msgs.types import JointState, PoseClean
 from steadypose.nodes.commands.complete import complete
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.body.skeleton import J
+from steadypose.prior.complete.stream import CompletionError
 from steadypose.prior.fit import optimise
 
 
@@ -116,9 +117,9 @@ def test_what_cannot_be_is_said(tmp_path: Path) -> None:
         complete(source, tmp_path / "out.npz", picture=tmp_path / "a.txt")
     with pytest.raises(FileNotFoundError, match="no weights 'nobody'"):
         complete(source, tmp_path / "out.npz", weights="nobody")
-    with pytest.raises(LaunchError, match="expected metres"):
+    with pytest.raises(CompletionError, match="expected metres"):
         complete(write(tmp_path / "mm.npz", waving(20) * 1000), tmp_path / "out.npz")
-    with pytest.raises(LaunchError, match="expected a body with joints"):
+    with pytest.raises(CompletionError, match="expected a body with joints"):
         complete(write(tmp_path / "none.npz", np.full((5, 22, 3), np.nan)), tmp_path / "out.npz")
     (tmp_path / "out.npz").write_text("mine")
     with pytest.raises(LaunchError, match="--force"):

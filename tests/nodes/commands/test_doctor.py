@@ -11,9 +11,10 @@ from types import SimpleNamespace as Made
 
 import pytest
 
-from steadypose.nodes.commands.doctor import command, installation, machine, running
-from steadypose.nodes.commands.doctor.command import doctor
-from steadypose.nodes.commands.doctor.finding import INSTALL, Finding, Verdict
+from steadypose.nodes.commands import doctor as command
+from steadypose.nodes.commands import doctor_checks as checks
+from steadypose.nodes.commands.doctor import doctor
+from steadypose.nodes.commands.doctor_checks import INSTALL, Finding, Verdict
 from steadypose.nodes.graph import extras
 from steadypose.nodes.graph.extras import install_command
 
@@ -67,7 +68,7 @@ def test_a_check_that_breaks_is_a_finding_and_the_others_go_on(
 
 
 def test_packages_are_there() -> None:
-    assert verdicts(installation.check_packages)["packages"] is Verdict.GOOD
+    assert verdicts(command.check_packages)["packages"] is Verdict.GOOD
 
 
 def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,8 +77,8 @@ def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) 
             raise importlib.metadata.PackageNotFoundError(name)
         return "0.0.1" if name == "numpy" else importlib.metadata.version(name)
 
-    monkeypatch.setattr(installation, "version", lacking)
-    findings = {finding.what: finding for finding in installation.check_packages()}
+    monkeypatch.setattr(command, "version", lacking)
+    findings = {finding.what: finding for finding in command.check_packages()}
     extra = findings["extra view"]
     assert extra.verdict is Verdict.NOTE
     assert extra.found.startswith("the picture in the browser, and steadypose plot: ")
@@ -93,48 +94,48 @@ def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) 
 def test_what_a_pull_brought_is_missed_though_nothing_was_installed_anew(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    pulled = installation.PROJECT.read_text().replace("dependencies = [", 'dependencies = [\n  "brandnew>=1",', 1)
-    monkeypatch.setattr(installation, "PROJECT", tmp_path / "pyproject.toml")
-    installation.PROJECT.write_text(pulled)
-    finding = next(iter(installation.check_packages()))
+    pulled = command.PROJECT.read_text().replace("dependencies = [", 'dependencies = [\n  "brandnew>=1",', 1)
+    monkeypatch.setattr(command, "PROJECT", tmp_path / "pyproject.toml")
+    command.PROJECT.write_text(pulled)
+    finding = next(iter(command.check_packages()))
     assert (finding.verdict, finding.found) == (Verdict.BAD, "brandnew not installed, expected >=1")
 
 
 def test_every_extra_is_told_what_for() -> None:
-    assert set(installation.required()[1]) == set(installation.EXTRAS)
+    assert set(command.required()[1]) == set(command.EXTRAS)
 
 
 def test_an_installed_wheel_is_asked_what_it_requires(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     told = ["numpy>=1.26", "tomli>=2; python_version < '3.0'", "rerun-sdk>=0.30; extra == 'view'"]
     told.append("ros-rclpy>=9.1; sys_platform == 'nowhere' and extra == 'ros2'")
-    monkeypatch.setattr(installation, "PROJECT", tmp_path / "pyproject.toml")
-    monkeypatch.setattr(installation, "requires", lambda name: told)
-    needed, extras = installation.required()
+    monkeypatch.setattr(command, "PROJECT", tmp_path / "pyproject.toml")
+    monkeypatch.setattr(command, "requires", lambda name: told)
+    needed, extras = command.required()
     assert needed == told[:2]
     assert extras == {"view": told[2:3], "ros2": told[3:]}
-    assert verdicts(installation.check_packages)["packages"] is Verdict.GOOD
-    assert "extra ros2" not in verdicts(installation.check_packages)
+    assert verdicts(command.check_packages)["packages"] is Verdict.GOOD
+    assert "extra ros2" not in verdicts(command.check_packages)
 
 
 def test_another_python_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for version, expected in (((3, 10, 0), Verdict.GOOD), ((3, 13, 1), Verdict.GOOD), ((3, 14, 0), Verdict.BAD)):
-        monkeypatch.setattr(installation.sys, "version_info", version)
-        finding = only(installation.check_python)
+        monkeypatch.setattr(command.sys, "version_info", version)
+        finding = only(command.check_python)
         assert finding.verdict is expected
         assert finding.found == ".".join(map(str, version))
 
 
 def test_a_busy_processor_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine.os, "getloadavg", lambda: (64.0, 0.0, 0.0))
-    monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: {0, 1})
-    assert verdicts(machine.check_processor)["processor"] is Verdict.NOTE
-    monkeypatch.setattr(machine.os, "getloadavg", lambda: (0.2, 0.0, 0.0))
-    assert verdicts(machine.check_processor)["processor"] is Verdict.GOOD
+    monkeypatch.setattr(checks.os, "getloadavg", lambda: (64.0, 0.0, 0.0))
+    monkeypatch.setattr(checks.os, "sched_getaffinity", lambda _: {0, 1})
+    assert verdicts(checks.check_processor)["processor"] is Verdict.NOTE
+    monkeypatch.setattr(checks.os, "getloadavg", lambda: (0.2, 0.0, 0.0))
+    assert verdicts(checks.check_processor)["processor"] is Verdict.GOOD
 
 
 def test_a_message_makes_its_way_and_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    finding = only(running.check_messages)
+    finding = only(checks.check_messages)
     assert finding.verdict is Verdict.GOOD
     assert str(tmp_path / "steadypose") in finding.found
     assert not list((tmp_path / "steadypose").iterdir())
@@ -143,14 +144,14 @@ def test_a_message_makes_its_way_and_leaves_nothing_behind(monkeypatch: pytest.M
 def test_a_directory_that_cannot_be_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "file"))
-    finding = only(running.check_messages)
+    finding = only(checks.check_messages)
     assert finding.verdict is Verdict.BAD
     assert "Not a directory" in finding.found
 
 
 def test_a_path_too_long_for_sockets(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / ("x" * 100)))
-    finding = only(running.check_messages)
+    finding = only(checks.check_messages)
     assert finding.verdict is Verdict.BAD
     assert "too long" in finding.found
 
@@ -159,26 +160,26 @@ def test_missing_weights_are_missing_and_nothing_is_timed(monkeypatch: pytest.Mo
     from steadypose.prior.models import weights as checkpoint
 
     monkeypatch.setattr(checkpoint, "WEIGHTS", tmp_path / "weights")
-    findings = command._examine(running.check_models)
-    assert [finding.verdict for finding in findings] == [Verdict.BAD] * len(running.MODELS)
-    assert [finding.fix.split("steadypose train ")[1] for finding in findings] == list(running.MODELS)
+    findings = command._examine(checks.check_models)
+    assert [finding.verdict for finding in findings] == [Verdict.BAD] * len(checks.MODELS)
+    assert [finding.fix.split("steadypose train ")[1] for finding in findings] == list(checks.MODELS)
 
 
 def test_damaged_weights_are_not_taken_for_whole(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     from steadypose.prior.models import weights as checkpoint
 
-    for model in running.MODELS:
+    for model in checks.MODELS:
         (tmp_path / f"{model}-default.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0garbage!")
     monkeypatch.setattr(checkpoint, "WEIGHTS", tmp_path)
-    assert set(verdicts(running.check_models).values()) == {Verdict.BAD}
+    assert set(verdicts(checks.check_models).values()) == {Verdict.BAD}
 
 
 def test_the_prior_is_timed_on_a_body_that_stands(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running, "FRAMES", 40)
+    monkeypatch.setattr(checks, "FRAMES", 40)
     for target_ms, expected in ((1e9, Verdict.GOOD), (0.0, Verdict.NOTE)):
-        monkeypatch.setattr(running, "TARGET_MS", target_ms)
-        monkeypatch.setattr(running, "BUDGET_MS", max(target_ms, 1e6))
-        finding = running._self_test()
+        monkeypatch.setattr(checks, "TARGET_MS", target_ms)
+        monkeypatch.setattr(checks, "BUDGET_MS", max(target_ms, 1e6))
+        finding = checks._self_test()
         assert finding.verdict is expected
         assert "ms a frame" in finding.found
 
@@ -190,35 +191,35 @@ def test_missing_streams_say_what_to_play_instead(monkeypatch: pytest.MonkeyPatc
         raise recording.LaunchError(f"{path} does not exist")
 
     monkeypatch.setattr(recording, "open_recording", gone)
-    finding = only(running.check_streams)
+    finding = only(checks.check_streams)
     assert finding.verdict is Verdict.BAD
     assert "--input" in finding.fix
 
 
 def test_no_camera_is_fine() -> None:
-    assert only(machine.check_camera).verdict is Verdict.GOOD
+    assert only(checks.check_camera).verdict is Verdict.GOOD
 
 
 def test_an_oak_without_usb_rights_gets_its_rule(monkeypatch: pytest.MonkeyPatch) -> None:
     import depthai
 
     monkeypatch.setattr(depthai.Device, "getAllAvailableDevices", staticmethod(list))
-    monkeypatch.setattr(machine, "Path", lambda _: Made(glob=lambda _: [Made(read_text=lambda: "03e7\n")]))
-    finding = only(machine.check_camera)
+    monkeypatch.setattr(checks, "Path", lambda _: Made(glob=lambda _: [Made(read_text=lambda: "03e7\n")]))
+    finding = only(checks.check_camera)
     assert finding.verdict is Verdict.NOTE
     assert finding.found == "1 plugged in that cannot be opened"
     assert "/etc/udev/rules.d" in finding.fix
     monkeypatch.setattr(depthai.Device, "getAllAvailableDevices", lambda: [Made(getDeviceId=lambda: "14442C")])
-    assert only(machine.check_camera).found == "14442C"
+    assert only(checks.check_camera).found == "14442C"
 
 
 def test_webcams_that_may_not_be_used_name_the_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(machine, "DEVICES", tmp_path)
-    assert only(machine.check_webcam).found == "none"
+    monkeypatch.setattr(checks, "DEVICES", tmp_path)
+    assert only(checks.check_webcam).found == "none"
     (tmp_path / "video0").write_text("")
-    assert (only(machine.check_webcam).verdict, only(machine.check_webcam).found) == (Verdict.GOOD, "video0")
-    monkeypatch.setattr(machine.os, "access", lambda *_: False)
-    finding = only(machine.check_webcam)
+    assert (only(checks.check_webcam).verdict, only(checks.check_webcam).found) == (Verdict.GOOD, "video0")
+    monkeypatch.setattr(checks.os, "access", lambda *_: False)
+    finding = only(checks.check_webcam)
     assert finding.verdict is Verdict.NOTE
     assert "usermod -aG video" in finding.fix
 
@@ -226,7 +227,7 @@ def test_webcams_that_may_not_be_used_name_the_group(monkeypatch: pytest.MonkeyP
 def test_it_needs_nothing_that_it_looks_for() -> None:
     code = (
         "import sys; sys.modules.update(dict.fromkeys(('torch', 'zmq', 'numpy', 'rosbags', 'depthai')));"
-        "from steadypose.nodes.commands.doctor.command import CHECKS, _examine; "
+        "from steadypose.nodes.commands.doctor import CHECKS, _examine; "
         "print([f.verdict.name for c in CHECKS for f in _examine(c)])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

@@ -15,7 +15,12 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
 from steadypose.nodes.cli import main
-from steadypose.nodes.commands.fitting import (
+from steadypose.nodes.commands.key_points import read_key_points
+from steadypose.nodes.graph.clock import FRAME_NS
+from steadypose.nodes.sources.npz import NpzError
+from steadypose.prior.body.skeleton import REST_POSITIONS
+from steadypose.prior.fit import solve
+from steadypose.prior.fit.bodies import (
     Fit,
     bodies_seen,
     fit_body,
@@ -26,11 +31,6 @@ from steadypose.nodes.commands.fitting import (
     stands_elsewhere,
     track_of,
 )  # fmt: skip
-from steadypose.nodes.commands.key_points import read_key_points
-from steadypose.nodes.graph.clock import FRAME_NS
-from steadypose.nodes.sources.npz import NpzError
-from steadypose.prior.body.skeleton import REST_POSITIONS
-from steadypose.prior.fit import solve
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.observations import SeenJoints
 from steadypose.prior.fit.solve import FitSettings

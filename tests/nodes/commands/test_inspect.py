@@ -16,11 +16,9 @@ from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import CleanBody, Diagnostics, Level, PoseClean, PoseRaw
-from steadypose.nodes.commands.inspect import info as info_module
-from steadypose.nodes.commands.inspect.echo import echo
-from steadypose.nodes.commands.inspect.hz import Rate, hz, measure
-from steadypose.nodes.commands.inspect.info import info
-from steadypose.nodes.commands.inspect.topic import InspectError
+from steadypose.nodes.commands import info as info_module
+from steadypose.nodes.commands.info import info
+from steadypose.nodes.commands.inspect import InspectError, Rate, echo, hz, measure
 
 DEADLINE_S = 20.0
 

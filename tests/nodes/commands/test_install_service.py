@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from steadypose.nodes.commands import install_service as command
-from steadypose.nodes.commands.install_service import install_service
-from steadypose.nodes.commands.service_unit import Service, quoted
+from steadypose.nodes.commands.install_service import Service, install_service, quoted
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
 

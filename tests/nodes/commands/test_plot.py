@@ -13,11 +13,9 @@ from tests.helpers.synthetic_poses import messages
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw
-from steadypose.nodes.commands.plot.command import plot
-from steadypose.nodes.commands.plot.errors import errors_of
-from steadypose.nodes.commands.plot.history import read_history
-from steadypose.nodes.commands.plot.panels import busiest_joints
-from steadypose.nodes.commands.plot.picture import PlotError
+from steadypose.nodes.commands.plot import plot
+from steadypose.nodes.commands.plot_history import PlotError, errors_of, read_history
+from steadypose.nodes.commands.plot_panels import busiest_joints
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.body.skeleton import J
 

@@ -10,8 +10,8 @@ from conftest import record, walk
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.nodes.commands.clean import clean
-from steadypose.nodes.commands.inspect.info import info
-from steadypose.nodes.commands.repair import repair
+from steadypose.nodes.commands.info import info
+from steadypose.nodes.commands.small import repair
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from steadypose.nodes.commands.training_data import little_data
+from steadypose.nodes.commands.train import little_data
 from steadypose.nodes.graph.settings import LaunchError
 
 

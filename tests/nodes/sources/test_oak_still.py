@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.helpers.fake_oak import CAMERA, Player, depth_frame, moment, readings
 
-from steadypose.nodes.commands.calibrate.command import CalibrateOak, calibrate
+from steadypose.nodes.commands.calibrate import CalibrateOak, calibrate
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.sources import oak_still
 from steadypose.nodes.sources.camera import CameraError

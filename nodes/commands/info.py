@@ -1,4 +1,4 @@
-"""``steadypose info``: what is in a recording, or who publishes a topic."""
+"""``steadypose info``: what is in a recording or a file of poses, or who publishes a topic."""
 
 from __future__ import annotations
 
@@ -9,25 +9,30 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from steadypose.msgs.codec import wire_type
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.transport import Subscriber
-from steadypose.msgs.types import Diagnostics, Message, PoseClean, PoseEvents, PoseRaw
-from steadypose.nodes.commands.inspect.files import describe_file
-from steadypose.nodes.commands.inspect.hz import Rate
-from steadypose.nodes.commands.inspect.topic import (
+from steadypose.msgs.types import Diagnostics, JointState, Message, PoseClean, PoseEvents, PoseRaw
+from steadypose.nodes.commands.inspect import (
     Address,
     LaunchFile,
+    Rate,
     endpoints_of,
     plural,
     recording_at,
     subscribe,
 )
-from steadypose.nodes.commands.printable import printable
+from steadypose.nodes.commands.output import printable
+from steadypose.nodes.driving import Diagnosis
 from steadypose.nodes.graph.clock import POLL_S
+from steadypose.nodes.sources.cleaned import is_output
+from steadypose.nodes.sources.npz import read_arrays
+from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.clean.settings import PriorSettings
 
 INFO_S = 2.0
 """for which `info` listens to a topic that is published"""
@@ -145,3 +150,46 @@ def _listen(subscriber: Subscriber) -> tuple[list[float], _Contents]:
             arrivals.append(time.monotonic())
             contents.add(received[1])
     return arrivals, contents
+
+
+def describe_file(path: Path) -> Iterator[str]:
+    """Lines that say what it holds, and what is probably wrong with it.
+
+    Raises:
+        NpzError, CsvError: it holds no poses.
+    """
+    if path.suffix == ".npz":
+        arrays = read_arrays(path)
+        output = is_output(arrays)
+        yield f"{path}: {'an output of clean, complete or fit' if output else 'joints'}, {_size(path)}"
+        for name, array in arrays.items():
+            yield f"    {name} {array.shape} {array.dtype}"
+        if output:
+            state = arrays["state"]
+            shares = ", ".join(f"{kind.name.lower()} {(state == kind).mean():.1%}" for kind in JointState)
+            yield f"joints: {shares}; poses flagged as anomalies: {arrays['anomaly_flag'].mean():.1%}"
+    else:
+        yield f"{path}: joints, {_size(path)}"
+    source = open_recording(path)
+    diagnosis = Diagnosis(PriorSettings())
+    stamps, seen, skeletons, ids = [], [], set(), set()
+    for _, message in source:
+        if isinstance(message, PoseRaw):
+            diagnosis.see(message)
+            stamps.append(message.stamp_ns / 1e9)
+            skeletons.add(message.skeleton)
+            for body in message.bodies:
+                if (there := np.isfinite(body.positions).all(axis=-1)).any():
+                    ids.add(body.id)
+                    seen.append(there.mean())
+    rate = Rate.of(stamps)
+    share = f"{np.mean(seen):.0%} of their joints observed" if seen else "nobody in any frame"
+    yield f"{rate.count} frames{rate.brief}, {stamps[-1] - stamps[0]:.2f} s; skeleton {', '.join(skeletons)}"
+    yield f"bodies {', '.join(map(str, sorted(ids))) or 'none'}; {share}"
+    for cause, count in source.refused.items():
+        yield f"refused, {cause}: {count}"
+    yield from diagnosis.look()
+
+
+def _size(path: Path) -> str:
+    return f"{path.stat().st_size / 1e6:.2f} MB"

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JointState
-from steadypose.nodes.commands.plot.history import History, Track
-from steadypose.nodes.commands.plot.picture import PlotError, body_of
+from steadypose.nodes.commands.plot_history import History, PlotError, Track, body_of
 from steadypose.nodes.graph.extras import how_to_install
 from steadypose.nodes.sinks.drawing import (
     ALL_BONES,

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import matplotlib
 import numpy as np
+import tomlkit
 import tyro
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
-from steadypose.nodes.commands.calibrate.launch_file import lens_of, read_launch, save_calibration
-from steadypose.nodes.commands.calibrate.pictures import (
+from steadypose.nodes.commands.calibrate_pictures import (
     depth_picture,
     read_depth,
     read_pictures,
     write_floor_grid,
     write_picture,
 )
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.camera.calibration import (
     MIN_CORNERS,
@@ -36,6 +39,7 @@ from steadypose.prior.camera.calibration import (
 
 if TYPE_CHECKING:
     from steadypose.nodes.sources.oak_still import Still
+
 
 PAPERS_MM = {"a4": (297.0, 210.0), "a3": (420.0, 297.0), "letter": (279.4, 215.9)}
 GOOD_SIGMA_M = 0.005
@@ -314,3 +318,44 @@ def _described(pose: Pose) -> str:
         f"camera at x {x:.3f}, y {y:.3f} m, {z:.3f} m above the floor, "
         f"looking {np.degrees(np.arcsin(-forward[2])):.1f} degrees down"
     )
+
+
+def read_launch(path: Path) -> Launch:
+    if not path.is_file():
+        raise LaunchError(
+            f"no launch file at {path}: expected the camera's own; start from a copy of one in launch/ such as oak.toml"
+        )
+    return Launch.read(path)
+
+
+def lens_of(path: Path) -> Intrinsics:
+    """The lens in a launch file's ``[input.calibration]``."""
+    calibration = read_launch(path).settings(InputSettings).calibration
+    if not calibration.size:
+        raise CalibrationError(f"{path} has no lens in [input.calibration]: first run steadypose calibrate lens")
+    width, height = calibration.size
+    fx, fy = calibration.focal
+    cx, cy = calibration.centre
+    return Intrinsics((width, height), (fx, fy), (cx, cy), tuple(calibration.distortion))
+
+
+def save_calibration(path: Path, *, lens: Intrinsics | None = None, pose: Pose | None = None) -> None:
+    """Write what was found to ``[input.calibration]`` of a launch file, which is left as it is otherwise."""
+    document = tomlkit.parse(path.read_text(encoding="utf-8"))
+    section = document.setdefault("input", tomlkit.table()).setdefault("calibration", tomlkit.table())
+    if lens:
+        section["size"] = list(lens.size)
+        for name in ("focal", "centre", "distortion"):
+            section[name] = [round(value, 6) for value in getattr(lens, name)]
+    if pose:
+        section["position"] = [round(float(value), 5) for value in pose.position]
+        section["orientation"] = [round(float(value), 7) for value in pose.orientation]
+    # the user's own file: whole, as it was or as it becomes, whatever happens in between
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(tomlkit.dumps(document), encoding="utf-8")
+        shutil.copymode(path, part)
+        Launch.read(part)
+        part.replace(path.resolve())
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,17 +1,81 @@
-"""Python and the packages of an installation."""
+"""``steadypose doctor``: what works on this machine, what is missing, and what to type about it."""
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
 
-from steadypose.nodes.commands.doctor.finding import INSTALL, PROJECT, Finding, Verdict
+from rich.console import Console
+from rich.table import Table
+
+from steadypose.nodes.commands.doctor_checks import (
+    INSTALL,
+    PROJECT,
+    Finding,
+    Verdict,
+    check_camera,
+    check_clock,
+    check_loops,
+    check_memory,
+    check_messages,
+    check_models,
+    check_processor,
+    check_streams,
+    check_webcam,
+)
 from steadypose.nodes.graph.extras import EXTRAS, install_command
+
+
+def doctor(live: bool = False, launch: str = "replay") -> int:
+    """Check this machine: what works, what is missing, and what to type about it.
+
+    Args:
+        live: listen for three seconds to a tracker that publishes, and to nodes that run, and say what is wrong there.
+        launch: the launch file whose addresses these are.
+
+    Returns:
+        0 if `steadypose run` can work here, otherwise 1; with `live`, 0 if nothing is wrong.
+    """
+    console = Console(highlight=False)
+    if live:
+        from steadypose.nodes.commands.doctor_live import listen
+
+        return listen(launch, console)
+    table = Table("", "what", "found", box=None, pad_edge=False, header_style="bold")
+    with console.status("looking"):
+        findings = [finding for check in CHECKS for finding in _examine(check)]
+    for finding in findings:
+        table.add_row(finding.verdict.value, finding.what, finding.found)
+    console.print(table)
+    for finding in findings:
+        if finding.fix:
+            console.print(f"\n{finding.verdict.value} {finding.what}: {finding.found}")
+            console.print(f"  {finding.fix}", markup=False, soft_wrap=True)
+    bad = [finding.what for finding in findings if finding.verdict is Verdict.BAD]
+    console.print()
+    console.print(f"`steadypose run` cannot work yet: {', '.join(bad)}" if bad else "`steadypose run` can work here")
+    return 1 if bad else 0
+
+
+def _examine(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
+    found: list[Finding] = []
+    try:
+        found.extend(check())
+    except Exception as error:  # one broken check must not hide the results of the others
+        found.append(Finding(_name(check), Verdict.BAD, f"{type(error).__name__}: {error}", INSTALL))
+    return found
+
+
+def _name(check: Callable[[], Iterator[Finding]]) -> str:
+    return check.__name__.removeprefix("check_").replace("_", " ")
+
 
 PYTHONS = ((3, 10), (3, 13))
 """the oldest and the newest that all packages of an installation come for"""
+
+
 KEY_PACKAGES = ("numpy", "numba", "rosbags", "pyzmq")
 
 
@@ -72,3 +136,18 @@ def _missing(wanted: list[str]) -> list[str]:
         if not installed or not requirement.specifier.contains(installed, prereleases=True):
             missing.append(f"{requirement.name} {installed or 'not installed'}, expected {requirement.specifier}")
     return missing
+
+
+CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
+    check_python,
+    check_packages,
+    check_processor,
+    check_memory,
+    check_clock,
+    check_messages,
+    check_loops,
+    check_models,
+    check_streams,
+    check_camera,
+    check_webcam,
+)

@@ -1,30 +1,29 @@
-"""Offline fit of one recording: test-time optimisation, initialised by the nodes' output."""
+"""Fit of the bodies of a cleaned stream: test-time optimisation, initialised by ``pose/clean``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import CleanBody, JointState, Message, PoseClean, PoseWorld, WorldBody
-from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import REST_HEIGHT, quaternions
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.adapt import SensorFrame
+from steadypose.prior.fit.humor_network import HumorNet
+from steadypose.prior.fit.motion import float_tensor
+from steadypose.prior.fit.observations import POINT_SHARE, Observed, SeenJoints, SurfacePoints, thinned
+from steadypose.prior.fit.solve import FitSettings, Start
+from steadypose.prior.fit.windows import FittedTrack, Track, fit_track
+from steadypose.prior.timing.rate import FPS
 
-if TYPE_CHECKING:
-    from steadypose.prior.fit.humor_network import HumorNet
-    from steadypose.prior.fit.solve import FitSettings
-    from steadypose.prior.fit.windows import FittedTrack, Track
-
-
+FRAME_NS = 1e9 / FPS
 MIN_SIGMA = 0.01
 """Metres: no sensor means the joints that our bones end in to less."""
 
@@ -116,11 +115,6 @@ def track_of(seen: Seen, points: Floats | None) -> Track:
         seen: the body.
         points: (T, N, 3) metres, world, of its surface, NaN where there are fewer; None where there are none.
     """
-    from steadypose.prior.fit.motion import float_tensor
-    from steadypose.prior.fit.observations import POINT_SHARE, Observed, SeenJoints, SurfacePoints, thinned
-    from steadypose.prior.fit.solve import Start
-    from steadypose.prior.fit.windows import Track
-
     positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
     offsets = estimate_offsets(positions)
     floor = 0.0 if seen.calibrated else lowest_floor(positions)
@@ -170,8 +164,6 @@ def fit_body(
     advanced: Callable[[], None] = lambda: None,
 ) -> Fit:
     """Fit one body; where that fails, or it stands elsewhere, ``pose/clean`` stays, and its anomaly is flagged."""
-    from steadypose.prior.fit.windows import fit_track
-
     positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
     before = np.linalg.norm(positions - raw, axis=-1)
     if stands_elsewhere(positions, 0.0 if seen.calibrated else lowest_floor(positions)):

@@ -1,0 +1,326 @@
+"""``steadypose echo`` and ``steadypose hz``: what a topic or a recording says, and how often.
+
+A topic is looked for where this machine's nodes publish it; ``--launch`` takes the addresses (and keys) of a launch
+file in place of these, ``--endpoint`` an address of one's own. Nothing here holds the nodes up.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+from steadypose.msgs.keys import load_keys
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import TOPICS
+from steadypose.msgs.transport import Subscriber
+from steadypose.msgs.types import JOINTS, Diagnostics, JointState, Message, PoseClean, PoseEvents, PoseRaw, WorldBody
+from steadypose.nodes.commands.output import printable
+from steadypose.nodes.graph.access import TransportSettings
+from steadypose.nodes.graph.clock import POLL_S
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.topology import publishers
+from steadypose.prior.settings import nearest
+
+PATIENCE_S = 3.0
+"""without a message, after which a hint is printed"""
+Topics = Annotated[tuple[str, ...], tyro.conf.arg(name="topic", metavar="TOPIC")]
+Count = Annotated[int | None, tyro.conf.arg(metavar="N")]
+LaunchFile = Annotated[str | None, tyro.conf.arg(metavar="FILE")]
+Address = Annotated[tuple[str, ...], tyro.conf.arg(name="endpoint", metavar="ADDRESS")]
+
+
+class InspectError(ValueError):
+    """No such topic or recording. The text says what there is."""
+
+
+def messages_of(
+    target: str, topics: tuple[str, ...], launch: str | None, endpoints: tuple[str, ...], *, newest: bool = False
+) -> Iterator[tuple[str, Message]]:
+    """What comes on a topic until Ctrl-C, or what is in a recording.
+
+    Args:
+        newest: of a topic, skip what could not be taken in time.
+    """
+    if target in TOPICS:
+        if topics:
+            raise InspectError(f"--topic chooses from a recording; {target} is a topic itself")
+        with subscribe(target, launch, endpoints, conflate=newest) as subscriber:
+            yield from receive(subscriber, target)
+        return
+    for topic in topics:
+        if topic not in TOPICS:
+            raise InspectError(f"no topic {topic!r}{nearest(topic, TOPICS)}; there are {', '.join(TOPICS)}")
+    with RecordingReader(recording_at(target)) as recording:
+        for topic, _, message in recording.messages(topics or None):
+            yield topic, message
+
+
+def recording_at(target: str) -> Path:
+    path = Path(target)
+    if not path.exists():
+        raise InspectError(f"no topic or recording {target!r}{nearest(target, TOPICS)}; topics are {', '.join(TOPICS)}")
+    return path
+
+
+def _transport(launch: str | None) -> TransportSettings:
+    return TransportSettings() if launch is None else Launch.read(launch).transport
+
+
+def endpoints_of(topic: str, launch: str | None, endpoints: tuple[str, ...]) -> tuple[str, ...]:
+    """Where a topic may be published."""
+    return endpoints or tuple(_transport(launch).endpoint(node) for node in publishers(topic))
+
+
+def subscribe(topic: str, launch: str | None, endpoints: tuple[str, ...], *, conflate: bool = False) -> Subscriber:
+    transport = _transport(launch)
+    keys = load_keys(transport.keys) if transport.keys else None
+    addresses = endpoints_of(topic, launch, endpoints)
+    return Subscriber(addresses, topic, keys=keys, clear_text=transport.clear_text, conflate=conflate)
+
+
+def receive(subscriber: Subscriber, topic: str) -> Iterator[tuple[str, Message]]:
+    """What comes, for ever; a silence at the start is remarked on."""
+    started: float | None = time.monotonic()
+    while True:
+        received = subscriber.receive(POLL_S)
+        if received is not None:
+            started = None
+            yield received
+        elif started is not None and time.monotonic() - started > PATIENCE_S:
+            started = None
+            print(f"nothing on {topic} yet: is `steadypose run` running?", file=sys.stderr)
+
+
+def plural(count: int, one: str, more: str) -> str:
+    return f"{count} {one if count == 1 else more}"
+
+
+def echo(
+    target: Annotated[str, tyro.conf.arg(metavar="TOPIC|RECORDING")],
+    count: Count = None,
+    full: bool = False,
+    topics: Topics = (),
+    launch: LaunchFile = None,
+    endpoints: Address = (),
+) -> None:
+    """Print messages, a line for each and one for each body.
+
+    Try:
+      steadypose echo pose/world
+      steadypose echo diagnostics --full --count 3
+      steadypose echo RECORDING --topic pose/clean
+
+    Args:
+        target: a topic, such as pose/clean, or a recording.
+        count: stop after so many messages.
+        full: print every field instead, as YAML.
+        topics: of a recording, this topic alone. May be given again.
+        launch: the launch file, or the name of one of the project's own, whose addresses to look at.
+        endpoints: the address to look at. May be given again.
+    """
+    left = sys.maxsize if count is None else count
+    for topic, message in messages_of(target, topics, launch, endpoints, newest=True):
+        lines = _yaml(topic, message).split("\n") if full else _lines(topic, message)
+        print("\n".join(map(printable, lines)), flush=target in TOPICS)
+        left -= 1
+        if left <= 0:
+            return
+
+
+def _lines(topic: str, message: Message) -> Iterator[str]:
+    """A message in a line, and a line for each body."""
+    stamp = f"{topic:<11} {message.stamp_ns / 1e9:.3f}"
+    if isinstance(message, Diagnostics):
+        yield f"{stamp}  {message.node}: {message.level.name} {message.message}"
+        return
+    end = "  end of stream" if message.end_of_stream else ""
+    if isinstance(message, PoseEvents):
+        yield f"{stamp}  {message.source}  {plural(len(message.events), 'event', 'events')}{end}"
+        for event in message.events:
+            hand = f"{event.hand.name.lower()} " if event.hand else ""
+            what = f"{hand}{event.kind.name.lower()} {event.phase.name.lower()}"
+            yield f"  {event.body}: {what}, confidence {event.confidence:.2f}"
+        return
+    kind = f"  {message.skeleton}" if isinstance(message, PoseRaw) else ""
+    delay = f"  delay {message.delay_frames}" if isinstance(message, PoseClean) else ""
+    yield f"{stamp}  {message.source}{kind}{delay}  {plural(len(message.bodies), 'body', 'bodies')}{end}"
+    if isinstance(message, PoseRaw):
+        for raw in message.bodies:
+            given = np.isfinite(raw.positions).all(axis=1)
+            centre = raw.positions[given].mean(axis=0) if given.any() else np.full(3, np.nan)
+            seen = f"{given.sum()} of {len(raw.positions)} joints"
+            yield f"  {raw.id}: {seen}, their centre {_vector(centre)} in the sensor's frame"
+        return
+    for body in message.bodies:
+        states = ", ".join(
+            f"{(body.state == state).sum()} {state.name.lower()}" for state in JointState if (body.state == state).any()
+        )
+        spread = f"sigma up to {body.sigma.max() * 100:.1f} cm"
+        if isinstance(body, WorldBody):
+            speed = float(np.linalg.norm(body.root_velocity))
+            tracking = body.tracking.name.lower()
+            yield f"  {body.id}: root {_vector(body.root_position)}, {speed:.2f} m/s, {tracking}; {states}; {spread}"
+        else:
+            flag = " FLAGGED" if body.anomaly_flag else ""
+            anomaly = f"; anomaly {body.anomaly:.2f}{flag}" if np.isfinite(body.anomaly) or flag else ""
+            yield f"  {body.id}: root {_vector(body.positions[0])} in the sensor's frame; {states}; {spread}{anomaly}"
+
+
+def _vector(values: NDArray[np.floating]) -> str:
+    return "(" + ", ".join(f"{value:.2f}" for value in values) + ") m"
+
+
+def _yaml(topic: str, message: Message) -> str:
+    return "\n".join(["---", f"topic: {topic}", *_fields(message, "")])
+
+
+def _fields(record: Any, indent: str) -> Iterator[str]:
+    """The fields of a message as lines of YAML; arrays of the canonical joints with the joints' names."""
+    for field in fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, list) and value:
+            yield f"{indent}{field.name}:"
+            for item in value:
+                first, *others = _fields(item, indent + "    ")
+                yield f"{indent}  - {first.strip()}"
+                yield from others
+        elif is_dataclass(value):
+            yield f"{indent}{field.name}:"
+            yield from _fields(value, indent + "  ")
+        elif isinstance(value, np.ndarray) and value.shape[:1] == (len(JOINTS),):
+            yield f"{indent}{field.name}:"
+            for joint, row in zip(JOINTS, value, strict=True):
+                yield f"{indent}  {joint}: {_scalar(row, JointState if field.name == 'state' else None)}"
+        elif isinstance(value, np.ndarray) and value.ndim == 2:
+            yield f"{indent}{field.name}:"
+            yield from (f"{indent}  - {_scalar(row)}" for row in value)
+        elif isinstance(value, dict):
+            yield f"{indent}{field.name}:" + ("" if value else " {}")
+            yield from (f"{indent}  {key}: {_scalar(text)}" for key, text in value.items())
+        else:
+            yield f"{indent}{field.name}: {_scalar(value)}"
+
+
+def _scalar(value: Any, names: Callable[[int], IntEnum] | None = None) -> str:
+    if names is not None:
+        return names(int(value)).name
+    if isinstance(value, np.ndarray):
+        return "[" + ", ".join(_scalar(item) for item in value.tolist()) + "]"
+    if isinstance(value, IntEnum):
+        return value.name
+    if isinstance(value, bool | np.bool_):
+        return str(bool(value)).lower()
+    if isinstance(value, float | np.floating):
+        return f"{float(value):.5g}" if np.isfinite(value) else f".{float(value)}".replace(".-", "-.")
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    return str(value)
+
+
+HZ_EVERY_S = 1.0
+
+
+def hz(
+    target: Annotated[str, tyro.conf.arg(metavar="TOPIC|RECORDING")],
+    window: float = 10.0,
+    count: Count = None,
+    topics: Topics = (),
+    launch: LaunchFile = None,
+    endpoints: Address = (),
+) -> None:
+    """Measure how often messages come: of a topic by the time they arrive, of a recording by their stamps.
+
+    Try:
+      steadypose hz pose/world
+      steadypose hz pose/raw --launch kiosk
+
+    Args:
+        target: a topic, such as pose/clean, or a recording.
+        window: seconds to look back; a recording is measured as a whole.
+        count: stop after so many messages.
+        topics: of a recording, this topic alone. May be given again.
+        launch: the launch file, or the name of one of the project's own, whose addresses to look at.
+        endpoints: the address to look at. May be given again.
+    """
+    if target not in TOPICS:
+        stamps: dict[str, list[float]] = {}
+        for topic, message in messages_of(target, topics, launch, endpoints):
+            stamps.setdefault(topic, []).append(message.stamp_ns / 1e9)
+        for topic, found in stamps.items():
+            print(f"{topic}: {Rate.of(found[:count])}")
+        return
+    with subscribe(target, launch, endpoints) as subscriber:
+        arrivals = (time.monotonic() for _ in receive(subscriber, target))
+        lost = 0
+        for rate in measure(arrivals, window, count):
+            missed = subscriber.dropped[target] - lost
+            lost = subscriber.dropped[target]
+            print(f"{rate}" + (f" lost: {missed}" if missed else ""), flush=True)
+
+
+@dataclass(frozen=True)
+class Rate:
+    """How often something came: mean rate in Hz, and the intervals between in seconds."""
+
+    mean_hz: float
+    shortest_s: float
+    longest_s: float
+    deviation_s: float
+    count: int
+    """things that came"""
+
+    @classmethod
+    def of(cls, times: list[float] | deque[float]) -> Rate:
+        """Of times in seconds, in the order they came; NaN for fewer than two."""
+        steps = np.diff(np.array(times))
+        if not len(steps):
+            return cls(np.nan, np.nan, np.nan, np.nan, len(times))
+        span = float(steps.sum())
+        mean = len(steps) / span if span > 0 else np.nan
+        return cls(mean, float(steps.min()), float(steps.max()), float(steps.std()), len(times))
+
+    @property
+    def brief(self) -> str:
+        """In a few words, to follow the number of messages."""
+        return f", {self.mean_hz:.2f} Hz, longest gap {self.longest_s * 1e3:.0f} ms" if self.count > 1 else ""
+
+    def __str__(self) -> str:
+        return (
+            f"average rate: {self.mean_hz:.3f} Hz  min: {self.shortest_s:.4f} s  max: {self.longest_s:.4f} s  "
+            f"std dev: {self.deviation_s:.5f} s  window: {self.count}"
+        )
+
+
+def measure(arrivals: Iterator[float], window_s: float, count: int | None = None) -> Iterator[Rate]:
+    """The rate over the last ``window_s`` seconds, once a second while something arrives, and at the end.
+
+    Args:
+        arrivals: times of arrival in seconds, rising, given as they come.
+        window_s: seconds to look back.
+        count: arrivals after which to end.
+    """
+    recent: deque[float] = deque()
+    reported_at = None
+    for number, now in enumerate(arrivals, start=1):
+        recent.append(now)
+        while now - recent[0] > window_s:
+            recent.popleft()
+        reported_at = now if reported_at is None else reported_at
+        if number == count:
+            break
+        if now - reported_at >= HZ_EVERY_S:
+            reported_at = now
+            yield Rate.of(recent)
+    if recent and recent[-1] != reported_at:
+        yield Rate.of(recent)

@@ -1,0 +1,212 @@
+"""The bodies of a recording on the grid of 30 Hz, to be completed, and what was completed as ``pose/clean``.
+
+A key frame may stand seconds from the next: so, other than `clean`, this gives frames where the input has none.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import CleanBody, JointState, PoseClean, PoseRaw
+from steadypose.prior.arrays import Floats
+from steadypose.prior.body.bone_lengths import estimate_offsets
+from steadypose.prior.body.kinematics import quaternions, rotation_matrix
+from steadypose.prior.body.layouts import SKELETONS, to_canonical
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, finite_joints
+from steadypose.prior.complete.body import Completed, Uncertainty
+from steadypose.prior.complete.root_path import root_path
+from steadypose.prior.models.root_velocity import LiveRootVelocity
+from steadypose.prior.timing.resample import PERIOD_NS
+
+APART_NS = 8_000_000_000
+"""Gap in nanoseconds, without any observation of a body, that is not filled if longer: a new stretch begins."""
+
+BETWEEN_NS = PERIOD_NS * 3 // 2
+"""Interval in nanoseconds up to which two observations of a joint are joined by a line; in longer ones motion is
+completed."""
+
+SIZES = (0.4, 2.5)
+"""Range of factors between a person's bones and those of a generic adult; others are not in metres."""
+
+
+class CompletionError(ValueError):
+    """A recording cannot be completed. The text says what was expected, what came, and what to do."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A body on the grid, from when it was first observed until it was away for long.
+
+    Attributes:
+        body: its number.
+        first: of its frames, counted on the grid.
+        given: (T, 22, 3) metres, z up; NaN where not known.
+        offsets: (22, 3) metres, its bones.
+    """
+
+    body: int
+    first: int
+    given: Floats
+    offsets: Floats
+
+
+def stretches_of(source: str, raws: Sequence[PoseRaw], anchor_ns: int) -> list[Stretch]:
+    """Every body of a recording on the grid that begins at ``anchor_ns``; errors call the recording ``source``.
+
+    Raises:
+        CompletionError: it has an unknown skeleton, nobody, or nobody in metres.
+    """
+    stamps: dict[int, list[int]] = defaultdict(list)
+    positions: dict[int, list[Floats]] = defaultdict(list)
+    for message in raws:
+        if message.skeleton not in SKELETONS:
+            raise CompletionError(
+                f"{source}: skeleton {message.skeleton!r} is not known: expected one of {', '.join(SKELETONS)}, or one "
+                "of your own by --skeletons"
+            )
+        turn, place = rotation_matrix(message.sensor_pose.orientation), message.sensor_pose.position
+        for body in message.bodies:
+            observed = np.where((body.confidence > 0)[:, None], body.positions, np.nan).astype(np.float64)
+            joints, _ = to_canonical(SKELETONS[message.skeleton], observed, body.confidence)
+            newer = not stamps[body.id] or message.stamp_ns > stamps[body.id][-1]
+            if newer and finite_joints(joints).any():
+                stamps[body.id].append(message.stamp_ns)
+                positions[body.id].append(joints @ turn.T + place)
+    found = [
+        stretch
+        for body in stamps
+        if stamps[body]
+        for stretch in _on_grid(body, np.array(stamps[body]), np.stack(positions[body]), anchor_ns)
+    ]
+    if not found:
+        raise CompletionError(f"{source}: expected a body with joints in some frame, got none; see what it holds: info")
+    return found
+
+
+def _on_grid(body: int, stamps: NDArray[np.int64], positions: Floats, anchor_ns: int) -> list[Stretch]:
+    """A body on the grid, in as many parts as it was away for long between."""
+    offsets = estimate_offsets(positions[:: max(len(positions) // 900, 1)])
+    _check_size(body, offsets)
+    ends = np.flatnonzero(np.diff(stamps) > APART_NS) + 1
+    found = []
+    for rows in np.split(np.arange(len(stamps)), ends):
+        first, last = (round((int(stamps[row]) - anchor_ns) / PERIOD_NS) for row in (rows[0], rows[-1]))
+        ticks = anchor_ns + np.arange(first, last + 1) * PERIOD_NS
+        given = np.full((len(ticks), 22, 3), np.nan)
+        for joint in range(22):
+            usable = rows[np.isfinite(positions[rows, joint]).all(axis=-1)]
+            if len(usable):
+                given[:, joint] = _interpolated(stamps[usable], positions[usable, joint], ticks)
+        found.append(Stretch(body, first, given, offsets))
+    return found
+
+
+def _interpolated(stamps: NDArray[np.int64], places: Floats, ticks: NDArray[np.int64]) -> Floats:
+    """(N, 3) at ``ticks`` (N,); NaN where no observation is near."""
+    after = np.searchsorted(stamps, ticks).clip(0, len(stamps) - 1)
+    before = np.where(stamps[after] > ticks, np.maximum(after - 1, 0), after)
+    span = stamps[after] - stamps[before]
+    share = np.where(span > 0, (ticks - stamps[before]) / np.maximum(span, 1), 0.0)[:, None]
+    between = (span <= BETWEEN_NS) & (stamps[before] <= ticks) & (ticks <= stamps[after])
+    nearest = np.where(np.abs(ticks - stamps[before]) <= np.abs(stamps[after] - ticks), before, after)
+    near = np.abs(stamps[nearest] - ticks) <= PERIOD_NS // 2
+    joined = np.where(between[:, None], (1.0 - share) * places[before] + share * places[after], places[nearest])
+    return np.where((between | near)[:, None], joined, np.nan)
+
+
+def _check_size(body: int, offsets: Floats) -> None:
+    size = np.linalg.norm(offsets, axis=-1).sum() / np.linalg.norm(REST_OFFSETS, axis=-1).sum()
+    if not SIZES[0] < size < SIZES[1]:
+        raise CompletionError(
+            f"body {body}: its bones are {size:.3g} times those of an adult: expected metres; convert the positions, "
+            "or see whether the skeleton is the right one"
+        )
+
+
+def clean_messages(
+    raws: Sequence[PoseRaw], done: list[tuple[Stretch, Completed]], uncertainty: Uncertainty, anchor_ns: int
+) -> list[PoseClean]:
+    """``pose/clean`` of every frame of the grid on which there is a body, in the frames in which these were seen."""
+    bodies: dict[int, list[CleanBody]] = defaultdict(list)
+    ordered = sorted(raws, key=lambda message: message.stamp_ns)
+    stamps = np.array([message.stamp_ns for message in ordered])
+
+    def context(frame: int) -> PoseRaw:
+        at = np.searchsorted(stamps, anchor_ns + frame * PERIOD_NS + PERIOD_NS // 2, side="right") - 1
+        return ordered[max(int(at), 0)]
+
+    for stretch, completed in done:
+        sigma = uncertainty.of(stretch.given)
+        lengths = np.linalg.norm(stretch.offsets, axis=-1) * (np.array(PARENTS) >= 0)
+        for row in np.flatnonzero(finite_joints(completed.positions).all(axis=1)):
+            frame = stretch.first + int(row)
+            pose = context(frame).sensor_pose
+            turn = rotation_matrix(pose.orientation)
+            rotations = completed.rotations[row].copy()
+            rotations[0] = turn.T @ rotations[0]
+            known = completed.known[row]
+            bodies[frame].append(
+                CleanBody(
+                    id=stretch.body,
+                    positions=(completed.positions[row] - pose.position) @ turn,
+                    rotations=quaternions(rotations),
+                    state=np.where(known, JointState.SEEN, JointState.IMPUTED),
+                    sigma=sigma[row],
+                    anomaly=np.nan,
+                    anomaly_flag=False,
+                    joint_anomaly=np.full(22, np.nan),
+                    bone_lengths=lengths,
+                    raw_positions=(stretch.given[row] - pose.position) @ turn,
+                    raw_confidence=known.astype(np.float32),
+                )
+            )
+    messages = []
+    for frame in sorted(bodies):
+        raw = context(frame)
+        messages.append(
+            PoseClean(
+                anchor_ns + frame * PERIOD_NS, raw.frame_id, raw.source, raw.sensor_pose, raw.calibrated, 0,
+                bodies[frame],
+            )
+        )  # fmt: skip
+    last = messages[-1]
+    end = PoseClean(last.stamp_ns, last.frame_id, last.source, last.sensor_pose, last.calibrated, 0, [], True)
+    return [*messages, end]
+
+
+def root_steps(
+    done: Sequence[tuple[Stretch, Completed]], centred: Sequence[int], weights: str
+) -> dict[tuple[int, int], Floats]:
+    """How far to move bodies that are known about their root only: (3,) metres by number and frame of the grid.
+
+    Args:
+        done: what was completed.
+        centred: numbers of such bodies.
+        weights: of the network that predicts a root's velocity.
+    """
+    steps: dict[tuple[int, int], Floats] = {}
+    network = LiveRootVelocity.load(weights) if centred else None
+    for stretch, completed in done:
+        if network is not None and stretch.body in centred:
+            joints = completed.positions - completed.positions[:, :1]
+            path = root_path(network, joints, completed.rotations[:, 0]) - completed.positions[:, 0]
+            steps |= {(stretch.body, stretch.first + row): step for row, step in enumerate(path)}
+    return steps
+
+
+def moved(message: PoseClean, steps: Mapping[tuple[int, int], Floats], anchor_ns: int) -> PoseClean:
+    """The message with bodies where their `root_steps` have them."""
+    frame = round((message.stamp_ns - anchor_ns) / PERIOD_NS)
+    turn = rotation_matrix(message.sensor_pose.orientation)
+    bodies = [
+        replace(body, positions=body.positions + turn.T @ step)
+        if (step := steps.get((body.id, frame))) is not None and not message.end_of_stream
+        else body
+        for body in message.bodies
+    ]
+    return replace(message, bodies=bodies)
