@@ -14,50 +14,30 @@ from importlib.metadata import version
 
 from steadypose.nodes.graph.extras import extra_of, how_to_install
 
-#: name: (where, what it does)
+EVALUATE = "steadypose.benchmarks.command"
 COMMANDS = {
-    "run": ("steadypose.nodes.commands.run:run", "start the nodes of a launch file, watch them, show how they do"),
-    "node": ("steadypose.nodes.commands.node:node", "one node, for another machine or a supervisor such as systemd"),
-    "clean": ("steadypose.nodes.commands.clean:clean", "clean a recording or .npz offline, with the nodes' own code"),
-    "retarget": (
-        "steadypose.nodes.commands.export:retarget",
-        "a recording's person as a robot's motion, by its URDF",
-    ),
-    "fit": (
-        "steadypose.nodes.commands.fit:fit",
-        "fit a motion to a recording: slower than clean, and with all of it in view",
-    ),
-    "complete": (
-        "steadypose.nodes.commands.complete:complete",
-        "key frames to motion, a part of a body to all of it, offline",
-    ),
-    "export": ("steadypose.nodes.commands.export:export", "cleaned motion as BVH, GLB, CSV or TRC, for other programs"),
-    "echo": ("steadypose.nodes.commands.inspect:echo", "print the messages of a topic or recording"),
-    "hz": ("steadypose.nodes.commands.inspect:hz", "measure the rate of a topic or recording"),
-    "info": ("steadypose.nodes.commands.info:info", "what is in a recording, or on a topic"),
-    "repair": ("steadypose.nodes.commands.small:repair", "what can be read of a damaged recording, as a whole one"),
-    "plot": ("steadypose.nodes.commands.plot:plot", "what happened in a recording, as pictures"),
-    "prepare": ("steadypose.nodes.commands.prepare:prepare", "motion capture into training data"),
-    "train": ("steadypose.nodes.commands.train:train", "train a model of the prior"),
-    "evaluate": (
-        "steadypose.benchmarks.command:evaluate",
-        "measure steadypose beside tuned baselines, study by study (in a checkout)",
-    ),
-    "simulate": (
-        "steadypose.nodes.commands.small:simulate",
-        "make streams as a depth camera would see them, with their truth",
-    ),
-    "calibrate": (
-        "steadypose.nodes.commands.calibrate:calibrate",
-        "a camera's lens and place in the world, into its launch file",
-    ),
-    "doctor": ("steadypose.nodes.commands.doctor:doctor", "what is missing on this machine, and how to get it"),
-    "install-service": (
-        "steadypose.nodes.commands.install_service:install_service",
-        "run a launch file at every boot, under systemd",
-    ),
-    "keys": ("steadypose.nodes.commands.small:keys", "make CurveZMQ keys, for messages that leave this machine"),
+    "run": ("run", "start the nodes of a launch file, watch them, show how they do"),
+    "node": ("node", "one node, for another machine or a supervisor such as systemd"),
+    "clean": ("clean", "clean a recording or .npz offline, with the nodes' own code"),
+    "retarget": ("export", "a recording's person as a robot's motion, by its URDF"),
+    "fit": ("fit", "fit a motion to a recording: slower than clean, and with all of it in view"),
+    "complete": ("complete", "key frames to motion, a part of a body to all of it, offline"),
+    "export": ("export", "cleaned motion as BVH, GLB, CSV or TRC, for other programs"),
+    "echo": ("inspect", "print the messages of a topic or recording"),
+    "hz": ("inspect", "measure the rate of a topic or recording"),
+    "info": ("info", "what is in a recording, or on a topic"),
+    "repair": ("small", "what can be read of a damaged recording, as a whole one"),
+    "plot": ("plot", "what happened in a recording, as pictures"),
+    "prepare": ("prepare", "motion capture into training data"),
+    "train": ("train", "train a model of the prior"),
+    "evaluate": (EVALUATE, "measure steadypose beside tuned baselines, study by study (in a checkout)"),
+    "simulate": ("small", "make streams as a depth camera would see them, with their truth"),
+    "calibrate": ("calibrate", "a camera's lens and place in the world, into its launch file"),
+    "doctor": ("doctor", "what is missing on this machine, and how to get it"),
+    "install-service": ("install_service", "run a launch file at every boot, under systemd"),
+    "keys": ("small", "make CurveZMQ keys, for messages that leave this machine"),
 }
+"""of each command: the module of the function of that name, in `nodes.commands` unless named whole; and what it does"""
 
 USAGE_ERROR = 2
 """exit status: what was asked for cannot be done, and will not be the next time either"""
@@ -115,8 +95,9 @@ def _main(arguments: list[str]) -> int:
 
 
 def _run(name: str, arguments: list[str]) -> object:
-    module, _, function = COMMANDS[name][0].partition(":")
-    command = getattr(importlib.import_module(module), function)
+    module, _ = COMMANDS[name]
+    place = module if "." in module else f"steadypose.nodes.commands.{module}"
+    command = getattr(importlib.import_module(place), name.replace("-", "_"))
     if name == "node":  # reads its arguments itself: tyro would take 0.1 s and 6 MB of every node
         return command(arguments)
     import tyro

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import matplotlib
 import numpy as np
-import tomlkit
 import tyro
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
-from steadypose.nodes.commands.calibrate_pictures import (
+from steadypose.nodes.commands.calibrate_files import (
     depth_picture,
+    lens_of,
     read_depth,
+    read_launch,
     read_pictures,
+    save_calibration,
     write_floor_grid,
     write_picture,
 )
-from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.camera.calibration import (
     MIN_CORNERS,
@@ -72,6 +71,29 @@ class PrintBoard:
     columns: int = Board.columns
     rows: int = Board.rows
 
+    def run(self) -> None:
+        if self.paper not in PAPERS_MM:
+            raise CalibrationError(f"--paper: expected one of {', '.join(PAPERS_MM)}, got {self.paper!r}")
+        if self.out.suffix not in (".pdf", ".png"):
+            raise CalibrationError(f"expected a .pdf or .png to write, got {self.out}")
+        width, height = PAPERS_MM[self.paper]
+        square = (
+            np.floor(2 * min((width - 2 * _MARGIN_MM) / self.columns, (height - 2 * _MARGIN_MM) / self.rows)) / 2
+        )  # half millimetres
+        board = Board(self.columns, self.rows, square / 1000)
+        across, up = (1000 * side for side in board.size)
+        left, bottom = (width - across) / 2, (height - up) / 2
+        with matplotlib.rc_context({"pdf.fonttype": 42}):
+            page = Figure(figsize=(width / _INCH_MM, height / _INCH_MM), facecolor="white")
+            axes = page.add_axes((left / width, bottom / height, across / width, up / height))
+            axes.imshow(board.picture(100), cmap="gray", interpolation="none", aspect="auto")
+            axes.set_axis_off()
+            words = f"world (0, 0)   x →   {board.columns} x {board.rows}, print at 100 %: a square is {square:g} mm"
+            page.text(left / width, 0.3 * bottom / height, words, fontsize=7, family="monospace", color="0.4")
+            page.savefig(self.out, dpi=DPI)
+        print(f"{self.out}: {self.paper.upper()}, {board.columns} x {board.rows} squares of {square:g} mm")
+        print("Print at 100 %, measure a square, and give its side in metres as --square.")
+
 
 @dataclass(frozen=True)
 class CalibrateLens:
@@ -98,6 +120,30 @@ class CalibrateLens:
     square: float = Board.square
     columns: int = Board.columns
     rows: int = Board.rows
+
+    def run(self) -> None:
+        read_launch(self.launch)
+        board = Board(self.columns, self.rows, self.square)
+        views, sizes, pictures = [], set(), 0
+        for name, picture in read_pictures(self.pictures):
+            pictures += 1
+            view = find_corners(picture, board)
+            print(f"{name}: {f'{len(view.image)} corners' if view else 'no board'}")
+            sizes.add(picture.shape[1::-1])
+            views += [view] if view else []
+        if len(sizes) > 1:
+            raise CalibrationError(
+                f"expected pictures of one size, got {', '.join(f'{w} x {h}' for w, h in sorted(sizes))}"
+            )
+        lens = calibrate_lens(views, sizes.pop())
+        save_calibration(self.launch, lens=lens)
+        angle = 2 * np.degrees(np.arctan(0.5 * lens.size[0] / lens.focal[0]))
+        print(
+            f"\nlens from {len(views)} of {pictures} pictures, {lens.error_px:.2f} pixels off on average "
+            "(0.5 is good); "
+            f"{lens.size[0]} x {lens.size[1]}, focal length {lens.focal[0]:.1f} pixels, {angle:.0f} degrees wide"
+        )
+        print(f"{self.launch}: [input.calibration] written. Next: steadypose calibrate pose")
 
 
 @dataclass(frozen=True)
@@ -128,6 +174,31 @@ class CalibratePose:
     rows: int = Board.rows
     picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
 
+    def run(self) -> None:
+        lens = lens_of(self.launch)
+        board = Board(self.columns, self.rows, self.square)
+        views, last = [], None
+        for name, picture in read_pictures(self.pictures):
+            if picture.shape[1::-1] != lens.size:
+                raise CalibrationError(
+                    f"{name}: expected {lens.size[0]} x {lens.size[1]} pixels, as the lens was calibrated for, got "
+                    f"{picture.shape[1]} x {picture.shape[0]}"
+                )
+            view, last = find_corners(picture, board), picture
+            print(f"{name}: {f'{len(view.image)} corners' if view else f'fewer than {MIN_CORNERS} corners'}")
+            views += [view] if view else []
+        found = camera_pose(views, lens)
+        assert last is not None, "without a picture there is no pose"
+        write_floor_grid(self.picture or self.launch.with_suffix(".floor.png"), last, lens, found.pose)
+        save_calibration(self.launch, pose=found.pose)
+        print(
+            f"\n{_described(found.pose)}; most corners within {found.error_px:.2f} pixels; "
+            f"sure to {1e3 * found.sigma_m:.1f} mm and {np.degrees(found.sigma_rad):.2f} degrees"
+        )
+        if found.sigma_m > GOOD_SIGMA_M:
+            print("More pictures, a larger board, or the board nearer to the camera would make it more certain.")
+        print(f"{self.launch}: [input.calibration] written; poses of this camera are calibrated now")
+
 
 @dataclass(frozen=True)
 class CalibrateFloor:
@@ -154,6 +225,17 @@ class CalibrateFloor:
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)
     picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
 
+    def run(self) -> None:
+        lens = lens_of(self.launch)
+        depth = read_depth(self.depth)
+        if not np.isfinite(self.up).all() or not np.linalg.norm(self.up) > 0:
+            raise CalibrationError(f"--up: expected a direction, got {self.up}")
+        pose, share = floor_pose(points_of_depth(depth, lens), np.array(self.up))
+        write_floor_grid(self.picture or self.launch.with_suffix(".floor.png"), depth_picture(depth), lens, pose)
+        save_calibration(self.launch, pose=pose)
+        print(f"{_described(pose)}; {share:.0%} of what it sees is floor")
+        print(f"{self.launch}: [input.calibration] written; poses of this camera are calibrated now")
+
 
 @dataclass(frozen=True)
 class CalibrateOak:
@@ -170,6 +252,29 @@ class CalibrateOak:
 
     launch: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
+
+    def run(self) -> None:
+        launch = read_launch(self.launch)
+        from steadypose.nodes.sources.oak_still import capture_with_camera  # brings depthai
+
+        try:
+            still = capture_with_camera(launch.settings(InputSettings).oak)
+        except RuntimeError as error:
+            raise CalibrationError(str(error)) from error
+        self._write(still)
+
+    def _write(self, still: Still) -> None:
+        picture, depth = self.out.with_name(f"{self.out.name}.png"), self.out.with_name(f"{self.out.name}.depth.png")
+        write_picture(picture, still.colour)
+        write_picture(depth, still.depth)
+        height, width = still.depth.shape
+        focal, centre = still.intrinsics[[0, 1], [0, 1]], still.intrinsics[:2, 2]
+        lens = Intrinsics((width, height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
+        save_calibration(self.launch, lens=lens)
+        up = "" if still.up is None else " --up " + " ".join(f"{value:.3f}" for value in still.up)
+        print(f"{self.launch}: [input.calibration] has the camera's lens now. With the board on the floor:")
+        print(f"  steadypose calibrate pose {self.launch} {picture} --square METRES")
+        print(f"without it:\n  steadypose calibrate floor {self.launch} {depth}{up}")
 
 
 def calibrate(
@@ -188,127 +293,7 @@ def calibrate(
     A camera with depth can do with 'floor' in place of 'pose'. What is found goes into the launch file, which keeps its
     comments; from then on poses are sent as calibrated. docs/calibrate.md shows it step by step.
     """
-    if isinstance(step, PrintBoard):
-        _print_board(step)
-    elif isinstance(step, CalibrateLens):
-        _calibrate_lens(step)
-    elif isinstance(step, CalibratePose):
-        _calibrate_pose(step)
-    elif isinstance(step, CalibrateOak):
-        _calibrate_oak(step)
-    else:
-        _calibrate_floor(step)
-
-
-def _print_board(step: PrintBoard) -> None:
-    if step.paper not in PAPERS_MM:
-        raise CalibrationError(f"--paper: expected one of {', '.join(PAPERS_MM)}, got {step.paper!r}")
-    if step.out.suffix not in (".pdf", ".png"):
-        raise CalibrationError(f"expected a .pdf or .png to write, got {step.out}")
-    width, height = PAPERS_MM[step.paper]
-    square = (
-        np.floor(2 * min((width - 2 * _MARGIN_MM) / step.columns, (height - 2 * _MARGIN_MM) / step.rows)) / 2
-    )  # half millimetres
-    board = Board(step.columns, step.rows, square / 1000)
-    across, up = (1000 * side for side in board.size)
-    left, bottom = (width - across) / 2, (height - up) / 2
-    with matplotlib.rc_context({"pdf.fonttype": 42}):
-        page = Figure(figsize=(width / _INCH_MM, height / _INCH_MM), facecolor="white")
-        axes = page.add_axes((left / width, bottom / height, across / width, up / height))
-        axes.imshow(board.picture(100), cmap="gray", interpolation="none", aspect="auto")
-        axes.set_axis_off()
-        words = f"world (0, 0)   x →   {board.columns} x {board.rows}, print at 100 %: a square is {square:g} mm"
-        page.text(left / width, 0.3 * bottom / height, words, fontsize=7, family="monospace", color="0.4")
-        page.savefig(step.out, dpi=DPI)
-    print(f"{step.out}: {step.paper.upper()}, {board.columns} x {board.rows} squares of {square:g} mm")
-    print("Print at 100 %, measure a square, and give its side in metres as --square.")
-
-
-def _calibrate_lens(step: CalibrateLens) -> None:
-    read_launch(step.launch)
-    board = Board(step.columns, step.rows, step.square)
-    views, sizes, pictures = [], set(), 0
-    for name, picture in read_pictures(step.pictures):
-        pictures += 1
-        view = find_corners(picture, board)
-        print(f"{name}: {f'{len(view.image)} corners' if view else 'no board'}")
-        sizes.add(picture.shape[1::-1])
-        views += [view] if view else []
-    if len(sizes) > 1:
-        raise CalibrationError(
-            f"expected pictures of one size, got {', '.join(f'{w} x {h}' for w, h in sorted(sizes))}"
-        )
-    lens = calibrate_lens(views, sizes.pop())
-    save_calibration(step.launch, lens=lens)
-    angle = 2 * np.degrees(np.arctan(0.5 * lens.size[0] / lens.focal[0]))
-    print(
-        f"\nlens from {len(views)} of {pictures} pictures, {lens.error_px:.2f} pixels off on average (0.5 is good); "
-        f"{lens.size[0]} x {lens.size[1]}, focal length {lens.focal[0]:.1f} pixels, {angle:.0f} degrees wide"
-    )
-    print(f"{step.launch}: [input.calibration] written. Next: steadypose calibrate pose")
-
-
-def _calibrate_pose(step: CalibratePose) -> None:
-    lens = lens_of(step.launch)
-    board = Board(step.columns, step.rows, step.square)
-    views, last = [], None
-    for name, picture in read_pictures(step.pictures):
-        if picture.shape[1::-1] != lens.size:
-            raise CalibrationError(
-                f"{name}: expected {lens.size[0]} x {lens.size[1]} pixels, as the lens was calibrated for, got "
-                f"{picture.shape[1]} x {picture.shape[0]}"
-            )
-        view, last = find_corners(picture, board), picture
-        print(f"{name}: {f'{len(view.image)} corners' if view else f'fewer than {MIN_CORNERS} corners'}")
-        views += [view] if view else []
-    found = camera_pose(views, lens)
-    assert last is not None, "without a picture there is no pose"
-    write_floor_grid(step.picture or step.launch.with_suffix(".floor.png"), last, lens, found.pose)
-    save_calibration(step.launch, pose=found.pose)
-    print(
-        f"\n{_described(found.pose)}; most corners within {found.error_px:.2f} pixels; "
-        f"sure to {1e3 * found.sigma_m:.1f} mm and {np.degrees(found.sigma_rad):.2f} degrees"
-    )
-    if found.sigma_m > GOOD_SIGMA_M:
-        print("More pictures, a larger board, or the board nearer to the camera would make it more certain.")
-    print(f"{step.launch}: [input.calibration] written; poses of this camera are calibrated now")
-
-
-def _calibrate_floor(step: CalibrateFloor) -> None:
-    lens = lens_of(step.launch)
-    depth = read_depth(step.depth)
-    if not np.isfinite(step.up).all() or not np.linalg.norm(step.up) > 0:
-        raise CalibrationError(f"--up: expected a direction, got {step.up}")
-    pose, share = floor_pose(points_of_depth(depth, lens), np.array(step.up))
-    write_floor_grid(step.picture or step.launch.with_suffix(".floor.png"), depth_picture(depth), lens, pose)
-    save_calibration(step.launch, pose=pose)
-    print(f"{_described(pose)}; {share:.0%} of what it sees is floor")
-    print(f"{step.launch}: [input.calibration] written; poses of this camera are calibrated now")
-
-
-def _calibrate_oak(step: CalibrateOak) -> None:
-    launch = read_launch(step.launch)
-    from steadypose.nodes.sources.oak_still import capture_with_camera  # brings depthai
-
-    try:
-        still = capture_with_camera(launch.settings(InputSettings).oak)
-    except RuntimeError as error:
-        raise CalibrationError(str(error)) from error
-    _write_still(step, still)
-
-
-def _write_still(step: CalibrateOak, still: Still) -> None:
-    picture, depth = step.out.with_name(f"{step.out.name}.png"), step.out.with_name(f"{step.out.name}.depth.png")
-    write_picture(picture, still.colour)
-    write_picture(depth, still.depth)
-    height, width = still.depth.shape
-    focal, centre = still.intrinsics[[0, 1], [0, 1]], still.intrinsics[:2, 2]
-    lens = Intrinsics((width, height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
-    save_calibration(step.launch, lens=lens)
-    up = "" if still.up is None else " --up " + " ".join(f"{value:.3f}" for value in still.up)
-    print(f"{step.launch}: [input.calibration] has the camera's lens now. With the board on the floor:")
-    print(f"  steadypose calibrate pose {step.launch} {picture} --square METRES")
-    print(f"without it:\n  steadypose calibrate floor {step.launch} {depth}{up}")
+    step.run()
 
 
 def _described(pose: Pose) -> str:
@@ -318,44 +303,3 @@ def _described(pose: Pose) -> str:
         f"camera at x {x:.3f}, y {y:.3f} m, {z:.3f} m above the floor, "
         f"looking {np.degrees(np.arcsin(-forward[2])):.1f} degrees down"
     )
-
-
-def read_launch(path: Path) -> Launch:
-    if not path.is_file():
-        raise LaunchError(
-            f"no launch file at {path}: expected the camera's own; start from a copy of one in launch/ such as oak.toml"
-        )
-    return Launch.read(path)
-
-
-def lens_of(path: Path) -> Intrinsics:
-    """The lens in a launch file's ``[input.calibration]``."""
-    calibration = read_launch(path).settings(InputSettings).calibration
-    if not calibration.size:
-        raise CalibrationError(f"{path} has no lens in [input.calibration]: first run steadypose calibrate lens")
-    width, height = calibration.size
-    fx, fy = calibration.focal
-    cx, cy = calibration.centre
-    return Intrinsics((width, height), (fx, fy), (cx, cy), tuple(calibration.distortion))
-
-
-def save_calibration(path: Path, *, lens: Intrinsics | None = None, pose: Pose | None = None) -> None:
-    """Write what was found to ``[input.calibration]`` of a launch file, which is left as it is otherwise."""
-    document = tomlkit.parse(path.read_text(encoding="utf-8"))
-    section = document.setdefault("input", tomlkit.table()).setdefault("calibration", tomlkit.table())
-    if lens:
-        section["size"] = list(lens.size)
-        for name in ("focal", "centre", "distortion"):
-            section[name] = [round(value, 6) for value in getattr(lens, name)]
-    if pose:
-        section["position"] = [round(float(value), 5) for value in pose.position]
-        section["orientation"] = [round(float(value), 7) for value in pose.orientation]
-    # the user's own file: whole, as it was or as it becomes, whatever happens in between
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(tomlkit.dumps(document), encoding="utf-8")
-        shutil.copymode(path, part)
-        Launch.read(part)
-        part.replace(path.resolve())
-    finally:
-        part.unlink(missing_ok=True)

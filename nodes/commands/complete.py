@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
@@ -14,12 +13,13 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.types import JOINTS, JointState, Message, PoseClean, PoseRaw
+from steadypose.msgs.types import JOINTS, JointState, Message, PoseRaw
 from steadypose.nodes.commands.output import (
     ARRAY_FILES,
     check_format,
     check_output,
     check_replaceable,
+    plural,
     put_in_place,
     unfinished,
     write_arrays,
@@ -33,12 +33,9 @@ from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sources.recording import NO_RIG, open_recording, with_end
 from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.body.own_layouts import add_layouts
-from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.complete.body import Completed, Fill, Uncertainty
-from steadypose.prior.complete.body import complete as fill_in
+from steadypose.prior.complete.body import Fill, Uncertainty
 from steadypose.prior.complete.parts import PartsCompleter
-from steadypose.prior.complete.root_path import is_root_centred
-from steadypose.prior.complete.stream import Stretch, clean_messages, moved, root_steps, stretches_of
+from steadypose.prior.complete.stream import Completion, complete_raws, moved, root_steps
 from steadypose.prior.models.completer.inference import LiveCompleter
 from steadypose.prior.timing.rate import FPS
 from steadypose.prior.world.pipeline import TrajectoryPipeline
@@ -96,6 +93,7 @@ def complete(
     check_output(source, out, *([picture] if picture else []))
     if picture is not None and picture.suffix not in (".png", ".svg", ".pdf"):
         raise LaunchError(f"--picture: expected a name ending in .png, .svg or .pdf, got {picture}")
+    check_replaceable(out, replace=force)
     one_thread()
     fill, uncertainty = load_completer(weights)
     if optimise:
@@ -105,112 +103,62 @@ def complete(
     console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task(source.name, total=None)
-        done = complete_recording(
-            source,
-            out,
+        completed = complete_source(
+            open_recording(source, read_toml(rig) if rig else NO_RIG),
+            str(source),
             fill,
             uncertainty,
-            rig=read_toml(rig) if rig else NO_RIG,
-            replace=force,
             began=lambda frames: progress.update(bar, total=frames),
             advanced=lambda frame: progress.update(bar, completed=frame),
         )
-    bodies = "1 body" if done.bodies == 1 else f"{done.bodies} bodies"
+    with unfinished(out) as part:
+        if out.suffix in ARRAY_FILES:
+            write_arrays(part, completed.arrays())
+        else:
+            every = [*((POSE_RAW, message) for message in completed.raws), *completed.answers]
+            write_recording(part, sorted(every, key=lambda pair: pair[1].stamp_ns))
+        put_in_place(part, out)
+    completion = completed.completion
+    people = len({stretch.body for stretch, _ in completion.done})
+    longest = max(done.span for _, done in completion.done) / FPS
     console.print(
-        f"{out}: {done.frames} frames of {bodies}; {done.given:.0%} of their joints were given, the rest completed; "
-        f"the longest gap was {done.longest_gap / 30:.1f} s",
+        f"{out}: {len(completion.clean) - 1} frames of {plural(people, 'body', 'bodies')}; {completion.given:.0%} of "
+        f"their joints were given, the rest completed; the longest gap was {longest:.1f} s",
         highlight=False,
     )
-    if done.unreached:
+    if completion.unreached:
         console.print(
-            f"  left out, for nothing near them is known: {done.unreached} joints", highlight=False, style="yellow"
+            f"  left out, for nothing near them is known: {completion.unreached} joints",
+            highlight=False,
+            style="yellow",
         )
-    for body in done.centred:
+    for body in completion.centred:
         console.print(f"  body {body} stands on its pelvis: its way is read from its motion", highlight=False)
-    for cause, count in done.refused.items():
+    for cause, count in completed.refused.items():
         console.print(f"  refused or dropped, {cause}: {count}", highlight=False)
     if picture is not None:
-        draw(done, source.name, picture)
+        draw(completion, source.name, picture)
         console.print(f"wrote {picture}", highlight=False)
     return 0
 
 
-@dataclass(frozen=True)
-class Done:
-    """Summary of the completion of one recording.
-
-    Attributes:
-        frames: given out.
-        bodies: how many.
-        given: share of the joints of these that the recording knew.
-        longest_gap: frames of which nothing was known, at most.
-        unreached: joints too far from all that is known.
-        stretches: what came in, and what came out.
-        refused: what was refused or dropped, by cause.
-        centred: bodies whose root stands still, whose way was read from their motion.
-    """
-
-    frames: int
-    bodies: int
-    given: float
-    longest_gap: int
-    unreached: int
-    stretches: list[tuple[Stretch, Completed]]
-    refused: dict[str, int]
-    centred: list[int]
-
-
-@dataclass(frozen=True)
-class Completion:
-    """What came of a recording.
-
-    Attributes:
-        raws: ``pose/raw`` as it was, with its end.
-        answers: ``pose/clean`` and ``pose/world`` with their topics, in order.
-        done: the summary.
-    """
+class CompletedSource(NamedTuple):
+    """What came of a source."""
 
     raws: list[PoseRaw]
+    """``pose/raw`` as it was, with its end"""
     answers: list[tuple[str, Message]]
-    done: Done
+    """``pose/clean`` and ``pose/world`` with their topics, in order"""
+    completion: Completion
+    refused: dict[str, int]
+    """what was refused or dropped, by cause"""
 
-
-def complete_recording(
-    source: Path,
-    out: Path,
-    fill: Fill,
-    uncertainty: Uncertainty,
-    *,
-    rig: Mapping[str, Any] = NO_RIG,
-    replace: bool = False,
-    began: Callable[[int], None] = lambda frames: None,
-    advanced: Callable[[int], None] = lambda frame: None,
-) -> Done:
-    """Complete one recording. The output is there whole, or not at all.
-
-    Args:
-        source: a recording or file of poses.
-        out: the recording to make, or .npz or .csv.
-        fill: a completer.
-        uncertainty: standard deviations of its output.
-        rig: what a file of motion does not say.
-        replace: whether what is at ``out`` may be replaced, if it is a recording or an .npz.
-        began: called with the number of frames of all bodies together.
-        advanced: called with how many of them are done.
-
-    Raises:
-        LaunchError, RecordingError, NpzError: the input cannot be used, or the output not be made.
-    """
-    check_replaceable(out, replace=replace)
-    completion = complete_source(open_recording(source, rig), str(source), fill, uncertainty, began, advanced)
-    with unfinished(out) as part:
-        if out.suffix in ARRAY_FILES:
-            write_arrays(part, completed_arrays(completion))
-        else:
-            every = [*((POSE_RAW, message) for message in completion.raws), *completion.answers]
-            write_recording(part, sorted(every, key=lambda pair: pair[1].stamp_ns))
-        put_in_place(part, out)
-    return completion.done
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of ``clean``, with a row for each frame of the grid on which there is a body."""
+        collector = NpzCollector()
+        for _, message in self.answers:
+            collector.add(message)
+        return collector.arrays(np.array([message.stamp_ns for message in self.completion.clean[:-1]], np.int64))
 
 
 def load_completer(weights: str) -> tuple[PartsCompleter, Uncertainty]:
@@ -226,60 +174,28 @@ def complete_source(
     uncertainty: Uncertainty,
     began: Callable[[int], None] = lambda frames: None,
     advanced: Callable[[int], None] = lambda frame: None,
-) -> Completion:
-    """Complete what a source has; ``name`` is what errors call it, the rest as of `complete_recording`.
+) -> CompletedSource:
+    """Complete what a source has; ``name`` is what errors call it, the rest as of `complete_raws`.
 
     Raises:
         LaunchError: it has no frame.
-        CompletionError: it shows nobody.
+        CompletionError: as `complete_raws`.
     """
-    messages = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
-    raws = [message for message in messages if not message.end_of_stream]
+    raws = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
     if not raws:
         raise LaunchError(f"{name}: expected frames, but none of {len(frames)} could be read")
-    anchor = min(message.stamp_ns for message in raws)
-    stretches = stretches_of(name, raws, anchor)
-    began(sum(len(stretch.given) for stretch in stretches))
-    done: list[tuple[Stretch, Completed]] = []
-    before = 0
-    for stretch in stretches:
-        completed = fill_in(fill, stretch.given, stretch.offsets, lambda k, at=before: advanced(at + k))
-        done.append((stretch, completed))
-        before += len(stretch.given)
-        advanced(before)
-    centred = sorted({s.body for s, _ in done if is_root_centred(s.given)})
-    clean = clean_messages(raws, done, uncertainty, anchor)
+    completion = complete_raws(name, raws[:-1], fill, uncertainty, began, advanced)
     settings = TrajectorySettings()
-    world, steps = TrajectoryPipeline(settings), root_steps(done, centred, settings.weights)
+    world, steps = TrajectoryPipeline(settings), root_steps(completion, settings.weights)
     answers: list[tuple[str, Message]] = []
-    for message in clean:
+    for message in completion.clean:
         answers.append((POSE_CLEAN, message))
-        answers += [(POSE_WORLD, answer) for answer in world.process(moved(message, steps, anchor))]
-    summary = Done(
-        frames=len(clean) - 1,
-        bodies=len({stretch.body for stretch, _ in done}),
-        given=float(np.average([c.known.mean() for _, c in done], weights=[len(s.given) for s, _ in done])),
-        longest_gap=max(completed.span for _, completed in done),
-        unreached=sum(int((~finite_joints(completed.positions)).sum()) for _, completed in done),
-        stretches=done,
-        refused={cause: n for cause, n in (frames.refused + world.counters).items() if n},
-        centred=centred,
-    )
-    return Completion(messages, answers, summary)
+        answers += [(POSE_WORLD, answer) for answer in world.process(moved(message, steps, completion.anchor_ns))]
+    refused = {cause: n for cause, n in (frames.refused + world.counters).items() if n}
+    return CompletedSource(raws, answers, completion, refused)
 
 
-def completed_arrays(completion: Completion) -> dict[str, NDArray[Any]]:
-    """The arrays of ``clean``, with a row for each frame of the grid on which there is a body."""
-    collector = NpzCollector()
-    stamps = []
-    for _, message in completion.answers:
-        collector.add(message)
-        if isinstance(message, PoseClean) and not message.end_of_stream:
-            stamps.append(message.stamp_ns)
-    return collector.arrays(np.array(stamps, np.int64))
-
-
-def draw(done: Done, title: str, path: Path) -> None:
+def draw(completion: Completion, title: str, path: Path) -> None:
     """Write the picture of the longest stretch that was completed: joints given when, stick figures, the trajectory."""
     import matplotlib
 
@@ -288,7 +204,7 @@ def draw(done: Done, title: str, path: Path) -> None:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
-    stretch, completed = max(done.stretches, key=lambda pair: len(pair[0].given))
+    stretch, completed = max(completion.done, key=lambda pair: len(pair[0].given))
     joints, known = completed.positions, completed.known
     there = np.flatnonzero(np.isfinite(joints).all(axis=(1, 2)))
     figure = Figure(figsize=(15, 9), layout="constrained")

@@ -6,9 +6,8 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
@@ -17,7 +16,6 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.msgs.types import JOINTS, Message, PoseRaw
-from steadypose.nodes.commands.key_points import has_key_points, read_key_points
 from steadypose.nodes.commands.output import (
     ARRAY_FILES,
     check_format,
@@ -31,11 +29,11 @@ from steadypose.nodes.driving import clean_joints, stream
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sources.key_points import has_key_points, read_key_points
 from steadypose.nodes.sources.npz import NpzError, read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.arrays import Floats
-from steadypose.prior.clean.adapt import SensorFrame
 from steadypose.prior.fit.picture import in_sight
 
 if TYPE_CHECKING:
@@ -119,12 +117,20 @@ def _fit_poses(
     from steadypose.prior.fit.windows import window_bounds
 
     bar = progress.add_task(source.name, total=None)
+    points = read_arrays(source, ("points",)).get("points") if source.suffix == ".npz" else None
     fitted = fit_source(
-        open_recording(source), str(source), _points(source), model=model, delay=delay, folder=folder,
+        open_recording(source), str(source), points, model=model, delay=delay, folder=folder,
         began=lambda bodies: progress.update(bar, total=sum(len(window_bounds(len(b.bodies))) for b in bodies)),
         advanced=lambda: progress.advance(bar),
     )  # fmt: skip
-    _write(out, folder, fitted)
+    part = folder / out.name
+    if out.suffix in ARRAY_FILES:
+        write_arrays(part, fitted.arrays())
+    else:
+        if part.exists():  # of a call that was killed
+            shutil.rmtree(part)
+        write_recording(part, fitted.messages)
+    put_in_place(part, out)
     fits = fitted.fits
     _explain(out, [(fit.seen.id, fit.seen.stamps_ns, fit.misfit, fit.track) for fit in fits], "m")
     return len(fitted.stamps_ns), [fit.track for fit in fits], [_line(fit) for fit in fits]
@@ -162,11 +168,6 @@ def _fit_picture(
     return frames, [track], [f"key points lie {np.nanmedian(misfit):.1f} pixels off in the median"]
 
 
-def _points(source: Path) -> NDArray[Any] | None:
-    """Points of the surface, of an .npz that has them."""
-    return read_arrays(source, ("points",)).get("points") if source.suffix == ".npz" else None
-
-
 def _write_smpl(out: Path, shape: Any, tracks: Sequence[FittedTrack | None]) -> list[str]:
     """Write the motion of each fitted body as SMPL's; lines to print."""
     from steadypose.prior.fit.smpl import smpl_motion
@@ -181,18 +182,6 @@ def _write_smpl(out: Path, shape: Any, tracks: Sequence[FittedTrack | None]) -> 
         off = np.linalg.norm(motion.joints - track.joints, axis=-1).mean() * 1e3
         lines.append(f"{path.name}: SMPL's joints lie {off:.0f} mm off the fitted ones in the mean")
     return lines
-
-
-def _write(out: Path, folder: Path, fitted: Fitted) -> None:
-    """Write the output whole, or not at all."""
-    part = folder / out.name
-    if out.suffix in ARRAY_FILES:
-        write_arrays(part, fitted_arrays(fitted))
-    else:
-        if part.exists():  # of a call that was killed
-            shutil.rmtree(part)
-        write_recording(part, fitted.messages)
-    put_in_place(part, out)
 
 
 def _explain(out: Path, fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit: str) -> None:
@@ -223,19 +212,24 @@ def _picture(path: Path, fits: Sequence[tuple[int, NDArray[np.int64], Floats, An
     figure.savefig(path, dpi=110)
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """What came of a source.
-
-    Attributes:
-        messages: of all topics, with poses replaced by the fitted ones.
-        stamps_ns: (T,) of its frames.
-        fits: of each body, for as long as it was seen.
-    """
+class Fitted(NamedTuple):
+    """What came of a source."""
 
     messages: list[tuple[str, Message]]
+    """of all topics, with poses replaced by the fitted ones"""
     stamps_ns: NDArray[np.int64]
+    """(T,) of its frames"""
     fits: list[Fit]
+    """of each body, for as long as it was seen"""
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of ``clean``, a row for each frame; of one body that was fitted, with its bones and the ground."""
+        collector = NpzCollector()
+        for _, message in self.messages:
+            collector.add(message)
+        arrays = collector.arrays(self.stamps_ns)
+        tracks = {fit.seen.id: fit.track for fit in self.fits if fit.track is not None}
+        return with_bones(arrays, next(iter(tracks.values()))) if len(tracks) == 1 else arrays
 
 
 def load_transitions(weights: str) -> HumorNet:
@@ -263,11 +257,8 @@ def fit_source(
         frames: the source.
         name: what errors call it.
         points: (T, N, 3) metres of the body's surface, in the sensor's frame, NaN where there are fewer.
-        model: of transitions.
         delay: of the initialisation, frames at 30 Hz.
-        folder: for finished windows, so that the same call goes on where it was stopped.
-        began: called with the bodies.
-        advanced: called after each window.
+        model, folder, began, advanced: as of `prior.fit.bodies.fit_stream`.
 
     Raises:
         LaunchError: nobody is seen for long enough.
@@ -275,45 +266,19 @@ def fit_source(
     """
     from steadypose.nodes.graph.prior_node import make_prior
     from steadypose.nodes.graph.trajectory_node import make_trajectory
-    from steadypose.prior.fit.bodies import bodies_seen, fit_body, rewritten
-    from steadypose.prior.fit.solve import FitSettings
+    from steadypose.prior.fit.bodies import fit_stream, rewritten
     from steadypose.prior.fit.windows import MIN_FRAMES
 
-    surface = _surface(name, points, len(frames))
+    surface = None if points is None else _surface(name, np.asarray(points), len(frames))
     messages = list(stream(frames, make_prior({"delay": delay}), make_trajectory({})))
-    bodies = bodies_seen(messages, MIN_FRAMES)
-    if not bodies:
+    fits = fit_stream(messages, surface, model, folder, began, advanced)
+    if not fits:
         raise LaunchError(
             f"{name}: expected somebody who is seen for {MIN_FRAMES} frames or more, found nobody; is the skeleton "
             "right, are the units metres? `steadypose info` says what it holds"
         )
     stamps = np.array([m.stamp_ns for _, m in messages if isinstance(m, PoseRaw) and not m.end_of_stream], np.int64)
-    began(bodies)
-    fits = []
-    for number, seen in enumerate(bodies):
-        own = None
-        if folder is not None:
-            own = folder / f"{number:04d}"
-            own.mkdir(exist_ok=True)
-        near = None
-        if surface is not None:
-            nearest = np.abs(stamps[None] - seen.stamps_ns[:, None]).argmin(axis=1)
-            near = np.stack([
-                SensorFrame.of(message.sensor_pose).to_world(frame)
-                for message, frame in zip(seen.clean, surface[nearest], strict=True)
-            ])  # fmt: skip
-        fits.append(fit_body(model, seen, near, FitSettings(), own, advanced))
     return Fitted(rewritten(messages, fits), stamps, fits)
-
-
-def fitted_arrays(fitted: Fitted) -> dict[str, NDArray[Any]]:
-    """The arrays of ``clean``, a row for each frame; of one body that was fitted, with its bones and the ground."""
-    collector = NpzCollector()
-    for _, message in fitted.messages:
-        collector.add(message)
-    arrays = collector.arrays(fitted.stamps_ns)
-    tracks = {fit.seen.id: fit.track for fit in fitted.fits if fit.track is not None}
-    return with_bones(arrays, next(iter(tracks.values()))) if len(tracks) == 1 else arrays
 
 
 def with_bones(arrays: dict[str, NDArray[Any]], track: FittedTrack) -> dict[str, NDArray[Any]]:
@@ -324,11 +289,8 @@ def with_bones(arrays: dict[str, NDArray[Any]], track: FittedTrack) -> dict[str,
     return arrays | {"bone_lengths": bones, "ground_plane": ground_plane(track.ground.mean(axis=0))}
 
 
-def _surface(name: str, points: ArrayLike | None, frames: int) -> Floats | None:
+def _surface(name: str, points: NDArray[Any], frames: int) -> Floats:
     """(T, N, 3) metres, points that a camera can see."""
-    if points is None:
-        return None
-    points = np.asarray(points)
     if points.dtype.kind not in "fiu" or points.ndim != 3 or len(points) != frames or points.shape[-1] != 3:
         raise NpzError(
             f"{name}: points: expected ({frames}, N, 3) metres, NaN for what is missing, got {points.dtype} "

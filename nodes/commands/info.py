@@ -22,11 +22,10 @@ from steadypose.nodes.commands.inspect import (
     LaunchFile,
     Rate,
     endpoints_of,
-    plural,
     recording_at,
     subscribe,
 )
-from steadypose.nodes.commands.output import printable
+from steadypose.nodes.commands.output import plural, printable
 from steadypose.nodes.driving import Diagnosis
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.sources.cleaned import is_output

@@ -25,7 +25,7 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import JOINTS, Diagnostics, JointState, Message, PoseClean, PoseEvents, PoseRaw, WorldBody
-from steadypose.nodes.commands.output import printable
+from steadypose.nodes.commands.output import plural, printable
 from steadypose.nodes.graph.access import TransportSettings
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
@@ -100,10 +100,6 @@ def receive(subscriber: Subscriber, topic: str) -> Iterator[tuple[str, Message]]
         elif started is not None and time.monotonic() - started > PATIENCE_S:
             started = None
             print(f"nothing on {topic} yet: is `steadypose run` running?", file=sys.stderr)
-
-
-def plural(count: int, one: str, more: str) -> str:
-    return f"{count} {one if count == 1 else more}"
 
 
 def echo(

@@ -113,3 +113,7 @@ def put_in_place(part: Path, out: Path) -> None:
 def printable(text: str) -> str:
     """The text, with what a terminal would obey instead of showing it made visible."""
     return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
+
+
+def plural(count: int, one: str, more: str) -> str:
+    return f"{count} {one if count == 1 else more}"

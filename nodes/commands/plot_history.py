@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from steadypose.prior.body.layouts import SKELETONS, to_canonical
 
 SENSOR = {"sensor.jitter_mm", "sensor.slow_error_mm"}
 """diagnostics of the prior"""
+_NONE = np.zeros(0)
 
 
 class Track(NamedTuple):
@@ -46,20 +47,6 @@ class Track(NamedTuple):
     """(T, 8)"""
     tracking: NDArray[np.uint8]
     """(T,) `Tracking`"""
-
-
-class Row(NamedTuple):
-    """A body in a message, as it is gathered; the fields of `Track`."""
-
-    time: float
-    positions: NDArray[np.floating]
-    raw: NDArray[np.floating] = np.zeros(0)
-    state: NDArray[np.uint8] = np.zeros(0, np.uint8)
-    sigma: NDArray[np.floating] = np.zeros(0)
-    anomaly: float = np.nan
-    flag: bool = False
-    contacts: NDArray[np.floating] = np.zeros(0)
-    tracking: int = Tracking.OK
 
 
 @dataclass
@@ -138,7 +125,7 @@ def _of_source(name: str, messages: Iterable[tuple[str, Message]]) -> History:
 
 def gather(name: str, messages: Iterable[tuple[str, int, Message]], start_ns: int) -> History:
     """Messages as arrays, each with its topic and stamp; ``name`` is the stream's, which begins at ``start_ns``."""
-    rows: dict[tuple[str, int], list[Row]] = {}
+    rows: dict[tuple[str, int], list[tuple[Any, ...]]] = {}
     stamps: dict[str, list[float]] = {}
     dropped_or_refused: dict[str, Mapping[str, str]] = {}
     sources, skeletons = Counter[str](), Counter[str]()
@@ -178,31 +165,24 @@ def gather(name: str, messages: Iterable[tuple[str, int, Message]], start_ns: in
     return history
 
 
-def _rows(message: PoseRaw | PoseClean | PoseWorld, time: float) -> Iterable[tuple[int, Row]]:
+def _rows(message: PoseRaw | PoseClean | PoseWorld, time: float) -> Iterable[tuple[int, tuple[Any, ...]]]:
+    """Each body of a message, and its row of every field of `Track`."""
     if isinstance(message, PoseRaw):
         skeleton = SKELETONS.get(message.skeleton)
         for body in message.bodies if skeleton else ():
             if skeleton and len(body.positions) == len(skeleton.joints):
                 positions, _ = to_canonical(skeleton, to_world(body.positions, message.sensor_pose), body.confidence)
-                yield body.id, Row(time, positions)
+                yield body.id, (time, positions, _NONE, _NONE, _NONE, np.nan, False, _NONE, Tracking.OK)
     elif isinstance(message, PoseClean):
         for body in message.bodies:
             positions = to_world(body.positions, message.sensor_pose)
             raw = to_world(body.raw_positions, message.sensor_pose)
-            yield body.id, Row(time, positions, raw, body.state, body.sigma, body.anomaly, body.anomaly_flag)
+            scores = body.anomaly, body.anomaly_flag
+            yield body.id, (time, positions, raw, body.state, body.sigma, *scores, _NONE, Tracking.OK)
     else:
         for body in message.bodies:
-            yield (
-                body.id,
-                Row(
-                    time,
-                    body.positions,
-                    state=body.state,
-                    sigma=body.sigma,
-                    contacts=body.contacts,
-                    tracking=body.tracking,
-                ),
-            )
+            of_world = body.contacts, body.tracking
+            yield body.id, (time, body.positions, _NONE, body.state, body.sigma, np.nan, False, *of_world)
 
 
 MAX_TRUTH_GAP_S = 0.05

@@ -203,11 +203,11 @@ def complete(
     Raises:
         ValueError: as `clean`; or there is no body.
     """
-    from steadypose.nodes.commands.complete import complete_source, completed_arrays, load_completer
+    from steadypose.nodes.commands.complete import complete_source, load_completer
 
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
-    completion = complete_source(source, "positions", *load_completer(weights))
-    return Poses(completed_arrays(completion), refused=completion.done.refused)
+    completed = complete_source(source, "positions", *load_completer(weights))
+    return Poses(completed.arrays(), refused=completed.refused)
 
 
 def fit(
@@ -238,13 +238,13 @@ def fit(
         ValueError: as `clean`; nobody is seen for long enough; or torch is not installed (the extra 'train').
     """
     require_extra("train")
-    from steadypose.nodes.commands.fit import fit_source, fitted_arrays, load_transitions
+    from steadypose.nodes.commands.fit import fit_source, load_transitions
 
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
     fitted = fit_source(source, "positions", points, model=load_transitions(weights), delay=delay)
     problems = [f"body {fit.seen.id}: not explained, left as `clean` has it" for fit in fitted.fits if not fit.track]
     warn(problems)
-    return Poses(fitted_arrays(fitted), problems)
+    return Poses(fitted.arrays(), problems)
 
 
 def plot(poses: Positions, output: str | Path | None = None, *, body: int | None = None) -> Figure:

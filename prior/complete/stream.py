@@ -6,7 +6,7 @@ A key frame may stand seconds from the next: so, other than `clean`, this gives 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,8 +18,8 @@ from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.kinematics import quaternions, rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, finite_joints
-from steadypose.prior.complete.body import Completed, Uncertainty
-from steadypose.prior.complete.root_path import root_path
+from steadypose.prior.complete.body import Completed, Fill, Uncertainty, complete
+from steadypose.prior.complete.root_path import is_root_centred, root_path
 from steadypose.prior.models.root_velocity import LiveRootVelocity
 from steadypose.prior.timing.resample import PERIOD_NS
 
@@ -55,12 +55,71 @@ class Stretch:
     offsets: Floats
 
 
-def stretches_of(source: str, raws: Sequence[PoseRaw], anchor_ns: int) -> list[Stretch]:
-    """Every body of a recording on the grid that begins at ``anchor_ns``; errors call the recording ``source``.
+@dataclass(frozen=True)
+class Completion:
+    """What came of a recording.
+
+    Attributes:
+        anchor_ns: stamp of the grid's first frame.
+        done: every stretch, and what it was completed to.
+        clean: ``pose/clean`` of the frames with a body, and the end of the stream.
+        centred: numbers of bodies whose pelvis lies at the origin, whose trajectory is read from their motion.
+    """
+
+    anchor_ns: int
+    done: list[tuple[Stretch, Completed]]
+    clean: list[PoseClean]
+    centred: list[int]
+
+    @property
+    def given(self) -> float:
+        """Share of the joints that the recording knew."""
+        known = [completed.known.mean() for _, completed in self.done]
+        return float(np.average(known, weights=[len(stretch.given) for stretch, _ in self.done]))
+
+    @property
+    def unreached(self) -> int:
+        """Number of joints too far from all that is known."""
+        return sum(int((~finite_joints(completed.positions)).sum()) for _, completed in self.done)
+
+
+def complete_raws(
+    source: str,
+    raws: Sequence[PoseRaw],
+    fill: Fill,
+    uncertainty: Uncertainty,
+    began: Callable[[int], None] = lambda frames: None,
+    advanced: Callable[[int], None] = lambda frame: None,
+) -> Completion:
+    """Complete the bodies of a recording.
+
+    Args:
+        source: what errors call the recording.
+        raws: its messages, one at least.
+        fill: a completer.
+        uncertainty: standard deviations of its output.
+        began: called with the number of frames of all bodies together.
+        advanced: called with how many of them are done.
 
     Raises:
         CompletionError: it has an unknown skeleton, nobody, or nobody in metres.
     """
+    anchor_ns = min(message.stamp_ns for message in raws)
+    stretches = _stretches(source, raws, anchor_ns)
+    began(sum(len(stretch.given) for stretch in stretches))
+    done: list[tuple[Stretch, Completed]] = []
+    before = 0
+    for stretch in stretches:
+        completed = complete(fill, stretch.given, stretch.offsets, lambda k, at=before: advanced(at + k))
+        done.append((stretch, completed))
+        before += len(stretch.given)
+        advanced(before)
+    centred = sorted({stretch.body for stretch, _ in done if is_root_centred(stretch.given)})
+    return Completion(anchor_ns, done, _clean_messages(raws, done, uncertainty, anchor_ns), centred)
+
+
+def _stretches(source: str, raws: Sequence[PoseRaw], anchor_ns: int) -> list[Stretch]:
+    """Every body of a recording on the grid that begins at ``anchor_ns``."""
     stamps: dict[int, list[int]] = defaultdict(list)
     positions: dict[int, list[Floats]] = defaultdict(list)
     for message in raws:
@@ -128,7 +187,7 @@ def _check_size(body: int, offsets: Floats) -> None:
         )
 
 
-def clean_messages(
+def _clean_messages(
     raws: Sequence[PoseRaw], done: list[tuple[Stretch, Completed]], uncertainty: Uncertainty, anchor_ns: int
 ) -> list[PoseClean]:
     """``pose/clean`` of every frame of the grid on which there is a body, in the frames in which these were seen."""
@@ -179,20 +238,19 @@ def clean_messages(
     return [*messages, end]
 
 
-def root_steps(
-    done: Sequence[tuple[Stretch, Completed]], centred: Sequence[int], weights: str
-) -> dict[tuple[int, int], Floats]:
+def root_steps(completion: Completion, weights: str) -> dict[tuple[int, int], Floats]:
     """How far to move bodies that are known about their root only: (3,) metres by number and frame of the grid.
 
     Args:
-        done: what was completed.
-        centred: numbers of such bodies.
+        completion: of a recording.
         weights: of the network that predicts a root's velocity.
     """
     steps: dict[tuple[int, int], Floats] = {}
-    network = LiveRootVelocity.load(weights) if centred else None
-    for stretch, completed in done:
-        if network is not None and stretch.body in centred:
+    if not completion.centred:
+        return steps
+    network = LiveRootVelocity.load(weights)
+    for stretch, completed in completion.done:
+        if stretch.body in completion.centred:
             joints = completed.positions - completed.positions[:, :1]
             path = root_path(network, joints, completed.rotations[:, 0]) - completed.positions[:, 0]
             steps |= {(stretch.body, stretch.first + row): step for row, step in enumerate(path)}

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import CleanBody, JointState, Message, PoseClean, PoseWorld, WorldBody
+from steadypose.msgs.types import CleanBody, JointState, Message, PoseClean, PoseRaw, PoseWorld, WorldBody
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
@@ -20,7 +20,7 @@ from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.motion import float_tensor
 from steadypose.prior.fit.observations import POINT_SHARE, Observed, SeenJoints, SurfacePoints, thinned
 from steadypose.prior.fit.solve import FitSettings, Start
-from steadypose.prior.fit.windows import FittedTrack, Track, fit_track
+from steadypose.prior.fit.windows import MIN_FRAMES, FittedTrack, Track, fit_track
 from steadypose.prior.timing.rate import FPS
 
 FRAME_NS = 1e9 / FPS
@@ -176,6 +176,45 @@ def fit_body(
     ):
         return Fit(seen, None, before)
     return Fit(seen, fitted, misfit)
+
+
+def fit_stream(
+    messages: Sequence[tuple[str, Message]],
+    surface: Floats | None,
+    model: HumorNet,
+    folder: Path | None = None,
+    began: Callable[[Sequence[Seen]], None] = lambda bodies: None,
+    advanced: Callable[[], None] = lambda: None,
+) -> list[Fit]:
+    """Fit every body of a cleaned stream that is seen for long enough.
+
+    Args:
+        messages: of the stream, ``pose/raw`` among them.
+        surface: (T, N, 3) metres, a row for each frame of ``pose/raw``: points of the body's surface in the sensor's
+            frame, NaN where there are fewer; None where there are none.
+        model: of transitions.
+        folder: for finished windows, so that the same call goes on where it was stopped.
+        began: called with the bodies.
+        advanced: called after each window.
+    """
+    bodies = bodies_seen(messages, MIN_FRAMES)
+    stamps = np.array([m.stamp_ns for _, m in messages if isinstance(m, PoseRaw) and not m.end_of_stream], np.int64)
+    began(bodies)
+    fits = []
+    for number, seen in enumerate(bodies):
+        own = None
+        if folder is not None:
+            own = folder / f"{number:04d}"
+            own.mkdir(exist_ok=True)
+        points = None
+        if surface is not None:
+            nearest = np.abs(stamps[None] - seen.stamps_ns[:, None]).argmin(axis=1)
+            points = np.stack([
+                SensorFrame.of(message.sensor_pose).to_world(frame)
+                for message, frame in zip(seen.clean, surface[nearest], strict=True)
+            ])  # fmt: skip
+        fits.append(fit_body(model, seen, points, FitSettings(), own, advanced))
+    return fits
 
 
 def rewritten(messages: Sequence[tuple[str, Message]], fits: Sequence[Fit]) -> list[tuple[str, Message]]:

@@ -13,7 +13,7 @@ from conftest import VirtualClock, raw, walking
 from steadypose.benchmarks.systems.calibration import BOARD, depth_points, error, held_poses, look_at, picture, rays
 from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.cli import main
-from steadypose.nodes.commands.calibrate_pictures import draw_floor
+from steadypose.nodes.commands.calibrate_files import draw_floor
 from steadypose.nodes.graph.launch import Launch, bundled
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.pose_input import PoseInputNode

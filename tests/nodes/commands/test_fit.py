@@ -15,8 +15,8 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
 from steadypose.nodes.cli import main
-from steadypose.nodes.commands.key_points import read_key_points
 from steadypose.nodes.graph.clock import FRAME_NS
+from steadypose.nodes.sources.key_points import read_key_points
 from steadypose.nodes.sources.npz import NpzError
 from steadypose.prior.body.skeleton import REST_POSITIONS
 from steadypose.prior.fit import solve

@@ -1,19 +1,24 @@
-"""Pictures for `calibrate`: read from files, folders and videos, and drawn with the floor that was found."""
+"""Files of `calibrate`: pictures, read and drawn with the floor that was found, and the launch file that is written."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import tomlkit
 from numpy.typing import NDArray
 from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.recording import VIDEOS
+from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.arrays import Floats
 from steadypose.prior.camera.calibration import (
     CalibrationError,
@@ -157,3 +162,44 @@ def write_picture(out: Path, picture: NDArray[Any]) -> None:
 def write_floor_grid(out: Path, picture: Image, lens: Intrinsics, pose: Pose) -> None:
     write_picture(out, draw_floor(picture, lens, pose))
     print(f"{out}: the floor's grid, half a metre a square; it must lie on the floor, its axes where the world begins")
+
+
+def read_launch(path: Path) -> Launch:
+    if not path.is_file():
+        raise LaunchError(
+            f"no launch file at {path}: expected the camera's own; start from a copy of one in launch/ such as oak.toml"
+        )
+    return Launch.read(path)
+
+
+def lens_of(path: Path) -> Intrinsics:
+    """The lens in a launch file's ``[input.calibration]``."""
+    calibration = read_launch(path).settings(InputSettings).calibration
+    if not calibration.size:
+        raise CalibrationError(f"{path} has no lens in [input.calibration]: first run steadypose calibrate lens")
+    width, height = calibration.size
+    fx, fy = calibration.focal
+    cx, cy = calibration.centre
+    return Intrinsics((width, height), (fx, fy), (cx, cy), tuple(calibration.distortion))
+
+
+def save_calibration(path: Path, *, lens: Intrinsics | None = None, pose: Pose | None = None) -> None:
+    """Write what was found to ``[input.calibration]`` of a launch file, which is left as it is otherwise."""
+    document = tomlkit.parse(path.read_text(encoding="utf-8"))
+    section = document.setdefault("input", tomlkit.table()).setdefault("calibration", tomlkit.table())
+    if lens:
+        section["size"] = list(lens.size)
+        for name in ("focal", "centre", "distortion"):
+            section[name] = [round(value, 6) for value in getattr(lens, name)]
+    if pose:
+        section["position"] = [round(float(value), 5) for value in pose.position]
+        section["orientation"] = [round(float(value), 7) for value in pose.orientation]
+    # the user's own file: whole, as it was or as it becomes, whatever happens in between
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(tomlkit.dumps(document), encoding="utf-8")
+        shutil.copymode(path, part)
+        Launch.read(part)
+        part.replace(path.resolve())
+    finally:
+        part.unlink(missing_ok=True)
