@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -28,6 +29,11 @@ MIRRORED = -0.2
 """handedness: trackers of the field stay above 0.2"""
 FASTEST = 8.0
 """times its height that a body moves in a second: twice a sprinter"""
+RUNNER_M_S, LIMB_M_S = 7.0, 8.0
+"""Speeds in m/s that no body keeps up for a second, nor any limb beside the trunk: of actors, dancers and sprinters of
+motion capture the greatest medians over 1.5 s are 3.7 and 4.8."""
+SPEED_BASE_NS = 50_000_000
+"""Interval in nanoseconds over which such a speed is measured: a jitter of 2 cm is then 0.6 m/s."""
 AT_ORIGIN_M = 1e-3
 FLOOR_M = (-0.4, 0.7)
 """height of the lowest joint of a leg: a pit, or a stage, is more"""
@@ -91,6 +97,37 @@ def check_jumps(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
             f"a body goes at {fast:.0f} units a second, {fast / height:.0f} times its height: expected less than "
             f"{FASTEST:.0f}; if an id goes from one person to another, --set prior.identify.enabled=true; if stamps "
             "are those of arrival, take those of capture",
+        )
+
+
+def check_speed(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
+    """A body in metres that moves faster than people do: a wrong rate, or wrong stamps."""
+    skeleton = SKELETONS.get(messages[-1].skeleton)
+    if skeleton is None:
+        return
+    rows: dict[int, list[tuple[int, Floats]]] = {}
+    for raw in messages:
+        for body in raw.bodies:
+            if len(body.positions) == len(skeleton.joints):
+                rows.setdefault(body.id, []).append((raw.stamp_ns, body.positions))
+    longest = max(rows.values(), key=len, default=[])
+    if len(longest) < ENOUGH:
+        return
+    stamps, joints = np.array([stamp for stamp, _ in longest]), np.array([places for _, places in longest], np.float64)
+    interval = max(float(np.median(np.diff(stamps))), 1.0)
+    step = min(math.ceil(SPEED_BASE_NS / interval), len(stamps) // 2)
+    seconds = (stamps[step:] - stamps[:-step]) * 1e-9
+    middle = np.nanmedian(joints, axis=1)
+    limbs = joints - middle[:, None]
+    moved = np.linalg.norm(middle[step:] - middle[:-step], axis=-1) / seconds
+    swung = np.linalg.norm(limbs[step:] - limbs[:-step], axis=-1) / seconds[:, None]
+    whole, limb = float(np.nanmedian(moved)), float(np.nanmax(np.nanmedian(swung, axis=0)))
+    if whole > RUNNER_M_S or limb > LIMB_M_S:
+        what = f"a body moves at {whole:.0f} m/s" if whole > RUNNER_M_S else f"a limb swings at {limb:.0f} m/s"
+        yield warning(
+            "too_fast",
+            f"{what}, as no person does for a second, and frames are {interval / 1e6:.3g} ms apart: expected the times "
+            "of capture; give fps the rate at which the recording was made, 30 for instance, or stamps of capture",
         )
 
 

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from steadypose.msgs.types import Level, PoseClean, PoseRaw
-from steadypose.nodes.checks.geometry import check_geometry, check_jumps
+from steadypose.nodes.checks.geometry import check_geometry, check_jumps, check_speed
 from steadypose.nodes.checks.layout import check_layout
 from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.checks.stamps import check_stamps
@@ -144,10 +144,15 @@ class StreamCheck:
                 f"{self._window.received} messages and nobody in any: expected bodies; if somebody stands there, the "
                 "tracker does not find them, or the publisher leaves `bodies` empty",
             )
-        if _usable(names):  # else joints are not what they are called
-            yield from check_geometry(messages)
-        if _usable(names) and _usable(stamps):
-            yield from check_jumps(messages)
+        if not _usable(names):  # else joints are not what they are called
+            return
+        shape = list(check_geometry(messages))
+        yield from shape
+        if _usable(stamps):
+            jumps = list(check_jumps(messages))
+            yield from jumps
+            if _usable(shape) and not jumps:
+                yield from check_speed(messages)
 
 
 def _usable(problems: list[Problem]) -> bool:

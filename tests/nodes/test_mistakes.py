@@ -118,6 +118,10 @@ WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         lambda j: frame_by_frame(j, 1e3 * seconds()),
         "they seem to be milliseconds taken for seconds",
     ),
+    "ten times the rate": (
+        lambda j: steadypose.clean(j, fps=300),
+        r"frames are 3\.33 ms apart: .* give fps the rate at which the recording was made",
+    ),
     "nothing but NaN": (lambda j: steadypose.clean(np.full_like(j, np.nan), fps=30), "all joints .* are NaN"),
     "nobody": (lambda j: steadypose.clean(np.full((FRAMES, 2, 22, 3), np.nan), fps=30), "no body in any frame"),
     "confidence in per cent": (

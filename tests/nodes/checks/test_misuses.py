@@ -196,6 +196,11 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
         "jumps",
         "prior.identify.enabled=true",
     ),
+    "ten times the rate": (
+        stamp(lambda ns, index: START_NS + 7 + index * 3_333_333),
+        "too_fast",
+        "the rate at which the recording was made",
+    ),
     "messages without bodies": (message(bodies=[]), "nobody", "leaves `bodies` empty"),
     "a calibration with another floor": (
         lambda raw, _: dataclasses.replace(
