@@ -42,13 +42,58 @@ class Table:
 
 
 def show(table: Table, console: Console) -> None:
-    """Print a table."""
-    rich = RichTable(title=table.title, caption=table.note or None, caption_justify="left")
-    for index, column in enumerate(table.columns):
-        rich.add_column(column, justify="right" if index else "left", overflow="fold")
-    for row in table.rows:
-        rich.add_row(*row)
-    console.print(rich)
+    """Print a table: no figure is broken, and columns that do not fit into the console's width follow below.
+
+    Of rows all named as ``group: method`` the group is a line of its own above its methods.
+    """
+    labels = [row[0].partition(": ") for row in table.rows]
+    grouped = all(name for _, _, name in labels)
+    names = [f"  {name}" for _, _, name in labels] if grouped else [row[0] for row in table.rows]
+    first = min(max(map(len, [table.columns[0], *names])), console.width // 3)
+    room = console.width - first
+    for number, columns in enumerate(_blocks(table, room)):
+        in_a_line = [max(_width(table, column), len(table.columns[column])) + 2 for column in columns]
+        wraps = sum(in_a_line) > room
+        grid = RichTable(
+            title=None if number else table.title,
+            title_justify="left",
+            box=None,
+            pad_edge=False,
+            header_style="bold",
+        )
+        grid.add_column(table.columns[0], width=first, overflow="fold")
+        for column, whole in zip(columns, in_a_line, strict=True):
+            width = _width(table, column) if wraps else whole - 2
+            grid.add_column(table.columns[column], justify="right", width=width)
+        last = None
+        for name, (group, _, _), row in zip(names, labels, table.rows, strict=True):
+            if grouped and group != last:
+                grid.add_row(group, *("" for _ in columns))
+                last = group
+            grid.add_row(name, *(row[column] for column in columns))
+        console.print(grid)
+    if table.note:
+        console.print(table.note, style="dim", highlight=False)
+    console.print()
+
+
+def _width(table: Table, column: int) -> int:
+    """Characters that a column of figures needs: its longest cell, and the longest word of its header."""
+    return max(len(text) for text in (*table.columns[column].split(), *(row[column] for row in table.rows)))
+
+
+def _blocks(table: Table, width: int) -> list[list[int]]:
+    """The columns of figures, in as many blocks as it takes for each to fit into ``width`` characters."""
+    blocks: list[list[int]] = [[]]
+    left = width
+    for column in range(1, len(table.columns)):
+        needed = _width(table, column) + 2
+        if needed > left and blocks[-1]:
+            blocks.append([])
+            left = width
+        blocks[-1].append(column)
+        left -= needed
+    return blocks
 
 
 def save(

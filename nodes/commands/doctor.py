@@ -43,7 +43,8 @@ def doctor(live: bool = False, launch: str = "replay") -> int:
         from steadypose.nodes.commands.doctor_live import listen
 
         return listen(launch, console)
-    table = Table("", "what", "found", box=None, pad_edge=False, header_style="bold")
+    table = Table("", "what", box=None, pad_edge=False, header_style="bold")
+    table.add_column("found", overflow="fold")
     with console.status("looking"):
         findings = [finding for check in CHECKS for finding in _examine(check)]
     for finding in findings:

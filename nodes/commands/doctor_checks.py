@@ -220,7 +220,7 @@ def check_models() -> Iterator[Finding]:
             yield Finding(f"weights of {model}", Verdict.BAD, str(error).split(". ")[0], fix)
         else:
             numbers = sum(array.size for array in state.values())
-            yield Finding(f"weights of {model}", Verdict.GOOD, f"default, {numbers / 1e6:.2f} million numbers")
+            yield Finding(f"weights of {model}", Verdict.GOOD, f"default, {numbers:,} numbers")
     if whole:
         yield _self_test()
 

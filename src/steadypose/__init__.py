@@ -75,9 +75,8 @@ _MESSAGES = (
 _MODULES = {
     **dict.fromkeys(_MESSAGES, "msgs.types"),
     **dict.fromkeys(("Publisher", "Subscriber"), "msgs.transport"),
-    **dict.fromkeys(("clean", "complete", "fit", "plot"), "nodes.library.arrays"),
+    **dict.fromkeys(("InputWarning", "clean", "complete", "fit", "plot"), "nodes.library.arrays"),
     "Filter": "nodes.library.filter",
-    "InputWarning": "nodes.library.inputs",
     "Poses": "nodes.library.poses",
     "SKELETONS": "prior.body.layouts",
     "sample": "nodes.library.sample",
