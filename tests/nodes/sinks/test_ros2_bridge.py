@@ -24,7 +24,7 @@ from steadypose.msgs.codec import decode
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseWorld, Tracking
-from steadypose.nodes.commands.doctor_checks import required
+from steadypose.nodes.commands.doctor import required
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
