@@ -176,8 +176,7 @@ def test_hgvaes_kl_counts_in_full_after_a_fifth_of_the_training(
     motion: MotionSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loss = captured(
-        monkeypatch,
-        lambda: hgvae.fit(small_hgvae(), Windows(motion), Windows(motion), tmp_path, 10, 8, 1e-3, seed=0),
+        monkeypatch, lambda: hgvae.fit(small_hgvae(), Windows(motion), Windows(motion), tmp_path, 10, 8, 1e-3, seed=0)
     )
     nats = value(loss, 0.0)[1]["KL"] / 2
     start = value(loss, 0.0)[0] - 0.001 * nats

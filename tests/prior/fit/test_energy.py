@@ -10,10 +10,7 @@ import torch
 from torch import Tensor
 
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
-from steadypose.prior.fit.energy import (
-    Standing,
-    energy,
-)
+from steadypose.prior.fit.energy import Standing, energy
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
 from steadypose.prior.fit.motion import Motion, Variables
 from steadypose.prior.fit.observations import SurfacePoints, thinned
