@@ -206,6 +206,20 @@ def _recursion(decay: Floats, source: Floats, gain: Floats | None = None) -> Flo
     return np.moveaxis(out, 0, -3)
 
 
+def time_correlated(noise: Floats, memory: Floats | float, axis: int = 0) -> Floats:
+    """White noise made a stationary AR(1) process of the same variance, in place.
+
+    Args:
+        noise: one frame after the other along ``axis``.
+        memory: correlation from a frame to the next; broadcasts against a frame.
+        axis: of time.
+    """
+    frames = np.moveaxis(noise, axis, 0)
+    for t in range(1, len(frames)):
+        frames[t] = memory * frames[t - 1] + np.sqrt(1.0 - memory**2) * frames[t]
+    return noise
+
+
 def stationary(dt: Floats, memory: float, shape: tuple[int, int], rng: np.random.Generator) -> Floats:
     """Standard normal (T, *shape) with a correlation time of ``memory`` seconds."""
     return _recursion(np.exp(-dt / memory)[:, None, None], rng.standard_normal((len(dt), *shape)))

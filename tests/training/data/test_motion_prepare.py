@@ -22,7 +22,6 @@ from steadypose.prior.body.layouts import CANONICAL
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.training.data.dataset import MotionSet
-from steadypose.training.data.datasets import Dropped
 from steadypose.training.data.prepare import (
     FPS,
     TOE_HEIGHT,
@@ -35,6 +34,7 @@ from steadypose.training.data.prepare import (
     stays_on_floor,
     write_prepared,
 )
+from steadypose.training.data.readers import Dropped
 
 Array = NDArray[np.float64]
 
