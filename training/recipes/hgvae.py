@@ -32,8 +32,8 @@ from steadypose.training.data.corruption import (
 )
 from steadypose.training.data.hgvae_windows import STRIDES, Batch, Windows, mean_tracks
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
+from steadypose.training.networks.graph import CompletionNet
 from steadypose.training.networks.hgvae import HGVAE, HGVAEOutput
-from steadypose.training.networks.hgvae_completion import CompletionNet
 from steadypose.training.recipes.hgvae_faults import train_anomaly
 from steadypose.training.weights import started
 

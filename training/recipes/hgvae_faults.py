@@ -53,8 +53,8 @@ from steadypose.training.data.corruption import (
 )
 from steadypose.training.data.hgvae_windows import STRIDES, Windows, standardise
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
+from steadypose.training.networks.graph import FaultNet
 from steadypose.training.networks.hgvae import HGVAE
-from steadypose.training.networks.hgvae_faults import FaultNet
 from steadypose.training.weights import started
 
 WINDOWS = 2000
@@ -110,7 +110,7 @@ def train_anomaly(path: Path, iterations: int, options: TrainingOptions) -> None
     )  # fmt: skip
     run = recipe.minimise(network, options.runs / f"{path.stem}-faults", iterations, seed)
     run.save(path.with_suffix(".faults.safetensors"), network, asdict(network.config), {
-        "Model": f"fault network beside {path.name}, training/networks/hgvae_faults.py",
+        "Model": f"fault network beside {path.name}, training/networks/graph.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, with tracking faults",
         "Licence": LICENCES[weights],
         "Training": f"with the HG-VAE, by `steadypose train`: {iterations} steps of {BATCH} windows, seed {seed}"

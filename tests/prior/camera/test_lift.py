@@ -11,7 +11,7 @@ import pytest
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
 from steadypose.prior.camera.depth_lifting import MIN_CONFIDENCE, lift
-from steadypose.prior.sim.depth import Stereo, render, room, spoil
+from steadypose.prior.sim.depth import Stereo, corrupt, render, room
 
 CAMERA = Stereo()
 K = {name: index for index, name in enumerate(COCO17.joints)}
@@ -169,7 +169,7 @@ def standing(yaw: float) -> np.ndarray:
 def test_the_root_holds_however_the_body_is_turned(degrees: int) -> None:
     joints = standing(np.radians(degrees))
     clean = render([(joints, REST_OFFSETS)], CAMERA, room(CAMERA, 1.2, 0.0, 5.0))
-    depth = spoil(clean, CAMERA, np.random.default_rng(degrees % 360))
+    depth = corrupt(clean, CAMERA, np.random.default_rng(degrees % 360))
     weights = COCO17.to_canonical
     truth = np.full((17, 3), np.nan)
     for canonical, row in enumerate(weights):

@@ -18,7 +18,7 @@ from steadypose.prior.models.hgvae.live_completion import (
     completion_features,
 )
 from steadypose.training.data.hgvae_windows import Windows
-from steadypose.training.networks.hgvae_completion import CompletionNet, certainty_of
+from steadypose.training.networks.graph import CompletionNet, certainty_of
 from steadypose.training.recipes.hgvae import completion_recipe
 
 WRIST = J["left_wrist"]
