@@ -16,14 +16,20 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import zmq
 
-from steadypose.msgs.addresses import TransportError, is_local, make_private, parse, refuse_used
-from steadypose.msgs.codec import encode, typestore
-from steadypose.msgs.delivery import Deliveries
-from steadypose.msgs.keys import ClientList, Keys, loopback_keys
-from steadypose.msgs.limits import check_size
+from steadypose.msgs.codec import check_size, encode, typestore
+from steadypose.msgs.delivery import MAX_FRAME, PREFIX, VERSION, Deliveries, Listener, read_subscription, read_taken
+from steadypose.msgs.security import (
+    ClientList,
+    Keys,
+    TransportError,
+    is_local,
+    loopback_keys,
+    make_private,
+    parse,
+    refuse_used,
+)
 from steadypose.msgs.topics import TOPICS, check_topic
 from steadypose.msgs.types import Message
-from steadypose.msgs.wire import MAX_FRAME, PREFIX, VERSION, Listener, read_subscription, read_taken
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -159,7 +165,7 @@ class Publisher:
 
         Raises:
             ValueError: if the message is not of the topic's type, encodes to more than `MAX_FRAME` bytes, or holds more
-                than `msgs.limits` allows.
+                than `msgs.codec` allows.
         """
         check_topic(topic, message)
         payload = encode(message)

@@ -22,17 +22,14 @@ from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.commands.output import printable
 from steadypose.nodes.commands.run_table import line, table
 from steadypose.nodes.commands.setting_names import check_settings, in_launch_file
-from steadypose.nodes.graph import health_file
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock
-from steadypose.nodes.graph.health_file import write_health
+from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.ledger import LOSSES, Ledger, losses
 from steadypose.nodes.graph.loops import COMPILED, compile_missing
 from steadypose.nodes.graph.node import RUN, WATCHER
-from steadypose.nodes.graph.run_lock import RunLock
-from steadypose.nodes.graph.startup import stop_on_signals
+from steadypose.nodes.graph.process import ALIVE, READY, STOPPING, notify, stop_on_signals
+from steadypose.nodes.graph.run_state import HEALTH_FILE, LOSSES, Ledger, RunLock, losses, write_health
 from steadypose.nodes.graph.supervisor import Supervisor
-from steadypose.nodes.graph.systemd import ALIVE, READY, STOPPING, notify
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, load
 from steadypose.nodes.sinks.recorder import RecorderSettings, free_directory
 from steadypose.nodes.sources.recording import DAMAGE, VIDEOS
@@ -116,6 +113,8 @@ def _toml(path: Path) -> str:
 def _check(launch: Launch) -> None:
     """Find here, before any process starts, what every one of them would stumble over."""
     for name in launch.nodes:
+        if extra := NODES[name].extra:
+            require_extra(extra)
         if preflight := NODES[name].preflight:
             load(preflight)(launch)
 
@@ -181,7 +180,7 @@ class _Run:
             notify(STOPPING)
             supervisor.stop()
             if self._writes_health:
-                (transport.ipc_directory / health_file.NAME).unlink(missing_ok=True)
+                (transport.ipc_directory / HEALTH_FILE).unlink(missing_ok=True)
             while received := subscriber.receive(0):
                 self._receive(received, supervisor)
         for name, diagnostics in self._diagnostics.items():

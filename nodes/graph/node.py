@@ -26,19 +26,19 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import ClassVar
 
-from steadypose.msgs.delivery import DEAF_S
-from steadypose.msgs.principals import Principals
+from steadypose.msgs.delivery import DEAF_S, Principals
 from steadypose.msgs.subscriber import SECOND
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.checks.problem import Problem, error
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock, Timeline
+from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.health import STALL_NS, Health
 from steadypose.nodes.graph.inbox import Inbox
 from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.process import ALIVE, READY, notify
 from steadypose.nodes.graph.relay import CONTEXT, Relay
-from steadypose.nodes.graph.systemd import ALIVE, READY, notify
 from steadypose.nodes.graph.topology import NODES, Delivery
 
 logger = logging.getLogger(__name__)
@@ -70,6 +70,8 @@ class Node(ABC):
     """by which `topology.NODES` declares it"""
 
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
+        if extra := NODES[self.name].extra:
+            require_extra(extra)
         self.launch = launch
         self.clock: Clock = clock or SystemClock()
         self._timeline: Timeline | None = None

@@ -11,8 +11,8 @@ from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.checks.stream import Answers, StreamChecks
 from steadypose.nodes.graph.clock import FRAME_NS, Clock
+from steadypose.nodes.graph.inbox import BodyLimit
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.load import BodyLimit
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread

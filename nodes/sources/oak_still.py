@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.nodes.sources.camera import CameraError
-from steadypose.nodes.sources.camera_settings import OakSettings
 from steadypose.nodes.sources.oak_device import (
     DEPTH_FPS,
     SYNC_THRESHOLD,
@@ -20,6 +19,7 @@ from steadypose.nodes.sources.oak_device import (
     aligned_depth,
     open_device,
 )
+from steadypose.nodes.sources.source import OakSettings
 from steadypose.prior.camera.gravity import GravityEstimator
 
 SETTLE_PAIRS = 30

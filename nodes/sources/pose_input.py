@@ -104,7 +104,7 @@ class PoseInputNode(Node):
                 return
             self.report_if_due()
         if self._relay:
-            self._relay.close(finished=True)
+            self._relay.forget()
 
     def mark(self, message: Message) -> tuple[int, int]:
         return self._at

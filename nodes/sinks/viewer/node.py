@@ -2,25 +2,42 @@
 
 It only subscribes, so the pipeline does not know of it: start it, stop it, look or do not look, the poses are the
 same. `PoseView` turns messages into drawings and knows neither sockets nor nodes; `ViewerServer` is the process that
-keeps the last minutes of drawings and serves them with the page. Both need the optional extra ``view``.
-"""
+keeps the last minutes of drawings and serves them with the page. Both need the optional extra ``view``."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from steadypose.msgs.types import Message
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.sinks.viewer.scene import PoseView
-from steadypose.nodes.sinks.viewer.server import FLUSH_S, LOOPBACK, ViewerServer
-from steadypose.nodes.sinks.viewer.settings import ViewerSettings
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.clean.settings import PriorSettings
 
 if TYPE_CHECKING:
     import rerun as rr
+
+    from steadypose.nodes.sinks.viewer.server import ViewerServer
+
+
+@dataclass(frozen=True)
+class ViewerSettings:
+    """``[viewer]``: the picture in the browser."""
+
+    host: str = "127.0.0.1"
+    """address to serve at. Any other than this machine's own shows people in a room to whoever listens on the network:
+    ``ssh -L 9090:localhost:9090 robot`` carries the picture safely"""
+    port: int = 9090
+    """of the web page and the drawings"""
+
+    def __post_init__(self) -> None:
+        if not self.host:
+            raise LaunchError("[viewer] host: expected an address to serve at, such as 127.0.0.1, got none")
+        if not 1 <= self.port <= 65535:
+            raise LaunchError(f"[viewer] port: expected 1 to 65535, got {self.port}")
 
 
 class ViewerNode(Node):
@@ -29,6 +46,10 @@ class ViewerNode(Node):
     name = "viewer"
 
     def run(self) -> None:
+        # not for those who only read a launch file
+        from steadypose.nodes.sinks.viewer.scene import PoseView
+        from steadypose.nodes.sinks.viewer.server import LOOPBACK, ViewerServer
+
         settings = self.launch.settings(ViewerSettings)
         with ViewerServer(settings.port, settings.host) as self._server:
             recording = connect(self._server)
@@ -62,6 +83,8 @@ def flagged_from(launch: Launch) -> float:
 def connect(server: ViewerServer) -> rr.RecordingStream:
     """A stream of drawings to the server."""
     import rerun as rr
+
+    from steadypose.nodes.sinks.viewer.server import FLUSH_S
 
     recording = rr.RecordingStream("steadypose", batcher_config=rr.ChunkBatcherConfig(flush_tick=FLUSH_S))
     server.show(recording)

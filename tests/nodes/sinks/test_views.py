@@ -33,11 +33,15 @@ from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Diagnostics, Level, PoseClean, PoseWorld
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.sinks.ros2.bridge import RVIZ, Ros2BridgeNode
-from steadypose.nodes.sinks.ros2.foxglove import LAYOUT, FoxgloveNode, FoxgloveSettings
-from steadypose.nodes.sinks.ros2.messages import ARROW, LINE_LIST, SPHERE_LIST, TEXT_VIEW_FACING
-from steadypose.nodes.sinks.ros2.settings import Ros2BridgeSettings
-from steadypose.nodes.sinks.ros2.topics import BodyTopics
+from steadypose.nodes.sinks.ros2.bridge import (
+    LAYOUT,
+    RVIZ,
+    FoxgloveNode,
+    FoxgloveSettings,
+    Ros2BridgeNode,
+    Ros2BridgeSettings,
+)
+from steadypose.nodes.sinks.ros2.messages import ARROW, LINE_LIST, SPHERE_LIST, TEXT_VIEW_FACING, BodyTopics
 from steadypose.nodes.sources.registry import InputSettings
 
 MANAGER = "Visualization Manager"

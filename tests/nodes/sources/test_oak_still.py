@@ -14,9 +14,9 @@ from steadypose.nodes.commands.calibrate import CalibrateOak, calibrate
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.sources import oak_still
 from steadypose.nodes.sources.camera import CameraError
-from steadypose.nodes.sources.camera_settings import OakSettings
-from steadypose.nodes.sources.oak_still import Still, capture
+from steadypose.nodes.sources.oak_device import Still, capture
 from steadypose.nodes.sources.registry import InputSettings
+from steadypose.nodes.sources.source import OakSettings
 from steadypose.prior.camera.calibration import CalibrationError
 
 UP = np.array([0.0, -np.cos(0.2), np.sin(0.2)])
