@@ -12,7 +12,8 @@ it was started again, has that subscription and a zero byte before it.
 
 A reliable subscriber says of each message when it has done with it: not that it has arrived, but that whatever followed
 from it is safe. What it has not taken is kept. Who comes under the name of one that has left, because its process was
-started again, is sent what that one had not taken, and before that as much as it asks for to be in the picture."""
+started again, is sent what that one had not taken, and before that as much as it asks for to be in the picture.
+"""
 
 from __future__ import annotations
 

@@ -9,7 +9,8 @@ says who may listen. It holds
   disconnected within a second or two, without a restart;
 - `server.key`: public key of the publishers to subscribe to; without it they are this machine's own;
 - `servers/HOST.key`: public keys of publishers that each have their own, by host as in their addresses; then those on
-  other hosts are not subscribed to."""
+  other hosts are not subscribed to.
+"""
 
 from __future__ import annotations
 

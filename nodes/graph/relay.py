@@ -6,7 +6,8 @@ anew is given `CONTEXT` answered inputs as well, lest bodies begin anew with it;
 have, and it is not published again.
 
 How far a node has come stands in a few bytes in the directory of the sockets, written with each message that all
-reliable subscribers have taken. They hold for nodes of the same supervisor only; a new run begins at the beginning."""
+reliable subscribers have taken. They hold for nodes of the same supervisor only; a new run begins at the beginning.
+"""
 
 from __future__ import annotations
 

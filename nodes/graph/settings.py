@@ -50,6 +50,16 @@ def check_addresses(setting: str, addresses: list[str]) -> None:
             raise LaunchError(f"{setting}: expected addresses such as tcp://192.168.1.21:7111, got {address!r}")
 
 
+def check_host_and_port(section: str, host: str, port: int, *, least: int = 1) -> None:
+    """Raises:
+    LaunchError: there is no host, or no such port; 0, where it is allowed, is any that is free.
+    """
+    if not host:
+        raise LaunchError(f"[{section}] host: expected an address, such as 127.0.0.1, got none")
+    if not least <= port <= 65535:
+        raise LaunchError(f"[{section}] port: expected {least}{'' if least else ' (any)'} to 65535, got {port}")
+
+
 def load_plugin(setting: str, reference: Any) -> Any:
     """What a launch file names as ``module:name`` of an installed package.
 

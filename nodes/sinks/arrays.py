@@ -4,7 +4,8 @@ One row for each row in: ``stamp_ns`` (T,), ``positions`` (T, 22, 3) metres in t
 (T, 22, 4) local, xyzw, ``state`` (T, 22) `msgs.types.JointState`, ``sigma`` (T, 22) metres, ``anomaly`` (T,),
 ``anomaly_flag`` (T,), ``joint_anomaly`` (T, 22), ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s,
 ``world_positions`` (T, 22, 3) metres, and ``joint_names`` (22,). Where the prior gave no body, numbers are NaN and the
-state is UNKNOWN. With several bodies an axis for them comes after time, and ``body_id`` (B,) names them."""
+state is UNKNOWN. With several bodies an axis for them comes after time, and ``body_id`` (B,) names them.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Cameras as sources, opened again when they are unplugged: OAK cameras, and any of the system's with MediaPipe.
 
 What runs with depthai is in `nodes.sources.oak_device`, what runs with OpenCV and MediaPipe in
-`nodes.sources.webcam_device`; both are imported where a camera is opened."""
+`nodes.sources.webcam_device`; both are imported where a camera is opened.
+"""
 
 from __future__ import annotations
 

@@ -3,7 +3,8 @@
 In: ``positions`` (T, J, 3) metres, NaN where missing; ``skeleton``, a name; ``stamp_ns`` (T,) or ``fps``; and where
 known ``confidence`` (T, J) in 0..1 and ``up``, the axis that points up (``z``, ``y`` or ``-y``). Of several bodies,
 ``positions`` (T, B, J, 3), all NaN where one is not there, ``confidence`` (T, B, J), and ``body_id`` (B,), their
-numbers, if they are not to be 0, 1, …."""
+numbers, if they are not to be 0, 1, ….
+"""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from steadypose.nodes.checks.problem import Problem, warning
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.graph.settings import LaunchError, check_host_and_port
 from steadypose.nodes.ros2.connection import Connection, Publish, check_ros, connect
 from steadypose.nodes.ros2.definitions import ros_types
 
@@ -60,8 +60,7 @@ class FoxgloveSettings:
     """what the frame of pose/world is called"""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise LaunchError(f"[foxglove] port: expected 0 (any) to 65535, got {self.port}")
+        check_host_and_port("foxglove", HOST, self.port, least=0)
 
 
 RVIZ, LAYOUT = PACKAGE / "launch/views/steadypose.rviz", PACKAGE / "launch/views/foxglove.json"

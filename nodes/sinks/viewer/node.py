@@ -2,7 +2,8 @@
 
 It only subscribes, so the pipeline does not know of it: start it, stop it, look or do not look, the poses are the
 same. `PoseView` turns messages into drawings and knows neither sockets nor nodes; `ViewerServer` is the process that
-keeps the last minutes of drawings and serves them with the page. Both need the optional extra ``view``."""
+keeps the last minutes of drawings and serves them with the page. Both need the optional extra ``view``.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from steadypose.msgs.types import Message
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.graph.settings import check_host_and_port
 from steadypose.prior.clean.settings import PriorSettings
 
 if TYPE_CHECKING:
@@ -34,10 +35,7 @@ class ViewerSettings:
     """of the web page and the drawings"""
 
     def __post_init__(self) -> None:
-        if not self.host:
-            raise LaunchError("[viewer] host: expected an address to serve at, such as 127.0.0.1, got none")
-        if not 1 <= self.port <= 65535:
-            raise LaunchError(f"[viewer] port: expected 1 to 65535, got {self.port}")
+        check_host_and_port("viewer", self.host, self.port)
 
 
 class ViewerNode(Node):

@@ -3,7 +3,8 @@ machine and have the token.
 
 A picture of people is not for everybody with a login: any user of the machine can connect to its loopback ports, and
 any page in a browser can, once its own name is made to lead to 127.0.0.1 (DNS rebinding). So drawings need a token, and
-no request is answered that names another host. A Content-Security-Policy restricts the page's connections to here."""
+no request is answered that names another host. A Content-Security-Policy restricts the page's connections to here.
+"""
 
 from __future__ import annotations
 

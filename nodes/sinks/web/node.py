@@ -13,7 +13,7 @@ from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.graph.settings import LaunchError, check_host_and_port
 from steadypose.nodes.sinks.web.form import to_json
 
 if TYPE_CHECKING:
@@ -35,10 +35,7 @@ class WebSettings:
     """that a client must know; empty: one drawn at random, which is part of the address that is printed"""
 
     def __post_init__(self) -> None:
-        if not self.host:
-            raise LaunchError("[web] host: expected an address to serve at, such as 127.0.0.1, got none")
-        if not 0 <= self.port <= 65535:
-            raise LaunchError(f"[web] port: expected 0 (any) to 65535, got {self.port}")
+        check_host_and_port("web", self.host, self.port, least=0)
         if self.token and (len(self.token) < 16 or not all(c.isalnum() or c in "-_" for c in self.token)):
             raise LaunchError(
                 f"[web] token: expected 16 or more letters, digits, - and _, got {len(self.token)} characters; "

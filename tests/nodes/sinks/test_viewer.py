@@ -377,5 +377,5 @@ def test_a_browser_that_comes_late_gets_the_beginning_and_what_is_kept(monkeypat
 
 
 def test_a_host_that_is_none() -> None:
-    with pytest.raises(LaunchError, match="expected an address to serve at"):
+    with pytest.raises(LaunchError, match="host: expected an address"):
         ViewerSettings(host="")

@@ -65,7 +65,6 @@ def play(launch: Launch, clock: VirtualClock, source: Frames, frames: int | None
     """Everything the node sends, or the first ``frames``, each with the time it was sent at."""
     node = PoseInputNode(launch, clock, source)
     sent = node._publisher = Sent(clock)  # type: ignore[assignment]
-    node._inbox = None
     if frames is not None:
         keep = sent.publish
 
@@ -144,7 +143,7 @@ def test_a_loop_goes_on_with_rising_stamps(launch: Launch, clock: VirtualClock) 
 
 def test_the_nodes_are_told_which_stamp_is_played_when(launch: Launch, clock: VirtualClock) -> None:
     node = PoseInputNode(launch, clock, Frames([START_NS, START_NS + SECOND_NS]))
-    node._publisher, node._inbox = Sent(clock), None  # type: ignore[assignment]
+    node._publisher = Sent(clock)  # type: ignore[assignment]
     start_ns = clock.time_ns
     node.work()
     assert node.timeline is not None
