@@ -265,7 +265,7 @@ class _Run:
         if source is None or source.state != "ended":
             self._progress_ns = self._progress_ns if source else self._clock.monotonic_ns()
             return None
-        if self._drained():
+        if self._drained(supervisor):
             if not {"viewer", "web"} & {*self._launch.nodes} or not self._console.is_terminal:
                 return 0
             if not self._over:
@@ -302,8 +302,8 @@ class _Run:
         unread = {key.removeprefix("refused."): n for key, n in values.items() if key.startswith("refused.")}
         return ", ".join(f"{cause}: {n}" for cause, n in unread.items() if cause.startswith(DAMAGE))
 
-    def _drained(self) -> bool:
-        """Whether the end of the stream has come through every node."""
+    def _drained(self, supervisor: Supervisor) -> bool:
+        """Whether the end of the stream has come through every node, and the recorder is there to complete its file."""
         streams = {NODES[name].stream for name in self._launch.nodes}
         recorded = set(self._launch.settings(RecorderSettings).topics)
         for name in self._launch.nodes:
@@ -313,6 +313,8 @@ class _Run:
             seen = {*declared.topics, declared.stream}
             wanted = streams & (seen if name != "recorder" else seen & recorded) - {None}
             diagnostics = self._diagnostics.get(name)
+            if name == "recorder" and not supervisor.children[name].reports:
+                return False
             if diagnostics is None or not wanted <= set(diagnostics.values.get("ended", "").split()):
                 return False
         return True

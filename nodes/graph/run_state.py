@@ -96,6 +96,7 @@ class Ledger:
         self._before: dict[str, Counter[str]] = {}
         self._latest: dict[str, Diagnostics] = {}
         self._restarts: Counter[str] = Counter()
+        self._ended: dict[str, set[str]] = {}
 
     def note(self, diagnostics: Diagnostics, restarts: int) -> Diagnostics:
         """Take a report of a node that was restarted so often; the report with the counts of all its processes."""
@@ -104,8 +105,12 @@ class Ledger:
         if restarts != self._restarts[node] and node in self._latest:
             before.update(self._counts(self._latest[node]))
         self._restarts[node], self._latest[node] = restarts, diagnostics
-        total = before + self._counts(diagnostics)
-        return dataclasses.replace(diagnostics, values=diagnostics.values | {key: str(n) for key, n in total.items()})
+        total = {key: str(n) for key, n in (before + self._counts(diagnostics)).items()}
+        if self._launch.transport.lossless:  # one that is killed after the end is not given it again
+            ended = self._ended.setdefault(node, set())
+            ended.update(diagnostics.values.get("ended", "").split())
+            total["ended"] = " ".join(sorted(ended))
+        return dataclasses.replace(diagnostics, values=diagnostics.values | total)
 
     def _counts(self, diagnostics: Diagnostics) -> Counter[str]:
         return Counter({k: int(n) for k, n in diagnostics.values.items() if k.startswith(self._restarted)})

@@ -66,6 +66,11 @@ class Child:
             return 0.0
         return (self._clock.monotonic_ns() - self._heard_ns) / 1e9
 
+    @property
+    def reports(self) -> bool:
+        """Whether it runs, and was heard since it was started."""
+        return self.state == "running" and self._heard_ns is not None
+
     def heard(self) -> None:
         """Note a report of the node."""
         if self.state in ("running", "stale"):

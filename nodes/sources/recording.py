@@ -100,4 +100,9 @@ def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Mes
         if isinstance(message, PoseRaw):
             last = message
     if last:
-        yield POSE_RAW, dataclasses.replace(last, bodies=[], end_of_stream=True)
+        yield POSE_RAW, end_of(last)
+
+
+def end_of(last: PoseRaw) -> PoseRaw:
+    """The mark of the end of a stream, after its last message."""
+    return dataclasses.replace(last, bodies=[], end_of_stream=True)
