@@ -8,7 +8,7 @@ import os
 import socket as posix
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -16,20 +16,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import zmq
 
-from steadypose.msgs.codec import check_size, encode, typestore
-from steadypose.msgs.delivery import MAX_FRAME, PREFIX, VERSION, Deliveries, Listener, read_subscription, read_taken
-from steadypose.msgs.security import (
-    ClientList,
-    Keys,
-    TransportError,
-    is_local,
-    loopback_keys,
-    make_private,
-    parse,
-    refuse_used,
-)
+from steadypose.msgs.addresses import TransportError, is_local, make_private, parse, refuse_used
+from steadypose.msgs.codec import encode, typestore
+from steadypose.msgs.delivery import Deliveries
+from steadypose.msgs.keys import ClientList, Keys, loopback_keys
+from steadypose.msgs.limits import check_size
 from steadypose.msgs.topics import TOPICS, check_topic
 from steadypose.msgs.types import Message
+from steadypose.msgs.wire import MAX_FRAME, PREFIX, VERSION, Listener, read_subscription, read_taken
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -165,7 +159,7 @@ class Publisher:
 
         Raises:
             ValueError: if the message is not of the topic's type, encodes to more than `MAX_FRAME` bytes, or holds more
-                than `msgs.codec` allows.
+                than `msgs.limits` allows.
         """
         check_topic(topic, message)
         payload = encode(message)
@@ -173,8 +167,14 @@ class Publisher:
         size = len(topic) + 1 + PREFIX.size + len(payload)
         if size > MAX_FRAME:
             raise ValueError(f"{topic}: expected a message of at most {MAX_FRAME} bytes, got {size}")
-        if not self._wait(lambda: not self._deliveries.waited_for(topic), timeout_s):
-            return False
+        self._note_subscribers()
+        deadline = time.monotonic() + timeout_s
+        while self._deliveries.waited_for(topic):
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return False
+            self._socket.poll(milliseconds(min(left, _LOOK_S)))
+            self._note_subscribers()
         id, sequence = self._id_of(topic), self._deliveries.sequence[topic]
         frame = topic.encode() + b"\0" + PREFIX.pack(VERSION, id, sequence, time.monotonic_ns()) + payload
         self._socket.send(frame)
@@ -198,7 +198,15 @@ class Publisher:
 
     def is_taken(self, topic: str, sequence: int, timeout_s: float = 0.0) -> bool:
         """Whether all reliable subscribers of a topic have taken a message; waits until they have, or for so long."""
-        return self._wait(lambda: self._deliveries.is_taken(topic, sequence), timeout_s)
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._note_subscribers()
+            if self._deliveries.is_taken(topic, sequence):
+                return True
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return False
+            self._socket.poll(milliseconds(left))
 
     @property
     def subscribers(self) -> frozenset[str]:
@@ -209,19 +217,13 @@ class Publisher:
     def wait_for_subscribers(self, names: Iterable[str], *, timeout_s: float) -> bool:
         """Wait until the subscribers of these names are there; False if `timeout_s` passed before."""
         wanted = frozenset(names)
-        return self._wait(lambda: wanted <= {listener.name for listener in self._listeners}, timeout_s)
-
-    def _wait(self, until: Callable[[], bool], timeout_s: float) -> bool:
-        """Take what subscribers say until a condition holds; False if it does not in time."""
         deadline = time.monotonic() + timeout_s
-        while True:
-            self._note_subscribers()
-            if until():
-                return True
+        while not wanted <= self.subscribers:
             left = deadline - time.monotonic()
             if left <= 0:
                 return False
-            self._socket.poll(milliseconds(min(left, _LOOK_S)))
+            self._socket.poll(milliseconds(left))
+        return True
 
     def check(self) -> None:
         """Enforce the list of keys; to be called about once a second.

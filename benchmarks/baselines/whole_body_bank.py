@@ -3,8 +3,8 @@
 As `benchmarks.baselines.bank`, but of eight smoothers over modes of the whole body instead of joints: eigenvectors of
 the covariance of joints' accelerations, learned once from other people's motion (`prior.models.mixture.modes`). In
 white noise it has 0.84 to 0.93 of that bank's error, whoever moves. The smoothers are the product's own
-(`prior.models.mixture.bank`), and their weights in each mode the likelihood of the mode's innovations: this is what
-the product falls back to.
+(`prior.models.mixture.bank`), and their weights in each mode the likelihood of the mode's innovations. The product
+falls back to the same, but for an estimate of the noise that modes share where it is white.
 """
 
 from __future__ import annotations
@@ -42,10 +42,11 @@ def whole_body_bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
     bodies, joints = frames.shape[1:3]
     bank, sure, answers = new_bank(bodies, delay), np.ones((bodies, joints)), np.full(frames.shape, np.nan)
     experts, features = np.empty((bodies, joints, EXPERTS, 3)), np.empty((bodies, joints, FEATURES), np.float32)
+    unknown = np.zeros(bodies)  # of the noise, whether it is white
     scale, gap, between = np.empty(bodies), np.empty((bodies, joints)), np.empty((bodies, joints))
 
     def answer(count: int, back: int) -> None:
-        describe(bank, count, back, PARENT, experts, features, scale, gap, between)
+        describe(bank, count, back, PARENT, unknown, experts, features, scale, gap, between)
         answers[count - 1 - back] = experts[:, :, MULTIPLE_MODEL]
 
     for t, frame in enumerate(frames):

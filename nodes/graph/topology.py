@@ -45,8 +45,6 @@ class NodeDeclaration:
     delivery: Delivery = Delivery.AS_LAUNCHED
     optional: bool = False
     """poses go on without it: a run whose optional node cannot run does"""
-    extra: str = ""
-    """of `extras.EXTRAS`, that it needs; empty: none"""
     preflight: str = ""
     """a function of the `Launch`, as ``module:name``, that raises what would keep the node from starting; or empty"""
 
@@ -61,17 +59,10 @@ class NodeDeclaration:
         return frozenset(topic for topics in self.subscribes.values() for topic in topics)
 
 
-_POSES = {"trajectory": (POSE_WORLD, DIAGNOSTICS), "pose_input": (DIAGNOSTICS,)}
 _ALL_STREAMS = {
     "pose_input": (POSE_RAW, POSE_TRUTH, DIAGNOSTICS),
     "prior": (POSE_CLEAN, DIAGNOSTICS),
     "trajectory": (POSE_WORLD, DIAGNOSTICS),
-}
-_IN_ROS = {
-    "events": (POSE_EVENTS, DIAGNOSTICS),
-    "trajectory": (POSE_WORLD, DIAGNOSTICS),
-    "prior": (POSE_CLEAN, DIAGNOSTICS),
-    "pose_input": (POSE_RAW, DIAGNOSTICS),
 }
 
 _NODES: dict[str, NodeDeclaration] = {
@@ -104,52 +95,66 @@ _NODES: dict[str, NodeDeclaration] = {
     ),
     "ros2_bridge": NodeDeclaration(
         node="steadypose.nodes.sinks.ros2.bridge:Ros2BridgeNode",
-        subscribes=_IN_ROS,
+        subscribes={
+            "events": (POSE_EVENTS, DIAGNOSTICS),
+            "trajectory": (POSE_WORLD, DIAGNOSTICS),
+            "prior": (POSE_CLEAN, DIAGNOSTICS),
+            "pose_input": (POSE_RAW, DIAGNOSTICS),
+        },
         section="ros2",
-        settings="steadypose.nodes.sinks.ros2.bridge:Ros2BridgeSettings",
+        settings="steadypose.nodes.sinks.ros2.settings:Ros2BridgeSettings",
         preflight="steadypose.nodes.sinks.ros2.bridge:check_ros2",
     ),
     "foxglove": NodeDeclaration(
-        node="steadypose.nodes.sinks.ros2.bridge:FoxgloveNode",
-        subscribes=_IN_ROS,
+        node="steadypose.nodes.sinks.ros2.foxglove:FoxgloveNode",
+        subscribes={
+            "events": (POSE_EVENTS, DIAGNOSTICS),
+            "trajectory": (POSE_WORLD, DIAGNOSTICS),
+            "prior": (POSE_CLEAN, DIAGNOSTICS),
+            "pose_input": (POSE_RAW, DIAGNOSTICS),
+        },
         section="foxglove",
-        settings="steadypose.nodes.sinks.ros2.bridge:FoxgloveSettings",
+        settings="steadypose.nodes.sinks.ros2.foxglove:FoxgloveSettings",
         delivery=Delivery.BEST_EFFORT,
-        extra="foxglove",
+        preflight="steadypose.nodes.sinks.ros2.foxglove:check_foxglove",
     ),
     "web": NodeDeclaration(
         node="steadypose.nodes.sinks.web.node:WebNode",
-        subscribes={"events": (POSE_EVENTS, DIAGNOSTICS), "prior": (DIAGNOSTICS,), **_POSES},
+        subscribes={
+            "events": (POSE_EVENTS, DIAGNOSTICS),
+            "trajectory": (POSE_WORLD, DIAGNOSTICS),
+            "prior": (DIAGNOSTICS,),
+            "pose_input": (DIAGNOSTICS,),
+        },
         section="web",
-        settings="steadypose.nodes.sinks.web.node:WebSettings",
+        settings="steadypose.nodes.sinks.web.settings:WebSettings",
         delivery=Delivery.BEST_EFFORT,
-        extra="web",
+        preflight="steadypose.nodes.sinks.web.settings:check_web",
     ),
     "retarget": NodeDeclaration(
-        node="steadypose.nodes.sinks.retarget:RetargetNode",
-        subscribes=_POSES,
+        node="steadypose.nodes.sinks.retarget.node:RetargetNode",
+        subscribes={"trajectory": (POSE_WORLD, DIAGNOSTICS), "pose_input": (DIAGNOSTICS,)},
         section="retarget",
-        settings="steadypose.nodes.sinks.retarget:RetargetSettings",
+        settings="steadypose.nodes.sinks.retarget.settings:RetargetSettings",
         delivery=Delivery.BEST_EFFORT,
-        extra="retarget",
-        preflight="steadypose.nodes.sinks.retarget:check_retarget",
+        preflight="steadypose.nodes.sinks.retarget.settings:check_retarget",
     ),
     "vmc": NodeDeclaration(
-        node="steadypose.nodes.sinks.datagrams:VmcNode",
-        subscribes=_POSES,
+        node="steadypose.nodes.sinks.vmc:VmcNode",
+        subscribes={"trajectory": (POSE_WORLD, DIAGNOSTICS), "pose_input": (DIAGNOSTICS,)},
         section="vmc",
-        settings="steadypose.nodes.sinks.datagrams:VmcSettings",
+        settings="steadypose.nodes.sinks.vmc:VmcSettings",
         delivery=Delivery.BEST_EFFORT,
-        extra="vmc",
+        preflight="steadypose.nodes.sinks.vmc:check_vmc",
     ),
     "viewer": NodeDeclaration(
         node="steadypose.nodes.sinks.viewer.node:ViewerNode",
         subscribes=_ALL_STREAMS,
         section="viewer",
-        settings="steadypose.nodes.sinks.viewer.node:ViewerSettings",
+        settings="steadypose.nodes.sinks.viewer.settings:ViewerSettings",
         delivery=Delivery.BEST_EFFORT,
         optional=True,
-        extra="view",
+        preflight="steadypose.nodes.sinks.viewer.settings:check_viewer",
     ),
     "recorder": NodeDeclaration(
         node="steadypose.nodes.sinks.recorder:RecorderNode",

@@ -7,8 +7,8 @@ features, a second one the whole body's, and each joint's output is computed fro
 
 ``x`` being the experts' positions. The second term extrapolates beyond filters that lag, and corrects a joint from the
 context of the whole body, by an amount bounded by the estimated noise ``scale``; it vanishes where the raw joint has
-all the weight, so that a perfect input stays unchanged. Live, a share of the way from there to the multiple-model
-estimate is added, as far as the noise is white (`prior.models.mixture.whiteness`).
+all the weight, so that a perfect input stays unchanged. A share of the way from there to the multiple-model estimate is
+added, as far as the noise is white (`prior.models.mixture.whiteness`).
 
 Outputs are smoothed over time by gates that the network computes (as in gated recurrent units, Cho et al. 2014):
 weights that fluctuate would add noise of their own.
@@ -159,7 +159,7 @@ def answer(
     scale: Tensor,
     gap: Tensor,
     between: Tensor,
-    fallback: Tensor | float = 0.0,
+    fallback: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Positions (..., 22, 3) metres, and their variances along an axis (..., 22) mm².
 
@@ -173,7 +173,7 @@ def answer(
         gap: (..., 22) frames to the nearest observation of each joint.
         between: (..., 22) metres along an axis, deviation of the multiple-model estimate in gaps between two
             sightings; otherwise 0.
-        fallback: (..., 1, 1) share of the multiple-model estimate in what is not the raw joint's.
+        fallback: (...) share of the multiple-model estimate in what is not the raw joint's (`whiteness.fallback`).
     """
     logits, reach, correction, log_sigma = outputs.split([EXPERTS, EXPERTS, 3, 1], dim=-1)
     weights = logits.softmax(dim=-1)
@@ -189,7 +189,7 @@ def answer(
     # from the joint as it came, so that rounding does not move it
     came = experts[..., RAW, :]
     places = came + (weights[..., None] * (experts - came[..., None, :])).sum(dim=-2) + moved
-    places = places + fallback * free * (experts[..., MULTIPLE_MODEL, :] - places)
+    places = places + fallback[..., None, None] * free * (experts[..., MULTIPLE_MODEL, :] - places)
     coasted = 1e3 * COASTING / FPS * gap
     variance = (2.0 * log_sigma[..., 0].clamp(MIN_LOG_SIGMA, MAX_LOG_SIGMA)).exp() + coasted.square()
     inside = between > 0.0

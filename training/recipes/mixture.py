@@ -29,6 +29,7 @@ from steadypose.prior.models.mixture.bank import (
 )
 from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
 from steadypose.prior.models.mixture.modes import body_covariance
+from steadypose.prior.models.mixture.whiteness import Whiteness, fallback
 from steadypose.prior.models.weights import LICENCES
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.recordings import load_kinect, load_motion, write_arrays
@@ -89,6 +90,7 @@ class Batch(NamedTuple):
     scale: Tensor
     gap: Tensor
     between: Tensor
+    fallback: Tensor
     truth: Tensor
     counts: Tensor
 
@@ -99,19 +101,19 @@ def through_bank(sensed: Sensed, delay: int) -> Batch:
     kept = frames - delay
     features = np.empty((kept, clips, 22, FEATURES), dtype=np.float32)
     experts = np.empty((kept, clips, 22, EXPERTS, 3))
-    heading, scale = np.empty((kept, clips, 2)), np.empty((kept, clips))
+    heading, (scale, share) = np.empty((kept, clips, 2)), np.empty((2, kept, clips))
     gap, between = np.empty((2, kept, clips, 22))
-    bank, covariance = new_bank(clips, delay), body_covariance()
+    bank, whiteness, covariance = new_bank(clips, delay), Whiteness(clips), body_covariance()
     for t in range(frames):
         advance(bank, t, 1 / FPS, sensed.seen[:, t], sensed.confidence[:, t], DENSITIES, MEASUREMENT_SIGMA, covariance)
-        at = t - delay
+        at, white = t - delay, whiteness.share(sensed.seen[:, t])
         if at >= 0:
-            describe(bank, t + 1, delay, PARENT, experts[at], features[at], scale[at], gap[at], between[at])
-            heading[at] = bank.heading
+            describe(bank, t + 1, delay, PARENT, white, experts[at], features[at], scale[at], gap[at], between[at])
+            heading[at], share[at] = bank.heading, fallback(white, scale[at])
     middle = sensed.truth[:, :1, :1]
     middle = np.where(np.isfinite(middle), middle, 0.0)  # so that single precision is enough
     arrays = (
-        features, experts - middle.swapaxes(0, 1)[:, :, :, None], heading, scale, gap, between,
+        features, experts - middle.swapaxes(0, 1)[:, :, :, None], heading, scale, gap, between, share,
         (sensed.truth - middle)[:, :kept].swapaxes(0, 1), _counts(sensed.truth)[:, :kept].swapaxes(0, 1),
     )  # fmt: skip
     return Batch(*(torch.from_numpy(a.astype(np.float32)).transpose(0, 1) for a in arrays))
@@ -174,7 +176,7 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
     outputs = network(batch.features, (batch.gap >= 0).any(dim=-1))
     known = batch.truth.isfinite().all(dim=-1) & batch.experts.isfinite().all(dim=(-1, -2))
     experts = torch.where(known[..., None, None], batch.experts, 0.0)
-    places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.gap, batch.between)
+    places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.gap, batch.between, batch.fallback)
     weight = known / (1.0 + batch.gap.clamp(min=0))  # far from any sighting nothing can be learned
     seen = known * (batch.gap == 0).float()
     own = errors(places, batch.truth, weight, batch.counts)

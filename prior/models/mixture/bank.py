@@ -8,9 +8,10 @@ noise included.
 
 Their mean, weighted by each filter's likelihood, is the static multiple-model estimate (Bar-Shalom, Li and Kirubarajan
 2001, section 11.6), with exponential forgetting. The measurement noise is unknown: for each filter it is the most
-likely one given the innovations (concentrated likelihood), so that only the ratio of process to measurement noise
-distinguishes the filters. That mean, of each track, is one more expert; the experts' weights are computed by
-`training.networks.mixture`, from `prior.models.mixture.features`. Training and the live node share this code.
+likely one given the innovations (concentrated likelihood) and, where noise is white, that of the body's other tracks
+(`SHARED`), so that only the ratio of process to measurement noise distinguishes the filters. That mean, of each track,
+is one more expert; the experts' weights are computed by `training.networks.mixture`, from
+`prior.models.mixture.features`. Training and the live node share this code.
 """
 
 from __future__ import annotations
@@ -52,6 +53,10 @@ RAW = EXPERTS - 1
 
 MEAN_FRAMES = 18
 """Frames of the running means of distances and differences."""
+
+SHARED = 9.0
+"""Sightings for which the noise of the body's tracks, their geometric mean, counts in that of each: within a few
+frames, one that moves fast looks like one that is noisy. 4 to 15 differ by 1 % at most (validation)."""
 
 LOG_FLOOR = 3e-4
 """Metres, floor of lengths in logarithms."""
@@ -290,28 +295,31 @@ def _measure_differences(recent, sizes, age):
 
 
 @njit(cache=True)
-def multiple_model_weights(squared_innovations, log_variances, sightings, weights):
-    """Write the smoothers' weights in the multiple-model estimate of one joint: their normalised likelihoods.
+def multiple_model_weights(squared_innovations, log_variances, sightings, expected, counts, weights):
+    """Write the smoothers' weights in the multiple-model estimate of one track: their normalised likelihoods.
 
     Args:
         squared_innovations: (M,), as of `Bank`.
         log_variances: (M,), as of `Bank`.
         sightings: as of `Bank`.
+        expected: the variance of the measurement noise as far as other tracks show it, in units of `MEASUREMENT_SIGMA`
+            squared.
+        counts: sightings for which it counts.
         weights: (M,), written; they sum to 1.
 
     Returns:
-        The estimated variance of the measurement noise, in units of `MEASUREMENT_SIGMA` squared.
+        The estimated variance of the measurement noise, in the same units.
     """
-    most, noise = -np.inf, 0.0
+    most, noise, total = -np.inf, 0.0, sightings + counts
     for m in range(len(weights)):
-        scale = squared_innovations[m] / sightings if sightings > 0.0 else 1.0
-        weights[m] = -1.5 * (sightings * np.log(scale) + log_variances[m])
+        scale = (squared_innovations[m] + counts * expected) / total if total > 0.0 else 1.0
+        weights[m] = -1.5 * (total * np.log(scale) + log_variances[m])
         most = max(most, weights[m])
-    total = 0.0
+    sum_of_weights = 0.0
     for m in range(len(weights)):
         weights[m] = np.exp(weights[m] - most)
-        total += weights[m]
+        sum_of_weights += weights[m]
     for m in range(len(weights)):
-        weights[m] /= total
-        noise += weights[m] * (squared_innovations[m] / sightings if sightings > 0.0 else 1.0)
+        weights[m] /= sum_of_weights
+        noise += weights[m] * ((squared_innovations[m] + counts * expected) / total if total > 0.0 else 1.0)
     return noise

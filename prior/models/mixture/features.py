@@ -19,6 +19,7 @@ from steadypose.prior.models.mixture.bank import (
     MEASUREMENT_SIGMA,
     MULTIPLE_MODEL,
     RAW,
+    SHARED,
     multiple_model_weights,
 )
 from steadypose.prior.timing.rate import FPS
@@ -62,7 +63,7 @@ def _log(square):
 
 
 @njit(cache=True)
-def describe(bank, count, back, parents, experts, features, scale, gap, between):
+def describe(bank, count, back, parents, whiteness, experts, features, scale, gap, between):
     """Write the experts and features of a frame, and update the running means. Frames must come once, in order.
 
     Args:
@@ -70,6 +71,7 @@ def describe(bank, count, back, parents, experts, features, scale, gap, between)
         count: frames taken in, the newest included.
         back: frames between the newest and this one.
         parents: (J,) of the joints, the root's being 0.
+        whiteness: (S,) share of the noise that is known to be white, and so the same in all tracks; see `SHARED`.
         experts: (S, J, EXPERTS, 3) metres, written; NaN of a joint not yet seen.
         features: (S, J, FEATURES) float32, written.
         scale: (S,) metres along an axis, estimated noise of the body's joints; written.
@@ -84,7 +86,8 @@ def describe(bank, count, back, parents, experts, features, scale, gap, between)
         total, seen_joints = 0.0, 0.0
         _write_experts(
             bank.position[s, :, :, slot], bank.modes[s], bank.squared_innovations[s], bank.log_variances[s],
-            bank.sightings[s], bank.raw[s, :, slot], bank.unseen[s, :, slot], experts[s], weights, noise,
+            bank.sightings[s], bank.raw[s, :, slot], bank.unseen[s, :, slot], SHARED * whiteness[s], experts[s],
+            weights, noise,
         )  # fmt: skip
         for j in range(joints):
             gap[s, j], between[s, j] = bank.unseen[s, j, slot], 0.0
@@ -132,13 +135,25 @@ def describe(bank, count, back, parents, experts, features, scale, gap, between)
 
 
 @njit(cache=True)
-def _write_experts(tracks, modes, squared_innovations, log_variances, sightings, raw, unseen, experts, weights, noise):
-    """Write the joints' experts (J, EXPERTS, 3), their smoothers' weights (J, M) and noise (J,)."""
+def _write_experts(
+    tracks, modes, squared_innovations, log_variances, sightings, raw, unseen, shared, experts, weights, noise
+):
+    """Write the joints' experts (J, EXPERTS, 3), their smoothers' weights (J, M) and noise (J,); the noise of all
+    tracks counts for ``shared`` sightings in that of each."""
     joints = len(tracks)
     own, found = np.empty((joints, _SMOOTHERS)), np.empty(joints)
-    mean = np.zeros((joints, 3))
+    mean, logarithm, tracked = np.zeros((joints, 3)), 0.0, 0
     for t in range(joints):
-        found[t] = multiple_model_weights(squared_innovations[t], log_variances[t], sightings[t], own[t])
+        found[t] = multiple_model_weights(squared_innovations[t], log_variances[t], sightings[t], 0.0, 0.0, own[t])
+        if sightings[t] > 0.0:
+            logarithm += np.log(found[t])
+            tracked += 1
+    for t in range(joints):
+        if shared > 0.0 and tracked > 0:
+            expected = np.exp(logarithm / tracked)
+            found[t] = multiple_model_weights(
+                squared_innovations[t], log_variances[t], sightings[t], expected, shared, own[t]
+            )
         for m in range(_SMOOTHERS):
             for axis in range(3):
                 mean[t, axis] += own[t, m] * tracks[t, m, axis]

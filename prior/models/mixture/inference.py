@@ -32,7 +32,7 @@ from steadypose.prior.models.mixture.form import (
     REACH,
 )
 from steadypose.prior.models.mixture.modes import body_covariance
-from steadypose.prior.models.mixture.whiteness import Whiteness
+from steadypose.prior.models.mixture.whiteness import Whiteness, fallback
 from steadypose.prior.models.weights import load_weights
 from steadypose.prior.timing.fixed_lag import Smoothed
 from steadypose.prior.timing.rate import FPS
@@ -58,7 +58,7 @@ class MixtureSmoother:
         shapes = (joints, joints, body, body, (slots, 22, OUTPUTS))
         self._memory = _Memory(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
         self._bank = new_bank(slots, delay)
-        self._whiteness, self._fallback = Whiteness(slots), np.zeros(slots)
+        self._whiteness, self._white = Whiteness(slots), np.zeros(slots)
         self._covariance = body_covariance()
         self._experts = np.empty((slots, 22, EXPERTS, 3))
         self._features = np.empty((slots, 22, FEATURES), dtype=np.float32)
@@ -79,7 +79,7 @@ class MixtureSmoother:
         step = stamp_s - self._stamps[-1] if self._stamps else 1 / FPS
         certainty = np.ones((self._slots, 22)) if confidence is None else confidence
         self._note(stamp_s)
-        self._fallback = self._whiteness.fallback(positions)
+        self._white = self._whiteness.share(positions)
         advance(self._bank, self._count - 1, step, positions, certainty, DENSITIES, MEASUREMENT_SIGMA, self._covariance)
         return self._answer(self.delay) if self._count > self.delay else None
 
@@ -113,11 +113,12 @@ class MixtureSmoother:
         """The estimate of the frame ``back`` before the newest."""
         bank = self._bank
         described = self._experts, self._features, self._scale, self._gap, self._between
-        describe(bank, self._count, back, PARENT, *described)
+        describe(bank, self._count, back, PARENT, self._white, *described)
+        share = fallback(self._white, self._scale)
         places, sigma = np.full((self._slots, 22, 3), np.nan), np.full((self._slots, 22), np.inf)
         for slot in np.flatnonzero((self._gap >= 0).any(axis=1)):
             outputs = _outputs(self._features[slot], self._net, self._memory, slot)
-            frame = bank.heading[slot], self._scale[slot], self._gap[slot], self._between[slot], self._fallback[slot]
+            frame = bank.heading[slot], self._scale[slot], self._gap[slot], self._between[slot], share[slot]
             _mixed(outputs, self._experts[slot], *frame, places[slot], sigma[slot])
         return Smoothed(self._stamps[-1 - back], places, sigma)
 

@@ -18,9 +18,13 @@ MEMORY, LEAST = 45, 10
 START = 15
 """Frames of observation that count as much as having none."""
 
-FALLBACK = 1.5
-"""Share of the multiple-model estimate, times the square of the whiteness, and at most all. On validation people the
-whiteness is 0.8 in independent noise, and 0.03 to 0.2 on a Kinect, on MediaPipe and in noise of half a second."""
+SHARE = 1.5
+"""White share of the noise, times the square of the whiteness, and at most all. On validation people the whiteness is
+0.8 in independent noise, and 0.03 to 0.2 on a Kinect, on MediaPipe and in noise of half a second."""
+
+LARGE = 0.01
+"""Metres along an axis, white noise in which the multiple-model estimate has at most three quarters of the weight: all
+in much less, half in much more, where what is known of people helps."""
 
 STILL = 1e-3
 """Metres: a bone that varies by less has no noise to speak of."""
@@ -49,12 +53,12 @@ class Whiteness:
         for moment in (self._frames, self._mean, self._variance, self._change):
             moment[slot] = 0.0
 
-    def fallback(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Take in joints (S, 22, 3) metres, NaN where unobserved; the share (S,) of the multiple-model estimate."""
-        return np.minimum(FALLBACK * self.update(positions) ** 2, 1.0)
+    def share(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Take in joints (S, 22, 3) metres, NaN where unobserved; the share (S,) of the noise that is white."""
+        return np.minimum(SHARE * self.update(positions) ** 2, 1.0)
 
     def update(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Take in joints as `fallback`; whiteness (S,) from 0, lasting or not known, to 1."""
+        """Take in joints as `share`; whiteness (S,) from 0, lasting or not known, to 1."""
         length = np.linalg.norm(positions[:, _BONES] - positions[:, _PARENTS], axis=-1)
         change = 0.5 * (length - self._last) ** 2
         self._last = length
@@ -73,3 +77,13 @@ class Whiteness:
         white[some] = np.nanmedian(ratio[some], axis=1)
         frames = self._frames.max(axis=1)
         return white * frames / (frames + START)
+
+
+def fallback(white: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The share (S,) of the multiple-model estimate.
+
+    Args:
+        white: (S,) share of the noise that is white.
+        scale: (S,) metres along an axis, estimated noise.
+    """
+    return np.minimum(white, 0.5 + 0.5 / (1.0 + np.square(scale / LARGE)))

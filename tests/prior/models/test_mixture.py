@@ -16,6 +16,7 @@ from steadypose.prior.models.mixture.bank import (
     EXPERTS,
     MEASUREMENT_SIGMA,
     MULTIPLE_MODEL,
+    SHARED,
     Bank,
     advance,
     new_bank,
@@ -24,7 +25,6 @@ from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.models.mixture.modes import body_covariance
 from steadypose.prior.models.mixture.tracks import HELD, MEMORY, MIN_SCALE, SETTLED
-from steadypose.prior.models.mixture.whiteness import Whiteness
 from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.sensors import Sensed
@@ -62,8 +62,9 @@ def noisy(truth: Floats, sigma: float = 0.02) -> Floats:
     return truth + sigma * np.random.default_rng(5).standard_normal(truth.shape)
 
 
+@pytest.mark.parametrize("white", [0.0, 0.6])
 @pytest.mark.parametrize("delay", DELAYS)
-def test_experts_are_fixed_lag_smoothers_and_their_mean_by_predictions(delay: int) -> None:
+def test_experts_are_fixed_lag_smoothers_and_their_mean_by_predictions(delay: int, white: float) -> None:
     seen, known_sigma = noisy(walk(40)), MEASUREMENT_SIGMA / 0.8
     bank, confidence = new_bank(1, delay), np.full((1, 22), 0.8)
     textbook = [FixedLagRTS(delay, density, known_sigma) for density in DENSITIES]
@@ -83,14 +84,21 @@ def test_experts_are_fixed_lag_smoothers_and_their_mean_by_predictions(delay: in
         expected = [smoother.update(frame, t / FPS) for smoother in textbook]
         if t < max(delay, 1):
             continue
-        describe(bank, t + 1, delay, PARENT, experts, features, scale, gap, between)
+        describe(bank, t + 1, delay, PARENT, np.array([white]), experts, features, scale, gap, between)
         each = np.stack([one.positions[0] for one in expected if one is not None], axis=1)
         np.testing.assert_allclose(experts[0, :, : len(DENSITIES)], each, atol=1e-9)
-        likelihood = -1.5 * (count * np.log(misfit / count) + spread)
-        weights = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
-        weights /= weights.sum(axis=1, keepdims=True)
+        noise = (likely(count, misfit, spread) * misfit / count).sum(axis=1)
+        shared = SHARED * white
+        weights = likely(count + shared, misfit + shared * np.exp(np.log(noise).mean()), spread)
         mean = (weights[..., None] * each).sum(axis=1)
         np.testing.assert_allclose(experts[0, :, MULTIPLE_MODEL], mean, atol=1e-8)
+
+
+def likely(count: Floats, misfit: Floats, spread: Floats) -> Floats:
+    """(22, M) weights of the smoothers, by the likelihood of so many innovations."""
+    likelihood = -1.5 * (count * np.log(misfit / count) + spread)
+    weights = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
+    return weights / weights.sum(axis=1, keepdims=True)
 
 
 def multiple_model(seen: Floats, covariance: Floats, delay: int = 4) -> tuple[Floats, Bank]:
@@ -100,7 +108,7 @@ def multiple_model(seen: Floats, covariance: Floats, delay: int = 4) -> tuple[Fl
     for t, frame in enumerate(seen[:, None]):
         advance(bank, t, 1 / FPS, frame, np.ones((1, 22)), DENSITIES, MEASUREMENT_SIGMA, covariance)
         if t >= delay:
-            describe(bank, t + 1, delay, PARENT, experts, features, scale, gap, between)
+            describe(bank, t + 1, delay, PARENT, np.zeros(1), experts, features, scale, gap, between)
             found.append(experts[0, :, MULTIPLE_MODEL].copy())
     return np.array(found), bank
 
@@ -137,7 +145,7 @@ def test_the_gap_is_the_time_to_the_nearest_sighting() -> None:
     for t, frame in enumerate(seen):
         advance(bank, t, 1 / FPS, frame, np.ones((1, 22)), DENSITIES, MEASUREMENT_SIGMA, body_covariance())
         if t >= 4:
-            describe(bank, t + 1, 4, PARENT, experts, features, scale, gap, between)
+            describe(bank, t + 1, 4, PARENT, np.zeros(1), experts, features, scale, gap, between)
             found.append(int(gap[0, 5]))
     assert found == [-1, -1, -1, 0, 0, 0, 1, 2]
     assert (np.delete(gap, 5) == 0).all()
@@ -159,12 +167,8 @@ def test_live_form_gives_what_torch_gives(tmp_path: Path) -> None:
         batch = through_bank(sensed, delay)
         with torch.no_grad():
             outputs = net(batch.features, torch.ones(batch.features.shape[:2], dtype=torch.bool))
-            whiteness = Whiteness(2)
-            shares = torch.tensor(np.array([whiteness.fallback(frame) for frame in seen[:50]])[delay:].T)[
-                ..., None, None
-            ]
-            described = batch.experts, batch.heading, batch.scale, batch.gap, batch.between
-            expected, variance = answer(outputs, *described, shares[:, : outputs.shape[1]])
+            described = batch.experts, batch.heading, batch.scale, batch.gap, batch.between, batch.fallback
+            expected, variance = answer(outputs, *described)
         found = smoothed(seen, delay, str(path))[: 50 - delay]
         origin = truth[0, :, 0][:, None, None]
         np.testing.assert_allclose(places(found).swapaxes(0, 1), expected.numpy() + origin, atol=2e-5)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.helpers.bodies import waving
 
-from steadypose.prior.models.mixture.whiteness import FALLBACK, Whiteness
+from steadypose.prior.models.mixture.whiteness import LARGE, SHARE, Whiteness, fallback
 
 FRAMES, SIGMA = 90, 0.01
 
@@ -51,5 +51,10 @@ def test_the_share_rises_with_the_square_and_is_at_most_all() -> None:
     seen = waving(FRAMES) + lasting((FRAMES, 22, 3), 0.0)
     one, other = Whiteness(1), Whiteness(1)
     for frame in seen:
-        white, share = one.update(frame[None])[0], other.fallback(frame[None])[0]
-        assert share == pytest.approx(min(1.0, FALLBACK * white**2))
+        white, share = one.update(frame[None])[0], other.share(frame[None])[0]
+        assert share == pytest.approx(min(1.0, SHARE * white**2))
+
+
+def test_the_estimate_by_likelihood_has_all_of_little_noise_and_half_of_much() -> None:
+    scale = np.array([1e-4, LARGE, 100 * LARGE, LARGE])
+    np.testing.assert_allclose(fallback(np.array([1.0, 1.0, 1.0, 0.3]), scale), [1.0, 0.75, 0.5, 0.3], atol=1e-3)

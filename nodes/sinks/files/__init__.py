@@ -1,0 +1,1 @@
+"""Cleaned motion as files that other programs read: BVH, GLB, CSV, TRC."""
