@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, J
 from steadypose.prior.sim.camera import segment_gap
+from steadypose.prior.sim.noise import time_correlated
 
 Mask = NDArray[np.bool_]
 
@@ -41,10 +42,7 @@ def along_sight(truth: Floats, sigma: float, rng: np.random.Generator, ratio: fl
 def correlated(truth: Floats, sigma: float, rng: np.random.Generator, memory: float = 0.9) -> Floats:
     """Stationary AR(1) noise of ``sigma`` metres, with correlation ``memory`` from a frame to the next: like a depth
     camera's errors, which no low-pass filter separates from motion."""
-    noise = rng.normal(0.0, sigma, truth.shape)
-    for t in range(1, len(noise)):
-        noise[t] = memory * noise[t - 1] + np.sqrt(1 - memory**2) * noise[t]
-    return truth + noise
+    return truth + time_correlated(rng.normal(0.0, sigma, truth.shape), memory)
 
 
 def spiked(seen: Floats, rng: np.random.Generator, share: float = 0.01, size: float = 0.30) -> Floats:

@@ -2,37 +2,65 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Mapping
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from steadypose.msgs.limits import check_size
-from steadypose.msgs.topics import TOPICS
-from steadypose.msgs.types import (
-    CleanBody,
-    Diagnostics,
-    Event,
-    EventKind,
-    Hand,
-    Level,
-    Message,
-    Phase,
-    Pose,
-    PoseClean,
-    PoseEvents,
-    PoseRaw,
-    PoseWorld,
-    RawBody,
-    Tracking,
-    WorldBody,
-)
+from steadypose.msgs.forms import Array, ListOf, States
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
+from steadypose.msgs.types import Diagnostics, Level, Message, Pose, forms_of
+
+MAX_BODIES = 128
+MAX_EVENTS = 16 * MAX_BODIES
+MAX_VALUES = 1000
+"""of one node's diagnostics"""
+
+_HEADER = "iIs"
+#: what comes before the count that is limited: numbers as `struct` names them, s for a string
+_BEFORE = {
+    POSE_RAW: (_HEADER + "ss" + 7 * "d" + "?", MAX_BODIES),
+    POSE_CLEAN: (_HEADER + "s" + 7 * "d" + "?" + "I", MAX_BODIES),
+    POSE_WORLD: (_HEADER + "s" + 4 * "d", MAX_BODIES),
+    POSE_EVENTS: (_HEADER + "s", MAX_EVENTS),
+    POSE_TRUTH: (_HEADER + "s" + 4 * "d", MAX_BODIES),
+    DIAGNOSTICS: (_HEADER + "I" + "B" + "sss", MAX_VALUES),
+}
+
+
+def check_size(topic: str, payload: bytes | memoryview) -> None:
+    """Raises:
+    ValueError: CDR of a message that holds more bodies, events or values than any is to hold. A million bytes of bodies
+        without joints would take seconds to decode, in which nobody else is heard.
+    """
+    before, most = _BEFORE[topic]
+    order = "<" if len(payload) > 1 and payload[1] & 1 else ">"
+    at = 0
+    data = memoryview(payload)[4:]
+    try:
+        for kind in before:
+            size = 4 if kind == "s" else struct.calcsize(kind)
+            at += -at % size
+            if kind == "s":
+                (length,) = struct.unpack_from(f"{order}I", data, at)
+                at += length
+            at += size
+        at += -at % 4
+        (count,) = struct.unpack_from(f"{order}I", data, at)
+    except struct.error:
+        return  # too short, which decoding says better
+    if count > most:
+        raise ValueError(f"expected at most {most} bodies, events or values, got {count}")
+
 
 DEFINITIONS = Path(__file__).parent / "msg"
 ROS_DEFINITIONS = {
@@ -67,20 +95,20 @@ def typestore() -> Typestore:
     for path in sorted(DEFINITIONS.glob("*.msg")):
         definitions |= get_types_from_msg(path.read_text(), f"steadypose_msgs/msg/{path.stem}")
     store.register(definitions)
-    for codec in _CODECS.values():
-        store.get_msgdef(codec.wire_type)
+    for kind in TOPICS.values():
+        store.get_msgdef(wire_type(kind))
     return store
 
 
-def wire_type(message_type: type[Message]) -> str:
+def wire_type(kind: type) -> str:
     """The ROS 2 name of a message type, such as `steadypose_msgs/msg/PoseRaw`."""
-    return _CODECS[message_type].wire_type
+    return "diagnostic_msgs/msg/DiagnosticArray" if kind is Diagnostics else f"steadypose_msgs/msg/{kind.__name__}"
 
 
 def encode(message: Message) -> bytes:
     """The message as CDR, little-endian, with its four bytes of encapsulation."""
-    codec = _CODECS[type(message)]
-    return bytes(typestore().serialize_cdr(codec.to_wire(message), codec.wire_type, little_endian=True))
+    kind = type(message)
+    return bytes(typestore().serialize_cdr(_codec(kind).to_wire(message), wire_type(kind), little_endian=True))
 
 
 def decode(topic: str, payload: bytes | memoryview) -> Message:
@@ -92,244 +120,125 @@ def decode(topic: str, payload: bytes | memoryview) -> Message:
     """
     if topic not in TOPICS:
         raise DecodeError(f"unknown topic {topic!r}: expected one of {', '.join(TOPICS)}")
-    codec = _CODECS[TOPICS[topic]]
+    kind = TOPICS[topic]
     try:
         check_size(topic, payload)
-        return codec.from_wire(typestore().deserialize_cdr(payload, codec.wire_type))
+        return _codec(kind).from_wire(typestore().deserialize_cdr(payload, wire_type(kind)))
     except (SerdeError, ValueError) as error:
-        raise DecodeError(f"{topic}: {len(payload)} bytes are not a {codec.wire_type}: {error}") from error
+        raise DecodeError(f"{topic}: {len(payload)} bytes are not a {wire_type(kind)}: {error}") from error
 
 
-def _ros(name: str) -> Any:
-    return typestore().types[name]
+class _Codec(NamedTuple):
+    to_wire: Callable[[Any], Any]
+    from_wire: Callable[[Any], Any]
 
 
-def _flat(array: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
-    return np.ascontiguousarray(array, dtype).reshape(-1)
+class _Part(NamedTuple):
+    """One field of a definition: its value for a message, and the fields of the message that it is read into."""
+
+    write: Callable[[Any], Any]
+    read: Mapping[str, Callable[[Any], Any]]
 
 
-def _f32(array: NDArray[Any]) -> NDArray[Any]:
-    return _flat(array, np.float32)
+@cache
+def _codec(kind: type) -> _Codec:
+    """How messages of a kind go over the wire, by their definition in `msgs/msg` and their fields' forms."""
+    if kind is Diagnostics:
+        return _Codec(_diagnostics_to_wire, _diagnostics_from_wire)
+    store, name = typestore(), wire_type(kind)
+    parts = [_part(kind, field, node) for field, node in store.fielddefs[name][1]]
+    made, writes = store.types[name], [part.write for part in parts]
+    reads = [item for part in parts for item in part.read.items()]
+    return _Codec(
+        lambda message: made(*[write(message) for write in writes]),
+        lambda wire: kind(**{field: read(wire) for field, read in reads}),
+    )
 
 
-def _own(array: NDArray[Any], *shape: int) -> NDArray[Any]:
-    # a copy: what was decoded is a read-only, perhaps unaligned view into the payload
-    return np.array(array).reshape(shape)
+def _part(kind: type, field: str, node: Any) -> _Part:
+    form = forms_of(kind).get(field)
+    nodetype, what = node
+    if isinstance(form, ListOf):
+        item = _codec(form.kind)
+        return _Part(
+            lambda m: [item.to_wire(one) for one in getattr(m, field)],
+            {field: lambda w: [item.from_wire(one) for one in getattr(w, field)]},
+        )
+    if nodetype in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        array = form.array if isinstance(form, States) else form
+        assert isinstance(array, Array)
+        dtype, shape = array.dtype, tuple(n if isinstance(n, int) else -1 for n in array.shape)
+        # a copy: what was decoded is a read-only, perhaps unaligned view into the payload
+        return _Part(
+            lambda m: np.ascontiguousarray(getattr(m, field), dtype).reshape(-1),
+            {field: lambda w: np.array(getattr(w, field)).reshape(shape)},
+        )
+    if what == "std_msgs/msg/Header":
+        return _Part(
+            lambda m: _header(m.stamp_ns, m.frame_id),
+            {"stamp_ns": lambda w: _nanoseconds(w.header.stamp), "frame_id": lambda w: w.header.frame_id},
+        )
+    if what == "builtin_interfaces/msg/Time":
+        name = f"{field}_ns"
+        return _Part(lambda m: _time(getattr(m, name)), {name: lambda w: _nanoseconds(getattr(w, field))})
+    if what == "geometry_msgs/msg/Vector3":
+        vector = typestore().types[what]
+        return _Part(lambda m: vector(*getattr(m, field).tolist()), {field: lambda w: _xyz(getattr(w, field))})
+    if what == "geometry_msgs/msg/Pose" and field == "root_pose":
+        return _Part(
+            lambda m: _pose(m.root_position, m.root_orientation),
+            {"root_position": lambda w: _xyz(w.root_pose.position), "root_orientation": lambda w: _xyzw(w.root_pose)},
+        )
+    if what == "geometry_msgs/msg/Pose":
+        return _Part(
+            lambda m: _pose(getattr(m, field).position, getattr(m, field).orientation),
+            {field: lambda w: Pose(_xyz(getattr(w, field).position), _xyzw(getattr(w, field)))},
+        )
+    return _Part(attrgetter(field), {field: attrgetter(field)})
 
 
-def _header_to_wire(stamp_ns: int, frame_id: str) -> Any:
-    time = _ros("builtin_interfaces/msg/Time")(*divmod(stamp_ns, 10**9))
-    return _ros("std_msgs/msg/Header")(time, frame_id)
+def _time(stamp_ns: int) -> Any:
+    return typestore().types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
 
 
-def _ns_from_wire(time: Any) -> int:
+def _nanoseconds(time: Any) -> int:
     if time.nanosec >= 10**9:
         raise ValueError(f"stamp.nanosec: expected under 1000000000, got {time.nanosec}")
     return time.sec * 10**9 + time.nanosec
 
 
-def _pose_to_wire(position: NDArray[Any], orientation: NDArray[Any]) -> Any:
-    return _ros("geometry_msgs/msg/Pose")(
-        _ros("geometry_msgs/msg/Point")(*position.tolist()),
-        _ros("geometry_msgs/msg/Quaternion")(*orientation.tolist()),
+def _header(stamp_ns: int, frame_id: str) -> Any:
+    return typestore().types["std_msgs/msg/Header"](_time(stamp_ns), frame_id)
+
+
+def _pose(position: NDArray[Any], orientation: NDArray[Any]) -> Any:
+    types = typestore().types
+    return types["geometry_msgs/msg/Pose"](
+        types["geometry_msgs/msg/Point"](*position.tolist()),
+        types["geometry_msgs/msg/Quaternion"](*orientation.tolist()),
     )
 
 
-def _position_from_wire(pose: Any) -> NDArray[np.float64]:
-    return np.array([pose.position.x, pose.position.y, pose.position.z])
+def _xyz(wire: Any) -> NDArray[np.float64]:
+    return np.array([wire.x, wire.y, wire.z])
 
 
-def _orientation_from_wire(pose: Any) -> NDArray[np.float64]:
-    return np.array([pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w])
-
-
-def _raw_to_wire(m: PoseRaw) -> Any:
-    body = _ros("steadypose_msgs/msg/RawBody")
-    return _ros("steadypose_msgs/msg/PoseRaw")(
-        header=_header_to_wire(m.stamp_ns, m.frame_id),
-        source=m.source,
-        skeleton=m.skeleton,
-        sensor_pose=_pose_to_wire(m.sensor_pose.position, m.sensor_pose.orientation),
-        calibrated=m.calibrated,
-        bodies=[body(b.id, _f32(b.positions), _f32(b.confidence)) for b in m.bodies],
-        end_of_stream=m.end_of_stream,
-    )
-
-
-def _raw_from_wire(w: Any) -> PoseRaw:
-    return PoseRaw(
-        stamp_ns=_ns_from_wire(w.header.stamp),
-        frame_id=w.header.frame_id,
-        source=w.source,
-        skeleton=w.skeleton,
-        sensor_pose=Pose(_position_from_wire(w.sensor_pose), _orientation_from_wire(w.sensor_pose)),
-        calibrated=w.calibrated,
-        bodies=[RawBody(b.id, _own(b.positions, -1, 3), _own(b.confidence, -1)) for b in w.bodies],
-        end_of_stream=w.end_of_stream,
-    )
-
-
-def _clean_to_wire(m: PoseClean) -> Any:
-    body = _ros("steadypose_msgs/msg/CleanBody")
-    return _ros("steadypose_msgs/msg/PoseClean")(
-        header=_header_to_wire(m.stamp_ns, m.frame_id),
-        source=m.source,
-        sensor_pose=_pose_to_wire(m.sensor_pose.position, m.sensor_pose.orientation),
-        calibrated=m.calibrated,
-        delay_frames=m.delay_frames,
-        bodies=[
-            body(
-                id=b.id,
-                positions=_f32(b.positions),
-                rotations=_f32(b.rotations),
-                state=_flat(b.state, np.uint8),
-                sigma=_f32(b.sigma),
-                anomaly=b.anomaly,
-                anomaly_flag=b.anomaly_flag,
-                joint_anomaly=_f32(b.joint_anomaly),
-                bone_lengths=_f32(b.bone_lengths),
-                raw_positions=_f32(b.raw_positions),
-                raw_confidence=_f32(b.raw_confidence),
-            )
-            for b in m.bodies
-        ],
-        end_of_stream=m.end_of_stream,
-    )
-
-
-def _clean_from_wire(w: Any) -> PoseClean:
-    return PoseClean(
-        stamp_ns=_ns_from_wire(w.header.stamp),
-        frame_id=w.header.frame_id,
-        source=w.source,
-        sensor_pose=Pose(_position_from_wire(w.sensor_pose), _orientation_from_wire(w.sensor_pose)),
-        calibrated=w.calibrated,
-        delay_frames=w.delay_frames,
-        bodies=[
-            CleanBody(
-                id=b.id,
-                positions=_own(b.positions, -1, 3),
-                rotations=_own(b.rotations, -1, 4),
-                state=_own(b.state, -1),
-                sigma=_own(b.sigma, -1),
-                anomaly=b.anomaly,
-                anomaly_flag=b.anomaly_flag,
-                joint_anomaly=_own(b.joint_anomaly, -1),
-                bone_lengths=_own(b.bone_lengths, -1),
-                raw_positions=_own(b.raw_positions, -1, 3),
-                raw_confidence=_own(b.raw_confidence, -1),
-            )
-            for b in w.bodies
-        ],
-        end_of_stream=w.end_of_stream,
-    )
-
-
-def _world_to_wire(m: PoseWorld) -> Any:
-    body = _ros("steadypose_msgs/msg/WorldBody")
-    vector = _ros("geometry_msgs/msg/Vector3")
-    return _ros("steadypose_msgs/msg/PoseWorld")(
-        header=_header_to_wire(m.stamp_ns, m.frame_id),
-        source=m.source,
-        ground_plane=_flat(m.ground_plane, np.float64),
-        bodies=[
-            body(
-                id=b.id,
-                root_pose=_pose_to_wire(b.root_position, b.root_orientation),
-                root_velocity=vector(*b.root_velocity.tolist()),
-                covariance=_flat(b.covariance, np.float64),
-                positions=_f32(b.positions),
-                rotations=_f32(b.rotations),
-                state=_flat(b.state, np.uint8),
-                sigma=_f32(b.sigma),
-                contacts=_f32(b.contacts),
-                tracking=int(b.tracking),
-            )
-            for b in m.bodies
-        ],
-        end_of_stream=m.end_of_stream,
-    )
-
-
-def _world_from_wire(w: Any) -> PoseWorld:
-    return PoseWorld(
-        stamp_ns=_ns_from_wire(w.header.stamp),
-        frame_id=w.header.frame_id,
-        source=w.source,
-        ground_plane=_own(w.ground_plane, -1),
-        bodies=[
-            WorldBody(
-                id=b.id,
-                root_position=_position_from_wire(b.root_pose),
-                root_orientation=_orientation_from_wire(b.root_pose),
-                root_velocity=np.array([b.root_velocity.x, b.root_velocity.y, b.root_velocity.z]),
-                covariance=_own(b.covariance, 6, 6),
-                positions=_own(b.positions, -1, 3),
-                rotations=_own(b.rotations, -1, 4),
-                state=_own(b.state, -1),
-                sigma=_own(b.sigma, -1),
-                contacts=_own(b.contacts, -1),
-                tracking=Tracking(b.tracking),
-            )
-            for b in w.bodies
-        ],
-        end_of_stream=w.end_of_stream,
-    )
-
-
-def _events_to_wire(m: PoseEvents) -> Any:
-    event, vector = _ros("steadypose_msgs/msg/Event"), _ros("geometry_msgs/msg/Vector3")
-    time = _ros("builtin_interfaces/msg/Time")
-    return _ros("steadypose_msgs/msg/PoseEvents")(
-        header=_header_to_wire(m.stamp_ns, m.frame_id),
-        source=m.source,
-        events=[
-            event(
-                body=e.body,
-                kind=int(e.kind),
-                phase=int(e.phase),
-                hand=int(e.hand),
-                confidence=e.confidence,
-                direction=vector(*e.direction.tolist()),
-                since=time(*divmod(e.since_ns, 10**9)),
-            )
-            for e in m.events
-        ],
-        end_of_stream=m.end_of_stream,
-    )
-
-
-def _events_from_wire(w: Any) -> PoseEvents:
-    return PoseEvents(
-        stamp_ns=_ns_from_wire(w.header.stamp),
-        frame_id=w.header.frame_id,
-        source=w.source,
-        events=[
-            Event(
-                body=e.body,
-                kind=EventKind(e.kind),
-                phase=Phase(e.phase),
-                hand=Hand(e.hand),
-                confidence=e.confidence,
-                direction=np.array([e.direction.x, e.direction.y, e.direction.z]),
-                since_ns=_ns_from_wire(e.since),
-            )
-            for e in w.events
-        ],
-        end_of_stream=w.end_of_stream,
-    )
+def _xyzw(pose: Any) -> NDArray[np.float64]:
+    turned = pose.orientation
+    return np.array([turned.x, turned.y, turned.z, turned.w])
 
 
 def _diagnostics_to_wire(m: Diagnostics) -> Any:
-    pair = _ros("diagnostic_msgs/msg/KeyValue")
-    status = _ros("diagnostic_msgs/msg/DiagnosticStatus")(
+    types = typestore().types
+    pair = types["diagnostic_msgs/msg/KeyValue"]
+    status = types["diagnostic_msgs/msg/DiagnosticStatus"](
         level=int(m.level),
         name=m.node,
         message=m.message,
         hardware_id="",
         values=[pair(key, value) for key, value in m.values.items()],
     )
-    return _ros("diagnostic_msgs/msg/DiagnosticArray")(header=_header_to_wire(m.stamp_ns, ""), status=[status])
+    return types["diagnostic_msgs/msg/DiagnosticArray"](header=_header(m.stamp_ns, ""), status=[status])
 
 
 def _diagnostics_from_wire(w: Any) -> Diagnostics:
@@ -337,24 +246,9 @@ def _diagnostics_from_wire(w: Any) -> Diagnostics:
         raise ValueError(f"status: expected one, got {len(w.status)}")
     status = w.status[0]
     return Diagnostics(
-        stamp_ns=_ns_from_wire(w.header.stamp),
+        stamp_ns=_nanoseconds(w.header.stamp),
         node=status.name,
         level=Level(status.level),
         message=status.message,
         values={pair.key: pair.value for pair in status.values},
     )
-
-
-class _Codec(NamedTuple):
-    wire_type: str
-    to_wire: Callable[[Any], Any]
-    from_wire: Callable[[Any], Message]
-
-
-_CODECS: dict[type[Message], _Codec] = {
-    PoseRaw: _Codec("steadypose_msgs/msg/PoseRaw", _raw_to_wire, _raw_from_wire),
-    PoseClean: _Codec("steadypose_msgs/msg/PoseClean", _clean_to_wire, _clean_from_wire),
-    PoseWorld: _Codec("steadypose_msgs/msg/PoseWorld", _world_to_wire, _world_from_wire),
-    PoseEvents: _Codec("steadypose_msgs/msg/PoseEvents", _events_to_wire, _events_from_wire),
-    Diagnostics: _Codec("diagnostic_msgs/msg/DiagnosticArray", _diagnostics_to_wire, _diagnostics_from_wire),
-}

@@ -1,4 +1,14 @@
-"""What reliable subscribers have taken, and what they may still have to be sent again.
+"""What is in the frames of a connection, whose messages are taken, and what reliable subscribers have taken of them.
+
+From the publisher, one frame is one message:
+
+    topic, UTF-8 | 0 | version, uint8 | publisher, uint32 | sequence, uint32 | sent, uint64 | CDR
+
+with little-endian integers; `sent` is in nanoseconds of the publisher's monotonic clock.
+
+To the publisher, beside the subscriptions of ZeroMQ itself: the name of a subscriber, as a subscription, and from one
+that must miss nothing, which messages it has taken. What is for that subscriber alone, because it had not taken it when
+it was started again, has that subscription and a zero byte before it.
 
 A reliable subscriber says of each message when it has done with it: not that it has arrived, but that whatever followed
 from it is safe. What it has not taken is kept. Who comes under the name of one that has left, because its process was
@@ -7,12 +17,74 @@ started again, is sent what that one had not taken, and before that as much as i
 
 from __future__ import annotations
 
+import struct
 import time
-from collections import Counter, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
-from steadypose.msgs.wire import Listener, Taken
+VERSION = 2
+MAX_FRAME = 2**20
+"""bytes; 100 people with 100 joints each are 160 kB"""
+PREFIX = struct.Struct("<BIIQ")
+
+# No topic begins with this byte. It is also the last in order, and ZeroMQ subscribes in that order: whose name has
+# arrived gets its topics.
+_NAME = b"\xff"
+_TAKEN = b"\x02"
+_COUNT = struct.Struct("<III")
+
+
+class Listener(NamedTuple):
+    """A subscriber with a name, as it makes itself known."""
+
+    name: str
+    instance: int
+    """drawn at random at start, so that a restarted publisher is recognised as a new one, uint32"""
+    reliable: tuple[str, ...] = ()
+    """topics of which it must miss nothing"""
+    context: int = 0
+    """messages of each that it wants to see again, if the one of this name before it had taken them"""
+
+    def subscription(self) -> bytes:
+        """What it subscribes to, to be known, and to be sent what is for it alone."""
+        topics = " ".join(self.reliable).encode()
+        return _NAME + b"\0".join([self.name.encode(), b"%08x" % self.instance, topics, b"%d" % self.context])
+
+
+def read_subscription(prefix: bytes) -> Listener | None:
+    """The listener that a subscription makes known; None if it is another subscription."""
+    if not prefix.startswith(_NAME):
+        return None
+    try:
+        name, instance, topics, context = prefix.removeprefix(_NAME).split(b"\0")
+        return Listener(name.decode(), int(instance, 16), tuple(topics.decode().split()), int(context))
+    except ValueError:
+        return None
+
+
+class Taken(NamedTuple):
+    """How far a listener has come with a topic of a publisher."""
+
+    instance: int
+    publisher: int
+    following: int
+    """sequence of the message that it expects next"""
+    topic: str
+
+    def frame(self) -> bytes:
+        return _TAKEN + _COUNT.pack(self.instance, self.publisher, self.following) + self.topic.encode()
+
+
+def read_taken(frame: bytes, topics: Collection[str]) -> Taken | None:
+    """What a frame says of a listener's progress; None if it is something else."""
+    if not frame.startswith(_TAKEN) or len(frame) < 1 + _COUNT.size:
+        return None
+    topic = frame[1 + _COUNT.size :].decode(errors="replace")
+    instance, publisher, following = _COUNT.unpack_from(frame, 1)
+    return Taken(instance, publisher, following, topic) if topic in topics else None
+
 
 WINDOW = 256
 """messages of a topic that a reliable subscriber may be behind before it is waited for; with what is sent beside them,
@@ -160,3 +232,54 @@ class Deliveries:
 def _ahead(sequence: int, following: int) -> bool:
     """Whether a message comes no earlier than the one that is expected next."""
     return (sequence - following) % WRAP < WRAP // 2
+
+
+AWAY_S = 1.0
+"""of silence after which another publisher may go on with a source"""
+MOST = 1024
+"""streams that are remembered"""
+
+
+class _Principal(NamedTuple):
+    """Who publishes a stream: its number, by which connection it came, when it was last heard, and who was before."""
+
+    publisher: int
+    connection: object
+    heard_s: float
+    before: int | None
+
+
+class Principals:
+    """Binds each source to the publisher that is first heard with it. To be shared by subscribers of one program.
+
+    An address has one publisher at a time, so a new one there is the old one, started again; but a source that comes
+    from elsewhere as well has two publishers, and only the first is heard.
+    """
+
+    def __init__(self) -> None:
+        self._bound: OrderedDict[tuple[str, str], _Principal] = OrderedDict()
+
+    def admits(self, topic: str, source: str, publisher: int, connection: object, *, ended: bool = False) -> bool:
+        """Whether a message is from whom its source belongs to.
+
+        Args:
+            topic, source, publisher: of the message.
+            connection: of a subscriber to a single address; None of one to several.
+            ended: whether the stream ends with this message, and its source is free.
+        """
+        now_s, key = time.monotonic(), (topic, source)
+        bound = self._bound.get(key)
+        before = bound.before if bound else None
+        if bound and bound.publisher != publisher:
+            again = connection is not None and connection is bound.connection and publisher != bound.before
+            if not again and now_s - bound.heard_s < AWAY_S:
+                return False
+            before = bound.publisher
+        if ended:
+            self._bound.pop(key, None)
+            return True
+        self._bound[key] = _Principal(publisher, connection, now_s, before)
+        self._bound.move_to_end(key)
+        if len(self._bound) > MOST:
+            self._bound.popitem(last=False)
+        return True

@@ -8,7 +8,7 @@ import os
 import socket as posix
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -16,14 +16,20 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import zmq
 
-from steadypose.msgs.addresses import TransportError, is_local, make_private, parse, refuse_used
-from steadypose.msgs.codec import encode, typestore
-from steadypose.msgs.delivery import Deliveries
-from steadypose.msgs.keys import ClientList, Keys, loopback_keys
-from steadypose.msgs.limits import check_size
+from steadypose.msgs.codec import check_size, encode, typestore
+from steadypose.msgs.delivery import MAX_FRAME, PREFIX, VERSION, Deliveries, Listener, read_subscription, read_taken
+from steadypose.msgs.security import (
+    ClientList,
+    Keys,
+    TransportError,
+    is_local,
+    loopback_keys,
+    make_private,
+    parse,
+    refuse_used,
+)
 from steadypose.msgs.topics import TOPICS, check_topic
 from steadypose.msgs.types import Message
-from steadypose.msgs.wire import MAX_FRAME, PREFIX, VERSION, Listener, read_subscription, read_taken
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -159,7 +165,7 @@ class Publisher:
 
         Raises:
             ValueError: if the message is not of the topic's type, encodes to more than `MAX_FRAME` bytes, or holds more
-                than `msgs.limits` allows.
+                than `msgs.codec` allows.
         """
         check_topic(topic, message)
         payload = encode(message)
@@ -167,14 +173,8 @@ class Publisher:
         size = len(topic) + 1 + PREFIX.size + len(payload)
         if size > MAX_FRAME:
             raise ValueError(f"{topic}: expected a message of at most {MAX_FRAME} bytes, got {size}")
-        self._note_subscribers()
-        deadline = time.monotonic() + timeout_s
-        while self._deliveries.waited_for(topic):
-            left = deadline - time.monotonic()
-            if left <= 0:
-                return False
-            self._socket.poll(milliseconds(min(left, _LOOK_S)))
-            self._note_subscribers()
+        if not self._wait(lambda: not self._deliveries.waited_for(topic), timeout_s):
+            return False
         id, sequence = self._id_of(topic), self._deliveries.sequence[topic]
         frame = topic.encode() + b"\0" + PREFIX.pack(VERSION, id, sequence, time.monotonic_ns()) + payload
         self._socket.send(frame)
@@ -198,15 +198,7 @@ class Publisher:
 
     def is_taken(self, topic: str, sequence: int, timeout_s: float = 0.0) -> bool:
         """Whether all reliable subscribers of a topic have taken a message; waits until they have, or for so long."""
-        deadline = time.monotonic() + timeout_s
-        while True:
-            self._note_subscribers()
-            if self._deliveries.is_taken(topic, sequence):
-                return True
-            left = deadline - time.monotonic()
-            if left <= 0:
-                return False
-            self._socket.poll(milliseconds(left))
+        return self._wait(lambda: self._deliveries.is_taken(topic, sequence), timeout_s)
 
     @property
     def subscribers(self) -> frozenset[str]:
@@ -217,13 +209,19 @@ class Publisher:
     def wait_for_subscribers(self, names: Iterable[str], *, timeout_s: float) -> bool:
         """Wait until the subscribers of these names are there; False if `timeout_s` passed before."""
         wanted = frozenset(names)
+        return self._wait(lambda: wanted <= {listener.name for listener in self._listeners}, timeout_s)
+
+    def _wait(self, until: Callable[[], bool], timeout_s: float) -> bool:
+        """Take what subscribers say until a condition holds; False if it does not in time."""
         deadline = time.monotonic() + timeout_s
-        while not wanted <= self.subscribers:
+        while True:
+            self._note_subscribers()
+            if until():
+                return True
             left = deadline - time.monotonic()
             if left <= 0:
                 return False
-            self._socket.poll(milliseconds(left))
-        return True
+            self._socket.poll(milliseconds(min(left, _LOOK_S)))
 
     def check(self) -> None:
         """Enforce the list of keys; to be called about once a second.

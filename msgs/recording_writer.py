@@ -136,10 +136,7 @@ class RecordingWriter:
 
     def split(self) -> None:
         """Complete this part, and begin the next."""
-        self._part.close()
-        self._done.append(self._part.info)
-        self._remove_oldest()
-        self._write_metadata()
+        self._finish()
         self._part = _Part(self.directory, self._part.number + 1)
 
     def _is_full(self, stamp_ns: int) -> bool:
@@ -149,20 +146,20 @@ class RecordingWriter:
         span_ns = max(stamp_ns, info.last_ns) - info.first_ns
         return 0 < self._split_bytes <= self._part.size or 0 < self._split_ns <= span_ns
 
-    def _remove_oldest(self) -> None:
+    def close(self) -> None:
+        """Complete the recording: the index, and `metadata.yaml`."""
+        if not self._part.closed:
+            self._finish()
+
+    def _finish(self) -> None:
+        """Complete this part, remove the oldest where there is a limit, and say so in the metadata."""
+        self._part.close()
+        self._done.append(self._part.info)
         sizes = {info.path: info.path.stat().st_size for info in self._done}
         while self._keep_bytes and len(self._done) > 1 and sum(sizes.values()) > self._keep_bytes:
             oldest = self._done.pop(0)
             oldest.path.unlink()
             del sizes[oldest.path]
-
-    def close(self) -> None:
-        """Complete the recording: the index, and `metadata.yaml`."""
-        if self._part.closed:
-            return
-        self._part.close()
-        self._done.append(self._part.info)
-        self._remove_oldest()
         self._write_metadata()
 
     def _write_metadata(self) -> None:

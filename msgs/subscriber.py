@@ -15,14 +15,12 @@ from typing import TYPE_CHECKING
 
 import zmq
 
-from steadypose.msgs.addresses import TransportError, check_private, is_local, parse
 from steadypose.msgs.codec import DecodeError, decode, typestore
-from steadypose.msgs.keys import Keys, loopback_keys
-from steadypose.msgs.principals import Principals
+from steadypose.msgs.delivery import MAX_FRAME, PREFIX, VERSION, Listener, Principals, Taken
 from steadypose.msgs.publisher import KEEPALIVE, milliseconds
+from steadypose.msgs.security import Keys, TransportError, check_private, is_local, loopback_keys, parse
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.types import Diagnostics, Message
-from steadypose.msgs.wire import MAX_FRAME, PREFIX, VERSION, Listener, Taken
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -5,19 +5,22 @@ the floor at z = 0. A constructor takes anything numpy reads as an array, gives 
 raises `ValueError` naming the field, what was expected and what came. It checks form, not plausibility: a NaN or
 a body 10 km away is a valid message, and the receiver's business.
 
-Messages compare by value, NaN equal to NaN.
+Messages compare by value, NaN equal to NaN. The annotation of a field says what it holds, for the constructors and for
+the codec alike, which takes the rest from the definitions in `msgs/msg`.
 """
 
-from __future__ import annotations
-
+# without `from __future__ import annotations`: the constructors read the annotations
 import math
-import operator
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from steadypose.msgs import forms
+from steadypose.msgs.forms import Array, Form, Integer, ListOf, UnfitError
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -33,16 +36,6 @@ CONTACTS = (
     "left_knee", "right_knee", "left_ankle", "right_ankle", "left_foot", "right_foot", "left_wrist", "right_wrist",
 )  # fmt: skip
 """The joints of `WorldBody.contacts`, in its order (an ankle stands for the heel, a foot for the toe)."""
-
-# What a field holds. For a type checker any array will do, because the constructors convert.
-Float32 = NDArray[Any]
-Float64 = NDArray[Any]
-UInt8 = NDArray[Any]
-
-_J = len(JOINTS)
-_C = len(CONTACTS)
-_SECONDS_END = 2**31  # builtin_interfaces/Time counts seconds in an int32
-_INT32 = 2**31
 
 
 class JointState(IntEnum):
@@ -112,10 +105,31 @@ class Level(IntEnum):
     STALE = 3
 
 
+# for a type checker any array will do, because the constructors convert
+_Array = NDArray[Any]
+_J, _C = len(JOINTS), len(CONTACTS)
+Id = Annotated[int, Integer(-(2**31), 2**31)]
+Stamp = Annotated[int, Integer(0, 2**31 * 10**9)]  # builtin_interfaces/Time counts seconds in an int32
+Number = Annotated[float, forms.number]
+Text = Annotated[str, forms.text]
+Vector = Annotated[_Array, Array(np.float64, (3,))]
+Quaternion = Annotated[_Array, Array(np.float64, (4,))]
+Positions = Annotated[_Array, Array(np.float32, (_J, 3))]
+Rotations = Annotated[_Array, Array(np.float32, (_J, 4))]
+PerJoint = Annotated[_Array, Array(np.float32, (_J,))]
+States = Annotated[_Array, forms.States(Array(np.uint8, (_J,)), JointState.IMPUTED)]
+
+
 def _same(a: Any, b: Any) -> bool:
     if isinstance(a, np.ndarray):
         return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
     return a == b or (isinstance(a, float) and math.isnan(a) and math.isnan(b))
+
+
+@cache
+def forms_of(kind: type) -> dict[str, Form]:
+    """The forms of a message's fields, by their names; those without one are taken as they come."""
+    return {f.name: f.type.__metadata__[0] for f in fields(kind) if hasattr(f.type, "__metadata__")}  # pyright: ignore
 
 
 class _Record:
@@ -129,77 +143,30 @@ class _Record:
             return NotImplemented
         return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))  # type: ignore[arg-type]
 
-    def _fail(self, name: str, expected: str, got: object) -> ValueError:
-        return ValueError(f"{type(self).__name__}.{name}: expected {expected}, got {got}")
-
-    def _array(self, name: str, dtype: type[np.generic], *shape: int) -> None:
-        value = getattr(self, name)
-        try:
-            array = np.asarray(value, dtype)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise self._fail(name, f"{dtype.__name__} numbers of shape {shape}", repr(value)[:80]) from error
-        if array.shape != shape:
-            raise self._fail(name, f"shape {shape}", f"shape {array.shape}")
-        setattr(self, name, array)
-
-    def _states(self, name: str) -> None:
-        states = np.asarray(getattr(self, name))
-        if states.size and not (states.min() >= 0 and states.max() <= JointState.IMPUTED):
-            raise self._fail(name, f"JointState values, 0 to {JointState.IMPUTED:d}", states.tolist())
-        self._array(name, np.uint8, _J)
-
-    def _integer(self, name: str, low: int, end: int) -> None:
-        value = getattr(self, name)
-        try:
-            number = operator.index(value)
-        except TypeError as error:
-            raise self._fail(name, "an integer", repr(value)[:80]) from error
-        if not low <= number < end:
-            raise self._fail(name, f"an integer of {low} or more and under {end}", number)
-        setattr(self, name, number)
-
-    def _number(self, name: str) -> None:
-        value = getattr(self, name)
-        try:
-            setattr(self, name, float(value))
-        except (TypeError, ValueError) as error:
-            raise self._fail(name, "a number", repr(value)[:80]) from error
-
-    def _stamp(self) -> None:
-        self._integer("stamp_ns", 0, _SECONDS_END * 10**9)
-
-    def _texts(self, *names: str) -> None:
-        for name in names:
-            value = getattr(self, name)
-            if not isinstance(value, str):
-                raise self._fail(name, "a string", repr(value)[:80])
-
-    def _list(self, name: str, item: type) -> None:
-        value = getattr(self, name)
-        if not isinstance(value, list) or not all(isinstance(x, item) for x in value):
-            raise self._fail(name, f"a list of {item.__name__}", repr(value)[:80])
+    def __post_init__(self) -> None:
+        for name, form in forms_of(type(self)).items():
+            try:
+                setattr(self, name, form(getattr(self, name)))
+            except UnfitError as error:
+                raise ValueError(f"{type(self).__name__}.{name}: {error}") from error
 
 
 @dataclass(slots=True, eq=False)
 class Pose(_Record):
     """A frame's pose in the z-up world: world = orientation · point + position."""
 
-    position: Float64
+    position: Vector
     """(3,) metres, world"""
-    orientation: Float64
+    orientation: Quaternion
     """(4,) xyzw, from the frame to the world"""
 
-    def __post_init__(self) -> None:
-        self._array("position", np.float64, 3)
-        self._array("orientation", np.float64, 4)
-
     @classmethod
-    def identity(cls) -> Self:
+    def identity(cls) -> "Self":
         """The pose of a frame that is the world itself."""
         return cls(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
     @classmethod
-    def from_up(cls, up: str) -> Self:
+    def from_up(cls, up: str) -> "Self":
         """The pose, at the origin, of a frame whose axis `up` points up.
 
         `z` is the identity. `y` (graphics) and `-y` (a level camera: x right, y down, z forward) turn about x
@@ -220,207 +187,152 @@ class Pose(_Record):
 class RawBody(_Record):
     """One body as the sensor gives it, in the joints of the message's skeleton."""
 
-    id: int
+    id: Id
     """the sensor's track id, int32"""
-    positions: Float32
+    positions: Annotated[_Array, Array(np.float32, ("J", 3))]
     """(J, 3) metres, header frame; NaN where missing"""
-    confidence: Float32
+    confidence: Annotated[_Array, Array(np.float32, ("J",))]
     """(J,) 0 to 1"""
 
     def __post_init__(self) -> None:
-        self._integer("id", -_INT32, _INT32)
-        shape = np.shape(self.positions)
-        if len(shape) != 2:
-            raise self._fail("positions", "shape (J, 3)", f"shape {shape}")
-        self._array("positions", np.float32, shape[0], 3)
-        self._array("confidence", np.float32, shape[0])
+        _Record.__post_init__(self)
+        if len(self.confidence) != len(self.positions):
+            shapes = f"expected shape {self.positions.shape[:1]}, got shape {self.confidence.shape}"
+            raise ValueError(f"RawBody.confidence: {shapes}")
 
 
 @dataclass(slots=True, eq=False)
 class PoseRaw(_Record):
     """`pose/raw`: what a skeleton source saw at one moment."""
 
-    stamp_ns: int
+    stamp_ns: Stamp
     """capture, nanoseconds, 0 or later"""
-    frame_id: str
+    frame_id: Text
     """the frame of the positions"""
-    source: str
+    source: Text
     """the camera or recording, by name"""
-    skeleton: str
+    skeleton: Text
     """the joints' names and order: `smpl22`, `coco17`, `kinect22`, …"""
     sensor_pose: Pose
     """of `frame_id` in the world; only the orientation means anything unless `calibrated`"""
     calibrated: bool
     """whether `sensor_pose.position`, and so the floor at z = 0, can be trusted"""
-    bodies: list[RawBody]
+    bodies: Annotated[list[RawBody], ListOf(RawBody)]
     end_of_stream: bool = False
     """the source ends here: sent once, without bodies"""
-
-    def __post_init__(self) -> None:
-        self._stamp()
-        self._texts("frame_id", "source", "skeleton")
-        self._list("bodies", RawBody)
 
 
 @dataclass(slots=True, eq=False)
 class CleanBody(_Record):
     """One body after the prior, in the canonical joints `JOINTS`."""
 
-    id: int
+    id: Id
     """the sensor's track id, int32"""
-    positions: Float32
+    positions: Positions
     """(22, 3) metres, header frame"""
-    rotations: Float32
+    rotations: Rotations
     """(22, 4) xyzw, each from the joint's to its parent's frame; the pelvis' to the header frame. At rest, all
     identity, the body stands in a T with +x forward, +y left, +z up"""
-    state: UInt8
+    state: States
     """(22,) `JointState`"""
-    sigma: Float32
+    sigma: PerJoint
     """(22,) metres, standard deviation of a position along an axis"""
-    anomaly: float
+    anomaly: Number
     """how unlike human motion the last half second is: -log10 of the rate at which clean motion scores as high; NaN if
     it was not scored"""
     anomaly_flag: bool
     """the estimate cannot be trusted"""
-    joint_anomaly: Float32
+    joint_anomaly: PerJoint
     """(22,) the same scale, joint by joint: which ones caused it; NaN where not seen"""
-    bone_lengths: Float32
+    bone_lengths: PerJoint
     """(22,) metres, joint to parent; 0 for the pelvis"""
-    raw_positions: Float32
+    raw_positions: Positions
     """(22, 3) metres, header frame: the joints that went in; NaN where missing"""
-    raw_confidence: Float32
+    raw_confidence: PerJoint
     """(22,) 0 to 1"""
-
-    def __post_init__(self) -> None:
-        self._integer("id", -_INT32, _INT32)
-        self._array("positions", np.float32, _J, 3)
-        self._array("rotations", np.float32, _J, 4)
-        self._states("state")
-        self._array("sigma", np.float32, _J)
-        self._number("anomaly")
-        self._array("joint_anomaly", np.float32, _J)
-        self._array("bone_lengths", np.float32, _J)
-        self._array("raw_positions", np.float32, _J, 3)
-        self._array("raw_confidence", np.float32, _J)
 
 
 @dataclass(slots=True, eq=False)
 class PoseClean(_Record):
     """`pose/clean`: the bodies at one moment, refined and complete, in the sensor's frame."""
 
-    stamp_ns: int
+    stamp_ns: Stamp
     """the moment the poses are of, on the clock of capture; nanoseconds"""
-    frame_id: str
+    frame_id: Text
     """the frame of the positions, as it came"""
-    source: str
+    source: Text
     """the camera or recording, by name"""
     sensor_pose: Pose
     """of `frame_id` in the world, as it came"""
     calibrated: bool
     """whether `sensor_pose.position` can be trusted"""
-    delay_frames: int
+    delay_frames: Annotated[int, Integer(0, 2**32)]
     """how many later frames, at 30 Hz, the prior waited for"""
-    bodies: list[CleanBody]
+    bodies: Annotated[list[CleanBody], ListOf(CleanBody)]
     end_of_stream: bool = False
     """the source ends here: sent once, without bodies"""
-
-    def __post_init__(self) -> None:
-        self._stamp()
-        self._texts("frame_id", "source")
-        self._integer("delay_frames", 0, 2**32)
-        self._list("bodies", CleanBody)
 
 
 @dataclass(slots=True, eq=False)
 class WorldBody(_Record):
     """One body in the world, in the canonical joints `JOINTS`."""
 
-    id: int
+    id: Id
     """the sensor's track id, int32"""
-    root_position: Float64
+    root_position: Vector
     """(3,) metres, world: the pelvis"""
-    root_orientation: Float64
+    root_orientation: Quaternion
     """(4,) xyzw, from the body (+x forward, +y left, +z up) to the world"""
-    root_velocity: Float64
+    root_velocity: Vector
     """(3,) m/s, world"""
-    covariance: Float64
+    covariance: Annotated[_Array, Array(np.float64, (6, 6))]
     """(6, 6) of root position and velocity: m², m²/s, m²/s²"""
-    positions: Float32
+    positions: Positions
     """(22, 3) metres, world"""
-    rotations: Float32
+    rotations: Rotations
     """(22, 4) xyzw, each from the joint's to its parent's frame; the pelvis' to the world"""
-    state: UInt8
+    state: States
     """(22,) `JointState`"""
-    sigma: Float32
+    sigma: PerJoint
     """(22,) metres, standard deviation of a position along an axis"""
-    contacts: Float32
+    contacts: Annotated[_Array, Array(np.float32, (_C,))]
     """(8,) probability that each of `CONTACTS` bears load on something: rests on it, or rolls over it"""
-    tracking: Tracking
-
-    def __post_init__(self) -> None:
-        self._integer("id", -_INT32, _INT32)
-        self._array("root_position", np.float64, 3)
-        self._array("root_orientation", np.float64, 4)
-        self._array("root_velocity", np.float64, 3)
-        self._array("covariance", np.float64, 6, 6)
-        self._array("positions", np.float32, _J, 3)
-        self._array("rotations", np.float32, _J, 4)
-        self._states("state")
-        self._array("sigma", np.float32, _J)
-        self._array("contacts", np.float32, _C)
-        self._integer("tracking", Tracking.OK, Tracking.LOST + 1)
-        self.tracking = Tracking(self.tracking)
+    tracking: Annotated[Tracking, Integer(0, len(Tracking), Tracking)]
 
 
 @dataclass(slots=True, eq=False)
 class PoseWorld(_Record):
     """`pose/world`: the bodies at one moment, in the world. `pose/truth` has the same form."""
 
-    stamp_ns: int
+    stamp_ns: Stamp
     """the moment the poses are of, on the clock of capture; nanoseconds"""
-    frame_id: str
+    frame_id: Text
     """the world's name"""
-    source: str
+    source: Text
     """the camera or recording, by name"""
-    ground_plane: Float64
+    ground_plane: Annotated[_Array, Array(np.float64, (4,))]
     """(4,) a, b, c, d with ax + by + cz + d = 0, the unit normal (a, b, c) up, d in metres"""
-    bodies: list[WorldBody]
+    bodies: Annotated[list[WorldBody], ListOf(WorldBody)]
     end_of_stream: bool = False
     """the source ends here: sent once, without bodies"""
-
-    def __post_init__(self) -> None:
-        self._stamp()
-        self._texts("frame_id", "source")
-        self._array("ground_plane", np.float64, 4)
-        self._list("bodies", WorldBody)
 
 
 @dataclass(slots=True, eq=False)
 class Event(_Record):
     """Something that one body does."""
 
-    body: int
+    body: Id
     """`WorldBody.id`, int32"""
-    kind: EventKind
-    phase: Phase
-    hand: Hand
+    kind: Annotated[EventKind, Integer(0, len(EventKind), EventKind)]
+    phase: Annotated[Phase, Integer(0, len(Phase), Phase)]
+    hand: Annotated[Hand, Integer(0, len(Hand), Hand)]
     """of HAND_RAISED, WAVES and POINTS"""
-    confidence: float
+    confidence: Number
     """0 to 1: the probability of its condition, given the standard deviations of the joints it was computed from"""
-    direction: Float64
+    direction: Vector
     """(3,) of POINTS: unit vector, world, from the head through the wrist; zeros otherwise"""
-    since_ns: int
+    since_ns: Stamp
     """capture, nanoseconds: when it began"""
-
-    def __post_init__(self) -> None:
-        self._integer("body", -_INT32, _INT32)
-        self._integer("kind", EventKind.ENTERED, EventKind.FACES_SENSOR + 1)
-        self._integer("phase", Phase.BEGINS, Phase.ENDS + 1)
-        self._integer("hand", Hand.NONE, Hand.RIGHT + 1)
-        self.kind, self.phase, self.hand = EventKind(self.kind), Phase(self.phase), Hand(self.hand)
-        self._number("confidence")
-        self._array("direction", np.float64, 3)
-        self._integer("since_ns", 0, _SECONDS_END * 10**9)
 
 
 @dataclass(slots=True, eq=False)
@@ -428,42 +340,29 @@ class PoseEvents(_Record):
     """`pose/events`: all that begins, holds or ends at one moment. Sent when something begins or ends, and once a
     second."""
 
-    stamp_ns: int
+    stamp_ns: Stamp
     """of the `pose/world` it was computed from, nanoseconds"""
-    frame_id: str
+    frame_id: Text
     """the world's name"""
-    source: str
+    source: Text
     """the camera or recording, by name"""
-    events: list[Event]
+    events: Annotated[list[Event], ListOf(Event)]
     end_of_stream: bool = False
     """the source ends here: sent once, without events"""
-
-    def __post_init__(self) -> None:
-        self._stamp()
-        self._texts("frame_id", "source")
-        self._list("events", Event)
 
 
 @dataclass(slots=True, eq=False)
 class Diagnostics(_Record):
     """`diagnostics`: how one node is doing; on the wire a diagnostic_msgs/DiagnosticArray of one status."""
 
-    stamp_ns: int
+    stamp_ns: Stamp
     """nanoseconds, on the clock of the frames it speaks of"""
-    node: str
-    level: Level
-    message: str
+    node: Text
+    level: Annotated[Level, Integer(0, len(Level), Level)]
+    message: Text
     """one line for a person"""
-    values: dict[str, str] = field(default_factory=dict)
+    values: Annotated[dict[str, str], forms.texts] = field(default_factory=dict)
     """rates, latencies, counts of dropped and refused messages, by name"""
-
-    def __post_init__(self) -> None:
-        self._stamp()
-        self._texts("node", "message")
-        self._integer("level", Level.OK, Level.STALE + 1)
-        self.level = Level(self.level)
-        if not all(isinstance(text, str) for pair in self.values.items() for text in pair):
-            raise self._fail("values", "strings for keys and values", repr(self.values)[:80])
 
 
 Message = PoseRaw | PoseClean | PoseWorld | PoseEvents | Diagnostics

@@ -15,7 +15,7 @@ from steadypose.msgs.types import Message, PoseClean, PoseRaw
 from steadypose.nodes.checks.stream import StreamCheck
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.npz import ArraySource
 from steadypose.nodes.sources.recording import with_end
 from steadypose.nodes.sources.source import RecordedSource

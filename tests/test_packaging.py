@@ -115,7 +115,7 @@ MESSAGES_ALONE = """
 import sys
 blocked = ("numba", "scipy", "torch", "matplotlib", "rich", "tyro", "cv2", "depthai", "safetensors")
 sys.modules.update(dict.fromkeys(blocked))
-import steadypose.msgs.codec, steadypose.msgs.keys, steadypose.msgs.recording, steadypose.msgs.transport
+import steadypose.msgs.codec, steadypose.msgs.security, steadypose.msgs.recording, steadypose.msgs.transport
 from steadypose import PACKAGE
 from steadypose.msgs.recording import RecordingReader
 with RecordingReader(PACKAGE / "sim_data" / "walk_turn") as recording:

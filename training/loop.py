@@ -1,4 +1,6 @@
-"""The training loop of every model: it minimises a loss, resumably, with a progress bar and curves drawn as it goes."""
+"""The training of every model: a recipe gives a network and its loss, which the loop minimises, resumably, with a
+progress bar, curves drawn as it goes, and a card beside the weights.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +8,24 @@ import json
 import math
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import Tensor, nn
-from torch.optim.lr_scheduler import LRScheduler
+from torch.optim import AdamW, Optimizer
+from torch.optim.lr_scheduler import CosineAnnealingLR, LRScheduler
 
+from steadypose.prior.models.weights import LICENCES
+from steadypose.training.data.dataset import MotionSet
 from steadypose.training.distributed import average_gradients, from_first, processes, rank, share, writes
-from steadypose.training.weights import save_weights
+from steadypose.training.weights import save_weights, started
+
+Network = TypeVar("Network", bound=nn.Module)
+Rng = np.random.Generator
 
 Loss = Callable[[int, float, np.random.Generator], tuple[Tensor, dict[str, float]]]
 """The loss of a random batch, and terms to plot; called with the number of samples, the progress of the training in
@@ -52,6 +60,100 @@ class TrainingOptions:
         """Where the weights of ``model`` go, in the folder of its run: ``RUNS/MODEL-SET/MODEL-SET.safetensors``."""
         name = f"{model}-{self.weights}"
         return self.runs / name / f"{name}.safetensors"
+
+    def motion(self, *, flat: bool = False) -> tuple[MotionSet, MotionSet]:
+        """Prepared motion to train and to validate on; ``flat``: as of `MotionSet.load`."""
+        train, val = (MotionSet.load(self.data, self.weights, split, flat=flat) for split in ("train", "val"))
+        return train, val
+
+
+@dataclass(frozen=True)
+class Recipe(Generic[Network]):
+    """What is a model's own in its training.
+
+    Attributes:
+        model: its name.
+        network: makes it, untrained.
+        loss: of a random batch, and terms to plot; called with the network in training mode, the number of samples, the
+            progress of the training in [0, 1), and a random generator, which differs between torchrun's processes.
+        evaluate: quantities to plot beside these, on validation data; called in evaluation mode, without gradients.
+        iterations: optimiser steps, unless the user asks for another number.
+        batch: samples a step, of all processes together.
+        rate: of AdamW at the start.
+        sample: what a sample is, in the plural.
+        decay: of the weights.
+        schedule: of the rate, of the optimiser and the number of steps; a cosine down to a hundredth, if left out.
+        evaluations: number of evaluations and checkpoints.
+        clip: maximum norm of the gradient.
+        parameters: of the network, which are trained; all of them, if left out.
+    """
+
+    model: str
+    network: Callable[[], Network]
+    loss: Callable[[Network, int, float, Rng], tuple[Tensor, dict[str, float]]]
+    evaluate: Callable[[Network], dict[str, float]]
+    iterations: int
+    batch: int
+    rate: float
+    sample: str = "windows"
+    decay: float = 0.0
+    schedule: Callable[[Optimizer, int], LRScheduler] | None = None
+    evaluations: int = 40
+    clip: float = 1.0
+    parameters: Callable[[Network], list[nn.Parameter]] | None = None
+
+    def minimise(self, network: Network, directory: Path, iterations: int, seed: int) -> TrainingRun:
+        """Train ``network`` in place, in the folder of a run; a checkpoint there is resumed."""
+        parameters = network.parameters() if self.parameters is None else self.parameters(network)
+        optimiser = AdamW(parameters, lr=self.rate, weight_decay=self.decay)
+        make = self.schedule or (lambda optimiser, steps: CosineAnnealingLR(optimiser, steps, self.rate / 100))
+        run = TrainingRun(directory, network, make(optimiser, iterations), iterations, self.evaluations)
+
+        def loss(count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+            return self.loss(network, count, done, rng)
+
+        run.minimise(loss, lambda: self.evaluate(network), self.batch, seed, self.clip)
+        return run
+
+    def train(
+        self,
+        options: TrainingOptions,
+        described: str,
+        data: str,
+        *,
+        licence: str | None = None,
+        started_anew: Callable[[Network], None] = lambda network: None,
+        calibrated: Callable[[Network], Any] | None = None,
+    ) -> Path:
+        """Train as the user asks, and write the weights with their card.
+
+        Args:
+            options: of ``steadypose train``.
+            described: the model, for the card.
+            data: what it is trained on, for the card.
+            licence: of the weights, if not their set's.
+            started_anew: fits what gradients do not, such as the scale of features, where the training begins without
+                other weights and without a checkpoint.
+            calibrated: the trained network's configuration; what it was made with, if left out.
+
+        Returns:
+            The path of the weights.
+        """
+        path, iterations = options.path(self.model), options.iterations or self.iterations
+        torch.manual_seed(options.seed)
+        network = self.network()
+        origin = started(network, self.model, options.start)
+        if options.start is None and not (path.parent / "checkpoint.pt").exists():
+            started_anew(network)
+        run = self.minimise(network, path.parent, iterations, options.seed)
+        config: Any = network.config if calibrated is None else calibrated(network)
+        return run.save(path, network, asdict(config), {
+            "Model": described,
+            "Data": data,
+            "Licence": licence or LICENCES[options.weights],
+            "Training": f"`steadypose train {self.model} --weights {options.weights} --iterations {iterations}`: "
+            f"{self.batch} {self.sample} a step, AdamW {self.rate:g}, seed {options.seed}{origin}",
+        })  # fmt: skip
 
 
 class TrainingRun:

@@ -20,8 +20,8 @@ from steadypose.prior.models.hgvae.features import to_tracks
 from steadypose.training.data.corruption import with_sensor_error
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.data.hgvae_windows import Windows, standardise
+from steadypose.training.networks.graph import FaultNet, load_fault_net
 from steadypose.training.networks.hgvae import HGVAE
-from steadypose.training.networks.hgvae_faults import FaultNet, load_fault_net
 from steadypose.training.recipes.hgvae_faults import Scored, score_windows
 
 SENSORS = {"motion capture, 3 mm": 0.003, "camera, 20 mm": 0.02}

@@ -26,7 +26,7 @@ from steadypose.prior.fit.observations import Observed, Pinhole, SeenJoints
 from steadypose.prior.fit.picture import track_of_picture
 from steadypose.prior.fit.solve import PICTURES, FitSettings, Start, fit_window
 from steadypose.prior.fit.windows import Track, load_of
-from steadypose.prior.sim.depth import Stereo, render, spoil
+from steadypose.prior.sim.depth import Stereo, corrupt, render
 from steadypose.prior.timing.rate import FPS
 
 NOISE, HIDDEN_BELOW = 0.04, 0.9
@@ -122,7 +122,7 @@ def pictures(clips: MotionClips, clip: int, rng: np.random.Generator) -> Picture
     wall = np.full((stereo.height, stereo.width), 2.0 * AWAY)
     points = np.full((len(truth), POINTS, 3), np.nan)
     for row, joints in enumerate(optical):
-        depth = spoil(render([(joints, clips.offsets[clip])], stereo, wall), stereo, rng) * 1e-3
+        depth = corrupt(render([(joints, clips.offsets[clip])], stereo, wall), stereo, rng) * 1e-3
         v, u = np.nonzero((depth > 0.5) & (depth < 1.6 * AWAY))
         some = rng.permutation(len(u))[:POINTS]
         z = depth[v[some], u[some]]

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
+
+import torch
 
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.machine import ROOT
@@ -12,7 +15,7 @@ from steadypose.benchmarks.motion import as_set, digest, prepared_set
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
 from steadypose.prior.fit.tensors import load_network
 from steadypose.training.data.dataset import MotionSet
-from steadypose.training.recipes.humor import fit_transitions
+from steadypose.training.recipes.humor import Sequences, recipe_of
 
 STEPS, BATCH, LEARNING_RATE, EVALUATIONS = 250, 64, 1e-3, 5
 """Of a brief training: a forty-eighth of the sequences that what ships has seen."""
@@ -57,9 +60,11 @@ def _trained(config: HumorConfig, train: MotionSet, val: MotionSet, runs: Path, 
     stem = name.replace(" ", "-").replace(",", "").replace(":", "")
     path = runs / stem / f"{stem}.safetensors"
     if not path.is_file():
-        card = {"Training": f"{steps} steps of {BATCH} sequences, for the bench"}
-        fit_transitions(
-            config, train, val, path, card, steps, BATCH, LEARNING_RATE, seed=0, known=shipped(),
-            evaluations=EVALUATIONS,
-        )  # fmt: skip
+        recipe = recipe_of(config, Sequences.of(train), Sequences.of(val))
+        recipe = replace(recipe, batch=BATCH, rate=LEARNING_RATE, evaluations=EVALUATIONS)
+        torch.manual_seed(0)
+        model = HumorNet(config)
+        model.load_state_dict(dict(shipped().named_buffers()), strict=False)  # fitting them anew takes a minute
+        run = recipe.minimise(model, path.parent, steps, seed=0)
+        run.save(path, model, asdict(config), {"Training": f"{steps} steps of {BATCH} sequences, for the bench"})
     return load_network(HumorNet, HumorConfig.from_dict, str(path), "humor")

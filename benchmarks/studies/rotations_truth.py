@@ -16,8 +16,8 @@ from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.mocap.bvh import Bvh
 from steadypose.prior.mocap.clip import Y_UP_TO_Z_UP, forward
 from steadypose.prior.timing.rate import FPS
-from steadypose.training.data.datasets import bvh_motion, members
 from steadypose.training.data.prepare import find_faults, resample
+from steadypose.training.data.readers import bvh_motion, members
 
 FRAMES, SKIPPED = 240, 60
 """Frames of a clip, and how many of them, at its start, are not scored: a filter is not judged by how it begins."""

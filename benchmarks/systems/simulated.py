@@ -28,7 +28,7 @@ from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.msgs.types import CONTACTS, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.threads import one_thread
-from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.recording import RecordingSource
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment

@@ -41,7 +41,7 @@ from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, PoseRaw
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.ledger import LOSSES, Ledger
+from steadypose.nodes.graph.run_state import LOSSES, Ledger
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery
 from steadypose.prior.timing.rate import FPS
 

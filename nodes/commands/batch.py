@@ -30,9 +30,9 @@ from steadypose.nodes.cli import is_for_user
 from steadypose.nodes.commands.cleaning import clean_recording
 from steadypose.nodes.driving import NOBODY
 from steadypose.nodes.graph.extras import require_extra
-from steadypose.nodes.graph.safe_python import command, environment
+from steadypose.nodes.graph.process import own_command, own_environment
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sources.motion import SUFFIXES
+from steadypose.nodes.sources.npz import SUFFIXES
 
 MANIFEST = "manifest.jsonl"
 _LINE = '{"input": '
@@ -279,8 +279,10 @@ class _Worker:
 
     def __init__(self, settings: Settings) -> None:
         self.connection, theirs = Pipe()
-        serve = command("steadypose.nodes.commands.batch:serve", str(theirs.fileno()))
-        self.process = subprocess.Popen(serve, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env=environment())
+        serve = own_command("steadypose.nodes.commands.batch:serve", str(theirs.fileno()))
+        self.process = subprocess.Popen(
+            serve, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env=own_environment()
+        )
         theirs.close()  # so that its end closes with the process
         with suppress(OSError):
             self.connection.send(settings)

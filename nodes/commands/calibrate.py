@@ -37,7 +37,7 @@ from steadypose.prior.camera.calibration import (
 )
 
 if TYPE_CHECKING:
-    from steadypose.nodes.sources.oak_still import Still
+    from steadypose.nodes.sources.oak_device import Still
 
 
 PAPERS_MM = {"a4": (297.0, 210.0), "a3": (420.0, 297.0), "letter": (279.4, 215.9)}
@@ -255,7 +255,7 @@ class CalibrateOak:
 
     def run(self) -> None:
         launch = read_launch(self.launch)
-        from steadypose.nodes.sources.oak_still import capture_with_camera  # brings depthai
+        from steadypose.nodes.sources.oak_device import capture_with_camera  # brings depthai
 
         try:
             still = capture_with_camera(launch.settings(InputSettings).oak)

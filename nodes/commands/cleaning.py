@@ -16,7 +16,7 @@ from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.commands.output import ARRAY_FILES, check_replaceable, put_in_place, unfinished, write_arrays
 from steadypose.nodes.driving import OfflineRun
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.own_layouts import add_layouts

@@ -28,8 +28,8 @@ from steadypose.nodes.commands.output import (
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
+from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sinks.drawing import ALL_BONES, STATE_COLOURS, facing
-from steadypose.nodes.sinks.npz import NpzCollector
 from steadypose.nodes.sources.recording import NO_RIG, open_recording, with_end
 from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.body.own_layouts import add_layouts

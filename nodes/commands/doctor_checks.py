@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from steadypose import PACKAGE
-from steadypose.msgs.addresses import TransportError, make_private
+from steadypose.msgs.security import TransportError, make_private
 from steadypose.nodes.graph.extras import install_command
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ LONGEST_IPC_PATH = 107  # bytes of a unix socket's path that the system takes
 
 def check_messages() -> Iterator[Finding]:
     """The directory of the ipc sockets, and a message there and back."""
-    from steadypose.nodes.graph.access import TransportSettings
+    from steadypose.nodes.graph.settings import TransportSettings
 
     directory = TransportSettings().ipc_directory
     longest = len(os.fsencode(directory / "trajectory"))

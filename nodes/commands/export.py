@@ -62,13 +62,11 @@ def export(
     if out.suffix in (".glb", ".vrma"):
         require_extra("export")
     # scipy, after it is known that there is something to do
-    from steadypose.nodes.sinks.files.bvh import to_bvh
-    from steadypose.nodes.sinks.files.motion import read_motion
-    from steadypose.nodes.sinks.files.tables import to_csv, to_trc
+    from steadypose.nodes.sinks.motion_files import read_motion, to_bvh, to_csv, to_trc
 
     motion = read_motion(source, body)
     if out.suffix in (".glb", ".vrma"):
-        from steadypose.nodes.sinks.files.glb import to_glb, to_vrma
+        from steadypose.nodes.sinks.glb import to_glb, to_vrma
 
         content = to_glb(motion, NAMES[names]) if out.suffix == ".glb" else to_vrma(motion)
     elif out.suffix == ".bvh":
@@ -125,9 +123,8 @@ def retarget(
     from steadypose.nodes.graph.prior_node import make_prior
     from steadypose.nodes.graph.threads import one_thread
     from steadypose.nodes.graph.trajectory_node import make_trajectory
-    from steadypose.nodes.sinks.retarget.follower import Follower
-    from steadypose.nodes.sinks.retarget.retargeter import Retargeter
-    from steadypose.nodes.sinks.retarget.robot import load_robot
+    from steadypose.nodes.sinks.retargeter import Follower, Retargeter
+    from steadypose.nodes.sinks.robot import load_robot
 
     given = {}
     for link in links:

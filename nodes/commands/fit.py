@@ -28,7 +28,7 @@ from steadypose.nodes.commands.output import (
 from steadypose.nodes.driving import clean_joints, stream
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.key_points import has_key_points, read_key_points
 from steadypose.nodes.sources.npz import NpzError, read_arrays
 from steadypose.nodes.sources.recording import open_recording

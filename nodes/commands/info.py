@@ -28,8 +28,7 @@ from steadypose.nodes.commands.inspect import (
 from steadypose.nodes.commands.output import plural, printable
 from steadypose.nodes.driving import Diagnosis
 from steadypose.nodes.graph.clock import POLL_S
-from steadypose.nodes.sources.cleaned import is_output
-from steadypose.nodes.sources.npz import read_arrays
+from steadypose.nodes.sources.npz import is_output, read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.clean.settings import PriorSettings
 

@@ -20,15 +20,15 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from steadypose.msgs.keys import load_keys
 from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.security import load_keys
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import JOINTS, Diagnostics, JointState, Message, PoseClean, PoseEvents, PoseRaw, WorldBody
 from steadypose.nodes.commands.output import plural, printable
-from steadypose.nodes.graph.access import TransportSettings
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import TransportSettings
 from steadypose.nodes.graph.topology import publishers
 from steadypose.prior.settings import nearest
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.loops import COMPILED, compile_missing
 from steadypose.nodes.graph.node import supervisor_id
+from steadypose.nodes.graph.process import startup, stop_on_signals
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.graph.startup import startup, stop_on_signals
 from steadypose.nodes.graph.topology import NODES, load
 from steadypose.prior.settings import nearest
 

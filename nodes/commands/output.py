@@ -16,7 +16,7 @@ from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.recording_writer import recorded_parts
 from steadypose.msgs.types import Message
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.csv_table import write_csv
+from steadypose.nodes.sinks.arrays import write_csv
 from steadypose.nodes.sinks.recorder import LogTimes
 
 ARRAY_FILES = (".npz", ".csv")

@@ -16,8 +16,7 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.types import JOINTS, Diagnostics, Message, PoseClean, PoseEvents, PoseRaw, PoseWorld, Tracking
 from steadypose.nodes.sinks.drawing import to_world
-from steadypose.nodes.sources.cleaned import Arrays, as_messages, is_output
-from steadypose.nodes.sources.npz import ArraySource, read_arrays
+from steadypose.nodes.sources.npz import Arrays, ArraySource, as_messages, is_output, read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 

@@ -18,8 +18,9 @@ from rich.table import Table
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.prior.mocap.clip import Clip, MotionError, documented
 from steadypose.prior.mocap.files import SUFFIXES, describe
-from steadypose.training.data.datasets import DATA_SETS, SPLITS, UNREADABLE, DataSet, Dropped, read_own
+from steadypose.training.data.datasets import DATA_SETS, SPLITS, DataSet
 from steadypose.training.data.prepare import FPS, Prepared, at_speed, prepare_clip, write_prepared
+from steadypose.training.data.readers import UNREADABLE, Dropped, read_own
 
 
 class PrepareError(ValueError):

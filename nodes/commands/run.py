@@ -22,17 +22,14 @@ from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.commands.output import printable
 from steadypose.nodes.commands.run_table import line, table
 from steadypose.nodes.commands.setting_names import check_settings, in_launch_file
-from steadypose.nodes.graph import health_file
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock
-from steadypose.nodes.graph.health_file import write_health
+from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.ledger import LOSSES, Ledger, losses
 from steadypose.nodes.graph.loops import COMPILED, compile_missing
 from steadypose.nodes.graph.node import RUN, WATCHER
-from steadypose.nodes.graph.run_lock import RunLock
-from steadypose.nodes.graph.startup import stop_on_signals
+from steadypose.nodes.graph.process import ALIVE, READY, STOPPING, notify, stop_on_signals
+from steadypose.nodes.graph.run_state import HEALTH_FILE, LOSSES, Ledger, RunLock, losses, write_health
 from steadypose.nodes.graph.supervisor import Supervisor
-from steadypose.nodes.graph.systemd import ALIVE, READY, STOPPING, notify
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, load
 from steadypose.nodes.sinks.recorder import RecorderSettings, free_directory
 from steadypose.nodes.sources.recording import DAMAGE, VIDEOS
@@ -116,6 +113,8 @@ def _toml(path: Path) -> str:
 def _check(launch: Launch) -> None:
     """Find here, before any process starts, what every one of them would stumble over."""
     for name in launch.nodes:
+        if extra := NODES[name].extra:
+            require_extra(extra)
         if preflight := NODES[name].preflight:
             load(preflight)(launch)
 
@@ -181,7 +180,7 @@ class _Run:
             notify(STOPPING)
             supervisor.stop()
             if self._writes_health:
-                (transport.ipc_directory / health_file.NAME).unlink(missing_ok=True)
+                (transport.ipc_directory / HEALTH_FILE).unlink(missing_ok=True)
             while received := subscriber.receive(0):
                 self._receive(received, supervisor)
         for name, diagnostics in self._diagnostics.items():
@@ -266,7 +265,7 @@ class _Run:
         if source is None or source.state != "ended":
             self._progress_ns = self._progress_ns if source else self._clock.monotonic_ns()
             return None
-        if self._drained():
+        if self._drained(supervisor):
             if not {"viewer", "web"} & {*self._launch.nodes} or not self._console.is_terminal:
                 return 0
             if not self._over:
@@ -303,8 +302,8 @@ class _Run:
         unread = {key.removeprefix("refused."): n for key, n in values.items() if key.startswith("refused.")}
         return ", ".join(f"{cause}: {n}" for cause, n in unread.items() if cause.startswith(DAMAGE))
 
-    def _drained(self) -> bool:
-        """Whether the end of the stream has come through every node."""
+    def _drained(self, supervisor: Supervisor) -> bool:
+        """Whether the end of the stream has come through every node, and the recorder is there to complete its file."""
         streams = {NODES[name].stream for name in self._launch.nodes}
         recorded = set(self._launch.settings(RecorderSettings).topics)
         for name in self._launch.nodes:
@@ -314,6 +313,8 @@ class _Run:
             seen = {*declared.topics, declared.stream}
             wanted = streams & (seen if name != "recorder" else seen & recorded) - {None}
             diagnostics = self._diagnostics.get(name)
+            if name == "recorder" and not supervisor.children[name].reports:
+                return False
             if diagnostics is None or not wanted <= set(diagnostics.values.get("ended", "").split()):
                 return False
         return True

@@ -6,9 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any
 
-from steadypose.nodes.graph.access import ServerSettings, TransportSettings
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.graph.settings import LaunchError, ServerSettings, TransportSettings
 from steadypose.nodes.graph.topology import NODES, load
 from steadypose.prior.settings import nearest
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import tyro
 
-from steadypose.msgs.keys import create_keys
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
+from steadypose.msgs.security import create_keys
 from steadypose.nodes.graph.launch import bundled
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.sim.streams import ManifestError, read_manifest, record

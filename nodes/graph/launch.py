@@ -17,8 +17,7 @@ from typing import Any, TypeVar
 
 from steadypose import PACKAGE
 from steadypose.msgs.topics import DIAGNOSTICS
-from steadypose.nodes.graph.access import ServerSettings, TransportSettings
-from steadypose.nodes.graph.settings import LaunchError, load_plugin, resolve_paths
+from steadypose.nodes.graph.settings import LaunchError, ServerSettings, TransportSettings, load_plugin, resolve_paths
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, NodeDeclaration, add_node, load
 from steadypose.prior.body.own_layouts import add_layouts
 from steadypose.prior.settings import build_settings, nearest

@@ -18,7 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 
-from steadypose.nodes.graph.safe_python import command, environment
+from steadypose.nodes.graph.process import own_command, own_environment
 from steadypose.prior import loop_cache
 
 COMPILED = {"prior", "trajectory"}
@@ -123,12 +123,12 @@ def _compile(folder: Path, say: Callable[[str], None]) -> None:
     with tempfile.TemporaryFile("w+") as errors:
         processes = [
             subprocess.Popen(
-                command("steadypose.nodes.graph.loops:compile_part", part, str(writing)),
+                own_command("steadypose.nodes.graph.loops:compile_part", part, str(writing)),
                 pass_fds=[writing],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
-                env=environment(),
+                env=own_environment(),
             )
             for part in ("beginning", "end")
         ]

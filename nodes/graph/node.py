@@ -26,19 +26,19 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import ClassVar
 
-from steadypose.msgs.delivery import DEAF_S
-from steadypose.msgs.principals import Principals
+from steadypose.msgs.delivery import DEAF_S, Principals
 from steadypose.msgs.subscriber import SECOND
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.checks.problem import Problem, error
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock, Timeline
+from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.health import STALL_NS, Health
 from steadypose.nodes.graph.inbox import Inbox
 from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.process import ALIVE, READY, notify
 from steadypose.nodes.graph.relay import CONTEXT, Relay
-from steadypose.nodes.graph.systemd import ALIVE, READY, notify
 from steadypose.nodes.graph.topology import NODES, Delivery
 
 logger = logging.getLogger(__name__)
@@ -70,6 +70,8 @@ class Node(ABC):
     """by which `topology.NODES` declares it"""
 
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
+        if extra := NODES[self.name].extra:
+            require_extra(extra)
         self.launch = launch
         self.clock: Clock = clock or SystemClock()
         self._timeline: Timeline | None = None
@@ -80,7 +82,8 @@ class Node(ABC):
         self._blocked_ns = 0
         self._disconnected: Counter[str] = Counter()
         self._deaf: frozenset[str] = frozenset()
-        self._inbox: Inbox | None = None
+        self.inbox = Inbox([], None)
+        self._subscribers: list[Subscriber] = []
         self._refused_before: Counter[str] = Counter()
         self._supervisor = supervisor_id()
         self._run = os.environ.get(RUN, "")
@@ -133,21 +136,7 @@ class Node(ABC):
     @property
     def behind(self) -> bool:
         """Whether frames wait that will be dropped if this node does not catch up."""
-        return self.queue_limit is not None and self._inbox is not None and len(self._inbox) > 0
-
-    def gap_is_ours(self, message: Message) -> bool:
-        """Whether frames of a message's stream, just before it, were dropped here."""
-        return self._inbox is not None and self._inbox.dropped_of(message)
-
-    @property
-    def dropped_sources(self) -> frozenset[str]:
-        """Sources that go on, though their last messages were dropped here."""
-        return self._inbox.sources if self._inbox is not None else frozenset()
-
-    @property
-    def dropped_late(self) -> int:
-        """Frames dropped here so far because they were late."""
-        return self._inbox.overrun if self._inbox is not None else 0
+        return self.queue_limit is not None and len(self.inbox) > 0
 
     def stop(self) -> None:
         """Ask the node to end; `run` returns within `POLL_S` and what the message at hand takes."""
@@ -163,7 +152,7 @@ class Node(ABC):
 
         Raises:
             TransportError: an address cannot be bound.
-            LaunchError: keys are requested_at for and cannot be used.
+            LaunchError: the keys that are asked for cannot be used.
         """
         transport = self.launch.transport
         keys = transport.curve_keys()
@@ -204,7 +193,7 @@ class Node(ABC):
                     )
                     for addresses in self._addresses()
                 ]
-                self._inbox = Inbox(self._subscribers, self.queue_limit)
+                self.inbox = Inbox(self._subscribers, self.queue_limit)
             self.health.state = "running"
             self.report()
             notify(READY)
@@ -231,12 +220,11 @@ class Node(ABC):
 
     def take_next(self, timeout_s: float) -> bool:
         """Work on the next message; False if none came in ``timeout_s``."""
-        assert self._inbox is not None, "a node that subscribes to none has no messages to take"
-        received = self._inbox.next(timeout_s)
+        received = self.inbox.next(timeout_s)
         if received is None:
             self.settle()
             return False
-        self.health.note_queue(len(self._inbox))
+        self.health.note_queue(len(self.inbox))
         topic, message = received
         if isinstance(message, Diagnostics):
             # of several kiosks each has its own
@@ -286,21 +274,21 @@ class Node(ABC):
         Returns:
             False if the node was stopped while it waited.
         """
-        if self._relay and self._inbox is not None and self._relay.knows(topic, message):
+        if self._relay and self._subscribers and self._relay.knows(topic, message):
             return True
-        requested_at = self.clock.monotonic_ns()
+        asked_ns = self.clock.monotonic_ns()
         self._await_subscribers()
         while not self._publisher.publish(topic, message, timeout_s=POLL_S):
             if self._stopping:
                 self.health.counts[f"dropped.stopped {topic}"] += 1
                 return False
-            if self.health.state == "running" and self.clock.monotonic_ns() - requested_at > STALL_NS:
+            if self.health.state == "running" and self.clock.monotonic_ns() - asked_ns > STALL_NS:
                 self.health.state = f"{WAITING} {', '.join(sorted(self._publisher.waited_for(topic)))} to go on"
             self.report_if_due()
         if self.health.state.startswith(WAITING):
             self.health.state = "running"
         now = self.clock.monotonic_ns()
-        self._blocked_ns += now - requested_at
+        self._blocked_ns += now - asked_ns
         of_frame = not isinstance(message, Diagnostics) and not message.end_of_stream
         latency_ns = None
         if of_frame and self.timeline:  # the delay is of the stream's time, which may run faster
@@ -331,7 +319,7 @@ class Node(ABC):
             self._stopping = True
         notify(ALIVE)
         self._publisher.check()
-        if self._relay and self._inbox is not None:
+        if self._relay and self._subscribers:
             self._subscribers[0].take(0)  # who waits in `publish` is not deaf
         self._disconnected, self._deaf = self._publisher.refused, self._publisher.silent(DEAF_S)
         unread = self._publisher.silent(STALL_NS / 1e9)
@@ -342,12 +330,11 @@ class Node(ABC):
     def diagnostics(self) -> Diagnostics:
         """How this node is doing."""
         received = Counter({f"refused.{cause}": n for cause, n in self._disconnected.items()})
-        if self._inbox is not None:
-            received["dropped.late"] = self._inbox.overrun
-            for subscriber in self._subscribers:
-                received.update({f"dropped.lost {topic}": n for topic, n in subscriber.dropped.items()})
-                received.update({f"dropped.expired {topic}": n for topic, n in subscriber.late.items()})
-                received.update({f"refused.{cause}": n for cause, n in subscriber.refused.items()})
+        received["dropped.late"] = self.inbox.overrun
+        for subscriber in self._subscribers:
+            received.update({f"dropped.lost {topic}": n for topic, n in subscriber.dropped.items()})
+            received.update({f"dropped.expired {topic}": n for topic, n in subscriber.late.items()})
+            received.update({f"refused.{cause}": n for cause, n in subscriber.refused.items()})
         problems = [*self._wire_problems(), *self._deaf_problems(), *self.problems(), *self.health.stall(self.name)]
         run = {RUN: self._run} if self._run else {}
         return self.health.report(self.name, received, self.status() | run, problems)
@@ -362,8 +349,6 @@ class Node(ABC):
 
     def _wire_problems(self) -> Iterator[Problem]:
         """Problems with received bytes that are no messages, since the last call."""
-        if self._inbox is None:
-            return
         refused = sum((subscriber.refused for subscriber in self._subscribers), Counter[str]())
         new, self._refused_before = refused - self._refused_before, refused
         if second := new.pop(SECOND, 0):

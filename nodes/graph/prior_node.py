@@ -11,8 +11,8 @@ from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.checks.stream import Answers, StreamChecks
 from steadypose.nodes.graph.clock import FRAME_NS, Clock
+from steadypose.nodes.graph.inbox import BodyLimit
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.load import BodyLimit
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
@@ -76,14 +76,14 @@ class PriorNode(Node):
             return
         self._checks.see(message, self.clock.now_ns())
         self._answers.asked(message)
-        started_ns, gap = self.clock.monotonic_ns(), self.gap_is_ours(message)
+        started_ns, gap = self.clock.monotonic_ns(), self.inbox.dropped_of(message)
         if isinstance(self._pipeline, StreamBatch):
             cleaned = self._pipeline.process_at(message, started_ns, hurry=self.behind, gap=gap)
         else:
             cleaned = self._pipeline.process(message, hurry=self.behind, gap=gap)
         if self.queue_limit is not None:
             spent_ns = self.clock.monotonic_ns() - started_ns
-            self._limit.note(self._pipeline.bodies, spent_ns, self.dropped_late)
+            self._limit.note(self._pipeline.bodies, spent_ns, self.inbox.overrun)
             self._pipeline.most_bodies = self._limit.bodies
         for clean in cleaned:
             self._bodies = len(clean.bodies)
@@ -93,7 +93,7 @@ class PriorNode(Node):
 
     def problems(self) -> list[Problem]:
         now_ns = self.clock.now_ns()
-        for source in self.dropped_sources:
+        for source in self.inbox.sources:
             self._checks.heard(source, now_ns)
             if isinstance(self._pipeline, StreamBatch):
                 self._pipeline.heard(source, self.clock.monotonic_ns())

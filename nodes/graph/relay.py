@@ -4,17 +4,36 @@ An input has been answered once all that was published until it was worked on is
 then is it taken here. So whatever dies on the way, each message is still kept by somebody before it. A node that begins
 anew is given `CONTEXT` answered inputs as well, lest bodies begin anew with it; what it makes of them, its subscribers
 have, and it is not published again.
+
+How far a node has come stands in a few bytes in the directory of the sockets, written with each message that all
+reliable subscribers have taken. They hold for nodes of the same supervisor only; a new run begins at the beginning.
 """
 
 from __future__ import annotations
 
+import os
+import struct
 from collections import deque
 from pathlib import Path
+from typing import NamedTuple
 
 from steadypose.msgs.publisher import Publisher, Resume
 from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.graph.clock import FRAME_NS
-from steadypose.nodes.graph.progress import Progress, ProgressFile
+
+_FORM = struct.Struct("<qqqqqq")
+
+
+class Progress(NamedTuple):
+    """What was published and taken."""
+
+    publisher: int = 0
+    """the publisher's number"""
+    sequence: tuple[int, int] = (0, 0)
+    """of the next message of the node's first topic, and of its second"""
+    mark: tuple[int, int] = (0, 0)
+    """what the node itself notes of the last message: `Node.mark`"""
+
 
 CONTEXT = 128
 """messages: the four seconds of a stream of 30 Hz that the longest window, and twice the longest delay, are within"""
@@ -34,9 +53,10 @@ class Relay:
     """
 
     def __init__(self, file: Path, topics: tuple[str, ...], supervisor: int, lag: int = 0) -> None:
-        self._file = ProgressFile(file, supervisor)
+        self._path, self._supervisor = file, supervisor
+        self._file: int | None = None
         self._topics = topics
-        self.begun = self._file.read() if topics else None
+        self.begun = self._read() if topics and supervisor else None
         self._answered = self.begun if self.begun and any(self.begun.sequence) else None
         self.context = CONTEXT if topics and supervisor else 0
         """answered inputs to be given again to one that begins anew"""
@@ -57,7 +77,7 @@ class Relay:
         """Note who publishes: what is not taken of it is to be told from what another one publishes."""
         if self._topics:
             self._recent.append(self.begun or Progress(publisher.id))
-            self._file.write(self._recent[0])
+            self._keep(self._recent[0])
 
     def knows(self, topic: str, message: Message) -> bool:
         """Whether the subscribers have this from the node before this one."""
@@ -95,7 +115,7 @@ class Relay:
             following = [untaken.get(topic, publisher.sequence(topic)) for topic in self._topics]
             first, second = (*following, 0)[:2]
             self._recent.append(Progress(publisher.id, (first, second), newest))
-            self._file.write(self._recent[0])
+            self._keep(self._recent[0])
         answered = 0
         while self._inputs and self._inputs[0] <= self._taken:
             self._inputs.popleft()
@@ -107,6 +127,28 @@ class Relay:
         """Whether all that was published is taken."""
         return not self._untaken
 
-    def close(self, *, finished: bool) -> None:
-        """Stop keeping the progress; one that is finished has none any more."""
-        self._file.close(finished=finished)
+    def forget(self) -> None:
+        """Keep no progress any more: the stream is finished."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+        if self._supervisor:
+            self._path.unlink(missing_ok=True)
+
+    def _read(self) -> Progress | None:
+        """Where the node before this one was; None if there was none, or it was another supervisor's."""
+        try:
+            supervisor, publisher, *numbers = _FORM.unpack(self._path.read_bytes())
+        except (OSError, struct.error):
+            return None
+        if supervisor != self._supervisor:
+            return None
+        return Progress(publisher, (numbers[0], numbers[1]), (numbers[2], numbers[3]))
+
+    def _keep(self, progress: Progress) -> None:
+        if not self._supervisor:
+            return
+        if self._file is None:
+            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        form = _FORM.pack(self._supervisor, progress.publisher, *progress.sequence, *progress.mark)
+        os.pwrite(self._file, form, 0)

@@ -8,9 +8,9 @@ import subprocess
 import threading
 from collections.abc import Callable, Sequence
 
-from steadypose.nodes.graph import safe_python
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.node import RUN, SUPERVISOR
+from steadypose.nodes.graph.process import own_command, own_environment
 from steadypose.nodes.graph.topology import NODES
 
 BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
@@ -29,7 +29,7 @@ STOP_S = 5.0
 """between SIGTERM and SIGKILL"""
 USAGE_ERROR = 2
 """exit status of a node that cannot do what its launch file says: if it never could, it never will"""
-COMMAND = (*safe_python.command("steadypose.nodes.cli:main"), "node")
+COMMAND = (*own_command("steadypose.nodes.cli:main"), "node")
 
 
 class Child:
@@ -65,6 +65,11 @@ class Child:
         if self.state not in ("running", "stale") or self._heard_ns is None:
             return 0.0
         return (self._clock.monotonic_ns() - self._heard_ns) / 1e9
+
+    @property
+    def reports(self) -> bool:
+        """Whether it runs, and was heard since it was started."""
+        return self.state == "running" and self._heard_ns is not None
 
     def heard(self) -> None:
         """Note a report of the node."""
@@ -154,7 +159,7 @@ class Child:
 
 def _environment(run: str) -> dict[str, str]:
     """Of a node: that of this process, which is its supervisor, less what systemd says to this process alone."""
-    kept = safe_python.environment()
+    kept = own_environment()
     for said in ("NOTIFY_SOCKET", "WATCHDOG_USEC"):
         kept.pop(said, None)
     return kept | {SUPERVISOR: str(os.getpid()), RUN: run}

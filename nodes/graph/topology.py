@@ -45,6 +45,8 @@ class NodeDeclaration:
     delivery: Delivery = Delivery.AS_LAUNCHED
     optional: bool = False
     """poses go on without it: a run whose optional node cannot run does"""
+    extra: str = ""
+    """of `extras.EXTRAS`, that it needs; empty: none"""
     preflight: str = ""
     """a function of the `Launch`, as ``module:name``, that raises what would keep the node from starting; or empty"""
 
@@ -59,10 +61,17 @@ class NodeDeclaration:
         return frozenset(topic for topics in self.subscribes.values() for topic in topics)
 
 
+_POSES = {"trajectory": (POSE_WORLD, DIAGNOSTICS), "pose_input": (DIAGNOSTICS,)}
 _ALL_STREAMS = {
     "pose_input": (POSE_RAW, POSE_TRUTH, DIAGNOSTICS),
     "prior": (POSE_CLEAN, DIAGNOSTICS),
     "trajectory": (POSE_WORLD, DIAGNOSTICS),
+}
+_IN_ROS = {
+    "events": (POSE_EVENTS, DIAGNOSTICS),
+    "trajectory": (POSE_WORLD, DIAGNOSTICS),
+    "prior": (POSE_CLEAN, DIAGNOSTICS),
+    "pose_input": (POSE_RAW, DIAGNOSTICS),
 }
 
 _NODES: dict[str, NodeDeclaration] = {
@@ -95,66 +104,52 @@ _NODES: dict[str, NodeDeclaration] = {
     ),
     "ros2_bridge": NodeDeclaration(
         node="steadypose.nodes.sinks.ros2.bridge:Ros2BridgeNode",
-        subscribes={
-            "events": (POSE_EVENTS, DIAGNOSTICS),
-            "trajectory": (POSE_WORLD, DIAGNOSTICS),
-            "prior": (POSE_CLEAN, DIAGNOSTICS),
-            "pose_input": (POSE_RAW, DIAGNOSTICS),
-        },
+        subscribes=_IN_ROS,
         section="ros2",
-        settings="steadypose.nodes.sinks.ros2.settings:Ros2BridgeSettings",
+        settings="steadypose.nodes.sinks.ros2.bridge:Ros2BridgeSettings",
         preflight="steadypose.nodes.sinks.ros2.bridge:check_ros2",
     ),
     "foxglove": NodeDeclaration(
-        node="steadypose.nodes.sinks.ros2.foxglove:FoxgloveNode",
-        subscribes={
-            "events": (POSE_EVENTS, DIAGNOSTICS),
-            "trajectory": (POSE_WORLD, DIAGNOSTICS),
-            "prior": (POSE_CLEAN, DIAGNOSTICS),
-            "pose_input": (POSE_RAW, DIAGNOSTICS),
-        },
+        node="steadypose.nodes.sinks.ros2.bridge:FoxgloveNode",
+        subscribes=_IN_ROS,
         section="foxglove",
-        settings="steadypose.nodes.sinks.ros2.foxglove:FoxgloveSettings",
+        settings="steadypose.nodes.sinks.ros2.bridge:FoxgloveSettings",
         delivery=Delivery.BEST_EFFORT,
-        preflight="steadypose.nodes.sinks.ros2.foxglove:check_foxglove",
+        extra="foxglove",
     ),
     "web": NodeDeclaration(
         node="steadypose.nodes.sinks.web.node:WebNode",
-        subscribes={
-            "events": (POSE_EVENTS, DIAGNOSTICS),
-            "trajectory": (POSE_WORLD, DIAGNOSTICS),
-            "prior": (DIAGNOSTICS,),
-            "pose_input": (DIAGNOSTICS,),
-        },
+        subscribes={"events": (POSE_EVENTS, DIAGNOSTICS), "prior": (DIAGNOSTICS,), **_POSES},
         section="web",
-        settings="steadypose.nodes.sinks.web.settings:WebSettings",
+        settings="steadypose.nodes.sinks.web.node:WebSettings",
         delivery=Delivery.BEST_EFFORT,
-        preflight="steadypose.nodes.sinks.web.settings:check_web",
+        extra="web",
     ),
     "retarget": NodeDeclaration(
-        node="steadypose.nodes.sinks.retarget.node:RetargetNode",
-        subscribes={"trajectory": (POSE_WORLD, DIAGNOSTICS), "pose_input": (DIAGNOSTICS,)},
+        node="steadypose.nodes.sinks.retarget:RetargetNode",
+        subscribes=_POSES,
         section="retarget",
-        settings="steadypose.nodes.sinks.retarget.settings:RetargetSettings",
+        settings="steadypose.nodes.sinks.retarget:RetargetSettings",
         delivery=Delivery.BEST_EFFORT,
-        preflight="steadypose.nodes.sinks.retarget.settings:check_retarget",
+        extra="retarget",
+        preflight="steadypose.nodes.sinks.retarget:check_retarget",
     ),
     "vmc": NodeDeclaration(
-        node="steadypose.nodes.sinks.vmc:VmcNode",
-        subscribes={"trajectory": (POSE_WORLD, DIAGNOSTICS), "pose_input": (DIAGNOSTICS,)},
+        node="steadypose.nodes.sinks.datagrams:VmcNode",
+        subscribes=_POSES,
         section="vmc",
-        settings="steadypose.nodes.sinks.vmc:VmcSettings",
+        settings="steadypose.nodes.sinks.datagrams:VmcSettings",
         delivery=Delivery.BEST_EFFORT,
-        preflight="steadypose.nodes.sinks.vmc:check_vmc",
+        extra="vmc",
     ),
     "viewer": NodeDeclaration(
         node="steadypose.nodes.sinks.viewer.node:ViewerNode",
         subscribes=_ALL_STREAMS,
         section="viewer",
-        settings="steadypose.nodes.sinks.viewer.settings:ViewerSettings",
+        settings="steadypose.nodes.sinks.viewer.node:ViewerSettings",
         delivery=Delivery.BEST_EFFORT,
         optional=True,
-        preflight="steadypose.nodes.sinks.viewer.settings:check_viewer",
+        extra="view",
     ),
     "recorder": NodeDeclaration(
         node="steadypose.nodes.sinks.recorder:RecorderNode",

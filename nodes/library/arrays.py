@@ -19,8 +19,7 @@ from steadypose.nodes.driving import NOBODY, OfflineRun
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.library.poses import Poses
-from steadypose.nodes.sources.cleaned import as_input
-from steadypose.nodes.sources.npz import ArraySource, NpzError
+from steadypose.nodes.sources.npz import ArraySource, NpzError, as_input
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.body.layouts import CANONICAL

@@ -160,12 +160,15 @@ class RecorderNode(Node):
     def take_next(self, timeout_s: float) -> bool:
         took = super().take_next(timeout_s)
         if not took:
-            try:
-                self._writer.flush()
-            except OSError as error:
-                self._no_room(error.strerror or str(error))
+            self._flush()
             self.settle()
         return took
+
+    def _flush(self) -> None:
+        try:
+            self._writer.flush()
+        except OSError as error:
+            self._no_room(error.strerror or str(error))
 
     def settle(self, timeout_s: float = 0.0) -> bool:
         """As of every node; but only what would outlast this process counts as taken."""
@@ -185,6 +188,8 @@ class RecorderNode(Node):
             self._write(DIAGNOSTICS, diagnostics, message.stamp_ns)
         # a node that has not seen a pose yet reports at no time
         self._write(topic, message, message.stamp_ns or self._pose_ns or 0)
+        if not isinstance(message, Diagnostics) and message.end_of_stream:
+            self._flush()  # who is told that the stream has ended may stop this process
 
     def _write(self, topic: str, message: Message, stamp_ns: int) -> None:
         self._look_at_disk()

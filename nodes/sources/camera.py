@@ -1,18 +1,32 @@
-"""Cameras as sources, opened again when they are unplugged."""
+"""Cameras as sources, opened again when they are unplugged: OAK cameras, and any of the system's with MediaPipe.
+
+What runs with depthai is in `nodes.sources.oak_device`, what runs with OpenCV and MediaPipe in
+`nodes.sources.webcam_device`; both are imported where a camera is opened.
+"""
 
 from __future__ import annotations
 
 import logging
-from abc import abstractmethod
 from collections import Counter
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager
-from typing import Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.checks.problem import Problem, warning
-from steadypose.nodes.graph.clock import POLL_S
-from steadypose.nodes.sources.source import LiveSource, SourceContext
+from steadypose.nodes.graph.clock import POLL_S, Clock
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sources.source import (
+    MODEL,
+    LiveSource,
+    OakSettings,
+    SourceContext,
+    WebcamSettings,
+)
+
+if TYPE_CHECKING:
+    from steadypose.nodes.sources.webcam_device import VideoSource
 
 logger = logging.getLogger(__name__)
 
@@ -54,30 +68,27 @@ def count_failure(counts: Counter[str], camera: str, error: Exception) -> None:
 
 
 class CameraSource(LiveSource):
-    """The skeletons of a camera. While it is disconnected, it is tried again at growing intervals, indefinitely."""
+    """The skeletons of a camera. While it is disconnected, it is tried again at growing intervals, indefinitely.
 
-    def __init__(self, context: SourceContext) -> None:
+    Args:
+        clock: of the node.
+        connect: opens the camera; raises RuntimeError if it cannot be opened now.
+    """
+
+    def __init__(self, clock: Clock, connect: Callable[[], AbstractContextManager[Connection]]) -> None:
         super().__init__()
-        self._clock = context.clock
+        self._clock, self._connect = clock, connect
         self._state = "looking for a camera"
         self._connection: Connection | None = None
         self._connections = 0
         self._tried = False
         self._dropped: Counter[str] = Counter()  # by connections that are closed
 
-    @abstractmethod
-    def connect(self) -> AbstractContextManager[Connection]:
-        """Open the camera.
-
-        Raises:
-            RuntimeError: it cannot be opened now.
-        """
-
     def frames(self) -> Generator[PoseRaw | None, None, None]:
         tries = 0
         while True:
             try:
-                with self.connect() as self._connection:
+                with self._connect() as self._connection:
                     self._connections += 1
                     self._state = "waiting for the first frame"
                     for frame in self._connection.frames():
@@ -117,3 +128,52 @@ class CameraSource(LiveSource):
             values |= {"camera.name": self._connection.name} | self._connection.status()
             dropped.update(self._connection.counts)
         return values | {f"dropped.camera {cause}": str(n) for cause, n in dropped.items()}
+
+
+def open_oak(settings: OakSettings, context: SourceContext) -> CameraSource:
+    """The skeletons of an OAK camera.
+
+    Raises:
+        LaunchError: a setting cannot be used.
+    """
+    if settings.archive and not (settings.archive.endswith(".tar.xz") and Path(settings.archive).is_file()):
+        raise LaunchError(
+            f"[input.oak] archive: expected a file that is an NN archive (.tar.xz), got {settings.archive}; "
+            "Luxonis' hub has some, their modelconverter makes others"
+        )
+
+    def connect_oak() -> AbstractContextManager[Connection]:
+        from steadypose.nodes.sources.oak_device import connect  # brings depthai
+
+        return connect(settings, context.clock)  # pyright: ignore[reportArgumentType]  (one class, found under two names)
+
+    return CameraSource(context.clock, connect_oak)
+
+
+def open_webcam(settings: WebcamSettings, context: SourceContext) -> CameraSource | VideoSource:
+    """The camera, or the film in its place.
+
+    Raises:
+        LaunchError: the model is missing, or a setting cannot be used.
+    """
+    if settings.model and not Path(settings.model).is_file():
+        raise LaunchError(
+            f"[input.webcam] model: expected a pose landmarker for MediaPipe, a .task file, got {settings.model!r}; "
+            f"download one, such as {MODEL}, or leave it out: MediaPipe's own finds one body"
+        )
+    if settings.bodies > 1 and not settings.model:
+        raise LaunchError(
+            f"[input.webcam] bodies: MediaPipe's own model finds one, got {settings.bodies}; for more, give a model, "
+            f"such as {MODEL}"
+        )
+
+    def connect_webcam() -> AbstractContextManager[Connection]:
+        from steadypose.nodes.sources.webcam_device import connect  # brings OpenCV
+
+        return connect(settings, context.calibration, context.clock)  # pyright: ignore[reportArgumentType]
+
+    if not settings.video:
+        return CameraSource(context.clock, connect_webcam)
+    from steadypose.nodes.sources.webcam_device import VideoSource
+
+    return VideoSource(settings, context.calibration)  # pyright: ignore[reportArgumentType]

@@ -1,4 +1,4 @@
-"""Poses as ``.npz``: the plain arrays that a researcher has and wants, in place of a recording.
+"""Poses as plain arrays: ``.npz``, those that ``steadypose clean`` has written, and files of motion.
 
 In: ``positions`` (T, J, 3) metres, NaN where missing; ``skeleton``, a name; ``stamp_ns`` (T,) or ``fps``; and where
 known ``confidence`` (T, J) in 0..1 and ``up``, the axis that points up (``z``, ``y`` or ``-y``). Of several bodies,
@@ -17,12 +17,88 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.topics import POSE_RAW
-from steadypose.msgs.types import Message, Pose, PoseRaw, RawBody
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.types import (
+    CleanBody,
+    JointState,
+    Message,
+    Pose,
+    PoseClean,
+    PoseRaw,
+    PoseWorld,
+    RawBody,
+    Tracking,
+    WorldBody,
+)
 from steadypose.nodes.checks.layout import axes_hint, count_hint, frames_hint, skeleton_hint, stamps_hint
-from steadypose.nodes.sources.cleaned import CLEANED, as_input
-from steadypose.prior.body.layouts import SKELETONS
+from steadypose.prior.body.layouts import CANONICAL, SKELETONS
+from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.npz import check_arrays
+
+CLEANED = ("world_positions", "state")
+"""arrays of an output that an input lacks"""
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def is_output(arrays: Arrays) -> bool:
+    """Whether these are the arrays of an output: they name no skeleton, and have joints in the world."""
+    return "skeleton" not in arrays and all(name in arrays for name in CLEANED)
+
+
+def as_input(arrays: Arrays) -> Arrays:
+    """An output as the arrays of an input: its observed joints in the world, z up, those imputed NaN; others as are."""
+    if not is_output(arrays):
+        return arrays
+    observed = np.isin(arrays["state"], (JointState.SEEN, JointState.REFINED))
+    positions = np.where(observed[..., None], arrays["world_positions"], np.nan)
+    kept = {name: arrays[name] for name in ("stamp_ns", "body_id") if name in arrays}
+    return kept | {"positions": positions, "skeleton": np.array(CANONICAL.name), "up": np.array("z")}
+
+
+def as_messages(arrays: Arrays) -> Iterator[tuple[str, Message]]:
+    """An output as ``pose/clean`` and ``pose/world``, both in the world, without what went in."""
+    several = "body_id" in arrays
+    ids = arrays["body_id"].tolist() if several else [0]
+    names = [name for name in arrays if name not in ("stamp_ns", "joint_names", "body_id", "bone_lengths")]
+    rows = {name: arrays[name] if several else arrays[name][:, None] for name in names if arrays[name].ndim}
+    parents = np.maximum(PARENTS, 0)
+    for frame, stamp_ns in enumerate(arrays["stamp_ns"].tolist()):
+        clean, world = [], []
+        for number, body in enumerate(ids):
+            row = {name: rows[name][frame, number] for name in rows if len(rows[name]) > frame}
+            joints = row["world_positions"]
+            if np.isnan(joints).all():
+                continue
+            shared = {"id": body, "positions": joints, "state": row["state"], "sigma": row["sigma"]}
+            clean.append(
+                CleanBody(
+                    **shared,
+                    rotations=row["rotations"],
+                    anomaly=float(row["anomaly"]),
+                    anomaly_flag=bool(row["anomaly_flag"]),
+                    joint_anomaly=row["joint_anomaly"],
+                    bone_lengths=np.linalg.norm(joints - joints[parents], axis=-1),
+                    raw_positions=np.full_like(joints, np.nan),
+                    raw_confidence=np.zeros(len(joints)),
+                )
+            )
+            world.append(
+                WorldBody(
+                    **shared,
+                    root_position=joints[0],
+                    root_orientation=row["rotations"][0],
+                    root_velocity=row["root_velocity"],
+                    covariance=np.zeros((6, 6)),
+                    rotations=row["rotations"],
+                    contacts=row["contacts"],
+                    tracking=Tracking.OK,
+                )
+            )
+        pose = Pose.identity()
+        yield POSE_CLEAN, PoseClean(stamp_ns, "world", "arrays", pose, True, 0, clean)
+        yield POSE_WORLD, PoseWorld(stamp_ns, "world", "arrays", np.array([0.0, 0.0, 1.0, 0.0]), world)
+
 
 STAMPS_END_NS = 2**31 * 10**9
 """ROS 2 counts seconds in 31 bits"""
@@ -190,3 +266,35 @@ def read_stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> 
             raise NpzError(f"{path}: fps: {frames} frames at {fps.item():g} a second last longer than stamps can hold")
         return np.round(np.arange(frames) * (1e9 / float(fps.item()))).astype(np.int64)
     raise NpzError(f"{path}: expected stamp_ns (T,), nanoseconds of capture, or fps; got neither{frames_hint(arrays)}")
+
+
+SUFFIXES = (".bvh", ".trc", ".c3d", ".npy")
+"""Of files that hold nothing else; an .npz may."""
+
+
+class MotionSource(ArraySource):
+    """The one body of a file of motion, its joints canonical, z up.
+
+    Args:
+        path: of the file.
+        rig: what it does not say (`prior.mocap.files.Description`), as TOML has it.
+
+    Raises:
+        MotionError: it cannot be read, or no body is recognised in it.
+    """
+
+    def __init__(self, path: Path, rig: Mapping[str, Any]) -> None:
+        from steadypose.prior.mocap.files import describe, read_motion  # scipy, which nodes that play none do without
+
+        fps, positions = read_motion(path.name, path.read_bytes(), describe(rig))
+        super().__init__(path, {"positions": positions, "skeleton": np.array(CANONICAL.name), "fps": np.array(fps)})
+
+
+def holds_motion(path: Path) -> bool:
+    """Whether a file is one of motion; an .npz is if it holds poses, as AMASS' do, and no positions."""
+    if path.suffix.lower() in SUFFIXES:
+        return True
+    if path.suffix != ".npz" or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return {"poses.npy", "trans.npy"} <= set(archive.namelist())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.graph.clock import POLL_S, Clock, Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.sources.recording import with_end
+from steadypose.nodes.sources.recording import end_of
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import LiveSource, RecordedSource
 
@@ -30,6 +30,12 @@ class Position(NamedTuple):
     """by how much stamps are later than in the recording, because it was played before"""
     messages: int = 0
     """of this time through, that were published"""
+
+
+class _Played(NamedTuple):
+    at: Position
+    topic: str
+    message: Message
 
 
 class PoseInputNode(Node):
@@ -86,11 +92,14 @@ class PoseInputNode(Node):
 
     def _play(self, source: RecordedSource) -> None:
         began = Position(*self._relay.begun.mark) if self._relay and self._relay.begun else Position()
-        for topic, message in with_end(self._messages(source, began.loops_ns)):
-            if self._at <= began and not _is_end(message):
+        last: PoseRaw | None = None
+        for played, due_ns in _with_due(self._messages(source, began.loops_ns)):
+            self._at, topic, message = played
+            last = message if isinstance(message, PoseRaw) else last
+            if self._at <= began:
                 continue  # the node that was here before has published it, and it was taken
             if message.stamp_ns != self._last_ns:
-                self._wait_for(message.stamp_ns)
+                self._wait_for(message.stamp_ns, due_ns)
             if self.stopping:
                 return
             try:
@@ -99,12 +108,14 @@ class PoseInputNode(Node):
                 self.refuse(topic, error)
             self.settle()
             self.report_if_due()
+        if last and not self.stopping:
+            self.publish(POSE_RAW, end_of(last))
         while not self.settle(POLL_S):  # what was not taken is here alone
             if self.stopping:
                 return
             self.report_if_due()
         if self._relay:
-            self._relay.close(finished=True)
+            self._relay.forget()
 
     def mark(self, message: Message) -> tuple[int, int]:
         return self._at
@@ -130,21 +141,27 @@ class PoseInputNode(Node):
             return dataclasses.replace(message, sensor_pose=self._pose, calibrated=True)
         return message
 
-    def _messages(self, source: RecordedSource, shift_ns: int) -> Iterator[tuple[str, Message]]:
+    def _messages(self, source: RecordedSource, shift_ns: int) -> Iterator[_Played]:
         while True:
             newest_ns = 0
             first_ns: int | None = None
             for count, (topic, message) in enumerate(source, start=1):
-                self._at = Position(shift_ns, count)
                 first_ns = message.stamp_ns if first_ns is None else first_ns
                 newest_ns = max(newest_ns, message.stamp_ns)
-                yield topic, dataclasses.replace(message, stamp_ns=message.stamp_ns + shift_ns) if shift_ns else message
+                if shift_ns:
+                    message = dataclasses.replace(message, stamp_ns=message.stamp_ns + shift_ns)
+                yield _Played(Position(shift_ns, count), topic, message)
             if not self._loop or first_ns is None:
                 return
             shift_ns += newest_ns - first_ns + LOOP_PAUSE_NS
 
-    def _wait_for(self, stamp_ns: int) -> None:
-        """Wait until a stamp is due; where the source's clock was set, go on from now."""
+    def _wait_for(self, stamp_ns: int, due_stamp_ns: int) -> None:
+        """Wait until a frame is due; where the source's clock was set, go on from now.
+
+        Args:
+            stamp_ns: its own.
+            due_stamp_ns: that of the moment at which it is due.
+        """
         last_ns, self._last_ns = self._last_ns, stamp_ns
         if not self._rate:
             return
@@ -152,11 +169,22 @@ class PoseInputNode(Node):
             self._pace = Timeline(stamp_ns, self.clock.monotonic_ns(), self._rate)
             self._tell_pace()
             self.report()
-        due_ns = self._pace.wall(stamp_ns)
+        due_ns = self._pace.wall(due_stamp_ns)
         while (left_ns := due_ns - self.clock.monotonic_ns()) > 0 and not self.stopping:
             self.clock.sleep(min(left_ns, round(POLL_S * 1e9)))
             self.report_if_due()
 
 
-def _is_end(message: Message) -> bool:
-    return isinstance(message, PoseRaw) and message.end_of_stream
+def _with_due(messages: Iterable[_Played]) -> Iterator[tuple[_Played, int]]:
+    """Messages, each with the stamp of the moment at which it is due: its own, but where that is ahead of the next one
+    by mistake, the next one's."""
+    waiting: list[_Played] = []
+    last_ns = 0
+    for played in messages:
+        stamp_ns = played.message.stamp_ns
+        if waiting and stamp_ns != (ahead_ns := waiting[0].message.stamp_ns):
+            due_ns = stamp_ns if last_ns <= stamp_ns < ahead_ns else ahead_ns
+            yield from ((each, due_ns) for each in waiting)
+            last_ns, waiting = due_ns, []
+        waiting.append(played)
+    yield from ((each, each.message.stamp_ns) for each in waiting)

@@ -14,12 +14,9 @@ from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Diagnostics, Message, PoseRaw
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sources.calibration import CalibrationSettings
-from steadypose.nodes.sources.camera_settings import WebcamSettings
 from steadypose.nodes.sources.csv import CsvSource
-from steadypose.nodes.sources.motion import MotionSource, holds_motion
-from steadypose.nodes.sources.npz import NpzSource
-from steadypose.nodes.sources.source import RecordedSource
+from steadypose.nodes.sources.npz import MotionSource, NpzSource, holds_motion
+from steadypose.nodes.sources.source import CalibrationSettings, RecordedSource, WebcamSettings
 
 NO_RIG: Mapping[str, Any] = MappingProxyType({})
 _FILES = ".csv, .npz, .bvh, .trc, .c3d or .npy"
@@ -90,7 +87,7 @@ def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG) -> Recorde
 
 def _open_film(path: Path) -> RecordedSource:
     require_extra("webcam")
-    from steadypose.nodes.sources.webcam_video import VideoSource  # OpenCV
+    from steadypose.nodes.sources.webcam_device import VideoSource  # OpenCV
 
     return VideoSource(WebcamSettings(video=str(path)), CalibrationSettings())
 
@@ -103,4 +100,9 @@ def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Mes
         if isinstance(message, PoseRaw):
             last = message
     if last:
-        yield POSE_RAW, dataclasses.replace(last, bodies=[], end_of_stream=True)
+        yield POSE_RAW, end_of(last)
+
+
+def end_of(last: PoseRaw) -> PoseRaw:
+    """The mark of the end of a stream, after its last message."""
+    return dataclasses.replace(last, bodies=[], end_of_stream=True)

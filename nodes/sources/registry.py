@@ -7,19 +7,22 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from steadypose.msgs.keys import Keys
+from steadypose.msgs.security import Keys
 from steadypose.nodes.graph.clock import Clock, SystemClock
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError, load_plugin, path_setting
-from steadypose.nodes.sources.calibration import CalibrationSettings
-from steadypose.nodes.sources.camera_settings import OakSettings, WebcamSettings
+from steadypose.nodes.sources.camera import open_oak, open_webcam
 from steadypose.nodes.sources.merge import MergeSettings, MergeSource
-from steadypose.nodes.sources.oak import OakSource
-from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source
-from steadypose.nodes.sources.source import LiveSource, RecordedSource, SourceContext
-from steadypose.nodes.sources.tf import TfSettings, TfSource
-from steadypose.nodes.sources.webcam import open_webcam
+from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source, TfSettings, TfSource
+from steadypose.nodes.sources.source import (
+    CalibrationSettings,
+    LiveSource,
+    OakSettings,
+    RecordedSource,
+    SourceContext,
+    WebcamSettings,
+)
 from steadypose.prior.settings import nearest
 
 _SOURCE = "source"
@@ -66,7 +69,7 @@ class InputSettings:
 
     recording: str = path_setting(_declare(_open_recording))
     """rosbag2 directory, .mcap, .npz or .csv to play; a relative path starts at the launch file"""
-    oak: OakSettings = field(default_factory=OakSettings, metadata=_declare(OakSource, extra="oak"))
+    oak: OakSettings = field(default_factory=OakSettings, metadata=_declare(open_oak, extra="oak"))
     webcam: WebcamSettings = field(default_factory=WebcamSettings, metadata=_declare(open_webcam, extra="webcam"))
     ros2: Ros2Settings = field(default_factory=Ros2Settings, metadata=_declare(Ros2Source))
     merge: MergeSettings = field(default_factory=MergeSettings, metadata=_declare(MergeSource))

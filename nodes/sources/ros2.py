@@ -1,23 +1,228 @@
-"""Skeletons from a ROS 2 topic, in place of a camera: ``[input] source = "ros2"``."""
+"""Skeletons from a ROS 2 topic, and the pose of a sensor that moves from ROS 2's transforms."""
 
 from __future__ import annotations
 
+import dataclasses
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import dataclass
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rosbags.serde import SerdeError
 
-from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.checks.problem import Problem, warning
-from steadypose.nodes.graph.clock import POLL_S
+from steadypose.msgs.types import Pose, PoseRaw
+from steadypose.nodes.checks.problem import Problem, error, warning
+from steadypose.nodes.graph.clock import POLL_S, Clock
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2.connect import check_ros, connect
-from steadypose.nodes.ros2.definitions import deserialise
+from steadypose.nodes.ros2.connection import Connection, check_ros, connect
+from steadypose.nodes.ros2.definitions import deserialise, stamp_ns
 from steadypose.nodes.sources.adapters import from_azure_kinect, from_pose_array
 from steadypose.nodes.sources.source import LiveSource, SourceContext
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.settings import nearest
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+CACHE_NS = 10_000_000_000
+"""for how long transforms are kept, as tf2 does"""
+_IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+Moment = tuple[int, Floats, Floats]
+"""stamp, translation (3,) metres and quaternion (4,) xyzw, from the child's frame to the parent's"""
+_stamp = itemgetter(0)
+
+
+class TransformError(LookupError):
+    """A transform that is not known, yet or at all. The text says which, and why."""
+
+
+class TransformBuffer:
+    """The transforms received on ``/tf`` and ``/tf_static``."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, str] = {}
+        self._moments: dict[str, list[Moment]] = {}
+        """by child, in the order of their stamps"""
+        self._static: set[str] = set()
+
+    def add(self, message: Any, *, static: bool) -> None:
+        """Take a ``tf2_msgs/TFMessage``; transforms that are no pose are ignored."""
+        for transform in message.transforms:
+            child, parent = transform.child_frame_id.lstrip("/"), transform.header.frame_id.lstrip("/")
+            at, turned = transform.transform.translation, transform.transform.rotation
+            place = np.array([at.x, at.y, at.z])
+            quaternion = np.array([turned.x, turned.y, turned.z, turned.w])
+            sound = np.isfinite(place).all() and abs(np.linalg.norm(quaternion) - 1.0) < 0.01
+            if not sound or not child or not parent or child == parent:
+                continue
+            if self._parents.get(child, parent) != parent:
+                self._moments.pop(child, None)
+            self._parents[child] = parent
+            (self._static.add if static else self._static.discard)(child)
+            moments = self._moments.setdefault(child, [])
+            moment = stamp_ns(transform.header), place, quaternion
+            if static or (moments and moment[0] < moments[-1][0] - CACHE_NS):
+                moments.clear()  # or the clock was set back, as when a bag begins again
+            at_index = bisect_left(moments, moment[0], key=_stamp)
+            if at_index == len(moments) or moments[at_index][0] != moment[0]:  # the first of a stamp counts, as in tf2
+                moments.insert(at_index, moment)
+            del moments[: bisect_left(moments, moments[-1][0] - CACHE_NS, key=_stamp)]
+
+    def lookup(self, target: str, source: str, at_ns: int) -> tuple[Floats, Floats]:
+        """The pose of a frame in another at a time.
+
+        Returns:
+            position (3,) metres and quaternion (4,) xyzw of ``source`` in ``target``.
+
+        Raises:
+            TransformError: the frames are not connected, or not at that time.
+        """
+        up, down = self._path(source), self._path(target)
+        shared = next((frame for frame in up if frame in down), None)
+        if shared is None:
+            known = ", ".join(sorted({*self._parents, *self._parents.values()})) or "none"
+            raise TransformError(
+                f"no path from {source!r} to {target!r} in TF: expected one tree; frames heard of: {known}"
+            )
+        place, turned = self._chain(up[: up.index(shared)], at_ns)
+        other, back = self._chain(down[: down.index(shared)], at_ns)
+        inverse = back.inv()
+        return inverse.apply(place - other), (inverse * turned).as_quat()
+
+    def _path(self, frame: str) -> list[str]:
+        """From a frame up to the root of its tree."""
+        path = [frame]
+        while (parent := self._parents.get(path[-1])) is not None and parent not in path:
+            path.append(parent)
+        return path
+
+    def _chain(self, frames: list[str], at_ns: int) -> tuple[Floats, Rotation]:
+        place, turned = np.zeros(3), _rotation(_IDENTITY)
+        for frame in frames:
+            step, turn = self._at(frame, at_ns)
+            place, turned = step + turn.apply(place), turn * turned
+        return place, turned
+
+    def _at(self, frame: str, at_ns: int) -> tuple[Floats, Rotation]:
+        moments = self._moments[frame]
+        if frame in self._static:
+            return moments[-1][1], _rotation(moments[-1][2])
+        first, last = moments[0][0], moments[-1][0]
+        if not first <= at_ns <= last:
+            early = "older than the oldest" if at_ns < first else "newer than the newest"
+            off = (first - at_ns if at_ns < first else at_ns - last) / 1e9
+            raise TransformError(f"the transform of {frame!r} is wanted for a moment {off:.3f} s {early} heard on /tf")
+        after = bisect_left(moments, at_ns, key=_stamp)
+        b = moments[after]
+        if b[0] == at_ns:
+            return b[1], _rotation(b[2])
+        a = moments[after - 1]
+        share = (at_ns - a[0]) / (b[0] - a[0])
+        start = _rotation(a[2])
+        return a[1] + share * (b[1] - a[1]), start * (start.inv() * _rotation(b[2])) ** share
+
+
+def _rotation(quaternion: Floats) -> Rotation:
+    from scipy.spatial.transform import Rotation  # 16 MB: not for those nodes that only read a launch file
+
+    return Rotation.from_quat(quaternion)
+
+
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+
+
+@dataclass(frozen=True)
+class TfSettings:
+    """``[input.tf]``: the sensor's pose from TF, also of a robot that moves."""
+
+    fixed_frame: str = ""
+    """a fixed frame with z up, such as odom or map; empty: TF is not used"""
+    sensor_frame: str = ""
+    """the frame of the joints; empty: what the source's messages name"""
+    timeout: float = 0.2
+    """seconds that a message waits for the transform of its stamp"""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.timeout <= 5:
+            raise LaunchError(f"[input.tf] timeout: expected 0 to 5 seconds, got {self.timeout:g}")
+
+
+class TfSource(LiveSource):
+    """A live source whose messages get the pose that TF has of their frame at their stamp.
+
+    One that waited in vain is dropped and counted: where it was seen from is not known.
+    """
+
+    def __init__(
+        self, source: LiveSource, settings: TfSettings, clock: Clock, join: Callable[[str], Connection] = connect
+    ) -> None:
+        super().__init__()
+        check_ros()
+        self.refused = source.refused
+        self._source, self._settings, self._clock, self._join = source, settings, clock, join
+        self._buffer = TransformBuffer()
+        self._waiting: deque[tuple[int, PoseRaw]] = deque()
+        self._trouble = ""
+
+    def frames(self) -> Generator[PoseRaw | None, None, None]:
+        connection = self._join("steadypose_tf")
+        try:
+            connection.subscribe("tf", TF_MESSAGE, lambda cdr: self._heard(cdr, static=False), depth=100)
+            connection.subscribe(
+                "tf_static", TF_MESSAGE, lambda cdr: self._heard(cdr, static=True), latched=True, depth=100
+            )
+            with closing(self._source.frames()) as frames:
+                for frame in frames:
+                    if frame:
+                        self._waiting.append((self._clock.now_ns(), frame))
+                    connection.spin(0.0)
+                    yield from self._ready()
+                    yield None
+        finally:
+            connection.close()
+
+    def _heard(self, cdr: bytes, *, static: bool) -> None:
+        self._buffer.add(deserialise(cdr, TF_MESSAGE), static=static)
+
+    def _ready(self) -> Generator[PoseRaw, None, None]:
+        """Those whose transform is known, oldest first."""
+        while self._waiting:
+            came_ns, frame = self._waiting[0]
+            sensor = self._settings.sensor_frame or frame.frame_id
+            try:
+                place, turned = self._buffer.lookup(self._settings.fixed_frame, sensor, frame.stamp_ns)
+            except TransformError as trouble:
+                if self._clock.now_ns() - came_ns < self._settings.timeout * 1e9:
+                    return
+                self._waiting.popleft()
+                self._trouble = str(trouble)
+                self.refused["without a transform"] += 1
+                continue
+            self._waiting.popleft()
+            self._trouble = ""
+            yield dataclasses.replace(frame, sensor_pose=Pose(place, turned), calibrated=True)
+
+    def problems(self) -> list[Problem]:
+        found = self._source.problems()
+        if self._trouble:
+            found.append(
+                error(
+                    "tf",
+                    f"{self._trouble}; expected the sensor's frame in {self._settings.fixed_frame!r} at each stamp: "
+                    "is the robot's TF published, in this ROS_DOMAIN_ID, with clocks that agree? [input.tf] names the "
+                    "frames",
+                )
+            )
+        return found
+
+    def status(self) -> dict[str, str]:
+        return self._source.status()
+
 
 TYPES = {"MarkerArray": "visualization_msgs/msg/MarkerArray", "PoseArray": "geometry_msgs/msg/PoseArray"}
 

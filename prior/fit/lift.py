@@ -42,12 +42,7 @@ _AHEAD, _STRIDE, _STANDS = 0.2, 15, 30.0
 
 
 def starts_of_key_points(
-    pixels: Floats,
-    camera: Pinhole,
-    offsets: Floats,
-    ground: float,
-    *,
-    floor_known: bool = False,
+    pixels: Floats, camera: Pinhole, offsets: Floats, ground: float, *, floor_known: bool = False
 ) -> list[Start]:
     """Motions of a body in the rest pose, without depth.
 

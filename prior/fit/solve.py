@@ -11,17 +11,7 @@ import torch
 from torch import Tensor
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.fit.energy import (
-    Anchored,
-    Bones,
-    FirstState,
-    Ground,
-    Smooth,
-    Standing,
-    Term,
-    Transitions,
-    energy,
-)
+from steadypose.prior.fit.energy import Anchored, Bones, FirstState, Ground, Smooth, Standing, Term, Transitions, energy
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.motion import SCALES, Motion, Variables, float_tensor
 

@@ -77,13 +77,7 @@ CMU_BVH = Rig(
         lambda joint: joint.replace("Left", "Right"),
     ),
     metres=UNITS["CMU"],
-    lost_bones={
-        "Neck": 1.0,
-        "LeftShoulder": 1.0,
-        "RightShoulder": 1.0,
-        "LeftFingerBase": 0.5,
-        "RightFingerBase": 0.5,
-    },
+    lost_bones={"Neck": 1.0, "LeftShoulder": 1.0, "RightShoulder": 1.0, "LeftFingerBase": 0.5, "RightFingerBase": 0.5},
 )
 
 

@@ -182,12 +182,7 @@ def calibrate(recordings: Iterable[Markers]) -> Calibration:
     )
     left_hip, right_hip, _ = _hips(joined, measured)
     left_shoulder, right_shoulder = _shoulders(joined, measured)
-    upper = {
-        "left_knee": left_hip,
-        "right_knee": right_hip,
-        "left_elbow": left_shoulder,
-        "right_elbow": right_shoulder,
-    }
+    upper = {"left_knee": left_hip, "right_knee": right_hip, "left_elbow": left_shoulder, "right_elbow": right_shoulder}
     axis = {joint: _bend_axis(joint, upper[joint], joined) for joint in _HINGES}
     return Calibration(measured.pelvis_width, measured.pelvis_depth, measured.acromia, axis)
 

@@ -25,6 +25,9 @@ FRAME_S = 1.0 / FPS
 JOINT_FEATURES = 6
 """A joint's features: position and velocity."""
 
+OUTPUTS = 6
+"""Velocity and logarithm of its standard deviation; the network's other outputs, contacts, only train it."""
+
 CHANNELS = (JOINT_FEATURES, 6, 12, 24, 48)
 """of an edge, before the first convolution and after each"""
 
@@ -62,12 +65,10 @@ class NewestMotion(NamedTuple):
     Attributes:
         velocity: (B, 3) m/s, of the root.
         log_sigma: (B, 3) log of the standard deviation of that along each axis, m/s.
-        contact_logits: (B, 8) of `CONTACT_JOINTS`.
     """
 
     velocity: Floats
     log_sigma: Floats
-    contact_logits: Floats
 
 
 class LiveRootVelocity:
@@ -85,7 +86,7 @@ class LiveRootVelocity:
             conv, pool = part(weights, f"blocks.{k}.conv"), pool_matrix(level.groups)
             weight = mix_edges(pool, conv["weight"]).swapaxes(1, 2)  # (out, kernel, in): frames side by side
             self._layers.append((weight.reshape(len(weight), -1), mix_edges(pool, conv["bias"])))
-        self._head = weights["head.weight"], weights["head.bias"]
+        self._head = weights["head.weight"][:OUTPUTS], weights["head.bias"][:OUTPUTS]
 
     @classmethod
     def load(cls, weights: str) -> LiveRootVelocity:
@@ -113,4 +114,4 @@ class LiveRootVelocity:
             features = features.reshape(len(joints), frames, -1)
         weight, bias = self._head
         outputs = dense(features[:, 0], weight, bias)
-        return NewestMotion(outputs[:, :3], outputs[:, 3:6], outputs[:, 6:])
+        return NewestMotion(outputs[:, :3], outputs[:, 3:])

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -101,8 +100,10 @@ def render(people: Sequence[tuple[Floats, Floats]], camera: Stereo, background: 
     return depth
 
 
-def spoil(depth: Floats, camera: Stereo, rng: np.random.Generator) -> NDArray[np.uint16]:
+def corrupt(depth: Floats, camera: Stereo, rng: np.random.Generator) -> NDArray[np.uint16]:
     """(H, W) millimetres as a stereo camera gives them, 0 where it has none, from depth (H, W) in metres."""
+    import cv2  # of an extra: who renders without errors does without
+
     disparity = camera.focal * camera.baseline / depth
     # the matcher's window takes the nearer side here, both sides there
     half = camera.window // 2
@@ -133,6 +134,8 @@ def _rays(camera: Stereo) -> Floats:
 
 def _texture(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Floats:
     """Noise of unit variance that pixels within about ``size`` share."""
+    import cv2
+
     noise = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), size)
     return noise / noise.std()
 

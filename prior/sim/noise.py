@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.skeleton import MIRROR, J
+from steadypose.prior.body.skeleton import J
 
 KINECT_NOISE = Path(__file__).with_name("kinect_noise.json")
 """The parameters fitted to UI-PRMD's Kinect, with their provenance."""
@@ -206,6 +206,20 @@ def _recursion(decay: Floats, source: Floats, gain: Floats | None = None) -> Flo
     return np.moveaxis(out, 0, -3)
 
 
+def time_correlated(noise: Floats, memory: Floats | float, axis: int = 0) -> Floats:
+    """White noise made a stationary AR(1) process of the same variance, in place.
+
+    Args:
+        noise: one frame after the other along ``axis``.
+        memory: correlation from a frame to the next; broadcasts against a frame.
+        axis: of time.
+    """
+    frames = np.moveaxis(noise, axis, 0)
+    for t in range(1, len(frames)):
+        frames[t] = memory * frames[t - 1] + np.sqrt(1.0 - memory**2) * frames[t]
+    return noise
+
+
 def stationary(dt: Floats, memory: float, shape: tuple[int, int], rng: np.random.Generator) -> Floats:
     """Standard normal (T, *shape) with a correlation time of ``memory`` seconds."""
     return _recursion(np.exp(-dt / memory)[:, None, None], rng.standard_normal((len(dt), *shape)))
@@ -272,16 +286,6 @@ def swapped(
     return result
 
 
-def exchange_sides(positions: Floats, when: Mapping[str, NDArray[np.bool_]]) -> Floats:
-    """Positions (..., T, 22, 3) with the limbs of `swapped` groups exchanged."""
-    out = positions.copy()
-    for group, active in when.items():
-        exchange = np.moveaxis(active, 0, -1)[..., None]
-        for joint in SWAP_GROUPS[group]:
-            out[..., joint, :] = np.where(exchange, positions[..., MIRROR[joint], :], positions[..., joint, :])
-    return out
-
-
 def confidence_of(scale: Floats, rng: np.random.Generator) -> Floats:
     """Confidence that a tracker states: decreasing with ``scale`` (see `Errors`), 0.5 at 4 cm, with noise of its own.
 
@@ -289,29 +293,3 @@ def confidence_of(scale: Floats, rng: np.random.Generator) -> Floats:
     """
     logit = 1.6 * np.log(0.04 / np.maximum(scale, 1e-4)) + 0.8 * rng.standard_normal(scale.shape)
     return 1.0 / (1.0 + np.exp(-logit))
-
-
-def corrupt(positions: Floats, rng: np.random.Generator, model: NoiseModel, fps: float = 30.0) -> tuple[Floats, Floats]:
-    """Tracked motion without a scene, for training: thousands of windows a second.
-
-    Each window is seen by a camera at a random azimuth and at the person's height. Occlusion is not simulated: that
-    needs a `camera`.
-
-    Args:
-        positions: (..., T, 22, 3) metres, z up.
-        rng: source.
-        model: parameters.
-        fps: frames a second.
-
-    Returns:
-        noisy positions (..., T, 22, 3) and confidences (..., T, 22).
-    """
-    dt = np.full(positions.shape[-3], 1.0 / fps)
-    batch = positions.shape[:-3]
-    azimuth = rng.uniform(0, 2 * np.pi, (*batch, 1, 1))
-    axes = ray_axes(np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=-1))
-    errors = draw_errors(travelled(positions), dt, rng, model)
-    noisy = exchange_sides(positions, swapped(dt, batch, rng)) + np.einsum(
-        "...k,...kx->...x", errors.steady + errors.quick, axes
-    )
-    return noisy, confidence_of(errors.scale, rng)

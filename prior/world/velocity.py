@@ -87,7 +87,7 @@ class VelocityNetwork:
         if not observed:
             return []
         motion = np.stack([window.update(each) for window, each in zip(windows, observed, strict=True)])
-        velocity, log_sigma = self._net(motion)[:2]
+        velocity, log_sigma = self._net(motion)
         variance = np.exp(2.0 * log_sigma)
         variance[:, :2] = variance[:, :2].mean(axis=1, keepdims=True)  # the filter's noise must not know the heading
         speed = np.linalg.norm(velocity[:, :2], axis=1, keepdims=True)

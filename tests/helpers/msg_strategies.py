@@ -1,10 +1,15 @@
 """Any message that can be: hypothesis strategies, and one plain example of each."""
 
+import dataclasses
+from typing import Any
+
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from steadypose.msgs import forms
+from steadypose.msgs.forms import Array, Integer, ListOf, States
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
 from steadypose.msgs.types import (
     CleanBody,
     Diagnostics,
@@ -21,125 +26,42 @@ from steadypose.msgs.types import (
     RawBody,
     Tracking,
     WorldBody,
+    forms_of,
 )
 
-STAMPS = st.integers(0, 2**31 * 10**9 - 1)
-IDS = st.integers(-(2**31), 2**31 - 1)
-TEXTS = st.text(max_size=12)
 
-
-def f32(*shape: int):
-    return arrays(np.float32, shape, elements=st.floats(width=32))
-
-
-def f64(*shape: int):
-    return arrays(np.float64, shape, elements=st.floats())
-
-
-STATES = arrays(np.uint8, 22, elements=st.integers(0, 3))
-POSES = st.builds(Pose, f64(3), f64(4))
+def _of_form(form: Any) -> st.SearchStrategy[Any]:
+    if isinstance(form, States):
+        return arrays(np.uint8, 22, elements=st.integers(0, form.last))
+    if isinstance(form, Array):
+        elements: Any = st.floats(width=32 if form.dtype is np.float32 else 64)
+        return arrays(form.dtype, form.shape, elements=elements)  # type: ignore[arg-type]
+    if isinstance(form, ListOf):
+        return st.lists(of(form.kind), max_size=3)
+    if isinstance(form, Integer):
+        return st.integers(form.low, form.end - 1).map(form.kind)
+    text = st.text(max_size=12)
+    return {forms.number: st.floats(), forms.text: text, forms.texts: st.dictionaries(text, text, max_size=4)}[form]
 
 
 @st.composite
-def raw_bodies(draw: st.DrawFn) -> RawBody:
-    joints = draw(st.integers(0, 40))
-    return RawBody(draw(IDS), draw(f32(joints, 3)), draw(f32(joints)))
+def _raw_bodies(draw: st.DrawFn) -> RawBody:
+    joints, id = draw(st.integers(0, 40)), draw(_of_form(forms_of(RawBody)["id"]))
+    return RawBody(id, draw(_of_form(Array(np.float32, (joints, 3)))), draw(_of_form(Array(np.float32, (joints,)))))
 
 
-CLEAN_BODIES = st.builds(
-    CleanBody,
-    id=IDS,
-    positions=f32(22, 3),
-    rotations=f32(22, 4),
-    state=STATES,
-    sigma=f32(22),
-    anomaly=st.floats(),
-    anomaly_flag=st.booleans(),
-    joint_anomaly=f32(22),
-    bone_lengths=f32(22),
-    raw_positions=f32(22, 3),
-    raw_confidence=f32(22),
-)
-WORLD_BODIES = st.builds(
-    WorldBody,
-    id=IDS,
-    root_position=f64(3),
-    root_orientation=f64(4),
-    root_velocity=f64(3),
-    covariance=f64(6, 6),
-    positions=f32(22, 3),
-    rotations=f32(22, 4),
-    state=STATES,
-    sigma=f32(22),
-    contacts=f32(8),
-    tracking=st.sampled_from(Tracking),
-)
-RAW = st.builds(
-    PoseRaw,
-    stamp_ns=STAMPS,
-    frame_id=TEXTS,
-    source=TEXTS,
-    skeleton=TEXTS,
-    sensor_pose=POSES,
-    calibrated=st.booleans(),
-    bodies=st.lists(raw_bodies(), max_size=3),
-    end_of_stream=st.booleans(),
-)
-CLEAN = st.builds(
-    PoseClean,
-    stamp_ns=STAMPS,
-    frame_id=TEXTS,
-    source=TEXTS,
-    sensor_pose=POSES,
-    calibrated=st.booleans(),
-    delay_frames=st.integers(0, 2**32 - 1),
-    bodies=st.lists(CLEAN_BODIES, max_size=2),
-    end_of_stream=st.booleans(),
-)
-WORLD = st.builds(
-    PoseWorld,
-    stamp_ns=STAMPS,
-    frame_id=TEXTS,
-    source=TEXTS,
-    ground_plane=f64(4),
-    bodies=st.lists(WORLD_BODIES, max_size=2),
-    end_of_stream=st.booleans(),
-)
-EVENTS = st.builds(
-    PoseEvents,
-    stamp_ns=STAMPS,
-    frame_id=TEXTS,
-    source=TEXTS,
-    events=st.lists(
-        st.builds(
-            Event,
-            body=IDS,
-            kind=st.sampled_from(EventKind),
-            phase=st.sampled_from(Phase),
-            hand=st.sampled_from(Hand),
-            confidence=st.floats(),
-            direction=f64(3),
-            since_ns=STAMPS,
-        ),
-        max_size=3,
-    ),
-    end_of_stream=st.booleans(),
-)
-DIAGNOSIS = st.builds(
-    Diagnostics,
-    stamp_ns=STAMPS,
-    node=TEXTS,
-    level=st.sampled_from(Level),
-    message=TEXTS,
-    values=st.dictionaries(TEXTS, TEXTS, max_size=4),
-)
-ANY = st.one_of(
-    st.tuples(st.just(POSE_RAW), RAW),
-    st.tuples(st.just(POSE_CLEAN), CLEAN),
-    st.tuples(st.sampled_from([POSE_WORLD, POSE_TRUTH]), WORLD),
-    st.tuples(st.just(POSE_EVENTS), EVENTS),
-    st.tuples(st.just(DIAGNOSTICS), DIAGNOSIS),
-)
+def of(kind: type) -> st.SearchStrategy[Any]:
+    """Any message of a kind that can be."""
+    if kind is RawBody:
+        return _raw_bodies()
+    if kind is bool:
+        return st.booleans()
+    own = forms_of(kind)
+    fields = dataclasses.fields(kind)
+    return st.builds(kind, **{f.name: _of_form(own[f.name]) if f.name in own else of(f.type) for f in fields})  # type: ignore[arg-type]
+
+
+ANY = st.one_of(*(st.tuples(st.just(topic), of(kind)) for topic, kind in TOPICS.items()))
 
 
 def raw(stamp_ns: int = 0, joints: int = 32, bodies: int = 1) -> PoseRaw:

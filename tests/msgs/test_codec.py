@@ -12,8 +12,17 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from tests.helpers.msg_strategies import ANY, EXAMPLES, clean, diagnostics, raw
 
-from steadypose.msgs.codec import ROS_DEFINITIONS, DecodeError, decode, encode, typestore, wire_type
-from steadypose.msgs.limits import MAX_BODIES, MAX_EVENTS, MAX_VALUES
+from steadypose.msgs.codec import (
+    MAX_BODIES,
+    MAX_EVENTS,
+    MAX_VALUES,
+    ROS_DEFINITIONS,
+    DecodeError,
+    decode,
+    encode,
+    typestore,
+    wire_type,
+)
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD, TOPICS
 from steadypose.msgs.types import Diagnostics, Message, Pose, PoseEvents
 

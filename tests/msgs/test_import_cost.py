@@ -11,7 +11,7 @@ from pathlib import Path
 MEASURE = """
 import json, re, sys, time
 before = set(sys.modules)
-from steadypose.msgs import codec, keys, topics, transport, types
+from steadypose.msgs import codec, security, topics, transport, types
 subscriber = sorted(set(sys.modules) - before)
 from steadypose.msgs import recording
 # not getrusage: its maximum begins with that of the process which started this one

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from steadypose.msgs.keys import create_keys, load_keys
+from steadypose.msgs.security import create_keys, load_keys
 
 
 @pytest.mark.parametrize("part", [".", "clients", "servers"])

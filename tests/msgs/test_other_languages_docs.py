@@ -14,10 +14,10 @@ import pytest
 from tests.helpers.msg_strategies import world
 
 from steadypose.msgs.codec import encode
+from steadypose.msgs.delivery import PREFIX, VERSION
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import PoseRaw
-from steadypose.msgs.wire import PREFIX, VERSION
 
 PAGE = Path(__file__).parents[2] / "docs" / "other_languages.md"
 SUBSCRIBER, PUBLISHER = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)

@@ -16,15 +16,22 @@ import pytest
 import zmq
 from tests.helpers.msg_strategies import EXAMPLES, diagnostics, raw
 
-from steadypose.msgs import principals
+from steadypose.msgs import delivery
 from steadypose.msgs import publisher as publishing
-from steadypose.msgs.addresses import local_address, local_directory, make_private
 from steadypose.msgs.codec import encode
-from steadypose.msgs.keys import Keys, create_keys, load_keys, loopback_keys
+from steadypose.msgs.delivery import PREFIX
+from steadypose.msgs.security import (
+    Keys,
+    create_keys,
+    load_keys,
+    local_address,
+    local_directory,
+    loopback_keys,
+    make_private,
+)
 from steadypose.msgs.subscriber import MAX_RECEIVED
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import MAX_FRAME, VERSION, Publisher, Subscriber, TransportError
-from steadypose.msgs.wire import PREFIX
 
 SOON_S = 20.0
 """for what must happen; the machine may be busy"""
@@ -639,13 +646,13 @@ def test_a_source_has_one_publisher(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert subscriber.refused == {"second publisher": 10}
         second.publish(POSE_RAW, dataclasses.replace(raw(1), source="another"))
         assert subscriber.receive(SOON_S), "under a name of its own it is heard"
-        monkeypatch.setattr(principals, "AWAY_S", 0.0)
+        monkeypatch.setattr(delivery, "AWAY_S", 0.0)
         second.publish(POSE_RAW, raw(2))
         assert subscriber.receive(SOON_S) == (POSE_RAW, raw(2)), "the first is gone"
 
 
 def test_subscribers_of_one_program_agree_on_whose_a_source_is(tmp_path: Path):
-    paths, agreed = [f"ipc://{tmp_path}/{n}" for n in range(2)], principals.Principals()
+    paths, agreed = [f"ipc://{tmp_path}/{n}" for n in range(2)], delivery.Principals()
     with (
         Publisher(paths[0]) as kiosk,
         Publisher(paths[1]) as other,

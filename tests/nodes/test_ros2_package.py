@@ -152,8 +152,8 @@ def test_the_package_says_the_same_everywhere() -> None:
     assert version == messages.findtext("version")
     assert f'version="{version}"' in (PACKAGE / "setup.py").read_text()
     needs = {it.text for it in package.iterfind("exec_depend")}
-    from steadypose.nodes.sinks.ros2 import topics
+    from steadypose.nodes.sinks.ros2 import messages
 
-    source = Path(topics.__file__).read_text()
+    source = Path(messages.__file__).read_text()
     used = {part.rsplit('"', 1)[-1] for part in source.split("/msg/")[:-1]}
     assert {"geometry_msgs", "steadypose_msgs"} <= used <= needs

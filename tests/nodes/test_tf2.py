@@ -25,10 +25,10 @@ from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Pose, PoseClean, PoseWorld
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.ros2.definitions import deserialise, stamp_ns
-from steadypose.nodes.ros2.tf import TransformBuffer, TransformError
 from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode
 from steadypose.nodes.sinks.ros2.messages import tf_message, transform
 from steadypose.nodes.sinks.ros2.rep155 import LINKS, body_name, frames
+from steadypose.nodes.sources.ros2 import TransformBuffer, TransformError
 
 SYSTEM_PYTHON = Path("/usr/bin/python3")
 TF2 = """

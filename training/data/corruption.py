@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J, limbs
+from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.timing.rate import FPS
 
 Rng = np.random.Generator
@@ -21,15 +22,15 @@ Fault = Callable[[Floats, slice, list[int], Floats, Rng], None]
 window (T, 22, 3) is of another person, for faults that mix two bodies."""
 
 SLOW_HZ = 0.7
-"""Largest frequency of a sensor's slow error"""
+"""Largest frequency of a sensor's bias, Hz."""
 
 _LIMBS = limbs(
     ("wrist",), ("elbow", "wrist"), ("shoulder", "elbow", "wrist"),
     ("foot",), ("ankle", "foot"), ("knee", "ankle", "foot"), ("hip", "knee", "ankle", "foot"),
 )  # fmt: skip
 _LOWER = [joint for leg in limbs(("hip", "knee", "ankle", "foot")) for joint in leg]
-_ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_collar", "left_foot", "right_foot")]
-"""Joints that many sensors do not have"""
+ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_collar", "left_foot", "right_foot")]
+"""Joints that many sensors do not have."""
 
 
 def draw_bias_sigma(count: int, rng: Rng) -> Floats:
@@ -104,9 +105,7 @@ def with_drifting_error(positions: Floats, sigma: Floats, rng: Rng, jitter_share
     factor = np.exp(rng.choice([0.0, 0.5], (count, 1)) * rng.standard_normal((count, joints)))
     factor /= np.sqrt(np.square(factor).mean(axis=1, keepdims=True))
     memory = 1.0 - 10 ** rng.uniform(-3.0, -0.7, (count, 1, 1))
-    drift, new = rng.standard_normal((count, frames, joints, 3)), np.sqrt(1.0 - memory**2)
-    for t in range(1, frames):
-        drift[:, t] = memory * drift[:, t - 1] + new * drift[:, t]
+    drift = time_correlated(rng.standard_normal((count, frames, joints, 3)), memory, axis=1)
     fast, slow = (np.sqrt(share)[:, None, None, None] for share in (jitter_share, 1.0 - jitter_share))
     noise = slow * drift + fast * rng.standard_normal(drift.shape)
     return positions + sigma[:, None, None, None] * factor[:, None, :, None] * noise
@@ -114,9 +113,9 @@ def with_drifting_error(positions: Floats, sigma: Floats, rng: Rng, jitter_share
 
 def with_faults(clean: Floats, faults: Sequence[Fault], share: float, rng: Rng) -> Floats:
     """Windows (B, T, 22, 3), a ``share`` of them with one of ``faults``, which in 60 % lasts to the window's end."""
-    spoilt = clean.copy()
+    corrupted = clean.copy()
     frames = clean.shape[1]
-    for window in spoilt:
+    for window in corrupted:
         if rng.random() > share:
             continue
         length = int(np.clip(np.exp(rng.uniform(np.log(3), np.log(1.5 * frames))), 3, frames - 1))
@@ -124,7 +123,7 @@ def with_faults(clean: Floats, faults: Sequence[Fault], share: float, rng: Rng) 
         joints = _LIMBS[rng.integers(len(_LIMBS))] if rng.random() < 0.6 else [int(rng.integers(1, len(PARENTS)))]
         other = clean[rng.integers(len(clean))]
         faults[int(rng.integers(len(faults)))](window, slice(start, start + length), joints, other, rng)
-    return spoilt
+    return corrupted
 
 
 def stands_still(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rng) -> None:
@@ -192,7 +191,7 @@ def occlude(positions: Floats, rng: Rng) -> Floats:
     frames = positions.shape[1]
     for window in seen:
         if rng.random() < 0.4:
-            window[:, _ABSENT] = np.nan
+            window[:, ABSENT] = np.nan
         if rng.random() < 0.25:
             window[:, 1 + rng.choice(len(PARENTS) - 1, rng.integers(1, 7), replace=False)] = np.nan
         for _ in range(rng.integers(1, 4)):

@@ -18,7 +18,8 @@ from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import REST_SPEED, label_contacts
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
 from steadypose.prior.mocap.clip import Clip, MotionError
-from steadypose.training.data.datasets import Dropped, Split, Use
+from steadypose.training.data.datasets import Split, Use
+from steadypose.training.data.readers import Dropped
 
 FPS = 30.0
 """Frames a second of everything that is trained on."""
@@ -111,7 +112,7 @@ def prepare_clip(clip: Clip, weights: Use, split: Split, speed: float = 1.0) -> 
         lost = [JOINTS[j] for j in np.flatnonzero(~finite_joints(filled).all(axis=0))]
         cause = f"{(~complete).sum() / clip.fps:.2f} s of {clip.seconds:.2f} s lack {', '.join(lost)}"
         yield Dropped(clip.name, clip.source, f"cut: joints lost for more than {MAX_GAP} s or at an end", cause)
-    for start, stop in _runs(complete):
+    for start, stop in runs(complete):
         seconds = (stop - start) / clip.fps
         if seconds < MIN_SECONDS:
             yield _too_short(f"{clip.name}@{start / clip.fps:.1f}s", clip.source, seconds)
@@ -121,7 +122,7 @@ def prepare_clip(clip: Clip, weights: Use, split: Split, speed: float = 1.0) -> 
         bad, fault = find_faults(positions, MAX_ACCELERATION * speed**2)
         if fault:
             yield Dropped(clip.name, clip.source, "cut: impossible motion", fault)
-        for first, last in _runs(~bad):
+        for first, last in runs(~bad):
             whole = complete.all() and not fault
             name = clip.name if whole else f"{clip.name}@{start / clip.fps + first / FPS:.1f}s"
             if (last - first) / FPS < MIN_SECONDS:
@@ -162,7 +163,7 @@ def fill_gaps(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]
     time = np.arange(len(positions))
     for joint in np.flatnonzero(lost.any(axis=0)):
         seen = ~lost[:, joint]
-        for start, stop in _runs(lost[:, joint]):
+        for start, stop in runs(lost[:, joint]):
             filled[start:stop, joint] = np.nan
             if start > 0 and stop < len(positions) and (stop - start) / fps <= MAX_GAP:
                 for axis in range(3):
@@ -172,7 +173,7 @@ def fill_gaps(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]
     return filled
 
 
-def _runs(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+def runs(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     """Starts and stops of the runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)

@@ -16,8 +16,8 @@ from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J, finite_joints
 from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.training.data.datasets import DATA_SETS, DataSet, Split
-from steadypose.training.data.prepare import FPS, fill_gaps, find_faults, resample
-from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, load_pairs
+from steadypose.training.data.prepare import FPS, fill_gaps, find_faults, resample, runs
+from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
 
 SPEEDS = (1.0, 1.4, 1.9, 2.5)
 """Factors by which training motion is sped up: people of the test split move faster than those recorded for
@@ -134,26 +134,21 @@ def _at_speeds(clip: Clip, speeds: tuple[float, ...]) -> Iterator[tuple[float, N
     if clip.seconds < 1.0:
         return
     filled = fill_gaps(clip.positions, clip.fps)
-    for first, last in _runs(np.asarray(finite_joints(filled).all(axis=1))):
+    for first, last in runs(np.asarray(finite_joints(filled).all(axis=1))):
         if (last - first) / clip.fps < 1.0:
             continue
         slow = resample(filled[first:last], clip.fps)
         bad, _ = find_faults(slow)
         for speed in speeds:
             fast = resample(filled[first:last], clip.fps * speed)
-            spoilt = bad[np.minimum((np.arange(len(fast)) * speed).astype(int), len(bad) - 1)]
-            for a, b in _runs(~spoilt):
+            faulty = bad[np.minimum((np.arange(len(fast)) * speed).astype(int), len(bad) - 1)]
+            for a, b in runs(~faulty):
                 if b - a >= FPS:
                     yield speed, fast[a:b].astype(np.float32)
 
 
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-
-
 def _write_pairs(path: Path, out: Path) -> None:
-    subjects = (*TRAIN_SUBJECTS, "s07", "s08")
+    subjects = (*TRAIN_SUBJECTS, *VALIDATION_SUBJECTS)
     seen, truth, names = [], [], []
     for subject in subjects:
         clips = [pair for pair in load_pairs(path, [subject]) if pair.fps == FPS and len(pair.kinect) >= FPS]

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
+from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.timing.rate import FPS
-from steadypose.training.data.corruption import occlude
+from steadypose.training.data.corruption import ABSENT, occlude
 from steadypose.training.data.recordings import Motion, Pairs
 
 Rng = np.random.Generator
@@ -36,8 +37,6 @@ _SWINGS = (
     ("knee", ("ankle", "foot")),
     ("hip", ("knee", "ankle", "foot")),
 )
-_ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_collar", "left_foot", "right_foot")]
-"""Joints that many sensors do not have"""
 _HIPS = [J["left_hip"], J["right_hip"]]
 _LIMBS = [
     [J[f"{side}_{n}"] for n in names]
@@ -219,7 +218,7 @@ class Sensors:
                 flickering = (rng.random(22) < rng.choice([0.3, 1.0])) * 10 ** rng.uniform(-1.3, -0.3)
                 seen[clip][rng.random((frames, 22)) < flickering] = np.nan
         few = np.flatnonzero(rng.random(count) < 0.15)
-        seen[np.ix_(few, np.arange(frames), np.array(_ABSENT))] = np.nan
+        seen[np.ix_(few, np.arange(frames), np.array(ABSENT))] = np.nan
         for clip in np.flatnonzero(rng.random(count) < 0.05):  # sensors of few joints
             seen[clip][:, rng.random(22) < rng.uniform(0.2, 0.8)] = np.nan
         hidden = np.flatnonzero(rng.random(count) < 0.2)
@@ -243,11 +242,8 @@ def _confidences(count: int, frames: int, rng: Rng) -> Floats:
 
 
 def _coloured(shape: tuple[int, ...], memory: float, rng: Rng) -> Floats:
-    """Stationary AR(1) noise of unit variance, ``memory`` its correlation from a frame to the next."""
-    noise = rng.standard_normal(shape)
-    for t in range(1, len(noise)):
-        noise[t] = memory * noise[t - 1] + np.sqrt(1 - memory**2) * noise[t]
-    return noise
+    """Time-correlated noise of unit variance; see `time_correlated`."""
+    return time_correlated(rng.standard_normal(shape), memory)
 
 
 def _shaking(truth: Floats, rng: Rng) -> Floats:

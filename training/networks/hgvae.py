@@ -7,7 +7,7 @@ deterministic stream of all nodes, to which every stochastic level adds its late
 latent for each track.
 
 Beyond the paper: the encoder also reads the certainty of each entry, and entries that were not observed are filled in
-by the completion network (`training.networks.hgvae_completion`), so that one pass completes a window; and the cosine
+by the completion network (`training.networks.graph`), so that one pass completes a window; and the cosine
 transform may be truncated to its lowest coefficients, which makes the live model small.
 """
 
@@ -24,8 +24,7 @@ from torch.nn import functional as F
 
 from steadypose.prior.models.hgvae.config import JOINT_NODES, TRACK_LOG_VAR, HGVAEConfig, Level
 from steadypose.prior.models.layers.compiled_graph import LOG_VAR_RANGE
-from steadypose.training.networks.graph import GraphBlock, GraphLinear
-from steadypose.training.networks.hgvae_completion import CompletionNet, certainty_of
+from steadypose.training.networks.graph import CompletionNet, GraphBlock, GraphLinear, certainty_of
 
 INITIAL_LATENT_GAIN, INITIAL_POSTERIOR_LOG_VAR = 0.25, -4.0
 """Initialisation: the factor on what a level adds to the stream, and the bias of the posteriors' log-variance"""

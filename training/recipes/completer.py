@@ -13,7 +13,7 @@ of the body, and combinations of these; the known joints of some have a little n
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +22,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
 
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.skeleton import J, limbs
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, to_6d
 from steadypose.prior.models.completer.config import BENDS, FEATURES, OUTPUTS, CompleterConfig
 from steadypose.prior.models.completer.features import Bools, Line, Window, correction_share, read_window
-from steadypose.prior.models.weights import LICENCES
 from steadypose.training.data.dataset import LivelyWindows, MotionSet, describe_data, mirror_offsets, mirror_rotations
-from steadypose.training.loop import TrainingOptions, TrainingRun
-from steadypose.training.weights import started
+from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 
 class Completer(nn.Module):
@@ -83,8 +83,6 @@ class _Layer(nn.Module):
         return x + self.narrow(F.gelu(self.widen(self.norm2(x)), approximate="tanh"))
 
 
-Rng = np.random.Generator
-
 ITERATIONS, BATCH, LEARNING_RATE = 20_000, 1536, 8e-4
 """Frames a step; AdamW's rate at its highest, from where it falls along a cosine."""
 
@@ -120,35 +118,30 @@ _ENDS = [J[name] for name in ("pelvis", "spine3", "head", "left_wrist", "right_w
 
 def train_completer(options: TrainingOptions, config: CompleterConfig | None = None) -> Path:
     """Train the completer, of these sizes, on prepared motion; the path of the weights."""
-    iterations, weights, seed = options.iterations or ITERATIONS, options.weights, options.seed
-    path = options.path("completer")
-    torch.manual_seed(seed)
-    train, val = (MotionSet.load(options.data, weights, split) for split in ("train", "val"))
-    model = Completer(config or CompleterConfig())
-    model.usual.copy_(roma.rotmat_to_unitquat(roma.special_procrustes(train.rotations.mean(dim=0))))
-    origin = started(model, "completer", options.start)
-    optimiser = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=0.01)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, LEARNING_RATE, total_steps=iterations + 1, pct_start=0.05, final_div_factor=40
-    )
-    run = TrainingRun(path.parent, model, schedule, iterations, evaluations=40)
-    lively = LivelyWindows(train)
+    train, val = options.motion()
+    lively, sizes = LivelyWindows(train), config or CompleterConfig()
 
-    def loss_of(count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+    def network() -> Completer:
+        model = Completer(sizes)
+        model.usual.copy_(roma.rotmat_to_unitquat(roma.special_procrustes(train.rotations.mean(dim=0))))
+        return model
+
+    def loss_of(model: Completer, count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         gap, context = int(rng.integers(GAPS[0], GAPS[1] + 1)), int(rng.integers(CONTEXT[0], CONTEXT[1] + 1))
         frames = gap + context
         rows = lively.sample(max(count // frames, 1), frames, STRIDES, rng)
         return loss(model, Truth.of(train, rows, rng), masks(len(rows), gap, context, rng), rng)
 
-    run.minimise(loss_of, lambda: evaluate_completer(model, val), BATCH, seed, clip=1.0)
-    return run.save(path, model, asdict(calibrate(model, val)), {
-        "Model": f"a transformer of {model.config.layers} layers, {model.config.width} wide, over a window's frames",
-        "Data": describe_data(weights, train, val),
-        "Licence": LICENCES[weights],
-        "Training": f"`steadypose train completer --weights {weights} --iterations {iterations}`: {BATCH} frames a "
-        f"step in windows of {GAPS[0] + CONTEXT[0]} to {GAPS[1] + CONTEXT[1]}, AdamW {LEARNING_RATE:g}, "
-        f"seed {seed}{origin}",
-    })  # fmt: skip
+    def rise_and_fall(optimiser: Optimizer, steps: int) -> LRScheduler:
+        return OneCycleLR(optimiser, LEARNING_RATE, total_steps=steps + 1, pct_start=0.05, final_div_factor=40)
+
+    recipe = Recipe(
+        "completer", network, loss_of, lambda model: evaluate_completer(model, val), ITERATIONS, BATCH, LEARNING_RATE,
+        f"frames, in windows of {GAPS[0] + CONTEXT[0]} to {GAPS[1] + CONTEXT[1]},", decay=0.01, schedule=rise_and_fall,
+    )  # fmt: skip
+    described = f"a transformer of {sizes.layers} layers, {sizes.width} wide, over a window's frames"
+    data = describe_data(options.weights, train, val)
+    return recipe.train(options, described, data, calibrated=lambda model: calibrate(model, val))
 
 
 class Truth:

@@ -12,7 +12,7 @@ output are drawn, turned, and stripped of what a sensor may not give: the root, 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +28,10 @@ from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, REST_SP
 from steadypose.prior.body.skeleton import MIRROR, J
 from steadypose.prior.models.contacts import FEATURES, contact_features
 from steadypose.prior.models.mixture.inference import MixtureSmoother
-from steadypose.prior.models.weights import LICENCES
+from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.dataset import MotionSet, describe_data
-from steadypose.training.loop import TrainingOptions, TrainingRun
-from steadypose.training.weights import started
+from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 OUTPUTS = 2 * len(CONTACT_JOINTS)
 """Load, then rest, of each joint."""
@@ -82,10 +81,8 @@ class ContactNet(nn.Module):
         return load, rest, state
 
 
-Rng = np.random.Generator
-
 ITERATIONS, BATCH, LEARNING_RATE = 3_000, 64, 4e-3
-"""Clips a step; Adam's rate at the start, which falls along a cosine."""
+"""Clips a step; the rate at the start."""
 
 FRAMES = 90
 """Of a clip, from its first: the start of a stream is a part of it."""
@@ -187,9 +184,7 @@ def _errors(shape: tuple[int, ...], rng: Rng) -> Floats:
     whole = 10 ** rng.uniform(-3.0, -1.7, of_clip) * (rng.random(of_clip) < 0.4)
     memory = rng.uniform(0.8, 0.98, of_clip[:1])[:, None, None]
     lasting = rng.standard_normal(shape) * slow + rng.standard_normal((count, frames, 1, 3)) * whole
-    for t in range(1, frames):
-        lasting[:, t] = memory * lasting[:, t - 1] + np.sqrt(1.0 - memory**2) * lasting[:, t]
-    return lasting + fast * rng.standard_normal(shape)
+    return time_correlated(lasting, memory, axis=1) + fast * rng.standard_normal(shape)
 
 
 def draw(pool: Pool, clips: NDArray[np.int64], rng: Rng) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -228,35 +223,26 @@ def _tensor(values: NDArray[Any]) -> Tensor:
 
 def train_contacts(options: TrainingOptions) -> Path:
     """Train the contact network on prepared motion at several speeds; the path of the weights."""
-    iterations, weights, seed = options.iterations or ITERATIONS, options.weights, options.seed
-    path = options.path("contacts")
-    sets = {split: MotionSet.load(options.data, weights, split, flat=True) for split in CLIPS}
-    train, val = (_pool(path.parent, sets[split], split, seed) for split in CLIPS)
-    torch.manual_seed(seed)
-    model = ContactNet(ContactConfig())
-    origin = started(model, "contacts", options.start)
-    optimiser = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=LEARNING_RATE / 100)
-    run = TrainingRun(path.parent, model, schedule, iterations, evaluations=40)
+    motion = dict(zip(CLIPS, options.motion(flat=True), strict=True))
+    train, val = (_pool(options.path("contacts").parent, motion[split], split, options.seed) for split in CLIPS)
 
-    def loss_of(count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+    def loss_of(model: ContactNet, count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         features, load, rest, counts = draw(train, rng.integers(len(train.yaw), size=count), rng)
-        said_load, said_rest = model(features)
         losses = [
-            (F.binary_cross_entropy_with_logits(said, label, reduction="none") * counts).sum() / counts.sum()
-            for said, label in ((said_load, load), (said_rest, rest))
+            (F.binary_cross_entropy_with_logits(logits, label, reduction="none") * counts).sum() / counts.sum()
+            for logits, label in zip(model(features), (load, rest), strict=True)
         ]
         return losses[0] + losses[1], {"L_load": losses[0].item(), "L_rest": losses[1].item()}
 
-    run.minimise(loss_of, lambda: evaluate_contacts(model, val), BATCH, seed, clip=1.0)
-    return run.save(path, model, asdict(model.config), {
-        "Model": f"load and rest of {len(CONTACT_JOINTS)} joints, a recurrent network of {model.config.hidden} units",
-        "Data": describe_data(weights, sets["train"], sets["val"]),
-        "Licence": LICENCES[weights],
-        "Training": f"`steadypose train contacts --weights {weights} --iterations {iterations}`: "
-        f"{BATCH} clips of {FRAMES} frames a step, of {CLIPS['train']} through simulated sensors and the smoother, "
-        f"Adam {LEARNING_RATE:g}, seed {seed}{origin}",
-    })  # fmt: skip
+    recipe = Recipe(
+        "contacts", lambda: ContactNet(ContactConfig()), loss_of, lambda model: evaluate_contacts(model, val),
+        ITERATIONS, BATCH, LEARNING_RATE, f"clips of {FRAMES} frames",
+    )  # fmt: skip
+    described = (
+        f"load and rest of {len(CONTACT_JOINTS)} joints, a recurrent network, on {CLIPS['train']} clips through "
+    )
+    described += "simulated sensors and the smoother"
+    return recipe.train(options, described, describe_data(options.weights, *motion.values()))
 
 
 def _pool(directory: Path, motion: MotionSet, split: str, seed: int) -> Pool:

@@ -2,9 +2,8 @@
 
 Half of each batch is the paper's: clean windows, every entry observed, latents sampled, KL warmed up. The other half
 simulates a camera: entries are hidden, and completed by the completion network, which is trained first
-(`training.recipes.hgvae_completion`); observed entries are noisy or faulty; and the loss is the negative
-log-likelihood of the clean window at the posterior means. One pass then denoises and completes a window, with a
-standard deviation.
+(`completion_recipe`); observed entries are noisy or faulty; and the loss is the negative log-likelihood of the clean
+window at the posterior means. One pass then denoises and completes a window, with a standard deviation.
 """
 
 from __future__ import annotations
@@ -16,17 +15,121 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, CompletionConfig, HGVAEConfig, Level
 from steadypose.prior.models.weights import LICENCES, weights_path
-from steadypose.training.data.corruption import add_noise, draw_bias_sigma, occlude, vary_builds, with_faults
-from steadypose.training.data.dataset import MotionSet
+from steadypose.training.data.corruption import (
+    add_noise,
+    displaced,
+    draw_bias_sigma,
+    exchanged,
+    occlude,
+    stands_still,
+    vary_builds,
+    with_faults,
+)
 from steadypose.training.data.hgvae_windows import STRIDES, Batch, Windows, mean_tracks
-from steadypose.training.loop import TrainingOptions, TrainingRun
+from steadypose.training.loop import Recipe, Rng, TrainingOptions
+from steadypose.training.networks.graph import CompletionNet
 from steadypose.training.networks.hgvae import HGVAE, HGVAEOutput
-from steadypose.training.recipes.hgvae_completion import BATCH, BONE_SIGMA, FAULTS, TURN_SIGMA, train_completion
 from steadypose.training.recipes.hgvae_faults import train_anomaly
 from steadypose.training.weights import started
+
+ITERATIONS, COMPLETION_BATCH = 9_000, 128
+"""Steps of the model that runs live; windows a step of its completion network."""
+
+FAULTS = (stands_still, exchanged, displaced)
+FAULT_SHARE = 0.3
+"""Kinds of tracking faults among the observed joints, and the share of windows with one"""
+
+BONE_SIGMA, TURN_SIGMA = 0.05, 0.2
+"""Augmentation by `vary_builds`: deviation of the logarithm of bone lengths, and of rotations in radians; there are
+only 22 people to train on."""
+
+
+def completion_recipe(model: HGVAE, train: Windows, val: Windows) -> Recipe[CompletionNet]:
+    """Of ``model.completion``, whose loss is the negative log-likelihood of the hidden entries.
+
+    Each is weighted by its stated standard deviation (Seitzer et al., "On the Pitfalls of Heteroscedastic Uncertainty
+    Estimation", ICLR 2022, beta = 0.5): without the weight, entries of small deviation would dominate the gradient.
+
+    Args:
+        model: an HG-VAE with a completion network; its ``mean`` is set.
+        train: training motion.
+        val: motion of other people, for the validation curves.
+
+    Raises:
+        ValueError: the model has no completion network.
+    """
+    network = _network(model)
+
+    def loss_of(_: CompletionNet, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        clean, sizes = train.draw(count, model.config.frames, rng, STRIDES)
+        clean = vary_builds(clean, BONE_SIGMA, TURN_SIGMA, rng)
+        bias_sigma = draw_bias_sigma(count, rng)
+        seen = occlude(with_faults(add_noise(clean, rng, bias_sigma), FAULTS, FAULT_SHARE, rng), rng)
+        off, log_var, hidden = _errors(model, seen, clean, sizes, bias_sigma)
+        density = 0.5 * (log_var + off.square() * (-log_var).exp())
+        loss = (density * (0.5 * log_var.detach()).exp())[hidden].mean()
+        return loss, {"loss": loss.item()}
+
+    return Recipe(
+        "hgvae", lambda: network, loss_of, lambda _: evaluate_completion(model, val), ITERATIONS, COMPLETION_BATCH,
+        rate=2e-3, decay=1e-3, schedule=CosineAnnealingLR, evaluations=20,
+    )  # fmt: skip
+
+
+def _errors(model: HGVAE, seen: Floats, truth: Floats, sizes: Floats, bias_sigma: Floats | float) -> tuple[Tensor, ...]:
+    """Errors of completed windows, their stated log-variance, both in units of `SCALE`, and which entries count.
+
+    Args:
+        model: with a completion network.
+        seen: (B, T, 22, 3) metres, NaN where hidden.
+        truth: (B, T, 22, 3) metres.
+        sizes: (B,) of the bodies.
+        bias_sigma: (B,) metres along an axis, the sensor's slow error.
+
+    Returns:
+        Three times (B, 66, T): error, log-variance, and whether an entry was hidden since the body's first observation.
+    """
+    batch = Batch.of(model, seen, truth, sizes)
+    completed, log_var = _network(model).complete(batch.x, batch.observed, bias_sigma)
+    off = completed - batch.target
+    return off, log_var.repeat_interleave(3, dim=1), (batch.observed == 0) & (batch.counts > 0)
+
+
+def _network(model: HGVAE) -> CompletionNet:
+    if model.completion is None:
+        raise ValueError("expected a model with a completion network")
+    return model.completion
+
+
+@torch.no_grad()
+def evaluate_completion(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, float]:
+    """On unseen people: RMS error along an axis of joints hidden as in training, and of 1 and 4 in clean windows.
+
+    Returns:
+        ``hidden mm``, ``1 joints mm``, ``4 joints mm``; and ``found/stated``, the former's error over its deviation.
+    """
+    rng = np.random.default_rng(1)
+    clean, sizes = val.draw(windows, model.config.frames, rng)
+    bias_sigma = draw_bias_sigma(windows, rng)
+    off, log_var, hidden = _errors(model, occlude(add_noise(clean, rng, bias_sigma), rng), clean, sizes, bias_sigma)
+    found = {"hidden mm": _rms_mm(off[hidden]), "found/stated": (off * (-0.5 * log_var).exp())[hidden].std().item()}
+    for count in (1, 4):
+        seen = clean.copy()
+        for window in seen:
+            window[:, 1 + rng.choice(21, count, replace=False)] = np.nan
+        off, _, hidden = _errors(model, seen, clean, sizes, 0.0)
+        found[f"{count} joints mm"] = _rms_mm(off[hidden])
+    return found
+
+
+def _rms_mm(off: Tensor) -> float:
+    return off.square().mean().sqrt().item() * SCALE * 1000
+
 
 MODELS: dict[str, HGVAEConfig] = {
     "hgvae": HGVAEConfig(
@@ -45,7 +148,7 @@ MODELS: dict[str, HGVAEConfig] = {
 """``hgvae`` runs live on a robot's CPU; ``hgvae-wide`` has the paper's size, for recordings."""
 
 KL_START = 0.001
-"""beta at the start (section 5)"""
+"""beta at the start (section 5)."""
 WARM_UP = 0.2
 """Share of the training over which beta rises to 1 (the paper: 200 of 5,000 epochs, of a much longer training)."""
 CLIP_ENTRY = 100.0
@@ -60,49 +163,44 @@ def train_hgvae(options: TrainingOptions) -> Path:
     Returns:
         The path of the weights.
     """
-    return _train("hgvae", options, options.iterations or 9_000, batch=64, learning_rate=6e-3)
+    return _train("hgvae", options, ITERATIONS, batch=64, rate=6e-3)
 
 
 def train_hgvae_wide(options: TrainingOptions) -> Path:
     """Train the paper's size: fewer and smaller steps, so that it stays within an hour on two cores."""
-    return _train("hgvae-wide", options, options.iterations or 4_000, batch=32, learning_rate=5e-4)
+    return _train("hgvae-wide", options, 4_000, batch=32, rate=5e-4)
 
 
-def _train(model: str, options: TrainingOptions, iterations: int, batch: int, learning_rate: float) -> Path:
+def _train(model: str, options: TrainingOptions, iterations: int, batch: int, rate: float) -> Path:
     weights, seed, start, path = options.weights, options.seed, options.start, options.path(model)
-    train, val = (Windows(MotionSet.load(options.data, weights, split)) for split in ("train", "val"))
+    iterations = options.iterations or iterations
+    train, val = (Windows(motion) for motion in options.motion())
     torch.manual_seed(seed)
     network = HGVAE(MODELS[model])
     network.mean.copy_(mean_tracks(train, network.config.frames))
     origin = started(network, model, start)
-    rate = learning_rate if start is None else learning_rate / 2
-    train_completion(network, train, val, options.runs / f"{path.stem}-completion", iterations, seed)
-    run = fit(network, train, val, path.parent, iterations, batch, rate, seed)
+    completion = completion_recipe(network, train, val)
+    completion.minimise(_network(network), options.runs / f"{path.stem}-completion", iterations, seed)
+    recipe = recipe_of(model, train, val, batch, rate if start is None else rate / 2)
+    run = recipe.minimise(network, path.parent, iterations, seed)
     run.save(path, network, asdict(network.config), {
         "Model": f"HG-VAE, '{model}' of training/recipes/hgvae.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject",
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train {model} --weights {weights}`: {iterations} steps of {batch} windows, "
-        f"after as many of {BATCH} for its completion network, "
-        f"Adam {rate:g}, seed {seed}{origin}",
+        f"after as many of {completion.batch} for its completion network, "
+        f"AdamW {recipe.rate:g}, seed {seed}{origin}",
     })  # fmt: skip
     faults = None if start is None else str(weights_path(start, model).with_suffix(".faults.safetensors"))
     train_anomaly(path, -(-iterations // 3), replace(options, start=faults))
     return path
 
 
-def fit(
-    model: HGVAE, train: Windows, val: Windows, directory: Path, iterations: int, batch: int, rate: float, seed: int
-) -> TrainingRun:
-    """Train ``model``, all but its completion network, with the loss of the module's docstring."""
-    learned = [p for name, p in model.named_parameters() if not name.startswith("completion.")]
-    optimiser = torch.optim.Adam(learned, lr=rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
-    run = TrainingRun(directory, model, schedule, iterations, evaluations=24)
-    frames = model.config.frames
+def recipe_of(name: str, train: Windows, val: Windows, batch: int, rate: float) -> Recipe[HGVAE]:
+    """Of all of a model but its completion network, with the loss of the module's docstring."""
 
-    def loss_of(count: int, done: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
-        positions, sizes = train.draw(count, frames, rng, STRIDES)
+    def loss_of(model: HGVAE, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        positions, sizes = train.draw(count, model.config.frames, rng, STRIDES)
         half = count // 2
         whole = Batch.of(model, positions[:half], positions[:half], sizes[:half])
         bias_sigma = draw_bias_sigma(count - half, rng)
@@ -112,7 +210,7 @@ def fit(
         drawn = model(both.x, both.certainty, spread=(torch.arange(count) < half).float()[:, None])
         density = drawn.tracks.log_density(both.target) * both.counts
         stated = (0.5 * drawn.tracks.log_var[half:]).exp().detach()
-        # weighted by the stated deviation: see `training.recipes.hgvae_completion`
+        # weighted by the stated deviation: see `completion_recipe`
         density[half:] = density[half:] * (stated / stated.mean())
         likelihood = density.flatten(1).sum(dim=1)
         kl = drawn.kl[:half].sum() / count
@@ -120,9 +218,11 @@ def fit(
         loss = beta * kl - likelihood.mean()
         return loss, {"loss": loss.item(), "KL": 2 * kl.item()}
 
-    clip = CLIP_ENTRY * math.sqrt(frames * JOINT_NODES)
-    run.minimise(loss_of, lambda: evaluate_hgvae(model, val), batch, seed, clip)
-    return run
+    return Recipe(
+        name, lambda: HGVAE(MODELS[name]), loss_of, lambda model: evaluate_hgvae(model, val), ITERATIONS, batch, rate,
+        schedule=CosineAnnealingLR, evaluations=24, clip=CLIP_ENTRY * math.sqrt(MODELS[name].frames * JOINT_NODES),
+        parameters=lambda model: [p for name, p in model.named_parameters() if not name.startswith("completion.")],
+    )  # fmt: skip
 
 
 def evidence(drawn: HGVAEOutput, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ Everything is as the live node sees it: a sensor of a given error, half of it sl
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +15,7 @@ import torch
 from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.fit.tensors import load_network
@@ -49,11 +51,10 @@ from steadypose.training.data.corruption import (
     with_drifting_error,
     with_faults,
 )
-from steadypose.training.data.dataset import MotionSet
 from steadypose.training.data.hgvae_windows import STRIDES, Windows, standardise
-from steadypose.training.loop import TrainingOptions, TrainingRun
+from steadypose.training.loop import Recipe, Rng, TrainingOptions
+from steadypose.training.networks.graph import FaultNet
 from steadypose.training.networks.hgvae import HGVAE
-from steadypose.training.networks.hgvae_faults import FaultNet
 from steadypose.training.weights import started
 
 WINDOWS = 2000
@@ -89,16 +90,28 @@ def train_anomaly(path: Path, iterations: int, options: TrainingOptions) -> None
         options: as HG-VAE was trained with, but to start from weights of a fault network.
     """
     weights, seed = options.weights, options.seed
-    model = _model(path)
-    train, val = (Windows(MotionSet.load(options.data, weights, split)) for split in ("train", "val"))
+    model = load_network(HGVAE, HGVAEConfig.from_dict, str(path), "hgvae")
+    train, val = (Windows(motion) for motion in options.motion())
     torch.manual_seed(seed)
     network = FaultNet(FaultNetConfig(frames=model.config.frames))
     network.mean.copy_(model.mean)
     origin = started(network, "hgvae", options.start)
-    run = fit(network, model, train, val, options.runs / f"{path.stem}-faults", iterations, seed)
+
+    def loss_of(network: FaultNet, count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        loss = _loss(network, model, train, count, rng)
+        return loss, {"loss": loss.item()}
+
+    def evaluate(network: FaultNet) -> dict[str, float]:
+        return {"val loss": _loss(network, model, val, 1024, np.random.default_rng(1)).item()}
+
+    recipe = Recipe(
+        "hgvae", lambda: network, loss_of, evaluate, iterations, BATCH, rate=2e-3, decay=1e-3,
+        schedule=CosineAnnealingLR, evaluations=10, clip=math.inf,
+    )  # fmt: skip
+    run = recipe.minimise(network, options.runs / f"{path.stem}-faults", iterations, seed)
     run.save(path.with_suffix(".faults.safetensors"), network, asdict(network.config), {
-        "Model": f"fault network beside {path.name}, training/networks/hgvae_faults.py",
-        "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, spoilt as in train_faults.py",
+        "Model": f"fault network beside {path.name}, training/networks/graph.py",
+        "Data": f"the '{weights}' set of `steadypose prepare`, split by subject, with tracking faults",
         "Licence": LICENCES[weights],
         "Training": f"with the HG-VAE, by `steadypose train`: {iterations} steps of {BATCH} windows, seed {seed}"
         f"{origin}",
@@ -107,30 +120,7 @@ def train_anomaly(path: Path, iterations: int, options: TrainingOptions) -> None
     calibrate(network, model, val, WINDOWS, seed=0).save(path.with_suffix(".anomaly.json"), note)
 
 
-def _model(path: Path) -> HGVAE:
-    return load_network(HGVAE, HGVAEConfig.from_dict, str(path), "hgvae")
-
-
-def fit(
-    network: FaultNet, model: HGVAE, train: Windows, val: Windows, directory: Path, iterations: int, seed: int
-) -> TrainingRun:
-    """Train ``network``; see `train_anomaly`."""
-    optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
-    run = TrainingRun(directory, network, schedule, iterations, evaluations=10)
-
-    def loss_of(count: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
-        loss = _loss(network, model, train, count, rng)
-        return loss, {"loss": loss.item()}
-
-    def evaluate() -> dict[str, float]:
-        return {"val loss": _loss(network, model, val, 1024, np.random.default_rng(1)).item()}
-
-    run.minimise(loss_of, evaluate, BATCH, seed)
-    return run
-
-
-def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: np.random.Generator) -> Tensor:
+def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: Rng) -> Tensor:
     """Binary cross-entropy over the joints seen of which it is clear whether they are off."""
     clean, sizes = windows.draw(count, model.config.frames, rng, STRIDES)
     clean = vary_builds(clean, BONE_SIGMA, TURN_SIGMA, rng)
@@ -216,7 +206,7 @@ def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, see
     return Calibration(quantiles)
 
 
-def _at_paces(windows: Windows, frames: int, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def _at_paces(windows: Windows, frames: int, count: int, rng: Rng) -> tuple[Floats, Floats]:
     """Windows (B, T, 22, 3), up to ``count`` of each class of `PACES`, and body sizes."""
     kept: list[tuple[Floats, Floats]] = []
     wanted = np.full(len(PACES), count)

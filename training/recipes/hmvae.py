@@ -127,12 +127,7 @@ def _train(
 
 
 def fit(
-    model: MotionVAE,
-    train: MotionSet,
-    val: MotionSet,
-    directory: Path,
-    hyperparameters: Hyperparameters,
-    seed: int,
+    model: MotionVAE, train: MotionSet, val: MotionSet, directory: Path, hyperparameters: Hyperparameters, seed: int
 ) -> TrainingRun:
     """Train a VAE of windows as HM-VAE is trained, with equations 3 and 5 to 8.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +14,12 @@ from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, REST_SP
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet, roll_out, sample, transitions
 from steadypose.prior.fit.humor_state import State, canonical, choose, features, pose_features, stack, states_of
-from steadypose.prior.models.weights import LICENCES
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.dataset import MotionSet, describe_data, mirror_offsets, mirror_rotations
-from steadypose.training.loop import TrainingOptions, TrainingRun
-from steadypose.training.weights import started
-
-Rng = np.random.Generator
+from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 ITERATIONS, BATCH, LEARNING_RATE = 6_000, 128, 7e-4
-"""Sequences a step; Adam's rate at the start, which falls along a cosine."""
+"""Sequences a step; the rate at the start."""
 
 STEPS = 10
 """Steps of a training sequence."""
@@ -134,72 +130,26 @@ class Batch:
 
 def train_humor(options: TrainingOptions) -> Path:
     """Train the transition model on prepared motion; the path of the weights."""
-    iterations, weights = options.iterations or ITERATIONS, options.weights
-    train, val = (MotionSet.load(options.data, weights, split, flat=True) for split in ("train", "val"))
+    train, val = options.motion(flat=True)
     config = HumorConfig()
-    card = {
-        "Model": f"transitions of HuMoR: latent of {config.latent}, layers of {config.hidden}, "
-        f"{config.components} Gaussians of initial states",
-        "Data": describe_data(weights, train, val),
-        "Licence": LICENCES[weights],
-        "Training": f"`steadypose train humor --weights {weights} --iterations {iterations}`: {BATCH} sequences of "
-        f"{STEPS} steps a step, Adam {LEARNING_RATE:g}, seed {options.seed}",
-    }  # fmt: skip
-    return fit_transitions(
-        config, train, val, options.path("humor"), card, iterations, BATCH, LEARNING_RATE, options.seed, options.start
-    )
+    sequences = Sequences.of(train)
+    described = f"transitions of HuMoR: latent of {config.latent}, layers of {config.hidden}, {config.components} "
+    return recipe_of(config, sequences, Sequences.of(val)).train(
+        options, described + "Gaussians of initial states", describe_data(options.weights, train, val),
+        started_anew=lambda model: _fit_statistics(model, sequences, options.seed),
+    )  # fmt: skip
 
 
-def fit_transitions(
-    config: HumorConfig,
-    train: MotionSet,
-    val: MotionSet,
-    path: Path,
-    card: dict[str, str],
-    iterations: int,
-    batch: int,
-    learning_rate: float,
-    seed: int,
-    start: str | None = None,
-    known: HumorNet | None = None,
-    evaluations: int = 40,
-) -> Path:
-    """Train any configuration on any motion, as the ablations are.
+def recipe_of(config: HumorConfig, train: Sequences, val: Sequences) -> Recipe[HumorNet]:
+    """Of any configuration, on any motion: the ablations are trained alike."""
 
-    Args:
-        config: sizes, and what is left out.
-        train: motion to learn.
-        val: motion of other people, evaluated on as it goes.
-        path: of the weights; its folder is the run's.
-        card: as of `TrainingRun.save`; what training started from is added to its "Training".
-        iterations: optimiser steps.
-        batch: sequences of `STEPS` steps.
-        learning_rate: of Adam at the start; it falls along a cosine.
-        seed: of weights and of sampling.
-        start: weights to go on from: a set or a path.
-        known: a model whose statistics of states are taken over: to fit them takes a minute.
-        evaluations: as of `TrainingRun`.
+    def loss_of(model: HumorNet, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        return transition_loss(model, train.draw(count, STEPS, rng), done, rng)
 
-    Returns:
-        ``path``.
-    """
-    sequences, unseen = Sequences.of(train), Sequences.of(val)
-    torch.manual_seed(seed)
-    model = HumorNet(config)
-    origin = started(model, "humor", start)
-    if known is not None:
-        model.load_state_dict(dict(known.named_buffers()), strict=False)
-    elif start is None and not (path.parent / "checkpoint.pt").exists():
-        _fit_statistics(model, sequences, seed)
-    optimiser = torch.optim.Adam(model.parameters(), lr=learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=learning_rate / 100)
-    run = TrainingRun(path.parent, model, schedule, iterations, evaluations)
-
-    def loss_of(count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
-        return transition_loss(model, sequences.draw(count, STEPS, rng), done, rng)
-
-    run.minimise(loss_of, lambda: evaluate_humor(model, unseen), batch, seed, clip=1.0)
-    return run.save(path, model, asdict(config), {**card, "Training": card["Training"] + origin})
+    return Recipe(
+        "humor", lambda: HumorNet(config), loss_of, lambda model: evaluate_humor(model, val),
+        ITERATIONS, BATCH, LEARNING_RATE, f"sequences of {STEPS} steps",
+    )  # fmt: skip
 
 
 @torch.no_grad()

@@ -9,7 +9,8 @@ the feet in training.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,10 +27,9 @@ from steadypose.prior.fit.tensors import heading, yaw_rotation
 from steadypose.prior.models.layers.dense import SLOPE
 from steadypose.prior.models.layers.edge_graph import Level, pooling_levels
 from steadypose.prior.models.root_velocity import CHANNELS, FRAME_S, TrajectoryConfig
-from steadypose.prior.models.weights import LICENCES
+from steadypose.prior.sim.noise import time_correlated
 from steadypose.training.data.dataset import MotionSet, describe_data
-from steadypose.training.loop import TrainingOptions, TrainingRun
-from steadypose.training.weights import started
+from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 
 class RootMotion(NamedTuple):
@@ -93,7 +93,7 @@ def _features(joints: Tensor) -> Tensor:
 
 
 ITERATIONS, BATCH, LEARNING_RATE = 2_000, 64, 2e-3
-"""Windows a step; Adam's rate at the start, which falls along a cosine."""
+"""Windows a step; the rate at the start."""
 
 WINDOW = 48
 """Frames of a training window, 1.6 s."""
@@ -148,33 +148,20 @@ class _Windows:
 
 def train_trajectory(options: TrainingOptions) -> Path:
     """Train the trajectory network on prepared motion; the path of the weights."""
-    iterations, weights, seed = options.iterations or ITERATIONS, options.weights, options.seed
-    path = options.path("trajectory")
-    torch.manual_seed(seed)
-    train = MotionSet.load(options.data, weights, "train", flat=True)
-    val = MotionSet.load(options.data, weights, "val", flat=True)
+    train, val = options.motion(flat=True)
     starts, chances = _chances(train)
-    model = TrajectoryNet(TrajectoryConfig())
-    origin = started(model, "trajectory", options.start)
-    optimiser = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=LEARNING_RATE / 100)
-    run = TrainingRun(path.parent, model, schedule, iterations, evaluations=50)
 
-    def loss_of(count: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+    def loss_of(model: TrajectoryNet, count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         windows = _sample(train, starts, chances, count, rng)
         return _loss(model(windows.joints), windows)
 
-    run.minimise(loss_of, lambda: evaluate_trajectory(model, val), BATCH, seed)
-    config = calibrate(model, val)
-    return run.save(path, model, asdict(config), {
-        "Model": f"root velocity and contacts, {config.context} frames of context, 22 joints",
-        "Data": describe_data(weights, train, val),
-        "Licence": LICENCES[weights],
-        "Training": f"`steadypose train trajectory --weights {weights} --iterations {iterations}`: "
-        f"{BATCH} windows a step, Adam {LEARNING_RATE:g}, seed {seed}{origin}",
-        "Calibration": f"standard deviations times {config.sigma_scale}, errors last {config.correlation_s} s "
-        "(horizontal, vertical)",
-    })  # fmt: skip
+    recipe = Recipe(
+        "trajectory", lambda: TrajectoryNet(TrajectoryConfig()), loss_of,
+        lambda model: evaluate_trajectory(model, val), ITERATIONS, BATCH, LEARNING_RATE, evaluations=50, clip=math.inf,
+    )  # fmt: skip
+    described = f"root velocity and contacts, {TrajectoryConfig().context} frames of context, 22 joints"
+    data = describe_data(options.weights, train, val)
+    return recipe.train(options, described, data, calibrated=lambda model: calibrate(model, val))
 
 
 _SPAN = int(np.ceil((WINDOW + 1) * RATES[1])) + 2
@@ -188,9 +175,7 @@ def _chances(motion: MotionSet) -> tuple[np.ndarray, np.ndarray]:
     return rows[:, 0], weights / weights.sum()
 
 
-def _sample(
-    motion: MotionSet, starts: np.ndarray, chances: np.ndarray, count: int, rng: np.random.Generator
-) -> _Windows:
+def _sample(motion: MotionSet, starts: np.ndarray, chances: np.ndarray, count: int, rng: Rng) -> _Windows:
     """Random windows: replayed faster or slower, scaled, tilted, mirrored, and seen as a prior would leave them."""
     rows = rng.choice(starts, size=count, p=chances)[:, None] + np.arange(_SPAN)
     # One frame more at each end, for central differences.
@@ -236,7 +221,7 @@ def _mirror_half(windows: _Windows) -> _Windows:
     )
 
 
-def _corrupt(joints: Tensor, rng: np.random.Generator, noise_sd: float | None = None) -> Tensor:
+def _corrupt(joints: Tensor, rng: Rng, noise_sd: float | None = None) -> Tensor:
     """Add noise that lasts (AR(1)) to joints (B, T, 22, 3), the root's too, and hold a limb still in some windows.
 
     Args:
@@ -247,9 +232,7 @@ def _corrupt(joints: Tensor, rng: np.random.Generator, noise_sd: float | None = 
     count, time = joints.shape[:2]
     sd = rng.uniform(0.0, NOISE_SD, (count, 1, 1, 1)) if noise_sd is None else np.full((count, 1, 1, 1), noise_sd)
     memory = rng.uniform(0.7, 0.95, (count, 1, 1))
-    noise = rng.normal(0.0, 1.0, joints.shape)
-    for t in range(1, time):
-        noise[:, t] = memory * noise[:, t - 1] + np.sqrt(1.0 - memory**2) * noise[:, t]
+    noise = time_correlated(rng.normal(0.0, 1.0, tuple(joints.shape)), memory, axis=1)
     offset = rng.normal(0.0, OFFSET_SD, (count, 1, *joints.shape[2:]))
     noisy = joints + _tensor(sd * noise + offset)
     noisy = noisy - noisy[:, :, :1]

@@ -7,15 +7,16 @@ direction of view, and stays while these do. The network gives, frame by frame, 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Collection
-from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import OneCycleLR
 
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
@@ -33,7 +34,7 @@ from steadypose.prior.models.sensor_bias import (
 from steadypose.prior.timing.fixed_lag import FixedLagRTS
 from steadypose.training.data.dataset import mirror_offsets
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
-from steadypose.training.loop import TrainingOptions, TrainingRun
+from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 
 class CorrectionNet(nn.Module):
@@ -44,6 +45,7 @@ class CorrectionNet(nn.Module):
 
     def __init__(self, config: CorrectionConfig) -> None:
         super().__init__()
+        self.config = config
         self.register_buffer("mean", torch.zeros(FEATURES))
         self.register_buffer("scale", torch.ones(FEATURES))
         self.layers = nn.Sequential(
@@ -67,8 +69,8 @@ def mirror_features(x: Tensor) -> Tensor:
     )
 
 
-ITERATIONS, BATCH = 4_000, 256
-"""Frames a step."""
+ITERATIONS, BATCH, LEARNING_RATE, EVALUATIONS = 4_000, 256, 1e-3, 40
+"""Frames a step; the rate at the start, which rises to twice as much and falls to nothing."""
 HIDE = 0.1
 """Share of training frames with joints hidden, so that the network can do without some."""
 INPUT_NOISE = 0.03
@@ -77,21 +79,18 @@ INPUT_NOISE = 0.03
 
 def train_correction(options: TrainingOptions, subjects: Collection[str] = TRAIN_SUBJECTS) -> Path:
     """Train the Kinect's correction on ``ui_prmd.npz``, on these subjects of it; the path of the weights."""
-    iterations, seed, path = options.iterations or ITERATIONS, options.seed, options.path("correction")
-    torch.manual_seed(seed)
     # All six people: with one held back to watch, the other five teach measurably less (benchmarks/NOTEBOOK.md). The
     # length of the training was chosen that way once; `steadypose evaluate kinect_vicon` has people never seen.
     x, y = _examples(options.data, subjects)
-    config = CorrectionConfig(sensor=options.weights)
-    net = CorrectionNet(config)
-    net.mean.copy_(x.nanmean(dim=0).nan_to_num())
-    net.scale.copy_((x - net.mean).square().nanmean(dim=0).sqrt().nan_to_num().clamp(min=1e-2))
-    optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3, weight_decay=1e-2)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=iterations)
-    run = TrainingRun(path.parent, net, schedule, iterations, evaluations=40)
-    recent = deque[float](maxlen=run.every)
+    recent = deque[float](maxlen=max((options.iterations or ITERATIONS) // EVALUATIONS, 1))
 
-    def loss_of(count: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
+    def network() -> CorrectionNet:
+        net = CorrectionNet(CorrectionConfig(sensor=options.weights))
+        net.mean.copy_(x.nanmean(dim=0).nan_to_num())
+        net.scale.copy_((x - net.mean).square().nanmean(dim=0).sqrt().nan_to_num().clamp(min=1e-2))
+        return net
+
+    def loss_of(net: CorrectionNet, count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         rows = torch.from_numpy(rng.integers(len(x), size=count))
         inputs, targets = _hide(x[rows], rng), y[rows]
         half = count // 2
@@ -101,13 +100,16 @@ def train_correction(options: TrainingOptions, subjects: Collection[str] = TRAIN
         recent.append(1000 * loss.item())
         return loss, {"training mm": float(np.mean(recent))}
 
-    run.minimise(loss_of, dict, BATCH, seed)
-    return run.save(path, net, asdict(config), {
-        "Model": "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses",
-        "Data": f"UI-PRMD, Kinect beside Vicon: {', '.join(subjects)}",
-        "Licence": "Apache-2.0; the data is in the public domain (PDDL 1.0)",
-        "Training": f"`steadypose train correction --data ui_prmd.npz`: {iterations} steps of {BATCH}, seed {seed}",
-    })  # fmt: skip
+    recipe = Recipe(
+        "correction", network, loss_of, lambda net: {}, ITERATIONS, BATCH, LEARNING_RATE, "frames", decay=1e-2,
+        schedule=lambda optimiser, steps: OneCycleLR(optimiser, 2 * LEARNING_RATE, total_steps=steps),
+        evaluations=EVALUATIONS, clip=math.inf,
+    )  # fmt: skip
+    return recipe.train(
+        options, "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses",
+        f"UI-PRMD, Kinect beside Vicon: {', '.join(subjects)}",
+        licence="Apache-2.0; the data is in the public domain (PDDL 1.0)",
+    )  # fmt: skip
 
 
 def _examples(data: Path, subjects: Collection[str]) -> tuple[Tensor, Tensor]:

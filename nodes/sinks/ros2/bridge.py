@@ -1,8 +1,16 @@
-"""The ROS 2 bridge: poses and ``diagnostics`` out to ROS 2. docs/ros2.md lists the topics."""
+"""Poses and ``diagnostics`` as ROS 2 messages: to ROS 2, or without it to Foxglove over its WebSocket.
+
+docs/ros2.md lists the topics.
+"""
+
+# pyright: reportMissingImports=false
+# an optional extra, which need not be installed
 
 from __future__ import annotations
 
-from collections import Counter
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from steadypose import PACKAGE
 from steadypose.msgs.types import Message, PoseWorld
@@ -10,15 +18,56 @@ from steadypose.nodes.checks.problem import Problem, warning
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2.connect import check_ros, connect
-from steadypose.nodes.ros2.connection import Connection, Publish
-from steadypose.nodes.sinks.ros2.settings import Ros2BridgeSettings
-from steadypose.nodes.sinks.ros2.topics import BodyTopics
+from steadypose.nodes.graph.settings import LaunchError, check_host_and_port
+from steadypose.nodes.ros2.connection import Connection, Publish, check_ros, connect
+from steadypose.nodes.ros2.definitions import ros_types
 
-RVIZ = PACKAGE / "launch/views/steadypose.rviz"
+if TYPE_CHECKING:
+    from steadypose.nodes.sinks.ros2.messages import BodyTopics
+
+_NAMESPACE = re.compile(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Ros2BridgeSettings:
+    """``[ros2]``: poses in ROS 2."""
+
+    world_frame: str = "world"
+    """what the frame of pose/world is called in TF: map, odom, base_link, or a frame of its own"""
+    sensor_tf: bool = True
+    """publish where a calibrated sensor stands; off where the robot's own description does"""
+    clock: bool = True
+    """publish /clock while a recording is replayed, for nodes with use_sim_time"""
+    namespace: str = ""
+    """of the node and its topics, but for /tf, /tf_static, /clock and /diagnostics, which all robots share"""
+
+    def __post_init__(self) -> None:
+        if not self.world_frame or self.world_frame.startswith("/"):
+            raise LaunchError(f"[ros2] world_frame: expected a frame's name without a slash, got {self.world_frame!r}")
+        if self.namespace and not _NAMESPACE.fullmatch(self.namespace):
+            raise LaunchError(
+                f"[ros2] namespace: expected a name such as robot or fleet/robot1, got {self.namespace!r}"
+            )
+
+
+@dataclass(frozen=True)
+class FoxgloveSettings:
+    """``[foxglove]``: poses for Foxglove."""
+
+    port: int = 8765
+    """of the WebSocket: open ws://localhost:8765 in Foxglove"""
+    world_frame: str = "world"
+    """what the frame of pose/world is called"""
+
+    def __post_init__(self) -> None:
+        check_host_and_port("foxglove", HOST, self.port, least=0)
+
+
+RVIZ, LAYOUT = PACKAGE / "launch/views/steadypose.rviz", PACKAGE / "launch/views/foxglove.json"
 GLOBAL = ("tf", "tf_static", "clock", "diagnostics")
 """topics that are in no namespace, by ROS's convention"""
+HOST = "127.0.0.1"
+"""this machine only, as poses are personal data: from another machine, use ssh -L 8765:localhost:8765 robot"""
 
 
 def check_ros2(launch: Launch) -> None:
@@ -55,7 +104,76 @@ class RosOutput:
             self._connection.drop(publish)
 
 
-class Ros2BridgeNode(Node):
+class FoxgloveOutput:
+    """A WebSocket server with a channel for each topic, from its first message on.
+
+    The server keeps no message: what is latched is sent again when somebody subscribes, to all who have.
+    """
+
+    def __init__(self, port: int) -> None:
+        import foxglove
+        from foxglove.websocket import ServerListener
+
+        self._channels: dict[str, Any] = {}
+        self._latched: dict[str, bytes] = {}
+        output = self
+
+        class Latch(ServerListener):
+            def on_subscribe(self, client: Any, channel: Any) -> None:
+                output.repeat(channel.topic)
+
+        self._context = foxglove.Context()
+        try:
+            self._server: Any = foxglove.start_server(
+                name="steadypose", host=HOST, port=port, server_listener=Latch(), context=self._context
+            )
+        except (OSError, RuntimeError) as error:
+            raise LaunchError(f"[foxglove] port {port} cannot be opened: {error}") from error
+
+    @property
+    def url(self) -> str:
+        return f"ws://localhost:{self._server.port}"
+
+    def send(self, topic: str, kind: str, cdr: bytes, *, latched: bool = False) -> None:
+        import foxglove
+
+        if topic not in self._channels:
+            definition, _ = ros_types().generate_msgdef(kind, ros_version=2)
+            schema = foxglove.Schema(name=kind, encoding="ros2msg", data=definition.encode())
+            self._channels[topic] = foxglove.Channel(
+                f"/{topic}", schema=schema, message_encoding="cdr", context=self._context
+            )
+        if latched:
+            self._latched[topic] = cdr
+        self._channels[topic].log(cdr)
+
+    def repeat(self, channel: str) -> None:
+        """Send the latched message of a channel again, if there is one."""
+        topic = channel.removeprefix("/")
+        open_one, cdr = self._channels.get(topic), self._latched.get(topic)
+        if open_one and cdr is not None:
+            open_one.log(cdr)
+
+    def drop(self, topic: str) -> None:
+        self._latched.pop(topic, None)
+        if channel := self._channels.pop(topic, None):
+            channel.close()
+
+    def close(self) -> None:
+        self._server.stop()
+
+
+class RosMessagesNode(Node):
+    """Publishes what steadypose says as ROS messages, by the `BodyTopics` of its output."""
+
+    _topics: BodyTopics
+
+    def handle(self, topic: str, message: Message) -> None:
+        if refused := self._topics.send(message):
+            self.health.counts["refused.body not finite"] += refused
+
+
+class Ros2BridgeNode(RosMessagesNode):
     """Publishes bodies in ROS 2."""
 
     name = "ros2_bridge"
@@ -65,13 +183,15 @@ class Ros2BridgeNode(Node):
         check_ros()
         self._settings = launch.settings(Ros2BridgeSettings)
         self._bodies = 0
-        self._missing: Counter[str] = Counter()
+        self._output: RosOutput | None = None
 
     def work(self) -> None:
+        from steadypose.nodes.sinks.ros2.messages import BodyTopics  # here and below: not to read a launch file
+
         connection = connect("steadypose_bridge", self._settings.namespace)
         try:
             self._output = RosOutput(connection, self._settings.namespace)
-            self._topics = BodyTopics(self._output, self._settings)
+            self._topics = BodyTopics(self._output, self._settings)  # pyright: ignore[reportArgumentType]  (one class, found under two names)
             print(f"RViz: rviz2 -d {RVIZ.resolve()} -f {self._settings.world_frame}", flush=True)
             super().work()
         finally:
@@ -82,12 +202,34 @@ class Ros2BridgeNode(Node):
             self._bodies = len(message.bodies)
             if self._settings.clock and self.timeline and not self.timeline.is_now:
                 self._topics.send_clock(self.timeline.stamp_at(self.clock.now_ns()))
-        if refused := self._topics.send(message):
-            self.health.counts["refused.body not finite"] += refused
+        super().handle(topic, message)
 
     def problems(self) -> list[Problem]:
-        missing = self._output.missing if hasattr(self, "_output") else {}
+        missing = self._output.missing if self._output else {}
         return [warning("ros_type", f"/{topic} is not published: {why}") for topic, why in list(missing.items())[:1]]
 
     def status(self) -> dict[str, str]:
         return {"bodies": str(self._bodies)}
+
+
+class FoxgloveNode(RosMessagesNode):
+    """Serves poses to Foxglove, newest first when it falls behind; the pipeline never waits for it."""
+
+    name = "foxglove"
+    url = ""
+
+    def work(self) -> None:
+        from steadypose.nodes.sinks.ros2.messages import BodyTopics
+
+        settings = self.launch.settings(FoxgloveSettings)
+        output = FoxgloveOutput(settings.port)
+        try:
+            self.url = output.url
+            self._topics = BodyTopics(output, Ros2BridgeSettings(world_frame=settings.world_frame))  # pyright: ignore[reportArgumentType]
+            print(f"Foxglove: {self.url}, layout {LAYOUT.resolve()}", flush=True)
+            super().work()
+        finally:
+            output.close()
+
+    def status(self) -> dict[str, str]:
+        return {"address": self.url}

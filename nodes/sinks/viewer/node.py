@@ -8,19 +8,34 @@ keeps the last minutes of drawings and serves them with the page. Both need the 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from steadypose.msgs.types import Message
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.sinks.viewer.scene import PoseView
-from steadypose.nodes.sinks.viewer.server import FLUSH_S, LOOPBACK, ViewerServer
-from steadypose.nodes.sinks.viewer.settings import ViewerSettings
+from steadypose.nodes.graph.settings import check_host_and_port
 from steadypose.prior.clean.settings import PriorSettings
 
 if TYPE_CHECKING:
     import rerun as rr
+
+    from steadypose.nodes.sinks.viewer.server import ViewerServer
+
+
+@dataclass(frozen=True)
+class ViewerSettings:
+    """``[viewer]``: the picture in the browser."""
+
+    host: str = "127.0.0.1"
+    """address to serve at. Any other than this machine's own shows people in a room to whoever listens on the network:
+    ``ssh -L 9090:localhost:9090 robot`` carries the picture safely"""
+    port: int = 9090
+    """of the web page and the drawings"""
+
+    def __post_init__(self) -> None:
+        check_host_and_port("viewer", self.host, self.port)
 
 
 class ViewerNode(Node):
@@ -29,6 +44,10 @@ class ViewerNode(Node):
     name = "viewer"
 
     def run(self) -> None:
+        # not for those who only read a launch file
+        from steadypose.nodes.sinks.viewer.scene import PoseView
+        from steadypose.nodes.sinks.viewer.server import LOOPBACK, ViewerServer
+
         settings = self.launch.settings(ViewerSettings)
         with ViewerServer(settings.port, settings.host) as self._server:
             recording = connect(self._server)
@@ -62,6 +81,8 @@ def flagged_from(launch: Launch) -> float:
 def connect(server: ViewerServer) -> rr.RecordingStream:
     """A stream of drawings to the server."""
     import rerun as rr
+
+    from steadypose.nodes.sinks.viewer.server import FLUSH_S
 
     recording = rr.RecordingStream("steadypose", batcher_config=rr.ChunkBatcherConfig(flush_tick=FLUSH_S))
     server.show(recording)

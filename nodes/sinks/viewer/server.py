@@ -1,25 +1,179 @@
-"""Keeps the last minutes of drawings and serves them, with the page that shows them."""
+"""Keeps the last minutes of drawings and serves them with Rerun's page, to browsers that came here under a name of this
+machine and have the token.
+
+A picture of people is not for everybody with a login: any user of the machine can connect to its loopback ports, and
+any page in a browser can, once its own name is made to lead to 127.0.0.1 (DNS rebinding). So drawings need a token, and
+no request is answered that names another host. A Content-Security-Policy restricts the page's connections to here.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import hmac
+import ipaddress
 import secrets
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
+from collections import deque
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import quote
-
-from steadypose.nodes.graph.extras import require_extra
-from steadypose.nodes.sinks.viewer.drawings import Drawings
-from steadypose.nodes.sinks.viewer.page import DRAWINGS, PageServer
+from urllib.error import HTTPError, URLError
+from urllib.parse import quote, urlsplit
+from urllib.request import urlopen
 
 if TYPE_CHECKING:
     import rerun as rr
+
+MOST_BYTES = 2**28
+"""of drawings that are kept for browsers that come later: about five minutes of one body"""
+FIRST = 100
+"""pieces that are never let go: names, colours and layout are among them"""
+WAIT_S = 0.5
+"""for the next piece, before a reader looks whether its browser is still there"""
+
+
+class Drawings:
+    """Pieces of Rerun's data format, each whole by itself. For several threads."""
+
+    def __init__(self) -> None:
+        self._first: list[bytes] = []
+        self._later: deque[bytes] = deque()
+        self._let_go = 0
+        self._bytes = 0
+        self._closed = False
+        self._changed = threading.Condition()
+
+    def add(self, piece: bytes) -> None:
+        """Keep a piece, and let the oldest go."""
+        with self._changed:
+            if len(self._first) < FIRST:
+                self._first.append(piece)
+            else:
+                self._later.append(piece)
+                self._bytes += len(piece)
+            while self._bytes > MOST_BYTES:
+                self._bytes -= len(self._later.popleft())
+                self._let_go += 1
+            self._changed.notify_all()
+
+    def follow(self) -> Iterator[bytes]:
+        """The pieces that are kept, then each that comes; an empty one now and then, while none does."""
+        at = 0  # of all that ever were
+        while not self._closed:
+            with self._changed:
+                first, later = self._first[at:], []
+                if not first:
+                    start = max(at - FIRST - self._let_go, 0)
+                    later = [self._later[index] for index in range(start, len(self._later))]
+                    at = FIRST + self._let_go + len(self._later) if later else at
+                at += len(first)
+                if not first and not later:
+                    self._changed.wait(WAIT_S)
+            yield from first or later or [b""]
+
+    def close(self) -> None:
+        """End what readers follow."""
+        self._closed = True
+        with self._changed:
+            self._changed.notify_all()
+
+
+KEPT = ("Content-Type", "Content-Length", "Content-Encoding", "Cache-Control", "ETag")
+"""headers of Rerun's answers that are passed on"""
+POLICY = (
+    "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob: data:; "
+    "connect-src 'self' blob: data:; frame-src 'none'; form-action 'none'; base-uri 'self'"
+)
+DRAWINGS = "drawings.rrd"
+"""the last part of the drawings' path, after the token"""
+
+
+def is_own_name(host: str | None, names: frozenset[str]) -> bool:
+    """Whether a request's ``Host`` is this machine: an address, which leads where it says, or one of ``names``."""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return False
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return name in names
+    return True
+
+
+class PageServer:
+    """Serves another server's pages and the drawings, in threads.
+
+    Args:
+        host, port: to serve at.
+        origin: the other server, such as ``http://127.0.0.1:40123``.
+        token: that the path of the drawings begins with.
+        drawings: that are served.
+    """
+
+    def __init__(self, host: str, port: int, origin: str, token: str, drawings: Drawings) -> None:
+        names = frozenset({"localhost", host.lower(), socket.gethostname().lower(), socket.getfqdn().lower()})
+        own_path = f"/{token}/{DRAWINGS}".encode()
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                if not is_own_name(self.headers.get("Host"), names):
+                    self.send_error(403, "expected this machine's own name or address")
+                    return
+                try:
+                    path = urlsplit(self.path).path  # what comes after is for the page in the browser
+                    if path.endswith(DRAWINGS):
+                        self._send_drawings(path)
+                    else:
+                        self._send_page(path)
+                except (BrokenPipeError, ConnectionResetError):
+                    pass  # the browser has gone
+
+            def _send_drawings(self, path: str) -> None:
+                if not hmac.compare_digest(path.encode(), own_path):
+                    self.send_error(403, "expected the address that was printed, with its token")
+                    return
+                self.send_response(200)
+                self.send_header("Content-Type", "application/octet-stream")
+                self.send_header("Cache-Control", "no-store")
+                self.end_headers()
+                for piece in drawings.follow():
+                    self.wfile.write(piece)
+
+            def _send_page(self, path: str) -> None:
+                try:
+                    with urlopen(f"{origin}{path}", timeout=20) as answer:
+                        self.send_response(answer.status)
+                        for name in KEPT:
+                            if value := answer.headers.get(name):
+                                self.send_header(name, value)
+                        self.send_header("Content-Security-Policy", POLICY)
+                        self.send_header("Referrer-Policy", "no-referrer")
+                        self.end_headers()
+                        shutil.copyfileobj(answer, self.wfile)
+                except HTTPError as error:
+                    self.send_error(error.code)
+                except URLError:
+                    self.send_error(502)
+
+            def log_message(self, format: str, *args: object) -> None:
+                pass
+
+        self._server = ThreadingHTTPServer((host, port), Handler)
+        self._server.daemon_threads = True
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
 
 LOOPBACK = "127.0.0.1"
 FLUSH_S = 0.05
@@ -47,10 +201,8 @@ class ViewerServer:
             host: address to serve at.
 
         Raises:
-            LaunchError: Rerun is not installed.
             ViewerError: a port is taken, or the server does not come up.
         """
-        require_extra("view")
         self._page: PageServer | None = None
         self._drawings = Drawings()
         self._closed = threading.Event()

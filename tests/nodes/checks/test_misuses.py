@@ -14,7 +14,7 @@ from conftest import VirtualClock
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.helpers.msg_strategies import RAW
+from tests.helpers.msg_strategies import of
 from tests.helpers.synthetic_poses import walker
 
 from steadypose import PACKAGE
@@ -379,7 +379,7 @@ def _named(raw: PoseRaw, skeleton: str) -> PoseRaw:
     )
 
 
-@given(st.lists(RAW, min_size=1, max_size=4), st.sampled_from([*SKELETONS, None]), st.booleans())
+@given(st.lists(of(PoseRaw), min_size=1, max_size=4), st.sampled_from([*SKELETONS, None]), st.booleans())
 @settings(deadline=None, max_examples=60)
 def test_whatever_comes_is_survived(raws: list[PoseRaw], skeleton: str | None, live: bool) -> None:
     check = StreamCheck(2)

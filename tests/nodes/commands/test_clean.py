@@ -17,7 +17,7 @@ from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean, PoseWo
 from steadypose.nodes.commands.clean import clean
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.npz import NpzCollector
+from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.npz import NpzError
 
 FRAMES = 40

@@ -15,9 +15,8 @@ from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import JOINTS, PoseRaw, PoseWorld, Tracking, WorldBody
 from steadypose.nodes.cli import main
-from steadypose.nodes.sinks.files.bvh import to_bvh
-from steadypose.nodes.sinks.files.glb import to_glb
-from steadypose.nodes.sinks.files.motion import Y_UP, BodyMotion, read_motion
+from steadypose.nodes.sinks.glb import to_glb
+from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion, read_motion, to_bvh
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS

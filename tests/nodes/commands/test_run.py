@@ -162,6 +162,7 @@ class Processes:
     class _Child:
         restarts = 0
         state = "running"
+        reports = True
 
         def heard(self) -> None: ...
 
@@ -197,6 +198,20 @@ def test_a_run_is_over_when_the_end_has_come_everywhere(watched: tuple[_Run, Sup
     run._receive(news("trajectory", f"{POSE_CLEAN} {POSE_WORLD}"), processes)
     assert run._exit_status(processes) is None, "the recorder has not heard it yet"
     run._receive(news("recorder", f"{POSE_CLEAN} {POSE_RAW} {POSE_WORLD}"), processes)
+    assert run._exit_status(processes) == 0
+
+
+def test_a_recorder_killed_after_the_end_has_recorded_it(watched: tuple[_Run, Supervisor]) -> None:
+    run, processes = watched
+    processes.children["pose_input"].state = "ended"
+    every = f"{POSE_CLEAN} {POSE_RAW} {POSE_WORLD}"
+    for name in NODES:
+        run._receive(news(name, every), processes)
+    recorder: Any = processes.children["recorder"]
+    recorder.restarts, recorder.reports = 1, False
+    assert run._exit_status(processes) is None, "another one is to complete the file"
+    recorder.reports = True
+    run._receive(news("recorder"), processes)
     assert run._exit_status(processes) == 0
 
 

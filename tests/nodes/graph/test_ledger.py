@@ -8,7 +8,7 @@ import pytest
 
 from steadypose.msgs.types import Diagnostics, Level
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.ledger import Ledger
+from steadypose.nodes.graph.run_state import Ledger
 
 
 def report(node: str, **values: int) -> Diagnostics:

@@ -11,8 +11,7 @@ from conftest import VirtualClock, raw, walk, walking
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.checks.stream import StreamChecks
-from steadypose.nodes.graph.inbox import DEADLINE_NS, Inbox
-from steadypose.nodes.graph.load import CALM_NS, LOOK_NS, BodyLimit
+from steadypose.nodes.graph.inbox import CALM_NS, DEADLINE_NS, LOOK_NS, BodyLimit, Inbox
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.pipeline import CATCH_UP, PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings

@@ -19,7 +19,7 @@ from conftest import record, until, walk
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD, TOPICS
 from steadypose.msgs.types import PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.graph.health_file import NAME
+from steadypose.nodes.graph.run_state import HEALTH_FILE
 from steadypose.nodes.sources.pose_input import LOOP_PAUSE_NS
 
 
@@ -33,7 +33,7 @@ class Run:
     """
 
     def __init__(self, folder: Path, *arguments: str, where: Path | None = None) -> None:
-        self._health = folder / "steadypose" / NAME
+        self._health = folder / "steadypose" / HEALTH_FILE
         self._output = (folder / "output").open("w+")
         self.process = subprocess.Popen(
             [sys.executable, "-m", "steadypose.nodes.cli", "run", *arguments],

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from conftest import VirtualClock, listeners, running, until, walk
 
-from steadypose.msgs.keys import create_keys
+from steadypose.msgs.security import create_keys
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import PoseRaw, PoseWorld

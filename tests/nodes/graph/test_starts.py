@@ -19,14 +19,12 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Message
-from steadypose.nodes.graph import safe_python
 from steadypose.nodes.graph.clock import Timeline
-from steadypose.nodes.graph.health_file import NAME
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import SUPERVISOR, WATCHER, Node
-from steadypose.nodes.graph.run_lock import RunLock
+from steadypose.nodes.graph.process import own_command, own_environment, stop_on_signals
+from steadypose.nodes.graph.run_state import HEALTH_FILE, RunLock
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.graph.startup import stop_on_signals
 from steadypose.nodes.sinks.recorder import free_directory
 from steadypose.nodes.sources.pose_input import PoseInputNode
 
@@ -94,9 +92,9 @@ def test_a_second_run_is_refused_and_the_first_is_left_alone(begin: Any, recordi
     assert f"pose_input runs already at ipc://{folder}" in output.replace("/beside", "")
     assert f"(process {first.process.pid})" in output
     assert len(output.strip().splitlines()) == 1, "one sentence, and nothing was started"
-    assert json.loads((folder / "steadypose" / NAME).read_text())["pid"] == first.process.pid
+    assert json.loads((folder / "steadypose" / HEALTH_FILE).read_text())["pid"] == first.process.pid
     assert first.end()[0] == 0
-    assert not (folder / "steadypose" / NAME).exists()
+    assert not (folder / "steadypose" / HEALTH_FILE).exists()
 
 
 def test_locks_are_of_addresses_and_go_with_their_holder(
@@ -296,11 +294,11 @@ def test_a_process_of_our_own_does_not_even_where_python_knows_no_safe_path(
     hostile: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old = {key: value for key, value in os.environ.items() if key != "PYTHONSAFEPATH"}
-    command = safe_python.command("socket:gethostname")
+    command = own_command("socket:gethostname")
     assert subprocess.run(command, cwd=hostile, env=old, capture_output=True).returncode != 3
     assert not (tmp_path / "was run").exists()
     monkeypatch.setenv("PYTHONPATH", os.pathsep + "/somewhere")
-    assert safe_python.environment()["PYTHONPATH"] == "/somewhere"
+    assert own_environment()["PYTHONPATH"] == "/somewhere"
 
 
 def test_the_installer_starts_python_in_isolation(hostile: Path, tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def test_a_node_loads_nothing_that_its_work_does_without_and_counts_no_garbage_o
 def test_who_has_compiled_starts_anew_once_with_what_is_now_on_disk() -> None:
     script = """
 print("starts")
-from steadypose.nodes.graph.startup import startup
+from steadypose.nodes.graph.process import startup
 from steadypose.prior import loop_cache
 with startup():
     loop_cache.saved.add("a loop")

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from steadypose.msgs.topics import DIAGNOSTICS, TOPICS
+from steadypose.nodes.graph.extras import EXTRAS
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, load, publishers
 
@@ -21,6 +22,7 @@ def test_a_declaration_names_what_exists(name: str) -> None:
     if declared.settings:
         assert dataclasses.is_dataclass(load(declared.settings))
         assert declared.section
+    assert declared.extra in {"", *EXTRAS}
     if declared.preflight:
         assert callable(load(declared.preflight))
 

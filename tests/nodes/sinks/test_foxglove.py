@@ -13,7 +13,7 @@ from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.ros2.definitions import deserialise, new, serialise
-from steadypose.nodes.sinks.ros2.foxglove import FoxgloveNode, FoxgloveOutput
+from steadypose.nodes.sinks.ros2.bridge import FoxgloveNode, FoxgloveOutput
 
 pytest.importorskip("foxglove", reason="the extra 'foxglove' is not installed")
 

@@ -16,6 +16,7 @@ from steadypose.msgs.topics import POSE_RAW
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.recorder import NO_ROOM, RecorderNode
+from steadypose.nodes.sources.recording import end_of
 
 
 @pytest.fixture
@@ -91,3 +92,5 @@ def test_what_a_killed_recorder_had_not_written_was_not_taken(
         with RecordingReader(tmp_path / "out") as reader:
             assert not settled[-1] or reader.count(POSE_RAW) == len(settled)
     assert settled.count(True) == 3, "as often as the writer gives what it has to the system"
+    node.handle(POSE_RAW, end_of(walk(40)[-1]))
+    assert node.settle(), "who hears of the end may stop the recorder"

@@ -23,10 +23,10 @@ from steadypose.prior.sim.streams import make, read_manifest
 
 pytest.importorskip("mink", reason="the extra 'retarget' is not installed")
 
-from steadypose.nodes.sinks.retarget.follower import GONE_NS, Follower
-from steadypose.nodes.sinks.retarget.node import RetargetNode
-from steadypose.nodes.sinks.retarget.retargeter import EASE_S, SIDES, Retargeter, RobotPose
-from steadypose.nodes.sinks.retarget.robot import Robot, load_robot
+from steadypose.nodes.sinks.datagrams import GONE_NS
+from steadypose.nodes.sinks.retarget import RetargetNode
+from steadypose.nodes.sinks.retargeter import EASE_S, SIDES, Follower, Retargeter, RobotPose
+from steadypose.nodes.sinks.robot import Robot, load_robot
 
 URDF = PACKAGE / "launch" / "robots" / "humanoid29.urdf"
 FRAME_S = 1 / 30

@@ -28,14 +28,13 @@ from steadypose.nodes.commands.doctor import required
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2 import connect
+from steadypose.nodes.ros2 import connection as connecting
 from steadypose.nodes.ros2.connection import Connection
 from steadypose.nodes.ros2.definitions import deserialise, stamp_ns
-from steadypose.nodes.ros2.tf import TransformBuffer
-from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, RosOutput, check_ros2
+from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, Ros2BridgeSettings, RosOutput, check_ros2
+from steadypose.nodes.sinks.ros2.messages import BodyTopics
 from steadypose.nodes.sinks.ros2.rep155 import JOINTS, LINKS, frames
-from steadypose.nodes.sinks.ros2.settings import Ros2BridgeSettings
-from steadypose.nodes.sinks.ros2.topics import BodyTopics
+from steadypose.nodes.sources.ros2 import TransformBuffer
 
 LISTENER = """
 import json, sys
@@ -250,7 +249,7 @@ def test_a_type_that_is_not_to_be_had_is_told_and_the_rest_goes_on() -> None:
 
 
 def test_without_ros_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connect, "find_spec", lambda name: None)
+    monkeypatch.setattr(connecting, "find_spec", lambda name: None)
     with pytest.raises(LaunchError, match="add ros2"):
         check_ros2(Launch())
 
@@ -260,16 +259,16 @@ def test_a_sourced_ros_of_another_python_is_not_used(
     has_dds: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], ros: None
 ) -> None:
     """Such as ROS's own Python 3.12 on the path of a 3.11."""
-    monkeypatch.setattr(connect, "has_sourced_ros", lambda: True)
+    monkeypatch.setattr(connecting, "has_sourced_ros", lambda: True)
     monkeypatch.setitem(sys.modules, "rclpy", None)
     monkeypatch.delitem(sys.modules, "steadypose.nodes.ros2.rclpy_connection", raising=False)
     if has_dds:
-        connect.connect("test").close()
+        connecting.connect("test").close()
         assert "plain DDS" in capsys.readouterr().out
     else:
-        monkeypatch.setattr(connect, "find_spec", lambda name: None)
+        monkeypatch.setattr(connecting, "find_spec", lambda name: None)
         with pytest.raises(LaunchError, match=r"expected the Python that ROS is built for"):
-            connect.connect("test")
+            connecting.connect("test")
 
 
 FOREIGN = """

@@ -25,18 +25,15 @@ from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Diagnostics, JointState, Level, Pose, PoseClean, PoseRaw, RawBody, Tracking
 from steadypose.nodes.graph import extras
-from steadypose.nodes.graph.access import TransportSettings
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.viewer import drawings
+from steadypose.nodes.graph.settings import LaunchError, TransportSettings
 from steadypose.nodes.sinks.viewer import node as viewer_node
-from steadypose.nodes.sinks.viewer.drawings import Drawings
+from steadypose.nodes.sinks.viewer import server as drawings
+from steadypose.nodes.sinks.viewer import server as viewer_server
 from steadypose.nodes.sinks.viewer.layout import FAINT_RGB, SIDE_RGB
-from steadypose.nodes.sinks.viewer.node import ViewerNode
-from steadypose.nodes.sinks.viewer.page import is_own_name
+from steadypose.nodes.sinks.viewer.node import ViewerNode, ViewerSettings
 from steadypose.nodes.sinks.viewer.scene import PATH_SECONDS, PoseView
-from steadypose.nodes.sinks.viewer.server import LOOPBACK, ViewerError, ViewerServer
-from steadypose.nodes.sinks.viewer.settings import ViewerSettings
+from steadypose.nodes.sinks.viewer.server import LOOPBACK, Drawings, ViewerError, ViewerServer, is_own_name
 
 rr = pytest.importorskip("rerun", reason="the optional extra `view` is not installed")
 
@@ -275,7 +272,7 @@ class Server:
 def test_the_node_draws_what_is_published_and_ends_with_its_server(
     tmp_path: Path, log: Log, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(viewer_node, "ViewerServer", Server)
+    monkeypatch.setattr(viewer_server, "ViewerServer", Server)
     monkeypatch.setattr(viewer_node, "connect", lambda server: log)
     launch = Launch(transport=TransportSettings(directory=str(tmp_path)))
     node = ViewerNode(launch)
@@ -306,7 +303,7 @@ def test_without_rerun_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) 
     found = importlib.util.find_spec
     monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "rerun" else found(name))
     with pytest.raises(LaunchError, match="add view"):
-        ViewerServer(free_port())
+        ViewerNode(Launch())
 
 
 def test_the_page_may_call_nobody_but_this_server() -> None:
@@ -380,5 +377,5 @@ def test_a_browser_that_comes_late_gets_the_beginning_and_what_is_kept(monkeypat
 
 
 def test_a_host_that_is_none() -> None:
-    with pytest.raises(LaunchError, match="expected an address to serve at"):
+    with pytest.raises(LaunchError, match="host: expected an address"):
         ViewerSettings(host="")

@@ -23,7 +23,7 @@ pytest.importorskip("pythonosc", reason="the extra 'vmc' is not installed")
 from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_message import OscMessage
 
-from steadypose.nodes.sinks.vmc import BONES, VmcNode, VmcSettings, datagrams
+from steadypose.nodes.sinks.datagrams import BONES, VmcNode, VmcSettings, osc_bundles
 
 
 def worlds(name: str) -> list[PoseWorld]:
@@ -38,7 +38,7 @@ def messages(bundles: list[bytes]) -> list[tuple[str, list[object]]]:
 
 def test_the_bones_give_the_body_back_in_unitys_axes() -> None:
     body = worlds("walk_turn")[40].bodies[0]
-    bundles = datagrams(1.5, body)
+    bundles = osc_bundles(1.5, body)
     assert all(len(data) < 1400 for data in bundles)
     said = messages(bundles)
     assert said[:3] == [
@@ -58,7 +58,7 @@ def test_the_bones_give_the_body_back_in_unitys_axes() -> None:
 
 
 def test_nobody_is_said_too() -> None:
-    assert messages(datagrams(0.0, None)) == [("/VMC/Ext/OK", [0]), ("/VMC/Ext/T", [0.0])]
+    assert messages(osc_bundles(0.0, None)) == [("/VMC/Ext/OK", [0]), ("/VMC/Ext/T", [0.0])]
 
 
 def test_the_node_sends_to_where_it_is_told(make_launch: Callable[..., Launch]) -> None:

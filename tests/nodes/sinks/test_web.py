@@ -23,9 +23,8 @@ from steadypose.msgs.types import EventKind, JointState
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.web.form import hello, to_json
-from steadypose.nodes.sinks.web.node import WebNode, kept_token
+from steadypose.nodes.sinks.web.node import WebNode, WebSettings, kept_token
 from steadypose.nodes.sinks.web.server import FILES, MAX_CLIENTS, STATIC, WebServer
-from steadypose.nodes.sinks.web.settings import WebSettings
 
 pytest.importorskip("websockets", reason="the extra 'web' is not installed")
 

@@ -26,14 +26,11 @@ from steadypose.nodes.graph.prior_node import PriorNode
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
 from steadypose.nodes.sources import oak_device
-from steadypose.nodes.sources.calibration import CalibrationSettings
-from steadypose.nodes.sources.camera import PAUSES_S
-from steadypose.nodes.sources.camera_settings import OakSettings
-from steadypose.nodes.sources.oak import OakSource
+from steadypose.nodes.sources.camera import PAUSES_S, CameraSource, open_oak
 from steadypose.nodes.sources.oak_device import FRAME_ID, QUEUE, TIMEOUT_S, Host
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.registry import InputSettings, open_input
-from steadypose.nodes.sources.source import SourceContext
+from steadypose.nodes.sources.source import CalibrationSettings, OakSettings, SourceContext
 from steadypose.prior.body.layouts import COCO17
 
 CONTEXT = SourceContext(SystemClock(), CalibrationSettings())
@@ -98,7 +95,7 @@ def test_the_imu_levels_the_camera(walk: list[Moment]) -> None:
 
 
 def test_without_an_imu_the_camera_is_taken_for_level(walk: list[Moment]) -> None:
-    source = OakSource(OakSettings(), CONTEXT, opener(lambda _: script(walk)))
+    source = CameraSource(CONTEXT.clock, lambda: opener(lambda _: script(walk))(OakSettings(), CONTEXT.clock))
     frames = source.frames()
     frame = next(frame for frame in frames if frame)
     assert source.status()["camera.level"] == "taken for level"
@@ -111,7 +108,9 @@ def test_without_an_imu_the_camera_is_taken_for_level(walk: list[Moment]) -> Non
 def test_frames_reach_subscribers_and_diagnostics_tell(make_launch: MakeLaunch, walk: list[Moment]) -> None:
     # in the place of the prior, which a lossless node waits for
     launch = make_launch(nodes='["pose_input", "prior"]', input__source="oak")
-    source = OakSource(launch.settings(InputSettings).oak, CONTEXT, opener(lambda _: script(walk)))
+    source = CameraSource(
+        CONTEXT.clock, lambda: opener(lambda _: script(walk))(launch.settings(InputSettings).oak, CONTEXT.clock)
+    )
     node = PoseInputNode(launch, SystemClock(), source)
     launch.transport.ipc_directory.mkdir(exist_ok=True)
     got: list[PoseRaw] = []
@@ -136,7 +135,9 @@ def test_from_the_camera_to_the_world(make_launch: MakeLaunch, monkeypatch: pyte
     monkeypatch.setattr(oak_device, "QUEUE", 1000)  # these frames come faster than any camera's
     scene = [moment(frame) for frame in range(24)]
     launch = make_launch(input__source="oak")
-    source = OakSource(launch.settings(InputSettings).oak, CONTEXT, opener(lambda _: script(scene)))
+    source = CameraSource(
+        CONTEXT.clock, lambda: opener(lambda _: script(scene))(launch.settings(InputSettings).oak, CONTEXT.clock)
+    )
     nodes = [PoseInputNode(launch, SystemClock(), source), PriorNode(launch), TrajectoryNode(launch)]
     worlds: list[PoseWorld] = []
     with Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD) as subscriber, running(*nodes):
@@ -170,7 +171,7 @@ def test_it_goes_on_when_the_camera_is_plugged_in_again(clock: VirtualClock, wal
         with plugged(script(walk[:2]), clock, unplug=pull) as host:
             yield host
 
-    source = OakSource(OakSettings(), SourceContext(clock, CalibrationSettings()), connect)
+    source = CameraSource(clock, lambda: connect(OakSettings(), clock))
     frames, states = [], []
     for frame in source.frames():
         states.append(source.status()["camera"])
@@ -198,7 +199,7 @@ def test_it_looks_for_a_camera_at_growing_intervals(clock: VirtualClock) -> None
         raise RuntimeError("no camera found")
         yield
 
-    source = OakSource(OakSettings(), SourceContext(clock, CalibrationSettings()), connect)
+    source = CameraSource(clock, lambda: connect(OakSettings(), clock))
     frames = source.frames()
     while len(tries) < len(PAUSES_S) + 2:
         assert next(frames) is None
@@ -263,7 +264,7 @@ def test_what_is_no_skeleton_is_counted_and_the_next_frame_comes(walk: list[Mome
 
 def test_settings_that_cannot_be_used_say_so(make_launch: MakeLaunch, tmp_path) -> None:
     with pytest.raises(LaunchError, match=r"archive: expected a file that is an NN archive"):
-        OakSource(OakSettings(archive=str(tmp_path / "none.tar.xz")), CONTEXT)
+        open_oak(OakSettings(archive=str(tmp_path / "none.tar.xz")), CONTEXT)
     with pytest.raises(ValueError, match=r"confidence: expected 0 to 1, got 50"):
         OakSettings(confidence=50.0)
     with pytest.raises(ValueError, match=r"fps: expected 0 "):
@@ -275,7 +276,7 @@ def test_settings_that_cannot_be_used_say_so(make_launch: MakeLaunch, tmp_path) 
 def test_the_launch_file_can_be_run_without_a_camera_being_there() -> None:
     launch = Launch.read("oak")
     assert not launch.transport.lossless
-    assert isinstance(open_input(launch.settings(InputSettings), SystemClock()), OakSource)
+    assert isinstance(open_input(launch.settings(InputSettings), SystemClock()), CameraSource)
     _check(launch)
 
 

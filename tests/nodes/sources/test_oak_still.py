@@ -12,11 +12,11 @@ from tests.helpers.fake_oak import CAMERA, Player, depth_frame, moment, readings
 
 from steadypose.nodes.commands.calibrate import CalibrateOak, calibrate
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.sources import oak_still
+from steadypose.nodes.sources import oak_device
 from steadypose.nodes.sources.camera import CameraError
-from steadypose.nodes.sources.camera_settings import OakSettings
-from steadypose.nodes.sources.oak_still import Still, capture
+from steadypose.nodes.sources.oak_device import Still, capture
 from steadypose.nodes.sources.registry import InputSettings
+from steadypose.nodes.sources.source import OakSettings
 from steadypose.prior.camera.calibration import CalibrationError
 
 UP = np.array([0.0, -np.cos(0.2), np.sin(0.2)])
@@ -40,7 +40,7 @@ def test_the_picture_after_those_in_which_the_camera_settles() -> None:
         start = dai.Clock.now()  # pyright: ignore[reportCallIssue] (static)
         for index in range(2):
             for name, message in (("colour", picture(100 + index)), ("depth", depth_frame(scene))):
-                message.setTimestamp(start + index * oak_still.SYNC_THRESHOLD * 2)
+                message.setTimestamp(start + index * oak_device.SYNC_THRESHOLD * 2)
                 player.script.append((name, message))
         still = capture(pipeline, colour, player.outputs["depth"], (player.outputs["imu"], np.eye(3)), settle=1)
     assert still.colour[0, 0].tolist() == [101, 0, 10]
@@ -51,7 +51,7 @@ def test_the_picture_after_those_in_which_the_camera_settles() -> None:
 
 
 def test_a_camera_that_gives_nothing_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(oak_still, "PAIR_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(oak_device, "PAIR_TIMEOUT_S", 0.01)
     with dai.Pipeline(createImplicitDevice=False) as pipeline:
         player = pipeline.create(Player)
         with pytest.raises(CameraError, match="no picture with depth"):
@@ -63,7 +63,7 @@ def test_it_becomes_the_files_and_the_lens_that_the_other_steps_want(
 ) -> None:
     scene = moment(0)
     colour = np.zeros((*scene.depth.shape, 3), np.uint8)
-    monkeypatch.setattr(oak_still, "capture_with_camera", lambda _: Still(colour, scene.depth, CAMERA.intrinsics, UP))
+    monkeypatch.setattr(oak_device, "capture_with_camera", lambda _: Still(colour, scene.depth, CAMERA.intrinsics, UP))
     launch = tmp_path / "kitchen.toml"
     launch.write_text('# mine\n[input]\nsource = "oak"\n')
     calibrate(CalibrateOak(launch, tmp_path / "floor"))
@@ -78,7 +78,7 @@ def test_it_becomes_the_files_and_the_lens_that_the_other_steps_want(
 
 def test_a_folder_that_is_not_there_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     still = Still(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.uint16), CAMERA.intrinsics, UP)
-    monkeypatch.setattr(oak_still, "capture_with_camera", lambda _: still)
+    monkeypatch.setattr(oak_device, "capture_with_camera", lambda _: still)
     launch = tmp_path / "kitchen.toml"
     launch.write_text("")
     with pytest.raises(CalibrationError, match=r"gone/floor\.png cannot be written"):
@@ -90,7 +90,7 @@ def test_without_a_camera_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def none(settings: OakSettings) -> Still:
         raise CameraError("no camera found")
 
-    monkeypatch.setattr(oak_still, "capture_with_camera", none)
+    monkeypatch.setattr(oak_device, "capture_with_camera", none)
     launch = tmp_path / "kitchen.toml"
     launch.write_text("")
     with pytest.raises(CalibrationError, match="no camera found"):

@@ -65,7 +65,6 @@ def play(launch: Launch, clock: VirtualClock, source: Frames, frames: int | None
     """Everything the node sends, or the first ``frames``, each with the time it was sent at."""
     node = PoseInputNode(launch, clock, source)
     sent = node._publisher = Sent(clock)  # type: ignore[assignment]
-    node._inbox = None
     if frames is not None:
         keep = sent.publish
 
@@ -128,6 +127,13 @@ def test_a_clock_that_was_set_is_not_waited_for(launch: Launch, clock: VirtualCl
     assert waits(sent)[:4] == pytest.approx([0.0, 1.0, 0.0, 1.0])
 
 
+def test_one_stamp_that_is_ahead_is_not_waited_for(launch: Launch, clock: VirtualClock) -> None:
+    stamps = [START_NS + i * SECOND_NS for i in (0, 1, 7, 7, 3, 4, 14, 5, 6)]
+    sent = play(launch, clock, Frames(stamps))
+    assert [m.stamp_ns for _, m in sent[:-1]] == stamps, "stamps are as captured"
+    assert waits(sent)[:8] == pytest.approx([1.0, 2.0, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0])
+
+
 def test_stamps_that_repeat_or_step_back_come_at_once(launch: Launch, clock: VirtualClock) -> None:
     sent = play(launch, clock, Frames([START_NS + SECOND_NS, START_NS + SECOND_NS, START_NS]))
     assert waits(sent)[:2] == [0.0, 0.0]
@@ -144,7 +150,7 @@ def test_a_loop_goes_on_with_rising_stamps(launch: Launch, clock: VirtualClock) 
 
 def test_the_nodes_are_told_which_stamp_is_played_when(launch: Launch, clock: VirtualClock) -> None:
     node = PoseInputNode(launch, clock, Frames([START_NS, START_NS + SECOND_NS]))
-    node._publisher, node._inbox = Sent(clock), None  # type: ignore[assignment]
+    node._publisher = Sent(clock)  # type: ignore[assignment]
     start_ns = clock.time_ns
     node.work()
     assert node.timeline is not None

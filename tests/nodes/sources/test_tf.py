@@ -16,12 +16,11 @@ from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.ros2.connection import Connection, Publish
 from steadypose.nodes.ros2.definitions import serialise
-from steadypose.nodes.ros2.tf import CACHE_NS, TransformBuffer, TransformError
 from steadypose.nodes.sinks.ros2.messages import tf_message, transform
-from steadypose.nodes.sources import tf as module
+from steadypose.nodes.sources import ros2 as module
 from steadypose.nodes.sources.registry import InputSettings, open_input
+from steadypose.nodes.sources.ros2 import CACHE_NS, TfSettings, TfSource, TransformBuffer, TransformError
 from steadypose.nodes.sources.source import LiveSource
-from steadypose.nodes.sources.tf import TfSettings, TfSource
 
 FRAME_NS = 33_333_333
 

@@ -19,16 +19,12 @@ from steadypose.nodes.graph import extras
 from steadypose.nodes.graph.clock import Clock, SystemClock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sources import webcam, webcam_device
-from steadypose.nodes.sources.calibration import CalibrationSettings
-from steadypose.nodes.sources.camera import PAUSES_S
-from steadypose.nodes.sources.camera_settings import WebcamSettings
+from steadypose.nodes.sources import camera, webcam_device
+from steadypose.nodes.sources.camera import PAUSES_S, CameraSource
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.registry import InputSettings, open_input
-from steadypose.nodes.sources.source import SourceContext
-from steadypose.nodes.sources.webcam import WebcamSource
-from steadypose.nodes.sources.webcam_device import Lens
-from steadypose.nodes.sources.webcam_video import VideoSource
+from steadypose.nodes.sources.source import CalibrationSettings, SourceContext, WebcamSettings
+from steadypose.nodes.sources.webcam_device import Lens, VideoSource
 
 SIZE = (320, 240)
 NOT_CALIBRATED = CalibrationSettings()
@@ -79,9 +75,9 @@ class Seen:
         return Made(pose_world_landmarks=[world], pose_landmarks=[[Made(x=u, y=v) for u, v in places]])
 
 
-def open_webcam(settings: WebcamSettings, clock: Clock, seen: Seen) -> WebcamSource:
+def open_webcam(settings: WebcamSettings, clock: Clock, seen: Seen) -> CameraSource:
     connect = partial(webcam_device.connect, make_landmarker=seen.landmarker)
-    return WebcamSource(settings, SourceContext(clock, NOT_CALIBRATED), connect)
+    return CameraSource(clock, lambda: connect(settings, NOT_CALIBRATED, clock))
 
 
 def test_each_picture_gives_the_bodies_in_it(video: Path, model: str) -> None:
@@ -149,7 +145,7 @@ def test_a_film_that_cannot_be_read_says_so(model: str, tmp_path: Path) -> None:
     (tmp_path / "x.mp4").write_bytes(b"no film")
     settings = InputSettings(source="webcam", webcam=WebcamSettings(video=str(tmp_path / "x.mp4"), model=model))
     with pytest.raises(LaunchError, match="expected a film that OpenCV can read"):
-        webcam.open_webcam(settings.webcam, SourceContext(SystemClock(), NOT_CALIBRATED))
+        camera.open_webcam(settings.webcam, SourceContext(SystemClock(), NOT_CALIBRATED))
 
 
 def test_a_lens_that_is_calibrated_is_used_for_pictures_of_any_size() -> None:
@@ -195,7 +191,7 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
 )
 def test_settings_that_cannot_be_used_say_so(settings: WebcamSettings, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
-        webcam.open_webcam(settings, SourceContext(SystemClock(), NOT_CALIBRATED))
+        camera.open_webcam(settings, SourceContext(SystemClock(), NOT_CALIBRATED))
 
 
 @pytest.mark.parametrize("wrong", [{"bodies": 0}, {"camera": -1}, {"field_of_view": 60.0}])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import waving
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
-from steadypose.prior.camera.multi_view import DEPTH_ERROR_RATIO, PERIOD_NS, SOURCE, Merge, Sighting, merge_joints
+from steadypose.prior.camera.multi_view import DEPTH_ERROR_RATIO, PERIOD_NS, Merge, Sighting, merge_joints
 from steadypose.prior.sim.camera import Camera, film
 from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.scripts import SCRIPTS
@@ -65,16 +65,6 @@ def test_two_views_are_nearer_to_the_truth_than_one_and_lose_fewer_joints(two_vi
     assert both[1] > max(one[1], other[1])
 
 
-def test_one_body_comes_out_at_every_moment_of_the_grid_in_order(two_views) -> None:
-    front, back, _ = two_views
-    merged, merge = play([*front, *back])
-    stamps = np.array([m.stamp_ns for m in merged])
-    assert (np.diff(stamps) == PERIOD_NS).all()
-    assert all(len(m.bodies) == 1 for m in merged)
-    assert {(m.source, m.calibrated, m.skeleton) for m in merged} == {(SOURCE, True, "smpl22")}
-    assert not +merge.counters
-
-
 def test_bodies_are_interpolated_to_the_moment() -> None:
     """Somebody who slides along at 1 m/s, filmed by two cameras out of step, in different orders."""
     messages = []
@@ -110,21 +100,6 @@ def test_a_camera_errs_along_its_line_of_sight() -> None:
     share = DEPTH_ERROR_RATIO**-2 / (1 + DEPTH_ERROR_RATIO**-2)
     assert joints - truth == pytest.approx(np.tile([0.1 * share, 0.1 * share, 0.0], (22, 1)), abs=1e-3)
     assert (confidence == 1.0).all()
-
-
-def test_with_errors_that_are_independent_two_views_are_better_than_either() -> None:
-    rng, place, eyes = np.random.default_rng(0), np.tile([3.0, 0.0, 1.0], (22, 1)), ([0.0, 0.0, 1.0], [3.0, 3.0, 1.0])
-
-    def error(cameras: int) -> float:
-        away = []
-        for _ in range(200):
-            noise = [rng.normal(0.0, axis, (22, 3)) for axis in ([0.04, 0.02, 0.02], [0.02, 0.04, 0.02])]
-            views = [Sighting(place + n, np.ones(22), np.array(e)) for n, e in zip(noise, eyes, strict=True)]
-            away.append(merge_joints(views[:cameras])[0] - place)
-        return float(np.sqrt(np.mean(np.square(away))))
-
-    # of 4, 2, 2 cm: precisions 1/16 + 1/4 along both horizontal axes, 1/4 + 1/4 up
-    assert error(2) / error(1) == pytest.approx(np.sqrt((3.2 + 3.2 + 2.0) / (16.0 + 4.0 + 4.0)), rel=0.03)
 
 
 def test_confidence_weighs_and_what_is_apart_is_not_averaged() -> None:

@@ -23,7 +23,7 @@ from steadypose.prior.models.hgvae.anomaly import (
 )
 from steadypose.prior.models.hgvae.config import FaultNetConfig
 from steadypose.prior.models.hgvae.live_faults import OFF_SCALE, RECENT, ROUGH_SCALE, fault_features
-from steadypose.training.networks.hgvae_faults import FaultNet, load_fault_net
+from steadypose.training.networks.graph import FaultNet, load_fault_net
 
 HEIGHTS = np.linspace(0.0, 7.0, len(RATES))
 SCALE = Calibration(np.broadcast_to(HEIGHTS, (len(MISSING), len(SENSOR_SIGMAS), len(PACES), len(RATES))))

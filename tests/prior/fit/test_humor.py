@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,14 +17,13 @@ from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, heading, yaw_matrix
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.fit.humor_network import Gaussian, HumorConfig, HumorNet, roll_out, sample, transitions
+from steadypose.prior.fit.humor_network import HumorConfig, HumorNet, roll_out, sample, transitions
 from steadypose.prior.fit.humor_state import (
     CHANGE,
     FEATURES,
     State,
     canonical,
     facing,
-    features,
     moved_by,
     placed,
     pose_features,
@@ -35,7 +33,7 @@ from steadypose.prior.fit.humor_state import (
 )
 from steadypose.prior.fit.tensors import load_network
 from steadypose.prior.timing.rate import FPS
-from steadypose.training.recipes.humor import Sequences, fit_initial, fit_transitions, transition_loss
+from steadypose.training.recipes.humor import Sequences, fit_initial, transition_loss
 
 TOLD_MM, NATS = 68.0, 27.0
 """Of the weights that ship, on simulated people."""
@@ -80,17 +78,6 @@ def test_to_a_frame_and_back_is_nothing(seed: int) -> None:
     own = canonical(state, state)
     torch.testing.assert_close(own.root[:, :2], torch.zeros(3, 2).double())
     torch.testing.assert_close(torch.from_numpy(heading(own.rotations[:, 0].numpy())), torch.zeros(3).double())
-
-
-@given(SEEDS, st.floats(-3.0, 3.0))
-@settings(max_examples=20, deadline=None)
-def test_features_do_not_tell_where_somebody_stands_or_faces(seed: int, yaw: float) -> None:
-    state, elsewhere = some_states(seed), some_states(seed + 7)
-    # wherever `elsewhere` stands and faces, `state` seen from itself is what it was
-    moved = placed(state, elsewhere)
-    told, told_there = (features(canonical(s, s)) for s in (state, moved))
-    assert told.shape == (3, FEATURES)
-    torch.testing.assert_close(told, told_there)
 
 
 def test_facing_is_the_heading_and_has_a_derivative_where_the_body_faces_along_the_axis() -> None:
@@ -158,15 +145,6 @@ def test_a_rollout_is_step_after_step_of_each_alone(model: HumorNet) -> None:
             np.testing.assert_allclose(found.states.joints[body, t].detach().numpy(), joints, atol=1e-6)
 
 
-def test_where_somebody_stands_changes_nothing_but_where_they_go(model: HumorNet) -> None:
-    first, elsewhere = some_states(8), some_states(9)
-    latents = torch.randn(3, 4, 8, dtype=torch.float64)
-    here = roll_out(model, first, latents, bones(3)).states
-    there = roll_out(model, placed(first, elsewhere), latents, bones(3)).states
-    for t in range(4):
-        assert_same(placed(here[:, t], elsewhere), there[:, t], 1e-6)
-
-
 def test_the_likeliest_future_has_no_chance_in_it_and_samples_have(model: HumorNet) -> None:
     first = some_states(2)
     likeliest = [sample(model, first, 3, bones(3), None).states.root for _ in range(2)]
@@ -174,13 +152,6 @@ def test_the_likeliest_future_has_no_chance_in_it_and_samples_have(model: HumorN
     drawn = [sample(model, first, 3, bones(3), torch.Generator().manual_seed(seed)).latents for seed in (0, 0, 1)]
     torch.testing.assert_close(drawn[0], drawn[1])
     assert not torch.allclose(drawn[0], drawn[2])
-
-
-def test_divergence_is_that_of_torch() -> None:
-    generator = torch.Generator().manual_seed(0)
-    a, b = (Gaussian(*torch.randn(2, 5, 8, generator=generator)) for _ in range(2))
-    normals = [torch.distributions.Normal(g.mean, g.sigma) for g in (a, b)]
-    torch.testing.assert_close(a.kl(b), torch.distributions.kl_divergence(*normals).sum(-1))
 
 
 def initial_log_density(model: HumorNet, inputs: torch.Tensor) -> torch.Tensor:
@@ -235,22 +206,6 @@ def test_sequences_are_mirrored_bodies_that_are_consistent() -> None:
     torch.testing.assert_close(batch.states.joints.diff(dim=1) * FPS, batch.states.velocity[:, 1:], atol=1e-3, rtol=0)
     lengths = (batch.states.joints[:, :, 4] - batch.states.joints[:, :, 1]).norm(dim=-1)
     torch.testing.assert_close(lengths, batch.offsets[:, None, 4].norm(dim=-1).expand_as(lengths), atol=1e-5, rtol=0)
-
-
-def test_training_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    motion = as_set(simulated_clips(40, 4, seed=0))
-    known = HumorNet(HumorConfig(hidden=64))
-    path = tmp_path / "run" / "humor-x.safetensors"
-
-    def fit(steps: int) -> None:
-        card = {"Training": "a test"}
-        fit_transitions(HumorConfig(hidden=64), motion, motion, path, card, steps, 4, 1e-3, seed=0, known=known)
-
-    fit(2)
-    fit(3)
-    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step"] == 3
-    assert "a test" in path.with_suffix(".md").read_text()
-    load_network(HumorNet, HumorConfig.from_dict, str(path), "humor")
 
 
 @torch.no_grad()

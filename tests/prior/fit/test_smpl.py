@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ from steadypose.benchmarks.motion import simulated_clips
 from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.fit.smpl import BETAS, POSES, SmplShape, smpl_motion
 from steadypose.prior.mocap.clip import MotionError
-from steadypose.prior.mocap.files import read_amass
 
 
 @pytest.fixture(scope="module")
@@ -72,17 +70,6 @@ def test_another_skeleton_is_met_as_far_as_the_model_can(path: Path) -> None:
         found.poses[:-1, :66].reshape(-1, 3)
     )
     assert np.degrees(steps.magnitude()).max() < 45, "no joint flips from frame to frame"
-
-
-def test_readers_of_amass_take_it(path: Path) -> None:
-    joints = simulated_clips(30, 2, seed=5).positions[:, 0]
-    file = io.BytesIO()
-    np.savez(file, **smpl_motion(SmplShape.read(path), joints, lengths_of(joints)).arrays)
-    file.seek(0)
-    fps, read = read_amass(file)
-    assert fps == 30.0
-    own, other = (p - p[:, :1] for p in (joints, read))
-    assert np.linalg.norm(own - other, axis=-1).mean() < 0.1  # on the bones of a generic adult
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +18,8 @@ from steadypose.prior.models.hgvae.live_completion import (
     completion_features,
 )
 from steadypose.training.data.hgvae_windows import Windows
-from steadypose.training.networks.hgvae_completion import CompletionNet, certainty_of
-from steadypose.training.recipes.hgvae_completion import train_completion
+from steadypose.training.networks.graph import CompletionNet, certainty_of
+from steadypose.training.recipes.hgvae import completion_recipe
 
 WRIST = J["left_wrist"]
 TRACKS = slice(3 * WRIST, 3 * WRIST + 3)
@@ -167,9 +166,9 @@ def test_windows_come_in_whole_patches() -> None:
         CompletionNet(12, CompletionConfig(patch=5))
 
 
-def test_without_a_network_the_guess_stays_and_there_is_nothing_to_train(tmp_path: Path) -> None:
+def test_without_a_network_the_guess_stays_and_there_is_nothing_to_train() -> None:
     model = awake(replace(SMALL, completion=None))
     x, observed = torch.ones(1, 66, 12), torch.zeros(1, 66, 12)
     assert model.completed(x, observed, 0.0) == (x, observed)
     with pytest.raises(ValueError, match="completion"):
-        train_completion(model, Windows(None), Windows(None), tmp_path, 1, 0)  # type: ignore[arg-type]
+        completion_recipe(model, Windows(None), Windows(None))  # type: ignore[arg-type]

@@ -17,9 +17,8 @@ from steadypose.prior.models.hgvae.features import from_tracks, hang_unseen, in_
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
 from steadypose.prior.models.weights import WEIGHTS
 from steadypose.training.loop import TrainingOptions
-from steadypose.training.networks.graph import GraphBlock, GraphLinear
+from steadypose.training.networks.graph import GraphBlock, GraphLinear, load_fault_net
 from steadypose.training.networks.hgvae import HGVAE, Gaussian, dct_matrix
-from steadypose.training.networks.hgvae_faults import load_fault_net
 from steadypose.training.recipes.hgvae import train_hgvae
 from steadypose.training.weights import arrays_of
 

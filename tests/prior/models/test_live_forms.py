@@ -11,7 +11,7 @@ from steadypose.prior.models.hgvae.config import FaultNetConfig
 from steadypose.prior.models.hgvae.live_completion import LiveCompletion
 from steadypose.prior.models.hgvae.live_faults import LiveFaultNet, fault_features
 from steadypose.prior.models.sensor_bias import FEATURES, CorrectionConfig, LiveCorrection
-from steadypose.training.networks.hgvae_faults import FaultNet
+from steadypose.training.networks.graph import FaultNet
 from steadypose.training.recipes.sensor_bias import CorrectionNet
 from steadypose.training.weights import arrays_of
 

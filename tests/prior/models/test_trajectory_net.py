@@ -47,7 +47,7 @@ def test_depends_on_its_context_and_nothing_before(net: TrajectoryNet):
 def test_newest_frame_says_the_same(net: TrajectoryNet):
     joints = window(net, 3)
     whole, newest = net(joints), LiveRootVelocity(net.config, arrays_of(net))(joints.numpy())
-    for live, trained in zip(newest, whole, strict=True):
+    for live, trained in zip(newest, whole[:2], strict=True):  # contacts only train it
         torch.testing.assert_close(torch.from_numpy(live), trained[:, -1], atol=1e-4, rtol=1e-4)
 
 

@@ -8,17 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import spearmanr
+from scipy.stats import rankdata
 
-from steadypose.prior.body.skeleton import MIRROR, J
+from steadypose.prior.body.skeleton import J
 from steadypose.prior.sim.noise import (
     KINECT_NOISE,
     SWAP_GROUPS,
     NoiseModel,
     confidence_of,
-    corrupt,
     draw_errors,
-    exchange_sides,
     ray_axes,
     swapped,
     travelled,
@@ -35,14 +33,6 @@ def evenly(seconds: float, fps: float, speed: float = 0.0, batch: int = 1) -> tu
     """Travel (batch, T, 22) and dt (T,) of joints that all move at one speed."""
     frames = round(seconds * fps)
     return np.full((batch, frames, 22), speed / fps), np.full(frames, 1 / fps)
-
-
-def test_the_same_seed_draws_the_same_noise() -> None:
-    motion = SCRIPTS["reach"](np.random.default_rng(0))[0].positions[::4]
-    first, second, other = (corrupt(motion, np.random.default_rng(s), MODEL) for s in (1, 1, 2))
-    np.testing.assert_array_equal(first[0], second[0])
-    np.testing.assert_array_equal(first[1], second[1])
-    assert not np.array_equal(first[0], other[0])
 
 
 def test_a_still_joint_keeps_its_bias_and_a_moving_one_loses_it() -> None:
@@ -86,48 +76,26 @@ def test_jumps_come_as_often_as_said_and_end() -> None:
     assert (displaced > 0).mean() == pytest.approx(0.2 * mean, rel=0.25)
 
 
-def test_noise_has_heavy_tails_and_memory() -> None:
-    motion = np.stack([SCRIPTS["reach"](np.random.default_rng(s))[0].positions[::4] for s in range(2)])
-    noisy, _ = corrupt(motion, np.random.default_rng(3), MODEL)
-    error = noisy - motion
+def test_noise_has_heavy_tails_and_memory_and_confidence_is_informative() -> None:
+    motion = SCRIPTS["reach"](np.random.default_rng(0))[0].positions[::4]
+    drawn = draw_errors(travelled(motion), np.full(len(motion), 1 / 30), np.random.default_rng(3), MODEL)
+    error = drawn.steady + drawn.quick
     size = np.linalg.norm(error, axis=-1)
     assert 0.015 < np.median(size) < 0.06
     assert 2.5 < np.percentile(size, 95) / np.median(size) < 7.0, "1.6 for a Gaussian"
-    centred = error - error.mean(axis=1, keepdims=True)
-    assert (centred[:, 1:] * centred[:, :-1]).sum() / (centred**2).sum() > 0.5
-
-
-def test_confidence_tells_something_but_not_all() -> None:
-    motion = SCRIPTS["walk_turn"](np.random.default_rng(0))[0].positions[::4]
-    noisy, confidence = corrupt(motion, np.random.default_rng(0), MODEL)
-    assert confidence.min() >= 0
-    assert confidence.max() <= 1
-    relation = spearmanr(confidence.ravel(), np.linalg.norm(noisy - motion, axis=-1).ravel()).statistic  # type: ignore[union-attr]
-    assert -0.85 < relation < -0.25
+    centred = error - error.mean(axis=0)
+    assert (centred[1:] * centred[:-1]).sum() / (centred**2).sum() > 0.5
+    confidence = confidence_of(drawn.scale, np.random.default_rng(0))
+    assert -0.85 < float(np.corrcoef(rankdata(confidence), rankdata(size))[0, 1]) < -0.25
     small, large = (confidence_of(np.full(1000, s), np.random.default_rng(0)).mean() for s in (0.01, 0.3))
     assert small > 0.8
     assert large < 0.2
 
 
-def test_windows_may_come_in_any_batch_and_as_short_as_one_frame() -> None:
-    for shape in ((1, 22, 3), (8, 22, 3), (2, 3, 8, 22, 3)):
-        noisy, confidence = corrupt(np.zeros(shape), np.random.default_rng(0), MODEL)
-        assert noisy.shape == shape
-        assert confidence.shape == shape[:-1]
-        assert np.isfinite(noisy).all()
-
-
-def test_swaps_exchange_whole_limbs_for_a_moment() -> None:
-    positions = np.random.default_rng(0).normal(size=(900, 22, 3))
+def test_swaps_last_a_moment() -> None:
     when = swapped(np.full(900, 1 / 30), (), np.random.default_rng(1), rate_factor=20.0)
-    seen = exchange_sides(positions, when)
-    for group, joints in SWAP_GROUPS.items():
-        active = when[group]
-        assert 0 < active.mean() < 0.3
-        for joint in joints:
-            np.testing.assert_array_equal(seen[active, joint], positions[active, MIRROR[joint]])
-            np.testing.assert_array_equal(seen[~active, joint], positions[~active, joint])
-    np.testing.assert_array_equal(seen[:, J["head"]], positions[:, J["head"]])
+    assert when.keys() == SWAP_GROUPS.keys()
+    assert all(0 < active.mean() < 0.3 for active in when.values())
 
 
 def test_ray_axes_are_right_handed() -> None:
@@ -204,9 +172,3 @@ def test_errors_are_what_was_added_but_for_the_alignment() -> None:
     measured = errors(replace(clip, kinect=clip.truth + error))
     assert np.linalg.norm(measured, axis=-1).max() == pytest.approx(0.1, abs=0.03)
     assert np.median(np.linalg.norm(measured, axis=-1)) < 0.02
-
-
-def test_travel_counts_from_frame_to_frame() -> None:
-    positions = np.zeros((3, 22, 3))
-    positions[1:, :, 0], positions[2, :, 1] = 0.3, 0.4
-    np.testing.assert_allclose(travelled(positions)[:, 0], [0.3, 0.3, 0.4])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.world.compose import fit_legs, turn_legs
@@ -22,25 +21,6 @@ def pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def lengths(positions: np.ndarray) -> np.ndarray:
     return np.linalg.norm(positions - positions[list(PARENTS)], axis=1)
-
-
-def test_a_leg_of_the_right_lengths_stays():
-    _, positions = pose(0)
-    np.testing.assert_allclose(fit_legs(positions, np.full(22, 0.02), LENGTHS), positions, atol=1e-12)
-
-
-def test_a_foot_that_is_sure_draws_the_knee_and_stays_itself():
-    _, positions = pose(1)
-    moved, sigma = positions.copy(), np.full(22, 0.02)
-    foot = J["left_ankle"]
-    moved[foot] += [0.0, 0.0, -0.03]
-    sigma[foot] = 0.001
-    fitted = fit_legs(moved, sigma, LENGTHS)
-    assert np.linalg.norm(fitted[foot] - moved[foot]) < 0.001
-    off = np.abs(lengths(moved) - LENGTHS)[LEGS].sum()
-    assert np.abs(lengths(fitted) - LENGTHS)[LEGS].sum() < 0.8 * off
-    others = sorted(set(range(22)) - set(LEGS))
-    np.testing.assert_array_equal(fitted[others], positions[others])
 
 
 def test_the_answer_is_the_most_likely_one():
@@ -90,9 +70,3 @@ def test_rotations_that_are_none_are_left_alone():
     rotations[J["left_knee"]] = np.nan
     rotations[J["right_ankle"]] = 0.0
     np.testing.assert_array_equal(turn_legs(rotations, positions, positions + 0.01), rotations)
-
-
-def test_solved_rotations_stay_solved():
-    _, positions = pose(6)
-    solved = Rotation.from_matrix(solve_rotations(positions, REST_OFFSETS)).as_quat()
-    np.testing.assert_allclose(np.abs((turn_legs(solved, positions, positions) * solved).sum(axis=1)), 1.0, atol=1e-9)

@@ -44,26 +44,6 @@ def test_the_standing_part_is_the_product_of_two_gaussians():
         assert variances[k] == pytest.approx(weights @ (spreads + means**2) - (weights @ means) ** 2, abs=1e-8)
 
 
-def test_a_foot_seen_under_the_floor_is_raised_whether_it_rests_or_not():
-    for rest in (RESTS, 0.0 * FOUR):
-        raised = settle(-0.03, rest=rest)[0] - (SOLE - 0.03)
-        assert (raised > 0.01).all()
-
-
-def test_a_foot_in_the_air_stays_where_it_is_seen():
-    np.testing.assert_array_equal(settle(0.02, rest=0.0 * FOUR)[0], SOLE + 0.02)
-
-
-def test_a_sure_input_stays_as_it_is():
-    for above in (-0.03, -0.01, 0.01, 0.03):
-        np.testing.assert_allclose(settle(above, SURE)[0], SOLE + above, atol=1e-3)
-
-
-def test_the_floor_is_not_believed_far_above_or_below_it():
-    for above in (-0.3, 0.3):
-        np.testing.assert_allclose(settle(above)[0], SOLE + above, atol=1e-6)
-
-
 def test_where_no_floor_is_known_nothing_is_said():
     heights, variances, stands = settle(-0.03, floor=np.full(4, np.nan))
     np.testing.assert_array_equal(heights, SOLE - 0.03)

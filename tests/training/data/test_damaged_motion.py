@@ -33,12 +33,6 @@ READERS: dict[str, tuple[str | bytes, Callable]] = {
 
 
 @pytest.mark.parametrize("kind", READERS)
-def test_whole_files_are_read(kind: str) -> None:
-    content, read = READERS[kind]
-    read(content)
-
-
-@pytest.mark.parametrize("kind", READERS)
 @given(data=st.data())
 @settings(max_examples=150, deadline=None)
 def test_a_damaged_file_is_read_or_is_a_motion_error(kind: str, data: st.DataObject) -> None:

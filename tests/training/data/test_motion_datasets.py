@@ -16,7 +16,8 @@ from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.prior.mocap.cmu import CMU_AMC, CMU_BVH
 from steadypose.training.data.cmu import REPEATS
-from steadypose.training.data.datasets import DATA_SETS, Dropped, amc_motions, bvh_motion, members
+from steadypose.training.data.datasets import DATA_SETS
+from steadypose.training.data.readers import Dropped, amc_motions, bvh_motion, members
 
 # A body of ReActIdle's family, y up, facing +z, left +x: name, depth, offset, end site.
 BODY: list[tuple[str, int, tuple[float, float, float], tuple[float, float, float] | None]] = [

@@ -22,7 +22,6 @@ from steadypose.prior.body.layouts import CANONICAL
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.training.data.dataset import MotionSet
-from steadypose.training.data.datasets import Dropped
 from steadypose.training.data.prepare import (
     FPS,
     TOE_HEIGHT,
@@ -35,6 +34,7 @@ from steadypose.training.data.prepare import (
     stays_on_floor,
     write_prepared,
 )
+from steadypose.training.data.readers import Dropped
 
 Array = NDArray[np.float64]
 
@@ -71,11 +71,6 @@ def test_resampling_is_by_time(fps: float, frames: int) -> None:
     at = np.arange(len(out)) / FPS
     assert time[-1] - 1 / FPS < at[-1] <= time[-1] + 1e-6
     np.testing.assert_allclose(out[:, 0], at[:, None] * [1.0, -2.0, 0.5], atol=2e-3)
-
-
-def test_thirty_hertz_stays_as_it_is() -> None:
-    positions = np.random.default_rng(0).normal(size=(50, 22, 3))
-    np.testing.assert_array_equal(resample(positions, 1 / 0.0333333), positions)
 
 
 @given(start=st.integers(0, 30), length=st.integers(1, 12))
@@ -175,24 +170,6 @@ def test_what_is_too_short_is_dropped_in_words(frames: int) -> None:
     [dropped] = prepare_clip(a_clip(standing(frames)), "default", "train")
     assert isinstance(dropped, Dropped)
     assert dropped.kind == "shorter than 1 s"
-
-
-def test_the_file_holds_recordings_in_a_row(tmp_path: Path) -> None:
-    parts = [p for n in (40, 60) for p in prepare_clip(a_clip(standing(n)), "default", "train")]
-    kept = [p for p in parts if isinstance(p, Prepared)]
-    kept[1] = replace(kept[1], weights="research", split="val")
-    write_prepared(kept, tmp_path / "prepared.npz")
-    assert [p.name for p in tmp_path.iterdir()] == ["prepared.npz"]
-    with np.load(tmp_path / "prepared.npz") as z:
-        assert z["positions"].shape == (100, 22, 3)
-        assert z["rotations"].shape == (100, 22, 4)
-        assert z["offsets"].shape == (2, 22, 3)
-        assert z["contacts"].dtype == bool
-        assert {z[k].dtype for k in ("positions", "rotations", "offsets")} == {np.dtype(np.float32)}
-        assert z["clip_start"].tolist() == [0, 40, 100]
-        assert (z["set"].tolist(), z["split"].tolist()) == (["default", "research"], ["train", "val"])
-        assert z["flat"].all()
-        assert z["source"].tolist() == ["source"] * 2
 
 
 def test_the_command_prepares_what_it_finds_and_lists_what_it_leaves_out(

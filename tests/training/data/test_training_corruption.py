@@ -6,7 +6,6 @@ from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
 from steadypose.training.data.corruption import (
     add_noise,
     draw_bias_sigma,
-    exchanged,
     hide_joints,
     occlude,
     vary_builds,
@@ -70,11 +69,6 @@ def test_gaps_are_many_and_reach_the_newest_frame() -> None:
     assert hidden[:, -1].any(axis=1).mean() > 0.5
 
 
-def test_as_many_joints_are_hidden_as_asked_and_all_the_time() -> None:
-    hidden = np.isnan(hide_joints(WINDOWS, 5, np.random.default_rng(0))[..., 0])
-    assert (hidden.sum(axis=-1) == 5).all()
-
-
 def test_a_sensor_errs_by_what_is_said_half_of_it_for_good() -> None:
     off = with_sensor_error(WINDOWS, 0.02, np.random.default_rng(0)) - WINDOWS
     assert off.std() == pytest.approx(0.02, rel=0.05)
@@ -95,16 +89,3 @@ def test_a_fault_is_where_it_is_said_to_be(fault) -> None:
             assert not off[40:].any()
         if fault.__name__ not in ("sides_exchanged", "other_bones", "noisy"):
             assert set(np.flatnonzero(off.any(axis=0))) <= {*joints, *MIRROR[joints]}
-
-
-def test_exchanged_limbs_are_each_others() -> None:
-    window = WINDOWS[0].copy()
-    exchanged(window, slice(10, 50), [J["left_wrist"]], WINDOWS[1], np.random.default_rng(0))
-    np.testing.assert_array_equal(window[10:, J["left_wrist"]], WINDOWS[0, 10:, J["right_wrist"]])
-    np.testing.assert_array_equal(window[10:, J["right_wrist"]], WINDOWS[0, 10:, J["left_wrist"]])
-
-
-def test_the_share_asked_for_is_spoilt() -> None:
-    spoilt = with_faults(np.tile(WINDOWS, (10, 1, 1, 1)), FAULTS, 0.6, np.random.default_rng(0))
-    off = np.linalg.norm(spoilt - np.tile(WINDOWS, (10, 1, 1, 1)), axis=-1) > 0
-    assert off.any(axis=(1, 2)).mean() == pytest.approx(0.6, abs=0.1)

@@ -1,6 +1,8 @@
-"""CurveZMQ keys: who may listen when messages leave the machine.
+"""Addresses that messages travel by, which of them may be used, and CurveZMQ keys: who may listen.
 
-A directory of keys holds
+On this machine an ipc address is private to its user by its directory. A tcp address is not: there a pair of keys that
+only this user can read (`loopback_keys`) keeps other users out. Where messages leave the machine, a directory of keys
+says who may listen. It holds
 
 - `own.key_secret`, readable by its owner alone, and `own.key`, the public half to hand out;
 - `clients/*.key`: public keys of those who may subscribe here. Who is taken off the list is not let in any more, and is
@@ -8,24 +10,131 @@ A directory of keys holds
 - `server.key`: public key of the publishers to subscribe to; without it they are this machine's own;
 - `servers/HOST.key`: public keys of publishers that each have their own, by host as in their addresses; then those on
   other hosts are not subscribed to.
-
-On this machine an ipc address is private to its user by its directory. A tcp address is not: there a pair of keys that
-only this user can read (`loopback_keys`) keeps other users out.
 """
 
 from __future__ import annotations
 
+import ipaddress
 import os
+import socket
 import stat
+import tempfile
 import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from zmq.auth import create_certificates, load_certificate
 
-from steadypose.msgs.addresses import TransportError, is_local, local_directory, make_private, parse
+class TransportError(ValueError):
+    """An address that cannot, or must not, be used. The text says what to do."""
+
+
+def parse(endpoint: str) -> tuple[str, str]:
+    """Transport and path or host of an address.
+
+    Raises:
+        TransportError: it is malformed.
+    """
+    transport, _, address = endpoint.partition("://")
+    host, _, port = address.rpartition(":")
+    if transport == "ipc" and address:
+        return transport, address
+    if transport == "tcp" and host and (port.isdecimal() or port == "*"):
+        return transport, host.strip("[]")
+    raise TransportError(f"address: expected ipc://PATH or tcp://HOST:PORT, got {endpoint!r}")
+
+
+def is_local(endpoint: str) -> bool:
+    """Whether only this machine is at the other end."""
+    transport, host = parse(endpoint)
+    return transport == "ipc" or _is_loopback(host)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def refuse_used(path: Path) -> None:
+    """Raises:
+    TransportError: a publisher is at this path, or something that is no socket. ZeroMQ would take the path from the
+        one without either noticing, and delete the other.
+    """
+    try:
+        kind = path.lstat().st_mode
+    except OSError:
+        return
+    if not stat.S_ISSOCK(kind):
+        raise TransportError(f"cannot publish at ipc://{path}: expected no file there, or an old socket; remove it")
+    with socket.socket(socket.AF_UNIX) as probe:
+        try:
+            probe.connect(str(path))
+        except OSError:
+            return
+    raise TransportError(f"cannot publish at ipc://{path}: another publisher is there; stop it or choose another path")
+
+
+def check_private(directory: Path) -> None:
+    """Raises:
+    TransportError: others own the directory, or may write to it, and so could publish in this user's name.
+    """
+    try:
+        status = directory.lstat()
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise TransportError(f"{directory}: {error.strerror}") from error
+    if stat.S_ISLNK(status.st_mode) and status.st_uid in (0, os.getuid()):
+        status = directory.stat()
+    if not stat.S_ISDIR(status.st_mode):
+        raise TransportError(f"{directory}: expected a directory for sockets, got something else")
+    if status.st_uid not in (0, os.getuid()):
+        raise TransportError(
+            f"{directory} belongs to user {status.st_uid}: expected a directory of one's own for sockets; "
+            "set XDG_RUNTIME_DIR, or [transport] directory"
+        )
+    sticky = status.st_uid == 0 and status.st_mode & stat.S_ISVTX  # /tmp, for an address that somebody chose there
+    others = stat.S_IWOTH if status.st_gid == os.getgid() else stat.S_IWOTH | stat.S_IWGRP
+    if status.st_mode & others and not sticky:
+        raise TransportError(f"{directory} can be written to by others: run `chmod 700 {directory}`, or choose another")
+
+
+def make_private(directory: Path) -> None:
+    """Make a directory for sockets, accessible to this user only, unless it exists.
+
+    Raises:
+        TransportError: it exists with other owners or permissions, or cannot be made.
+    """
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise TransportError(f"cannot make {directory}: {error.strerror}") from error
+    check_private(directory)
+
+
+def local_directory() -> Path:
+    """Where ipc sockets live unless a launch file says otherwise: private to the user, gone after a reboot.
+
+    Raises:
+        TransportError: it is there, and others may write to it.
+    """
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    directory = Path(runtime) / "steadypose" if runtime else Path(tempfile.gettempdir()) / f"steadypose-{os.getuid()}"
+    check_private(directory)
+    return directory
+
+
+def local_address(node: str) -> str:
+    """Where ``node`` (``pose_input``, ``prior``, ``trajectory``) publishes unless a launch file says otherwise.
+
+    Raises:
+        TransportError: others may write to the directory.
+    """
+    return f"ipc://{local_directory() / node}"
+
 
 MADE_S = 2.0
 """that another process may take to make the keys of this user"""
@@ -97,10 +206,18 @@ def _listed(directory: Path) -> dict[str, bytes]:
 
 
 def _public(file: Path) -> bytes:
-    public, _ = load_certificate(file)
-    if len(public) != 40:
-        raise ValueError(f"{file}: expected keys of 40 characters, got one of {len(public)}")
-    return public
+    return _certificate(file)[0]
+
+
+def _certificate(file: Path) -> tuple[bytes, bytes | None]:
+    """Public and, where the file has it, secret key."""
+    from zmq.auth import load_certificate  # here, because reading an address takes no ZeroMQ
+
+    public, secret = load_certificate(file)
+    for key in (public, secret or public):
+        if len(key) != 40:
+            raise ValueError(f"{file}: expected keys of 40 characters, got one of {len(key)}")
+    return public, secret
 
 
 def create_keys(directory: str | Path) -> Keys:
@@ -117,6 +234,8 @@ def create_keys(directory: str | Path) -> Keys:
         os.close(os.open(secret, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     except FileExistsError as error:
         raise ValueError(f"{secret} exists already: expected a directory without keys, or use these") from error
+    from zmq.auth import create_certificates
+
     create_certificates(directory, _OWN)
     return load_keys(directory)
 
@@ -136,14 +255,11 @@ def load_keys(directory: str | Path) -> Keys:
     for folder in (directory, directory / "clients", directory / "servers"):
         if folder.is_dir():
             _check_folder(folder)
-    public, secret = load_certificate(secret_file)
+    public, secret = _certificate(secret_file)
     if secret is None:
         raise ValueError(f"{secret_file}: expected a secret key, found none; make new keys")
     server_file = directory / "server.key"
-    server = load_certificate(server_file)[0] if server_file.is_file() else public
-    for key in (public, secret, server):
-        if len(key) != 40:
-            raise ValueError(f"{directory}: expected keys of 40 characters, got one of {len(key)}")
+    server = _public(server_file) if server_file.is_file() else public
     clients = _listed(directory / "clients").values()
     return Keys(public, secret, server, frozenset({public, *clients}), _listed(directory / "servers"), directory)
 

@@ -35,7 +35,7 @@ from pygltflib import (
     Skin,
 )
 
-from steadypose.nodes.sinks.files.motion import Y_UP, BodyMotion
+from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion
 from steadypose.prior.body.avatars import VRM
 from steadypose.prior.body.skeleton import CHILDREN, JOINTS, PARENTS
 

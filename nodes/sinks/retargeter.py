@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from steadypose.msgs.types import CONTACTS, WorldBody
-from steadypose.nodes.sinks.retarget.robot import Robot
+from steadypose.msgs.types import CONTACTS, PoseWorld, WorldBody
+from steadypose.nodes.sinks.datagrams import Followed
+from steadypose.nodes.sinks.robot import Robot
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import global_rotations, rotation_matrices, rotation_matrix, yaw_matrix
 from steadypose.prior.body.skeleton import J
@@ -256,3 +257,24 @@ def _direction(p: Floats, start: str, end: str) -> Floats:
 
 def _length(p: Floats, *joints: str) -> float:
     return float(sum(np.linalg.norm(p[J[b]] - p[J[a]]) for a, b in pairwise(joints)))
+
+
+class Follower:
+    """The robot's poses for a stream of ``pose/world``: as one person, until they are gone.
+
+    Args:
+        retargeter: of the robot.
+        body: the id of the one to follow; None: the first who is there, then the next.
+    """
+
+    def __init__(self, retargeter: Retargeter, body: int | None = None) -> None:
+        self._retargeter, self._followed = retargeter, Followed(body)
+
+    def process(self, world: PoseWorld) -> RobotPose | None:
+        """The pose at a message's moment; None before there was anybody."""
+        before = self._followed.id
+        body = self._followed.update(world)
+        if self._followed.id != before:
+            self._retargeter.reset()
+        pose = None if body is None else self._retargeter.follow(world.stamp_ns, body)
+        return pose or self._retargeter.coast(world.stamp_ns)

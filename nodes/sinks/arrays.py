@@ -1,4 +1,4 @@
-"""Answers as ``.npz``: the plain arrays that a researcher has and wants, in place of a recording.
+"""Output as plain arrays: ``.npz``, and CSV for a spreadsheet.
 
 One row for each row in: ``stamp_ns`` (T,), ``positions`` (T, 22, 3) metres in the input's frame, ``rotations``
 (T, 22, 4) local, xyzw, ``state`` (T, 22) `msgs.types.JointState`, ``sigma`` (T, 22) metres, ``anomaly`` (T,),
@@ -9,12 +9,16 @@ state is UNKNOWN. With several bodies an axis for them comes after time, and ``b
 
 from __future__ import annotations
 
+import csv
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import JOINTS, Message, PoseClean, PoseWorld
+from steadypose.msgs.types import JOINTS, JointState, Message, PoseClean, PoseWorld
 from steadypose.nodes.graph.clock import FRAME_NS
 
 SLACK_NS = 1_000_000
@@ -125,3 +129,44 @@ def _slerp(a: NDArray[np.float64], b: NDArray[np.float64], fraction: NDArray[np.
     from_a = np.where(small, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / sine)
     from_b = np.where(small, fraction, np.sin(fraction * angle) / sine)
     return from_a * a + from_b * b
+
+
+OBSERVED = (JointState.SEEN, JointState.REFINED)
+_PARTS = ("x", "y", "z", "confidence", "state", "sigma")
+
+
+def write_csv(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays of `NpzCollector`, of one body or of several."""
+    several = "body_id" in arrays
+    columns = ["stamp", *(["body"] if several else [])]
+    columns += [f"{joint}_{part}" for joint in JOINTS for part in _PARTS] + ["anomaly", "anomaly_flag"]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        file.write("# skeleton: smpl22\n# up: z\n")
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(_rows(arrays, several))
+
+
+def _rows(arrays: Mapping[str, NDArray[Any]], several: bool) -> Iterator[list[str]]:
+    ids = arrays["body_id"].tolist() if several else [0]
+
+    def of_bodies(name: str) -> NDArray[Any]:
+        return arrays[name] if several else arrays[name][:, None]
+
+    joints, state, sigma = of_bodies("world_positions"), of_bodies("state"), of_bodies("sigma")
+    anomaly, flag = of_bodies("anomaly"), of_bodies("anomaly_flag")
+    observed = np.isin(state, OBSERVED).astype(int)
+    for row, stamp_ns in enumerate(arrays["stamp_ns"].tolist()):
+        for body, number in enumerate(ids):
+            if several and np.isnan(joints[row, body]).all():
+                continue  # who is not there has no row
+            cells = [f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}", *([str(number)] if several else [])]
+            for joint in range(len(JOINTS)):
+                at = row, body, joint
+                cells += [_cell(value, 5) for value in joints[at].tolist()]
+                cells += [str(observed[at]), str(state[at]), _cell(float(sigma[at]), 5)]
+            yield [*cells, _cell(float(anomaly[row, body]), 3), str(int(flag[row, body]))]
+
+
+def _cell(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else ""

@@ -1,4 +1,4 @@
-"""What a node's start takes of time and memory, and gives back."""
+"""Processes of our own: how one is started safely, what its start gives back, its signals, and its notes to systemd."""
 
 from __future__ import annotations
 
@@ -6,10 +6,37 @@ import ctypes
 import gc
 import os
 import signal
+import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
+
+_SCRIPT = (
+    # as python -P, which 3.10 does not have
+    "import sys; sys.path[:] = [p for p in sys.path if p]; "
+    "from importlib import import_module; module, _, name = sys.argv.pop(1).partition(':'); "
+    "sys.exit(getattr(import_module(module), name)())"
+)
+
+
+def own_command(function: str, *arguments: str) -> list[str]:
+    """The command line of a process that calls a function, and exits with what it returns.
+
+    Args:
+        function: as ``module:name``.
+        arguments: what it finds in `sys.argv`.
+    """
+    return [sys.executable, "-c", _SCRIPT, function, *arguments]
+
+
+def own_environment() -> dict[str, str]:
+    """This process' environment for such a process: without the working folder, which an empty part of a path means."""
+    found = dict(os.environ)
+    if parts := found.get("PYTHONPATH"):
+        found["PYTHONPATH"] = os.pathsep.join(part for part in parts.split(os.pathsep) if part)
+    return found | {"PYTHONSAFEPATH": "1"}
+
 
 _DONTNEED = 4
 """``MADV_DONTNEED`` of madvise(2)"""
@@ -68,3 +95,17 @@ def _give_back() -> None:
             if " r-xp " in line and "llvmlite" in line:
                 begin, end = (int(address, 16) for address in line.split()[0].split("-"))
                 libc.madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), _DONTNEED)
+
+
+READY = "READY=1"
+ALIVE = "WATCHDOG=1"
+STOPPING = "STOPPING=1"
+
+
+def notify(state: str) -> None:
+    """Send a line of the protocol of sd_notify(3) to who started this process, if it listens."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address.startswith(("/", "@")):
+        return
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
+        end.sendto(state.encode(), address.replace("@", "\0", 1) if address.startswith("@") else address)

@@ -1,8 +1,12 @@
-"""One cleaned body as other programs want it: at a steady rate, in the world, on bones that keep their lengths."""
+"""One cleaned body at a steady rate, on bones that keep their lengths, as BVH, CSV or TRC.
+
+BVH: centimetres, y up, the rest pose a T that faces +z. CSV: as `nodes.sources.csv` reads it. TRC: as OpenSim does.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +19,7 @@ from steadypose.msgs.types import PoseWorld
 from steadypose.nodes.sources.npz import read_arrays, read_stamps
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import forward_kinematics, global_rotations, rigid_alignment
-from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.body.skeleton import CHILDREN, JOINTS, PARENTS, J
 
 Y_UP: Floats = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 """From x forward, y left, z up to what animation programs have: x left, y up, z forward."""
@@ -140,3 +144,91 @@ def _chosen(path: Path, bodies: Counter[int], body: int | None) -> int:
         there = ", ".join(str(id) for id in bodies) or "none"
         raise ExportError(f"{path}: expected body {'' if body is None else body}, there are {there}")
     return bodies.most_common(1)[0][0] if body is None else body
+
+
+CENTIMETRES = 100.0
+ORDER = "ZXY"
+
+ENDS = {
+    "head": (0.0, 18.0, 3.0),
+    "foot": (0.0, 0.0, 7.0),
+    "left_wrist": (17.0, 0.0, 0.0),
+    "right_wrist": (-17.0, 0.0, 0.0),
+}
+"""Centimetres, x left, y up, z forward: how far head, feet and hands reach beyond their joints, of a generic adult."""
+
+
+def to_bvh(motion: BodyMotion, names: Sequence[str] = JOINTS) -> bytes:
+    """The file's contents; ``names`` of the 22 joints."""
+    lines = ["HIERARCHY"]
+    order: list[int] = []
+
+    def write(joint: int, depth: int) -> None:
+        order.append(joint)
+        offset = CENTIMETRES * Y_UP @ motion.offsets[joint]
+        channels = " ".join(f"{axis}rotation" for axis in ORDER)
+        rows = [
+            f"{'JOINT' if joint else 'ROOT'} {names[joint]}",
+            "{",
+            f"\tOFFSET {_row(offset)}",
+            f"\tCHANNELS 3 {channels}" if joint else f"\tCHANNELS 6 Xposition Yposition Zposition {channels}",
+        ]
+        lines.extend("\t" * depth + row for row in rows)
+        for child in CHILDREN[joint]:
+            write(child, depth + 1)
+        if not CHILDREN[joint]:
+            name = JOINTS[joint]
+            end = ENDS.get(name, ENDS.get(name.partition("_")[2]))
+            assert end is not None, "head, wrists and feet are all there is without children"
+            lines.extend("\t" * (depth + 1) + row for row in ("End Site", "{", f"\tOFFSET {_row(np.array(end))}", "}"))
+        lines.append("\t" * depth + "}")
+
+    write(J["pelvis"], 0)
+    # The turn of axes, about a rotation on both sides: only its vector turns.
+    turns = Rotation.from_rotvec(Rotation.from_quat(motion.rotations[:, order].reshape(-1, 4)).as_rotvec() @ Y_UP.T)
+    angles = turns.as_euler(ORDER, degrees=True).reshape(len(motion.root), -1)
+    rows = np.concatenate([CENTIMETRES * motion.root @ Y_UP.T, angles], axis=1)
+    lines += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / motion.fps:.9f}", *map(_row, rows)]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _row(values: np.ndarray) -> str:
+    return " ".join(f"{value:.6f}" for value in values)
+
+
+MILLIMETRES = 1000.0
+
+
+def to_csv(motion: BodyMotion) -> bytes:
+    """``stamp`` in seconds; of each joint ``_x _y _z`` in metres, world, z up, and ``_qx _qy _qz _qw``, local."""
+    parts = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    rows = np.concatenate([motion.positions, motion.rotations], axis=-1).reshape(len(motion.root), -1)
+    stamps = motion.start_s + np.arange(len(rows)) / motion.fps
+    lines = [
+        "# skeleton: smpl22",
+        "# up: z",
+        ",".join(["stamp", *(f"{joint}_{part}" for joint in JOINTS for part in parts)]),
+        *(f"{stamp:.9f}," + ",".join(f"{value:.6f}" for value in row) for stamp, row in zip(stamps, rows, strict=True)),
+    ]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def to_trc(motion: BodyMotion) -> bytes:
+    """Markers at the joints: millimetres, y up."""
+    rows = (MILLIMETRES * motion.positions @ Y_UP.T).reshape(len(motion.root), -1)
+    frames, rate = len(rows), f"{motion.fps:g}"
+    header = ("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate", "OrigDataStartFrame",
+              "OrigNumFrames")  # fmt: skip
+    lines = [
+        "PathFileType\t4\t(X/Y/Z)\tsteadypose.trc",
+        "\t".join(header),
+        "\t".join([rate, rate, str(frames), str(len(JOINTS)), "mm", rate, "1", str(frames)]),
+        "Frame#\tTime\t" + "\t\t\t".join(JOINTS) + "\t\t",
+        "\t\t" + "\t".join(f"{axis}{k + 1}" for k in range(len(JOINTS)) for axis in "XYZ"),
+        "",
+        *(
+            "\t".join([str(k + 1), f"{k / motion.fps:.6f}", *(f"{value:.4f}" for value in row)])
+            for k, row in enumerate(rows)
+        ),
+    ]
+    return ("\n".join(lines) + "\n").encode()

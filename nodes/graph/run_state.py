@@ -1,0 +1,194 @@
+"""What ``steadypose run`` keeps of its nodes: locks of their addresses, an account of each frame, ``health.json``."""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import json
+import os
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+from steadypose.msgs.security import local_directory, make_private
+from steadypose.msgs.topics import DIAGNOSTICS
+from steadypose.msgs.types import Diagnostics, Level
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.graph.supervisor import Supervisor
+from steadypose.nodes.graph.topology import NODES, Delivery
+
+HEALTH_FILE = "health.json"
+
+
+class RunLock:
+    """The addresses of a run's nodes, and where there is no other run, ``health.json``. A context manager.
+
+    Attributes:
+        has_health: whether ``health.json`` is this run's to write; the other run there has other nodes.
+    """
+
+    def __init__(self, launch: Launch) -> None:
+        """Raises:
+        LaunchError: another run has one of the addresses.
+        """
+        directory = launch.transport.make_ipc_directory()
+        self.has_health = True
+        with ExitStack() as stack:
+            for name in launch.nodes:
+                endpoint = launch.transport.endpoint(name)
+                if endpoint.startswith("ipc://"):
+                    holder = _take(stack, endpoint.removeprefix("ipc://") + ".lock")
+                else:  # whatever the directory of this launch's sockets
+                    make_private(local_directory())
+                    holder = _take(stack, f"{local_directory()}/{endpoint.replace('/', '')}.lock")
+                if holder is not None:
+                    raise LaunchError(
+                        f"{name} runs already at {endpoint}, in another `steadypose run`{holder}: stop that one, or "
+                        "give this one addresses of its own ([transport] directory, or [transport.endpoints])"
+                    )
+            self.has_health = _take(stack, f"{directory}/health.lock") is None
+            self._held = stack.pop_all()
+
+    def __enter__(self) -> RunLock:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._held.close()
+
+
+def _take(stack: ExitStack, path: str) -> str | None:
+    """Take a lock; returns None, or what is known of who has it."""
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+    except OSError as error:
+        raise LaunchError(f"cannot make {path}: {error.strerror}") from error
+    stack.callback(os.close, file)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        pid = os.read(file, 16).decode("ascii", "replace").strip()
+        return f" (process {pid})" if pid else ""
+    os.ftruncate(file, 0)
+    with suppress(OSError):  # a full disk: the lock holds all the same
+        os.write(file, str(os.getpid()).encode())
+    return None
+
+
+LOSSES = ("dropped.", "refused.")
+"""begin the counts of what did not go through a node"""
+
+
+class Ledger:
+    """The counts of a run's nodes. A node that is started again counts from 0; here its counts go on.
+
+    Args:
+        launch: of the run.
+    """
+
+    def __init__(self, launch: Launch) -> None:
+        self._launch = launch
+        # a lossless node counts on itself from what the one before it had published
+        self._restarted = LOSSES if launch.transport.lossless else (*LOSSES, "in.", "count.")
+        self._before: dict[str, Counter[str]] = {}
+        self._latest: dict[str, Diagnostics] = {}
+        self._restarts: Counter[str] = Counter()
+        self._ended: dict[str, set[str]] = {}
+
+    def note(self, diagnostics: Diagnostics, restarts: int) -> Diagnostics:
+        """Take a report of a node that was restarted so often; the report with the counts of all its processes."""
+        node = diagnostics.node
+        before = self._before.setdefault(node, Counter())
+        if restarts != self._restarts[node] and node in self._latest:
+            before.update(self._counts(self._latest[node]))
+        self._restarts[node], self._latest[node] = restarts, diagnostics
+        total = {key: str(n) for key, n in (before + self._counts(diagnostics)).items()}
+        if self._launch.transport.lossless:  # one that is killed after the end is not given it again
+            ended = self._ended.setdefault(node, set())
+            ended.update(diagnostics.values.get("ended", "").split())
+            total["ended"] = " ".join(sorted(ended))
+        return dataclasses.replace(diagnostics, values=diagnostics.values | total)
+
+    def _counts(self, diagnostics: Diagnostics) -> Counter[str]:
+        return Counter({k: int(n) for k, n in diagnostics.values.items() if k.startswith(self._restarted)})
+
+    def away(self, node: str, reports: dict[str, Diagnostics]) -> dict[str, str]:
+        """What was published for a node while it was not there, by topic, from the last reports of all.
+
+        A node that was killed had up to a second to say what it had taken, so this is of that accuracy.
+        """
+        declared = NODES[node]
+        if self._launch.transport.lossless or declared.delivery is Delivery.BEST_EFFORT or node not in reports:
+            return {}
+        values = {key: int(n) for key, n in reports[node].values.items() if key.startswith((*LOSSES, "in."))}
+        found = {}
+        for publisher, topics in declared.subscribes.items():
+            if publisher not in reports or not self._restarts[node] + self._restarts[publisher]:
+                continue
+            for topic in set(topics) - {DIAGNOSTICS}:
+                causes = (f"in.{topic}", f"dropped.lost {topic}", f"dropped.expired {topic}", "dropped.late")
+                accounted = sum(values.get(cause, 0) for cause in causes)
+                missing = int(reports[publisher].values.get(f"count.{topic}", 0)) - accounted
+                if missing > 0:
+                    found[f"dropped.away {topic}"] = str(missing)
+        return found
+
+
+def losses(diagnostics: Diagnostics, *kinds: str) -> str:
+    """What a node says that it dropped or refused, as a text; empty if nothing."""
+    values = diagnostics.values.items()
+    return ", ".join(f"{key} {n}" for key, n in values if key.startswith(kinds) and n != "0")
+
+
+def write_health(
+    directory: Path,
+    required: Sequence[str],
+    supervisor: Supervisor,
+    diagnostics: Mapping[str, Diagnostics],
+) -> None:
+    """Write ``health.json`` anew: the state of a run, for monitoring a machine without a screen.
+
+    It lies in the directory of the sockets and is rewritten atomically once a second. Check its age first: a file older
+    than a few seconds is no longer written. A full disk, like any other OSError, is ignored.
+
+    Args:
+        directory: of the sockets.
+        required: nodes that ``ok`` demands to be running.
+        supervisor: of the run.
+        diagnostics: the latest of each node, by its name.
+    """
+    nodes = {name: _node(name, supervisor, diagnostics.get(name)) for name in supervisor.children}
+    health = {
+        "time": time.time(),
+        "pid": os.getpid(),
+        "ok": all(nodes[name]["state"] == "running" for name in required),
+        "nodes": nodes,
+    }
+    unfinished = directory / f".{HEALTH_FILE}.{os.getpid()}"
+    with suppress(OSError):
+        unfinished.write_text(json.dumps(health, indent=1) + "\n")
+        unfinished.replace(directory / HEALTH_FILE)
+
+
+def _node(name: str, supervisor: Supervisor, latest: Diagnostics | None) -> dict[str, Any]:
+    child = supervisor.children[name]
+    known = child.state == "running" and latest is not None
+    status: dict[str, Any] = {"state": child.state, "restarts": child.restarts, "silent_s": round(child.silent_s, 1)}
+    if known and latest:
+        values, stream = latest.values, NODES[name].stream
+        status |= {
+            "state": values.get("state", child.state).partition(" ")[0],
+            "level": Level(latest.level).name,
+            "message": latest.message,
+            "memory_mb": float(values.get("memory_mb", 0)),
+        }
+        if stream and f"rate.{stream}" in values:
+            status["rate_hz"] = float(values[f"rate.{stream}"])
+        if "latency_ms.p99" in values:
+            status["latency_p99_ms"] = float(values["latency_ms.p99"])
+    elif child.state == "running":
+        status["state"] = "starting"
+    return status

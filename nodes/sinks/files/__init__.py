@@ -1,1 +1,0 @@
-"""Cleaned motion as files that other programs read: BVH, GLB, CSV, TRC."""

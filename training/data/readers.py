@@ -1,0 +1,169 @@
+"""From archives, folders and files to recordings: each as it is read, or the reason why it is left out."""
+
+from __future__ import annotations
+
+import tarfile
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from lzma import LZMAError
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from steadypose.prior.arrays import Floats
+from steadypose.prior.body.layouts import CANONICAL, Skeleton, to_canonical
+from steadypose.prior.body.rigs import Rig, RigError, up_axis
+from steadypose.prior.mocap.amc import Asf, read_amc, read_asf
+from steadypose.prior.mocap.bvh import Bvh, read_bvh
+from steadypose.prior.mocap.clip import TO_Z_UP, Clip, MotionError
+from steadypose.prior.mocap.cmu import CMU_AMC
+from steadypose.prior.mocap.files import SUFFIXES, UNDESCRIBED, Description, file_rig, read_motion
+
+REST_POSE_SPEED = 30.0
+"""m/s. No body does this: a first frame that is left faster is a rest pose that a converter has put in front."""
+
+LEAVING_SPEED, REST_POSE_SECONDS = 5.0, 0.1
+"""m/s, seconds. Converters that filter blend the rest pose into the motion: frames that are left faster than this, so
+soon after it, go too (five of `cmu_dance`'s at 120 Hz)."""
+
+UNREADABLE = "cannot be read"
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A recording, or a part of one, that does not go into training, and why.
+
+    Attributes:
+        name: of the recording.
+        source: its data set.
+        kind: the cause in general words, to count by.
+        cause: the cause in this case, with its figures.
+    """
+
+    name: str
+    source: str
+    kind: str
+    cause: str
+
+
+Progress = Callable[[float], None]
+"""Told how much of a file, 0 to 1, has been read."""
+
+
+def members(path: Path, suffixes: tuple[str, ...], progress: Progress) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of the files with some suffix in an archive (.tar, .tar.xz, ...), folder, or file.
+
+    Archives are read as a stream, in their own order; folders by name.
+
+    Raises:
+        MotionError: the archive is cut short or none.
+    """
+    if path.is_file() and path.suffix not in suffixes:
+        size = path.stat().st_size
+        try:
+            with path.open("rb") as raw, tarfile.open(fileobj=raw, mode="r|*") as archive:
+                for entry in archive:
+                    if entry.isfile() and entry.name.endswith(suffixes) and (file := archive.extractfile(entry)):
+                        yield entry.name, file.read()
+                        progress(raw.tell() / size)
+        except (tarfile.TarError, LZMAError, zlib.error, EOFError) as error:
+            raise MotionError(f"{path}: expected a .tar archive, whole: {error}") from error
+        return
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.suffix in suffixes)
+    root = path.parent if path.is_file() else path
+    for i, file in enumerate(files):
+        yield file.relative_to(root).as_posix(), file.read_bytes()
+        progress((i + 1) / len(files))
+
+
+def bvh_motion(text: str) -> tuple[Bvh, Skeleton, Floats]:
+    """A BVH file, its skeleton, and the positions (T, J, 3) of that skeleton's joints, metres, z up.
+
+    Raises:
+        MotionError: it cannot be read, or no body is recognised in it.
+    """
+    bvh = read_bvh(text)
+    try:
+        rig = file_rig(bvh.joints, bvh.parents, bvh.offsets, UNDESCRIBED)
+    except RigError as error:
+        raise MotionError(str(error)) from error
+    positions = _select(rig, bvh.joints, bvh.positions(rig.lost_bones))
+    return bvh, rig.skeleton, positions[_rest_frames(positions, bvh.fps) :]
+
+
+def _rest_frames(positions: Floats, fps: float) -> int:
+    """How many frames at the start are a rest pose that a converter has put in front, and the way out of it."""
+    start = positions[: max(2, round(REST_POSE_SECONDS * fps) + 1)]
+    speed = np.abs(np.diff(start, axis=0)).max(axis=(1, 2), initial=0.0) * fps
+    if not len(speed) or speed[0] <= REST_POSE_SPEED:
+        return 0
+    return int(np.flatnonzero(speed > LEAVING_SPEED)[-1]) + 1
+
+
+def _select(rig: Rig, joints: Sequence[str], positions: Floats) -> Floats:
+    """The rig's joints of (T, J, 3), in metres, z up."""
+    missing = set(rig.skeleton.joints) - set(joints)
+    if missing:
+        raise MotionError(f"expected the joints of '{rig.skeleton.name}', lacks {', '.join(sorted(missing))}")
+    selected = positions[:, [joints.index(j) for j in rig.skeleton.joints]] * rig.metres
+    up = rig.up or up_axis(to_canonical(rig.skeleton, selected)[0])
+    return selected @ TO_Z_UP[up].T
+
+
+def amc_motions(path: Path, progress: Progress) -> Iterator[tuple[str, Floats | MotionError]]:
+    """Names and positions (T, J, 3), metres, z up, of AMC files; of one that cannot be read, the reason.
+
+    The skeleton of ``01/01_05.amc`` is the ``.asf`` in the same folder.
+    """
+    skeletons: dict[str, Asf | MotionError] = {}
+    waiting: list[tuple[str, str]] = []
+    for name, content in members(path, (".asf", ".amc"), lambda share: progress(0.3 * share)):
+        # An archive has its files in any order.
+        if name.endswith(".asf"):
+            try:
+                skeletons[folder_of(name)] = read_asf(content.decode("ascii", "replace"))
+            except MotionError as error:
+                skeletons[folder_of(name)] = error
+        else:
+            waiting.append((name, content.decode("ascii", "replace")))
+    for done, (name, text) in enumerate(waiting, start=1):
+        progress(0.3 + 0.7 * done / len(waiting))
+        motion: Floats | MotionError
+        try:
+            skeleton = skeletons.get(
+                folder_of(name), MotionError("expected an .asf file in the same folder, found none")
+            )
+            if isinstance(skeleton, MotionError):
+                raise skeleton
+            motion = _select(CMU_AMC, skeleton.joints, read_amc(text, skeleton))
+        except MotionError as error:
+            motion = error
+        yield name, motion
+
+
+def folder_of(name: str) -> str:
+    """The folder that a file of an archive lies in."""
+    return PurePosixPath(name).parent.as_posix()
+
+
+def stem_of(name: str) -> str:
+    """A file's name without folder and suffix."""
+    return PurePosixPath(name).stem
+
+
+def read_own(path: Path, progress: Progress, description: Description = UNDESCRIBED) -> Iterator[Clip | Dropped]:
+    """The files of motion of anybody's folder, archive, or of one file; the folder that each lies in is a person's.
+
+    Args:
+        path: of these.
+        progress: told how much is read.
+        description: what the files do not say.
+    """
+    for name, content in members(path, SUFFIXES, progress):
+        try:
+            fps, positions = read_motion(name, content, description)
+        except MotionError as error:
+            yield Dropped(name, "own", UNREADABLE, str(error))
+            continue
+        yield Clip(name, "own", "own", folder_of(name), "", fps, CANONICAL, positions[_rest_frames(positions, fps) :])
