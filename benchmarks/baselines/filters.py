@@ -20,7 +20,6 @@ from steadypose.benchmarks.baselines.kalman import fixed_lag, smooth
 from steadypose.benchmarks.baselines.whole_body_bank import whole_body_bank
 from steadypose.prior.arrays import Floats
 from steadypose.prior.models.mixture.modes import body_covariance
-from steadypose.prior.timing.fixed_lag import OneEuroFilter
 from steadypose.prior.timing.rate import FPS
 
 OFFLINE = -1
@@ -29,6 +28,7 @@ OFFLINE = -1
 _HAMPEL_HALF = 5  # frames to either side, as far as they are known by then
 _HAMPEL_FLOOR = 0.005  # metres: in a still body, a spread of nothing would make every observation an outlier
 _GAUSSIAN_PAST = 12  # frames
+_VELOCITY_CUTOFF_HZ = 1.0  # of the One-Euro filter
 _MEASUREMENT_SIGMA = 0.02  # metres, as `fixed_lag` has it
 
 
@@ -82,9 +82,31 @@ def interpolate(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
 
 
 def one_euro(seen: Floats, stamps_s: Floats, delay: int, min_cutoff_hz: float, beta: float) -> Floats:
-    """The One-Euro filter (Casiez et al. 2012)."""
-    smoother = OneEuroFilter(min_cutoff_hz, beta)
-    return np.stack([smoother.update(frame, stamp) for frame, stamp in zip(seen, stamps_s, strict=True)])
+    """The One-Euro filter (Casiez, Roussel and Vogel, CHI 2012): the cut-off rises by ``beta`` Hz per m/s.
+
+    The speed is the norm of the joint's filtered velocity, so the result does not depend on how the axes lie. A missing
+    joint is held; the next measurement of it is weighted by the time since its last.
+    """
+    estimates = np.empty_like(seen)
+    previous, estimate, velocity = np.full_like(seen[0], np.nan), np.full_like(seen[0], np.nan), np.zeros_like(seen[0])
+    seen_at = np.full(seen.shape[1:-1], np.nan)
+    for t, (measured, stamp_s) in enumerate(zip(seen, stamps_s, strict=True)):
+        here, known = ~missing(measured), np.isfinite(seen_at)
+        step = np.where(known, stamp_s - seen_at, 1.0)[..., None]
+        moved = velocity + _weight(_VELOCITY_CUTOFF_HZ, step) * ((measured - previous) / step - velocity)
+        cutoff_hz = min_cutoff_hz + beta * np.linalg.norm(moved, axis=-1, keepdims=True)
+        filtered = np.where(known[..., None], estimate + _weight(cutoff_hz, step) * (measured - estimate), measured)
+        velocity = np.where((here & known)[..., None], moved, velocity)
+        estimate = np.where(here[..., None], filtered, estimate)
+        previous = np.where(here[..., None], measured, previous)
+        seen_at = np.where(here, stamp_s, seen_at)
+        estimates[t] = estimate
+    return estimates
+
+
+def _weight(cutoff_hz: Floats | float, step_s: Floats) -> Floats:
+    """Weight of the newest sample in an exponential filter (One-Euro paper, equation 5)."""
+    return 1.0 / (1.0 + 1.0 / (2 * np.pi * cutoff_hz * step_s))
 
 
 def constant_velocity(seen: Floats, stamps_s: Floats, delay: int, density: float) -> Floats:

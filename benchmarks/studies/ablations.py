@@ -31,13 +31,13 @@ from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 from steadypose.benchmarks.studies.spoiled import Condition
 from steadypose.benchmarks.studies.world import chain, measure
 from steadypose.prior.arrays import Floats
-from steadypose.prior.clean.denoise import DenoiseSettings
+from steadypose.prior.clean.bones import PersonSettings
 from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.gate import GateSettings
 from steadypose.prior.clean.impute import ImputeSettings
 from steadypose.prior.clean.orient import OrientSettings
-from steadypose.prior.clean.person import PersonSettings
 from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.reconstruct import DenoiseSettings
 from steadypose.prior.clean.refine import RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
 from steadypose.prior.clean.settings import PriorSettings

@@ -26,8 +26,8 @@ from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.complete.body import Fill, complete
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.fit.tensors import load_network
-from steadypose.prior.models.completer.features import read_window
-from steadypose.prior.models.completer.inference import LiveCompleter
+from steadypose.prior.models.completer import LiveCompleter
+from steadypose.prior.models.completer_features import read_window
 from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig
 from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tracks
 from steadypose.training.data.hgvae_windows import standardise

@@ -15,7 +15,7 @@ from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.studies.hgvae_common import Data
 from steadypose.benchmarks.studies.hgvae_faults import FAULTS, HELD, held
 from steadypose.prior.arrays import Floats
-from steadypose.prior.models.hgvae.anomaly import Calibration, decimals
+from steadypose.prior.models.hgvae.faults import Calibration, decimals
 from steadypose.prior.models.hgvae.features import to_tracks
 from steadypose.training.data.corruption import with_sensor_error
 from steadypose.training.data.dataset import MotionSet

@@ -3,7 +3,7 @@
 Single entries, whole joints, or a limb for a time are hidden; every method gets the same windows. "mean" is the
 training mean of each track, "hold" the last observation, "line" linear interpolation in time, "guess" interpolation
 relative to the parent, "completion" the completion network's output, from which HG-VAE starts. The paper ascends log
-p(z | x) in the missing entries; here the ascent is in the latents.
+p(z | x) in the missing entries.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from torch import Tensor, nn
 
 from steadypose.benchmarks.corruption import LIMBS
 from steadypose.prior.arrays import Floats
-from steadypose.prior.clean.frame import BodyWindows
-from steadypose.prior.clean.impute import ImputeSettings, LatentAscent, completed_tracks
+from steadypose.prior.clean.impute import completed_tracks
 from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.features import Tracks, from_tracks, in_frame_of, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
@@ -36,7 +35,7 @@ BURSTS_S = (0.1, 0.3, 0.5, 1.0)
 PAPER_RATE = 0.01
 """Metres: Adam's rate for the entries, by its best result on windows of training."""
 
-SENSOR_SIGMA, BIAS_SIGMA = 0.003, 0.0
+BIAS_SIGMA = 0.0
 """Metres: the windows are clean."""
 
 
@@ -77,7 +76,7 @@ def impute_all(
         positions: (B, T, 22, 3) metres, complete.
         sizes: (B,) of the bodies.
         masks: (B, 66, T) entries to hide.
-        steps: of gradient ascent.
+        steps: of the paper's gradient ascent.
 
     Returns:
         By method: (B, 66, T) tracks, and the truth in the same frame, metres of a standard body.
@@ -90,7 +89,7 @@ def impute_all(
     for b in range(len(truth)):
         hold[b], line[b] = _held(truth[b], observed[b], mean), _line(truth[b], observed[b], mean)
         guess[b] = _guess(positions[b], sizes[b], clean[b], observed[b], line[b])
-    live = LiveHGVAE(model.config, arrays_of(model), SENSOR_SIGMA, 1)
+    live = LiveHGVAE(model.config, arrays_of(model), 1)
     hung = standardise(model, guess)
     completed, _ = model.completed(hung, torch.from_numpy(observed).float(), BIAS_SIGMA)
     guess_m, completed_m = (x.double().numpy() * SCALE + mean for x in (hung, completed))
@@ -98,15 +97,10 @@ def impute_all(
     if model.completion:
         found["completion"] = completed_m
     passes: dict[str, list[Floats]] = {}
-    for t, x, seen, size in zip(clean, guess, observed.astype(float), sizes, strict=True):
+    for t, x, seen in zip(clean, guess, observed.astype(float), strict=True):
         tracks = t._replace(x=x, observed=seen)
         reconstruction = live.reconstruct(x[None], seen[None], np.array([BIAS_SIGMA]))
-        batch = Tracks(*(np.asarray(part)[None] for part in tracks))
-        windows = BodyWindows(np.zeros(1, dtype=np.intp), batch, seen[None], np.array([size]), reconstruction, live)
         passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(tracks, reconstruction.mean[0]))
-        for count in steps:
-            climbed = LatentAscent(live.latents, ImputeSettings()).complete(windows, 0, count)
-            passes.setdefault(f"HG-VAE, {count} steps", []).append(completed_tracks(tracks, climbed.mean))
     found |= {name: np.stack(windows) for name, windows in passes.items()}
     for count in steps:
         found[f"HG-VAE, the paper's ascent, {count} steps"] = ascend_entries(model, line, observed, count)

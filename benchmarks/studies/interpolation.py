@@ -30,7 +30,7 @@ from steadypose.prior.complete.body import Fill
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.root_path import bridge
 from steadypose.prior.fit.optimise import Optimiser
-from steadypose.prior.models.completer.inference import LiveCompleter
+from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.root_velocity import LiveRootVelocity
 from steadypose.training.data.dataset import MotionSet
 

@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 from scipy.spatial.transform import Rotation
 
+from steadypose.benchmarks.baselines.kalman import fixed_lag
 from steadypose.benchmarks.machine import ROOT
 from steadypose.benchmarks.metrics import acceleration_error, contact_speed, length_variation, position_error
 from steadypose.benchmarks.provenance import WORLD, require_committed
@@ -36,7 +37,6 @@ from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import PARENTS, J
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.timing.fixed_lag import FixedLagRTS
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
@@ -167,13 +167,10 @@ def hold_last(track: Track) -> Floats:
 
 def smooth(track: Track, delay: int, density: float) -> Floats:
     """The fixed-lag RTS smoother's answers: (T, 22, 3)."""
-    answers = []
-    for visit in track.visits():
-        smoother = FixedLagRTS(delay, density, MEASUREMENT_SIGMA)
-        frames = zip(track.seen[visit], track.stamps_s[visit], strict=True)
-        held = [smoother.update(frame, stamp) for frame, stamp in frames]
-        answers += [answer.positions for answer in (*held, *smoother.flush()) if answer]
-    return np.stack(answers)
+    visits = track.visits()
+    return np.concatenate(
+        [fixed_lag(track.seen[v], track.stamps_s[v], delay, 2, density, MEASUREMENT_SIGMA) for v in visits]
+    )
 
 
 def steadypose(messages: Sequence[tuple[str, Message]], tracks: Sequence[Track], delay: int) -> list[dict[str, Floats]]:

@@ -17,7 +17,7 @@ from steadypose.nodes.driving import NOBODY
 from steadypose.nodes.graph.launch import apply_override, read_toml
 from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.prior.body.own_layouts import add_layouts
+from steadypose.prior.body.layouts import add_layouts
 
 
 def clean(

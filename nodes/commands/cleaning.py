@@ -19,7 +19,7 @@ from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.recording import open_recording
-from steadypose.prior.body.own_layouts import add_layouts
+from steadypose.prior.body.layouts import add_layouts
 
 
 @dataclass(frozen=True)

@@ -32,11 +32,11 @@ from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sinks.drawing import ALL_BONES, STATE_COLOURS, facing
 from steadypose.nodes.sources.recording import NO_RIG, open_recording, with_end
 from steadypose.nodes.sources.source import RecordedSource
-from steadypose.prior.body.own_layouts import add_layouts
+from steadypose.prior.body.layouts import add_layouts
 from steadypose.prior.complete.body import Fill, Uncertainty
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.stream import Completion, complete_raws, moved, root_steps
-from steadypose.prior.models.completer.inference import LiveCompleter
+from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.timing.rate import FPS
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings

@@ -15,7 +15,7 @@ from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.recording import open_recording
-from steadypose.prior.body.avatars import NAMES
+from steadypose.prior.body.skeleton import AVATAR_NAMES
 
 FORMATS = (".bvh", ".glb", ".vrma", ".csv", ".trc")
 NAMED = (".bvh", ".glb")
@@ -68,9 +68,9 @@ def export(
     if out.suffix in (".glb", ".vrma"):
         from steadypose.nodes.sinks.glb import to_glb, to_vrma
 
-        content = to_glb(motion, NAMES[names]) if out.suffix == ".glb" else to_vrma(motion)
+        content = to_glb(motion, AVATAR_NAMES[names]) if out.suffix == ".glb" else to_vrma(motion)
     elif out.suffix == ".bvh":
-        content = to_bvh(motion, NAMES[names])
+        content = to_bvh(motion, AVATAR_NAMES[names])
     else:
         content = {".csv": to_csv, ".trc": to_trc}[out.suffix](motion)
     partial = out.with_name(f".{out.name}.part")

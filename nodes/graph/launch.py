@@ -19,7 +19,7 @@ from steadypose import PACKAGE
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.nodes.graph.settings import LaunchError, ServerSettings, TransportSettings, load_plugin, resolve_paths
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, NodeDeclaration, add_node, load
-from steadypose.prior.body.own_layouts import add_layouts
+from steadypose.prior.body.layouts import add_layouts
 from steadypose.prior.settings import build_settings, nearest
 
 if sys.version_info >= (3, 11):
@@ -40,7 +40,7 @@ class _EveryLaunch:
     transport: TransportSettings = field(default_factory=TransportSettings)
     server: ServerSettings = field(default_factory=ServerSettings)
     skeletons: dict[str, Any] = field(default_factory=dict)
-    """joint layouts of the user's own (`prior.body.own_layouts`)"""
+    """joint layouts of the user's own (`prior.body.layouts`)"""
     plugins: dict[str, Any] = field(default_factory=dict)
     """nodes of other packages: to each name the ``module:name`` of its `NodeDeclaration`"""
 

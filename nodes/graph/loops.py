@@ -48,10 +48,9 @@ def compile_from_the_end() -> None:
 
     from steadypose.prior.body.inverse_kinematics import fit_lengths, solve_pose
     from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS
-    from steadypose.prior.clean.settings import JITTER_SIGMA
+    from steadypose.prior.models.hgvae.faults import LiveFaultNet
     from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tracks
     from steadypose.prior.models.hgvae.inference import LiveHGVAE
-    from steadypose.prior.models.hgvae.live_faults import LiveFaultNet
     from steadypose.prior.models.mixture.inference import MixtureSmoother
 
     smoother = MixtureSmoother(delay=1, slots=1)
@@ -59,8 +58,8 @@ def compile_from_the_end() -> None:
     smoother.flush()
     _, placed = solve_pose(REST_POSITIONS, REST_OFFSETS)
     fit_lengths(placed, REST_OFFSETS, np.ones(22))
-    size, sigma = body_size(REST_OFFSETS[None]), np.array([JITTER_SIGMA])
-    hgvae = LiveHGVAE.load("default", JITTER_SIGMA, max_batch=1)
+    size, sigma = body_size(REST_OFFSETS[None]), np.array([0.02])
+    hgvae = LiveHGVAE.load("default", max_batch=1)
     windows = np.tile(REST_POSITIONS, (1, hgvae.frames, 1, 1))
     windows[:, -5:, -1] = np.nan
     tracks = to_tracks(windows, size)

@@ -80,7 +80,7 @@ class PriorNode(Node):
         if isinstance(self._pipeline, StreamBatch):
             cleaned = self._pipeline.process_at(message, started_ns, hurry=self.behind, gap=gap)
         else:
-            cleaned = self._pipeline.process(message, hurry=self.behind, gap=gap)
+            cleaned = self._pipeline.process(message, gap=gap)
         if self.queue_limit is not None:
             spent_ns = self.clock.monotonic_ns() - started_ns
             self._limit.note(self._pipeline.bodies, spent_ns, self.inbox.overrun)

@@ -22,8 +22,7 @@ from steadypose.nodes.library.poses import Poses
 from steadypose.nodes.sources.npz import ArraySource, NpzError, as_input
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.source import RecordedSource
-from steadypose.prior.body.layouts import CANONICAL
-from steadypose.prior.body.own_layouts import add_layouts
+from steadypose.prior.body.layouts import CANONICAL, add_layouts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -19,9 +19,8 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.settings import check_host_and_port
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.avatars import VRM
 from steadypose.prior.body.kinematics import global_rotations, rotation_matrices
-from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.body.skeleton import PARENTS, VRM
 
 GONE_NS = 1_000_000_000
 """absence, nanoseconds, after which another person is followed"""

@@ -36,8 +36,7 @@ from pygltflib import (
 )
 
 from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion
-from steadypose.prior.body.avatars import VRM
-from steadypose.prior.body.skeleton import CHILDREN, JOINTS, PARENTS
+from steadypose.prior.body.skeleton import CHILDREN, JOINTS, PARENTS, VRM
 
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _KINDS = {np.dtype(np.float32): FLOAT, np.dtype(np.uint16): UNSIGNED_SHORT, np.dtype(np.uint8): UNSIGNED_BYTE}

@@ -33,7 +33,7 @@ TRUNK_PLACE_SPREAD = 0.05
 """Metres along each axis: deviation between sensors in the places of hips, neck and shoulders on the trunk."""
 
 LENGTH_BIASES = 3.0
-"""Least error of a single sample of a bone, as a multiple of the sensor's slow error; most of it is shared by
+"""Least error of a single sample of a bone, as a multiple of the sensor's bias; most of it is shared by
 successive samples."""
 
 LIKE_SAMPLES = 12
@@ -65,7 +65,7 @@ def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float, sam
 
     Args:
         positions: (T, 22, 3) metres, NaN where unobserved; samples of about 6 Hz.
-        bias_sigma: metres along an axis, the sensor's slow error.
+        bias_sigma: metres along an axis, the sensor's bias.
         noise_sigma: metres along an axis, the positions' other error.
         samples: how many there will be in the end.
     """

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.layouts import Skeleton
+from steadypose.prior.body.layouts import MIDDLES, NEEDED, Skeleton
 from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, J
 
 Mixture = Mapping[str, float]
@@ -36,6 +36,17 @@ ON_THE_JOINT = 0.15
 _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), ("l", "r"))
 _INLINE = re.compile(r"twist|roll", re.IGNORECASE)
 _TIP = re.compile(r"(end|nub|tip|top)\d*$", re.IGNORECASE)
+_PARTS = {
+    "hjc": "hip", "kjc": "knee", "ajc": "ankle", "toebase": "foot", "bigtoe": "foot", "footindex": "foot",
+    "toe": "foot", "toes": "foot", "clavicle": "collar", "sjc": "shoulder", "ejc": "elbow", "wjc": "wrist",
+}  # fmt: skip
+"""Other names of the parts of named points."""
+_MIDDLE_PARTS = {
+    "pelvis": "pelvis", "hip": "pelvis", "hips": "pelvis", "midhip": "pelvis", "spine1": "spine1", "spine2": "spine2",
+    "spine3": "spine3", "neck": "neck", "midshoulder": "neck", "head": "head",
+}  # fmt: skip
+_WORDS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+_SIDE_OF = {"l": "left", "left": "left", "r": "right", "right": "right"}
 _MIDDLE = ("pelvis", "spine1", "spine2", "spine3", "neck", "head")
 _ABOVE_HIPS: Floats = REST_POSITIONS[:, 2] - REST_POSITIONS[list(HIPS), 2].mean()
 """(22,) metres."""
@@ -210,6 +221,35 @@ def _weights(source: str | Mixture) -> Mixture:
 def collar(spine3: str | Mixture, neck: str | Mixture, shoulder: str | Mixture) -> Mixture:
     """The rest skeleton's collar as a mixture of its neighbours."""
     return mix((spine3, 0.333), (neck, 0.278), (shoulder, 0.389))
+
+
+def recognise_points(names: Sequence[str]) -> Skeleton:
+    """The skeleton of named points, as TRC and C3D files hold them: by their names alone, as points have no tree.
+
+    A name has a side and a part: ``RAnkle``, ``right_ankle``, ``ANKLE_R`` and ``R.Ankle`` are one joint. Pelvis, neck
+    and head may be the middle of hips, shoulders and ears; a joint that no point is of stays unobserved.
+
+    Raises:
+        RigError: hips or shoulders are not among them.
+    """
+    table: dict[str, str | dict[str, float]] = {}
+    sided: dict[str, str] = {}
+    for name in names:
+        words = [word.lower() for word in _WORDS.findall(name)]
+        sides = {_SIDE_OF[word] for word in words if word in _SIDE_OF}
+        part = "".join(word for word in words if word not in _SIDE_OF)
+        if len(sides) == 1:
+            sided.setdefault(f"{sides.pop()}_{_PARTS.get(part, part)}", name)
+        elif part in _MIDDLE_PARTS:
+            table.setdefault(_MIDDLE_PARTS[part], name)
+    for middle, part in MIDDLES.items():
+        ends = [sided[f"{side}_{part}"] for side in ("left", "right") if f"{side}_{part}" in sided]
+        if middle not in table and len(ends) == 2:
+            table[middle] = dict.fromkeys(ends, 1.0)
+    table |= {joint: name for joint, name in sided.items() if joint in JOINTS}
+    if missing := [joint for joint in NEEDED if joint not in table]:
+        raise RigError(f"expected points of {', '.join(missing)}; got {', '.join(names[:8])}...; say with --rig which")
+    return Skeleton("points", tuple(dict.fromkeys(names)), {joint: table[joint] for joint in JOINTS if joint in table})
 
 
 def _limbs(tree: Tree, pairs: Mapping[str, str]) -> tuple[_Limb, _Limb]:

@@ -108,3 +108,23 @@ def limbs(*chains: tuple[str, ...]) -> list[list[int]]:
 def finite_joints(positions: NDArray[np.floating]) -> NDArray[np.bool_]:
     """(..., J) which joints of (..., J, 3) have three finite coordinates: those that were observed."""
     return np.asarray(np.isfinite(positions).all(axis=-1))
+
+
+_AVATAR_BONES = {
+    "pelvis": ("hips", "Hips"), "spine1": ("spine", "Spine"), "spine2": ("chest", "Spine1"),
+    "spine3": ("upperChest", "Spine2"), "neck": ("neck", "Neck"), "head": ("head", "Head"),
+    "hip": ("UpperLeg", "UpLeg"), "knee": ("LowerLeg", "Leg"), "ankle": ("Foot", "Foot"), "foot": ("Toes", "ToeBase"),
+    "collar": ("Shoulder", "Shoulder"), "shoulder": ("UpperArm", "Arm"), "elbow": ("LowerArm", "ForeArm"),
+    "wrist": ("Hand", "Hand"),
+}  # fmt: skip
+_SIDED = [joint.rpartition("_") for joint in JOINTS]
+
+VRM: tuple[str, ...] = tuple(side + _AVATAR_BONES[part][0] for side, _, part in _SIDED)
+"""(22,) names of VRM 1.0's humanoid bones; with a capital first letter those of Unity and of the VMC protocol."""
+
+AVATAR_NAMES: Mapping[str, tuple[str, ...]] = {
+    "smpl22": JOINTS,
+    "vrm": VRM,
+    "mixamo": tuple(f"mixamorig:{side.capitalize()}{_AVATAR_BONES[part][1]}" for side, _, part in _SIDED),
+}
+"""Names of the canonical joints in avatars' rigs, whose tree is the same and whose rest pose is a T too."""

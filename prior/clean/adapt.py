@@ -29,7 +29,7 @@ UNIT_TOLERANCE = 0.01
 _REST_LENGTHS = np.linalg.norm(REST_OFFSETS[1:], axis=1)
 
 
-class Sighting(NamedTuple):
+class BodyJoints(NamedTuple):
     """Joints of a body, or of S bodies by slot.
 
     Attributes:
@@ -41,11 +41,11 @@ class Sighting(NamedTuple):
     confidence: Floats
 
 
-def stacked(found: Collection[Sighting]) -> Sighting:
+def stacked(bodies: Collection[BodyJoints]) -> BodyJoints:
     """N bodies as one: (N, 22, 3) and (N, 22)."""
-    return Sighting(
-        np.array([seen.positions for seen in found]).reshape(-1, 22, 3),
-        np.array([seen.confidence for seen in found]).reshape(-1, 22),
+    return BodyJoints(
+        np.array([seen.positions for seen in bodies]).reshape(-1, 22, 3),
+        np.array([seen.confidence for seen in bodies]).reshape(-1, 22),
     )
 
 
@@ -97,9 +97,9 @@ def layout_of(raw: PoseRaw, counters: Counter[str]) -> Skeleton | None:
     return layout
 
 
-def sightings(
+def canonical_bodies(
     raw: PoseRaw, layout: Skeleton, sensor: SensorFrame, counters: Counter[str], *, numbered: bool
-) -> dict[int, Sighting]:
+) -> dict[int, BodyJoints]:
     """A message's bodies as canonical joints in the world.
 
     Args:
@@ -110,24 +110,24 @@ def sightings(
         numbered: whether bodies are called by their place in the message, for a source that does not know whose body
             is whose, or by their id.
     """
-    found: dict[int, Sighting] = {}
+    bodies: dict[int, BodyJoints] = {}
     for index, body in enumerate(raw.bodies):
         if len(body.positions) != len(layout.joints):
             counters["wrong_joint_count"] += 1
             continue
         key = index if numbered else body.id
-        if key in found:
+        if key in bodies:
             counters["body_id_repeated"] += 1
             continue
-        positions, confidence = _sighting(body, layout, counters)
+        positions, confidence = _canonical(body, layout, counters)
         if _is_too_large(positions):
             counters["body_too_large"] += 1
             continue
-        found[key] = Sighting(sensor.to_world(positions), confidence)
-    return found
+        bodies[key] = BodyJoints(sensor.to_world(positions), confidence)
+    return bodies
 
 
-def _sighting(body: RawBody, layout: Skeleton, counters: Counter[str]) -> tuple[Floats, Floats]:
+def _canonical(body: RawBody, layout: Skeleton, counters: Counter[str]) -> tuple[Floats, Floats]:
     """A body's canonical joints in the sensor's frame; what is not finite or too far away is missing."""
     joints = body.positions.astype(np.float64)
     finite = finite_joints(joints)

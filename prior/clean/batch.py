@@ -12,32 +12,26 @@ least latency of the network. The minimum decays slowly (`DRIFT`), so that it fo
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from steadypose.msgs.types import PoseClean, PoseRaw
-from steadypose.prior.arrays import Bools
 from steadypose.prior.body.layouts import Skeleton
 from steadypose.prior.clean.adapt import (
+    BodyJoints,
     SensorFrame,
-    Sighting,
     clean_bodies,
     clean_message,
     end_of_stream,
     layout_of,
-    sightings,
-    stacked,
 )
-from steadypose.prior.clean.core import CleanCore
-from steadypose.prior.clean.frame import CleanFrame, Observation, SensorNoise
+from steadypose.prior.clean.admission import SLOWEST_NS, SensorPoseGate, StampGate, Verdict
+from steadypose.prior.clean.frame import CleanFrame
 from steadypose.prior.clean.identify import Identify
-from steadypose.prior.clean.pipeline import BACKWARDS_NS, CATCH_UP
-from steadypose.prior.clean.sensor_pose import SensorPoseGate, Verdict
+from steadypose.prior.clean.pipeline import BACKWARDS_NS, CATCH_UP, BodyPipeline
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.clean.slots import Slots
-from steadypose.prior.clean.stamp_gate import SLOWEST_NS, StampGate
 from steadypose.prior.timing.resample import PERIOD_NS, Resampler
 
 PATIENCE_NS = 2 * PERIOD_NS
@@ -76,31 +70,20 @@ class _Stream:
     late: int = 0
 
 
-class StreamBatch:
+class StreamBatch(BodyPipeline[tuple[str, int]]):
     """The prior for many streams, distinguished by their messages' ``source``.
 
     Args:
         settings: of the prior; ``max_bodies`` is the limit of all streams together.
         max_streams: further ones are refused.
-
-    Attributes:
-        counters: messages, bodies and joints refused or dropped so far, by cause.
-        delay_frames: frames at 30 Hz between a frame and its answer.
-        most_bodies: of all streams that are worked on, as of `PriorPipeline`.
     """
 
     def __init__(self, settings: PriorSettings, max_streams: int) -> None:
-        self.most_bodies = settings.max_bodies
-        self.counters: Counter[str] = Counter()
-        self.delay_frames = settings.delay
-        self._settings, self._max_streams = settings, max_streams
-        self._timeout_ns = round(settings.timeout * 1e9)
-        self._core = CleanCore(settings, self.counters)
-        self._slots: Slots[tuple[str, int]] = Slots(settings.max_bodies, settings.timeout, self.counters)
+        super().__init__(settings)
+        self._max_streams = max_streams
         self._streams: dict[str, _Stream] = {}
         self._stamps: dict[str, StampGate] = {}
-        self._waiting: dict[int, list[Sighting]] = {}
-        self._origin_ns = 0
+        self._waiting: dict[int, list[BodyJoints]] = {}
         self._done_ns: int | None = None
 
     @property
@@ -114,7 +97,8 @@ class StreamBatch:
         Args:
             raw: the message.
             now_ns: its arrival, on the server's clock.
-            hurry, gap: as of `PriorPipeline.process`.
+            hurry: the node falls behind: skip grid times that are late.
+            gap: as of `PriorPipeline.process`.
         """
         stamps = self._stamps.pop(raw.source, None) or StampGate(self._timeout_ns, BACKWARDS_NS, self.counters)
         self._stamps[raw.source] = stamps
@@ -153,21 +137,6 @@ class StreamBatch:
         if self._streams and all(stream.last.end_of_stream for stream in self._streams.values()):
             cleaned += self.flush()  # nobody is left for whose sake there will be another frame
         return cleaned
-
-    @property
-    def bodies(self) -> int:
-        """That are worked on."""
-        return self._slots.taken
-
-    @property
-    def offered(self) -> int:
-        """Bodies that are worked on, and those that would be if there were time."""
-        return self._slots.taken + self._slots.left_out
-
-    @property
-    def sensor_noise(self) -> SensorNoise | None:
-        """The latest estimate of the sensors' error, the median over bodies; None before the first body."""
-        return self._core.sensor_noise
 
     def flush(self) -> list[PoseClean]:
         """The frames that the delay still holds, oldest first; all streams are then forgotten."""
@@ -210,10 +179,9 @@ class StreamBatch:
             if len(self._streams) >= self._max_streams:
                 self.counters["too_many_streams"] += 1
                 return
-            slots, identify = self._settings.max_bodies, self._settings.identify
             stream = self._streams[raw.source] = _Stream(
-                resampler=Resampler(slots, aligned=True, delayed=self._settings.delay > 0),
-                identify=Identify(identify, 2 * slots, self.counters) if identify.enabled else None,
+                resampler=Resampler(self._settings.max_bodies, aligned=True, delayed=self._settings.delay > 0),
+                identify=self._new_identify(),
                 offset_ns=now_ns - raw.stamp_ns,
                 last=raw,
                 sensor_pose=SensorPoseGate(),
@@ -228,7 +196,10 @@ class StreamBatch:
             stream.late += 1
             return
         stream.last, stream.time_ns = raw, time_ns
-        for tick_ns, *ready in stream.resampler.update(time_ns, *self._arranged(raw, layout, stream)):
+        # levelled, but seen from where the sensor stands: the streams have no world in common
+        sensor = SensorFrame.of(raw.sensor_pose).levelled()
+        joints = self._arranged(raw, layout, sensor, stream.identify, lambda body_id: (raw.source, body_id))
+        for tick_ns, *ready in stream.resampler.update(time_ns, *joints):
             if self._done_ns is not None and tick_ns <= self._done_ns:
                 # the first frames of a stream, which nobody expected yet, are not late
                 self.counters["late_for_batch"] += stream.first_ns >= 0
@@ -237,21 +208,7 @@ class StreamBatch:
             stream.late = 0
             stream.first_ns = tick_ns if stream.first_ns < 0 else stream.first_ns
             stream.newest_ns = tick_ns
-            self._waiting.setdefault(tick_ns, []).append(Sighting(*ready))
-
-    def _arranged(self, raw: PoseRaw, layout: Skeleton, stream: _Stream) -> Sighting:
-        """A message's bodies, by slot.
-
-        Levelled, but seen from where the sensor stands: the streams have no world in common.
-        """
-        sensor = SensorFrame.of(raw.sensor_pose).levelled()
-        found = sightings(raw, layout, sensor, self.counters, numbered=stream.identify is not None)
-        own = stream.identify.update(raw.stamp_ns, *stacked(found.values())) if stream.identify else found
-        keys = [None if key is None else (raw.source, key) for key in own]
-        named = list(zip(keys, found.values(), strict=True))
-        if (out := self._slots.crowded_out(self.most_bodies, named, sensor.origin)).any():
-            self._drop(out)
-        return self._slots.arrange(named)
+            self._waiting.setdefault(tick_ns, []).append(BodyJoints(*ready))
 
     def _advance(self, now_ns: int, hurry: bool) -> list[PoseClean]:
         """Process the grid times that wait for no further stream."""
@@ -266,18 +223,7 @@ class StreamBatch:
             if self._done_ns is None:
                 self._origin_ns = tick_ns
             self._done_ns = tick_ns
-            seen = self._merged(self._waiting.pop(tick_ns, []))
-            gone = self._slots.advance(tick_ns, seen.positions)
-            if gone.any():
-                self._drop(gone)
-            observation = Observation(
-                stamp_s=(tick_ns - self._origin_ns) * 1e-9,
-                positions=seen.positions,
-                confidence=seen.confidence,
-                present=self._slots.present,
-                sensor_position=np.zeros(3),
-            )
-            frame = self._core.step(observation, hurry=hurry)
+            frame = self._advance_to(tick_ns, self._merged(self._waiting.pop(tick_ns, [])), np.zeros(3))
             if frame is not None:
                 cleaned += self._split(frame)
         return cleaned
@@ -295,9 +241,9 @@ class StreamBatch:
         self.counters["frames_skipped"] += int(late)
         self._slots.excuse(self._done_ns)
 
-    def _merged(self, parts: list[Sighting]) -> Sighting:
+    def _merged(self, parts: list[BodyJoints]) -> BodyJoints:
         slots = self._settings.max_bodies
-        merged = Sighting(np.full((slots, 22, 3), np.nan), np.zeros((slots, 22)))
+        merged = BodyJoints(np.full((slots, 22, 3), np.nan), np.zeros((slots, 22)))
         for part in parts:
             there = np.isfinite(part.positions[..., 0])
             merged.positions[there], merged.confidence[there] = part.positions[there], part.confidence[there]
@@ -307,7 +253,7 @@ class StreamBatch:
         """A frame of all streams, as one message for each stream that was present."""
         stamp_ns = self._origin_ns + round(frame.estimate.stamp_s * 1e9)
         cleaned = []
-        answered: set[int] = set()
+        published: set[int] = set()
         for name, stream in list(self._streams.items()):
             # stamps were seconds on the way, and may be a nanosecond off the grid
             if not 0 <= stream.first_ns <= stamp_ns + 1000:
@@ -318,10 +264,10 @@ class StreamBatch:
                 continue
             ids = {slot: key[1] for slot, key in enumerate(self._slots.keys) if key is not None and key[0] == name}
             bodies = clean_bodies(frame, SensorFrame.of(stream.last.sensor_pose).levelled(), ids)
-            answered |= bodies.keys()
+            published |= bodies.keys()
             own_ns = max(stamp_ns - round(stream.offset_ns), 0)
             cleaned.append(clean_message(stream.last, own_ns, self.delay_frames, list(bodies.values())))
-        self._core.note_answered(frame, answered)
+        self._core.note_published(frame, published)
         return cleaned
 
     def _forget(self, name: str) -> None:
@@ -329,8 +275,5 @@ class StreamBatch:
         self._drop(np.array([key is not None and key[0] == name for key in self._slots.keys]))
         del self._streams[name]
 
-    def _drop(self, slot: Bools) -> None:
-        self._core.forget(slot)
-        self._slots.free(slot)
-        for stream in self._streams.values():
-            stream.resampler.clear(slot)
+    def _resamplers(self) -> Iterable[Resampler]:
+        return (stream.resampler for stream in self._streams.values())

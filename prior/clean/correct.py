@@ -9,9 +9,9 @@ import numpy as np
 from steadypose.prior.arrays import Bools
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.clean.frame import Gated
+from steadypose.prior.clean.history import Ring
 from steadypose.prior.models.sensor_bias import HISTORY, SMOOTHER_DENSITY, LiveCorrection, features, recall, trunk_frame
-from steadypose.prior.timing.fixed_lag import FixedLagRTS
-from steadypose.prior.timing.ring import Ring
+from steadypose.prior.timing.kalman import ConstantVelocityFilter
 
 FADE = 0.9
 """Decay per frame of the last correction while none can be computed, because the trunk is hidden."""
@@ -34,7 +34,7 @@ class Correct:
 
     def __init__(self, settings: CorrectSettings, slots: int) -> None:
         self._net = LiveCorrection.load(settings.sensor, slots)
-        self._smoother = FixedLagRTS(0, SMOOTHER_DENSITY)
+        self._smoother = ConstantVelocityFilter(SMOOTHER_DENSITY)
         self._history = Ring(HISTORY[-1] + 1, (slots, 22, 3))
         self._correction = np.zeros((slots, 22, 3))
 
@@ -50,7 +50,6 @@ class Correct:
         """The newest frame, corrected."""
         newest, observation = gated.positions, gated.observation
         smoothed = self._smoother.update(newest, observation.stamp_s)
-        assert smoothed is not None  # a lag of 0 answers at once
         self._history.push(np.where(finite_joints(newest)[..., None], smoothed.positions, np.nan))
         slots = np.flatnonzero(observation.present)
         history = recall(self._history.all[:, slots])

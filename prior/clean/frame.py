@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.models.hgvae.features import Tracks
-from steadypose.prior.models.hgvae.inference import LiveHGVAE, Reconstruction
+from steadypose.prior.models.hgvae.inference import Reconstruction
 
 
 @dataclass(frozen=True)
@@ -23,16 +23,11 @@ class SensorNoise:
 
     Attributes:
         jitter_sigma: metres, independent from frame to frame, of a joint of full confidence.
-        bias_sigma: metres, the slow error (bias): constant or slowly varying, so that no filter averages it out.
+        bias_sigma: metres, the bias: constant or slowly varying, so that no filter averages it out.
     """
 
     jitter_sigma: float
     bias_sigma: float
-
-    @property
-    def total_sigma(self) -> float:
-        """Metres, of both."""
-        return float(np.hypot(self.bias_sigma, self.jitter_sigma))
 
 
 @dataclass(frozen=True)
@@ -78,18 +73,14 @@ class BodyWindows:
     Attributes:
         slots: (B,) of the bodies.
         tracks: the observed windows, each in its body's frame.
-        confidence: (B, 66, T) of each entry; 0 where not observed.
         size: (B,) of the bodies, as `body_size` gives it.
         reconstruction: (B, 66, T) mean and standard deviation.
-        model: which keeps these windows' activations, by row, for `decode`, `score` and `gradient`.
     """
 
     slots: NDArray[np.intp]
     tracks: Tracks
-    confidence: Floats
     size: Floats
     reconstruction: Reconstruction
-    model: LiveHGVAE
 
 
 @dataclass(frozen=True)

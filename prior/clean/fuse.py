@@ -13,12 +13,12 @@ from steadypose.msgs.types import JointState
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import RIGID, fit_lengths, place_joints, solve_pose
 from steadypose.prior.body.skeleton import BONES_BETWEEN, PARENT
+from steadypose.prior.clean.bones import SensorBias
 from steadypose.prior.clean.frame import Estimate, Imputed, Person
 from steadypose.prior.clean.history import BRIEF_S
 from steadypose.prior.clean.occluded import OccludedJoints
-from steadypose.prior.clean.slow_error import SlowError
 from steadypose.prior.compiled import njit
-from steadypose.prior.timing.fixed_lag import Smoothed
+from steadypose.prior.timing.kalman import Smoothed
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Fuse:
         self,
         smoothed: Smoothed,
         person: Person,
-        slow_error: SlowError,
+        slow_error: SensorBias,
         rotations: Floats,
         imputed: Imputed | None,
         unseen_s: Floats,

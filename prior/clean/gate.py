@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import MIRROR, limbs
-from steadypose.prior.clean.bone_outliers import BoneOutliers
 from steadypose.prior.clean.frame import Gated, Observation
+from steadypose.prior.clean.history import Ring
+from steadypose.prior.clean.outliers import RECENT, BoneOutliers, frozen_joints
 from steadypose.prior.compiled import median, njit
-from steadypose.prior.timing.fixed_lag import FixedLagRTS, Smoothed
-from steadypose.prior.timing.frozen_joints import RECENT, frozen_joints
+from steadypose.prior.timing.kalman import ConstantVelocityFilter, Smoothed
 from steadypose.prior.timing.rate import FPS
-from steadypose.prior.timing.ring import Ring
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class Gate:
     def __init__(self, settings: GateSettings, slots: int, counters: Counter[str]) -> None:
         self._settings = settings
         self._counters = counters
-        self._filter = FixedLagRTS(0, acceleration_density=8.0, measurement_sigma=0.015)
+        self._filter = ConstantVelocityFilter(acceleration_density=8.0, measurement_sigma=0.015)
         self._bones = BoneOutliers(slots)
         self._observed = Ring(RECENT + 1, (slots, 22, 3))
         self._jitter = np.zeros(slots)
@@ -140,7 +139,7 @@ class Gate:
         """Update the jitter from the median of a body's distances (S, 22) between joints and predictions.
 
         The median, so that a limb in violent motion, or a joint that jumps, does not count. Noise that is correlated
-        over frames does not show here; it belongs to the slow error.
+        over frames does not show here; it belongs to the bias.
         """
         jitter = _median_by_row(distance) / _UNIT_DISTANCE
         for slot in np.flatnonzero(np.isfinite(jitter)):

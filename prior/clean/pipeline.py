@@ -3,33 +3,34 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Iterable
 from functools import cache
+from typing import Generic
 
 import numpy as np
 
 from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
-from steadypose.prior.arrays import Bools
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.layouts import CANONICAL, Skeleton
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.clean.adapt import (
+    BodyJoints,
     SensorFrame,
-    Sighting,
+    canonical_bodies,
     clean_bodies,
     clean_message,
     end_of_stream,
     layout_of,
-    sightings,
     stacked,
 )
+from steadypose.prior.clean.admission import SensorPoseGate, StampGate, Verdict
 from steadypose.prior.clean.core import CleanCore
 from steadypose.prior.clean.frame import CleanFrame, Observation, SensorNoise
 from steadypose.prior.clean.identify import Identify
-from steadypose.prior.clean.sensor_pose import SensorPoseGate, Verdict
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.clean.slots import Slots
-from steadypose.prior.clean.stamp_gate import StampGate
+from steadypose.prior.clean.slots import Key, Slots
 from steadypose.prior.timing.rate import FPS
-from steadypose.prior.timing.resample import Resampler
+from steadypose.prior.timing.resample import Frame, Resampler
 
 BACKWARDS_NS = 1_000_000_000
 """A stamp this far before the last starts a new stream; one nearer is a frame out of order."""
@@ -38,8 +39,8 @@ CATCH_UP = 3
 as the messages themselves."""
 
 
-class PriorPipeline:
-    """The prior over one stream. The same messages give the same answers, bit for bit.
+class BodyPipeline(Generic[Key]):
+    """What the prior over one stream and over many share: the stages, and the slots in which bodies go through them.
 
     Attributes:
         counters: messages, bodies and joints refused or dropped so far, by cause.
@@ -51,18 +52,82 @@ class PriorPipeline:
         self.most_bodies = settings.max_bodies
         self.counters: Counter[str] = Counter()
         self.delay_frames = settings.delay
-        self._timeout_ns = settings.timeout * 1e9
-        slots = settings.max_bodies
+        self._settings = settings
+        self._timeout_ns = round(settings.timeout * 1e9)
         self._core = CleanCore(settings, self.counters)
-        self._identify = Identify(settings.identify, 2 * slots, self.counters) if settings.identify.enabled else None
-        self._slots: Slots[int] = Slots(slots, settings.timeout, self.counters)
-        self._resampler = Resampler(slots, delayed=settings.delay > 0)
+        self._slots: Slots[Key] = Slots(settings.max_bodies, settings.timeout, self.counters)
+        self._origin_ns = 0  # stamps within are seconds since: a float of seconds since 1970 would round them
+
+    @property
+    def bodies(self) -> int:
+        """That are worked on."""
+        return self._slots.taken
+
+    @property
+    def offered(self) -> int:
+        """Bodies that are worked on, and those that would be if there were time."""
+        return self._slots.taken + self._slots.left_out
+
+    @property
+    def sensor_noise(self) -> SensorNoise | None:
+        """The latest estimate of the sensor's error, the median over bodies; None before the first body."""
+        return self._core.sensor_noise
+
+    def _resamplers(self) -> Iterable[Resampler]:
+        raise NotImplementedError
+
+    def _new_identify(self) -> Identify | None:
+        """A tracker of ids, if the source gives none."""
+        settings = self._settings.identify
+        return Identify(settings, 2 * self._settings.max_bodies, self.counters) if settings.enabled else None
+
+    def _arranged(
+        self, raw: PoseRaw, layout: Skeleton, sensor: SensorFrame, identify: Identify | None, key: Callable[[int], Key]
+    ) -> BodyJoints:
+        """A message's bodies, by slot, as that sensor observes them; ``key`` of an id."""
+        bodies = canonical_bodies(raw, layout, sensor, self.counters, numbered=identify is not None)
+        ids = identify.update(raw.stamp_ns, *stacked(bodies.values())) if identify else bodies
+        keys = [None if body_id is None else key(body_id) for body_id in ids]
+        keyed = list(zip(keys, bodies.values(), strict=True))
+        if (out := self._slots.crowded_out(self.most_bodies, keyed, sensor.origin)).any():
+            self._drop(out)
+        return self._slots.arrange(keyed)
+
+    def _advance_to(self, stamp_ns: int, joints: BodyJoints, sensor_position: Floats) -> CleanFrame | None:
+        """One step of the 30 Hz grid."""
+        timed_out = self._slots.advance(stamp_ns, joints.positions)
+        if timed_out.any():
+            self._drop(timed_out)
+        return self._core.step(
+            Observation(
+                stamp_s=(stamp_ns - self._origin_ns) * 1e-9,
+                positions=joints.positions,
+                confidence=joints.confidence,
+                present=self._slots.present,
+                sensor_position=sensor_position,
+            )
+        )
+
+    def _drop(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
+        self._core.forget(slot)
+        self._slots.free(slot)
+        for resampler in self._resamplers():
+            resampler.clear(slot)
+
+
+class PriorPipeline(BodyPipeline[int]):
+    """The prior over one stream. The same messages give the same answers, bit for bit."""
+
+    def __init__(self, settings: PriorSettings) -> None:
+        super().__init__(settings)
+        self._identify = self._new_identify()
+        self._resampler = Resampler(settings.max_bodies, delayed=settings.delay > 0)
         self._stamps = StampGate(self._timeout_ns, BACKWARDS_NS, self.counters)
         self._sensor_pose = SensorPoseGate()
         self._last: PoseRaw | None = None
-        self._origin_ns = 0  # stamps within are seconds since: a float of seconds since 1970 would round them
 
-    def process(self, raw: PoseRaw, *, hurry: bool = False, gap: bool = False) -> list[PoseClean]:
+    def process(self, raw: PoseRaw, *, gap: bool = False) -> list[PoseClean]:
         """Take a ``pose/raw`` message and give the ``pose/clean`` messages it completes, oldest first.
 
         A message that cannot be used is counted in `counters` and otherwise ignored; one whose stamp jumps waits until
@@ -70,17 +135,11 @@ class PriorPipeline:
 
         Args:
             raw: the message.
-            hurry: hidden joints are imputed without gradient ascent: for a live node that falls behind. A replay is
-                never in a hurry.
             gap: messages before this one were dropped by the node, so that a gap in the stamps is no new stream.
         """
-        return [
-            clean
-            for admitted, _ in self._stamps.admit(raw, gap=gap)
-            for clean in self._process(admitted, hurry=hurry, gap=gap)
-        ]
+        return [clean for admitted, _ in self._stamps.admit(raw, gap=gap) for clean in self._process(admitted, gap=gap)]
 
-    def _process(self, raw: PoseRaw, *, hurry: bool, gap: bool) -> list[PoseClean]:
+    def _process(self, raw: PoseRaw, *, gap: bool) -> list[PoseClean]:
         if raw.end_of_stream:
             if self._identify:
                 self._identify.reset()
@@ -110,40 +169,23 @@ class PriorPipeline:
         if self._last is None:
             self._origin_ns = raw.stamp_ns
         self._last = raw
-        ticks = self._resampler.update(raw.stamp_ns, *self._arranged(raw, layout))
+        joints = self._arranged(raw, layout, SensorFrame.of(raw.sensor_pose), self._identify, int)
+        ticks = self._resampler.update(raw.stamp_ns, *joints)
         if gap and len(ticks) > CATCH_UP:
             self.counters["frames_skipped"] += len(ticks) - CATCH_UP
             ticks = ticks[-CATCH_UP:]
-        cleaned = [self._step(stamp_ns, Sighting(*joints), raw, hurry=hurry) for stamp_ns, *joints in ticks]
-        return flushed + [message for message in cleaned if message is not None]
-
-    @property
-    def bodies(self) -> int:
-        """That are worked on."""
-        return self._slots.taken
-
-    @property
-    def offered(self) -> int:
-        """Bodies that are worked on, and those that would be if there were time."""
-        return self._slots.taken + self._slots.left_out
-
-    @property
-    def sensor_noise(self) -> SensorNoise | None:
-        """The latest estimate of the sensor's error, the median over bodies; None before the first body."""
-        return self._core.sensor_noise
+        return flushed + self._stepped(ticks, raw)
 
     def flush(self) -> list[PoseClean]:
         """The frames that the delay still holds, oldest first; the stream is then forgotten."""
-        held = [clean for raw, _ in self._stamps.release() for clean in self._process(raw, hurry=False, gap=False)]
+        held = [clean for raw, _ in self._stamps.release() for clean in self._process(raw, gap=False)]
         return held + self._flush()
 
     def _flush(self) -> list[PoseClean]:
         last = self._last
         cleaned: list[PoseClean] = []
         if last is not None:
-            for stamp_ns, *joints in self._resampler.drain():
-                message = self._step(stamp_ns, Sighting(*joints), last, hurry=False)
-                cleaned += [] if message is None else [message]
+            cleaned += self._stepped(self._resampler.drain(), last)
             cleaned += [self._message(frame, last) for frame in self._core.flush()]
         self._drop(np.ones_like(self._slots.present))
         self._resampler.reset()
@@ -151,41 +193,20 @@ class PriorPipeline:
         self._last = None
         return cleaned
 
-    def _arranged(self, raw: PoseRaw, layout: Skeleton) -> Sighting:
-        """A message's bodies, by slot."""
-        sensor = SensorFrame.of(raw.sensor_pose)
-        found = sightings(raw, layout, sensor, self.counters, numbered=self._identify is not None)
-        keys = self._identify.update(raw.stamp_ns, *stacked(found.values())) if self._identify else found
-        named = list(zip(keys, found.values(), strict=True))
-        if (out := self._slots.crowded_out(self.most_bodies, named, sensor.origin)).any():
-            self._drop(out)
-        return self._slots.arrange(named)
+    def _stepped(self, ticks: list[Frame], raw: PoseRaw) -> list[PoseClean]:
+        """The messages that frames of the 30 Hz grid complete, oldest first; ``raw`` is the newest message."""
+        origin = SensorFrame.of(raw.sensor_pose).origin
+        frames = (self._advance_to(stamp_ns, BodyJoints(*joints), origin) for stamp_ns, *joints in ticks)
+        return [self._message(frame, raw) for frame in frames if frame is not None]
 
-    def _step(self, stamp_ns: int, seen: Sighting, raw: PoseRaw, *, hurry: bool) -> PoseClean | None:
-        """One step of the 30 Hz grid."""
-        gone = self._slots.advance(stamp_ns, seen.positions)
-        if gone.any():
-            self._drop(gone)
-        observation = Observation(
-            stamp_s=(stamp_ns - self._origin_ns) * 1e-9,
-            positions=seen.positions,
-            confidence=seen.confidence,
-            present=self._slots.present,
-            sensor_position=SensorFrame.of(raw.sensor_pose).origin,
-        )
-        frame = self._core.step(observation, hurry=hurry)
-        return None if frame is None else self._message(frame, raw)
-
-    def _drop(self, slot: Bools) -> None:
-        self._core.forget(slot)
-        self._resampler.clear(slot)
-        self._slots.free(slot)
+    def _resamplers(self) -> Iterable[Resampler]:
+        return (self._resampler,)
 
     def _message(self, frame: CleanFrame, raw: PoseRaw) -> PoseClean:
         """The answer, in the frame of the message that completed it."""
         ids = {slot: key for slot, key in enumerate(self._slots.keys) if key is not None}
         bodies = clean_bodies(frame, SensorFrame.of(raw.sensor_pose), ids)
-        self._core.note_answered(frame, bodies)
+        self._core.note_published(frame, bodies)
         stamp_ns = self._origin_ns + round(frame.estimate.stamp_s * 1e9)
         return clean_message(raw, stamp_ns, self.delay_frames, list(bodies.values()))
 

@@ -1,19 +1,58 @@
-"""The reconstruct stage: HG-VAE's reconstruction of the window of each body, for denoise, score and impute."""
+"""The stages reconstruct and denoise: HG-VAE's reconstruction of each body's window, and observed joints fused with it.
+
+HG-VAE is trained to denoise windows, and knows how poses go on, of which the smoothers of the whole body know the
+linear part. Behind these it reduces the error in 4 cm of noise, after four frames, by 1 % on dancers and 8 % on people
+who exercise (validation, estimated beside earlier weights); in 1 cm it has next to no weight. The errors of
+both estimates are correlated, as most of their noise is the same, so the weights are not those of independent
+estimates.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from steadypose.prior.arrays import Bools, Floats
-from steadypose.prior.clean.frame import BodyWindows, Person, SensorNoise
-from steadypose.prior.clean.history import History
-from steadypose.prior.models.hgvae.features import body_size, to_tracks
+from steadypose.prior.body.skeleton import HIPS, J
+from steadypose.prior.clean.frame import BodyWindows, Person
+from steadypose.prior.clean.history import BRIEF_S, History
+from steadypose.prior.compiled import njit
+from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
+from steadypose.prior.timing.kalman import Smoothed
+from steadypose.prior.timing.rate import FPS
 
 MIN_CONFIDENCE = 0.1
-"""Lower bound of the confidence of a joint that passed the gate"""
+"""Lower bound of the confidence of a joint that passed the gate."""
+
+MODEL_SIGMA = 0.005
+"""Metres along an axis: lower bound of HG-VAE's own error, apart from the sensor's noise."""
+
+NOISE_LEFT = 0.75
+"""Variance that the sensor's noise causes in HG-VAE's reconstruction, relative to that in the smoother's estimate."""
+
+MEMORY = 15
+"""Frames of the running mean of the squared distance between the two estimates, from which HG-VAE's own error
+follows."""
+
+SUDDEN = 3.0
+"""A squared distance of the current frame above this multiple of the running mean replaces it (divided by the
+multiple)."""
+
+LATE_S, LATE_NEWEST_S = 0.01, 0.03
+"""Seconds by which HG-VAE lags behind a moving joint: of a frame `SETTLED` frames before the newest or older, and of
+the newest. At 3 m/s that is 3 or 9 cm; of a motion that has just begun, the running mean does not show it yet."""
+
+SETTLED = 4
+"""Frames before the newest from which on a frame of the window has settled."""
+
+RENEWAL = 0.5
+"""Weight of the newest window in the running mean of a frame's reconstructions: successive windows disagree, which
+would be jitter."""
+
+_BESIDE_PELVIS = np.array([*HIPS, J["spine1"]])
 
 
 @dataclass(frozen=True)
@@ -30,8 +69,8 @@ class ReconstructSettings:
 class Reconstruct:
     """Runs HG-VAE once over the last frames of the bodies present."""
 
-    def __init__(self, settings: ReconstructSettings, noise: SensorNoise, slots: int) -> None:
-        self._model = LiveHGVAE.load(settings.weights, noise.total_sigma, slots)
+    def __init__(self, settings: ReconstructSettings, slots: int) -> None:
+        self._model = LiveHGVAE.load(settings.weights, slots)
         self.frames = self._model.frames
 
     def update(self, history: History, present: Bools, person: Person, bias_sigma: Floats) -> BodyWindows | None:
@@ -41,7 +80,7 @@ class Reconstruct:
             history: of the observations.
             present: (S,) which slots hold a body.
             person: their bones.
-            bias_sigma: (S,) metres along an axis, slow error of the sensor, estimated from each body.
+            bias_sigma: (S,) metres along an axis, the sensor's bias, estimated from each body.
         """
         slots = np.flatnonzero(present)
         if not len(slots):
@@ -50,5 +89,138 @@ class Reconstruct:
         tracks = to_tracks(history.positions[-self.frames :, slots].swapaxes(0, 1), size)
         by_joint = np.clip(history.confidence[-self.frames :, slots], MIN_CONFIDENCE, 1.0)
         confidence = tracks.observed * np.repeat(by_joint.transpose(1, 2, 0), 3, axis=1)
-        reconstruction = self._model.reconstruct(tracks.x, confidence, bias_sigma[slots])
-        return BodyWindows(slots, tracks, confidence, size, reconstruction, self._model)
+        return BodyWindows(slots, tracks, size, self._model.reconstruct(tracks.x, confidence, bias_sigma[slots]))
+
+
+@dataclass(frozen=True)
+class DenoiseSettings:
+    """Settings of the denoise stage.
+
+    Attributes:
+        enabled: off, observed joints stay as smoothed.
+    """
+
+    enabled: bool = True
+
+
+class Denoise:
+    """Moves the smoother's estimate of observed joints towards HG-VAE's reconstruction.
+
+    Args:
+        delay_frames: between the newest frame and the one that is answered.
+        slots: maximum number of bodies.
+    """
+
+    def __init__(self, delay_frames: int, slots: int) -> None:
+        self._apart = np.zeros((slots, 22))  # m², mean square of the distance between the two along an axis
+        self._frames = np.zeros((slots, 22))
+        self._reconstructed = np.full((delay_frames + 1, slots, 22, 3), np.nan)
+        self._before = np.full((slots, 22, 3), np.nan)
+
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
+        self._reconstructed[:, slot] = np.nan
+        self._before[slot] = np.nan
+        self._apart[slot] = self._frames[slot] = 0.0
+
+    def update(
+        self, windows: BodyWindows | None, smoothed: Smoothed | None, history: History, jitter: Floats
+    ) -> Smoothed | None:
+        """Take in HG-VAE's reconstruction of the newest windows; the smoother's newest estimate, if any, denoised.
+
+        Args:
+            windows: None if no body is present.
+            smoothed: (S, 22) joints and their standard deviations, of the frame ``delay_frames`` before the newest.
+            history: of the observations.
+            jitter: (S,) metres along an axis, as of the newest frame.
+        """
+        self._take(windows, history)
+        return None if smoothed is None else self._denoised(smoothed, history, jitter, len(self._reconstructed) - 1)
+
+    def flush(self, held: list[Smoothed], history: History, jitter: Floats) -> list[Smoothed]:
+        """The last estimates that the smoother held, oldest first, denoised."""
+        return [self._denoised(smoothed, history, jitter, len(held) - 1 - k) for k, smoothed in enumerate(held)]
+
+    def _take(self, windows: BodyWindows | None, history: History) -> None:
+        self._reconstructed[:-1], self._reconstructed[-1] = self._reconstructed[1:], np.nan
+        if windows is None:
+            return
+        slots, tracks = windows.slots, windows.tracks
+        latest = from_tracks(windows.reconstruction.mean[..., -len(self._reconstructed) :], tracks, windows.size)
+        _place_pelvis(latest, history.positions[:, slots].swapaxes(0, 1))
+        latest = latest.swapaxes(0, 1)
+        before = self._reconstructed[:, slots]
+        # a window that ends without any observation is worse for earlier frames than the last one that had some
+        seen = np.asarray(np.isfinite(history.positions[-1, slots, :, 0]).any(axis=1))
+        renewed = np.where(seen[:, None, None], before + RENEWAL * (latest - before), before)
+        self._reconstructed[:, slots] = np.where(np.isnan(before), latest, renewed)
+
+    def _denoised(self, smoothed: Smoothed, history: History, jitter: Floats, back: int) -> Smoothed:
+        """The smoother's estimate of the frame ``back`` before the newest, denoised.
+
+        The weights are those of least variance for two estimates of which the second has the share `NOISE_LEFT` of the
+        first one's noise, and an error of its own. That error is estimated for each joint from the running mean of the
+        squared distance between the two, less what noise explains (innovation-based adaptation, as in adaptive Kalman
+        filters: Mehra 1970), so that motion unlike HG-VAE's training data loses its weight; and from the joint's speed,
+        by HG-VAE's lag. Only jitter counts as noise: bias, HG-VAE reproduces.
+        """
+        reconstructed = self._reconstructed[-1 - back]
+        seen = np.isfinite(history.positions[-1 - back][..., 0])
+        # also in a frame without any observation: else the estimate would jump to the smoother's
+        seen |= ~seen.any(axis=1, keepdims=True)
+        # and between two observations that are near
+        seen |= history.seen_since(back) & (history.unseen_s[-1 - back] < BRIEF_S)
+        known = seen & np.isfinite(reconstructed[..., 0] + smoothed.sigma)
+        moved = np.where(known[..., None], reconstructed - smoothed.positions, 0.0)
+        square = np.square(moved).mean(axis=-1)
+        self._frames += known
+        self._apart += known * (square - self._apart) / np.clip(self._frames, 1, MEMORY)
+        gained = (1.0 - NOISE_LEFT) * np.square(np.where(known, np.minimum(smoothed.sigma, jitter[:, None]), 0.0))
+        own = np.maximum(np.maximum(self._apart, square / SUDDEN) - gained, MODEL_SIGMA**2)
+        late_s = np.interp(back, (0, SETTLED), (LATE_NEWEST_S, LATE_S))
+        step = np.nan_to_num(smoothed.positions - self._before)  # one frame
+        own += (late_s * FPS) ** 2 * np.square(step).mean(axis=-1)
+        self._before = smoothed.positions
+        share = gained / (gained + own)
+        return smoothed._replace(
+            positions=smoothed.positions + share[..., None] * moved,
+            sigma=smoothed.sigma * np.sqrt(1.0 - share * (1.0 - NOISE_LEFT)),
+        )
+
+
+@njit(cache=True)
+def _place_pelvis(reconstructed, seen):
+    """Replace the reconstructed pelvis, in place, by hips and spine less their mean observed offset from it.
+
+    The tracks of other joints are relative to the trunk's path, the pelvis's is relative to that path's mean, so no
+    other joint informs HG-VAE of the pelvis's noise, and it removes less of it than of any other joint's.
+
+    Args:
+        reconstructed: (B, K, 22, 3) metres, of the newest frames.
+        seen: (B, T, 22, 3) metres, observed; NaN where not.
+    """
+    joints = len(_BESIDE_PELVIS)
+    lies, counts = np.empty((joints, 3)), np.empty(joints)
+    for row in range(len(reconstructed)):
+        among = 0
+        for k in range(joints):
+            joint, counts[k] = _BESIDE_PELVIS[k], 0.0
+            for axis in range(3):
+                lies[k, axis] = 0.0
+            for t in range(seen.shape[1]):
+                if math.isnan(seen[row, t, 0, 0] - seen[row, t, joint, 0]):
+                    continue
+                counts[k] += 1.0
+                for axis in range(3):
+                    lies[k, axis] += seen[row, t, 0, axis] - seen[row, t, joint, axis]
+            if counts[k] > 0:
+                among += 1
+        if among == 0:
+            continue
+        for t in range(reconstructed.shape[1]):
+            for axis in range(3):
+                place = 0.0
+                for k in range(joints):
+                    if counts[k] > 0:
+                        place += (reconstructed[row, t, _BESIDE_PELVIS[k], axis] + lies[k, axis] / counts[k]) / among
+                reconstructed[row, t, 0, axis] = place

@@ -12,9 +12,9 @@ from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import heading, yaw_matrix
 from steadypose.prior.clean.frame import Gated, Person
+from steadypose.prior.clean.history import Ring
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.hmvae.inference import LiveHMVAE
-from steadypose.prior.timing.ring import Ring
 
 
 @dataclass(frozen=True)

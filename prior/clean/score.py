@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.clean.frame import BodyWindows, Score
-from steadypose.prior.models.hgvae.anomaly import SENSOR_SIGMAS, Calibration, decimals, joint_odds, pace
-from steadypose.prior.models.hgvae.live_faults import LiveFaultNet
+from steadypose.prior.models.hgvae.faults import SENSOR_SIGMAS, Calibration, LiveFaultNet, decimals, joint_odds, pace
 from steadypose.prior.timing.rate import FPS
 
 MEAN_ANOMALY = 0.54

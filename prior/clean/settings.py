@@ -2,27 +2,41 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
+from steadypose.prior.clean.bones import PersonSettings
 from steadypose.prior.clean.correct import CorrectSettings
-from steadypose.prior.clean.denoise import DenoiseSettings
-from steadypose.prior.clean.frame import SensorNoise
 from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.gate import GateSettings
 from steadypose.prior.clean.identify import IdentifySettings
 from steadypose.prior.clean.impute import ImputeSettings
 from steadypose.prior.clean.orient import OrientSettings
-from steadypose.prior.clean.person import PersonSettings
-from steadypose.prior.clean.reconstruct import ReconstructSettings
+from steadypose.prior.clean.reconstruct import DenoiseSettings, ReconstructSettings
 from steadypose.prior.clean.refine import RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
-from steadypose.prior.clean.smooth import MAX_DELAY, SmoothSettings
 from steadypose.prior.settings import build_settings, check_range
 
-JITTER_SIGMA = 0.02
-"""Metres along an axis, of a joint of full confidence: the jitter assumed by HG-VAE's score (`LiveHGVAE.score`)."""
+logger = logging.getLogger(__name__)
+
+MAX_DELAY = 16
+"""Frames, the longest delay that the mixture of smoothers was trained for."""
+
+UNUSED = ("steps", "rate")
+"""Keys of ``[prior.impute]`` of version 0.2, ignored with a warning: ascent in the latents gained nothing."""
+
+
+@dataclass(frozen=True)
+class SmoothSettings:
+    """Settings of the smooth stage: there are no noise parameters to tune.
+
+    Attributes:
+        weights: weight set (``default``), or a path to a ``.safetensors`` file.
+    """
+
+    weights: str = "default"
 
 
 @dataclass(frozen=True)
@@ -35,7 +49,7 @@ class PriorSettings:
         max_bodies: bodies tracked at once.
         timeout: seconds without an observation after which a body is dropped, and without a frame after which the
             stream starts anew.
-        bias_sigma: metres along an axis, expected standard deviation of the sensor's slow error: the prior of its
+        bias_sigma: metres along an axis, expected standard deviation of the sensor's bias: the prior of its
             estimate from the stream, and the least that a fault has to exceed. Depth cameras have 2 cm or more.
         identify: whether ids are the source's (the default) or assigned by the prior.
         gate, correct, smooth, encode, denoise, bones, score, impute, refine, fuse, orient: settings of the stages.
@@ -70,11 +84,6 @@ class PriorSettings:
                 if isinstance(value := getattr(stage, f.name), int | float):
                     check_range(f"[prior.{section}] {f.name}", value, 0, 1e6)
 
-    @property
-    def noise(self) -> SensorNoise:
-        """The sensor's error, as far as it is known before the stream."""
-        return SensorNoise(JITTER_SIGMA, self.bias_sigma)
-
     @classmethod
     def from_dict(cls, settings: Mapping[str, Any]) -> PriorSettings:
         """From the section of a launch file.
@@ -82,4 +91,8 @@ class PriorSettings:
         Raises:
             ValueError: a key that does not exist (the message names the nearest that does) or a wrong type.
         """
+        impute = settings.get("impute")
+        if isinstance(impute, Mapping) and (unused := [key for key in UNUSED if key in impute]):
+            logger.warning("[prior.impute] %s: no longer used, and to be refused by a later version", ", ".join(unused))
+            settings = {**settings, "impute": {key: value for key, value in impute.items() if key not in unused}}
         return build_settings(cls, settings, "prior")

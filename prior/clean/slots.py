@@ -10,7 +10,7 @@ import numpy as np
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.clean.adapt import Sighting
+from steadypose.prior.clean.adapt import BodyJoints
 
 MIN_JOINTS = 6
 """Least number of visible canonical joints of a new body."""
@@ -24,7 +24,7 @@ class Slots(Generic[Key]):
 
     Args:
         count: of slots.
-        timeout_s: seconds without a sighting after which a body is dropped.
+        timeout_s: seconds without an observation after which a body is dropped.
         counters: gets ``body_too_little_seen``, ``too_many_bodies`` and ``body_for_load``.
 
     Attributes:
@@ -42,18 +42,18 @@ class Slots(Generic[Key]):
         self.present = np.zeros(count, dtype=bool)
         self._last_seen_ns = np.zeros(count, dtype=np.int64)  # 0: not on the grid yet
 
-    def crowded_out(self, most: int, sightings: Iterable[tuple[Key | None, Sighting]], sensor: Floats) -> Bools:
+    def crowded_out(self, most: int, bodies: Iterable[tuple[Key | None, BodyJoints]], sensor: Floats) -> Bools:
         """The slots (S,) of bodies beyond the ``most`` that there is time for: those that were seen farthest away.
 
         Args:
             most: bodies, from now on.
-            sightings: of the newest message, as of `arrange`.
+            bodies: of the newest message, as of `arrange`.
             sensor: (3,) metres, where it stands.
         """
         self._most = most
         out = np.zeros(len(self.keys), dtype=bool)
         if most < len(self.keys):
-            for key, seen in sightings:
+            for key, seen in bodies:
                 if key is not None and key in self.keys:
                     self._distance[self.keys.index(key)] = _distance(seen.positions, sensor)
             taken = [slot for slot, key in enumerate(self.keys) if key is not None]
@@ -69,18 +69,18 @@ class Slots(Generic[Key]):
         """Bodies were not looked at until now: none has been out of sight."""
         self._last_seen_ns[self._last_seen_ns > 0] = stamp_ns
 
-    def arrange(self, sightings: Iterable[tuple[Key | None, Sighting]]) -> Sighting:
+    def arrange(self, bodies: Iterable[tuple[Key | None, BodyJoints]]) -> BodyJoints:
         """Sort bodies into slots by key (None: a body without one, which is left out): joints and confidence by
         slot."""
         positions, confidence = np.full((len(self.keys), 22, 3), np.nan), np.zeros((len(self.keys), 22))
         self.left_out = 0
-        for key, seen in sightings:
+        for key, seen in bodies:
             if key is None:
                 continue
             slot = self._slot(key, int(np.isfinite(seen.positions[:, 0]).sum()))
             if slot is not None:
                 positions[slot], confidence[slot] = seen
-        return Sighting(positions, confidence)
+        return BodyJoints(positions, confidence)
 
     def advance(self, stamp_ns: int, positions: Floats) -> Bools:
         """Advance to a grid time, with its joints (S, 22, 3); returns the slots (S,) whose bodies have timed out."""

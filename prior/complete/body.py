@@ -17,7 +17,7 @@ from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
 from steadypose.prior.body.skeleton import PARENTS, finite_joints
 from steadypose.prior.complete.views import AROUND, LONGEST_GAP, gaps, views
-from steadypose.prior.models.completer.features import draw_line, rotations_of_6d
+from steadypose.prior.models.completer_features import draw_line, rotations_of_6d
 
 MIN_SIGMA = 0.002
 """Metres along an axis: the least of a joint that was given."""

@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS, Skeleton, to_canonical
-from steadypose.prior.body.points import recognise_points
-from steadypose.prior.body.rigs import Rig, RigError, Tree, recognise, up_axis
+from steadypose.prior.body.rigs import Rig, RigError, Tree, recognise, recognise_points, up_axis
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS
 from steadypose.prior.mocap.bvh import read_bvh
 from steadypose.prior.mocap.clip import TO_Z_UP, MotionError, documented, forward

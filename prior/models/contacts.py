@@ -7,11 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Floats, Floats32
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT
 from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.models.layers.dense import Floats as Floats32
-from steadypose.prior.models.layers.dense import dense
+from steadypose.prior.models.layers import dense
 from steadypose.prior.models.weights import Arrays, load_weights
 
 OF_JOINT = 12
@@ -108,11 +107,7 @@ class LiveContacts:
 
     @classmethod
     def load(cls, weights: str) -> LiveContacts:
-        """From the weights of this name.
-
-        Raises:
-            FileNotFoundError: there are none; says which there are.
-        """
+        """From the weights of this name; raises as `load_weights`."""
         return cls(load_weights(weights, "contacts")[0])
 
     def __call__(self, features: NDArray[np.float32], state: NDArray[np.float32]) -> Contacts:

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Floats32
 from steadypose.prior.body.skeleton import PARENTS
-from steadypose.prior.models.layers.dense import Floats, dense, leaky_relu
-from steadypose.prior.models.layers.edge_graph import mix_edges, pool_matrix, pooling_levels
+from steadypose.prior.models.layers import dense, leaky_relu, mix_edges, pool_matrix, pooling_levels
 from steadypose.prior.models.weights import Arrays, load_weights, part
 from steadypose.prior.timing.rate import FPS
 
@@ -67,8 +67,8 @@ class NewestMotion(NamedTuple):
         log_sigma: (B, 3) log of the standard deviation of that along each axis, m/s.
     """
 
-    velocity: Floats
-    log_sigma: Floats
+    velocity: Floats32
+    log_sigma: Floats32
 
 
 class LiveRootVelocity:
@@ -90,11 +90,7 @@ class LiveRootVelocity:
 
     @classmethod
     def load(cls, weights: str) -> LiveRootVelocity:
-        """From the weights of this name.
-
-        Raises:
-            FileNotFoundError: there are none; says which there are.
-        """
+        """From the weights of this name; raises as `load_weights`."""
         arrays, config = load_weights(weights, "trajectory")
         return cls(TrajectoryConfig.from_dict(config), arrays)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import HIPS, SHOULDERS, finite_joints
-from steadypose.prior.models.layers.compiled_graph import Network, Program
+from steadypose.prior.models.compiled_graph import Network, Program
 from steadypose.prior.models.weights import Arrays, load_weights, part
 
 SMOOTHER_DENSITY = 1.0
@@ -110,11 +110,7 @@ class LiveCorrection:
 
     @classmethod
     def load(cls, sensor: str, max_batch: int) -> LiveCorrection:
-        """From the weights of this sensor.
-
-        Raises:
-            FileNotFoundError: there are none; says which there are.
-        """
+        """From the weights of this sensor; raises as `load_weights`."""
         return cls(load_weights(sensor, "correction")[0], max_batch)
 
     def __call__(self, features: Floats) -> Floats:
@@ -124,5 +120,5 @@ class LiveCorrection:
         """
         rows = slice(0, len(features))
         self._net.matrix(self._features, rows)[:, 0] = np.nan_to_num((features - self._mean) / self._scale)
-        self._net.run(self._net.steps, rows)
+        self._net.run(rows)
         return self._net.matrix(self._answer, rows).reshape(-1, 22, 3).astype(np.float64)

@@ -15,11 +15,12 @@ from steadypose.benchmarks.baselines.filters import (
     gaussian_hampel,
     hold_last,
     interpolate,
+    one_euro,
 )
 from steadypose.benchmarks.baselines.kalman import fixed_lag, process_noise, transition
 from steadypose.benchmarks.baselines.whole_body_bank import whole_body_bank
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J
-from steadypose.prior.timing.fixed_lag import FixedLagRTS
+from steadypose.prior.timing.kalman import ConstantVelocityFilter
 
 STAMPS = np.arange(40) / 30.0
 NAN = float("nan")
@@ -45,16 +46,14 @@ def line(values: list[float]) -> np.ndarray:
     return np.repeat(np.array(values)[:, None, None], 3, axis=-1)
 
 
-def test_constant_velocity_agrees_with_the_products_own_smoother() -> None:
+def test_constant_velocity_agrees_with_the_products_own_filter() -> None:
     seen = motion(np.random.default_rng(0))
     stamps = STAMPS + np.random.default_rng(1).uniform(-0.01, 0.01, len(STAMPS))
     seen[10:14, 1, 0] = np.nan
     seen[20:, 2, 1] = np.nan
-    for delay in (0, 3):
-        smoother = FixedLagRTS(delay, 0.7, measurement_sigma=0.02)
-        held = [smoother.update(frame, stamp) for frame, stamp in zip(seen, stamps, strict=True)]
-        expected = np.stack([answer.positions for answer in (*held, *smoother.flush()) if answer])
-        np.testing.assert_allclose(fixed_lag(seen, stamps, delay, 2, 0.7), expected, atol=1e-6)
+    own = ConstantVelocityFilter(0.7, measurement_sigma=0.02)
+    expected = np.stack([own.update(frame, stamp).positions for frame, stamp in zip(seen, stamps, strict=True)])
+    np.testing.assert_allclose(fixed_lag(seen, stamps, 0, 2, 0.7), expected, atol=1e-6)
 
 
 def test_constant_acceleration_is_the_smoother_of_its_model() -> None:
@@ -191,3 +190,34 @@ def test_a_density_a_joint_follows_a_wrist_more_closely_than_a_hip() -> None:
     assert moved[J["left_wrist"]] > moved[J["left_hip"]] > 0.0
     same = constant_velocity(seen, np.arange(12) / 30, 0, 0.5)[-1, 0, 0, 0]
     assert moved.min() < same < moved.max()
+
+
+def naive_one_euro(values: np.ndarray, stamps: np.ndarray, fmin: float, beta: float, fd: float) -> np.ndarray:
+    """The paper's algorithm 1, one joint, with the norm of the velocity as its speed."""
+
+    def weight(dt: float, cutoff: float) -> float:
+        return 1 / (1 + (1 / (2 * np.pi * cutoff)) / dt)
+
+    out = [values[0]]
+    velocity = np.zeros(3)
+    for i in range(1, len(values)):
+        dt = stamps[i] - stamps[i - 1]
+        a = weight(dt, fd)
+        velocity = a * (values[i] - values[i - 1]) / dt + (1 - a) * velocity
+        a = weight(dt, fmin + beta * float(np.linalg.norm(velocity)))
+        out.append(a * values[i] + (1 - a) * out[-1])
+    return np.array(out)
+
+
+def test_one_euro_is_the_papers_algorithm_between_gaps() -> None:
+    rng = np.random.default_rng(11)
+    positions, stamps = np.cumsum(rng.normal(0, 0.05, (24, 3, 3)), axis=0), np.cumsum(rng.uniform(0.01, 0.08, 24))
+    positions[rng.random((24, 3)) < 0.3] = np.nan
+    got = one_euro(positions, stamps, 0, 1.2, 3.0)
+    for joint in range(positions.shape[1]):
+        seen = np.flatnonzero(np.isfinite(positions[:, joint, 0]))
+        expected = naive_one_euro(positions[seen, joint], stamps[seen], 1.2, 3.0, 1.0)
+        np.testing.assert_allclose(got[seen, joint], expected, atol=1e-12)
+        assert np.isnan(got[: seen[0], joint]).all()
+        for frame in set(range(seen[0], len(stamps))) - set(seen.tolist()):
+            np.testing.assert_array_equal(got[frame, joint], got[frame - 1, joint])

@@ -11,8 +11,7 @@ from tests.nodes.conftest import walk
 
 import steadypose
 from steadypose.nodes.commands.cleaning import clean_recording
-from steadypose.prior.body.layouts import SKELETONS
-from steadypose.prior.body.own_layouts import add_layouts
+from steadypose.prior.body.layouts import SKELETONS, add_layouts
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "library.md").read_text(), re.MULTILINE | re.DOTALL)

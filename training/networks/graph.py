@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from steadypose.prior.fit.tensors import load_network
+from steadypose.prior.models.compiled_graph import LOG_VAR_RANGE
 from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, CompletionConfig, FaultNetConfig
 from steadypose.prior.models.hgvae.live_completion import (
     FIRST_LOG_VAR,
@@ -20,7 +21,6 @@ from steadypose.prior.models.hgvae.live_completion import (
     WINDOW_INPUTS,
     completion_features,
 )
-from steadypose.prior.models.layers.compiled_graph import LOG_VAR_RANGE
 from steadypose.prior.models.weights import weights_path
 
 

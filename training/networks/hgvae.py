@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from steadypose.prior.models.compiled_graph import LOG_VAR_RANGE
 from steadypose.prior.models.hgvae.config import JOINT_NODES, TRACK_LOG_VAR, HGVAEConfig, Level
-from steadypose.prior.models.layers.compiled_graph import LOG_VAR_RANGE
 from steadypose.training.networks.graph import CompletionNet, GraphBlock, GraphLinear, certainty_of
 
 INITIAL_LATENT_GAIN, INITIAL_POSTERIOR_LOG_VAR = 0.25, -4.0

@@ -28,8 +28,17 @@ from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.skeleton import J, limbs
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, to_6d
-from steadypose.prior.models.completer.config import BENDS, FEATURES, OUTPUTS, CompleterConfig
-from steadypose.prior.models.completer.features import Bools, Line, Window, correction_share, read_window
+from steadypose.prior.models.completer_features import (
+    BENDS,
+    FEATURES,
+    OUTPUTS,
+    Bools,
+    CompleterConfig,
+    Line,
+    Window,
+    correction_share,
+    read_window,
+)
 from steadypose.training.data.dataset import LivelyWindows, MotionSet, describe_data, mirror_offsets, mirror_rotations
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 

@@ -18,22 +18,23 @@ from torch.nn import functional as F
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from steadypose.prior.arrays import Floats
+from steadypose.prior.clean.outliers import MIN_NOISE, frozen_joints
 from steadypose.prior.fit.tensors import load_network
-from steadypose.prior.models.hgvae.anomaly import (
+from steadypose.prior.models.hgvae.config import SCALE, FaultNetConfig, HGVAEConfig
+from steadypose.prior.models.hgvae.faults import (
     MISSING,
     PACE_EDGES,
     PACES,
     RATES,
+    RECENT,
     SENSOR_SIGMAS,
     Calibration,
+    fault_features,
     joint_odds,
     pace,
 )
-from steadypose.prior.models.hgvae.config import SCALE, FaultNetConfig, HGVAEConfig
 from steadypose.prior.models.hgvae.features import to_tracks
-from steadypose.prior.models.hgvae.live_faults import RECENT, fault_features
 from steadypose.prior.models.weights import LICENCES
-from steadypose.prior.timing.frozen_joints import MIN_NOISE, frozen_joints
 from steadypose.training.data.corruption import (
     JITTER_SHARE,
     displaced,

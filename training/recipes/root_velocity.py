@@ -24,8 +24,7 @@ from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, limbs
 from steadypose.prior.fit.hmvae_network import SkeletonConv, SkeletonPool
 from steadypose.prior.fit.tensors import heading, yaw_rotation
-from steadypose.prior.models.layers.dense import SLOPE
-from steadypose.prior.models.layers.edge_graph import Level, pooling_levels
+from steadypose.prior.models.layers import SLOPE, Level, pooling_levels
 from steadypose.prior.models.root_velocity import CHANNELS, FRAME_S, TrajectoryConfig
 from steadypose.prior.sim.noise import time_correlated
 from steadypose.training.data.dataset import MotionSet, describe_data

@@ -31,7 +31,7 @@ from steadypose.prior.models.sensor_bias import (
     recall,
     trunk_frame,
 )
-from steadypose.prior.timing.fixed_lag import FixedLagRTS
+from steadypose.prior.timing.kalman import ConstantVelocityFilter
 from steadypose.training.data.dataset import mirror_offsets
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
@@ -129,9 +129,8 @@ def _examples_of(data: Path, subject: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _clip(pair: KinectPair) -> tuple[np.ndarray, np.ndarray]:
     seen, _ = to_canonical(KINECT22, pair.kinect)
-    smoother = FixedLagRTS(0, SMOOTHER_DENSITY)
-    answers = [smoother.update(frame, t / pair.fps) for t, frame in enumerate(seen)]
-    smoothed = np.stack([a.positions for a in answers if a is not None])
+    smoother = ConstantVelocityFilter(SMOOTHER_DENSITY)
+    smoothed = np.stack([smoother.update(frame, t / pair.fps).positions for t, frame in enumerate(seen)])
     padded = np.concatenate([np.full((HISTORY[-1], 22, 3), np.nan), smoothed])
     history = np.stack([recall(padded[t : t + HISTORY[-1] + 1, None])[:, 0] for t in range(len(smoothed))], axis=1)
     shared = np.asarray((finite_joints(seen) & finite_joints(pair.vicon)).all(axis=0))

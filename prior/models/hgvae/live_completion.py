@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.compiled import njit
+from steadypose.prior.models.compiled_graph import LOG_VAR_RANGE, Network, Program
 from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, CompletionConfig
-from steadypose.prior.models.layers.compiled_graph import LOG_VAR_RANGE, Network, Program
 from steadypose.prior.models.weights import Arrays, part
 
 NEAR = 8.0
@@ -38,7 +38,7 @@ CENTIMETRE = 0.01 / SCALE
 
 BIAS_SCALE = 0.01
 BIAS_MIN = 0.002
-"""Metres along an axis: the slow error enters as the logarithm of its ratio to the first, at least the second."""
+"""Metres along an axis: the bias enters as the logarithm of its ratio to the first, at least the second."""
 
 HALF_CERTAIN_SIGMA = 0.01
 """Metres along an axis: a completed entry of this standard deviation has a certainty of one half."""
@@ -52,7 +52,7 @@ FRAME_INPUTS = JOINT_NODES + 2 * JOINTS
 """Inputs a frame: tracks, and the nearness of each joint's last and next observation."""
 
 WINDOW_INPUTS = 2 * JOINTS + 2
-"""Inputs a window: noise of each joint and of all, mobility of each, and the sensor's slow error."""
+"""Inputs a window: noise of each joint and of all, mobility of each, and the sensor's bias."""
 
 _NEVER = -1.0
 
@@ -64,7 +64,7 @@ class Features(NamedTuple):
         nodes: (B, T / patch, inputs) float32.
         mobility: (B, 22) float32, mean squared displacement of a joint relative to its parent in `LAG` frames, less
             what its noise explains.
-        noise: (B, 22) float32, variance of an observation: jitter and slow error.
+        noise: (B, 22) float32, variance of an observation: jitter and bias.
         gap: (B, 22, T) float32, frames to an observation, 1 / (1 / last + 1 / next) between two; 0 where observed, -1
             of a joint never seen.
     """
@@ -96,7 +96,7 @@ def completion_features(
     Args:
         deviations: (B, 66, T) tracks less the training mean, in units of `SCALE`; interpolated where not observed.
         observed: (B, 66, T) more than 0 where observed.
-        bias_sigma: (B,) metres along an axis, the sensor's slow error.
+        bias_sigma: (B,) metres along an axis, the sensor's bias.
         patch: frames in a node.
     """
     count, _, frames = deviations.shape
@@ -245,7 +245,7 @@ class LiveCompletion:
         Args:
             deviations: (B, 66, T) tracks less the training mean, in units of `SCALE`; changed.
             observed: (B, 66, T) more than 0 where observed.
-            bias_sigma: (B,) metres along an axis, the sensor's slow error.
+            bias_sigma: (B,) metres along an axis, the sensor's bias.
 
         Returns:
             (B, 66, T) certainty of each entry, see `completion.certainty_of`.
@@ -257,7 +257,7 @@ class LiveCompletion:
         features = completion_features(deviations[partly], observed[partly], bias_sigma[partly], self._patch)
         rows = slice(0, len(partly))
         self._net.matrix(self._nodes, rows)[:] = features.nodes
-        self._net.run(self._net.steps, rows)
+        self._net.run(rows)
         written = self._net.matrix(self._written, rows)
         _fuse(written, features.line_variance(), partly, observed, deviations, certainty)
         return certainty

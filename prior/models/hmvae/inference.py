@@ -12,10 +12,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from steadypose.prior.arrays import Floats32
 from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.models.hmvae.config import CHANNELS, DEVIATION, NO_ROTATION, ROTATION_FEATURES, HMVAEConfig
-from steadypose.prior.models.layers.dense import Floats, dense, leaky_relu
-from steadypose.prior.models.layers.edge_graph import mix_edges, pool_matrix, pooling_levels, unpool_matrix
+from steadypose.prior.models.layers import dense, leaky_relu, mix_edges, pool_matrix, pooling_levels, unpool_matrix
 from steadypose.prior.models.weights import Arrays, load_weights, part
 
 _NO_ROTATION = np.array(NO_ROTATION, dtype=np.float32)
@@ -55,10 +55,10 @@ class LiveHMVAE:
         ]  # of each edge, the stream's channels
         decoder[0] = stream.reshape(len(last), -1, last.shape[-1]), none, last_stretch  # the bias comes with z_l
 
-        def from_deep(latent: Floats) -> Floats:
+        def from_deep(latent: Floats32) -> Floats32:
             return _TemporalLinear(*first)(_expanded(latent, part(weights, "from_global"), steps[4]))
 
-        def from_local(latent: Floats) -> Floats:  # beside a stream of zeros
+        def from_local(latent: Floats32) -> Floats32:  # beside a stream of zeros
             features = _expanded(latent, part(weights, "from_local"), steps[1])
             features = features.reshape(*features.shape[:2], edges[0], -1)
             joined = np.concatenate([np.zeros_like(features), features], axis=-1)
@@ -70,15 +70,11 @@ class LiveHMVAE:
 
     @classmethod
     def load(cls, weights: str) -> LiveHMVAE:
-        """From the weights of this name.
-
-        Raises:
-            FileNotFoundError: there are none; says which there are.
-        """
+        """From the weights of this name; raises as `load_weights`."""
         arrays, config = load_weights(weights, "hmvae")
         return cls(HMVAEConfig.from_dict(config), arrays)
 
-    def __call__(self, x: Floats) -> Floats:
+    def __call__(self, x: Floats32) -> Floats32:
         """Decode the posterior's mean of windows (B, T, 22, 6): equations 10 and 11."""
         first, *others = self._encoder
         seen, mean = x, None
@@ -99,7 +95,7 @@ class LiveHMVAE:
         return _columns(decoded * np.float32(DEVIATION) + _NO_ROTATION, mean.swapaxes(-1, -2))
 
 
-def _rotations(x: Floats) -> Floats:
+def _rotations(x: Floats32) -> Floats32:
     """(..., 3, 3) of the first two columns (..., 6), by Gram and Schmidt."""
     first, second = x[..., :3], x[..., 3:]
     first = first / np.maximum(np.linalg.norm(first, axis=-1, keepdims=True), 1e-12)
@@ -108,7 +104,7 @@ def _rotations(x: Floats) -> Floats:
     return np.stack([first, second, np.cross(first, second)], axis=-1)
 
 
-def _mean_pose(x: Floats) -> Floats:
+def _mean_pose(x: Floats32) -> Floats32:
     """(B, 1, 22, 3, 3) local rotations: the mean of bones' orientations in windows x (B, T, 22, 6)."""
     local = _rotations(x)
     orientations = local.copy()
@@ -120,12 +116,12 @@ def _mean_pose(x: Floats) -> Floats:
     return local
 
 
-def _first_two(rotations: Floats) -> Floats:
+def _first_two(rotations: Floats32) -> Floats32:
     """(..., 6): the first two columns of (..., 3, 3)."""
     return rotations[..., :2].swapaxes(-1, -2).reshape(*rotations.shape[:-2], ROTATION_FEATURES)
 
 
-def _columns(x: Floats, frame: Floats) -> Floats:
+def _columns(x: Floats32, frame: Floats32) -> Floats32:
     """The two columns in x (..., 6), which are vectors, in these frames (..., 3, 3)."""
     return (x.reshape(*x.shape[:-1], 2, 3) @ frame).reshape(x.shape)
 
@@ -140,7 +136,7 @@ class _TemporalLinear:
         stride: in time.
     """
 
-    def __init__(self, weight: Floats, bias: Floats, stretch: Floats, stride: int = 1) -> None:
+    def __init__(self, weight: Floats32, bias: Floats32, stretch: Floats32, stride: int = 1) -> None:
         kernel = weight.shape[2]
         padded = np.pad(stretch, [((kernel - 1) // 2,) * 2, (0, 0)], mode="reflect")
         gathered = np.lib.stride_tricks.sliding_window_view(padded, kernel, axis=0)[::stride].swapaxes(1, 2)
@@ -151,7 +147,7 @@ class _TemporalLinear:
         self._over_time = np.ascontiguousarray(taps.reshape(-1, taps.shape[-1]))
         self._weight, self._bias = merged.reshape(len(merged), -1), bias
 
-    def __call__(self, x: Floats) -> Floats:
+    def __call__(self, x: Floats32) -> Floats32:
         """(B, T, in) to (B, T', out)."""
         windows = (self._over_time @ x).reshape(-1, self._weight.shape[1])
         return dense(windows, self._weight, self._bias).reshape(len(x), -1, len(self._weight))
@@ -166,7 +162,7 @@ class _Latent:
         self._channels, self._weight = channels, weight.reshape(latent, -1)
         self._bias = linear["bias"][:latent]
 
-    def __call__(self, x: Floats) -> Floats:
+    def __call__(self, x: Floats32) -> Floats32:
         edges = x.reshape(*x.shape[:2], -1, self._channels).swapaxes(1, 2).reshape(-1, self._weight.shape[1])
         return (edges @ self._weight.T + self._bias).reshape(len(x), -1)
 
@@ -178,7 +174,7 @@ class _Affine:
         function: affine, (B, E, latent) to (B, T, out).
     """
 
-    def __init__(self, function: Callable[[Floats], Floats], edges: int, latent: int) -> None:
+    def __init__(self, function: Callable[[Floats32], Floats32], edges: int, latent: int) -> None:
         size = edges * latent
         basis = np.eye(1 + size, size, k=-1, dtype=np.float32).reshape(-1, edges, latent)
         zero, *rows = function(basis)
@@ -186,25 +182,25 @@ class _Affine:
         self._weight = np.ascontiguousarray((np.stack(rows) - zero).reshape(size, -1).T)
         self._bias = zero.ravel()
 
-    def __call__(self, latent: Floats) -> Floats:
+    def __call__(self, latent: Floats32) -> Floats32:
         return dense(latent, self._weight, self._bias).reshape(-1, *self._shape)
 
 
-def _unpooled(weight: Floats, unpool: Floats) -> Floats:
+def _unpooled(weight: Floats32, unpool: Floats32) -> Floats32:
     """(out, pooled in, kernel): a convolution's weight with the unpooling before it."""
     outputs, _, kernel = weight.shape
     edges = weight.reshape(outputs, len(unpool), -1, kernel)
     return np.einsum("oeck,eg->ogck", edges, unpool).reshape(outputs, -1, kernel)
 
 
-def _expanded(latent: Floats, linear: Arrays, steps: int) -> Floats:
+def _expanded(latent: Floats32, linear: Arrays, steps: int) -> Floats32:
     """(B, T, E * C) features of a latent (B, E, d), edge by edge."""
     features = latent @ linear["weight"].T + linear["bias"]
     features = features.reshape(*latent.shape[:2], -1, steps)  # (C, T) within an edge
     return features.transpose(0, 3, 1, 2).reshape(len(latent), steps, -1)
 
 
-def _stretch(steps: int, factor: int) -> Floats:
+def _stretch(steps: int, factor: int) -> Floats32:
     """(steps * factor, steps): linear interpolation over time, as `torch.nn.functional.interpolate` does it."""
     places = np.maximum((np.arange(steps * factor) + 0.5) / factor - 0.5, 0.0)
     return np.maximum(1.0 - np.abs(np.minimum(places, steps - 1)[:, None] - np.arange(steps)), 0.0).astype(np.float32)

@@ -2,9 +2,10 @@
 
 Every mode of the body's motion, and every joint that is no part of the body, is a track
 (`prior.models.mixture.tracks`), followed by constant-velocity Kalman filters that differ in the density of their
-process noise, each with the fixed-lag smoother of its last frames (see `FixedLagRTS`, of which these are many side by
-side). One of small density averages noise away and lags behind fast motion; one of large density follows everything,
-noise included.
+process noise, each with the fixed-lag smoother of its last frames. One of small density averages noise away and lags
+behind fast motion; one of large density follows everything, noise included. A smoother is computed in its
+augmented-state form (Anderson and Moore 1979, section 7.3): the positions of the last frames are updated along with the
+newest one, by way of their covariance with it, which is the RTS result without a backward pass.
 
 Their mean, weighted by each filter's likelihood, is the static multiple-model estimate (Bar-Shalom, Li and Kirubarajan
 2001, section 11.6), with exponential forgetting. The measurement noise is unknown: for each filter it is the most

@@ -34,7 +34,7 @@ from steadypose.prior.models.mixture.form import (
 from steadypose.prior.models.mixture.modes import body_covariance
 from steadypose.prior.models.mixture.whiteness import Whiteness, fallback
 from steadypose.prior.models.weights import load_weights
-from steadypose.prior.timing.fixed_lag import Smoothed
+from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
 
 Floats = NDArray[np.float32]

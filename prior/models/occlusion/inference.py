@@ -61,11 +61,7 @@ class LiveOcclusion:
 
     @classmethod
     def load(cls, weights: str) -> LiveOcclusion:
-        """From the weights of this name.
-
-        Raises:
-            FileNotFoundError: there are none; says which there are.
-        """
+        """From the weights of this name; raises as `load_weights`."""
         return cls(load_weights(weights, "occlusion")[0])
 
     def __call__(self, rows: Occluded) -> Weighed:

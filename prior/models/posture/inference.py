@@ -60,11 +60,7 @@ class LivePosture:
 
     @classmethod
     def load(cls, weights: str) -> LivePosture:
-        """From the weights of this name.
-
-        Raises:
-            FileNotFoundError: there are none; says which there are.
-        """
+        """From the weights of this name; raises as `load_weights`."""
         return cls(load_weights(weights, "posture")[0])
 
     def __call__(self, positions: Floats, sigma: Floats, offsets: Floats) -> Expected:

@@ -121,7 +121,7 @@ def test_a_gap_of_our_own_making_resets_no_body(lost: int) -> None:
     for frame in frames[:60]:
         before = prior.process(frame)
     bones = before[-1].bodies[0].bone_lengths
-    after = prior.process(frames[60 + lost], hurry=True, gap=True)
+    after = prior.process(frames[60 + lost], gap=True)
     assert len(after) <= CATCH_UP, "what was dropped is not computed after all"
     for frame in frames[60 + lost + 1 :]:
         after = prior.process(frame)

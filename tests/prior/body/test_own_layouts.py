@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from steadypose.prior.body.layouts import COCO17, SKELETONS, to_canonical
-from steadypose.prior.body.own_layouts import add_layouts
+from steadypose.prior.body.layouts import COCO17, SKELETONS, add_layouts, to_canonical
 
 
 @pytest.mark.usefixtures("own_layouts")

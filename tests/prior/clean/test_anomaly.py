@@ -10,19 +10,22 @@ from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.score import OwnScale, Scorer, ScoreSettings
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.models.hgvae.anomaly import (
+from steadypose.prior.models.hgvae.config import FaultNetConfig
+from steadypose.prior.models.hgvae.faults import (
     FROZEN_ODDS,
     MISSING,
+    OFF_SCALE,
     PACES,
     RATES,
+    RECENT,
+    ROUGH_SCALE,
     SENSOR_SIGMAS,
     Calibration,
     decimals,
+    fault_features,
     joint_odds,
     pace,
 )
-from steadypose.prior.models.hgvae.config import FaultNetConfig
-from steadypose.prior.models.hgvae.live_faults import OFF_SCALE, RECENT, ROUGH_SCALE, fault_features
 from steadypose.training.networks.graph import FaultNet, load_fault_net
 
 HEIGHTS = np.linspace(0.0, 7.0, len(RATES))

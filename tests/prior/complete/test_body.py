@@ -14,7 +14,7 @@ from steadypose.prior.complete.body import Uncertainty, complete, frames_apart
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.root_path import bridge, is_root_centred, root_path
 from steadypose.prior.complete.views import LONGEST, LONGEST_GAP, gaps, views
-from steadypose.prior.models.completer.inference import LiveCompleter
+from steadypose.prior.models.completer import LiveCompleter
 
 LEGS = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
 

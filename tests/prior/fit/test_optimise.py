@@ -13,9 +13,8 @@ from steadypose.prior.fit import optimise
 from steadypose.prior.fit.hmvae_network import HMVAE
 from steadypose.prior.fit.optimise import Optimiser
 from steadypose.prior.fit.tensors import to_6d
-from steadypose.prior.models.completer.config import CompleterConfig
-from steadypose.prior.models.completer.features import solved_rotations
-from steadypose.prior.models.completer.inference import LiveCompleter
+from steadypose.prior.models.completer import LiveCompleter
+from steadypose.prior.models.completer_features import CompleterConfig, solved_rotations
 from steadypose.prior.models.hmvae.config import HMVAEConfig
 from steadypose.training.recipes.completer import Completer
 from steadypose.training.weights import arrays_of

@@ -3,7 +3,7 @@ import torch
 
 from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.fit.hmvae_network import SkeletonConv, SkeletonPool, SkeletonUnpool
-from steadypose.prior.models.layers.edge_graph import pooling_levels
+from steadypose.prior.models.layers import pooling_levels
 
 SMPL24 = (*PARENTS, 20, 21)  # with hands, as the official code has it
 

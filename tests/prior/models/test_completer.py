@@ -18,14 +18,15 @@ from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.kinematics import rotation_matrices
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
-from steadypose.prior.models.completer.config import FEATURES, CompleterConfig
-from steadypose.prior.models.completer.features import (
+from steadypose.prior.models.completer import LiveCompleter
+from steadypose.prior.models.completer_features import (
+    FEATURES,
+    CompleterConfig,
     anchored,
     draw_line,
     read_window,
     solved_rotations,
 )
-from steadypose.prior.models.completer.inference import LiveCompleter
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.loop import TrainingOptions
 from steadypose.training.recipes.completer import Completer, Truth, answer, masks, train_completer

@@ -8,8 +8,8 @@ import torch
 from tests.prior.models.test_hgvae import awake
 
 from steadypose.prior.models.hgvae.config import FaultNetConfig
+from steadypose.prior.models.hgvae.faults import LiveFaultNet, fault_features
 from steadypose.prior.models.hgvae.live_completion import LiveCompletion
-from steadypose.prior.models.hgvae.live_faults import LiveFaultNet, fault_features
 from steadypose.prior.models.sensor_bias import FEATURES, CorrectionConfig, LiveCorrection
 from steadypose.training.networks.graph import FaultNet
 from steadypose.training.recipes.sensor_bias import CorrectionNet

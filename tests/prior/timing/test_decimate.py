@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from steadypose.prior.timing.decimate import DecimationFilter, Frame
+from steadypose.prior.timing.resample import DecimationFilter, Frame
 
 HZ = 60
 

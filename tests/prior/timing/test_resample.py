@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from tests.helpers.bodies import waving
 
-from steadypose.prior.timing.decimate import Frame
-from steadypose.prior.timing.resample import LOOK_AHEAD_NS, MAX_GAP_NS, PERIOD_NS, Resampler
+from steadypose.prior.timing.resample import LOOK_AHEAD_NS, MAX_GAP_NS, PERIOD_NS, RUNS, Frame, Republished, Resampler
 
 SLOTS = 2
 
@@ -99,3 +99,30 @@ def test_at_the_end_no_grid_time_is_lost(hz: int) -> None:
     frames = [f for s in stamps for f in resampler.update(s, line(s)[:1], np.ones((1, 22)))] + resampler.drain()
     assert [f.stamp_ns for f in frames] == [k * PERIOD_NS for k in range(61)]
     assert all(np.allclose(f.positions, line(f.stamp_ns)[:1], atol=1e-9) for f in frames)
+
+
+def dropped(frames: np.ndarray) -> list[bool]:
+    republished = Republished()
+    return [republished.update(frame[None]) for frame in frames]
+
+
+@pytest.mark.parametrize("times", [2, 3])
+def test_what_a_stream_repeats_regularly_is_dropped(times: int) -> None:
+    frames = np.repeat(waving(60), times, axis=0)
+    frames[:, 4] = np.nan
+    new = np.arange(len(frames)) % times == 0
+    found = np.array(dropped(frames))
+    assert not found[new].any()
+    assert found[~new][RUNS * (times - 1) :].all()
+
+
+def test_who_stands_still_without_noise_is_no_repetition() -> None:
+    moving = waving(60)
+    frames = np.concatenate([moving[:20], np.repeat(moving[20:21], 40, axis=0), moving[20:]])
+    assert not any(dropped(frames))
+    assert not any(dropped(np.repeat(moving[:1], 100, axis=0)))
+
+
+def test_a_tracker_that_stops_is_given_on_after_its_usual_repetitions() -> None:
+    frames = np.concatenate([np.repeat(waving(60), 2, axis=0), np.repeat(waving(1), 30, axis=0)])
+    assert sum(dropped(frames)[120:]) == 1

@@ -15,8 +15,7 @@ from tests.prior.body.test_rigs import FAMILIES
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.commands.prepare import prepare
 from steadypose.nodes.sources.recording import open_recording
-from steadypose.prior.body.points import recognise_points
-from steadypose.prior.body.rigs import RigError
+from steadypose.prior.body.rigs import RigError, recognise_points
 from steadypose.prior.body.skeleton import JOINTS, REST_POSITIONS, J
 from steadypose.prior.mocap.clip import MotionError
 from steadypose.prior.mocap.files import Description, read_motion

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from tests.helpers.bodies import raw, stream, waving
 
 from steadypose.msgs.types import PoseClean, PoseRaw
+from steadypose.prior.clean.admission import LASTING, StampGate
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.pipeline import BACKWARDS_NS, PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.clean.stamp_gate import LASTING, StampGate
 from steadypose.prior.timing.resample import PERIOD_NS
 
 SECOND_NS = 10**9

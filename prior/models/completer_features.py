@@ -1,4 +1,4 @@
-"""Features of the completer, and the interpolation that it corrects: compiled loops, in training and live alike.
+"""Sizes and features of the completer, and the interpolation that it corrects, in training and live alike.
 
 The line: rotations by slerp and root by lerp between what is known before and after, joint by joint. What is known on
 one side only is held, what is never known has the mean pose. The bend: a cubic with the velocities at both ends, less
@@ -9,20 +9,31 @@ the line; the network's output has a gate for it. The correction: the rest of th
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Bools, Floats
+from steadypose.prior.arrays import Bools, Floats, Floats32
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.kinematics import heading, quaternions, rotation_matrices, yaw_matrix
 from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENTS, J, finite_joints
 from steadypose.prior.compiled import njit
-from steadypose.prior.models.completer.config import BENDS, FEATURES
 from steadypose.prior.timing.rate import FPS
 
-Floats32 = NDArray[np.float32]
+JOINTS = 22
+
+BENDS = JOINTS * 6 + 3
+"""Numbers of a frame's bend: of each rotation's first two columns, and of the root's position."""
+
+FEATURES = JOINTS * (6 + 3 + 3 + 3) + 9 + BENDS
+"""Numbers of a frame: of each joint its rotation (6D), position, velocity, whether it is known, and how near that is
+before and after; of the root its position, velocity and the same three; and the bend."""
+
+OUTPUTS = JOINTS * 6 + 3 + JOINTS + 1
+"""Corrections of each joint's 6D rotation and of the root's position, metres; and logits of the gates of each joint's
+and the root's bend."""
 
 NEAR = 8.0
 """Frames from something known at which its nearness is a half: 1 / (1 + d / NEAR)."""
@@ -36,6 +47,32 @@ MAX_BEND = 2.0
 _FASTEST = 10.0  # m/s
 _SPINE = [J["spine1"], J["spine2"]]
 _LEAVES = [joint for joint, children in enumerate(CHILDREN) if not children]
+
+
+@dataclass(frozen=True)
+class CompleterConfig:
+    """The sizes of the completer.
+
+    Attributes:
+        width: of the transformer's tokens, one a frame.
+        heads: of each layer's attention.
+        layers: how many.
+        reach: frames at which relative positions are clipped.
+        never_sigma: (22,) metres along an axis, error of each joint where it is never known, of validation people.
+        half_frames: frames from the nearest in which a joint is known at which its error is half of that.
+    """
+
+    width: int = 128
+    heads: int = 8
+    layers: int = 5
+    reach: int = 64
+    never_sigma: tuple[float, ...] = (0.1,) * JOINTS
+    half_frames: float = 10.0
+
+    @classmethod
+    def from_dict(cls, config: dict[str, Any]) -> CompleterConfig:
+        """From the JSON of a weights file."""
+        return cls(**{**config, "never_sigma": tuple(config["never_sigma"])})
 
 
 class Line(NamedTuple):

@@ -1,16 +1,29 @@
-"""Outlier rejection of stamps: one wrong stamp must not end the stream, and one publisher must not be two."""
+"""Outlier rejection of a message's stamp and of its sensor's pose, before its bodies are looked at.
+
+One wrong stamp must not end the stream, and one publisher must not be two; one wrong pose must not displace all bodies.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
+from enum import Enum, auto
 
-from steadypose.msgs.types import PoseRaw
+import numpy as np
+
+from steadypose.msgs.types import Pose, PoseRaw
 
 LASTING = 3
-"""messages in a row, of stamps that follow each other, after which a jump of stamps is accepted: a pause, or a clock
-that was set"""
+"""Messages in a row, of stamps that follow each other, after which a jump of stamps is accepted: a pause, or a clock
+that was set."""
 SLOWEST_NS = 10_000_000_000
-"""between two stamps of a stream; one that is slower is taken for a pause at every message"""
+"""Nanoseconds at most between two stamps of a stream; one that is slower is taken for a pause at every message."""
+STEP_M, SPEED = 0.5, 10.0
+"""Metres and m/s: a sensor may have moved by STEP_M + SPEED * elapsed since its last accepted pose; a running robot
+does 4 m/s."""
+TURN, TURN_RATE = 0.5, 10.0
+"""Radians and rad/s: the same of its orientation; a person's head turns at up to 6 rad/s."""
+LASTING_S = 0.2
+"""Seconds after which a suspect pose is accepted: the sensor was moved, or calibrated."""
 
 
 class StampGate:
@@ -71,3 +84,45 @@ class StampGate:
         if self._held:
             self._counters["stamp_outlier"] += len(self._held)
             self._held = []
+
+
+class Verdict(Enum):
+    """Outcome for one pose."""
+
+    ACCEPTED = auto()
+    SUSPECT = auto()
+    """a jump that may be an outlier: skip this frame"""
+    MOVED = auto()
+    """a jump that has lasted: the sensor was moved, start anew"""
+
+
+class SensorPoseGate:
+    """Rejects poses that jump, until the jump has lasted for `LASTING_S`. A still or moving sensor passes unchanged."""
+
+    def __init__(self) -> None:
+        self._accepted: tuple[int, Pose] | None = None
+        self._suspect_since_ns: int | None = None
+
+    def reset(self) -> None:
+        """Forget the sensor."""
+        self._accepted = self._suspect_since_ns = None
+
+    def judge(self, pose: Pose, stamp_ns: int) -> Verdict:
+        """Judge the sensor's pose in the frame of ``stamp_ns``, which is later than the last."""
+        if self._accepted is None or _is_near(*self._accepted, stamp_ns, pose):
+            self._accepted, self._suspect_since_ns = (stamp_ns, pose), None
+            return Verdict.ACCEPTED
+        if self._suspect_since_ns is None:
+            self._suspect_since_ns = stamp_ns
+        if stamp_ns - self._suspect_since_ns < LASTING_S * 1e9:
+            return Verdict.SUSPECT
+        self._accepted, self._suspect_since_ns = (stamp_ns, pose), None
+        return Verdict.MOVED
+
+
+def _is_near(before_ns: int, before: Pose, after_ns: int, after: Pose) -> bool:
+    """Whether a sensor may have moved from one pose to the other."""
+    elapsed_s = (after_ns - before_ns) * 1e-9
+    turned = 2.0 * np.arccos(min(abs(float(before.orientation @ after.orientation)), 1.0))
+    moved = float(np.linalg.norm(after.position - before.position))
+    return moved <= STEP_M + SPEED * elapsed_s and turned <= TURN + TURN_RATE * elapsed_s

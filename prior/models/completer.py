@@ -6,10 +6,15 @@ import math
 
 import numpy as np
 
-from steadypose.prior.arrays import Floats
-from steadypose.prior.models.completer.config import BENDS, CompleterConfig
-from steadypose.prior.models.completer.features import anchored, correction_share, read_window, rotations_of_6d
-from steadypose.prior.models.layers.dense import Floats as Floats32
+from steadypose.prior.arrays import Floats, Floats32
+from steadypose.prior.models.completer_features import (
+    BENDS,
+    CompleterConfig,
+    anchored,
+    correction_share,
+    read_window,
+    rotations_of_6d,
+)
 from steadypose.prior.models.weights import Arrays, load_weights, part
 
 
@@ -30,11 +35,7 @@ class LiveCompleter:
 
     @classmethod
     def load(cls, weights: str) -> LiveCompleter:
-        """From the weights of this name.
-
-        Raises:
-            FileNotFoundError: there are none; says which there are.
-        """
+        """From the weights of this name; raises as `load_weights`."""
         arrays, config = load_weights(weights, "completer")
         return cls(CompleterConfig.from_dict(config), arrays)
 

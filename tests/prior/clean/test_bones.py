@@ -1,4 +1,4 @@
-"""What bones tell of the sensor."""
+"""What bones tell: of the sensor, and of the person."""
 
 import numpy as np
 import pytest
@@ -6,15 +6,22 @@ from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import RIGID, place_joints
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.clean.slow_error import MIN_FRAMES, UNKNOWN_VARIANCE, SlowError, SlowErrorEstimator
-from steadypose.prior.timing.fixed_lag import Smoothed
+from steadypose.prior.clean.bones import (
+    MIN_FRAMES,
+    UNKNOWN_VARIANCE,
+    BiasEstimator,
+    PersonEstimator,
+    PersonSettings,
+    SensorBias,
+)
+from steadypose.prior.timing.kalman import Smoothed
 
 BONES = np.tile(REST_OFFSETS, (1, 1, 1))
 
 
-def found(seen: np.ndarray, sigma: float, jitter: float, bias_sigma: float = 0.02) -> SlowError:
+def found(seen: np.ndarray, sigma: float, jitter: float, bias_sigma: float = 0.02) -> SensorBias:
     """After all frames (T, 22, 3) of one body."""
-    estimator = SlowErrorEstimator(bias_sigma, 1)
+    estimator = BiasEstimator(bias_sigma, 1)
     error = estimator.update(None, BONES, np.array([jitter]))
     for frame in seen:
         error = estimator.update(Smoothed(0.0, frame[None], np.full((1, 22), sigma)), BONES, np.array([jitter]))
@@ -60,9 +67,47 @@ def test_a_rig_with_other_bones_is_not_at_fault() -> None:
 
 
 def test_a_body_that_leaves_is_forgotten() -> None:
-    estimator = SlowErrorEstimator(0.02, 1)
+    estimator = BiasEstimator(0.02, 1)
     for frame in waving(30):
         estimator.update(Smoothed(0.0, frame[None], np.full((1, 22), 0.001)), BONES, np.zeros(1))
     estimator.forget(np.array([True]))
     nothing = Smoothed(0.0, np.full((1, 22, 3), np.nan), np.full((1, 22), np.inf))
     assert estimator.update(nothing, BONES, np.array([0.02])).bias_sigma[0] == pytest.approx(0.02)
+
+
+BIAS = 0.02
+
+
+def lengths(offsets: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(offsets, axis=-1)
+
+
+def worst(offsets: np.ndarray, truth: np.ndarray) -> float:
+    """Metres, of the bone that is the furthest from its true length."""
+    return float(np.abs(lengths(offsets) - lengths(truth)).max())
+
+
+def test_the_stage_knows_bones_from_the_first_frame_and_then_moves_without_steps() -> None:
+    stage, present = PersonEstimator(PersonSettings(), 2), np.array([True, False])
+    told = []
+    for frame in waving(120, 0.85) + np.random.default_rng(0).normal(size=(120, 22, 3)) * 0.02:
+        both = np.stack([frame, np.full((22, 3), np.nan)])
+        smoothed = Smoothed(0.0, both, np.where(np.isnan(both[..., 0]), np.inf, 0.02))
+        told.append(lengths(stage.update(smoothed, np.full(2, BIAS), present).offsets[0]))
+    assert np.abs(told[0] - 0.85 * lengths(REST_OFFSETS)).max() < 0.06
+    assert np.abs(np.diff(told, axis=0)).max() < 0.005
+    assert worst(stage.current.offsets[0], 0.85 * REST_OFFSETS) < 0.03
+    np.testing.assert_array_equal(stage.current.offsets[1], REST_OFFSETS)
+
+
+def test_in_a_crowd_everybodys_bones_are_renewed_as_often_as_those_of_one_of_eight() -> None:
+    """A bench puts clips side by side as bodies: they must not wait for one another."""
+
+    def renewals(slots: int) -> np.ndarray:
+        stage, present = PersonEstimator(PersonSettings(), slots), np.ones(slots, dtype=bool)
+        for frame in waving(120):
+            smoothed = Smoothed(0.0, np.tile(frame, (slots, 1, 1)), np.full((slots, 22), 0.02))
+            stage.update(smoothed, np.full(slots, BIAS), present)
+        return stage._used
+
+    assert renewals(8).min() == renewals(64).min() > 12
