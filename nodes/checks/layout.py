@@ -14,7 +14,6 @@ from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.checks.window import bodies
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
 from steadypose.prior.body.likeness import likenesses
-from steadypose.prior.clean.slots import MIN_JOINTS
 from steadypose.prior.settings import nearest
 
 UNIT_TOLERANCE = 0.01
@@ -126,6 +125,8 @@ def _confidence(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
 
 
 def _seen(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
+    from steadypose.prior.clean.slots import MIN_JOINTS  # 95 MB of numba: not for nodes that only read arrays
+
     seen = [int(np.isfinite(body.positions).all(axis=1).sum()) for body in bodies(messages)]
     if seen and 0 < (usual := int(np.median(seen))) < MIN_JOINTS:
         yield warning(
