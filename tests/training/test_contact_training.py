@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.helpers.prepared import write_motion
 
-from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS, J
+from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.models.contacts import LiveContacts
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.loop import TrainingOptions
@@ -26,22 +27,7 @@ def prepared(tmp_path: Path) -> Path:
         pose[:, [J["right_ankle"], J["right_foot"]], 0] += 0.3 * np.sin(2 * np.pi * time + clip)[:, None]
         pose[:, [J["right_ankle"], J["right_foot"]], 2] += 0.15
         clips.append(pose)
-    path = tmp_path / "prepared.npz"
-    np.savez(
-        path,
-        positions=np.concatenate(clips).astype(np.float32),
-        rotations=np.tile(np.array([0, 0, 0, 1], dtype=np.float32), (240, 22, 1)),
-        offsets=np.repeat(REST_OFFSETS[None], 4, axis=0).astype(np.float32),
-        contacts=np.zeros((240, 8), dtype=bool),
-        clip_start=np.arange(5) * 60,
-        split=np.array(["train"] * 2 + ["val"] * 2),
-        set=np.array(["default"] * 4),
-        flat=np.ones(4, dtype=bool),
-        subject=np.array(["somebody"] * 4),
-        source=np.array(["synthetic"] * 4),
-        action=np.array(["waving"] * 4),
-    )
-    return path
+    return write_motion(tmp_path / "prepared.npz", clips, ["train"] * 2 + ["val"] * 2)
 
 
 @pytest.fixture(autouse=True)

@@ -7,22 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.helpers.prepared import write_motion
 
 from steadypose.prior.body.kinematics import yaw_matrix
-from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
+from steadypose.prior.body.skeleton import REST_POSITIONS
 from steadypose.prior.fit.tensors import load_tensors
 from steadypose.prior.models.root_velocity import TrajectoryConfig
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.loop import TrainingOptions
 from steadypose.training.recipes import root_velocity as training
 from steadypose.training.recipes.root_velocity import TrajectoryNet
-
-
-def rest_pose() -> np.ndarray:
-    pose = np.zeros((22, 3))
-    for joint, parent in enumerate(PARENTS[1:], start=1):
-        pose[joint] = pose[parent] + REST_OFFSETS[joint]
-    return pose + [0, 0, 0.9]
 
 
 @pytest.fixture
@@ -32,33 +26,16 @@ def prepared(tmp_path: Path) -> Path:
     clips, count = [], 150
     for _ in range(6):
         t, speed = np.arange(count) / 30, rng.uniform(0.0, 1.5)
-        pose = np.repeat(rest_pose()[None], count, axis=0)
+        pose = np.repeat((REST_POSITIONS + [0, 0, 0.9])[None], count, axis=0)
         swing = 0.4 * speed * np.sin(2 * np.pi * t)
         pose[:, [4, 7, 10], 0] += swing[:, None]
         pose[:, [5, 8, 11], 0] -= swing[:, None]
         pose[..., 0] += speed * t[:, None]
         clips.append(pose @ yaw_matrix(rng.uniform(-3, 3)).T)
     yaws = [np.arctan2(*(c[0, 1] - c[0, 2])[[0, 1]] * [-1, 1]) for c in clips]
-    rotations = np.zeros((6, count, 22, 4))
-    rotations[..., 3] = 1.0
-    for clip, yaw in enumerate(yaws):
-        rotations[clip, :, 0] = [0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]
-    path = tmp_path / "prepared.npz"
-    np.savez(
-        path,
-        positions=np.concatenate(clips).astype(np.float32),
-        rotations=rotations.reshape(-1, 22, 4).astype(np.float32),
-        offsets=np.repeat(REST_OFFSETS[None], 6, axis=0).astype(np.float32),
-        contacts=np.zeros((6 * count, 8), dtype=bool),
-        clip_start=np.arange(7) * count,
-        split=np.array(["train"] * 4 + ["val"] * 2),
-        set=np.array(["default"] * 6),
-        flat=np.array([True, True, True, False, True, True]),
-        subject=np.array(["somebody"] * 6),
-        source=np.array(["synthetic"] * 6),
-        action=np.array(["walking"] * 6),
-    )
-    return path
+    roots = [[0, 0, np.sin(yaw / 2), np.cos(yaw / 2)] for yaw in yaws]
+    split, flat = ["train"] * 4 + ["val"] * 2, [True, True, True, False, True, True]
+    return write_motion(tmp_path / "prepared.npz", clips, split, np.repeat(roots, count, axis=0), flat)
 
 
 def test_where_somebody_climbs_contacts_are_not_learned(prepared: Path):

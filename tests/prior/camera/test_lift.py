@@ -95,15 +95,6 @@ def test_a_joint_in_a_hole_is_unobserved_and_the_chain_goes_on() -> None:
     assert positions[K["right_wrist"], 2] == pytest.approx(BODY / 1000 + 0.04, abs=0.01)
 
 
-def test_an_object_in_front_of_a_wrist_is_not_the_wrist() -> None:
-    pixels = keypoints()
-    depth = flat_person(pixels)
-    y, x = np.mgrid[: CAMERA.height, : CAMERA.width]
-    cx, cy = pixels[K["left_wrist"]]
-    depth[(np.abs(x - cx) < 15) & (np.abs(y - cy) < 15)] = 1500
-    assert np.isnan(lifted(depth, pixels)[K["left_wrist"]]).all()
-
-
 def test_what_the_detector_doubts_or_places_outside_is_unobserved() -> None:
     pixels = keypoints()
     depth = flat_person(pixels)

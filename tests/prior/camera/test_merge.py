@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import waving
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
@@ -78,17 +77,6 @@ def test_bodies_are_interpolated_to_the_moment() -> None:
     for m in merged[1:]:
         x = sorted(float(body.positions[0, 0] - BODY[0, 0, 0]) for body in m.bodies)
         assert x == pytest.approx([0.0, m.stamp_ns * 1e-9], abs=1e-5)
-
-
-def test_where_a_camera_was_blind_for_a_while_it_says_nothing() -> None:
-    """Somebody who slides along at 2 m/s; one of the cameras skips a fifth of a second."""
-    moves = [(k * PERIOD_NS, BODY[0] + [2.0 * k / 30, 0.0, 0.0]) for k in range(30)]
-    messages = [seen("a", stamp, body) for stamp, body in moves]
-    messages += [seen("b", stamp + 1, body, eye=(0, 4, 1)) for k, (stamp, body) in enumerate(moves) if not 10 < k < 16]
-    merged, _ = play(messages)
-    assert len(merged) > 25
-    for m in merged[1:]:
-        assert m.bodies[0].positions[0, 0] - BODY[0, 0, 0] == pytest.approx(2.0 * m.stamp_ns * 1e-9, abs=1e-5)
 
 
 def test_a_camera_errs_along_its_line_of_sight() -> None:
@@ -165,12 +153,3 @@ def test_cameras_whose_clocks_were_set_back_start_anew() -> None:
         merge.update(seen("a", ahead + k * PERIOD_NS, BODY[k]))
     merged = [m for k in range(60) for m in merge.update(seen("a", k * PERIOD_NS, BODY[k % 60]))]
     assert merged[-1].stamp_ns == 59 * PERIOD_NS
-
-
-def test_a_turned_camera_is_turned_back() -> None:
-    turn = Rotation.from_rotvec([0.3, -0.8, 0.5])
-    pose = Pose(np.array([1.0, 2.0, 1.5]), turn.as_quat())
-    body = RawBody(0, turn.inv().apply(BODY[0] - pose.position), np.ones(22))
-    merged, _ = play([dataclasses.replace(seen("a", 10 * PERIOD_NS), sensor_pose=pose, bodies=[body])])
-    assert merged[0].bodies[0].positions == pytest.approx(BODY[0], abs=1e-5)
-    assert merged[0].sensor_pose == Pose.identity()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import fields
 
 import numpy as np
@@ -20,20 +19,18 @@ from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet, roll_out, sample, transitions
 from steadypose.prior.fit.humor_state import (
     CHANGE,
-    FEATURES,
     State,
     canonical,
     facing,
     moved_by,
     placed,
-    pose_features,
     small_exp,
     small_log,
     states_of,
 )
 from steadypose.prior.fit.tensors import load_network
 from steadypose.prior.timing.rate import FPS
-from steadypose.training.recipes.humor import Sequences, fit_initial, transition_loss
+from steadypose.training.recipes.humor import Sequences, transition_loss
 
 TOLD_MM, NATS = 68.0, 27.0
 """Of the weights that ship, on simulated people."""
@@ -152,31 +149,6 @@ def test_the_likeliest_future_has_no_chance_in_it_and_samples_have(model: HumorN
     drawn = [sample(model, first, 3, bones(3), torch.Generator().manual_seed(seed)).latents for seed in (0, 0, 1)]
     torch.testing.assert_close(drawn[0], drawn[1])
     assert not torch.allclose(drawn[0], drawn[2])
-
-
-def initial_log_density(model: HumorNet, inputs: torch.Tensor) -> torch.Tensor:
-    """(...) nats, of standardised features (..., `FEATURES`) of states in their canonical frames."""
-    known = pose_features(inputs)
-    factors = model.mixture_precisions
-    off = ((known.reshape(-1, known.shape[-1]) - model.mixture_means.unsqueeze(1)) @ factors).square().sum(dim=-1)
-    log_root = factors.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
-    width = known.shape[-1]
-    each = (model.mixture_log_weights + log_root - 0.5 * width * math.log(math.tau)).unsqueeze(1) - 0.5 * off
-    return torch.logsumexp(each, dim=0).reshape(inputs.shape[:-1])
-
-
-def test_the_mixture_of_first_states_is_sklearns(model: HumorNet) -> None:
-    told = torch.randn(2000, FEATURES, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    net = HumorNet(HumorConfig(hidden=64, latent=8, components=2)).double()
-    fit_initial(net, told, seed=0)
-    known = pose_features(told)
-    normal = torch.distributions.MultivariateNormal(
-        known.mean(0), torch.cov(known.T, correction=0) + 1e-3 * torch.eye(133)
-    )
-    found = initial_log_density(net, told)
-    assert found.shape == (2000,)
-    # two components know independent noise no worse than one
-    assert found.mean() >= normal.log_prob(known).mean() - 1.0
 
 
 VARIANTS = [

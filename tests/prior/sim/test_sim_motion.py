@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, label_contacts
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, REST_OFFSETS, J
 from steadypose.prior.sim.body import TOE_HEIGHT, random_offsets, stature
-from steadypose.prior.sim.gait import RATE, Stand, Turn, Walk, plan
+from steadypose.prior.sim.gait import RATE, Stand, Walk, plan
 from steadypose.prior.sim.motion import Intent, Motion, perform, two_bone
 from steadypose.prior.sim.scripts import SCRIPTS
 
@@ -64,14 +64,6 @@ def test_contacts_are_those_that_motion_shows(script: str) -> None:
         assert (labelled == motion.contacts[::4])[:, 2:6].mean() > 0.88
 
 
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_the_same_seed_plays_the_same(script: str) -> None:
-    for a, b in zip(played(script), SCRIPTS[script](np.random.default_rng(SEED)), strict=True):
-        np.testing.assert_array_equal(a.positions, b.positions)
-    others = SCRIPTS[script](np.random.default_rng(SEED + 1))
-    assert not np.array_equal(played(script)[0].offsets, others[0].offsets)
-
-
 def test_a_walk_has_the_measures_of_a_walk() -> None:
     motion = straight_walk()
     heel, toe = motion.contacts[:, 2], motion.contacts[:, 4]
@@ -96,15 +88,6 @@ def test_knees_bend_as_knees_do() -> None:
             angle = np.degrees(np.arctan2(bend[:, 0, 2] - bend[:, 2, 0], bend[:, 0, 0] + bend[:, 2, 2]))
             assert angle.min() > 0.0
             assert angle.max() < 130.0
-
-
-def test_a_turn_ends_with_the_feet_under_the_body() -> None:
-    motion = perform(
-        Intent(plan((1.0, 2.0), 0.0, [Turn(np.pi, 2.8), Stand(0.5)])), REST_OFFSETS, np.random.default_rng(0)
-    )
-    feet = motion.positions[-1, [J["left_ankle"], J["right_ankle"]]]
-    assert np.linalg.norm(feet[:, :2].mean(axis=0) - [1.0, 2.0]) < 0.1
-    assert feet[0, 1] < feet[1, 1], "facing -x, the left foot is on the side of -y"
 
 
 def test_sitting_is_on_the_chair() -> None:

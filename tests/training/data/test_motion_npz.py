@@ -113,8 +113,3 @@ def test_amass_rest_pose_stands_upright_facing_where_it_is_turned() -> None:
 def test_what_amass_would_not_hold_is_refused_in_words(arrays: dict[str, Any], message: str) -> None:
     with pytest.raises(MotionError, match=message):
         read_amass(as_file(**arrays))
-
-
-def test_what_is_no_npz_is_refused_in_words() -> None:
-    with pytest.raises(MotionError, match=r"expected an \.npz"):
-        read_amass(io.BytesIO(b"nothing of the kind"))

@@ -273,18 +273,6 @@ def test_what_only_measures_trains_no_weights_whatever_the_file_says(tmp_path: P
     assert len(MotionSet.load(path, "research", "train").positions) == 110
 
 
-def test_what_research_weights_are_validated_on_tests_nobody(tmp_path: Path) -> None:
-    """One session's walks were half of the test split."""
-    parts = [p for n in (40, 50, 60) for p in prepare_clip(a_clip(standing(n)), "default", "train")]
-    first, second, third = (p for p in parts if isinstance(p, Prepared))
-    path = tmp_path / "prepared.npz"
-    write_prepared([first, replace(second, split="test"), replace(third, weights="research", split="val")], path)
-    assert len(MotionSet.load(path, "default", "test").positions) == 50
-    with pytest.raises(MotionError, match="no clip of split 'val'"):
-        MotionSet.load(path, "default", "val")
-    assert len(MotionSet.load(path, "research", "val").positions) == 60
-
-
 def test_people_are_the_same_in_all_files_of_a_source(tmp_path: Path) -> None:
     clips = [
         replace(a_clip(standing(40)), source=source, subject="02") for source in ("CMU (AMC)", "CMU (BVH)", "Other")

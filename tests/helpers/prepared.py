@@ -1,0 +1,37 @@
+"""A file as `steadypose prepare` writes it, of motion made by a test."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from steadypose.prior.body.skeleton import REST_OFFSETS
+
+
+def write_motion(
+    path: Path,
+    clips: Sequence[np.ndarray],
+    split: Sequence[str],
+    root_rotations: np.ndarray | None = None,
+    flat: Sequence[bool] | None = None,
+) -> Path:
+    """Clips (T, 22, 3) metres, z up, of the rest skeleton, with root rotations (N, 4) xyzw; returns ``path``."""
+    positions = np.concatenate(clips).astype(np.float32)
+    rotations = np.tile(np.array([0, 0, 0, 1], dtype=np.float32), (len(positions), 22, 1))
+    if root_rotations is not None:
+        rotations[:, 0] = root_rotations
+    same = {"set": "default", "subject": "somebody", "source": "synthetic", "action": "moving"}
+    np.savez(
+        path,
+        positions=positions,
+        rotations=rotations,
+        offsets=np.repeat(REST_OFFSETS[None], len(clips), axis=0).astype(np.float32),
+        contacts=np.zeros((len(positions), 8), dtype=bool),
+        clip_start=np.cumsum([0, *map(len, clips)]),
+        split=np.array(split),
+        flat=np.ones(len(clips), dtype=bool) if flat is None else np.array(flat),
+        **{name: np.array([value] * len(clips)) for name, value in same.items()},
+    )
+    return path
