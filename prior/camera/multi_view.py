@@ -41,7 +41,7 @@ MAX_BODIES = 16
 
 
 @dataclass(frozen=True)
-class Sightings:
+class CameraFrame:
     """The bodies in one frame of one camera.
 
     Attributes:
@@ -72,14 +72,14 @@ class Merge:
         self._reset()
 
     def _reset(self) -> None:
-        self._last: dict[str, Sightings] = {}
-        self._waiting: dict[int, list[Sightings]] = {}
+        self._last: dict[str, CameraFrame] = {}
+        self._waiting: dict[int, list[CameraFrame]] = {}
         self._given_ns = -1
         self._late = 0
 
     def update(self, raw: PoseRaw) -> list[PoseRaw]:
         """Take a camera's message; returns the merged messages that it completes, oldest first."""
-        seen = self._sightings(raw)
+        seen = self._frame(raw)
         if seen is None:
             return []
         before = self._last.get(raw.source)
@@ -98,7 +98,7 @@ class Merge:
                 self._waiting.setdefault(tick, []).append(_interpolated(before, seen, tick))
         return self._complete()
 
-    def _sightings(self, raw: PoseRaw) -> Sightings | None:
+    def _frame(self, raw: PoseRaw) -> CameraFrame | None:
         """A message's bodies in the world; None if it cannot be used."""
         skeleton, place = SKELETONS.get(raw.skeleton), raw.sensor_pose
         unit = abs(float(np.linalg.norm(place.orientation)) - 1.0) < 0.01
@@ -115,7 +115,7 @@ class Merge:
             trust = np.array([body.confidence for body in bodies], np.float64).reshape(joints.shape[:2])
             joints, trust = to_canonical(skeleton, joints, np.clip(np.nan_to_num(trust), 0.0, 1.0))
             turn = Rotation.from_quat(place.orientation).as_matrix()
-            return Sightings(raw.stamp_ns, joints @ turn.T + place.position, trust, place.position)
+            return CameraFrame(raw.stamp_ns, joints @ turn.T + place.position, trust, place.position)
         return None
 
     def _complete(self) -> list[PoseRaw]:
@@ -129,13 +129,13 @@ class Merge:
             self._given_ns = tick
         return merged
 
-    def _message(self, stamp_ns: int, views: list[Sightings]) -> PoseRaw:
+    def _message(self, stamp_ns: int, views: list[CameraFrame]) -> PoseRaw:
         bodies = [RawBody(k, *merge_joints(group)) for k, group in enumerate(match_views(views))]
         return PoseRaw(stamp_ns, FRAME_ID, SOURCE, CANONICAL.name, Pose.identity(), True, bodies)
 
 
 @dataclass(frozen=True)
-class Sighting:
+class CameraBody:
     """One body as one camera sees it.
 
     Attributes:
@@ -149,19 +149,19 @@ class Sighting:
     eye: Floats
 
 
-def match_views(views: list[Sightings]) -> list[list[Sighting]]:
+def match_views(views: list[CameraFrame]) -> list[list[CameraBody]]:
     """The bodies of several cameras at one moment, one list of observations for each body."""
-    groups: list[list[Sighting]] = []
+    groups: list[list[CameraBody]] = []
     for view in sorted(views, key=lambda view: -len(view.joints)):
-        own = [Sighting(j, c, view.eye) for j, c in zip(view.joints, view.confidence, strict=True)]
+        own = [CameraBody(j, c, view.eye) for j, c in zip(view.joints, view.confidence, strict=True)]
         # a body is where the camera that has it first sees it
         firsts = np.array([group[0].joints for group in groups]).reshape(-1, 22, 3)
         pairs = {body: group for group, body in match_bodies(firsts, view.joints)}
-        for body, sighting in enumerate(own):
+        for body, observed in enumerate(own):
             if body in pairs:
-                groups[pairs[body]].append(sighting)
+                groups[pairs[body]].append(observed)
             else:
-                groups.append([sighting])
+                groups.append([observed])
     return groups
 
 
@@ -176,15 +176,15 @@ def match_bodies(some: Floats, others: Floats) -> list[tuple[int, int]]:
     return [(int(r), int(c)) for r, c in zip(rows, columns, strict=True) if near[r, c]]
 
 
-def merge_joints(sightings: list[Sighting]) -> tuple[Floats, Floats]:
+def merge_joints(bodies: list[CameraBody]) -> tuple[Floats, Floats]:
     """Joints (22, 3) and their confidence (22,) of a body that several cameras see.
 
     The precision of an observation, up to a factor, is ``c² / d² (I + (1 / ALONG² - 1) r rᵀ)`` for confidence c,
     distance d and line of sight r; the confidence that all were wrong is the product.
     """
-    joints = np.array([sighting.joints for sighting in sightings])
-    confidence = np.array([sighting.confidence for sighting in sightings])
-    ray = joints - np.array([sighting.eye for sighting in sightings])[:, None]
+    joints = np.array([observed.joints for observed in bodies])
+    confidence = np.array([observed.confidence for observed in bodies])
+    ray = joints - np.array([observed.eye for observed in bodies])[:, None]
     reach = np.maximum(np.linalg.norm(ray, axis=-1), 0.1)
     seen = finite_joints(joints) & (confidence > 0)
     weight = np.where(seen, (confidence / np.where(seen, reach, 1.0)) ** 2, 0.0)
@@ -208,7 +208,7 @@ def _ticks(after_ns: int, until_ns: int) -> range:
     return range((after_ns // PERIOD_NS + 1) * PERIOD_NS, until_ns + 1, PERIOD_NS)
 
 
-def _interpolated(before: Sightings | None, after: Sightings, tick: int) -> Sightings:
+def _interpolated(before: CameraFrame | None, after: CameraFrame, tick: int) -> CameraFrame:
     """What a camera saw at a moment between two of its pictures; bodies of the later one where there is no earlier."""
     joints, confidence = after.joints.copy(), after.confidence.copy()
     if before:
@@ -217,4 +217,4 @@ def _interpolated(before: Sightings | None, after: Sightings, tick: int) -> Sigh
             joints[later] += (1.0 - share) * (before.joints[earlier] - joints[later])
             confidence[later] = np.minimum(before.confidence[earlier], confidence[later])
     confidence[~finite_joints(joints)] = 0.0
-    return Sightings(tick, joints, confidence, after.eye)
+    return CameraFrame(tick, joints, confidence, after.eye)

@@ -33,7 +33,7 @@ mean squares reach 135 mm."""
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Uncertainty of the completer's answers, as found on validation people.
+    """Uncertainty of the completer's output, as found on validation people.
 
     Attributes:
         never: (22,) metres along an axis, standard deviation of each joint that is known in no frame.

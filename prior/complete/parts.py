@@ -1,7 +1,7 @@
 """The completer blended with HG-VAE's completion where parts of a body are hidden: that was trained longer on these,
 but not on gaps in time.
 
-Where some joints of a frame are known and others not, the answer lies between the two; rotations are solved anew.
+Where some joints of a frame are known and others not, the result lies between the two; rotations are solved anew.
 """
 
 from __future__ import annotations

@@ -39,8 +39,8 @@ def velocities(network: LiveRootVelocity, joints: Floats, root_rotations: Floats
     """
     turn = yaw_matrix(heading(root_rotations))
     rows = np.maximum(np.arange(len(joints))[:, None] + np.arange(1 - network.config.context, 1), 0)
-    answer = network(joints[rows] @ turn[:, None])
-    return (turn @ answer.velocity[..., None].astype(np.float64))[..., 0]
+    predicted = network(joints[rows] @ turn[:, None])
+    return (turn @ predicted.velocity[..., None].astype(np.float64))[..., 0]
 
 
 def root_path(network: LiveRootVelocity, joints: Floats, root_rotations: Floats) -> Floats:

@@ -25,7 +25,7 @@ class View(NamedTuple):
 
     Attributes:
         start: its first frame.
-        weight: (frames,) of its answer, beside those of the windows that overlap it.
+        weight: (frames,) of its output, beside those of the windows that overlap it.
     """
 
     start: int

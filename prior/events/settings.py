@@ -20,7 +20,7 @@ class EventSettings:
     hold: float = 0.07
     """seconds for which a condition holds before it begins or ends"""
     entered: float = 0.15
-    """seconds for which a body is followed before it has entered, and any of its events is told"""
+    """seconds for which a body is followed before it has entered, and any of its events is published"""
     left: float = 0.2
     """seconds after which a body that is no longer followed has left"""
     near: float = 1.2

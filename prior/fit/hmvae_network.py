@@ -168,7 +168,7 @@ class MotionVAE(nn.Module, ABC):
         """What `placed` makes windows of, (B, T, 22, 6), of z_l (B, edges, d) and z_g (B, edges, d)."""
 
     def placed(self, decoded: Tensor, x: Tensor) -> Tensor:
-        """Windows (B, T, 22, 6) of `decode`'s answer, where that is about something observed in windows x."""
+        """Windows (B, T, 22, 6) of `decode`'s output, where that is about something observed in windows x."""
         return decoded
 
     def reconstruct(self, x: Tensor) -> Tensor:

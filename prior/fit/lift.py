@@ -99,11 +99,11 @@ def lift(pixels: Floats, camera: Pinhole, points: Floats) -> Floats:
         off[~(far > 0)[None] | ~np.isfinite(off)] = np.inf
         order = np.argsort(off, axis=1)[:, :_NEAREST]
         beside = np.take_along_axis(off, order, axis=1) < _REACH
-        told = beside.any(axis=1)
-        if not told.any():
+        known = beside.any(axis=1)
+        if not known.any():
             continue
-        z = np.nanmedian(np.where(beside, far[order], np.nan)[told], axis=1) + _FLESH[told]
-        found[row, told] = np.concatenate([keys[told], np.ones((len(z), 1))], axis=1) * z[:, None]
+        z = np.nanmedian(np.where(beside, far[order], np.nan)[known], axis=1) + _FLESH[known]
+        found[row, known] = np.concatenate([keys[known], np.ones((len(z), 1))], axis=1) * z[:, None]
     return found @ rotation.T + position
 
 

@@ -1,7 +1,7 @@
 """Motion by search through HM-VAE (section 4, equations 14 and 15): latent vectors first, then the decoder too.
 
-The paper starts from random latent vectors; here they are those of the completer's answer. Unlike the official code,
-losses are means over what is known only, the best iterate is kept and not the last, and the answer meets what is known
+The paper starts from random latent vectors; here they are those of the completer's output. Unlike the official code,
+losses are means over what is known only, the best iterate is kept and not the last, and the output meets what is known
 without a step, where the official one overwrites key frames. It needs torch.
 """
 
@@ -72,12 +72,12 @@ class _Known:
 
 
 class Optimiser:
-    """Completes windows as `PartsCompleter` does, by search from its answer.
+    """Completes windows as `PartsCompleter` does, by search from its output.
 
     Args:
         model: whose windows are searched.
         completer: of the initial motion, and of the root.
-        seed: of random initial latent vectors, as in the paper; None: those of the completer's answer.
+        seed: of random initial latent vectors, as in the paper; None: those of the completer's output.
     """
 
     def __init__(self, model: HMVAE, completer: PartsCompleter, seed: int | None = None) -> None:

@@ -66,12 +66,12 @@ class SmplShape:
             except ValueError as error:  # of pickled objects, such as sparse matrices
                 raise MotionError(f"{path}: expected arrays of numbers: {error}") from error
         joints = len(PARENTS)
-        told = f"v_template {vertices.shape}, shapedirs {shapes.shape}, J_regressor {regressor.shape}"
+        got = f"v_template {vertices.shape}, shapedirs {shapes.shape}, J_regressor {regressor.shape}"
         if (
             vertices.shape[1:] != (3,) or shapes.shape[:-1] != vertices.shape or not shapes.shape[-1]
             or regressor.ndim != 2 or regressor.shape[1] != len(vertices) or len(regressor) < joints
         ):  # fmt: skip
-            raise MotionError(f"{path}: expected (V, 3), (V, 3, betas) and ({joints} or more, V), got {told}")
+            raise MotionError(f"{path}: expected (V, 3), (V, 3, betas) and ({joints} or more, V), got {got}")
         if tree.ndim != 2 or tree.shape[1] < joints or tuple(tree[0, 1:joints]) != PARENTS[1:]:
             raise MotionError(f"{path}: kintree_table: expected SMPL's joints, whose first {joints} have known parents")
         regressor = regressor[:joints]
@@ -151,18 +151,18 @@ def smpl_motion(shape: SmplShape, joints: Floats, lengths: Floats) -> SmplMotion
 
     def closure() -> torch.Tensor:
         optimiser.zero_grad()
-        beta, turns, _, said = posed()
+        beta, turns, _, reached = posed()
         # bones of another model are off alike in all frames: together these say of betas what one says
         energy = len(target) * beta.square().sum() + (turns / TURN_SIGMA).square().sum()
-        energy = energy + ((said - target) / JOINT_SIGMA).square().sum()
+        energy = energy + ((reached - target) / JOINT_SIGMA).square().sum()
         energy.backward()
         return energy
 
     optimiser.step(closure)
     with torch.no_grad():
-        beta, _, rotations, said = (values.double().numpy() for values in posed())
-    return SmplMotion(_poses(rotations), _padded(beta, BETAS), said[:, 0] - _own_axes(shape.joints(beta)[0]),
-                      shape.gender, said)  # fmt: skip
+        beta, _, rotations, reached = (values.double().numpy() for values in posed())
+    return SmplMotion(_poses(rotations), _padded(beta, BETAS), reached[:, 0] - _own_axes(shape.joints(beta)[0]),
+                      shape.gender, reached)  # fmt: skip
 
 
 def _poses(rotations: Floats) -> Floats:

@@ -33,7 +33,7 @@ def fit_legs(positions: Floats, sigma: Floats, bone_lengths: NDArray[np.floating
     """Hips, knees, ankles and toes, moved towards the lengths of the bones between them; (22, 3) metres.
 
     Each by as much as it is uncertain, and all by as much as the lengths are known: constraints with compliance (XPBD,
-    Macklin et al. 2016), whose converged answer is the most likely one.
+    Macklin et al. 2016), whose converged result is the most likely one.
 
     Args:
         positions: (22, 3) metres; NaN where not known.

@@ -2,7 +2,7 @@
 
 A sensor's error of one foot's height lasts, so that no filter of that foot alone can estimate it; that a foot stands on
 the floor, at the height at which this person's feet stand, is another measurement of the same height. It is taken at
-publication, not by the filter: a lasting error taken anew each frame would be trusted ever more.
+publication, not by the filter: a bias taken anew each frame would be trusted ever more.
 
 While a foot stands, the filter learns better and better where, so that its estimate creeps. What is published of it
 stays: half a standard deviation more adds a tenth to an estimate's error.

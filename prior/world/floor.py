@@ -164,7 +164,7 @@ class Floor:
         Args:
             sole: (3,) metres, world: the joint, less its height above the sole.
             sigma: metres, of the height.
-            dt: seconds for which this foot has stood since it last told.
+            dt: seconds for which this foot has stood since it was last taken.
         """
         height = float(sole[2])
         if not self.known:
@@ -174,17 +174,17 @@ class Floor:
             level.idle_s += dt
         self._levels = [level for level in self._levels if level.idle_s < FORGOTTEN_S]
         self._variance += CREEP**2 * dt
-        surprise = (height - self._height) / math.sqrt(self._variance + sigma**2)
-        if surprise > GATE and height - self._height > STEP_M:
+        sigmas_off = (height - self._height) / math.sqrt(self._variance + sigma**2)
+        if sigmas_off > GATE and height - self._height > STEP_M:
             self._observe_level(sole, sigma, dt)
-        if surprise > GATE:
+        if sigmas_off > GATE:
             self._elsewhere_s += dt
             if self._elsewhere_s > PATIENCE_S and not self._calibrated:
                 self._height, self._variance, self._elsewhere_s = height, GUESS_SIGMA**2, 0.0
                 self._levels = [level for level in self._levels if level.height > height + STEP_M]
             return
         self._elsewhere_s = 0.0
-        if surprise < -GATE:
+        if sigmas_off < -GATE:
             self._variance = max(self._variance, sigma**2)
         gain = self._variance / (self._variance + sigma**2 * max(MEMORY_S / dt, 1.0))
         self._height += gain * (height - self._height)

@@ -27,7 +27,7 @@ MAX_SOURCES = 64
 
 
 class TrajectoryPipeline:
-    """Turns ``pose/clean`` into ``pose/world``, message by message; the same messages give the same answers.
+    """Turns ``pose/clean`` into ``pose/world``, message by message; the same messages give the same output.
 
     Attributes:
         counters: messages and bodies refused, and sources forgotten, by cause.

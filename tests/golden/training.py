@@ -61,6 +61,7 @@ FEW: tuple[tuple[Any, str, Any], ...] = (
     (hgvae_faults, "WINDOWS", 10),
     (humor, "_STATES_OF_MIXTURE", 2_000),
     (occlusion, "RECORDED", {"train": 1, "val": 1}),
+    (sensor_bias, "EVALUATIONS", 1),
 )
 """What takes minutes before or after the steps, made small."""
 

@@ -95,7 +95,7 @@ class MotionSet:
     @cached_property
     def person(self) -> NDArray[np.str_]:
         """(C,) who moves, by one name in all files of a source."""
-        return np.array([person_of(*told) for told in zip(self.source, self.subject, strict=True)], dtype=np.str_)
+        return np.array([person_of(*who) for who in zip(self.source, self.subject, strict=True)], dtype=np.str_)
 
     @property
     def hours(self) -> float:
@@ -115,7 +115,7 @@ class MotionSet:
         return MotionSet(
             self.rotations[frames], self.positions[frames], self.offsets[frames], self.contacts[frames],
             np.concatenate([[0], np.cumsum(lengths)]),
-            *(told[clips] if len(told) else told for told in (self.subject, self.action, self.source)),
+            *(names[clips] if len(names) else names for names in (self.subject, self.action, self.source)),
         )  # fmt: skip
 
     def sample(
@@ -145,7 +145,7 @@ class LivelyWindows:
     of ten exercises would outweigh all others.
 
     Args:
-        motion: of clips; where their sources are not told, they count as one.
+        motion: of clips; where their sources are not given, they count as one.
     """
 
     def __init__(self, motion: MotionSet) -> None:

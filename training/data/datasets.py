@@ -85,8 +85,8 @@ def _repeat(name: str, source: str) -> Dropped:
     return Dropped(name, source, "repeats another", f"the same recording as {REPEATS[name]}")
 
 
-class _Told(NamedTuple):
-    """What the path of a recording tells, and its skeleton."""
+class _Origin(NamedTuple):
+    """What the path of a recording, and its skeleton, say of its origin."""
 
     name: str
     subject: str
@@ -94,7 +94,7 @@ class _Told(NamedTuple):
 
 
 def _bvh_reader(
-    source: str, licence: str, tell: Callable[[str, Bvh], _Told]
+    source: str, licence: str, origin_of: Callable[[str, Bvh], _Origin]
 ) -> Callable[[Path, Progress], Iterator[Clip | Dropped]]:
     """Reads the BVH files of an archive or folder."""
 
@@ -108,50 +108,50 @@ def _bvh_reader(
             except MotionError as error:
                 yield Dropped(name, source, UNREADABLE, str(error))
                 continue
-            told = tell(name, bvh)
-            if told.name in REPEATS:
-                yield _repeat(told.name, source)
+            origin = origin_of(name, bvh)
+            if origin.name in REPEATS:
+                yield _repeat(origin.name, source)
                 continue
-            yield Clip(told.name, source, licence, told.subject, told.action, bvh.fps, skeleton, positions)
+            yield Clip(origin.name, source, licence, origin.subject, origin.action, bvh.fps, skeleton, positions)
 
     return read
 
 
-def _tell_cmu(name: str, _bvh: Bvh) -> _Told:
+def _origin_cmu(name: str, _bvh: Bvh) -> _Origin:
     subject = stem_of(name).split("_")[0][-2:]
-    return _Told(stem_of(name), subject, CMU_ACTIONS.get(subject, ""))
+    return _Origin(stem_of(name), subject, CMU_ACTIONS.get(subject, ""))
 
 
-def _tell_cmu_more(name: str, _bvh: Bvh) -> _Told:
-    return _Told(stem_of(name), stem_of(name).split("_")[0])
+def _origin_cmu_more(name: str, _bvh: Bvh) -> _Origin:
+    return _Origin(stem_of(name), stem_of(name).split("_")[0])
 
 
-def _tell_kind(name: str, _bvh: Bvh) -> _Told:
-    """All stand on one skeleton; who dances is not told, but no one of one kind is in another."""
+def _origin_kind(name: str, _bvh: Bvh) -> _Origin:
+    """All stand on one skeleton; who dances is not given, but no one of one kind is in another."""
     kind = PurePosixPath(name).parent.name
-    return _Told(f"{kind}_{stem_of(name)}", kind, kind)
+    return _Origin(f"{kind}_{stem_of(name)}", kind, kind)
 
 
-def _tell_reactidle(name: str, _bvh: Bvh) -> _Told:
+def _origin_reactidle(name: str, _bvh: Bvh) -> _Origin:
     subject, _, kind = stem_of(name).partition("_")
-    return _Told(stem_of(name), subject, f"idle, {kind}")
+    return _Origin(stem_of(name), subject, f"idle, {kind}")
 
 
-def _tell_bandai(name: str, bvh: Bvh) -> _Told:
+def _origin_bandai(name: str, bvh: Bvh) -> _Origin:
     """All bones have been retargeted to one body; the place of the hips in the rest pose differs by session."""
     session = " ".join(f"{v:.1f}" for v in bvh.offsets[bvh.joints.index("Hips")])
-    return _Told(stem_of(name), session, " ".join(stem_of(name).split("_")[1:-1]))
+    return _Origin(stem_of(name), session, " ".join(stem_of(name).split("_")[1:-1]))
 
 
-def _tell_dancedb(name: str, _bvh: Bvh) -> _Told:
+def _origin_dancedb(name: str, _bvh: Bvh) -> _Origin:
     stem = stem_of(name).removesuffix("-BVH")
     subject, _, emotion = stem.partition("_")
-    return _Told(stem, subject, emotion.split("_")[0].lower())
+    return _Origin(stem, subject, emotion.split("_")[0].lower())
 
 
-def _tell_lafan1(name: str, _bvh: Bvh) -> _Told:
+def _origin_lafan1(name: str, _bvh: Bvh) -> _Origin:
     action, _, subject = stem_of(name).rpartition("_")
-    return _Told(stem_of(name), subject, action.rstrip("0123456789"))
+    return _Origin(stem_of(name), subject, action.rstrip("0123456789"))
 
 
 def _read_cmu_expmap(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
@@ -169,8 +169,8 @@ def _read_cmu_expmap(path: Path, progress: Progress) -> Iterator[Clip | Dropped]
 
 def _read_amass(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
     for clip in read_own(path, progress):
-        told = {"source": "AMASS", "licence": "AMASS: non-commercial"}
-        yield replace(clip, **told) if isinstance(clip, Clip) else replace(clip, source=told["source"])
+        known = {"source": "AMASS", "licence": "AMASS: non-commercial"}
+        yield replace(clip, **known) if isinstance(clip, Clip) else replace(clip, source=known["source"])
 
 
 def _read_ui_prmd(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
@@ -220,20 +220,20 @@ DATA_SETS: tuple[DataSet, ...] = (
         lambda clip: _held_out(clip.subject in CMU_VALIDATION),
     ),
     DataSet(
-        "CMU (BVH)", r"cmu_bvh\b.*", "default", _bvh_reader("CMU (BVH)", CMU_LICENCE, _tell_cmu),
+        "CMU (BVH)", r"cmu_bvh\b.*", "default", _bvh_reader("CMU (BVH)", CMU_LICENCE, _origin_cmu),
         lambda _: "train",
     ),
     DataSet("CMU (expmap)", r"cmu_expmap\b.*", "default", _read_cmu_expmap, lambda _: "train"),
     DataSet(
-        "CMU (more)", r"cmu_more\b.*", "default", _bvh_reader("CMU (more)", CMU_LICENCE, _tell_cmu_more),
+        "CMU (more)", r"cmu_more\b.*", "default", _bvh_reader("CMU (more)", CMU_LICENCE, _origin_cmu_more),
         lambda _: "train",
     ),
     DataSet(
-        "CMU (dance)", r"cmu_dance\b.*", "default", _bvh_reader("CMU (dance)", CMU_LICENCE, _tell_kind),
+        "CMU (dance)", r"cmu_dance\b.*", "default", _bvh_reader("CMU (dance)", CMU_LICENCE, _origin_kind),
         lambda clip: "train" if clip.subject in DANCE_TRAINING else "test",
     ),
     DataSet(
-        "ReActIdle", r"reactidle\b.*", "default", _bvh_reader("ReActIdle", "MIT", _tell_reactidle),
+        "ReActIdle", r"reactidle\b.*", "default", _bvh_reader("ReActIdle", "MIT", _origin_reactidle),
         lambda clip: _held_out(clip.subject in REACTIDLE_VALIDATION),
     ),
     DataSet(
@@ -241,7 +241,7 @@ DATA_SETS: tuple[DataSet, ...] = (
         lambda clip: _held_out(clip.subject in VALIDATION_SUBJECTS),
     ),
     DataSet(
-        "Bandai-Namco", r"bandai_\d\b.*", "research", _bvh_reader("Bandai-Namco", "CC-BY-NC-4.0", _tell_bandai),
+        "Bandai-Namco", r"bandai_\d\b.*", "research", _bvh_reader("Bandai-Namco", "CC-BY-NC-4.0", _origin_bandai),
         lambda clip: _held_out(clip.subject == BANDAI_VALIDATION),
     ),
     DataSet(
@@ -249,11 +249,11 @@ DATA_SETS: tuple[DataSet, ...] = (
         lambda clip: _held_out(not AMASS_VALIDATION.isdisjoint(PurePosixPath(clip.name).parts)),
     ),
     DataSet(
-        "DanceDB", r"dancedb\b.*", "measure", _bvh_reader("DanceDB", "DanceDB: research", _tell_dancedb),
+        "DanceDB", r"dancedb\b.*", "measure", _bvh_reader("DanceDB", "DanceDB: research", _origin_dancedb),
         lambda clip: "val" if clip.subject in DANCEDB_VALIDATION else "test",
     ),
     DataSet(
-        "LAFAN1", r"lafan1\b.*", "measure", _bvh_reader("LAFAN1", "CC-BY-NC-ND-4.0", _tell_lafan1),
+        "LAFAN1", r"lafan1\b.*", "measure", _bvh_reader("LAFAN1", "CC-BY-NC-ND-4.0", _origin_lafan1),
         lambda clip: "val" if clip.subject == LAFAN1_VALIDATION else "test",
     ),
     DataSet(

@@ -48,7 +48,7 @@ class Dropped:
 
 
 Progress = Callable[[float], None]
-"""Told how much of a file, 0 to 1, has been read."""
+"""Called with the share of a file, 0 to 1, that has been read."""
 
 
 def members(path: Path, suffixes: tuple[str, ...], progress: Progress) -> Iterator[tuple[str, bytes]]:
@@ -157,7 +157,7 @@ def read_own(path: Path, progress: Progress, description: Description = UNDESCRI
 
     Args:
         path: of these.
-        progress: told how much is read.
+        progress: called with the share that is read.
         description: what the files do not say.
     """
     for name, content in members(path, SUFFIXES, progress):

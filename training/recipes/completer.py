@@ -244,7 +244,7 @@ def _anchored(values: Tensor, line: Line, tracks: slice) -> Tensor:
     return values - torch.where(ever, torch.lerp(at(line.before), at(line.after), weight), 0.0)
 
 
-def answer(model: Completer, window: Window) -> tuple[Tensor, Tensor]:
+def predict(model: Completer, window: Window) -> tuple[Tensor, Tensor]:
     """Local rotations (B, T, 22, 3, 3) and root (B, T, 3), metres, in the window's frame, with gradients."""
     line = window.line
     with torch.autocast("cpu", torch.bfloat16, enabled=model.training):
@@ -262,7 +262,7 @@ def answer(model: Completer, window: Window) -> tuple[Tensor, Tensor]:
 def loss(model: Completer, truth: Truth, known: Bools, rng: Rng) -> tuple[Tensor, dict[str, float]]:
     """Absolute errors where something was hidden, weighted by window (`EASY`); and its terms by name."""
     window = truth.seen(known, model.usual, rng)
-    rotations, root = answer(model, window)
+    rotations, root = predict(model, window)
     true, true_root = truth.in_frame_of(window)
     joints, turned = forward_kinematics(torch.stack([rotations, true]), truth.offsets[:, None])
     hidden = torch.from_numpy(~known)
@@ -355,7 +355,9 @@ def calibrate(model: Completer, motion: MotionSet, windows: int = 128) -> Comple
 def _errors(
     model: Completer, motion: MotionSet, known: Bools, windows: int, *, squared: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """(T, 22) mean distances of joints from the truth, metres, or their mean squares: of the answer, and the line."""
+    """(T, 22) mean distances of joints from the truth, metres, or their mean squares: of the prediction and the
+    line.
+    """
     rows = motion.all_windows(len(known), step=5)
     rows = rows[np.linspace(0, len(rows) - 1, windows).astype(int)]
     truth = Truth.of(motion, rows)
@@ -368,4 +370,4 @@ def _errors(
         return (off.square() if squared else off).mean(dim=0)
 
     base = torch.from_numpy(window.rotations).float(), torch.from_numpy(window.root).float()
-    return error(*answer(model, window)), error(*base)
+    return error(*predict(model, window)), error(*base)

@@ -159,10 +159,10 @@ def _smoothed(motion: MotionSet, first: NDArray[np.int64], rng: Rng) -> tuple[ND
     truth *= rng.uniform(*SCALES, (len(rows), 1, 1, 1))
     delay = int(rng.choice(DELAYS))
     smoother, seen = MixtureSmoother(delay, len(rows)), truth + _errors(truth.shape, rng)
-    answers = [smoother.update(seen[:, t], t / FPS) for t in range(FRAMES)]
-    kept = [answer for answer in answers if answer is not None]
-    positions = np.stack([answer.positions for answer in kept], axis=1)
-    sigma = np.stack([answer.sigma for answer in kept], axis=1)
+    estimates = [smoother.update(seen[:, t], t / FPS) for t in range(FRAMES)]
+    kept = [estimate for estimate in estimates if estimate is not None]
+    positions = np.stack([estimate.positions for estimate in kept], axis=1)
+    sigma = np.stack([estimate.sigma for estimate in kept], axis=1)
     positions, sigma = (_to_length(values) for values in (positions, sigma))
     load, rest = (np.stack([label_contacts(clip, FPS, speed) for clip in truth]) for speed in (LOAD_SPEED, REST_SPEED))
     return positions.astype(np.float32), sigma.astype(np.float32), yaw.astype(np.float32), load, rest
@@ -175,7 +175,7 @@ def _to_length(values: Floats) -> Floats:
 
 
 def _errors(shape: tuple[int, ...], rng: Rng) -> Floats:
-    """(C, T, 22, 3) metres, of as many sensors as clips: from frame to frame, lasting, and of the whole body."""
+    """(C, T, 22, 3) metres, of as many sensors as clips: jitter, time-correlated noise, and that of the whole body."""
     count, frames, joints, _ = shape
     of_clip = (count, 1, 1, 1)
     by_joint = np.exp(0.4 * rng.standard_normal((count, 1, joints, 1)))
@@ -183,8 +183,8 @@ def _errors(shape: tuple[int, ...], rng: Rng) -> Floats:
     slow = 10 ** rng.uniform(-3.0, -1.5, of_clip) * by_joint * (rng.random(of_clip) < 0.6)
     whole = 10 ** rng.uniform(-3.0, -1.7, of_clip) * (rng.random(of_clip) < 0.4)
     memory = rng.uniform(0.8, 0.98, of_clip[:1])[:, None, None]
-    lasting = rng.standard_normal(shape) * slow + rng.standard_normal((count, frames, 1, 3)) * whole
-    return time_correlated(lasting, memory, axis=1) + fast * rng.standard_normal(shape)
+    bias = rng.standard_normal(shape) * slow + rng.standard_normal((count, frames, 1, 3)) * whole
+    return time_correlated(bias, memory, axis=1) + fast * rng.standard_normal(shape)
 
 
 def draw(pool: Pool, clips: NDArray[np.int64], rng: Rng) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -209,12 +209,12 @@ def draw(pool: Pool, clips: NDArray[np.int64], rng: Rng) -> tuple[Tensor, Tensor
         rows(positions[:, 1:]), rows(positions[:, :-1]), 1.0 / FPS, rows(yaw[:, 1:]), rows(pool.sigma[clips][:, 1:]),
         of_frames(root_seen), of_frames(ground),
     )  # fmt: skip
-    answered = np.isfinite(pool.sigma[clips][:, 1:, :1])
-    load, rest, counts = pool.load[clips][:, 1:], pool.rest[clips][:, 1:], answered
+    estimated = np.isfinite(pool.sigma[clips][:, 1:, :1])
+    load, rest, counts = pool.load[clips][:, 1:], pool.rest[clips][:, 1:], estimated
     counts = np.repeat(counts, load.shape[-1], axis=-1)
     counts[alone, :, : _FEET.start] = counts[alone, :, _FEET.stop :] = False
-    told = torch.from_numpy(np.nan_to_num(features)).reshape(count, frames - 1, FEATURES)
-    return told, _tensor(load), _tensor(rest), _tensor(counts)
+    inputs = torch.from_numpy(np.nan_to_num(features)).reshape(count, frames - 1, FEATURES)
+    return inputs, _tensor(load), _tensor(rest), _tensor(counts)
 
 
 def _tensor(values: NDArray[Any]) -> Tensor:
@@ -262,7 +262,7 @@ def evaluate_contacts(model: ContactNet, pool: Pool) -> dict[str, float]:
     features, *labels, counts = draw(pool, np.arange(len(pool.yaw)), np.random.default_rng(0))
     counted = counts[..., _FEET] > 0
     found = {}
-    for name, said, label in zip(("load", "rest"), model(features), labels, strict=True):
-        yes, true = said[..., _FEET][counted] > 0, label[..., _FEET][counted] > 0.5
+    for name, logits, label in zip(("load", "rest"), model(features), labels, strict=True):
+        yes, true = logits[..., _FEET][counted] > 0, label[..., _FEET][counted] > 0.5
         found[f"val {name} F1"] = float(2 * (yes & true).sum() / (yes.sum() + true.sum()))
     return found

@@ -79,7 +79,7 @@ somebody is built or holds a limb is no fault."""
 FAULT_SHARE = 0.6
 """share of the windows that has a fault"""
 REPEATED = 0.15
-"""share of the windows in which a tracker repeats its last answer for some joints"""
+"""share of the windows in which a tracker repeats its last output for some joints"""
 
 
 def train_anomaly(path: Path, iterations: int, options: TrainingOptions) -> None:
@@ -126,12 +126,12 @@ def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: Rn
     clean, sizes = windows.draw(count, model.config.frames, rng, STRIDES)
     clean = vary_builds(clean, BONE_SIGMA, TURN_SIGMA, rng)
     sigma = np.exp(rng.uniform(np.log(SENSOR_SIGMAS[0]), np.log(SENSOR_SIGMAS[-1]), count))
-    spoilt = with_faults(clean, FAULTS, FAULT_SHARE, rng)
-    fast = rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.8)  # some sensors smooth what they say
-    answered = with_drifting_error(spoilt, sigma, rng, fast)
-    seen = with_faults(answered, (repeats,), REPEATED, rng)
-    astray = np.sqrt(((spoilt - clean + seen - answered)[:, -RECENT:] ** 2).mean(axis=(1, 3)))
-    repeated = (seen != answered)[:, -RECENT:].any(axis=-1).mean(axis=1)
+    faulty = with_faults(clean, FAULTS, FAULT_SHARE, rng)
+    fast = rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.8)  # some sensors smooth their output
+    noisy = with_drifting_error(faulty, sigma, rng, fast)
+    seen = with_faults(noisy, (repeats,), REPEATED, rng)
+    astray = np.sqrt(((faulty - clean + seen - noisy)[:, -RECENT:] ** 2).mean(axis=(1, 3)))
+    repeated = (seen != noisy)[:, -RECENT:].any(axis=-1).mean(axis=1)
     lost = (repeated > 0.5) & (sigma * np.sqrt(fast) > MIN_NOISE)[:, None]
     lacking = rng.random(count)
     for k in np.flatnonzero(lacking < 0.7):
@@ -143,8 +143,8 @@ def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: Rn
     clear = torch.from_numpy(shown & (off | (astray < 0.2 * limit) & (repeated == 0))).float()
     reconstructed = _reconstruct(model, seen, sizes, sigma * np.sqrt(1.0 - fast))
     logits = network(torch.from_numpy(fault_features(*reconstructed, sigma, network.mean.numpy())))
-    faulty = torch.from_numpy(off).float()
-    return (F.binary_cross_entropy_with_logits(logits, faulty, reduction="none") * clear).sum() / clear.sum()
+    labels = torch.from_numpy(off).float()
+    return (F.binary_cross_entropy_with_logits(logits, labels, reduction="none") * clear).sum() / clear.sum()
 
 
 @torch.no_grad()

@@ -32,7 +32,7 @@ from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 
 class RootMotion(NamedTuple):
-    """What the network says of each frame, in the frame of its input."""
+    """What the network predicts of each frame, in the frame of its input."""
 
     velocity: Tensor
     """(B, T, 3) m/s, of the root"""
@@ -130,7 +130,7 @@ _MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
 
 @dataclass(frozen=True)
 class _Windows:
-    """What the network is given and should say, in the frame of its input.
+    """What the network is given and should predict, in the frame of its input.
 
     Attributes:
         joints: (B, T, 22, 3) metres from the root, as the prior would leave them.
@@ -243,15 +243,15 @@ def _corrupt(joints: Tensor, rng: Rng, noise_sd: float | None = None) -> Tensor:
     return noisy
 
 
-def _loss(said: RootMotion, windows: _Windows) -> tuple[Tensor, dict[str, float]]:
+def _loss(predicted: RootMotion, windows: _Windows) -> tuple[Tensor, dict[str, float]]:
     """Equation 9, the likelihood of its error, and HuMoR's two terms of contacts; every term a mean."""
-    error = said.velocity - windows.velocity
+    error = predicted.velocity - windows.velocity
     l_velocity = error.square().mean()
     l_trajectory = (error[:, WARM_UP:].cumsum(dim=1) * FRAME_S).square().mean()
-    l_nll = (0.5 * (error.detach().square() * torch.exp(-2.0 * said.log_sigma)) + said.log_sigma).mean()
-    l_contact = F.binary_cross_entropy_with_logits(said.contact_logits, windows.contacts)
-    joint_velocity = said.velocity[:, :, None] + windows.joint_velocity
-    l_still = (torch.sigmoid(said.contact_logits) * joint_velocity.square().sum(dim=-1)).mean()
+    l_nll = (0.5 * (error.detach().square() * torch.exp(-2.0 * predicted.log_sigma)) + predicted.log_sigma).mean()
+    l_contact = F.binary_cross_entropy_with_logits(predicted.contact_logits, windows.contacts)
+    joint_velocity = predicted.velocity[:, :, None] + windows.joint_velocity
+    l_still = (torch.sigmoid(predicted.contact_logits) * joint_velocity.square().sum(dim=-1)).mean()
     loss = l_velocity + l_trajectory + NLL_WEIGHT * l_nll + CONTACT_WEIGHT * l_contact + STILL_WEIGHT * l_still
     return loss, {
         "L_velocity": l_velocity.item(), "L_trajectory": l_trajectory.item(), "L_contact": l_contact.item(),
@@ -260,7 +260,7 @@ def _loss(said: RootMotion, windows: _Windows) -> tuple[Tensor, dict[str, float]
 
 @torch.no_grad()
 def _validate(model: TrajectoryNet, motion: MotionSet, length: int, count: int) -> tuple[RootMotion, _Windows]:
-    """What the network says of about ``count`` windows of ``length`` frames of unseen people with 1 cm of noise."""
+    """What the network predicts of about ``count`` windows of ``length`` frames of unseen people with 1 cm of noise."""
     rows = motion.all_windows(length + 2, step=length)
     rows = rows[:: max(len(rows) // count, 1)]
     turn = yaw_rotation(heading(motion.rotations[rows[:, length // 2], 0]))
@@ -277,15 +277,15 @@ def evaluate_trajectory(model: TrajectoryNet, motion: MotionSet) -> dict[str, fl
         ``val velocity m/s``, the root mean square of the velocity's error along an axis; ``val 1 s drift cm``, that of
         the horizontal trajectory after one second; ``val feet F1`` of the contacts of heels and toes.
     """
-    said, windows = _validate(model, motion, WINDOW, count=512)
-    error = (said.velocity - windows.velocity)[:, WARM_UP:]
+    predicted, windows = _validate(model, motion, WINDOW, count=512)
+    error = (predicted.velocity - windows.velocity)[:, WARM_UP:]
     drift = error[:, :30, :2].sum(dim=1).norm(dim=-1) * FRAME_S * 100
-    predicted, true = said.contact_logits[..., 2:6] > 0, windows.contacts[..., 2:6] > 0.5
-    hits = (predicted & true).sum()
+    touching, true = predicted.contact_logits[..., 2:6] > 0, windows.contacts[..., 2:6] > 0.5
+    hits = (touching & true).sum()
     return {
         "val velocity m/s": float(error.square().mean().sqrt()),
         "val 1 s drift cm": float(drift.square().mean().sqrt()),
-        "val feet F1": float(2 * hits / (predicted.sum() + true.sum())),
+        "val feet F1": float(2 * hits / (touching.sum() + true.sum())),
     }
 
 
@@ -294,8 +294,8 @@ def calibrate(model: TrajectoryNet, motion: MotionSet) -> TrajectoryConfig:
 
     A second of accumulated velocity strays by sigma² · correlation_s if an error of size sigma lasts correlation_s.
     """
-    said, windows = _validate(model, motion, WINDOW, count=2048)
-    error = ((said.velocity - windows.velocity) * torch.exp(-said.log_sigma))[:, WARM_UP:]
+    predicted, windows = _validate(model, motion, WINDOW, count=2048)
+    error = ((predicted.velocity - windows.velocity) * torch.exp(-predicted.log_sigma))[:, WARM_UP:]
     size = error.square().mean(dim=(0, 1))
     strayed = (error[:, :30].sum(dim=1) * FRAME_S).square().mean(dim=0)
     axes = [slice(0, 2), slice(2, 3)]

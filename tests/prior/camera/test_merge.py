@@ -8,7 +8,7 @@ import pytest
 from tests.helpers.bodies import waving
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
-from steadypose.prior.camera.multi_view import DEPTH_ERROR_RATIO, PERIOD_NS, Merge, Sighting, merge_joints
+from steadypose.prior.camera.multi_view import DEPTH_ERROR_RATIO, PERIOD_NS, CameraBody, Merge, merge_joints
 from steadypose.prior.sim.camera import Camera, film
 from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.scripts import SCRIPTS
@@ -82,8 +82,8 @@ def test_bodies_are_interpolated_to_the_moment() -> None:
 def test_a_camera_errs_along_its_line_of_sight() -> None:
     """Two cameras at right angles: each is believed across its own line of sight."""
     truth = np.tile([2.0, 2.0, 1.0], (22, 1))
-    along_x = Sighting(truth + [0.1, 0.0, 0.0], np.ones(22), np.array([0.0, 2.0, 1.0]))
-    along_y = Sighting(truth + [0.0, 0.1, 0.0], np.ones(22), np.array([2.0, 0.0, 1.0]))
+    along_x = CameraBody(truth + [0.1, 0.0, 0.0], np.ones(22), np.array([0.0, 2.0, 1.0]))
+    along_y = CameraBody(truth + [0.0, 0.1, 0.0], np.ones(22), np.array([2.0, 0.0, 1.0]))
     joints, confidence = merge_joints([along_x, along_y])
     share = DEPTH_ERROR_RATIO**-2 / (1 + DEPTH_ERROR_RATIO**-2)
     assert joints - truth == pytest.approx(np.tile([0.1 * share, 0.1 * share, 0.0], (22, 1)), abs=1e-3)
@@ -93,8 +93,8 @@ def test_a_camera_errs_along_its_line_of_sight() -> None:
 def test_confidence_weighs_and_what_is_apart_is_not_averaged() -> None:
     place = np.tile([3.0, 0.0, 1.0], (22, 1))
     eyes = np.array([0.0, 0.0, 1.0]), np.array([6.0, 0.0, 1.0])
-    sure = Sighting(place, np.full(22, 0.9), eyes[0])
-    unsure = Sighting(place + [0.0, 0.1, 0.0], np.full(22, 0.3), eyes[1])
+    sure = CameraBody(place, np.full(22, 0.9), eyes[0])
+    unsure = CameraBody(place + [0.0, 0.1, 0.0], np.full(22, 0.3), eyes[1])
     joints, confidence = merge_joints([sure, unsure])
     assert joints[0, 1] == pytest.approx(0.1 * 0.3**2 / (0.9**2 + 0.3**2), rel=1e-2)
     assert confidence[0] == pytest.approx(1.0 - 0.1 * 0.7)
