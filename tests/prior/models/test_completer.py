@@ -29,7 +29,7 @@ from steadypose.prior.models.completer_features import (
 )
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.loop import TrainingOptions
-from steadypose.training.recipes.completer import Completer, Truth, answer, masks, train_completer
+from steadypose.training.recipes.completer import Completer, Truth, masks, predict, train_completer
 from steadypose.training.weights import arrays_of
 
 SMALL = CompleterConfig(width=16, heads=2, layers=2)
@@ -90,7 +90,7 @@ def test_the_live_form_gives_what_the_network_gives() -> None:
     seen[0, 8:25], seen[1, :, 16:] = np.nan, np.nan
     both = np.stack([offsets, offsets])
     window = read_window(seen, both, USUAL)
-    rotations, root = (part.detach().double().numpy() for part in answer(model, window))
+    rotations, root = (part.detach().double().numpy() for part in predict(model, window))
     live_rotations, live_root = live(seen, both)
     live_rotations[:, :, 0] = window.turn.swapaxes(1, 2)[:, None] @ live_rotations[:, :, 0]
     assert np.allclose(rotations, live_rotations, atol=1e-4)
