@@ -294,7 +294,9 @@ class Publisher:
             self._new_since = now
         try:
             connection = int(received.get(zmq.SRCFD))  # type: ignore[arg-type]
-        except zmq.ZMQError:  # who speaks the first version of the protocol cannot be told from others; see `check`
+        except (
+            zmq.ZMQError
+        ):  # who speaks the first version of the protocol cannot be distinguished from others; see `check`
             return
         self._new_subscriptions[connection] += 1
         too_many = len(self._subscriptions) > MAX_SUBSCRIPTIONS

@@ -189,7 +189,7 @@ class Subscriber:
             self._tell(taken)
 
     def _tell(self, taken: Taken) -> None:
-        with suppress(zmq.Again):  # who does not listen is told again
+        with suppress(zmq.Again):  # who does not listen gets it again
             self.socket.send(taken.frame(), zmq.NOBLOCK)
 
     def _receive(self, timeout_s: float) -> tuple[str, Message] | None:

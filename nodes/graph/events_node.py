@@ -14,7 +14,7 @@ from steadypose.prior.events.detector import NOWHERE, EventDetector
 from steadypose.prior.events.settings import EventSettings
 
 REPEAT_NS = 1_000_000_000
-"""of the stream, after which what holds is told again"""
+"""of the stream, after which what holds is published again"""
 
 
 class EventStream:
@@ -26,18 +26,18 @@ class EventStream:
 
     def __init__(self, settings: EventSettings) -> None:
         self._detector = EventDetector(settings)
-        self._told_ns: int | None = None
+        self._sent_ns: int | None = None
         self.sensor: NDArray[np.float64] = NOWHERE
 
     def process(self, world: PoseWorld) -> PoseEvents | None:
         """What is to be published of a message of ``pose/world``; None if nothing is."""
         events = self._detector.update(world, self.sensor)
-        told = self._told_ns
-        since_ns = REPEAT_NS if told is None else abs(world.stamp_ns - told)
+        sent_ns = self._sent_ns
+        since_ns = REPEAT_NS if sent_ns is None else abs(world.stamp_ns - sent_ns)
         changed = any(event.phase != Phase.HOLDS for event in events)
         if not changed and not world.end_of_stream and since_ns < REPEAT_NS:
             return None
-        self._told_ns = None if world.end_of_stream else world.stamp_ns
+        self._sent_ns = None if world.end_of_stream else world.stamp_ns
         return PoseEvents(world.stamp_ns, world.frame_id, world.source, events, world.end_of_stream)
 
 

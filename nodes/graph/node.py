@@ -100,7 +100,7 @@ class Node(ABC):
         self._set_ns = self.clock.now_ns() - self.clock.monotonic_ns()
 
     def _late_ns(self, timeline: Timeline, stamp_ns: int) -> int:
-        """How late it is for a stamp; where the wall clock was set since the timeline was told, by the nearer of both.
+        """How late it is for a stamp; where the wall clock was set since the timeline was known, by the nearer of both.
 
         Which of the two a stamp is of cannot be known: what was captured before it was set still comes after.
         """

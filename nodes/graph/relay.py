@@ -74,7 +74,7 @@ class Relay:
         return Resume(self.begun.publisher, dict(zip(self._topics, self.begun.sequence, strict=False)))
 
     def begin(self, publisher: Publisher) -> None:
-        """Note who publishes: what is not taken of it is to be told from what another one publishes."""
+        """Note who publishes: what is not taken of it is to be distinguished from what another one publishes."""
         if self._topics:
             self._recent.append(self.begun or Progress(publisher.id))
             self._keep(self._recent[0])

@@ -43,7 +43,7 @@ _NEAREST = ("state", "anomaly_flag")
 
 
 class NpzCollector:
-    """Gathers the answers of both pipelines on their 30 Hz grid, and gives them at the stamps of the input."""
+    """Gathers the output of both pipelines on their 30 Hz grid, and gives them at the stamps of the input."""
 
     def __init__(self) -> None:
         self._rows: dict[int, list[NDArray[np.void]]] = {}

@@ -189,7 +189,7 @@ class RecorderNode(Node):
         # a node that has not seen a pose yet reports at no time
         self._write(topic, message, message.stamp_ns or self._pose_ns or 0)
         if not isinstance(message, Diagnostics) and message.end_of_stream:
-            self._flush()  # who is told that the stream has ended may stop this process
+            self._flush()  # who hears that the stream has ended may stop this process
 
     def _write(self, topic: str, message: Message, stamp_ns: int) -> None:
         self._look_at_disk()

@@ -151,7 +151,7 @@ def open_oak(settings: OakSettings, context: SourceContext) -> CameraSource:
 
 
 def open_webcam(settings: WebcamSettings, context: SourceContext) -> CameraSource | VideoSource:
-    """The camera, or the film in its place.
+    """The camera, or the video in its place.
 
     Raises:
         LaunchError: the model is missing, or a setting cannot be used.

@@ -1,4 +1,4 @@
-"""Recorded skeletons: a rosbag2 directory, an ``.mcap``, an ``.npz``, a ``.csv``, a file of motion, or a film."""
+"""Recorded skeletons: a rosbag2 directory, an ``.mcap``, an ``.npz``, a ``.csv``, a file of motion, or a video."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from steadypose.nodes.sources.source import CalibrationSettings, RecordedSource,
 NO_RIG: Mapping[str, Any] = MappingProxyType({})
 _FILES = ".csv, .npz, .bvh, .trc, .c3d or .npy"
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
-"""films, in which MediaPipe finds the skeletons"""
+"""videos, in which MediaPipe finds the skeletons"""
 
 LOST, BROKEN, UNDECODABLE = "bytes of a damaged recording", "damaged recording", "undecodable"
 DAMAGE = (LOST, BROKEN, UNDECODABLE)
@@ -61,14 +61,14 @@ class RecordingSource:
 
 
 def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG) -> RecordedSource:
-    """The recording at ``path``: a rosbag2 directory, ``.mcap``, ``.npz`` or ``.csv``, a file of motion, or a film.
+    """The recording at ``path``: a rosbag2 directory, ``.mcap``, ``.npz`` or ``.csv``, a file of motion, or a video.
 
     Args:
         path: of the recording.
         rig: what a file of motion does not say (`prior.mocap.files.Description`).
 
     Raises:
-        LaunchError: there is nothing at the path, or it is a film and MediaPipe is not installed.
+        LaunchError: there is nothing at the path, or it is a video and MediaPipe is not installed.
         RecordingError, NpzError, CsvError, MotionError: the file holds no skeletons. All are ValueErrors that say what
             to do.
     """

@@ -26,12 +26,12 @@ Landmarker = Callable[[NDArray[Any], int], Any]
 
 
 class Lens:
-    """Undistorts a webcam's pictures, with intrinsics as calibrated, or guessed from the field of view.
+    """Undistorts a webcam's images, with intrinsics as calibrated, or guessed from the field of view.
 
     Args:
-        size: width and height of the pictures.
+        size: width and height of the images.
         field_of_view: radians; used without a calibration.
-        calibration: of the camera; scaled to pictures of another size.
+        calibration: of the camera; scaled to images of another size.
 
     Raises:
         LaunchError: the calibration is for another aspect ratio.
@@ -46,8 +46,8 @@ class Lens:
             if abs(scale[0] / scale[1] - 1.0) > 0.01:  # another part of the lens's view, and nobody says which
                 width, height = calibration.size
                 raise LaunchError(
-                    f"[input.calibration] size: the lens was calibrated for pictures of {width} x {height}, the camera "
-                    f"gives {size[0]} x {size[1]}; calibrate it with pictures of that size"
+                    f"[input.calibration] size: the lens was calibrated for images of {width} x {height}, the camera "
+                    f"gives {size[0]} x {size[1]}; calibrate it with images of that size"
                 )
             self.intrinsics[[0, 1], [0, 1]] = calibration.focal * scale
             self.intrinsics[:2, 2] = (np.array(calibration.centre) + 0.5) * scale - 0.5
@@ -58,15 +58,15 @@ class Lens:
                 )
 
     def undistort(self, image: NDArray[Any]) -> NDArray[Any]:
-        """A picture (H, W, 3) without distortion."""
+        """An image (H, W, 3) without distortion."""
         return cv2.remap(image, *self._maps, cv2.INTER_LINEAR) if self._maps else image
 
 
 class PoseFinder:
-    """Bodies in the pictures of one camera, each picture later than the last.
+    """Bodies in the images of one camera, each image later than the last.
 
     Attributes:
-        counts: pictures that failed, by cause.
+        counts: images that failed, by cause.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class PoseFinder:
         self._last_ms = -1
 
     def find(self, image: NDArray[Any], stamp_ns: int) -> PoseRaw | None:
-        """The bodies in a picture (H, W, 3), BGR, taken at ``stamp_ns``; None, counted, if it fails."""
+        """The bodies in an image (H, W, 3), BGR, taken at ``stamp_ns``; None, counted, if it fails."""
         self._started_ns = stamp_ns if self._started_ns is None else self._started_ns
         # the landmarker wants them to rise
         self._last_ms = max((stamp_ns - self._started_ns) // 1_000_000, self._last_ms + 1)
@@ -88,16 +88,16 @@ class PoseFinder:
         if self._lens is None or self._lens.size != size:
             self._lens = Lens(size, self._settings.field_of_view, self._calibration)
         try:
-            picture = cv2.cvtColor(self._lens.undistort(image), cv2.COLOR_BGR2RGB)
-            result = self._landmarker(picture, self._last_ms)
+            image = cv2.cvtColor(self._lens.undistort(image), cv2.COLOR_BGR2RGB)
+            result = self._landmarker(image, self._last_ms)
             return from_mediapipe(result, stamp_ns, size, self._lens.intrinsics, self._name)
-        except (cv2.error, ValueError) as error:  # a picture of another kind, a result that is none
+        except (cv2.error, ValueError) as error:  # an image of another kind, a result that is none
             count_failure(self.counts, self._name, error)
             return None
 
 
 class Webcam:
-    """An open webcam, and the landmarker for its pictures."""
+    """An open webcam, and the landmarker for its images."""
 
     def __init__(self, capture: cv2.VideoCapture, finder: PoseFinder, name: str, clock: Clock) -> None:
         self.name = name
@@ -114,7 +114,7 @@ class Webcam:
             if good:
                 yield self._finder.find(image, stamp_ns)
             else:
-                self.counts["picture that cannot be decoded"] += 1
+                self.counts["image that cannot be decoded"] += 1
                 yield None
 
     def status(self) -> dict[str, str]:
@@ -199,7 +199,7 @@ def connect(
     try:
         if not capture.isOpened():
             raise CameraError(f"camera {settings.camera} cannot be opened; `ls /dev/video*` lists them")
-        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest picture, not the oldest that waits
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest image, not the oldest that waits
         with make_landmarker(settings) as landmarker:
             name = f"webcam-{settings.camera}"
             yield Webcam(capture, PoseFinder(name, landmarker, settings, calibration), name, clock)
@@ -208,10 +208,10 @@ def connect(
 
 
 class VideoSource:
-    """The skeletons that MediaPipe sees in a film, a recorded source: no picture is left out, however long it takes.
+    """The skeletons that MediaPipe sees in a video, a recorded source: no image is left out, however long it takes.
 
     Raises:
-        LaunchError: the film cannot be opened.
+        LaunchError: the video cannot be opened.
     """
 
     def __init__(
@@ -222,35 +222,35 @@ class VideoSource:
     ) -> None:
         self.refused: Counter[str] = Counter()
         self._settings, self._calibration, self._make_landmarker = settings, calibration, make_landmarker
-        film = cv2.VideoCapture(settings.video)
-        if not film.isOpened():
-            raise LaunchError(f"[input.webcam] video: expected a film that OpenCV can read, got {settings.video!r}")
-        self._pictures = max(int(film.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-        self._period_ns = round(1e9 / (film.get(cv2.CAP_PROP_FPS) or 30.0))
-        film.release()
+        video = cv2.VideoCapture(settings.video)
+        if not video.isOpened():
+            raise LaunchError(f"[input.webcam] video: expected a video that OpenCV can read, got {settings.video!r}")
+        self._images = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+        self._period_ns = round(1e9 / (video.get(cv2.CAP_PROP_FPS) or 30.0))
+        video.release()
 
     def __len__(self) -> int:
-        return self._pictures
+        return self._images
 
     def __iter__(self) -> Iterator[tuple[str, Message]]:
-        film = cv2.VideoCapture(self._settings.video)
+        video = cv2.VideoCapture(self._settings.video)
         name = Path(self._settings.video).stem
         stamp_ns = -1
         try:
             with self._make_landmarker(self._settings) as landmarker:
                 finder = PoseFinder(name, landmarker, self._settings, self._calibration)
-                while film.grab():
-                    reported_ns = round(film.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+                while video.grab():
+                    reported_ns = round(video.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
                     # some containers state the frame rate alone
                     if reported_ns > stamp_ns:
                         stamp_ns = reported_ns
                     else:
                         stamp_ns += self._period_ns if stamp_ns >= 0 else 1
-                    good, image = film.retrieve()
+                    good, image = video.retrieve()
                     if good and (frame := finder.find(image, stamp_ns)) is not None:
                         yield POSE_RAW, frame
                     elif not good:
-                        self.refused["picture that cannot be decoded"] += 1
+                        self.refused["image that cannot be decoded"] += 1
                 self.refused.update(finder.counts)
         finally:
-            film.release()
+            video.release()

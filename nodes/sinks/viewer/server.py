@@ -86,7 +86,7 @@ class Drawings:
 
 
 KEPT = ("Content-Type", "Content-Length", "Content-Encoding", "Cache-Control", "ETag")
-"""headers of Rerun's answers that are passed on"""
+"""headers of Rerun's responses that are passed on"""
 POLICY = (
     "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob: data:; "
     "connect-src 'self' blob: data:; frame-src 'none'; form-action 'none'; base-uri 'self'"
@@ -187,7 +187,7 @@ class ViewerError(RuntimeError):
 class ViewerServer:
     """Keeps the drawings and serves them, with the page that shows them, to browsers that know the token.
 
-    It listens on this machine alone, unless told otherwise: a picture of people in a room is not for whoever shares
+    It listens on this machine alone, unless set otherwise: a picture of people in a room is not for whoever shares
     the network, nor, by the token, for other users of the machine. The page is that of a Rerun process, which has no
     drawings, passed on with a Content-Security-Policy, so that a browser lets it call nobody but this server: by itself
     it would send telemetry and ask for news of its version.

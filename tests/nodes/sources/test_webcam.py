@@ -33,14 +33,14 @@ FRAMES = 5
 
 @pytest.fixture
 def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A film of five pictures, each brighter than the last, in the place of camera 3."""
-    path = tmp_path / "film.avi"
+    """A video of five images, each brighter than the last, in the place of camera 3."""
+    path = tmp_path / "video.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, SIZE)
     for index in range(FRAMES):
         writer.write(np.full((SIZE[1], SIZE[0], 3), (40 * index, 0, 0), np.uint8))
     writer.release()
-    opened, film = cv2.VideoCapture, str(path)
-    cameras = {3: film, film: film}
+    opened, video = cv2.VideoCapture, str(path)
+    cameras = {3: video, video: video}
     monkeypatch.setattr(
         webcam_device.cv2, "VideoCapture", lambda name: opened(cameras[name]) if name in cameras else opened()
     )
@@ -86,7 +86,7 @@ def test_each_picture_gives_the_bodies_in_it(video: Path, model: str) -> None:
     frames: list[PoseRaw] = []
     for frame in source.frames():
         if frame is None:
-            break  # the film is over: the camera is gone
+            break  # the video is over: the camera is gone
         frames.append(frame)
         assert source.status()["camera"] in ("streaming", "waiting for the first frame")
     assert len(frames) == FRAMES
@@ -119,7 +119,7 @@ def test_a_picture_that_fails_is_counted_and_the_next_one_comes(video: Path, mod
     assert not source.refused
 
 
-def test_a_film_gives_every_picture_at_its_own_time(video: Path, model: str) -> None:
+def test_a_video_gives_every_picture_at_its_own_time(video: Path, model: str) -> None:
     seen = Seen()
     source = VideoSource(WebcamSettings(video=str(video), model=model), NOT_CALIBRATED, seen.landmarker)
     assert len(source) == FRAMES
@@ -127,13 +127,13 @@ def test_a_film_gives_every_picture_at_its_own_time(video: Path, model: str) -> 
         frames = [message for _, message in source if isinstance(message, PoseRaw)]
         steps = np.diff([frame.stamp_ns for frame in frames])
         np.testing.assert_allclose(steps, 1e9 / 30, rtol=0.02)
-        assert {frame.source for frame in frames} == {"film"}
+        assert {frame.source for frame in frames} == {"video"}
     colours = [int(colour[2]) for colour, _ in seen.pictures[:FRAMES]]
     assert colours == sorted(set(colours)), "each picture, and each once"
     assert not source.refused
 
 
-def test_a_film_is_a_recording_to_clean(video: Path) -> None:
+def test_a_video_is_a_recording_to_clean(video: Path) -> None:
     source = open_recording(video)
     assert isinstance(source, VideoSource)
     frames = [message for _, message in source if isinstance(message, PoseRaw)]
@@ -141,10 +141,10 @@ def test_a_film_is_a_recording_to_clean(video: Path) -> None:
     assert not any(frame.bodies for frame in frames), "MediaPipe sees nobody in an empty picture"
 
 
-def test_a_film_that_cannot_be_read_says_so(model: str, tmp_path: Path) -> None:
-    (tmp_path / "x.mp4").write_bytes(b"no film")
+def test_a_video_that_cannot_be_read_says_so(model: str, tmp_path: Path) -> None:
+    (tmp_path / "x.mp4").write_bytes(b"no video")
     settings = InputSettings(source="webcam", webcam=WebcamSettings(video=str(tmp_path / "x.mp4"), model=model))
-    with pytest.raises(LaunchError, match="expected a film that OpenCV can read"):
+    with pytest.raises(LaunchError, match="expected a video that OpenCV can read"):
         camera.open_webcam(settings.webcam, SourceContext(SystemClock(), NOT_CALIBRATED))
 
 
@@ -169,7 +169,7 @@ def test_a_lens_that_is_calibrated_is_used_for_pictures_of_any_size() -> None:
             np.testing.assert_allclose(shown, expected, atol=1.0)
     image = np.zeros((480, 640, 3), np.uint8)
     assert guessed.undistort(image) is image
-    with pytest.raises(LaunchError, match="for pictures of 640 x 480, the camera gives 1280 x 720; calibrate it"):
+    with pytest.raises(LaunchError, match="for images of 640 x 480, the camera gives 1280 x 720; calibrate it"):
         Lens((1280, 720), 1.05, told)
 
 
