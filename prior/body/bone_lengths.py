@@ -74,7 +74,7 @@ def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float, sam
     bias, noise = LENGTH_BIASES * bias_sigma, np.sqrt(2.0) * noise_sigma
     seen = np.asarray(finite_joints(positions).any(axis=0))
     seen |= seen[MIRROR]
-    bones = _bones(seen)
+    bones = _both_sides(_bones(seen))
     log_ratio, sigma = np.zeros(len(bones)), np.full((2, len(bones)), np.inf)  # now, and in the end
     for k, paths in enumerate(bones):
         generic = float(np.linalg.norm(REST_OFFSETS[paths[0]].sum(axis=0)))
@@ -109,28 +109,25 @@ _TRUNKS = ((J["pelvis"], (J["left_hip"],)), (J["spine3"], (J["neck"], J["left_co
 _ON_TRUNK = sorted({int(end) for _, joints in _TRUNKS for joint in joints for end in (joint, MIRROR[joint])})
 
 
-def _bones(seen: NDArray[np.bool_]) -> list[list[list[int]]]:
-    """What can be measured: for each, the one or two (left and right) paths of joints up to, not with, one seen.
-
-    Args:
-        seen: (22,) which joints ever are, on either side.
-    """
-    measurable: list[list[list[int]]] = []
+def _bones(seen: NDArray[np.bool_]) -> list[list[int]]:
+    """What can be measured of the joints (22,) that are ever ``seen``: for each, the path of joints from it up to, not
+    with, its nearest ancestor seen."""
+    measurable = []
     for joint in range(1, len(PARENTS)):
-        if not seen[joint]:
-            continue
         path = [joint]
         while PARENTS[path[-1]] > 0 and not seen[PARENTS[path[-1]]]:
             path.append(PARENTS[path[-1]])
-        if not seen[PARENTS[path[-1]]]:
-            continue
-        mirrored = MIRROR[path].tolist()
-        twin = next((paths for paths in measurable if paths[0] == mirrored), None)
-        if twin is None:
-            measurable.append([path])
-        else:
-            twin.append(path)
+        if seen[joint] and seen[PARENTS[path[-1]]]:
+            measurable.append(path)
     return measurable
+
+
+def _both_sides(paths: list[list[int]]) -> list[list[list[int]]]:
+    """The same bones, left and right together."""
+    pairs: dict[tuple[int, ...], list[list[int]]] = {}
+    for path in paths:
+        pairs.setdefault(min(tuple(path), tuple(MIRROR[path].tolist())), []).append(path)
+    return list(pairs.values())
 
 
 def _median(values: Floats) -> Floats:
@@ -177,12 +174,10 @@ def estimate_offsets(positions: NDArray[np.floating]) -> Floats:
     p = np.asarray(positions, dtype=np.float64)
     offsets = REST_OFFSETS.copy()
     seen = np.asarray(finite_joints(p).any(axis=0))
-    for joint, ancestor in _seen_bones(seen):
-        path = _path(ancestor, joint)
-        lengths = np.linalg.norm(p[:, joint] - p[:, ancestor], axis=-1)
+    for path in _bones(seen):
+        lengths = np.linalg.norm(p[:, path[0]] - p[:, PARENTS[path[-1]]], axis=-1)
         if np.isfinite(lengths).any():
-            scale = np.nanmedian(lengths) / np.linalg.norm(REST_OFFSETS[path].sum(axis=0))
-            offsets[path] *= scale
+            offsets[path] *= np.nanmedian(lengths) / np.linalg.norm(REST_OFFSETS[path].sum(axis=0))
     world = global_rotations(solve_rotations(p, offsets))
     for trunk, children in ((J["pelvis"], HIPS), (J["spine3"], (J["neck"], *COLLARS))):
         for joint in children:
@@ -192,23 +187,3 @@ def estimate_offsets(positions: NDArray[np.floating]) -> Floats:
             if usable.any():
                 offsets[joint] = np.median(vectors[usable], axis=0) - (offsets[end] if end != joint else 0.0)
     return offsets
-
-
-def _seen_bones(seen: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """(joint, nearest seen ancestor) of each joint that is ever seen."""
-    pairs: list[tuple[int, int]] = []
-    for joint in range(1, len(PARENTS)):
-        ancestor = PARENTS[joint]
-        while ancestor > 0 and not seen[ancestor]:
-            ancestor = PARENTS[ancestor]
-        if seen[joint] and seen[ancestor]:
-            pairs.append((joint, ancestor))
-    return pairs
-
-
-def _path(ancestor: int, joint: int) -> list[int]:
-    path = []
-    while joint != ancestor:
-        path.append(joint)
-        joint = PARENTS[joint]
-    return path
