@@ -85,9 +85,9 @@ def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float, sam
             median = _median(lengths)
             deviation = 1.4826 * _median(np.abs(lengths - median))
             log_ratio[k] = np.log(max(median, 0.1 * generic) / generic)
-            # What noise does not explain of the deviation is as lasting as the bias.
-            lasting = max(deviation**2 - noise**2, bias**2)
-            sigma[:, k] = np.sqrt(lasting / same + noise**2 / len(lengths) * counts[0] / counts) / generic
+            # what noise does not explain of the deviation is as slow as the bias
+            slow = max(deviation**2 - noise**2, bias**2)
+            sigma[:, k] = np.sqrt(slow / same + noise**2 / len(lengths) * counts[0] / counts) / generic
     spread = np.array([LIMB_SPREAD if paths[0][0] in LIMB_ENDS else TRUNK_SPREAD for paths in bones])
     weight = 1.0 / (spread**2 + sigma**2)
     stature = 1.0 / (weight.sum(axis=1) + STATURE_SPREAD**-2)

@@ -63,7 +63,7 @@ _HINGE[list(HIPS)] = (0.0, 1.0, 0.0)
 _HINGE[SHOULDERS[0]] = (0.0, 0.0, -1.0)
 _HINGE[SHOULDERS[1]] = (0.0, 0.0, 1.0)
 _HINGED = np.array([hinge.any() for hinge in _HINGE])
-# The sine of the bend below which the plane of a limb says nothing of its twist, and above which it says all.
+# The sine of the bend below which the plane of a limb shows nothing of its twist, and above which it shows all.
 _BEND_NONE, _BEND_FULL = 0.1, 0.35
 
 

@@ -149,18 +149,18 @@ def _handedness(skeleton: Skeleton, positions: Floats, joints: Floats) -> float:
     upwards = _unit(_mean(joints, "left_shoulder", "right_shoulder") - _mean(joints, "left_hip", "right_hip"))
     leftwards = sum(_unit(joints[:, J[f"left_{j}"]] - joints[:, J[f"right_{j}"]]) for j in ("hip", "shoulder"))
     forwards = _unit(np.cross(leftwards, upwards))
-    told: list[Floats] = []
+    shown: list[Floats] = []
     for side in ("left", "right"):
         hip, knee, ankle, foot = (joints[:, J[f"{side}_{j}"]] for j in ("hip", "knee", "ankle", "foot"))
-        told.append(_unit(foot - ankle))
+        shown.append(_unit(foot - ankle))
         bent = knee - (hip + ankle) / 2
         flexed = np.linalg.norm(bent, axis=1) > 0.08 * np.linalg.norm(hip - ankle, axis=1)
-        told.append(np.where(flexed[:, None], _unit(bent), np.nan))
+        shown.append(np.where(flexed[:, None], _unit(bent), np.nan))
     names = {name.lower().replace("_", ""): index for index, name in enumerate(skeleton.joints)}
     ears = [names[name] for name in ("leftear", "rightear", "lear", "rear", "earleft", "earright") if name in names]
     if "nose" in names and len(ears) == 2:
-        told.append(_unit(positions[:, names["nose"]] - positions[:, ears].mean(axis=1)))
-    cosines = np.concatenate([(forwards * direction).sum(axis=1) for direction in told])
+        shown.append(_unit(positions[:, names["nose"]] - positions[:, ears].mean(axis=1)))
+    cosines = np.concatenate([(forwards * direction).sum(axis=1) for direction in shown])
     cosines = cosines[np.isfinite(cosines)]
     return float(np.median(cosines)) if len(cosines) else float("nan")
 

@@ -177,7 +177,7 @@ def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int])
 
 
 def clean_message(raw: PoseRaw, stamp_ns: int, delay_frames: int, bodies: list[CleanBody]) -> PoseClean:
-    """The answer to a source of which ``raw`` came last; ``stamp_ns`` is the moment answered, on the source's clock."""
+    """The output for a source of which ``raw`` came last; ``stamp_ns`` is its time, on the source's clock."""
     return PoseClean(
         stamp_ns=stamp_ns,
         frame_id=raw.frame_id,
@@ -190,7 +190,7 @@ def clean_message(raw: PoseRaw, stamp_ns: int, delay_frames: int, bodies: list[C
 
 
 def end_of_stream(raw: PoseRaw, delay_frames: int) -> PoseClean:
-    """The last answer to a source that has ended with ``raw``."""
+    """The last output for a source that has ended with ``raw``."""
     ended = clean_message(raw, raw.stamp_ns, delay_frames, [])
     ended.end_of_stream = True
     return ended

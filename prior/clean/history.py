@@ -1,4 +1,4 @@
-"""The last frames of every body: source of the models' windows, and of the frames still to be answered."""
+"""The last frames of every body: source of the models' windows, and of the frames still to be published."""
 
 from __future__ import annotations
 

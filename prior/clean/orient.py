@@ -1,6 +1,6 @@
 """The orient stage: how each joint is turned, given where all joints are.
 
-Two hips 18 cm apart, each with an error that lasts, tell the root's heading badly, and a straight limb does not tell
+Two hips 18 cm apart, each with a bias, show the root's heading badly, and a straight limb does not show
 its twist. Rotations are solved for where the joints are to be expected by the whole body (`prior.models.posture`), each
 by its deviation; a filter keeps the twist through straight limbs (`prior.body.twist`). Positions stay as they are.
 """

@@ -107,7 +107,7 @@ class Denoise:
     """Moves the smoother's estimate of observed joints towards HG-VAE's reconstruction.
 
     Args:
-        delay_frames: between the newest frame and the one that is answered.
+        delay_frames: between the newest frame and the one that is published.
         slots: maximum number of bodies.
     """
 

@@ -23,13 +23,13 @@ FEATURES = OF_JOINT * len(CONTACT_JOINTS) + OF_BODY
 """Numbers of a frame."""
 
 FROM_ROOT, FASTEST = 0.5, 3.0
-"""Metres and m/s by which places and velocities are divided, and m/s beyond which no more is told."""
+"""Metres and m/s by which places and velocities are divided, and m/s at which velocities are clipped."""
 
 HEIGHT, HIGHEST = 0.1, 0.6
-"""Metres by which heights are divided, and beyond which no more is told."""
+"""Metres by which heights are divided, and at which they are clipped."""
 
 SIGMA, MIN_SIGMA, MAX_SIGMA = 0.01, 1e-3, 1.0
-"""Metres: the deviation whose logarithm is 0, and those beyond which no more is told."""
+"""Metres: the deviation whose logarithm is 0, and those at which it is clipped."""
 
 _JOINTS = list(CONTACT_JOINTS)
 
@@ -116,8 +116,8 @@ class LiveContacts:
         reset_kept, update_kept, new_kept = np.split(dense(state, *self._kept), 3, axis=-1)
         new = np.tanh(new_in + _sigmoid(reset_in + reset_kept) * new_kept)
         state = new + _sigmoid(update_in + update_kept) * (state - new)
-        said = _sigmoid(dense(state, *self._head))
-        return Contacts(said[:, : len(CONTACT_JOINTS)], said[:, len(CONTACT_JOINTS) :], state)
+        predicted = _sigmoid(dense(state, *self._head))
+        return Contacts(predicted[:, : len(CONTACT_JOINTS)], predicted[:, len(CONTACT_JOINTS) :], state)
 
 
 def _sigmoid(x: Floats32) -> Floats32:

@@ -60,7 +60,7 @@ class TrajectoryConfig:
 
 
 class NewestMotion(NamedTuple):
-    """What the network says of the newest frame, in the frame of its input.
+    """The network's output for the newest frame, in the frame of its input.
 
     Attributes:
         velocity: (B, 3) m/s, of the root.

@@ -44,20 +44,7 @@ def test_the_gap_to_the_nearest_sightings() -> None:
     assert (gap[2, WRIST] == -1).all()
     assert np.count_nonzero(gap) == 1 + 5 + 12
     observed[1, TRACKS, 9:] = 0
-    assert completion_features(deviations, observed, 0.0, patch=4).gap[1, WRIST].tolist() == [
-        0,
-        0,
-        0,
-        0,
-        1,
-        2,
-        3,
-        4,
-        5,
-        6,
-        7,
-        8,
-    ]
+    assert completion_features(deviations, observed, 0.0, patch=4).gap[1, WRIST].tolist() == [0] * 4 + [*range(1, 9)]
 
 
 def test_how_much_a_joint_moves_is_told_beside_the_one_above_and_without_the_noise() -> None:
