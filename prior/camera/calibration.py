@@ -26,28 +26,29 @@ from steadypose.prior.camera.gravity import level_pose
 
 Image = NDArray[np.uint8]
 
-MIN_CORNERS = 6
-"""of the board that must be seen for a picture to be used"""
-MIN_VIEWS = 8
-"""pictures of the board that a calibration takes, at least"""
+MIN_CORNERS, MIN_VIEWS = 6, 8
+"""Least number of the board's corners in a picture that is used, and of such pictures."""
+
 MIN_TILT = np.radians(20.0)
-"""between the planes of the board in two of the pictures, at least: parallel ones do not determine the focal length"""
+"""Least angle between the board's planes in two of the pictures, for parallel ones do not determine the focal length,
+radians."""
+
 MAX_FOCAL_SIGMA = 0.01
-"""of a focal length, the standard deviation up to which it is accepted"""
+"""Largest relative standard deviation of a focal length that is accepted."""
+
 OUTLIER_RATIO = 3.0
-"""times the median error of all pictures: one that is worse is left out (the board was bent, or moved)"""
-CORNER_SIGMA_PX = 0.05
-"""of a corner well seen, standard deviation"""
-CORNER_SCALE_PX = 0.3
-"""from where a corner should be, beyond which it is soon taken to be found wrong"""
-CORNER_QUANTILE = 0.8
-"""of the corners' reprojection errors: the one by which a pose is accepted or refused"""
+"""Ratio of a picture's error to the median of all beyond which it is left out: the board was bent, or moved."""
+
+CORNER_SIGMA_PX, CORNER_SCALE_PX, CORNER_QUANTILE = 0.05, 0.3, 0.8
+"""Standard deviation of a corner well seen, and scale of the robust loss, pixels; quantile of the corners' reprojection
+errors by which a pose is accepted."""
+
 MAX_RMS_PX = 2.0
-"""root mean square of where corners are seen, from where they should be, beyond which a result is refused"""
-FLOOR_SLACK, FLOOR_SHARE = 0.02, 0.1
-"""metres from the floor within which a point is an inlier, and the fraction of all points that must be"""
-FLOOR_TILT = np.radians(10.0)
-"""by which the floor's normal may differ from where up is taken to be"""
+"""Largest root mean square reprojection error of a result that is accepted, pixels."""
+
+FLOOR_SLACK, FLOOR_SHARE, FLOOR_TILT = 0.02, 0.1, np.radians(10.0)
+"""Distance from the floor within which a point is an inlier, metres; least share of such points; largest angle of the
+floor's normal from where up is taken to be, radians."""
 
 
 class CalibrationError(ValueError):

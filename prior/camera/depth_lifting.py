@@ -32,7 +32,7 @@ from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.compiled import njit
 
 MIN_CONFIDENCE = 0.3
-"""of a key point that is used; below it, detectors guess"""
+"""Least confidence of a key point that is used; below it, detectors guess."""
 
 _K = {name: index for index, name in enumerate(COCO17.joints)}
 _JOINTS = len(COCO17.joints)
@@ -46,31 +46,23 @@ _HEAD = tuple(_K[name] for name in ("nose", "left_eye", "right_eye", "left_ear",
 _THICKNESS = {"ear": 0.05, "shoulder": 0.07, "elbow": 0.045, "wrist": 0.04, "hip": 0.12, "knee": 0.065, "ankle": 0.055}
 _TO_CENTRE = np.array([_THICKNESS.get(name.split("_")[-1], 0.0) for name in COCO17.joints])
 
-# The trunk at the hips, cut level: an ellipse of these half axes in metres.
 _HALF_DEPTH, _HALF_BREADTH = 0.12, 0.18
-# Hips and shoulders, joint to joint, for a trunk (middle of the shoulders to middle of the hips) of length 1, and
-# the trunk's usual length in metres and the range that is accepted.
-_HIP_WIDTH, _SHOULDER_WIDTH = 0.35, 0.70
-_TRUNK_LENGTH, _TRUNK_LENGTHS = 0.51, (0.42, 0.60)
-_MAX_TURN_COSINE = np.cos(np.radians(50))
-"""beyond 50 degrees the far hip is hidden, and its depth cannot be read"""
-_HIP_SLACK = 0.03
-"""metres by which a hip's depth may be at odds with the width of the hips"""
-_SEEN_WIDTH = 0.65
-"""of the shoulders' width: nearer to each other, one of them is hidden"""
-_TURN_EVIDENCE = 0.10
-"""metres by which one side's arm and leg are nearer, when there is no doubt which side that is"""
-_FAR_SIDE_THRESHOLD = 0.5
-"""of 1, evidence above which the far side is taken as known"""
+"""Half axes of the trunk at the hips, cut level: an ellipse, metres."""
+_HIP_WIDTH, _SHOULDER_WIDTH, _TRUNK_LENGTH, _TRUNK_LENGTHS = 0.35, 0.70, 0.51, (0.42, 0.60)
+"""Widths of hips and shoulders, joint to joint, in lengths of the trunk (middle of the shoulders to middle of the
+hips); the trunk's usual length and the range that is accepted, metres."""
+_MAX_TURN_COSINE, _HIP_SLACK, _SEEN_WIDTH = np.cos(np.radians(50)), 0.03, 0.65
+"""Cosine of the turn beyond which the far hip is hidden; deviation of a hip's depth from the width of the hips, metres;
+share of the shoulders' width below which one of them is hidden."""
+_TURN_EVIDENCE, _FAR_SIDE_THRESHOLD, _CONFIDENCE_EVIDENCE = 0.10, 0.5, 0.05
+"""Difference in depth of both sides' arms and legs from which on the nearer side is certain, metres; share of that from
+which on the far side is taken as known; and the same difference in a detector's confidence."""
 _FAR_LIMBS = np.array([0.05, 0.05, -0.03, -0.03])
-"""metres behind the middle of the hips where the far arm (elbow, wrist) and leg (knee, ankle) are, at least"""
-_CONFIDENCE_EVIDENCE = 0.05
-"""by which a detector's confidence in the far side's arm and leg is less"""
-
+"""Least distance of the far elbow, wrist, knee and ankle behind the middle of the hips, metres."""
 _TRUNK_REACH, _HEAD_REACH = 0.40, 0.50
-"""metres: from the trunk's depth to a shoulder or a hip; from the middle of the shoulders to the face"""
+"""Longest distance from the trunk's depth to a shoulder or hip, and from middle shoulder to face, metres."""
 _ARM, _LEG = (0.45, 0.40), (0.60, 0.60)
-"""metres: the longest bones that are accepted"""
+"""Longest bones that are accepted, metres."""
 _LIMBS = [
     ([_K[f"{side}_{joint}"] for joint in joints], lengths)
     for side in ("left", "right")
@@ -78,23 +70,20 @@ _LIMBS = [
 ]
 _LIMB_ENDS = [[_K[f"{side}_{joint}"] for joint in ("elbow", "wrist", "knee", "ankle")] for side in ("left", "right")]
 _MIN_SEPARATION = {"ear": 0.08, "elbow": 0.06, "wrist": 0.06, "knee": 0.06, "ankle": 0.05}
-"""metres: a left and a right joint nearer to each other are one that was seen twice"""
+"""Distance of a left and a right joint below which they are one that was seen twice, metres."""
 
-# The neighbourhood of a key point: a disc of this radius in metres at the body, and how it is sampled.
-_RADIUS = 0.03
-_MIN_PIXELS, _MAX_PIXELS = 2.0, 16.0
+_RADIUS, _MIN_PIXELS, _MAX_PIXELS = 0.03, 2.0, 16.0
+"""Radius of the disc about a key point that is sampled, metres at the body, and its range in the image, pixels."""
 _GRID = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), axis=-1).reshape(-1, 2)
 _DISC = _GRID[np.hypot(*_GRID.T) <= 1.0]
 _LINE_SAMPLES = np.linspace(0.1, 0.9, 9)
-"""where lines between joints are sampled"""
-# What counts as one surface: depths that differ by this much; the noise of stereo grows with the distance's square.
-_BAND, _BAND_GROWTH = 0.04, 0.005
-_MIN_FILL = 0.25
-"""of its neighbourhood that a surface must fill"""
-_HIP_SAMPLES, _HIP_SIDE_SAMPLES = 2.7, 2.2
-"""times that radius: the neighbourhoods of the middle of the hips, and of each of them"""
-_TRUNK_BAND = 0.25
-"""metres of depth over which a trunk's skin extends, leaning or turned"""
+"""Shares of a line between joints at which it is sampled."""
+_BAND, _BAND_GROWTH, _MIN_FILL = 0.04, 0.005, 0.25
+"""Extent in depth of one surface, metres, and its growth with the distance's square, 1/m, as the noise of stereo; least
+share of its neighbourhood that it fills."""
+_HIP_SAMPLES, _HIP_SIDE_SAMPLES, _TRUNK_BAND = 2.7, 2.2, 0.25
+"""Ratios of the discs about the middle of the hips and each of them to that radius; extent in depth of a trunk's skin,
+leaning or turned, metres."""
 
 
 def lift(

@@ -298,15 +298,14 @@ def _arm(rotations: Floats, root: Floats, offsets: Floats, side: Side, intent: I
         return positions[:, shoulder], world[:, collar], world[:, J["spine3"]]
 
     at, _, chest = place()
-    level = _upright(chest)
-    wrist = at + np.einsum("tij,tj->ti", level, _hanging(forward, sign, lengths))
+    # Arms hang by gravity, however the chest leans.
+    wrist = at + _apply(yaw_matrix(heading(chest)), _hanging(forward, sign, lengths))
     pole = chest @ np.array([-1.0, 0.25 * sign, -0.2])
-    heading = yaw_matrix(intent.plan.yaw)
     for action in intent.arms[side]:
         if action.frame == "world":
             goal = action.wrist + np.zeros_like(at)
         elif action.frame == "pelvis":
-            goal = root + _apply(heading, action.wrist)
+            goal = root + _apply(yaw_matrix(intent.plan.yaw), action.wrist)
         else:
             goal = at + _apply(chest, action.wrist * lengths.sum())
         weight = action.weight[:, None]
@@ -336,11 +335,6 @@ def _apply(rotation: Floats, vector: Floats) -> Floats:
 def _smooth_ramp(u: Floats) -> Floats:
     u = np.clip(u, 0.0, 1.0)
     return u * u * (3 - 2 * u)
-
-
-def _upright(orientation: Floats) -> Floats:
-    """Only the heading of orientations (T, 3, 3): arms hang by gravity, however the chest leans."""
-    return yaw_matrix(heading(orientation))
 
 
 def _hanging(forward: Floats, sign: float, lengths: Floats) -> Floats:

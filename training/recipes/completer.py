@@ -95,27 +95,21 @@ class _Layer(nn.Module):
 ITERATIONS, BATCH, LEARNING_RATE = 20_000, 1536, 8e-4
 """Frames a step; AdamW's rate at its highest, from where it falls along a cosine."""
 
-GAPS = (5, 64)
-"""Range of frames of a gap."""
+GAPS, CONTEXT = (5, 64), (2, 14)
+"""Ranges of the lengths of a gap, and of what is known around it, before and after together, frames."""
 
-CONTEXT = (2, 14)
-"""Range of frames that are known around it, before and after together."""
-
-STRIDES = (1, 1, 1, 2)
-"""Frame rates, as frames from one to the next."""
-
-SCALES = (0.85, 1.15)
-"""Range of factors on people's sizes."""
+STRIDES, SCALES = (1, 1, 1, 2), (0.85, 1.15)
+"""Frame strides of windows; range of factors on people's sizes."""
 
 NOISY, NOISE = 0.3, 0.015
 """Share of windows whose known joints are noisy, and its largest standard deviation, metres along an axis."""
 
 POSE_WEIGHT, PATH_WEIGHT, ROTATION_WEIGHT, VELOCITY_WEIGHT = 4.0, 4.0, 1.0, 10.0
-"""Of joints about the root and the root itself, metres; global rotation matrices; metres a frame of joints."""
+"""Weights of joints about the root and the root itself, 1/m; global rotation matrices; joints' steps, frames/m."""
 
 EASY = 0.05
-"""Metres: a window's loss is divided by this plus the interpolation's error, so that the relative error counts and fast
-motion does not dominate."""
+"""Error that is added to the interpolation's to divide a window's loss by, so that fast motion does not dominate,
+metres."""
 
 _ARMS = limbs(("elbow", "wrist"), ("shoulder", "elbow", "wrist"))
 _LEGS = limbs(("knee", "ankle", "foot"), ("ankle", "foot"))
@@ -227,7 +221,7 @@ def masks(count: int, gap: int, context: int, rng: Rng) -> Bools:
             elif rng.random() < 0.5:
                 hidden = np.flatnonzero(rng.random(22) < rng.uniform(0.05, 0.6))
             else:
-                hidden = np.setdiff1d(np.arange(22), _ENDS)
+                hidden = _BETWEEN
             row[span, hidden] = False
     return known
 
@@ -284,9 +278,7 @@ def loss(model: Completer, truth: Truth, known: Bools, rng: Rng) -> tuple[Tensor
         ((rotations - true).abs() * rotations_hidden).flatten(3)
     )
     l_velocity = mean(F.pad(world.diff(dim=1).abs(), (0, 0, 0, 0, 1, 0)))
-    total = (
-        POSE_WEIGHT * l_pose + PATH_WEIGHT * l_path + ROTATION_WEIGHT * l_rotation + VELOCITY_WEIGHT * l_velocity
-    )  # fmt: skip
+    total = POSE_WEIGHT * l_pose + PATH_WEIGHT * l_path + ROTATION_WEIGHT * l_rotation + VELOCITY_WEIGHT * l_velocity
     return total, {"loss": total.item(), "pose mm": 1e3 * l_pose.item(), "path mm": 1e3 * l_path.item()}
 
 
@@ -315,14 +307,8 @@ def evaluate_completer(model: Completer, motion: MotionSet, windows: int = 192) 
     return found
 
 
-HIDDEN_PARTS = (
-    _ARMS[1],
-    _ARMS[3],
-    _LEGS[0],
-    _LEGS[2],
-    [J["head"], J["neck"]],
-    np.setdiff1d(np.arange(22), _ENDS).tolist(),
-)
+_BETWEEN = np.setdiff1d(np.arange(22), _ENDS)
+HIDDEN_PARTS = (_ARMS[1], _ARMS[3], _LEGS[0], _LEGS[2], [J["head"], J["neck"]], _BETWEEN.tolist())
 """What is hidden to see how far off joints are that are never known; by the first in which a joint is."""
 
 
