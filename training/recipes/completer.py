@@ -117,6 +117,7 @@ _LOWER = sorted(_LEGS[0] + _LEGS[2])
 _BOTH_ARMS = sorted(_ARMS[1] + _ARMS[3])
 _PARTS = (*_ARMS, *_LEGS, _LOWER, _LOWER, _BOTH_ARMS, [*_BOTH_ARMS, J["head"], J["neck"]], [J["pelvis"], *_LOWER])
 _ENDS = [J[name] for name in ("pelvis", "spine3", "head", "left_wrist", "right_wrist", "left_ankle", "right_ankle")]
+_BETWEEN = np.setdiff1d(np.arange(22), _ENDS)
 
 
 def train_completer(options: TrainingOptions, config: CompleterConfig | None = None) -> Path:
@@ -307,7 +308,6 @@ def evaluate_completer(model: Completer, motion: MotionSet, windows: int = 192) 
     return found
 
 
-_BETWEEN = np.setdiff1d(np.arange(22), _ENDS)
 HIDDEN_PARTS = (_ARMS[1], _ARMS[3], _LEGS[0], _LEGS[2], [J["head"], J["neck"]], _BETWEEN.tolist())
 """What is hidden to see how far off joints are that are never known; by the first in which a joint is."""
 
