@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import Tensor, nn
-from torch.optim import AdamW, Optimizer
+from torch.optim import Adam, AdamW, Optimizer
 from torch.optim.lr_scheduler import CosineAnnealingLR, LRScheduler
 
 from steadypose.prior.models.weights import LICENCES
@@ -79,9 +79,10 @@ class Recipe(Generic[Network]):
         evaluate: quantities to plot beside these, on validation data; called in evaluation mode, without gradients.
         iterations: optimiser steps, unless the user asks for another number.
         batch: samples a step, of all processes together.
-        rate: of AdamW at the start.
+        rate: of the optimiser at the start.
         sample: what a sample is, in the plural.
         decay: of the weights.
+        optimiser: AdamW, but for Adam as a paper has it.
         schedule: of the rate, of the optimiser and the number of steps; a cosine down to a hundredth, if left out.
         evaluations: number of evaluations and checkpoints.
         clip: maximum norm of the gradient.
@@ -97,6 +98,7 @@ class Recipe(Generic[Network]):
     rate: float
     sample: str = "windows"
     decay: float = 0.0
+    optimiser: type[Adam] = AdamW
     schedule: Callable[[Optimizer, int], LRScheduler] | None = None
     evaluations: int = 40
     clip: float = 1.0
@@ -105,7 +107,7 @@ class Recipe(Generic[Network]):
     def minimise(self, network: Network, directory: Path, iterations: int, seed: int) -> TrainingRun:
         """Train ``network`` in place, in the folder of a run; a checkpoint there is resumed."""
         parameters = network.parameters() if self.parameters is None else self.parameters(network)
-        optimiser = AdamW(parameters, lr=self.rate, weight_decay=self.decay)
+        optimiser = self.optimiser(parameters, lr=self.rate, weight_decay=self.decay)
         make = self.schedule or (lambda optimiser, steps: CosineAnnealingLR(optimiser, steps, self.rate / 100))
         run = TrainingRun(directory, network, make(optimiser, iterations), iterations, self.evaluations)
 
@@ -152,7 +154,7 @@ class Recipe(Generic[Network]):
             "Data": data,
             "Licence": licence or LICENCES[options.weights],
             "Training": f"`steadypose train {self.model} --weights {options.weights} --iterations {iterations}`: "
-            f"{self.batch} {self.sample} a step, AdamW {self.rate:g}, seed {options.seed}{origin}",
+            f"{self.batch} {self.sample} a step, {self.optimiser.__name__} {self.rate:g}, seed {options.seed}{origin}",
         })  # fmt: skip
 
 

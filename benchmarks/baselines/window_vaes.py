@@ -17,7 +17,7 @@ from steadypose.prior.fit.hmvae_network import HMVAE, EdgeLinear, MotionVAE, Pos
 from steadypose.prior.models.hmvae.config import CHANNELS, ROTATION_FEATURES, HMVAEConfig
 from steadypose.prior.models.layers import SLOPE
 from steadypose.training.data.dataset import MotionSet
-from steadypose.training.recipes.hmvae import STRIDES, Hyperparameters, fit
+from steadypose.training.recipes.hmvae import STRIDES, Hyperparameters, recipe_of
 
 CONFIGS: Mapping[int, HMVAEConfig] = {
     8: HMVAEConfig(),
@@ -144,9 +144,10 @@ def trained(name: str, frames: int, train: MotionSet, val: MotionSet, runs: Path
         runs: folder for checkpoints of this data; a training killed there resumes, one finished there is not repeated.
         steps: of training.
     """
-    torch.manual_seed(0)
-    model = MODELS[name](CONFIGS[frames])
     directory = runs / f"{name.lower()}-{frames}-{steps}"
     hyperparameters = Hyperparameters(steps, FRAMES_A_STEP // frames, _LEARNING_RATE, _STRIDES[frames])
-    fit(model, train, val, directory, hyperparameters, seed=0)
+    recipe = recipe_of(name, lambda: MODELS[name](CONFIGS[frames]), train, val, hyperparameters)
+    torch.manual_seed(0)
+    model = recipe.network()
+    recipe.minimise(model, directory, steps, seed=0)
     return model

@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import roma
 import torch
 from torch import Tensor
+from torch.optim import Adam, Optimizer
+from torch.optim.lr_scheduler import LRScheduler, MultiStepLR
 
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.fit.hmvae_network import HMVAE, MotionVAE
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, remove_heading, to_6d
 from steadypose.prior.models.hmvae.config import HMVAEConfig
-from steadypose.prior.models.weights import LICENCES
 from steadypose.training.data.dataset import LivelyWindows, MotionSet, describe_data, mirror_offsets, mirror_rotations
-from steadypose.training.loop import TrainingOptions, TrainingRun
-from steadypose.training.weights import started
+from steadypose.training.loop import Recipe, Rng, TrainingOptions
+
+VAE = TypeVar("VAE", bound=MotionVAE)
 
 JOINT_WEIGHT = 10.0
 """lambda of equation 5."""
@@ -107,57 +110,33 @@ def train_long_hmvae(options: TrainingOptions) -> Path:
     return _train("hmvae64", LONG_CONFIG, "window 64 about its mean pose", LONG, options)
 
 
-def _train(
-    name: str, config: HMVAEConfig, described: str, hyperparameters: Hyperparameters, options: TrainingOptions
-) -> Path:
-    torch.manual_seed(options.seed)
-    weights, path = options.weights, options.path(name)
-    train, val = (MotionSet.load(options.data, weights, split) for split in ("train", "val"))
-    model = HMVAE(config)
-    origin = started(model, name, options.start)
-    used = replace(hyperparameters, iterations=options.iterations or hyperparameters.iterations)
-    run = fit(model, train, val, path.parent, used, options.seed)
-    return run.save(path, model, asdict(config), {
-        "Model": f"HM-VAE, {described}, 22 joints (prior/fit/hmvae_network.py)",
-        "Data": describe_data(weights, train, val),
-        "Licence": LICENCES[weights],
-        "Training": f"`steadypose train {name} --weights {weights} --iterations {used.iterations}`: "
-        f"{used.batch} windows a step, Adam {used.learning_rate:g}, seed {options.seed}{origin}",
-    })  # fmt: skip
+def _train(name: str, config: HMVAEConfig, described: str, used: Hyperparameters, options: TrainingOptions) -> Path:
+    train, val = options.motion()
+    recipe = recipe_of(name, lambda: HMVAE(config), train, val, used)
+    described = f"HM-VAE, {described}, 22 joints (prior/fit/hmvae_network.py)"
+    return recipe.train(options, described, describe_data(options.weights, train, val))
 
 
-def fit(
-    model: MotionVAE, train: MotionSet, val: MotionSet, directory: Path, hyperparameters: Hyperparameters, seed: int
-) -> TrainingRun:
-    """Train a VAE of windows as HM-VAE is trained, with equations 3 and 5 to 8.
+def recipe_of(
+    name: str, network: Callable[[], VAE], train: MotionSet, val: MotionSet, used: Hyperparameters
+) -> Recipe[VAE]:
+    """Of a VAE of windows, trained as HM-VAE is, with equations 3 and 5 to 8."""
+    windows = LivelyWindows(train) if used.lively else train
 
-    Args:
-        model: changed in place.
-        train: what it learns.
-        val: what it is evaluated on as it goes.
-        directory: of the run's checkpoint and curves; a checkpoint there is resumed.
-        hyperparameters: of the training.
-        seed: of sampling.
-
-    Returns:
-        The finished run, with its curves.
-    """
-    iterations, strides = hyperparameters.iterations, hyperparameters.strides
-    optimiser = torch.optim.Adam(model.parameters(), lr=hyperparameters.learning_rate, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.MultiStepLR(optimiser, [int(iterations * f) for f in (0.6, 0.85)], gamma=0.3)
-    run = TrainingRun(directory, model, schedule, iterations, evaluations=24)
-    windows = LivelyWindows(train) if hyperparameters.lively else train
-
-    def loss_of(count: int, done: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
-        rows = windows.sample(count, model.window, strides, rng)
+    def loss_of(model: VAE, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        rows = windows.sample(count, model.window, used.strides, rng)
         rotations, offsets = _augment(train.rotations[rows], train.offsets[rows[:, 0]])
         rotations, _ = remove_heading(rotations, model.window // 2 - 1)
-        seen = corrupt(rotations, offsets, rng) if hyperparameters.denoise else rotations
-        local_weight = (done - GLOBAL_FIRST) / LOCAL_WARM_UP
-        return _loss(model, seen, rotations, offsets, local_weight, hyperparameters)
+        seen = corrupt(rotations, offsets, rng) if used.denoise else rotations
+        return _loss(model, seen, rotations, offsets, (done - GLOBAL_FIRST) / LOCAL_WARM_UP, used)
 
-    run.minimise(loss_of, lambda: evaluate_hmvae(model, val), hyperparameters.batch, seed, clip=1.0)
-    return run
+    def falls_twice(optimiser: Optimizer, steps: int) -> LRScheduler:
+        return MultiStepLR(optimiser, [int(steps * share) for share in (0.6, 0.85)], gamma=0.3)
+
+    return Recipe(
+        name, network, loss_of, lambda model: evaluate_hmvae(model, val), used.iterations, used.batch,
+        used.learning_rate, decay=1e-4, optimiser=Adam, schedule=falls_twice, evaluations=24,
+    )  # fmt: skip
 
 
 def _augment(rotations: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
@@ -174,7 +153,7 @@ def _augment(rotations: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     return rotations, offsets
 
 
-def corrupt(rotations: Tensor, offsets: Tensor, rng: np.random.Generator, noise: float | None = None) -> Tensor:
+def corrupt(rotations: Tensor, offsets: Tensor, rng: Rng, noise: float | None = None) -> Tensor:
     """Windows (B, T, 22, 3, 3) as they are solved from noisy joints, on bones (B, 22, 3).
 
     Args:
