@@ -14,10 +14,9 @@ from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
 from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.impute import ImputeSettings
-from steadypose.prior.clean.orient import OrientSettings
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.reconstruct import DenoiseSettings
-from steadypose.prior.clean.refine import RefineSettings
+from steadypose.prior.clean.rotations import OrientSettings, RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
 from steadypose.prior.clean.settings import PriorSettings
 

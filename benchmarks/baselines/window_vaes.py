@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from steadypose.prior.fit.hmvae_network import HMVAE, EdgeLinear, MotionVAE, Posterior, SkeletonConv
-from steadypose.prior.models.hmvae.config import CHANNELS, ROTATION_FEATURES, HMVAEConfig
+from steadypose.prior.models.hmvae import CHANNELS, ROTATION_FEATURES, HMVAEConfig
 from steadypose.prior.models.layers import SLOPE
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.recipes.hmvae import STRIDES, Hyperparameters, recipe_of

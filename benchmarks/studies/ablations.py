@@ -35,10 +35,9 @@ from steadypose.prior.clean.bones import PersonSettings
 from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.gate import GateSettings
 from steadypose.prior.clean.impute import ImputeSettings
-from steadypose.prior.clean.orient import OrientSettings
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.reconstruct import DenoiseSettings
-from steadypose.prior.clean.refine import RefineSettings
+from steadypose.prior.clean.rotations import OrientSettings, RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.models.mixture import inference, whiteness

@@ -23,7 +23,7 @@ from steadypose.benchmarks.scores import figures, score
 from steadypose.prior.arrays import Floats
 from steadypose.prior.fit.hmvae_network import HMVAE, MotionVAE
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, load_network, remove_heading, to_6d
-from steadypose.prior.models.hmvae.config import HMVAEConfig
+from steadypose.prior.models.hmvae import HMVAEConfig
 
 DEPENDS_ON = ("hmvae weights", "hmvae64 weights")
 

@@ -34,9 +34,9 @@ from steadypose.benchmarks.studies.rotations_truth import SCORED, SKIPPED, read
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import global_rotations, heading, rotation_matrices
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.clean.orient import OrientSettings
+from steadypose.prior.clean.rotations import OrientSettings
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.models.posture.root import RootCovariance
+from steadypose.prior.models.posture import RootCovariance
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.ui_prmd import VALIDATION_SUBJECTS, load_pairs
 

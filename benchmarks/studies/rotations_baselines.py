@@ -11,7 +11,7 @@ from steadypose.benchmarks.corruption import gaussian
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import REST_POSITIONS, TRUNK
-from steadypose.prior.models.posture.inference import trunk_frame
+from steadypose.prior.models.posture import trunk_frame
 
 RIDGE, NOISE = 1e-3, 0.02
 """Of standardised features, a frame; and metres along an axis, of the noise that the ridge regression is fitted in."""

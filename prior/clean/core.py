@@ -17,9 +17,8 @@ from steadypose.prior.clean.fuse import Fuse
 from steadypose.prior.clean.gate import Gate
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.impute import impute
-from steadypose.prior.clean.orient import Orient
 from steadypose.prior.clean.reconstruct import Denoise, Reconstruct
-from steadypose.prior.clean.refine import Refine
+from steadypose.prior.clean.rotations import Orient, Refine
 from steadypose.prior.clean.score import Scorer
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.models.mixture.inference import MixtureSmoother

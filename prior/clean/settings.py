@@ -13,9 +13,8 @@ from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.gate import GateSettings
 from steadypose.prior.clean.identify import IdentifySettings
 from steadypose.prior.clean.impute import ImputeSettings
-from steadypose.prior.clean.orient import OrientSettings
 from steadypose.prior.clean.reconstruct import DenoiseSettings, ReconstructSettings
-from steadypose.prior.clean.refine import RefineSettings
+from steadypose.prior.clean.rotations import OrientSettings, RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
 from steadypose.prior.settings import build_settings, check_range
 

@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, to_6d
-from steadypose.prior.models.hmvae.config import CHANNELS, DEVIATION, NO_ROTATION, ROTATION_FEATURES, HMVAEConfig
+from steadypose.prior.models.hmvae import CHANNELS, DEVIATION, NO_ROTATION, ROTATION_FEATURES, HMVAEConfig
 from steadypose.prior.models.layers import SLOPE, pool_matrix, pooling_levels, unpool_matrix
 
 

@@ -22,7 +22,7 @@ from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.fit.hmvae_network import HMVAE
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, load_network, remove_heading, to_6d
 from steadypose.prior.models.completer_features import anchored, draw_line, rotations_of_6d, solved_rotations
-from steadypose.prior.models.hmvae.config import HMVAEConfig
+from steadypose.prior.models.hmvae import HMVAEConfig
 
 MODEL = "hmvae64"
 """Its weights' name."""

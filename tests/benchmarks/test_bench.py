@@ -23,7 +23,7 @@ from steadypose.benchmarks.studies.streaming import recovery
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.fit.hmvae_network import HMVAE
 from steadypose.prior.fit.tensors import load_tensors
-from steadypose.prior.models.hmvae.config import HMVAEConfig
+from steadypose.prior.models.hmvae import HMVAEConfig
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from steadypose.prior.fit.hmvae_network import HMVAE
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
 from steadypose.prior.fit.humor_state import State
 from steadypose.prior.models.hgvae.config import CompletionConfig, HGVAEConfig, Level
-from steadypose.prior.models.hmvae.config import HMVAEConfig
+from steadypose.prior.models.hmvae import HMVAEConfig
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.data.hgvae_windows import Windows
 from steadypose.training.networks.hgvae import HGVAE

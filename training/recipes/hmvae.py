@@ -19,7 +19,7 @@ from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.fit.hmvae_network import HMVAE, MotionVAE
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, remove_heading, to_6d
-from steadypose.prior.models.hmvae.config import HMVAEConfig
+from steadypose.prior.models.hmvae import HMVAEConfig
 from steadypose.training.data.dataset import LivelyWindows, MotionSet, describe_data, mirror_offsets, mirror_rotations
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 

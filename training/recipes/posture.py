@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from steadypose.prior.body.skeleton import HIPS, MIRROR, SHOULDERS
-from steadypose.prior.models.posture.inference import DIMENSIONS, body_size, trunk_frame
+from steadypose.prior.models.posture import DIMENSIONS, body_size, trunk_frame
 from steadypose.prior.models.weights import LICENCES
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.loop import TrainingOptions

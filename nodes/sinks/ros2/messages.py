@@ -26,7 +26,7 @@ from steadypose.nodes.ros2.definitions import header, new, serialise
 from steadypose.nodes.sinks.ros2.rep155 import Links, body_name, frames, joint_angles, joint_rotations, measures, urdf
 from steadypose.prior.body.kinematics import rotation_matrix
 from steadypose.prior.body.skeleton import PARENTS, J
-from steadypose.prior.models.posture.root import RootCovariance
+from steadypose.prior.models.posture import RootCovariance
 
 if TYPE_CHECKING:
     from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeSettings

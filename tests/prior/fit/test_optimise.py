@@ -15,7 +15,7 @@ from steadypose.prior.fit.optimise import Optimiser
 from steadypose.prior.fit.tensors import to_6d
 from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.completer_features import CompleterConfig, solved_rotations
-from steadypose.prior.models.hmvae.config import HMVAEConfig
+from steadypose.prior.models.hmvae import HMVAEConfig
 from steadypose.training.recipes.completer import Completer
 from steadypose.training.weights import arrays_of
 

@@ -10,11 +10,10 @@ from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.clean.refine import rotations_of
+from steadypose.prior.clean.rotations import rotations_of
 from steadypose.prior.fit.hmvae_network import HMVAE, Posterior, SkeletonConv
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, load_tensors, remove_heading, to_6d, yaw_rotation
-from steadypose.prior.models.hmvae.config import HMVAEConfig
-from steadypose.prior.models.hmvae.inference import LiveHMVAE
+from steadypose.prior.models.hmvae import HMVAEConfig, LiveHMVAE
 from steadypose.prior.models.weights import WEIGHTS, load_weights
 from steadypose.training.data.dataset import MotionSet, mirror_offsets, mirror_rotations
 from steadypose.training.loop import TrainingOptions

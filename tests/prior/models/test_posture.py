@@ -5,8 +5,7 @@ from tests.helpers.bodies import fk, random_pose
 
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, J
-from steadypose.prior.models.posture.inference import LENGTH_SIGMA, LivePosture, on_bones
-from steadypose.prior.models.posture.root import LEAST_SIGMA, RootCovariance
+from steadypose.prior.models.posture import LEAST_SIGMA, LENGTH_SIGMA, LivePosture, RootCovariance, on_bones
 
 BODIES = 60
 

@@ -12,12 +12,13 @@ preferred. So a body may lie, or stand on its hands.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, SHOULDERS
+from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, SHOULDERS, J
 from steadypose.prior.models.weights import Arrays, load_weights
 
 DIMENSIONS = 66
@@ -25,12 +26,19 @@ UNLIKE = 0.01
 """Metres along an axis, by which any joint may differ from what training people do."""
 
 MIN_SIGMA, MAX_SIGMA = 1e-5, 0.5
-"""Metres: of what is said of a joint; one of which nothing is said has the largest."""
+"""Metres: bounds of a joint's standard deviation; one that is not known has the largest."""
 
 LENGTH_SIGMA = 0.01
-"""Metres: what is taken for the error of a person's bone lengths."""
+"""Metres: assumed error of a person's bone lengths."""
 _ROUNDS = 2
 _ENDS = np.arange(1, len(PARENT))
+
+LEAST_SIGMA = math.radians(0.5)
+"""Radians about an axis: lower bound of a root's deviation, whatever the sensor."""
+
+_SPINE = J["spine3"]
+_LEAST_UP = 0.05
+"""Metres that the spine rises above the hips: of a body folded up, it says little of how that is turned about them."""
 
 _CORNERS = [*HIPS, *SHOULDERS]
 _REST_SIZE = float(np.linalg.norm(REST_OFFSETS, axis=-1).sum())
@@ -79,6 +87,48 @@ class LivePosture:
         return Expected(expected @ frame.swapaxes(-1, -2) + middle[:, None], left, frame)
 
 
+class RootCovariance:
+    """The covariance of a root's orientation, as the orient stage finds it.
+
+    Args:
+        weights: the posture's weight set, or a path to a ``.safetensors`` file.
+    """
+
+    def __init__(self, weights: str = "default") -> None:
+        self._posture = LivePosture.load(weights)
+
+    def __call__(self, positions: Floats, sigma: Floats, root: Floats) -> Floats:
+        """(B, 3, 3) rad², of rotations about the axes of the positions.
+
+        To first order: the left axis lies along the hips, l, and the up axis in the plane of the spine, u, from the
+        pelvis. In the root's own axes an error of l turns it by (dl_z, ., -dl_x) / |l|, and one of u by
+        (du_x + turn_z u_y) / u_z about the left axis.
+
+        Args:
+            positions: (B, 22, 3) metres.
+            sigma: (B, 22) metres, standard deviations along an axis.
+            root: (B, 3, 3) orientations of the pelvis.
+        """
+        bones = positions - positions[:, PARENT]
+        bones[:, 0] = 0.0
+        expected = self._posture(positions, sigma, bones)
+        left = expected.positions[:, HIPS[0]] - expected.positions[:, HIPS[1]]
+        spine = expected.positions[:, _SPINE] - expected.positions[:, 0]
+        up = np.einsum("bij,bi->bj", root, spine)
+        up_z = np.maximum(up[:, 2], _LEAST_UP)
+        by_left, by_spine = np.zeros((2, len(root), 3, 3))
+        by_left[:, 0, 2] = 1.0 / np.maximum(np.linalg.norm(left, axis=-1), 1e-3)
+        by_left[:, 2, 0] = -by_left[:, 0, 2]
+        by_left[:, 1, 0] = by_left[:, 2, 0] * up[:, 1] / up_z
+        by_spine[:, 1, 0] = 1.0 / up_z
+        turn = root.swapaxes(-1, -2) @ expected.frame
+        jacobian = np.zeros((len(root), 3, 22, 3))
+        jacobian[:, :, HIPS[0]], jacobian[:, :, _SPINE] = by_left @ turn, by_spine @ turn
+        jacobian[:, :, HIPS[1]], jacobian[:, :, 0] = -jacobian[:, :, HIPS[0]], -jacobian[:, :, _SPINE]
+        jacobian = root @ jacobian.reshape(len(root), 3, 66)
+        return jacobian @ expected.covariance @ jacobian.swapaxes(-1, -2) + LEAST_SIGMA**2 * np.eye(3)
+
+
 def on_bones(mean: Floats, covariance: Floats, lengths: Floats) -> tuple[Floats, Floats]:
     """Joints given the lengths of bones, by an extended Kalman filter's update, iterated (Bell and Cathey 1993).
 
@@ -101,8 +151,8 @@ def on_bones(mean: Floats, covariance: Floats, lengths: Floats) -> tuple[Floats,
         slope[:, _ENDS - 1, PARENT[1:]] = -bone / length[..., None]
         flat = slope.reshape(len(mean), -1, DIMENSIONS)
         across = flat @ covariance
-        told = across @ flat.swapaxes(-1, -2) + LENGTH_SIGMA**2 * np.eye(len(_ENDS))
-        gain = np.linalg.solve(told, across).swapaxes(-1, -2)
+        innovation = across @ flat.swapaxes(-1, -2) + LENGTH_SIGMA**2 * np.eye(len(_ENDS))
+        gain = np.linalg.solve(innovation, across).swapaxes(-1, -2)
         off = lengths - length + (flat @ (mean.reshape(prior.shape) - prior)[..., None])[..., 0]
         mean = (prior + (gain @ off[..., None])[..., 0]).reshape(mean.shape)
         left = covariance - gain @ across
