@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.checks.window import tracks
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Floats, medians
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
-from steadypose.prior.body.likeness import Likeness, Stance, likeness, likenesses, medians, stance
+from steadypose.prior.body.likeness import Likeness, Stance, likeness, likenesses, stance
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.adapt import SensorFrame
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Floats, medians
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.skeleton import REST_POSITIONS, J, finite_joints
 
@@ -90,13 +90,6 @@ def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | 
         SPAN_NAMES[int(np.flatnonzero(seen)[worst])],
         float(np.exp(off[worst])),
     )
-
-
-def medians(values: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Of (N, ...) over N, of what is not NaN; NaN where all is: numpy's ``nanmedian`` in a tenth of its time."""
-    ordered, count = np.sort(values, axis=0), (~np.isnan(values)).sum(axis=0)
-    middle = np.stack([np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)])
-    return np.take_along_axis(ordered, middle, axis=0).mean(axis=0)
 
 
 def likenesses(positions: NDArray[np.floating]) -> list[Likeness]:

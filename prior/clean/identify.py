@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Bools, Floats
+from steadypose.prior.arrays import Bools, Floats, medians
 from steadypose.prior.body.skeleton import TRUNK_LANDMARKS, J, finite_joints
 from steadypose.prior.timing.kalman import ConstantVelocityFilter
 
@@ -156,7 +156,7 @@ class Identify:
         if expected is None or not len(rows) or not len(bodies):
             return row_of, places, score
         # a body's position: the median displacement of its joints from the pose last seen
-        place = _median(bodies[None] - self._pose[rows, None])
+        place = medians(bodies[None] - self._pose[rows, None], axis=-2)
         unseen_s = now - self._seen_s[rows]
         there, sigma = _out_of_sight(self._place[rows], expected.positions[rows], expected.sigma[rows], unseen_s)
         score[rows] = _place_score(place - there[:, None], sigma[:, None])
@@ -258,16 +258,8 @@ def _bone_lengths(bodies: Floats, confidence: Floats) -> Floats:
 
 def _middle(body: Floats) -> Floats:
     """(3,) metres, median of the joints of a body's trunk, or of all joints (22, 3) where none of the trunk is seen."""
-    trunk = _median(body[list(TRUNK_LANDMARKS)])
-    return trunk if np.isfinite(trunk).all() else _median(body)
-
-
-def _median(points: Floats) -> Floats:
-    """(..., 3) median of points (..., K, 3) that are not NaN; NaN where all are."""
-    ordered = np.sort(points, axis=-2)  # NaN last
-    count = np.isfinite(ordered[..., 0]).sum(axis=-1)[..., None, None]
-    middle = [np.take_along_axis(ordered, np.maximum(place, 0), axis=-2) for place in ((count - 1) // 2, count // 2)]
-    return np.where(count[..., 0] > 0, 0.5 * (middle[0] + middle[1])[..., 0, :], np.nan)
+    trunk = medians(body[list(TRUNK_LANDMARKS)])
+    return trunk if np.isfinite(trunk).all() else medians(body)
 
 
 def _out_of_sight(last: Floats, coasting: Floats, sigma: Floats, unseen_s: Floats) -> tuple[Floats, Floats]:

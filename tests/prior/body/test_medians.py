@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from steadypose.prior.body.likeness import medians
+from steadypose.prior.arrays import medians
 
 
 @pytest.mark.filterwarnings("ignore:All-NaN slice")
