@@ -1,25 +1,25 @@
 """The errors of a depth camera's body tracker, as a random process with parameters fitted to a real Kinect.
 
-For each joint, as `training.recipes.sensor_noise` finds on UI-PRMD:
+For each joint:
 
 - an **offset**, constant for a session, and a **bias** that drifts with the *distance the joint travels*, not with
-time:
-  a still joint keeps its error, whatever the frame rate;
+  time: a still joint keeps its error, whatever the frame rate;
 - **fast** noise that grows with the joint's speed and whose scale varies over an order of magnitude (log-normally, with
-a
-  correlation time of half a second), which makes its tails heavy;
+  a correlation time of half a second), which makes its tails heavy;
 - **jumps**: the joint is displaced for a frame or for seconds (a wrong surface, the other limb), then returns;
 - **swaps** of left and right limbs for short bursts;
 - a share of all this that all joints of the body have in common.
 
-Errors are drawn in the frame of the camera's ray to the joint: along it, to its right, and up.
+Errors are drawn in the frame of the camera's ray to the joint: along it, to its right, and up. The parameters were
+fitted once, by their statistics, to UI-PRMD's Kinect beside its Vicon (`training/recipes/sensor_noise.py` of commit
+d5d5ec8), and are kept as a result.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +103,7 @@ class NoiseModel:
 
     @classmethod
     def load(cls, path: Path = KINECT_NOISE) -> NoiseModel:
-        """Read the ``parameters`` of a JSON file that `save` wrote.
+        """Read the ``parameters`` of a JSON file such as `KINECT_NOISE`.
 
         Raises:
             ValueError: the file lacks a parameter or has one too many.
@@ -111,20 +111,9 @@ class NoiseModel:
         parameters = json.loads(path.read_text())["parameters"]
         names = {f.name for f in fields(cls)}
         if set(parameters) != names:
-            raise ValueError(f"{path}: expected parameters {sorted(names)}, got {sorted(parameters)}; fit it again")
+            raise ValueError(f"{path}: expected parameters {sorted(names)}, got {sorted(parameters)}")
         arrays: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in parameters.items()}
         return cls(**arrays)
-
-    def save(self, path: Path, about: Mapping[str, object]) -> None:
-        """Write the parameters, after entries ``about`` them (provenance, figures)."""
-
-        def plain(value: object) -> object:
-            if isinstance(value, np.ndarray):
-                return np.round(value, 6).tolist()
-            return round(value, 6) if isinstance(value, float) else value
-
-        parameters = {k: plain(v) for k, v in asdict(self).items()}
-        path.write_text(json.dumps({**about, "parameters": parameters}, indent=1) + "\n")
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ def make(stream: Stream) -> tuple[list[PoseRaw], list[PoseWorld]]:
         noise = NoiseModel.load(stream.noise)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ManifestError(
-            f"{stream.name}: noise: expected parameters as training/recipes/sensor_noise.py writes them: {error}"
+            f"{stream.name}: noise: expected parameters as {KINECT_NOISE.name} has them: {error}"
         ) from error
     playing, filming = (np.random.default_rng(s) for s in np.random.SeedSequence(stream.seed).spawn(2))
     people = [_cut(m, stream.seconds) for m in SCRIPTS[stream.script](playing)]
