@@ -15,7 +15,7 @@ from typing import Any
 from steadypose import PACKAGE
 from steadypose.benchmarks.machine import uncommitted
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.events.settings import EventSettings
+from steadypose.prior.events.detector import EventSettings
 from steadypose.prior.fit.solve import FitSettings
 from steadypose.prior.models.weights import WEIGHTS
 from steadypose.prior.world.settings import TrajectorySettings

@@ -32,7 +32,7 @@ from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import heading
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.events.settings import EventSettings
+from steadypose.prior.events.detector import EventSettings
 from steadypose.prior.mocap.clip import person_of
 from steadypose.prior.sim.camera import film
 from steadypose.prior.sim.motion import Motion

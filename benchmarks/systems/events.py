@@ -29,7 +29,7 @@ from steadypose.nodes.graph.events_node import EventStream
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.graph.trajectory_node import make_trajectory
-from steadypose.prior.events.settings import EventSettings
+from steadypose.prior.events.detector import EventSettings
 from steadypose.prior.sim.camera import Camera, film
 from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.streams import START_NS

@@ -27,9 +27,9 @@ RECIPES = {
     "humor": ("humor", "train_humor"),
     "correction": ("sensor_bias", "train_correction"),
     "mixture": ("mixture", "train_mixture"),
-    "body_modes": ("body_modes", "train_modes"),
+    "body_modes": ("moments", "train_modes"),
     "occlusion": ("occlusion", "train_occlusion"),
-    "posture": ("posture", "train_posture"),
+    "posture": ("moments", "train_posture"),
 }
 """of each model: the module of `training.recipes`, and its function"""
 Model = Literal[tuple(RECIPES)]  # pyright: ignore[reportInvalidTypeForm]

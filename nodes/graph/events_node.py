@@ -10,8 +10,7 @@ from steadypose.msgs.types import Message, Phase, PoseClean, PoseEvents, PoseWor
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.prior.events.detector import NOWHERE, EventDetector
-from steadypose.prior.events.settings import EventSettings
+from steadypose.prior.events.detector import NOWHERE, EventDetector, EventSettings
 
 REPEAT_NS = 1_000_000_000
 """of the stream, after which what holds is published again"""

@@ -99,7 +99,7 @@ _NODES: dict[str, NodeDeclaration] = {
         publishes=(POSE_EVENTS,),
         subscribes={"trajectory": (POSE_WORLD,), "prior": (POSE_CLEAN,), "pose_input": (DIAGNOSTICS,)},
         section="events",
-        settings="steadypose.prior.events.settings:EventSettings",
+        settings="steadypose.prior.events.detector:EventSettings",
         optional=True,
     ),
     "ros2_bridge": NodeDeclaration(

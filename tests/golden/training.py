@@ -11,9 +11,9 @@ from __future__ import annotations
 import hashlib
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
-from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -22,40 +22,14 @@ import numpy as np
 import torch
 from tests.golden.__main__ import compare
 
+from steadypose.nodes.commands.train import RECIPES
 from steadypose.training.data.recordings import write_arrays
 from steadypose.training.loop import TrainingOptions, TrainingRun
-from steadypose.training.recipes import (
-    body_modes,
-    completer,
-    contacts,
-    hgvae,
-    hgvae_faults,
-    hmvae,
-    humor,
-    mixture,
-    occlusion,
-    posture,
-    root_velocity,
-    sensor_bias,
-)
+from steadypose.training.recipes import contacts, hgvae_faults, humor, occlusion, sensor_bias
 
 STEPS, CLIPS = 20, 6
 """Optimiser steps of each recipe, and clips of each source and split that they are trained on."""
 
-RECIPES: dict[str, Callable[[TrainingOptions], Path]] = {
-    "hmvae": hmvae.train_hmvae,
-    "hmvae64": hmvae.train_long_hmvae,
-    "hgvae": hgvae.train_hgvae,
-    "trajectory": root_velocity.train_trajectory,
-    "contacts": contacts.train_contacts,
-    "completer": completer.train_completer,
-    "humor": humor.train_humor,
-    "posture": posture.train_posture,
-    "correction": partial(sensor_bias.train_correction, subjects=("s01",)),
-    "mixture": mixture.train_mixture,
-    "occlusion": occlusion.train_occlusion,
-    "body_modes": body_modes.train_modes,
-}
 FEW: tuple[tuple[Any, str, Any], ...] = (
     (contacts, "CLIPS", {"train": 64, "val": 64}),
     (hgvae_faults, "WINDOWS", 10),
@@ -100,7 +74,9 @@ def digest_of(recipe: str, data: Path, arrays: Path, folder: Path) -> str:
         stack.enter_context(patch.object(torch.Tensor, "backward", backward))
         stack.enter_context(patch.object(TrainingRun, "__init__", evaluated_once))
         name = "kinect_v2" if recipe == "correction" else "default"
-        RECIPES[recipe](TrainingOptions(data, folder, name, STEPS))
+        module, function = RECIPES[recipe]
+        train = getattr(import_module(f"steadypose.training.recipes.{module}"), function)
+        train(TrainingOptions(data, folder, name, STEPS), **({"subjects": ("s01",)} if recipe == "correction" else {}))
     for path in sorted([*folder.rglob("*.safetensors"), *folder.rglob("curves.json"), *folder.rglob("*.anomaly.json")]):
         found.update(path.name.encode() + path.read_bytes())
     return found.hexdigest()[:24]
@@ -113,7 +89,7 @@ def outcomes(prepared: Path, mocap: Path, arrays: Path) -> Iterator[tuple[str, s
         write_arrays(mocap, arrays)
     with tempfile.TemporaryDirectory() as folder:
         few_clips(prepared, Path(folder) / "few.npz")
-        for recipe in RECIPES:
+        for recipe in (name for name in RECIPES if name != "hgvae-wide"):
             data = mocap / "ui_prmd.npz" if recipe == "correction" else Path(folder) / "few.npz"
             yield recipe, digest_of(recipe, data, arrays, Path(folder) / recipe)
 

@@ -2,7 +2,7 @@
 
 Joints of a body accelerate together: six of the 22 eigenvectors of that covariance hold five sixths of it. It is the
 same for x, y and z, so that it does not depend on the body's heading, and is learned from training motion
-(`training.recipes.body_modes`).
+(`training.recipes.moments`).
 """
 
 from __future__ import annotations

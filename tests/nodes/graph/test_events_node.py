@@ -14,7 +14,7 @@ from steadypose.msgs.types import EventKind, Phase, PoseEvents, PoseWorld
 from steadypose.nodes.graph.events_node import EventsNode, EventStream
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.topology import POSE_NODES, publishers
-from steadypose.prior.events.settings import EventSettings
+from steadypose.prior.events.detector import EventSettings
 
 
 def worlds(seconds: float) -> list[PoseWorld]:

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import Event, EventKind, Hand, JointState, Phase, PoseWorld, Tracking, WorldBody
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
-from steadypose.prior.events.detector import EventDetector
-from steadypose.prior.events.settings import EventSettings
+from steadypose.prior.events.detector import EventDetector, EventSettings
 from steadypose.prior.events.trigger import Trigger, Wave
 
 FRAME_NS = 33_333_333
