@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import Event, EventKind, Hand, Phase, PoseWorld, Tracking, WorldBody
-from steadypose.prior.events.features import Arm, Features, features
-from steadypose.prior.events.trigger import Trigger, Wave
+from steadypose.prior.events.features import Arm, Features, facing_away, features
+from steadypose.prior.events.trigger import Facing, Trigger, Wave
 from steadypose.prior.settings import check_range
 
 
@@ -40,6 +40,8 @@ class EventSettings:
     """radians between where the trunk faces and the sensor"""
     faces_margin: float = 0.2
     """radians more, at which one no longer faces it"""
+    faces_turn: float = 0.3
+    """metres by which the line from right to left of hips and shoulders changes in a second, root mean square"""
     stands: float = 0.85
     """height of the hips above the lower ankle, in lengths of the leg, from which on one stands"""
     stands_margin: float = 0.2
@@ -153,6 +155,7 @@ class _Body:
             self._triggers[EventKind.WAVES, hand] = trigger(0.5, 0.0, 0.0)
             self._triggers[EventKind.POINTS, hand] = trigger(s.point_elbow, s.point_elbow_margin, s.point_hold)
         self._waves = {hand: Wave(s.wave_swing, s.wave_within) for hand in (Hand.LEFT, Hand.RIGHT)}
+        self._facing = Facing(s.faces_turn)
         self._heights: deque[tuple[int, float]] = deque()
         self._falls: deque[tuple[int, float]] = deque()
         self._wrists: deque[tuple[int, tuple[list[float], ...]]] = deque()
@@ -214,7 +217,8 @@ class _Body:
             (lies or fallen) and not (stands or sits),
         )
         take(EventKind.NEAR, none, -seen.distance.value, seen.distance.sigma)
-        take(EventKind.FACES_SENSOR, none, -seen.turned.value, seen.turned.sigma, possible=not lies)
+        turned = facing_away(*self._facing.update(now, seen.across, seen.across_sigma), seen.to_sensor)
+        take(EventKind.FACES_SENSOR, none, -turned.value, turned.sigma, possible=not lies)
         speeds = self._wrist_speeds(now, seen.arms)
         for hand, arm, speed in zip((Hand.LEFT, Hand.RIGHT), seen.arms, speeds, strict=True):
             take(EventKind.HAND_RAISED, hand, *arm.raised, possible=not lies)

@@ -7,6 +7,7 @@ that drifts moves none of them but the distance to the sensor.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,9 @@ from steadypose.prior.body.skeleton import J
 Point = list[float]
 HAND = 0.18
 """metres from wrist to fingertips of an adult (Drillis and Contini 1966: 0.108 of the stature)"""
+
+NARROW = 0.05
+"""Width in metres of hips and shoulders together, as seen from above, under which nobody knows where a body faces."""
 
 EXTENT = [J[name] for name in ("head", "neck", "pelvis", "left_knee", "right_knee", "left_ankle", "right_ankle")]
 
@@ -56,8 +60,12 @@ class Features(NamedTuple):
 
     distance: Quantity
     """metres on the floor from sensor to pelvis"""
-    turned: Quantity
-    """radians between where hips and shoulders face, and the sensor"""
+    to_sensor: tuple[float, float]
+    """(2,) metres on the floor from the pelvis to the sensor"""
+    across: tuple[float, float]
+    """(2,) metres on the floor from right to left, hips and shoulders together; a body faces a right angle to it"""
+    across_sigma: float
+    """metres, of each of the two"""
     extension: Quantity
     """height of the hips above the lower ankle, in lengths of the leg"""
     thigh: Quantity
@@ -96,8 +104,12 @@ def features(body: WorldBody, sensor: NDArray[np.float64]) -> Features:
         p[J["left_hip"]][k] - p[J["right_hip"]][k] + p[J["left_shoulder"]][k] - p[J["right_shoulder"]][k]
         for k in (0, 1)
     ]
+    to_sensor = (float(sensor[0] - body.root_position[0]), float(sensor[1] - body.root_position[1]))
     return Features(
-        *_seen_from(body, left, s, sensor),
+        _away(body, to_sensor),
+        to_sensor,
+        (left[0], left[1]),
+        math.sqrt(sum(s[J[f"{side}_{part}"]] ** 2 for side in ("left", "right") for part in ("hip", "shoulder"))),
         extension,
         thigh,
         extent,
@@ -107,20 +119,23 @@ def features(body: WorldBody, sensor: NDArray[np.float64]) -> Features:
     )
 
 
-def _seen_from(
-    body: WorldBody, left: list[float], s: list[float], sensor: NDArray[np.float64]
-) -> tuple[Quantity, Quantity]:
-    """Distance to the sensor, and the angle by which the body, whose left is (2,), is turned from it."""
-    x, y = (float(sensor[k] - body.root_position[k]) for k in (0, 1))
+def facing_away(across: Sequence[float], sigma: float, to_sensor: Sequence[float]) -> Quantity:
+    """Radians between where a body faces, whose left lies along ``across``, and the sensor; all on the floor."""
+    width, far = math.hypot(*across), math.hypot(*to_sensor)
+    if far < 1e-6 or not width > NARROW:
+        return Quantity(math.nan, math.nan)
+    cosine = (across[1] * to_sensor[0] - across[0] * to_sensor[1]) / (width * far)
+    return Quantity(math.acos(max(-1.0, min(1.0, cosine))), sigma / width)
+
+
+def _away(body: WorldBody, to_sensor: Sequence[float]) -> Quantity:
+    """Metres on the floor from the sensor to the pelvis."""
+    (x, y), c = to_sensor, body.covariance
     far = math.hypot(x, y)
     if far < 1e-6:
-        return Quantity(0.0, 0.0), Quantity(math.nan, math.nan)
-    c = body.covariance
+        return Quantity(0.0, 0.0)
     variance = float(c[0, 0] * x * x + (c[0, 1] + c[1, 0]) * x * y + c[1, 1] * y * y) / far**2
-    width = math.hypot(*left)
-    turned = math.acos(max(-1.0, min(1.0, (left[1] * x - left[0] * y) / (width * far)))) if width > 0.05 else math.nan
-    doubt = sum(s[J[f"{side}_{part}"]] ** 2 for side in ("left", "right") for part in ("hip", "shoulder"))
-    return Quantity(far, math.sqrt(max(variance, 0.0))), Quantity(turned, math.sqrt(doubt) / max(width, 0.05))
+    return Quantity(far, math.sqrt(max(variance, 0.0)))
 
 
 def _thigh(p: list[Point], s: list[float], side: str) -> Quantity:

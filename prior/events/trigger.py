@@ -67,7 +67,10 @@ class Trigger:
 
 
 SWINGS = 2
-"""out and back"""
+"""Number of swings of a wave: out and back, and once more where it is not about upright, for so an arm that is raised
+aside and lowered again begins as well."""
+CENTRED = 0.4
+"""Angle in radians of the middle of a swing from upright, up to which it is about upright."""
 
 
 class Wave:
@@ -84,6 +87,7 @@ class Wave:
 
     def _reset(self) -> None:
         self._low, self._high = math.inf, -math.inf
+        self._about_upright = False
         self._side = self._turns = self._turned_ns = 0
 
     def update(self, stamp_ns: int, angle: float, upright: bool, up: bool) -> bool:
@@ -99,13 +103,43 @@ class Wave:
             self._reset()
         self._low, self._high = min(self._low, angle), max(self._high, angle)
         if self._side <= 0 and angle - self._low > self._swing:
-            self._turn(1, stamp_ns, angle)
+            self._turn(1, stamp_ns, angle, self._low)
         elif self._side >= 0 and self._high - angle > self._swing:
-            self._turn(-1, stamp_ns, angle)
-        return self._turns >= SWINGS
+            self._turn(-1, stamp_ns, angle, self._high)
+        return self._turns > SWINGS or (self._turns == SWINGS and self._about_upright)
 
-    def _turn(self, side: int, stamp_ns: int, angle: float) -> None:
+    def _turn(self, side: int, stamp_ns: int, angle: float, extreme: float) -> None:
+        self._about_upright = abs(angle + extreme) < 2.0 * CENTRED
         self._side = side
         self._low = self._high = angle
         self._turns += 1
         self._turned_ns = stamp_ns
+
+
+class Facing:
+    """Where a body faces: a Kalman filter of the line from its right to its left, each of two coordinates alike.
+
+    A sensor's noise turns hips and shoulders by more than what a threshold asks for; people turn slower than that.
+
+    Args:
+        turn: metres by which the line changes in a second, root mean square.
+    """
+
+    def __init__(self, turn: float) -> None:
+        self._density = turn * turn
+        self._stamp_ns, self._line, self._variance = NEVER, (math.nan, math.nan), math.inf
+
+    def update(self, stamp_ns: int, line: tuple[float, float], sigma: float) -> tuple[tuple[float, float], float]:
+        """The line (2,) and its standard deviation, in metres, with the next observation of it; NaN where unknown."""
+        if math.isnan(line[0]) or math.isnan(line[1]):
+            self._stamp_ns = NEVER
+            return line, math.nan
+        if self._stamp_ns == NEVER:
+            self._line, self._variance = line, sigma * sigma
+        else:
+            self._variance += self._density * (stamp_ns - self._stamp_ns) * 1e-9
+            gain = self._variance / max(self._variance + sigma * sigma, 1e-12)
+            self._line = tuple(old + gain * (new - old) for old, new in zip(self._line, line, strict=True))
+            self._variance *= 1.0 - gain
+        self._stamp_ns = stamp_ns
+        return self._line, math.sqrt(self._variance)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.types import Event, EventKind, Hand, JointState, Phase, PoseWorld, Tracking, WorldBody
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.events.detector import EventDetector, EventSettings
-from steadypose.prior.events.trigger import Trigger, Wave
+from steadypose.prior.events.trigger import Facing, Trigger, Wave
 
 FRAME_NS = 33_333_333
 START_NS = 1_000_000_000
@@ -244,6 +244,33 @@ def test_a_trigger_begins_above_its_threshold_only_and_ends_below_the_other_only
 def test_a_forearm_that_does_not_swing_does_not_wave(course: Callable[[float], float]) -> None:
     wave = Wave(0.28, 0.8)
     assert not any(wave.update(k * FRAME_NS, course(k / 30), True, True) for k in range(90))
+
+
+def test_an_arm_raised_aside_and_lowered_does_not_wave() -> None:
+    """Its forearm comes up from one side and goes back to it: a swing, and back, but not about upright."""
+    wave = Wave(EventSettings().wave_swing, EventSettings().wave_within)
+    angles = 0.6 + 0.42 * np.cos(np.linspace(0.0, 2.0 * np.pi, 40))
+    assert not any(wave.update(START_NS + k * FRAME_NS, angle, True, True) for k, angle in enumerate(angles))
+    again = [*angles, *angles, *angles]
+    assert wave_begins(again), "but who does it again and again waves"
+
+
+def wave_begins(angles: list[float]) -> bool:
+    wave = Wave(EventSettings().wave_swing, EventSettings().wave_within)
+    return any(wave.update(START_NS + k * FRAME_NS, angle, True, True) for k, angle in enumerate(angles))
+
+
+def test_where_a_body_faces_is_told_through_noise_and_followed_where_there_is_none() -> None:
+    rng = np.random.default_rng(0)
+    noisy, sure = Facing(0.3), Facing(0.3)
+    for k in range(60):
+        line, sigma = noisy.update(START_NS + k * FRAME_NS, (0.5 + rng.normal(0.0, 0.3), rng.normal(0.0, 0.3)), 0.3)
+        (x, y), _ = sure.update(START_NS + k * FRAME_NS, (np.cos(k / 20.0), np.sin(k / 20.0)), 0.005)
+    assert sigma < 0.15
+    assert abs(np.arctan2(line[1], line[0])) < 0.5
+    assert np.arctan2(y, x) == pytest.approx(59 / 20.0, abs=0.05)
+    assert np.isnan(noisy.update(START_NS + 61 * FRAME_NS, (np.nan, 0.0), 0.3)[0][0])
+    assert noisy.update(START_NS + 62 * FRAME_NS, (0.0, 1.0), 0.3)[0] == (0.0, 1.0), "what was unknown begins anew"
 
 
 def test_who_waves_with_the_whole_arm_begins_to_wave_once() -> None:
