@@ -19,7 +19,7 @@ from steadypose.prior.compiled import njit
 from steadypose.prior.models.weights import Arrays, part
 
 LOG_VAR_RANGE = (-10.0, 3.0)
-"""of latents and, in units of `prior.models.hgvae.config.SCALE`, of tracks: standard deviations from 1.3 mm to 0.9 m"""
+"""Range of log-variances, in units of `prior.models.hgvae.config.SCALE`: standard deviations from 1.3 mm to 0.9 m."""
 
 # Steps: the kind, the matrix written, that read, and what else the kind needs (see `_do`).
 _LINEAR, _GELU = range(2)
@@ -119,9 +119,6 @@ class Network:
     Args:
         program: a network written down; later changes to it are not seen here.
         max_batch: windows at once, each in its row.
-
-    Attributes:
-        values: (max_batch, all matrices) of every window.
     """
 
     def __init__(self, program: Program, max_batch: int) -> None:
@@ -132,16 +129,16 @@ class Network:
         self._ends = self._starts[:-1] + sizes
         self._weights = _zeros(sum(map(len, program.weights)))
         np.concatenate(program.weights, out=self._weights)
-        self.values = _zeros(max_batch, self._starts[-1])
+        self._values = _zeros(max_batch, self._starts[-1])
         self._scratch = _zeros(3, -(-self._shapes.max(axis=0).prod() // _LINE) * _LINE)
 
     def matrix(self, number: int, rows: slice) -> Floats32:
         """(B, n, f) one matrix of the windows in these rows; a view."""
-        return self.values[rows, self._starts[number] : self._ends[number]].reshape(-1, *self._shapes[number])
+        return self._values[rows, self._starts[number] : self._ends[number]].reshape(-1, *self._shapes[number])
 
     def run(self, rows: slice) -> None:
         """Do all steps for the windows in these rows."""
-        _forward(self._steps, self._shapes, self._starts, self._weights, self.values[rows], self._scratch)
+        _forward(self._steps, self._shapes, self._starts, self._weights, self._values[rows], self._scratch)
 
 
 def _zeros(*shape: int) -> Floats32:
