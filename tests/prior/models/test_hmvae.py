@@ -146,26 +146,15 @@ def test_a_missing_split_and_a_missing_file_are_said(tmp_path: Path) -> None:
         MotionSet.load(prepared(tmp_path / "m.npz"), "kinect_v2", "train")
 
 
-def test_training_resumes_where_it_was_killed_and_ends_the_same(tmp_path: Path, monkeypatch) -> None:
+def test_training_writes_weights_and_curves_and_ends_the_same_twice(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("steadypose.prior.models.weights.WEIGHTS", tmp_path / "weights")
     monkeypatch.setattr("steadypose.training.recipes.hmvae.SHORT", replace(SHORT, batch=4))
     data = prepared(tmp_path / "m.npz")
-    whole = train_hmvae(TrainingOptions(data, tmp_path / "a", iterations=6)).read_bytes()
-
-    steps = iter(range(100))
-    original = torch.optim.Adam.step
-
-    def dies(*args, **keywords):
-        if next(steps) == 4:
-            raise KeyboardInterrupt
-        return original(*args, **keywords)
-
-    monkeypatch.setattr(torch.optim.Adam, "step", dies)
-    with pytest.raises(KeyboardInterrupt):
-        train_hmvae(TrainingOptions(data, tmp_path / "b", iterations=6))
-    monkeypatch.setattr(torch.optim.Adam, "step", original)
-    assert train_hmvae(TrainingOptions(data, tmp_path / "b", iterations=6)).read_bytes() == whole
-    assert [c["step"] for c in json.loads((tmp_path / "b/hmvae-default/curves.json").read_text())] == [1, 2, 3, 4, 5, 6]
+    first, second = (
+        train_hmvae(TrainingOptions(data, tmp_path / run, iterations=3)).read_bytes() for run in ("a", "b")
+    )
+    assert first == second
+    assert [c["step"] for c in json.loads((tmp_path / "b/hmvae-default/curves.json").read_text())] == [1, 2, 3]
     assert (tmp_path / "b/hmvae-default/curves.png").stat().st_size > 1000
 
 
