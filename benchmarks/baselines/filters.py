@@ -19,7 +19,7 @@ from steadypose.benchmarks.baselines.beside import beside
 from steadypose.benchmarks.baselines.kalman import fixed_lag, smooth
 from steadypose.benchmarks.baselines.whole_body_bank import whole_body_bank
 from steadypose.prior.arrays import Floats
-from steadypose.prior.models.mixture.modes import body_covariance
+from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.timing.rate import FPS
 
 OFFLINE = -1

@@ -1,7 +1,7 @@
 """A baseline without parameters to tune: the multiple-model estimate of smoothers of the whole body.
 
 As `benchmarks.baselines.bank`, but of eight smoothers over modes of the whole body instead of joints: eigenvectors of
-the covariance of joints' accelerations, learned once from other people's motion (`prior.models.mixture.modes`). In
+the covariance of joints' accelerations, learned once from other people's motion (`prior.models.mixture.tracks`). In
 white noise it has 0.84 to 0.93 of that bank's error, whoever moves. The smoothers are the product's own
 (`prior.models.mixture.bank`), and their weights in each mode the likelihood of the mode's innovations. The product
 falls back to the same, but for an estimate of the noise that modes share where it is white.
@@ -21,7 +21,7 @@ from steadypose.prior.models.mixture.bank import (
     new_bank,
 )
 from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
-from steadypose.prior.models.mixture.modes import body_covariance
+from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.timing.rate import FPS
 
 

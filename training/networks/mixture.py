@@ -24,10 +24,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from steadypose.prior.models.mixture.bank import EXPERTS, MULTIPLE_MODEL, RAW
-from steadypose.prior.models.mixture.features import FEATURES
-from steadypose.prior.models.mixture.form import (
+from steadypose.prior.models.mixture.features import (
     COASTING,
     CORRECTION,
+    FEATURES,
     GATES,
     MAX_LOG_SIGMA,
     MIN_LOG_SIGMA,

@@ -28,7 +28,7 @@ from steadypose.prior.models.mixture.bank import (
     new_bank,
 )
 from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
-from steadypose.prior.models.mixture.modes import body_covariance
+from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.models.mixture.whiteness import Whiteness, fallback
 from steadypose.prior.models.weights import LICENCES
 from steadypose.prior.timing.rate import FPS

@@ -1,4 +1,4 @@
-"""Input features of the mixture's network: `FEATURES` numbers for each joint and frame.
+"""Input features of the mixture's network: `FEATURES` numbers for each joint and frame; and its outputs' bounds.
 
 They are invariant under translation and rotation about the vertical: lengths, and vectors in the frame of the body's
 heading.
@@ -54,6 +54,24 @@ joint), three each; vectors between these; sizes of differences; bone; pose; mul
 delay."""
 FEATURES = _DELAY + len(_DELAYS) + 1
 """Features of each joint."""
+
+OUTPUTS = 2 * EXPERTS + 4
+"""Outputs of each joint: logits of the weights w, then b, the correction r (3), and the log standard deviation."""
+
+GATES = 3
+"""Gates of each joint, weights of the last frame's output: of w and b, of r, and of the deviation."""
+
+REACH = 1.0
+"""Bound of each b: how far the estimate may leave the experts' convex hull."""
+
+CORRECTION = 2.0
+"""Bound of the correction along an axis, in units of the estimated noise."""
+
+COASTING = 0.1
+"""m/s: least growth of a joint's standard deviation with the time to its nearest observation."""
+
+MIN_LOG_SIGMA, MAX_LOG_SIGMA = -3.0, 6.0
+"""Range of the natural logarithm of the standard deviation in millimetres."""
 
 
 @njit(cache=True)

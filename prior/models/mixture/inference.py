@@ -22,16 +22,18 @@ from steadypose.prior.models.mixture.bank import (
     forget,
     new_bank,
 )
-from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
-from steadypose.prior.models.mixture.form import (
+from steadypose.prior.models.mixture.features import (
     COASTING,
     CORRECTION,
+    FEATURES,
     MAX_LOG_SIGMA,
     MIN_LOG_SIGMA,
     OUTPUTS,
+    PARENT,
     REACH,
+    describe,
 )
-from steadypose.prior.models.mixture.modes import body_covariance
+from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.models.mixture.whiteness import Whiteness, fallback
 from steadypose.prior.models.weights import load_weights
 from steadypose.prior.timing.kalman import Smoothed

@@ -14,9 +14,13 @@ only the diagonal is kept through such a change.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
+from steadypose.prior.models.weights import load_weights
 
 MEMORY = 9
 """Time constant of the likelihoods' exponential forgetting, in sightings: 5 to 15 differ by 3 % at most
@@ -33,6 +37,21 @@ MIN_EIGENVALUE = 1e-5
 
 INITIAL_SPEED = 1.0
 """m/s along an axis, standard deviation of a new joint's velocity."""
+
+
+@cache
+def body_covariance(name: str = "default") -> Floats:
+    """(22, 22) covariance of joints' accelerations along an axis, relative to their mean variance; read-only.
+
+    Six of its eigenvectors hold five sixths of it. It is the same for x, y and z, so that it does not depend on the
+    body's heading, and is learned from training motion (`training.recipes.moments`).
+
+    Args:
+        name: a weight set or a path, as of `load_weights`.
+    """
+    covariance = load_weights(name, "body_modes")[0]["covariance"].astype(np.float64)
+    covariance.flags.writeable = False
+    return covariance
 
 
 @njit(cache=True)

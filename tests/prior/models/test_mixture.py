@@ -24,8 +24,7 @@ from steadypose.prior.models.mixture.bank import (
 )
 from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
 from steadypose.prior.models.mixture.inference import MixtureSmoother
-from steadypose.prior.models.mixture.modes import body_covariance
-from steadypose.prior.models.mixture.tracks import HELD, MEMORY, MIN_SCALE, SETTLED
+from steadypose.prior.models.mixture.tracks import HELD, MEMORY, MIN_SCALE, SETTLED, body_covariance
 from steadypose.prior.timing.kalman import ConstantVelocityFilter, Smoothed
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.sensors import Sensed
