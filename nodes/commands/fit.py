@@ -34,7 +34,7 @@ from steadypose.nodes.sources.npz import NpzError, read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.arrays import Floats
-from steadypose.prior.fit.picture import in_sight
+from steadypose.prior.camera.key_points import in_sight
 
 if TYPE_CHECKING:
     from steadypose.prior.fit.bodies import Fit, Seen

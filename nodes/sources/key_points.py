@@ -11,7 +11,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,7 @@ from steadypose.nodes.sources.npz import NpzError, read_arrays, read_stamps
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS
-from steadypose.prior.fit.picture import KeyPointRecording, in_sight
-
-if TYPE_CHECKING:
-    pass
-
+from steadypose.prior.camera.key_points import KeyPointRecording, in_sight
 
 HIGHEST = 100.0
 """Height in metres of a camera above the floor, at most."""

@@ -1,31 +1,198 @@
-"""What is to be fitted of a person in a picture: key points, and points of the surface where the camera has depth.
+"""Fits to key points of one camera: initial poses, and what is to be fitted.
 
-Torch is imported by the functions that need it: a recording of key points is read and checked without.
+With points of a depth camera, each key point is as far away as the surface about it in the image. Without, depth
+follows from where the rays of feet meet a floor that is known, or from the longest bones in the image, for these lie
+across the line of sight; the angle of the heading from the widths of hips and shoulders, its sign from where the toes
+point. Where no toes are seen there are two starts, of which the fit of less energy is taken.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d, median_filter, percentile_filter
 
-from steadypose.msgs.types import JOINTS, JointState
+from steadypose.msgs.types import JointState
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
-from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.kinematics import quaternions
-from steadypose.prior.body.skeleton import REST_OFFSETS
+from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, quaternions, yaw_matrix
+from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, SHOULDERS, J
+from steadypose.prior.camera.key_points import KeyPointRecording
+from steadypose.prior.fit.humor_network import HumorNet
+from steadypose.prior.fit.motion import float_tensor
+from steadypose.prior.fit.observations import KeyPoints, Observed, Pinhole, SeenJoints, SurfacePoints, thinned
+from steadypose.prior.fit.solve import FitSettings, Start
+from steadypose.prior.fit.windows import FittedTrack, Track, fit_track
+from steadypose.prior.sim.body import CAPSULES
 from steadypose.prior.timing.rate import FPS
 
-if TYPE_CHECKING:
-    from steadypose.prior.fit.humor_network import HumorNet
-    from steadypose.prior.fit.observations import Pinhole
-    from steadypose.prior.fit.solve import FitSettings, Start
-    from steadypose.prior.fit.windows import FittedTrack, Track
+_BONES = [(J[a], J[b]) for side in ("left", "right") for a, b in (
+    (f"{side}_hip", f"{side}_knee"), (f"{side}_knee", f"{side}_ankle"), (f"{side}_shoulder", f"{side}_elbow"),
+    (f"{side}_elbow", f"{side}_wrist"), (f"{side}_hip", f"{side}_shoulder"),
+)]  # fmt: skip
+_ACROSS = 80.0
+"""Percentile of the ratios of bones' lengths in the picture to their own that counts as that of a bone across the line
+of sight; the largest is as likely an outlier."""
+_MEDIAN_FRAMES, _SMOOTHING_SIGMA = 5, 3.0
+"""Frames: window of the median filter, standard deviation of the Gaussian one, of root and heading."""
+
+_REACH, _NEAREST = 0.08, 5
+"""Metres in the picture, at a point's depth, within which it tells how far a key point is; of so many at most."""
+_FLESH = np.array([max((r for a, b, r in CAPSULES if name in (a, b)), default=0.1) for name in JOINTS])
+"""Metres from the skin to each joint."""
+_SIZES = 0.6, 1.25
+"""Least and largest size that the floor may give, of the initial bones'."""
+_ANKLES_TOES = [(J[f"{side}_ankle"], J[f"{side}_foot"]) for side in ("left", "right")]
+_FEET = np.array(CONTACT_JOINTS[2:6])
+_AHEAD, _STRIDE, _STANDS = 0.2, 15, 30.0
+"""Metres by which the nearest foot is nearer than the root; frames in which a foot stands more often than not."""
+
+
+def starts_of_key_points(
+    pixels: Floats, camera: Pinhole, offsets: Floats, ground: float, *, floor_known: bool = False
+) -> list[Start]:
+    """Motions of a body in the rest pose, without depth.
+
+    Args:
+        pixels: (T, 22, 2), NaN where not found.
+        camera: that took it.
+        offsets: (22, 3) metres, initial bones.
+        ground: metres, world, initial height of the floor.
+        floor_known: whether that is so, not a guess: the body is then as large as one that stands on it.
+
+    Returns:
+        A body in the rest pose with its arms down, that follows the key points in place and heading; where no toes are
+        seen, one with its left side away from the camera and one with it towards the camera.
+    """
+    focal, centre = camera.focal.numpy().astype(float), camera.centre.numpy().astype(float)
+    rotation, position = camera.rotation.numpy().astype(float), camera.position.numpy().astype(float)
+    rays = (pixels - centre) / focal
+    rest = _arms_down(offsets)
+    depth = _depth(rays, rest)
+    if floor_known and (standing := _standing_depth(rays, rotation, position, ground)) is not None:
+        size = float(np.median(standing / depth))
+        if _SIZES[0] < size < _SIZES[1]:
+            depth, offsets, rest = standing, offsets * size, rest * size
+    hips = _nanmean(rays[:, HIPS])
+    middle = _interpolated(np.where(np.isfinite(hips), hips, _nanmean(rays)))
+    root = np.concatenate([middle, np.ones((len(middle), 1))], axis=1) * depth[:, None]
+    root = gaussian_filter1d(root, _SMOOTHING_SIGMA, axis=0, mode="nearest") @ rotation.T + position
+    across = _across(rays, depth, rest)
+    right_axis, ahead = rotation[:, 0], rotation[:, 2]
+    starts = []
+    toes = _toes(rays)
+    for side in (np.ones(len(root)), -np.ones(len(root))) if toes is None else (toes,):
+        left = across[:, None] * right_axis + (side * np.sqrt(1.0 - across**2))[:, None] * ahead
+        yaw = np.arctan2(-left[:, 0], left[:, 1])
+        rotations = np.tile(solve_rotations(rest, offsets), (len(root), 1, 1, 1))
+        rotations[:, 0] = yaw_matrix(yaw)
+        starts.append(Start.of(root, rotations, offsets, ground))
+    return starts
+
+
+def lift(pixels: Floats, camera: Pinhole, points: Floats) -> Floats:
+    """(T, 22, 3) metres, world: key points (T, 22, 2) behind the surface that points (T, N, 3) show about them; NaN
+    where there is none."""
+    focal, centre = camera.focal.numpy().astype(float), camera.centre.numpy().astype(float)
+    rotation, position = camera.rotation.numpy().astype(float), camera.position.numpy().astype(float)
+    seen = (points - position) @ rotation
+    depth = seen[..., 2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        places = seen[..., :2] / depth[..., None]
+    rays = (pixels - centre) / focal
+    found = np.full((*pixels.shape[:2], 3), np.nan)
+    for row, (keys, near, far) in enumerate(zip(rays, places, depth, strict=True)):
+        off = np.linalg.norm(keys[:, None] - near, axis=-1) * far
+        off[~(far > 0)[None] | ~np.isfinite(off)] = np.inf
+        order = np.argsort(off, axis=1)[:, :_NEAREST]
+        beside = np.take_along_axis(off, order, axis=1) < _REACH
+        known = beside.any(axis=1)
+        if not known.any():
+            continue
+        z = np.nanmedian(np.where(beside, far[order], np.nan)[known], axis=1) + _FLESH[known]
+        found[row, known] = np.concatenate([keys[known], np.ones((len(z), 1))], axis=1) * z[:, None]
+    return found @ rotation.T + position
+
+
+def _standing_depth(rays: Floats, rotation: Floats, position: Floats, ground: float) -> Floats | None:
+    """(T,) metres along the optical axis to the root of a body that stands on the floor; None if no foot is seen there.
+
+    The ray of a foot that stands meets the floor where the foot is, that of one in the air farther away.
+    """
+    feet = np.concatenate([rays[:, _FEET], np.ones((len(rays), len(_FEET), 1))], axis=-1) @ rotation.T
+    drop = ground + np.array(REST_HEIGHT)[2:6] - position[2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        meets = np.where((feet[..., 2] < 0) & (drop < 0), drop / feet[..., 2], np.inf)
+    nearest = np.where(np.isfinite(meets), meets, np.inf).min(axis=1)
+    if not np.isfinite(nearest).any():
+        return None
+    depth = _interpolated(np.where(np.isfinite(nearest), nearest, np.nan)) + _AHEAD
+    return percentile_filter(depth, _STANDS, _STRIDE, mode="nearest")
+
+
+def _depth(rays: Floats, rest: Floats) -> Floats:
+    """(T,) metres along the optical axis, of key points (T, 22, 2) at depth 1, by the bones of the pose ``rest``."""
+    a, b = np.array(_BONES).T
+    lengths = np.linalg.norm(rest[b] - rest[a], axis=-1)
+    ratios = np.linalg.norm(rays[:, b] - rays[:, a], axis=-1) / lengths
+    inverse = [np.percentile(row[np.isfinite(row)], _ACROSS) if np.isfinite(row).any() else np.nan for row in ratios]
+    return 1.0 / _interpolated(np.array(inverse))
+
+
+def _across(rays: Floats, depth: Floats, rest: Floats) -> Floats:
+    """(T,) component, -1 to 1, of the body's left axis along the picture's x, by the widths of hips and shoulders."""
+    widths = [
+        (rays[:, left, 0] - rays[:, right, 0]) * depth / np.linalg.norm(rest[left] - rest[right])
+        for left, right in (HIPS, SHOULDERS)
+    ]
+    width = _interpolated(_nanmean(np.stack(widths, axis=1)))
+    return np.clip(gaussian_filter1d(width, _SMOOTHING_SIGMA, mode="nearest"), -1.0, 1.0)
+
+
+def _toes(rays: Floats) -> Floats | None:
+    """(T,) 1 where toes point to the right of the picture, so that the left side is the far one, -1 where to the left;
+    None where they are not seen in half of the frames."""
+    pointing = np.stack([rays[:, toe, 0] - rays[:, ankle, 0] for ankle, toe in _ANKLES_TOES], axis=1)
+    if np.isfinite(pointing).any(axis=1).mean() < 0.5:
+        return None
+    smooth = gaussian_filter1d(_interpolated(_nanmean(pointing)), _SMOOTHING_SIGMA, mode="nearest")
+    return np.where(smooth < 0.0, -1.0, 1.0)
+
+
+def _arms_down(offsets: Floats) -> Floats:
+    """(22, 3) metres from the pelvis: the rest pose of these bones, with the arms down."""
+    pose = REST_POSITIONS.copy()
+    for side in ("left", "right"):
+        shoulder = pose[J[f"{side}_shoulder"]]
+        for part in ("elbow", "wrist"):
+            joint = J[f"{side}_{part}"]
+            pose[joint] = shoulder - [0.0, 0.0, np.linalg.norm(pose[joint] - shoulder)]
+    return place_joints(solve_rotations(pose, offsets), offsets)
+
+
+def _nanmean(values: Floats) -> Floats:
+    """(T, ...) mean over the second axis of (T, K, ...), without a warning where all is NaN."""
+    known = np.isfinite(values)
+    count = known.sum(axis=1)
+    return np.where(count > 0, np.where(known, values, 0.0).sum(axis=1) / np.maximum(count, 1), np.nan)
+
+
+def _interpolated(values: Floats) -> Floats:
+    """(T,) or (T, D) with NaN interpolated in time, then median-filtered."""
+    rows = np.arange(len(values))
+    columns = values.reshape(len(values), -1).copy()
+    for column in columns.T:
+        known = np.isfinite(column)
+        column[:] = np.interp(rows, rows[known], column[known])
+    return median_filter(columns, (_MEDIAN_FRAMES, 1), mode="nearest").reshape(values.shape)
+
 
 Clean = Callable[[Floats], Floats]
 """what `steadypose clean` makes of joints (T, 22, 3) metres, world, at 30 Hz: joints of that shape, NaN where nobody"""
@@ -36,43 +203,8 @@ PIXEL_SIGMA = 0.01
 CAMERA_HEIGHT, CAMERA_HEIGHT_SIGMA = 1.3, 0.3
 """Height of a camera above the floor where it is not known, and its standard deviation, in metres."""
 
-NEAREST, FARTHEST = 0.05, 100.0
-"""Range of distances of a point from the camera, in metres."""
-
 LIFTED_SIGMA = 0.08
 """Standard deviation along an axis of key points as deep as the surface about them, in metres."""
-
-
-@dataclass(frozen=True)
-class KeyPointRecording:
-    """One person's key points at the times of a 30 Hz grid, in canonical joints.
-
-    Attributes:
-        stamps_ns: (T,) of the grid.
-        pixels: (T, 22, 2); NaN where not found.
-        confidence: (T, 22).
-        focal: (2,) pixels.
-        centre: (2,) pixels.
-        rotation: (3, 3) from the camera's frame to one that is z up.
-        camera_height: metres; None where not known.
-        points: (T, N, 3) metres, in the camera's frame; None where there are none.
-    """
-
-    stamps_ns: NDArray[np.int64]
-    pixels: Floats
-    confidence: Floats
-    focal: Floats
-    centre: Floats
-    rotation: Floats
-    camera_height: float | None
-    points: Floats | None
-
-
-def in_sight(points: Floats) -> Floats:
-    """Points (T, N, 3) metres from a depth camera, NaN where none can see them: at its place, where many put what they
-    have no depth of, or too far away."""
-    away = np.linalg.norm(np.where(np.isfinite(points), points, np.inf), axis=-1, keepdims=True)
-    return np.where((away > NEAREST) & (away < FARTHEST), points, np.nan)
 
 
 def track_of_picture(
@@ -99,13 +231,6 @@ def track_of_picture(
         points: (T, N, 3) metres, world, of the body's surface, NaN where there are fewer; None if there are none.
         clean: `steadypose clean`.
     """
-    import torch
-
-    from steadypose.prior.fit.lift import lift, starts_of_key_points
-    from steadypose.prior.fit.motion import float_tensor
-    from steadypose.prior.fit.observations import KeyPoints, Observed, SeenJoints, SurfacePoints, thinned
-    from steadypose.prior.fit.windows import Track
-
     sigma = PIXEL_SIGMA * float(camera.focal.mean())
     observed: list[Observed] = [KeyPoints(float_tensor(pixels), float_tensor(confidence), camera, sigma)]
     starts = starts_of_key_points(pixels, camera, REST_OFFSETS, floor, floor_known=floor_known)
@@ -119,8 +244,6 @@ def track_of_picture(
 
 def _start_of_joints(cleaned: Floats, floor: float) -> list[Start]:
     """The motion of joints (T, 22, 3) metres, world; none where half of them or more are NaN."""
-    from steadypose.prior.fit.solve import Start
-
     known = np.flatnonzero(np.isfinite(cleaned).all(axis=(1, 2)))
     if 2 * len(known) < len(cleaned):
         return []
@@ -132,11 +255,6 @@ def _start_of_joints(cleaned: Floats, floor: float) -> list[Start]:
 
 def track_of_key_points(recording: KeyPointRecording, clean: Clean) -> Track:
     """As `track_of_picture`, of a recording; the camera is at the origin of the world."""
-    import torch
-
-    from steadypose.prior.fit.motion import float_tensor
-    from steadypose.prior.fit.observations import Pinhole
-
     camera = Pinhole(
         float_tensor(recording.focal),
         float_tensor(recording.centre),
@@ -163,8 +281,6 @@ def fit_key_points(
     advanced: Callable[[], None] = lambda: None,
 ) -> FittedTrack:
     """Fit one person."""
-    from steadypose.prior.fit.windows import fit_track
-
     if recording.camera_height is None:
         settings = replace(settings, ground_height_sigma=CAMERA_HEIGHT_SIGMA)
     return fit_track(model, track_of_key_points(recording, clean), settings, folder, advanced=advanced)

@@ -9,8 +9,8 @@ import torch
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
-from steadypose.prior.fit.lift import lift, starts_of_key_points
 from steadypose.prior.fit.observations import Pinhole
+from steadypose.prior.fit.picture import lift, starts_of_key_points
 from steadypose.prior.fit.solve import Start
 
 FRAMES, HEIGHT = 40, 1.3
