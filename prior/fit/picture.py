@@ -41,18 +41,19 @@ _ACROSS = 80.0
 """Percentile of the ratios of bones' lengths in the picture to their own that counts as that of a bone across the line
 of sight; the largest is as likely an outlier."""
 _MEDIAN_FRAMES, _SMOOTHING_SIGMA = 5, 3.0
-"""Frames: window of the median filter, standard deviation of the Gaussian one, of root and heading."""
+"""Window of the median filter and standard deviation of the Gaussian one, of root and heading, frames."""
 
 _REACH, _NEAREST = 0.08, 5
-"""Metres in the picture, at a point's depth, within which it tells how far a key point is; of so many at most."""
+"""Distance in the image, at a point's depth, within which it says how far a key point is, metres; of so many at most."""
 _FLESH = np.array([max((r for a, b, r in CAPSULES if name in (a, b)), default=0.1) for name in JOINTS])
-"""Metres from the skin to each joint."""
+"""Distance from the skin to each joint, metres."""
 _SIZES = 0.6, 1.25
 """Least and largest size that the floor may give, of the initial bones'."""
 _ANKLES_TOES = [(J[f"{side}_ankle"], J[f"{side}_foot"]) for side in ("left", "right")]
 _FEET = np.array(CONTACT_JOINTS[2:6])
 _AHEAD, _STRIDE, _STANDS = 0.2, 15, 30.0
-"""Metres by which the nearest foot is nearer than the root; frames in which a foot stands more often than not."""
+"""Distance by which the nearest foot is nearer than the root, metres; frames of the percentile filter over which a foot
+stands at times, and its percentile."""
 
 
 def starts_of_key_points(
@@ -195,7 +196,7 @@ def _interpolated(values: Floats) -> Floats:
 
 
 Clean = Callable[[Floats], Floats]
-"""what `steadypose clean` makes of joints (T, 22, 3) metres, world, at 30 Hz: joints of that shape, NaN where nobody"""
+"""Joints (T, 22, 3) metres, world, at 30 Hz, as `steadypose clean` leaves them; NaN where nobody."""
 
 PIXEL_SIGMA = 0.01
 """Standard deviation of a key point in the picture, in focal lengths."""

@@ -140,7 +140,7 @@ class MotionSet:
         return np.concatenate(starts)[:, None] + np.arange(window)
 
 
-class LivelyWindows:
+class SpeedWeightedWindows:
     """Draws windows of motion, the faster the likelier, and each source by the square root of its size: a large one
     of ten exercises would outweigh all others.
 

@@ -39,7 +39,13 @@ from steadypose.prior.models.completer_features import (
     correction_share,
     read_window,
 )
-from steadypose.training.data.dataset import LivelyWindows, MotionSet, describe_data, mirror_offsets, mirror_rotations
+from steadypose.training.data.dataset import (
+    MotionSet,
+    SpeedWeightedWindows,
+    describe_data,
+    mirror_offsets,
+    mirror_rotations,
+)
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 
@@ -123,7 +129,7 @@ _BETWEEN = np.setdiff1d(np.arange(22), _ENDS)
 def train_completer(options: TrainingOptions, config: CompleterConfig | None = None) -> Path:
     """Train the completer, of these sizes, on prepared motion; the path of the weights."""
     train, val = options.motion()
-    lively, sizes = LivelyWindows(train), config or CompleterConfig()
+    windows, sizes = SpeedWeightedWindows(train), config or CompleterConfig()
 
     def network() -> Completer:
         model = Completer(sizes)
@@ -133,7 +139,7 @@ def train_completer(options: TrainingOptions, config: CompleterConfig | None = N
     def loss_of(model: Completer, count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         gap, context = int(rng.integers(GAPS[0], GAPS[1] + 1)), int(rng.integers(CONTEXT[0], CONTEXT[1] + 1))
         frames = gap + context
-        rows = lively.sample(max(count // frames, 1), frames, STRIDES, rng)
+        rows = windows.sample(max(count // frames, 1), frames, STRIDES, rng)
         return loss(model, Truth.of(train, rows, rng), masks(len(rows), gap, context, rng), rng)
 
     def rise_and_fall(optimiser: Optimizer, steps: int) -> LRScheduler:

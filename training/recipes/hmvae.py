@@ -20,7 +20,13 @@ from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.fit.hmvae_network import HMVAE, MotionVAE
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, remove_heading, to_6d
 from steadypose.prior.models.hmvae import HMVAEConfig
-from steadypose.training.data.dataset import LivelyWindows, MotionSet, describe_data, mirror_offsets, mirror_rotations
+from steadypose.training.data.dataset import (
+    MotionSet,
+    SpeedWeightedWindows,
+    describe_data,
+    mirror_offsets,
+    mirror_rotations,
+)
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 VAE = TypeVar("VAE", bound=MotionVAE)
@@ -70,7 +76,7 @@ class Hyperparameters:
         kl_weight: beta.
         joint_weight: lambda.
         denoise: whether its input is corrupted by noise and occlusion, the target being the clean window.
-        lively: whether windows are speed-weighted: fast motion is drawn more often, and large sources less.
+        speed_weighted: whether windows are speed-weighted: fast motion is drawn more often, and large sources less.
     """
 
     iterations: int
@@ -80,7 +86,7 @@ class Hyperparameters:
     kl_weight: float = KL_WEIGHT
     joint_weight: float = JOINT_WEIGHT
     denoise: bool = False
-    lively: bool = False
+    speed_weighted: bool = False
 
 
 SHORT = Hyperparameters(1_800, 64, 2e-3, kl_weight=ABOUT_MEAN_KL_WEIGHT, joint_weight=200.0, denoise=True)
@@ -95,7 +101,7 @@ LONG = Hyperparameters(
     kl_weight=ABOUT_MEAN_KL_WEIGHT,
     joint_weight=100.0,
     denoise=True,
-    lively=True,
+    speed_weighted=True,
 )
 
 
@@ -121,7 +127,7 @@ def recipe_of(
     name: str, network: Callable[[], VAE], train: MotionSet, val: MotionSet, used: Hyperparameters
 ) -> Recipe[VAE]:
     """Of a VAE of windows, trained as HM-VAE is, with equations 3 and 5 to 8."""
-    windows = LivelyWindows(train) if used.lively else train
+    windows = SpeedWeightedWindows(train) if used.speed_weighted else train
 
     def loss_of(model: VAE, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         rows = windows.sample(count, model.window, used.strides, rng)
