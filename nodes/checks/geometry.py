@@ -12,10 +12,10 @@ from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.checks.window import tracks
 from steadypose.prior.arrays import Floats, medians
+from steadypose.prior.body.kinematics import SensorFrame
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.likeness import Likeness, Stance, likeness, likenesses, stance
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.clean.adapt import SensorFrame
 
 ENOUGH = 15
 """messages to judge by"""

@@ -1,4 +1,4 @@
-"""Kinematics of the canonical skeleton: forward, headings and contacts.
+"""Kinematics of the canonical skeleton: forward, headings and contacts; and rotations, of joints and of sensors.
 
 Rotations are local (child in parent's frame), the root's is its orientation in the frame of the positions. The
 identity everywhere is a T-pose facing +x, left +y, up +z. From positions to rotations:
@@ -8,10 +8,13 @@ identity everywhere is a T-pose facing +x, left +y, up +z. From positions to rot
 from __future__ import annotations
 
 import math
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.msgs.types import Pose
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
 from steadypose.prior.compiled import njit
@@ -154,6 +157,40 @@ def rotation_matrices(q: Floats) -> Floats:
         2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return np.stack(rows, axis=-1).reshape(*q.shape[:-1], 3, 3)
+
+
+class SensorFrame(NamedTuple):
+    """Where a sensor stands in the world.
+
+    Attributes:
+        rotation: (3, 3) from its frame to the world's.
+        origin: (3,) metres.
+    """
+
+    rotation: Floats
+    origin: Floats
+
+    @classmethod
+    def of(cls, pose: Pose) -> SensorFrame:
+        """From a message's pose."""
+        return cls(_rotation(pose.orientation.tobytes()), pose.position)
+
+    def levelled(self) -> SensorFrame:
+        """Its own frame, z up."""
+        return SensorFrame(self.rotation, np.zeros(3))
+
+    def to_world(self, positions: Floats) -> Floats:
+        """Of (..., 3) metres in the sensor's frame."""
+        return positions @ self.rotation.T + self.origin
+
+    def from_world(self, positions: Floats) -> Floats:
+        """Of (..., 3) metres in the world."""
+        return (positions - self.origin) @ self.rotation
+
+
+@lru_cache(maxsize=8)
+def _rotation(quaternion: bytes) -> Floats:
+    return rotation_matrix(np.frombuffer(quaternion))
 
 
 def rigid_alignment(source: NDArray[np.floating], target: NDArray[np.floating]) -> tuple[Floats, Floats]:

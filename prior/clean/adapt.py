@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from steadypose.msgs.contract import broken
-from steadypose.msgs.types import CleanBody, Pose, PoseClean, PoseRaw, RawBody
+from steadypose.msgs.types import CleanBody, PoseClean, PoseRaw, RawBody
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.kinematics import quaternions, rotation_matrix
+from steadypose.prior.body.kinematics import SensorFrame, quaternions
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, finite_joints
 from steadypose.prior.clean.frame import CleanFrame
@@ -47,40 +46,6 @@ def stacked(bodies: Collection[BodyJoints]) -> BodyJoints:
         np.array([seen.positions for seen in bodies]).reshape(-1, 22, 3),
         np.array([seen.confidence for seen in bodies]).reshape(-1, 22),
     )
-
-
-class SensorFrame(NamedTuple):
-    """Where a sensor stands in the world.
-
-    Attributes:
-        rotation: (3, 3) from its frame to the world's.
-        origin: (3,) metres.
-    """
-
-    rotation: Floats
-    origin: Floats
-
-    @classmethod
-    def of(cls, pose: Pose) -> SensorFrame:
-        """From a message's pose."""
-        return cls(_rotation(pose.orientation.tobytes()), pose.position)
-
-    def levelled(self) -> SensorFrame:
-        """Its own frame, z up."""
-        return SensorFrame(self.rotation, np.zeros(3))
-
-    def to_world(self, positions: Floats) -> Floats:
-        """Of (..., 3) metres in the sensor's frame."""
-        return positions @ self.rotation.T + self.origin
-
-    def from_world(self, positions: Floats) -> Floats:
-        """Of (..., 3) metres in the world."""
-        return (positions - self.origin) @ self.rotation
-
-
-@lru_cache(maxsize=8)
-def _rotation(quaternion: bytes) -> Floats:
-    return rotation_matrix(np.frombuffer(quaternion))
 
 
 def layout_of(raw: PoseRaw, counters: Counter[str]) -> Skeleton | None:

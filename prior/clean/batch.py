@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from steadypose.msgs.types import PoseClean, PoseRaw
+from steadypose.prior.body.kinematics import SensorFrame
 from steadypose.prior.body.layouts import Skeleton
 from steadypose.prior.clean.adapt import (
     BodyJoints,
-    SensorFrame,
     clean_bodies,
     clean_message,
     end_of_stream,

@@ -11,11 +11,11 @@ import numpy as np
 
 from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
 from steadypose.prior.arrays import Bools, Floats
+from steadypose.prior.body.kinematics import SensorFrame
 from steadypose.prior.body.layouts import CANONICAL, Skeleton
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.clean.adapt import (
     BodyJoints,
-    SensorFrame,
     canonical_bodies,
     clean_bodies,
     clean_message,

@@ -13,9 +13,8 @@ from steadypose.msgs.types import CleanBody, JointState, Message, PoseClean, Pos
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.kinematics import REST_HEIGHT, quaternions
+from steadypose.prior.body.kinematics import REST_HEIGHT, SensorFrame, quaternions
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.clean.adapt import SensorFrame
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.motion import float_tensor
 from steadypose.prior.fit.observations import POINT_SHARE, Observed, SeenJoints, SurfacePoints, thinned
