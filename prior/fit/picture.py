@@ -44,7 +44,7 @@ _MEDIAN_FRAMES, _SMOOTHING_SIGMA = 5, 3.0
 """Window of the median filter and standard deviation of the Gaussian one, of root and heading, frames."""
 
 _REACH, _NEAREST = 0.08, 5
-"""Distance in the image, at a point's depth, within which it gives a key point's depth, metres; and how many points may."""
+"""Distance in the image within which a point gives a key point's depth, metres there; and number of such points."""
 _FLESH = np.array([max((r for a, b, r in CAPSULES if name in (a, b)), default=0.1) for name in JOINTS])
 """Distance from the skin to each joint, metres."""
 _SIZES = 0.6, 1.25
