@@ -14,6 +14,7 @@ import random
 import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -71,6 +72,13 @@ GARBAGE = (
     b"{" * 5000,
     b"RTPS\2\3" * 99,
 )
+FOXGLOVE_OPEN = (
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
+)
+ROS_DOMAIN = 87
+ROS_PORTS = range(7400 + 250 * ROS_DOMAIN, 7400 + 250 * ROS_DOMAIN + 30)
+"""where RTPS of that domain is taken: discovery and data of its first participants"""
 
 
 @dataclass(frozen=True)
@@ -230,7 +238,9 @@ def live(
     """
     _write(folder / "stepping", _stepping(list(islice(crowd(_frames(), 1), FRAMES))))
     gaps: dict[str, list[float]] = defaultdict(list)
-    names = [*POSE_NODES, "recorder", *(["foxglove"] if find_spec("foxglove") else [])]
+    optional = {"foxglove": "foxglove", "ros2_bridge": "cyclonedds"}
+    names = [*POSE_NODES, "recorder", *(node for node, module in optional.items() if find_spec(module))]
+    os.environ |= {"ROS_DOMAIN_ID": str(ROS_DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with _small_disk(folder / "disk") as disk, _free_port() as port:
         settings = [*_settings(folder / "stepping", disk / "out", lossless=False), f"foxglove.port={port}"]
         with running_nodes(names, settings) as nodes:
@@ -282,7 +292,38 @@ def _faults(nodes: Running, disk: Path, port: int, random_: random.Random) -> di
                     client.connect(endpoint.removeprefix("ipc://"))
                     client.sendall(garbage)
 
+    def disturb_foxglove() -> None:
+        """A client that is one, and then sends what none does."""
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0) as client:
+            client.sendall(FOXGLOVE_OPEN)
+            client.recv(4096)
+            for text in (
+                b'{"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 4294967295}]}',
+                b'{"op": 7}',
+                b"{",
+            ):
+                client.sendall(bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text)
+            client.sendall(bytes([0x82, 0x80 | 100, 0, 0, 0, 0]) + random_.randbytes(100))
+            client.sendall(bytes([0xFF, 0xFF]) + b"\xff" * 12)
+
+    def disturb_ros() -> None:
+        """Submessages of RTPS with lengths and kinds that are none."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+            for place in ROS_PORTS:
+                for _ in range(20):
+                    kind, length = (
+                        random_.choice((0x15, 0x09, 0x07, 0x06, random_.randrange(256))),
+                        random_.randrange(65536),
+                    )
+                    header = b"RTPS\2\3\1\x10" + random_.randbytes(12) + struct.pack("<BBH", kind, 1, length)
+                    with suppress(OSError):
+                        client.sendto(header + random_.randbytes(random_.randrange(400)), ("127.0.0.1", place))
+
     faults: dict[str, Callable[[], None]] = {"malformed clients": disturb}
+    if "foxglove" in nodes.supervisor.children:
+        faults["malformed Foxglove client"] = disturb_foxglove
+    if "ros2_bridge" in nodes.supervisor.children:
+        faults["malformed ROS client"] = disturb_ros
     for name in nodes.supervisor.children:
         faults[f"kill {name}"] = lambda name=name: _send(nodes, name, signal.SIGKILL)
         faults[f"stop {name}"] = lambda name=name: stop(name)
