@@ -23,6 +23,7 @@ from steadypose.nodes.commands.calibrate_files import (
     write_floor_grid,
     write_picture,
 )
+from steadypose.nodes.commands.calibrate_sensor import CalibrateSensor
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.camera.calibration import (
     MIN_CORNERS,
@@ -283,7 +284,8 @@ def calibrate(
         | Annotated[CalibrateOak, tyro.conf.subcommand("oak")]
         | Annotated[CalibrateLens, tyro.conf.subcommand("lens")]
         | Annotated[CalibratePose, tyro.conf.subcommand("pose")]
-        | Annotated[CalibrateFloor, tyro.conf.subcommand("floor")],
+        | Annotated[CalibrateFloor, tyro.conf.subcommand("floor")]
+        | Annotated[CalibrateSensor, tyro.conf.subcommand("sensor")],
         tyro.conf.arg(name=""),
     ],
 ) -> None:
@@ -291,7 +293,8 @@ def calibrate(
 
     In order: 'board' makes the board to print, 'lens' takes pictures of it, 'pose' takes pictures of it on the floor.
     A camera with depth can do with 'floor' in place of 'pose'. What is found goes into the launch file, which keeps its
-    comments; from then on poses are sent as calibrated. docs/calibrate.md shows it step by step.
+    comments; from then on poses are sent as calibrated. 'sensor' learns what a sensor itself gets wrong.
+    docs/calibrate.md shows it step by step.
     """
     step.run()
 

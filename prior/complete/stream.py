@@ -160,12 +160,12 @@ def _on_grid(body: int, stamps: NDArray[np.int64], positions: Floats, anchor_ns:
         for joint in range(22):
             usable = rows[np.isfinite(positions[rows, joint]).all(axis=-1)]
             if len(usable):
-                given[:, joint] = _interpolated(stamps[usable], positions[usable, joint], ticks)
+                given[:, joint] = interpolated(stamps[usable], positions[usable, joint], ticks)
         found.append(Stretch(body, first, given, offsets))
     return found
 
 
-def _interpolated(stamps: NDArray[np.int64], places: Floats, ticks: NDArray[np.int64]) -> Floats:
+def interpolated(stamps: NDArray[np.int64], places: Floats, ticks: NDArray[np.int64]) -> Floats:
     """(N, 3) at ``ticks`` (N,); NaN where no observation is near."""
     after = np.searchsorted(stamps, ticks).clip(0, len(stamps) - 1)
     before = np.where(stamps[after] > ticks, np.maximum(after - 1, 0), after)

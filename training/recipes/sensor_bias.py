@@ -1,5 +1,5 @@
 """A sensor's systematic error as a function of the pose that it shows, learned from recordings of the sensor beside a
-reference (UI-PRMD: Kinect and Vicon).
+reference: UI-PRMD's Kinect and Vicon, or a user's own.
 
 A smoother removes jitter; most of a depth camera's error is slow: it depends on the pose, on self-occlusion and on the
 direction of view, and stays while these do. The network gives, frame by frame, the correction of each joint.
@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import OneCycleLR
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import MIRROR, finite_joints
@@ -27,11 +29,13 @@ from steadypose.prior.models.sensor_bias import (
     SMOOTHER_DENSITY,
     VECTORS,
     CorrectionConfig,
+    LiveCorrection,
     features,
     recall,
     trunk_frame,
 )
 from steadypose.prior.timing.kalman import ConstantVelocityFilter
+from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.dataset import mirror_offsets
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
@@ -77,12 +81,82 @@ INPUT_NOISE = 0.03
 """Standard deviations of noise on the inputs: six people are few."""
 
 
+@dataclass(frozen=True)
+class SensorTake:
+    """A person as a sensor has them, and as a reference does, at the same moments of 30 Hz.
+
+    Attributes:
+        person: who it is.
+        observed: (T, 22, 3) metres, z up, by the sensor; NaN where unobserved.
+        camera: (3,) metres, where the sensor stands in that frame.
+        truth: (T, 22, 3) metres, by the reference, in any frame of its own; NaN where unknown.
+    """
+
+    person: str
+    observed: Floats
+    camera: Floats
+    truth: Floats
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How far one person's joints are from the reference, mean over joints and frames, in metres.
+
+    Attributes:
+        person: who it is; the correction was learned from all others.
+        observed_m: as the sensor has them, moved rigidly to where they fit best, once for each take.
+        corrected_m: the same, corrected.
+    """
+
+    person: str
+    observed_m: float
+    corrected_m: float
+
+
 def train_correction(options: TrainingOptions, subjects: Collection[str] = TRAIN_SUBJECTS) -> Path:
     """Train the Kinect's correction on ``ui_prmd.npz``, on these subjects of it; the path of the weights."""
     # All six people: with one held back to watch, the other five teach measurably less (benchmarks/NOTEBOOK.md). The
     # length of the training was chosen that way once; `steadypose evaluate kinect_vicon` has people never seen.
-    x, y = _examples(options.data, subjects)
-    recent = deque[float](maxlen=max((options.iterations or ITERATIONS) // EVALUATIONS, 1))
+    return _train(
+        options, *_examples(options.data, subjects), "systematic error of a Kinect v2",
+        f"UI-PRMD, Kinect beside Vicon: {', '.join(subjects)}",
+        "Apache-2.0; the data is in the public domain (PDDL 1.0)",
+    )  # fmt: skip
+
+
+def train_sensor(takes: Sequence[SensorTake], options: TrainingOptions) -> Path:
+    """Train the correction of the sensor named ``options.weights`` on recordings of it; the path of the weights."""
+    people = sorted({take.person for take in takes})
+    x, y = _usable(*(np.concatenate(part) for part in zip(*map(_take, takes), strict=True)))
+    data = f"{len(takes)} recordings of {len(people)} people beside a reference"
+    return _train(options, x, y, f"systematic error of the sensor {options.weights}", data, "that of the recordings")
+
+
+def leave_one_person_out(takes: Sequence[SensorTake], options: TrainingOptions) -> Iterator[HeldOut]:
+    """Every person's error under a correction learned from all others: what somebody new can expect.
+
+    Args:
+        takes: of two people at least.
+        options: of each training; ``runs`` is a folder without runs.
+    """
+    for number, person in enumerate(sorted({take.person for take in takes})):
+        others = [take for take in takes if take.person != person]
+        path = train_sensor(others, replace(options, weights=f"without-{number}"))
+        errors = []
+        for x, missing in (_take(take) for take in takes if take.person == person):
+            there = np.isfinite(x[:, 0])
+            correction = LiveCorrection.load(str(path), int(there.sum()))(x[there])
+            errors.append(
+                np.linalg.norm(np.stack([missing[there], missing[there] - correction]), axis=-1).reshape(2, -1)
+            )
+        yield HeldOut(person, *np.nanmean(np.concatenate(errors, axis=1), axis=1).tolist())
+
+
+def _train(options: TrainingOptions, x: Tensor, y: Tensor, described: str, data: str, licence: str) -> Path:
+    """Train on features x (N, FEATURES) and what is missing y (N, 22, 3); the path of the weights."""
+    iterations = options.iterations or ITERATIONS
+    evaluations = min(EVALUATIONS, max(iterations // 100, 1))
+    recent = deque[float](maxlen=max(iterations // evaluations, 1))
 
     def network() -> CorrectionNet:
         net = CorrectionNet(CorrectionConfig(sensor=options.weights))
@@ -103,18 +177,18 @@ def train_correction(options: TrainingOptions, subjects: Collection[str] = TRAIN
     recipe = Recipe(
         "correction", network, loss_of, lambda net: {}, ITERATIONS, BATCH, LEARNING_RATE, "frames", decay=1e-2,
         schedule=lambda optimiser, steps: OneCycleLR(optimiser, 2 * LEARNING_RATE, total_steps=steps),
-        evaluations=EVALUATIONS, clip=math.inf,
+        evaluations=evaluations, clip=math.inf,
     )  # fmt: skip
-    return recipe.train(
-        options, "systematic error of a Kinect v2, a two-layer perceptron on 0.4 s of poses",
-        f"UI-PRMD, Kinect beside Vicon: {', '.join(subjects)}",
-        licence="Apache-2.0; the data is in the public domain (PDDL 1.0)",
-    )  # fmt: skip
+    return recipe.train(options, f"{described}, a two-layer perceptron on 0.4 s of poses", data, licence=licence)
 
 
 def _examples(data: Path, subjects: Collection[str]) -> tuple[Tensor, Tensor]:
     """Features (N, FEATURES) and the missing part (N, 22, 3) of every frame, metres in the trunk's frame."""
-    x, y = (np.concatenate(part) for part in zip(*(_examples_of(data, s) for s in subjects), strict=True))
+    return _usable(*(np.concatenate(part) for part in zip(*(_examples_of(data, s) for s in subjects), strict=True)))
+
+
+def _usable(x: np.ndarray, y: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Those frames of x (N, FEATURES) and y (N, 22, 3) whose trunk is observed."""
     usable = np.isfinite(x[:, 0])
     return torch.from_numpy(x[usable]).float(), torch.from_numpy(y[usable]).float()
 
@@ -129,14 +203,34 @@ def _examples_of(data: Path, subject: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _clip(pair: KinectPair) -> tuple[np.ndarray, np.ndarray]:
     seen, _ = to_canonical(KINECT22, pair.kinect)
+    shared = np.asarray((finite_joints(seen) & finite_joints(pair.vicon)).all(axis=0))
+    alignment = rigid_alignment(pair.vicon[:, shared], seen[:, shared])
+    return _features_and_missing(seen, pair.vicon, alignment, np.zeros(3), pair.fps)
+
+
+def _take(take: SensorTake) -> tuple[np.ndarray, np.ndarray]:
+    alignment = rigid_alignment(take.truth, take.observed)
+    return _features_and_missing(take.observed, take.truth, alignment, take.camera, FPS)
+
+
+def _features_and_missing(
+    observed: Floats, truth: Floats, alignment: tuple[Floats, Floats], camera: Floats, fps: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The features (T, FEATURES) of every frame, and what is missing (T, 22, 3) metres in the trunk's frame.
+
+    Args:
+        observed: (T, 22, 3) metres, z up, by the sensor.
+        truth: (T, 22, 3) metres, by the reference.
+        alignment: that turns and moves the truth to the sensor's frame.
+        camera: (3,) metres, where the sensor stands.
+        fps: frames a second.
+    """
     smoother = ConstantVelocityFilter(SMOOTHER_DENSITY)
-    smoothed = np.stack([smoother.update(frame, t / pair.fps).positions for t, frame in enumerate(seen)])
+    smoothed = np.stack([smoother.update(frame, t / fps).positions for t, frame in enumerate(observed)])
     padded = np.concatenate([np.full((HISTORY[-1], 22, 3), np.nan), smoothed])
     history = np.stack([recall(padded[t : t + HISTORY[-1] + 1, None])[:, 0] for t in range(len(smoothed))], axis=1)
-    shared = np.asarray((finite_joints(seen) & finite_joints(pair.vicon)).all(axis=0))
-    rotation, translation = rigid_alignment(pair.vicon[:, shared], seen[:, shared])
-    truth = pair.vicon @ rotation.T + translation
-    return features(history, np.zeros(3)), (truth - seen) @ trunk_frame(smoothed)
+    rotation, translation = alignment
+    return features(history, camera), (truth @ rotation.T + translation - observed) @ trunk_frame(smoothed)
 
 
 def _hide(x: Tensor, generator: np.random.Generator) -> Tensor:

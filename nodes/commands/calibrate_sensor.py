@@ -1,0 +1,190 @@
+"""``steadypose calibrate sensor``: a sensor's own error, learned from recordings of it beside a reference."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.commands.output import check_output, plural
+from steadypose.nodes.graph.extras import require_extra
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sources.npz import read_arrays
+from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.arrays import Floats
+from steadypose.prior.body.kinematics import rotation_matrix
+from steadypose.prior.body.layouts import SKELETONS, to_canonical
+from steadypose.prior.body.skeleton import finite_joints
+from steadypose.prior.complete.stream import interpolated
+from steadypose.prior.timing.rate import FPS
+
+if TYPE_CHECKING:
+    from steadypose.training.recipes.sensor_bias import HeldOut, SensorTake
+
+ENDINGS = (".npz", ".csv", ".mcap")
+SHORTEST_S = 10.0
+"""Time in seconds that sensor and reference have in common, at least, in all recordings together."""
+
+
+@dataclass(frozen=True)
+class CalibrateSensor:
+    """A sensor's own error, from recordings of it beside a reference: markers, or several cameras.
+
+    What a depth camera or a network gets wrong depends on the pose and on the direction of view, and does not average
+    out. This learns it, and prints how far off people are of whom it has learned nothing, before and after. Ten people
+    of a few minutes each are good, three are the least that makes sense.
+
+    Sensor and reference have stamps of one clock, or start in the same frame. They need neither the same frame of
+    reference nor the same rate, and joints of either may be missing. The sensor stands still in a recording, which
+    shows one person; who it is says the array 'person' of an .npz, or the folder that it lies in, or the file's name.
+
+    Try:
+      steadypose calibrate sensor oak/ vicon/ --name my_oak
+      steadypose run oak --set prior.correct.sensor=my_oak
+
+    Args:
+        recording: of the sensor, as 'steadypose clean' reads it; or a folder of these.
+        reference: of the same time; or a folder with files of the same names.
+        name: of the sensor, for correct.sensor.
+        out: folder for the weights, correction-NAME.safetensors, and for their card.
+        iterations: optimiser steps; fewer make a weaker correction sooner.
+        install: put the weights where nodes find them by the name; else correct.sensor takes their path.
+    """
+
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
+    reference: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="REFERENCE")]
+    name: str = "my_sensor"
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path()
+    iterations: int | None = None
+    install: bool = False
+
+    def run(self) -> None:
+        check_output(self.recording, self.out / f"correction-{self.name}.safetensors")
+        takes = list(read_takes(self.recording, self.reference))
+        require_extra("train")
+        from steadypose.training.distributed import set_threads
+        from steadypose.training.loop import TrainingOptions
+        from steadypose.training.recipes.sensor_bias import leave_one_person_out, train_sensor
+        from steadypose.training.weights import install
+
+        set_threads(1)  # of so small a network two are slower
+        people = len({take.person for take in takes})
+        print(f"{plural(len(takes), 'recording', 'recordings')} of {plural(people, 'person', 'people')}")
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                options = TrainingOptions(self.recording, Path(folder), self.name, self.iterations)
+            except ValueError as error:
+                raise LaunchError(f"--{error}") from error
+            _print_held_out(list(leave_one_person_out(takes, options)) if people > 1 else [])
+            made = train_sensor(takes, options)
+            kept = [made, made.with_suffix(".md"), made.with_suffix(".png")]
+            for file in kept:
+                (self.out / file.name).write_bytes(file.read_bytes())
+        path = (self.out / made.name).resolve()
+        sensor = self.name if self.install else path
+        print(f"weights: {install(path) if self.install else path}")
+        print(f'for a launch file: [prior.correct] sensor = "{sensor}"; to try: --set prior.correct.sensor={sensor}')
+
+
+def _print_held_out(found: list[HeldOut]) -> None:
+    if not found:
+        print("one person: how far it helps others cannot be said; record at least three")
+        return
+    for held in found:
+        print(f"  without {held.person}: {1e3 * held.observed_m:.1f} mm off, corrected {1e3 * held.corrected_m:.1f}")
+    before, after = np.mean([(held.observed_m, held.corrected_m) for held in found], axis=0)
+    print(f"mean of {len(found)} people left out: {1e3 * before:.1f} mm off, corrected {1e3 * after:.1f}")
+    if after > before:
+        print("warning: it makes people whom it has not seen worse; do not use it, record more people")
+
+
+class _Joints(NamedTuple):
+    """Of one recording."""
+
+    stamps_ns: NDArray[np.int64]
+    positions: Floats
+    camera: Floats
+
+
+def read_takes(recording: Path, reference: Path) -> Iterator[SensorTake]:
+    """Recordings beside their references, on a grid of 30 Hz.
+
+    Raises:
+        LaunchError: they do not belong together; says what was expected.
+    """
+    require_extra("train")
+    from steadypose.training.recipes.sensor_bias import SensorTake
+
+    common_s = 0.0
+    for observed_at, truth_at in _pairs(recording, reference):
+        observed, truth = _joints(observed_at), _joints(truth_at)
+        first = max(observed.stamps_ns[0], truth.stamps_ns[0])
+        last = min(observed.stamps_ns[-1], truth.stamps_ns[-1])
+        if last <= first:
+            raise LaunchError(
+                f"{observed_at} and {truth_at}: expected stamps of one clock, but they have no time in common; where "
+                "there is none, give both an fps and let both start in the same frame"
+            )
+        ticks = np.arange(first, last, 1e9 / FPS).astype(np.int64)
+        common_s += (last - first) * 1e-9
+        yield SensorTake(_person(observed_at, recording), _at(observed, ticks), observed.camera, _at(truth, ticks))
+    if common_s < SHORTEST_S:
+        raise LaunchError(f"{recording}: expected {SHORTEST_S:g} s or more beside {reference}, got {common_s:.1f}")
+
+
+def _pairs(recording: Path, reference: Path) -> list[tuple[Path, Path]]:
+    for path in (recording, reference):
+        if not path.exists():
+            raise LaunchError(f"{path} does not exist: expected a recording, an .npz or .csv, or a folder of these")
+    if recording.is_file() or (recording / "metadata.yaml").exists():
+        return [(recording, reference)]
+    files = sorted(path for path in recording.rglob("*") if path.suffix in ENDINGS)
+    pairs = [(path, reference / path.relative_to(recording)) for path in files]
+    alone = [str(path) for path, other in pairs if not other.exists()]
+    if not pairs or alone:
+        what = f"of {', '.join(alone[:4])} there is none" if alone else f"{recording} holds none"
+        raise LaunchError(f"{reference}: expected a reference for each recording ({', '.join(ENDINGS)}): {what}")
+    return pairs
+
+
+def _person(path: Path, root: Path) -> str:
+    if path.suffix == ".npz" and "person" in (arrays := read_arrays(path)):
+        return str(arrays["person"])
+    return path.parent.name if path.parent != root and path != root else path.stem
+
+
+def _joints(path: Path) -> _Joints:
+    """The one body of a recording, z up, in canonical joints."""
+    stamps, positions, camera = [], [], np.zeros(3)
+    for _, raw in open_recording(path):
+        if not isinstance(raw, PoseRaw) or not raw.bodies:
+            continue
+        if len(raw.bodies) > 1:
+            raise LaunchError(f"{path}: expected one person, got {len(raw.bodies)} in a frame; cut the others out")
+        body, turn = raw.bodies[0], rotation_matrix(raw.sensor_pose.orientation)
+        observed = np.where((body.confidence > 0)[:, None], body.positions, np.nan).astype(np.float64)
+        joints, _ = to_canonical(SKELETONS[raw.skeleton], observed, body.confidence)
+        if finite_joints(joints).any() and (not stamps or raw.stamp_ns > stamps[-1]):
+            camera = np.asarray(raw.sensor_pose.position, np.float64)
+            stamps.append(raw.stamp_ns)
+            positions.append(joints @ turn.T + camera)
+    if len(stamps) < 2:
+        raise LaunchError(f"{path}: expected a person in two frames or more, got {len(stamps)}")
+    return _Joints(np.array(stamps), np.stack(positions), camera)
+
+
+def _at(joints: _Joints, ticks: NDArray[np.int64]) -> Floats:
+    """(T, 22, 3) metres at ``ticks``; NaN where a joint was not observed nearby."""
+    at = np.full((len(ticks), 22, 3), np.nan)
+    for joint in range(22):
+        usable = finite_joints(joints.positions[:, joint])
+        if usable.any():
+            at[:, joint] = interpolated(joints.stamps_ns[usable], joints.positions[usable, joint], ticks)
+    return at
