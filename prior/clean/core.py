@@ -12,6 +12,7 @@ import numpy as np
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.clean.bones import BiasEstimator, PersonEstimator, SensorBias
 from steadypose.prior.clean.correct import Correct
+from steadypose.prior.clean.depth_error import DepthError
 from steadypose.prior.clean.frame import CleanFrame, Gated, Imputed, Observation, Person, Score, SensorNoise
 from steadypose.prior.clean.fuse import Fuse
 from steadypose.prior.clean.gate import Gate
@@ -42,6 +43,7 @@ class _Newest(NamedTuple):
         present: (S,) which slots hold a body.
         person: their bones.
         bias: of the sensor, as estimated by then.
+        left_out: (S,) metres along an axis, what the smoother's deviations leave out of the sensor's error.
         rotations: (K, S, 22, 3, 3) local, of the last frames.
         score: of the newest frame.
         imputed: the last frames, completed; None without that stage.
@@ -51,6 +53,7 @@ class _Newest(NamedTuple):
     present: Bools
     person: Person
     bias: SensorBias
+    left_out: Floats
     rotations: Floats
     score: Score
     imputed: Imputed | None
@@ -81,6 +84,7 @@ class CleanCore:
         self._reconstruct = Reconstruct(settings.encode, slots) if denoise or score or impute else None
         self._denoise = Denoise(delay, slots) if denoise else None
         self._bias = BiasEstimator(settings.bias_sigma, slots)
+        self._depth_error = DepthError(slots)
         self._person = PersonEstimator(settings.bones, slots)
         self._score = Scorer(settings.score, settings.encode.weights, slots) if score else None
         self._imputes = impute
@@ -88,8 +92,8 @@ class CleanCore:
         self._orient = Orient(settings.orient, slots) if settings.orient.enabled else None
         self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
         stages = (
-            self._gate, self._correct, self._history, self._smooth, self._denoise, self._bias, self._person,
-            self._score, self._refine, self.fuse, self._orient,
+            self._gate, self._correct, self._history, self._smooth, self._denoise, self._bias, self._depth_error,
+            self._person, self._score, self._refine, self.fuse, self._orient,
         )  # fmt: skip
         self._stages = [stage for stage in stages if stage is not None]
         self._newest: _Newest | None = None
@@ -121,6 +125,7 @@ class CleanCore:
         if self._denoise:
             smoothed = self._denoise.update(windows, smoothed, self._history, gated.jitter)
         bias = self._bias.update(smoothed, person.offsets, gated.jitter)
+        left_out = self._depth_error.update(smoothed, self._smooth.white)
         person = self._person.update(smoothed, bias.bias_sigma, present)
         score = Score.unscored(len(present))
         if self._score:
@@ -132,7 +137,7 @@ class CleanCore:
         if present.any():
             sigmas = gated.jitter[present], bias.bias_sigma[present]
             self.sensor_noise = SensorNoise(*(float(np.median(sigma)) for sigma in sigmas))
-        self._newest = newest = _Newest(gated, present, person, bias, rotations, score, imputed)
+        self._newest = newest = _Newest(gated, present, person, bias, left_out, rotations, score, imputed)
         return None if smoothed is None else self._fused(smoothed, newest, self._delay)
 
     def flush(self) -> list[CleanFrame]:
@@ -182,6 +187,7 @@ class CleanCore:
             self._history.seen_since(back),
             newest.present,
         )
+        estimate = replace(estimate, sigma=np.hypot(estimate.sigma, newest.left_out[:, None]))
         if self._orient:
             estimate = self._orient.update(estimate)
         return CleanFrame(estimate, newest.score, self._history.observed[at], self._history.confidence[at])

@@ -47,6 +47,7 @@ class MixtureSmoother:
 
     Attributes:
         delay: frames.
+        white: (S,) share of each body's noise that is white, as of the newest frame.
     """
 
     def __init__(self, delay: int, slots: int, weights: str = "default") -> None:
@@ -60,7 +61,7 @@ class MixtureSmoother:
         shapes = (joints, joints, body, body, (slots, 22, OUTPUTS))
         self._memory = _Memory(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
         self._bank = new_bank(slots, delay)
-        self._whiteness, self._white = Whiteness(slots), np.zeros(slots)
+        self._whiteness, self.white = Whiteness(slots), np.zeros(slots)
         self._covariance = body_covariance()
         self._experts = np.empty((slots, 22, EXPERTS, 3))
         self._features = np.empty((slots, 22, FEATURES), dtype=np.float32)
@@ -81,7 +82,7 @@ class MixtureSmoother:
         step = stamp_s - self._stamps[-1] if self._stamps else 1 / FPS
         certainty = np.ones((self._slots, 22)) if confidence is None else confidence
         self._note(stamp_s)
-        self._white = self._whiteness.share(positions)
+        self.white = self._whiteness.share(positions)
         advance(self._bank, self._count - 1, step, positions, certainty, DENSITIES, MEASUREMENT_SIGMA, self._covariance)
         return self._answer(self.delay) if self._count > self.delay else None
 
@@ -115,8 +116,8 @@ class MixtureSmoother:
         """The estimate of the frame ``back`` before the newest."""
         bank = self._bank
         described = self._experts, self._features, self._scale, self._gap, self._between
-        describe(bank, self._count, back, PARENT, self._white, *described)
-        share = fallback(self._white, self._scale)
+        describe(bank, self._count, back, PARENT, self.white, *described)
+        share = fallback(self.white, self._scale)
         places, sigma = np.full((self._slots, 22, 3), np.nan), np.full((self._slots, 22), np.inf)
         for slot in np.flatnonzero((self._gap >= 0).any(axis=1)):
             outputs = _outputs(self._features[slot], self._net, self._memory, slot)
