@@ -1,10 +1,8 @@
 """Training of the mixture: ``steadypose train mixture --data MOCAP``, resumable.
 
 Clips of true motion pass through simulated sensors and the live node's own bank. The loss is the benchmark's position
-error (mm) and acceleration error (mm/frame²), of each clip relative to those of the multiple-model estimate, so that no
-kind of sensor or motion dominates. Errors above that estimate's own count several times, joint by joint and frame by
-frame: what nobody in training did must not be worse than without a network. The standard deviation is trained by its
-likelihood.
+error (mm) and acceleration error (mm/frame²), of each clip relative to those of the best single expert for that clip,
+so that no kind of sensor or motion dominates. The standard deviation is trained by its likelihood.
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ from steadypose.prior.models.mixture.bank import (
     DENSITIES,
     EXPERTS,
     MEASUREMENT_SIGMA,
-    MULTIPLE_MODEL,
     advance,
     new_bank,
 )
@@ -52,25 +49,19 @@ DELAYS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16])
 DELAY_SHARES = np.array([0.22, 0.08, 0.12, 0.05, 0.17, 0.03, 0.04, 0.13, 0.03, 0.03, 0.10])
 
 MIN_MM = 1.0
-"""Added to that estimate's position error in the denominator, so that a perfect input does not dominate."""
+"""Added to the best expert's position error in the denominator, so that a perfect input does not dominate."""
 
-SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.15, 0.2, 0.25, 0.3, 0.4)
+SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.25, 0.4, 0.8, 2.0, 3.0)
 """Weight of the acceleration error, by delay in frames: without delay, smoothness costs lag."""
 
 MIN_SMOOTH_MM = 0.5
 """mm/frame², the same of the acceleration error."""
 
-SPEED_WEIGHT, MAX_SPEED_WEIGHT = 1.0, 10.0
+SPEED_WEIGHT, MAX_SPEED_WEIGHT = 0.5, 60.0
 """Weight of a joint's position error: 1 + (speed / SPEED_WEIGHT m/s)², at most MAX_SPEED_WEIGHT. Joints are fast in few
 frames, in which filters lag most. Acceleration errors are weighted by the inverse of its root."""
 
-HARM = 4.0
-"""Weight of what a joint's position error exceeds the multiple-model estimate's by, in the mean over frames, relative
-to that estimate's error and `MIN_HARM_MM`."""
-
-MIN_HARM_MM = 0.5
-
-LAG = 0.5
+LAG = 1.0
 """Weight of a clip's position error above that of the expert nearest to the truth, relative to it: where a sensor's
 errors last, smoothness must not be bought by lag."""
 
@@ -151,11 +142,6 @@ def errors(places: Tensor, truth: Tensor, weight: Tensor, counts: Tensor) -> Err
     )
 
 
-def _off(places: Tensor, truth: Tensor, known: Tensor) -> Tensor:
-    """(C, T, 22) mm, distances to the truth, where it is known."""
-    return _length(torch.where(known[..., None], places - truth, 0.0) * 1e3)
-
-
 def _length(vectors: Tensor) -> Tensor:
     return (vectors.square().sum(dim=-1) + 1e-4).sqrt()
 
@@ -180,18 +166,13 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
     weight = known / (1.0 + batch.gap.clamp(min=0))  # far from any sighting nothing can be learned
     seen = known * (batch.gap == 0).float()
     own = errors(places, batch.truth, weight, batch.counts)
-    when_seen = errors(places, batch.truth, seen, batch.counts).position
     with torch.no_grad():
         each = [errors(experts[:, :, :, m], batch.truth, seen, batch.counts) for m in range(EXPERTS)]
-        nearest = torch.stack([one.position for one in each]).amin(dim=0)
-        position, acceleration = each[MULTIPLE_MODEL]
-        bound = _off(experts[..., MULTIPLE_MODEL, :], batch.truth, known)
-    harm = ((_off(places, batch.truth, known) - bound).relu() * seen).sum(dim=(1, 2)) / seen.sum(dim=(1, 2)).clamp(
-        min=1
-    )
+        position, acceleration = (torch.stack(values) for values in zip(*each, strict=True))
+        nearest, best = position.amin(dim=0), (position + acceleration).argmin(dim=0, keepdim=True)
+        position, acceleration = position.gather(0, best)[0], acceleration.gather(0, best)[0]
     relative = own.position / (position + MIN_MM) + smooth * own.acceleration / (acceleration + MIN_SMOOTH_MM)
-    relative = relative + HARM * harm / (position + MIN_HARM_MM)
-    relative = relative + LAG * (when_seen / (nearest + MIN_MM) - 1.0).relu()
+    relative = relative + LAG * (own.position / (nearest + MIN_MM) - 1.0).relu()
     square = torch.where(known[..., None], places - batch.truth, 0.0).square().mean(dim=-1).detach() * 1e6
     density = 0.5 * (variance.log() + square / variance)
     likelihood = (density * known).sum(dim=(1, 2)) / known.sum(dim=(1, 2)).clamp(min=1)
@@ -277,8 +258,9 @@ def train_mixture(options: TrainingOptions) -> Path:
     run = train(network, sensors, val, directory, iterations, seed, rate, fresh=start is None)
     card = {
         "Model": "weights that a network gives to a bank of fixed-lag smoothers, joint by joint",
-        "Data": "CMU (AMC 01; BVH 06, 07; expmap; salsa), ReActIdle, UI-PRMD s01-s06 (Vicon, and Kinect beside it), at "
-        "1 to 2.5 times its speed, through simulated sensors; validated on CMU 02, ReActIdle 013-015, UI-PRMD s07, s08",
+        "Data": "CMU (AMC 01; BVH 06, 07; 08 to 14 and others; expmap; salsa), ReActIdle, UI-PRMD s01-s06 (Vicon, and "
+        "Kinect beside it), at 1 to 2.5 times its speed, through simulated sensors; validated on CMU 02, ReActIdle "
+        "013-015, UI-PRMD s07, s08",
         "Licence": LICENCES["default"],
         "Seed": str(seed),
         "Training": f"`steadypose train mixture --iterations {iterations} --seed {seed}`{began}",
