@@ -10,7 +10,8 @@ from pathlib import Path
 import scipy
 from threadpoolctl import threadpool_limits
 
-_BLAS = "scipy.linalg.cython_blas"
+_USED = ("scipy.linalg.cython_blas", "scipy.linalg.cython_lapack")
+"""what numba's linear algebra calls"""
 
 
 def one_thread() -> None:
@@ -22,14 +23,15 @@ def one_thread() -> None:
     threadpool_limits(1)
 
 
-def _load_blas() -> None:
-    """Load the BLAS that compiled loops call, and of scipy nothing else: the rest of its ``linalg`` takes 12 MB."""
-    spec = PathFinder.find_spec(_BLAS, [str(Path(path, "linalg")) for path in scipy.__path__])
+def _load(name: str) -> None:
+    """Load a module of scipy that compiled loops call, and nothing else: all of its ``linalg`` takes 12 MB and 0.5 s."""
+    spec = PathFinder.find_spec(name, [str(Path(path, "linalg")) for path in scipy.__path__])
     if spec is None or spec.loader is None:
-        raise ImportError(f"this scipy ({scipy.__version__}) has no {_BLAS}", name=_BLAS)
-    sys.modules[_BLAS] = module = module_from_spec(spec)
+        raise ImportError(f"this scipy ({scipy.__version__}) has no {name}", name=name)
+    sys.modules[name] = module = module_from_spec(spec)
     spec.loader.exec_module(module)
 
 
-if _BLAS not in sys.modules:
-    _load_blas()  # as this is imported, before any loop: numba would load all of it, and `one_thread` comes after
+for _name in _USED:
+    if _name not in sys.modules:
+        _load(_name)  # as this is imported, before any loop: numba would load all of it, and `one_thread` comes after
