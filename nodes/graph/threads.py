@@ -24,7 +24,7 @@ def one_thread() -> None:
 
 
 def _load(name: str) -> None:
-    """Load a module of scipy that compiled loops call, and nothing else: all of its ``linalg`` takes 12 MB and 0.5 s."""
+    """Load a module of scipy that compiled loops call, and nothing else: all of ``linalg`` takes 12 MB and 0.5 s."""
     spec = PathFinder.find_spec(name, [str(Path(path, "linalg")) for path in scipy.__path__])
     if spec is None or spec.loader is None:
         raise ImportError(f"this scipy ({scipy.__version__}) has no {name}", name=name)
