@@ -68,7 +68,10 @@ _BEND_NONE, _BEND_FULL = 0.1, 0.35
 
 
 def solve_rotations(
-    positions: NDArray[np.floating], offsets: NDArray[np.floating], fallback: NDArray[np.floating] | None = None
+    positions: NDArray[np.floating],
+    offsets: NDArray[np.floating],
+    fallback: NDArray[np.floating] | None = None,
+    root: NDArray[np.floating] | None = None,
 ) -> Floats:
     """Local rotations from joint positions.
 
@@ -83,21 +86,27 @@ def solve_rotations(
         offsets: (22, 3) or (..., 22, 3) metres, the person's bones.
         fallback: (..., 22, 3, 3) local rotations for what cannot be solved (the last frame's, say); identity
             if left out.
+        root: (..., 3, 3) orientations of the pelvis, where they are known; solved if left out.
 
     Returns:
         (..., 22, 3, 3) local.
     """
-    return solve_pose(positions, offsets, fallback)[0]
+    return solve_pose(positions, offsets, fallback, root)[0]
 
 
 def solve_pose(
-    positions: NDArray[np.floating], offsets: NDArray[np.floating], fallback: NDArray[np.floating] | None = None
+    positions: NDArray[np.floating],
+    offsets: NDArray[np.floating],
+    fallback: NDArray[np.floating] | None = None,
+    root: NDArray[np.floating] | None = None,
 ) -> tuple[Floats, Floats]:
     """`solve_rotations`, and the positions (..., 22, 3) where those rotations put the joints on these bones."""
     shape = np.shape(positions)
     p, bones = _frames(positions, shape), _frames(offsets, shape)
     local, placed = _initial(fallback, p), np.empty_like(p)
-    _solve(p, np.asarray(finite_joints(p)), bones, local, placed)
+    if root is not None:
+        local[:, 0] = np.reshape(root, (-1, 3, 3))
+    _solve(p, np.asarray(finite_joints(p)), bones, local, placed, root is not None)
     return local.reshape(*shape, 3), placed.reshape(shape)
 
 
@@ -345,8 +354,9 @@ def _twist(joint, p, seen, above, turn, bone):
 
 
 @njit(cache=True)
-def _solve(positions, observed, offsets, local, placed):
-    """Of B frames: writes ``placed`` (B, 22, 3), and into ``local`` (B, 22, 3, 3) what can be solved."""
+def _solve(positions, observed, offsets, local, placed, root_known):
+    """Of B frames: writes ``placed`` (B, 22, 3), and into ``local`` (B, 22, 3, 3) what can be solved; the root's only
+    if it is not ``root_known``."""
     joints = len(PARENT)
     rest = np.empty((joints, 3))
     world = np.empty((joints, 3, 3))
@@ -366,7 +376,7 @@ def _solve(positions, observed, offsets, local, placed):
             for i in range(3):
                 placed[frame, joint, i] = here[i]
             for which in range(len(_RIGID_PARTS)):
-                if joint == _RIGID_PARTS[which]:
+                if joint == _RIGID_PARTS[which] and not (root_known and joint == 0):
                     _write_trunk(which, p, seen, rest, here, above, local[frame, joint])
             for k in range(_AIM.shape[1]):
                 target = _AIM[joint, k]

@@ -193,6 +193,24 @@ def _rotation(quaternion: bytes) -> Floats:
     return rotation_matrix(np.frombuffer(quaternion))
 
 
+def from_rotation_vectors(vectors: Floats) -> Floats:
+    """(..., 3, 3) rotations by vectors (..., 3), radians about their directions (Rodrigues)."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    cross = np.zeros((*vectors.shape, 3))
+    cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = -vectors[..., 2], vectors[..., 1], -vectors[..., 0]
+    cross -= cross.swapaxes(-1, -2)
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * (cross @ cross)
+
+
+def to_rotation_vectors(rotations: Floats) -> Floats:
+    """(..., 3) radians, of rotations (..., 3, 3) by less than a half turn."""
+    skew = 0.5 * (rotations - rotations.swapaxes(-1, -2))
+    vector = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
+    sine = np.linalg.norm(vector, axis=-1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1.0))
+    return vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0)[..., None]
+
+
 def rigid_alignment(source: NDArray[np.floating], target: NDArray[np.floating]) -> tuple[Floats, Floats]:
     """The rotation R (3, 3) and translation t (3,) with the least sum of |R source + t - target|².
 

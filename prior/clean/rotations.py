@@ -4,8 +4,8 @@ Refine solves those of the newest frames and, if enabled, has HM-VAE refine them
 
 Orient solves those that are published. Two hips 18 cm apart, each with a bias, show the root's heading badly, and a
 straight limb does not show its twist. So rotations are solved for where the joints are to be expected by the whole body
-(`prior.models.posture`), each by its deviation; a filter keeps the twist through straight limbs (`prior.body.twist`).
-Positions stay as they are.
+(`prior.models.posture`), each by its deviation; the root is averaged of its own joints and the whole body's posture,
+and a filter keeps the twist through straight limbs (`prior.body.twist`). Positions stay as they are.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from steadypose.prior.clean.frame import Estimate, Gated, Person
 from steadypose.prior.clean.history import Ring
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.hmvae import LiveHMVAE
-from steadypose.prior.models.posture import LivePosture
+from steadypose.prior.models.posture import LivePosture, average_root
 
 
 @dataclass(frozen=True)
@@ -119,9 +119,10 @@ class Orient:
         slots = np.flatnonzero(np.isfinite(estimate.positions).all(axis=(1, 2)))
         if not len(slots):
             return estimate
-        sigma, offsets = estimate.sigma[slots], estimate.offsets[slots]
-        expected = self._posture(estimate.positions[slots], sigma, offsets).positions
-        turned = global_rotations(solve_rotations(expected, offsets, estimate.rotations[slots]))
+        positions, sigma, offsets = estimate.positions[slots], estimate.sigma[slots], estimate.offsets[slots]
+        expected = self._posture(positions, sigma, offsets)
+        root = average_root(expected, positions, sigma, offsets)
+        turned = global_rotations(solve_rotations(expected.positions, offsets, estimate.rotations[slots], root))
         twist = self._twist[slots]
         follow_twist(turned, offsets, sigma, twist)
         self._twist[slots] = twist

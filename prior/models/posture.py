@@ -8,6 +8,10 @@ Then come the lengths of the person's bones.
 
 The frame is that of hips and shoulders, as noisy as they are: S holds a turn and a shift of it, in which no posture is
 preferred. So a body may lie, or stand on its hands.
+
+How the pelvis is turned in that frame is one more vector of the Gaussian, so that shoulders, spine and thighs show it
+too. The root is averaged of this and of the pelvis' own joints: by these where they are exact, by the whole body where
+they are noisy.
 """
 
 from __future__ import annotations
@@ -18,10 +22,12 @@ from typing import NamedTuple
 import numpy as np
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, SHOULDERS, J
+from steadypose.prior.body.kinematics import from_rotation_vectors, to_rotation_vectors
+from steadypose.prior.body.pelvis import rigid_covariance, rigid_pelvis
+from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, SHOULDERS
 from steadypose.prior.models.weights import Arrays, load_weights
 
-DIMENSIONS = 66
+DIMENSIONS, TURNS = 66, 3
 UNLIKE = 0.01
 """Metres along an axis, by which any joint may differ from what training people do."""
 
@@ -36,9 +42,11 @@ _ENDS = np.arange(1, len(PARENT))
 LEAST_SIGMA = math.radians(0.5)
 """Radians about an axis: lower bound of a root's deviation, whatever the sensor."""
 
-_SPINE = J["spine3"]
-_LEAST_UP = 0.05
-"""Metres that the spine rises above the hips: of a body folded up, it says little of how that is turned about them."""
+WITHIN = np.radians((1.5, 4.0, 5.0))
+"""Radians about the pelvis' axes, by which it is turned otherwise than the posture of a body says that is known."""
+
+DEPENDENT = 1.7
+"""Factor on the covariance of the average of the two estimates, which share most of their noise (validation people)."""
 
 _CORNERS = [*HIPS, *SHOULDERS]
 _REST_SIZE = float(np.linalg.norm(REST_OFFSETS, axis=-1).sum())
@@ -51,11 +59,15 @@ class Expected(NamedTuple):
         positions: (B, 22, 3) metres.
         covariance: (B, 66, 66) m² of these, in the axes of ``frame``.
         frame: (B, 3, 3) forward, left and up of the trunk, as columns.
+        root: (B, 3, 3) orientations of the pelvis.
+        root_covariance: (B, 3, 3) rad² about the pelvis' axes, as far as the noise of joints causes it.
     """
 
     positions: Floats
     covariance: Floats
     frame: Floats
+    root: Floats
+    root_covariance: Floats
 
 
 class LivePosture:
@@ -63,8 +75,10 @@ class LivePosture:
 
     def __init__(self, weights: Arrays) -> None:
         factor = weights["factor"].astype(np.float64)
-        self._mean = weights["mean"].astype(np.float64)
-        self._covariance = factor @ factor.T + UNLIKE**2 * np.eye(DIMENSIONS)
+        whole, mean = factor @ factor.T, weights["mean"].astype(np.float64)
+        self._mean, self._turn = mean[:DIMENSIONS], mean[DIMENSIONS:]
+        self._covariance = whole[:DIMENSIONS, :DIMENSIONS] + UNLIKE**2 * np.eye(DIMENSIONS)
+        self._turned_by = np.linalg.solve(self._covariance, whole[:DIMENSIONS, DIMENSIONS:]).T
 
     @classmethod
     def load(cls, weights: str) -> LivePosture:
@@ -84,11 +98,33 @@ class LivePosture:
         moved = (noise * (gain @ off[..., None])[..., 0]).reshape(local.shape)
         left = noise[:, :, None] * (np.eye(DIMENSIONS) - gain * noise[:, None, :])
         expected, left = on_bones((local - moved) * scale, left * scale**2, np.linalg.norm(offsets[:, 1:], axis=-1))
-        return Expected(expected @ frame.swapaxes(-1, -2) + middle[:, None], left, frame)
+        off = (expected / scale).reshape(len(local), -1) - self._mean
+        root = frame @ from_rotation_vectors(self._turn + off @ self._turned_by.T)
+        turned = self._turned_by @ left @ self._turned_by.T / scale**2
+        return Expected(expected @ frame.swapaxes(-1, -2) + middle[:, None], left, frame, root, turned)
+
+
+def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: Floats) -> Floats:
+    """(B, 3, 3) orientations of the root: the posture's and that of the pelvis' own joints, by their covariances.
+
+    Args:
+        expected: of these bodies.
+        positions: (B, 22, 3) metres, as observed.
+        sigma: (B, 22) metres, their standard deviations along an axis.
+        offsets: (B, 22, 3) metres, the bones.
+    """
+    known, rigid = expected.root_covariance + np.diag(WITHIN**2), _rigid_covariance(sigma, offsets)
+    off = to_rotation_vectors(expected.root.swapaxes(-1, -2) @ rigid_pelvis(positions, offsets))
+    share = known @ np.linalg.inv(known + rigid)
+    return expected.root @ from_rotation_vectors((share @ off[..., None])[..., 0])
+
+
+def _rigid_covariance(sigma: Floats, offsets: Floats) -> Floats:
+    return rigid_covariance(np.fmax(np.fmin(sigma, MAX_SIGMA), MIN_SIGMA), offsets)
 
 
 class RootCovariance:
-    """The covariance of a root's orientation, as the orient stage finds it.
+    """The covariance of a root's orientation, of joints and deviations as published: no message has to carry it.
 
     Args:
         weights: the posture's weight set, or a path to a ``.safetensors`` file.
@@ -100,10 +136,6 @@ class RootCovariance:
     def __call__(self, positions: Floats, sigma: Floats, root: Floats) -> Floats:
         """(B, 3, 3) rad², of rotations about the axes of the positions.
 
-        To first order: the left axis lies along the hips, l, and the up axis in the plane of the spine, u, from the
-        pelvis. In the root's own axes an error of l turns it by (dl_z, ., -dl_x) / |l|, and one of u by
-        (du_x + turn_z u_y) / u_z about the left axis.
-
         Args:
             positions: (B, 22, 3) metres.
             sigma: (B, 22) metres, standard deviations along an axis.
@@ -111,22 +143,10 @@ class RootCovariance:
         """
         bones = positions - positions[:, PARENT]
         bones[:, 0] = 0.0
-        expected = self._posture(positions, sigma, bones)
-        left = expected.positions[:, HIPS[0]] - expected.positions[:, HIPS[1]]
-        spine = expected.positions[:, _SPINE] - expected.positions[:, 0]
-        up = np.einsum("bij,bi->bj", root, spine)
-        up_z = np.maximum(up[:, 2], _LEAST_UP)
-        by_left, by_spine = np.zeros((2, len(root), 3, 3))
-        by_left[:, 0, 2] = 1.0 / np.maximum(np.linalg.norm(left, axis=-1), 1e-3)
-        by_left[:, 2, 0] = -by_left[:, 0, 2]
-        by_left[:, 1, 0] = by_left[:, 2, 0] * up[:, 1] / up_z
-        by_spine[:, 1, 0] = 1.0 / up_z
-        turn = root.swapaxes(-1, -2) @ expected.frame
-        jacobian = np.zeros((len(root), 3, 22, 3))
-        jacobian[:, :, HIPS[0]], jacobian[:, :, _SPINE] = by_left @ turn, by_spine @ turn
-        jacobian[:, :, HIPS[1]], jacobian[:, :, 0] = -jacobian[:, :, HIPS[0]], -jacobian[:, :, _SPINE]
-        jacobian = root @ jacobian.reshape(len(root), 3, 66)
-        return jacobian @ expected.covariance @ jacobian.swapaxes(-1, -2) + LEAST_SIGMA**2 * np.eye(3)
+        known = self._posture(positions, sigma, bones).root_covariance + np.diag(WITHIN**2)
+        rigid = _rigid_covariance(sigma, bones @ root)
+        covariance = DEPENDENT * known @ np.linalg.inv(known + rigid) @ rigid + LEAST_SIGMA**2 * np.eye(3)
+        return root @ covariance @ root.swapaxes(-1, -2)
 
 
 def on_bones(mean: Floats, covariance: Floats, lengths: Floats) -> tuple[Floats, Floats]:

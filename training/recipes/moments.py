@@ -14,8 +14,9 @@ from safetensors.numpy import save_file
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from steadypose.prior.body.pelvis import rigid_pelvis
 from steadypose.prior.body.skeleton import HIPS, MIRROR, SHOULDERS
-from steadypose.prior.models.posture import DIMENSIONS, body_size, trunk_frame
+from steadypose.prior.models.posture import DIMENSIONS, TURNS, body_size, trunk_frame
 from steadypose.prior.models.weights import LICENCES
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.data.recordings import Motion, load_motion, write_arrays
@@ -30,15 +31,16 @@ TURN, SHIFT = 0.12, 0.02
 
 
 class Posture(nn.Module):
-    """Mean (66,) and Cholesky factor (66, 66) of the covariance, metres of a body of the rest skeleton's size."""
+    """Mean (69,) and Cholesky factor (69, 69) of the covariance: 22 joints, metres of a body of the rest skeleton's
+    size, and the rotation vector of the pelvis, radians."""
 
     mean: Tensor
     factor: Tensor
 
     def __init__(self, postures: NDArray[np.float64]) -> None:
-        """Of postures (N, 66)."""
+        """Of postures (N, 69)."""
         super().__init__()
-        factor = np.linalg.cholesky(np.cov(postures.T) + 1e-8 * np.eye(DIMENSIONS))
+        factor = np.linalg.cholesky(np.cov(postures.T) + 1e-8 * np.eye(DIMENSIONS + TURNS))
         self.register_buffer("mean", torch.from_numpy(postures.mean(axis=0)))
         self.register_buffer("factor", torch.from_numpy(factor))
 
@@ -53,7 +55,7 @@ def train_posture(options: TrainingOptions) -> Path:
     rows = np.sort(rng.choice(len(weight), min(FRAMES, len(weight)), replace=False, p=weight / weight.sum()))
     positions, offsets = (values[rows].numpy().astype(np.float64) for values in (motion.positions, motion.offsets))
     save_weights(path, Posture(postures(positions, offsets, rng)), {}, {
-        "Model": "a Gaussian of the 22 joints in the trunk's frame",
+        "Model": "a Gaussian of the 22 joints and the pelvis' rotation in the trunk's frame",
         "Data": f"prepared motion, training split: {len(rows)} frames, of {', '.join(sorted(of_source))}, each by "
         "the root of its length; mirrored by chance",
         "Licence": LICENCES[options.weights],
@@ -65,14 +67,16 @@ def train_posture(options: TrainingOptions) -> Path:
 def postures(
     positions: NDArray[np.float64], offsets: NDArray[np.float64], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """(N, 66) of bodies (N, 22, 3), in their trunks' frames, which are off by chance."""
+    """(N, 69) of bodies (N, 22, 3), in their trunks' frames, which are off by chance."""
     mirrored = rng.random(len(positions)) < 0.5
-    positions[mirrored] = positions[mirrored][:, MIRROR] * (1.0, -1.0, 1.0)
+    for values in (positions, offsets):
+        values[mirrored] = values[mirrored][:, MIRROR] * (1.0, -1.0, 1.0)
     centred = positions - positions[:, [*HIPS, *SHOULDERS]].mean(axis=1, keepdims=True)
-    local = centred @ trunk_frame(positions) / body_size(offsets)[:, None, None]
-    turn = Rotation.from_rotvec(rng.normal(0.0, TURN, (len(local), 3))).as_matrix()
-    local = local @ turn.swapaxes(-1, -2) + rng.normal(0.0, SHIFT, (len(local), 1, 3))
-    return local.reshape(len(local), -1)
+    off = Rotation.from_rotvec(rng.normal(0.0, TURN, (len(positions), 3))).as_matrix()
+    frame = trunk_frame(positions) @ off.swapaxes(-1, -2)
+    local = centred @ frame / body_size(offsets)[:, None, None] + rng.normal(0.0, SHIFT, (len(positions), 1, 3))
+    turn = Rotation.from_matrix(frame.swapaxes(-1, -2) @ rigid_pelvis(positions, offsets)).as_rotvec()
+    return np.concatenate([local.reshape(len(local), -1), turn], axis=1)
 
 
 def covariance_of(motion: Motion) -> NDArray[np.float64]:

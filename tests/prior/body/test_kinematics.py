@@ -8,9 +8,11 @@ from steadypose.prior.body.kinematics import (
     CONTACT_JOINTS,
     LOAD_SPEED,
     forward_kinematics,
+    from_rotation_vectors,
     label_contacts,
     quaternions,
     rotation_matrix,
+    to_rotation_vectors,
 )
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.fit import tensors
@@ -75,3 +77,11 @@ def test_quaternions_are_scipys() -> None:
     assert np.array_equal(np.abs(quaternions(half_turns)).round(9), np.eye(3, 4))
     for matrix, quaternion in zip(turns.as_matrix(), turns.as_quat(), strict=True):
         assert rotation_matrix(3.0 * quaternion) == pytest.approx(matrix)
+
+
+def test_rotation_vectors_are_scipys() -> None:
+    vectors = np.random.default_rng(0).normal(size=(40, 3))
+    vectors[0], vectors[1] = 0.0, 1e-7
+    turned = from_rotation_vectors(vectors)
+    np.testing.assert_allclose(turned, Rotation.from_rotvec(vectors).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(to_rotation_vectors(turned), Rotation.from_matrix(turned).as_rotvec(), atol=1e-9)

@@ -4,7 +4,8 @@ from tests.helpers.bodies import stream, waving
 
 from steadypose.msgs.types import CleanBody
 from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.skeleton import REST_OFFSETS, J
+from steadypose.prior.body.kinematics import global_rotations, heading, rotation_matrices, rotation_matrix
+from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
 
@@ -29,13 +30,22 @@ def test_positions_are_those_without_it_byte_for_byte() -> None:
     assert mine[-1].rotations.tobytes() != plain[-1].rotations.tobytes()
 
 
-def test_a_perfect_input_keeps_its_rotations() -> None:
-    mine, plain = (np.array([b.rotations for b in _bodies(waving(FRAMES), on)][SETTLED:]) for on in (True, False))
-    off = (Rotation.from_quat(mine.reshape(-1, 4)).inv() * Rotation.from_quat(plain.reshape(-1, 4))).magnitude()
-    limbs = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("hip", "shoulder", "knee", "elbow")]
-    others = np.ones(22, dtype=bool)
-    others[limbs] = False
-    assert np.degrees(off.reshape(-1, 22)[:, others]).max() < 0.5
+def _bones_off(bodies: list[CleanBody]) -> np.ndarray:
+    """(T, 21) radians by which bones, put on by the rotations, are off those between the joints."""
+    placed = global_rotations(rotation_matrices(np.array([b.rotations for b in bodies])))[:, PARENT[1:]]
+    bone = (placed @ REST_OFFSETS[1:, :, None])[..., 0]
+    joints = np.array([b.positions for b in bodies])
+    true = joints[:, 1:] - joints[:, PARENT[1:]]
+    return np.arctan2(np.linalg.norm(np.cross(bone, true), axis=-1), (bone * true).sum(axis=-1))
+
+
+def test_on_a_perfect_input_bones_lie_as_the_joints_and_the_heading_stays() -> None:
+    mine, plain = (_bodies(waving(FRAMES), on)[SETTLED:] for on in (True, False))
+    off, before = (np.degrees(_bones_off(bodies).max(axis=0)) for bodies in (mine, plain))
+    assert off.max() < 1.5
+    assert (off < before + 0.2).all()
+    turned, solved = (np.array([rotation_matrix(body.rotations[0]) for body in bodies]) for bodies in (mine, plain))
+    assert np.abs(np.degrees(heading(turned) - heading(solved))).max() < 0.5
 
 
 def test_with_noise_the_root_is_nearer_the_true_one_and_turns_less() -> None:
