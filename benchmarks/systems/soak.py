@@ -253,7 +253,7 @@ def live(
                     restarts = nodes.supervisor.children[message.node].restarts
                     reports[message.node] = ledger.note(message, restarts)
                 elif topic == POSE_WORLD:
-                    if fault:
+                    if fault and last_s:  # not for want of the first pose
                         gaps[fault][-1] = max(gaps[fault][-1], round(now - last_s, 3))
                     last_s = now
                 if now > due:
