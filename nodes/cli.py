@@ -9,20 +9,25 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
+import re
+import shutil
 import sys
+import textwrap
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from importlib.metadata import version
-
-from steadypose.nodes.graph.extras import extra_of, how_to_install
+from io import StringIO
+from typing import Any
 
 EVALUATE = "steadypose.benchmarks.command"
 COMMANDS = {
-    "run": ("run", "start the nodes of a launch file, watch them, show how they do"),
+    "run": ("run", "start a launch file's nodes, watch them, show how they do"),
     "node": ("node", "one node, for another machine or a supervisor such as systemd"),
     "clean": ("clean", "clean a recording or .npz offline, with the nodes' own code"),
     "retarget": ("export", "a recording's person as a robot's motion, by its URDF"),
-    "fit": ("fit", "fit a motion to a recording: slower than clean, and with all of it in view"),
+    "fit": ("fit", "fit a motion to a whole recording: slower than clean"),
     "complete": ("complete", "key frames to motion, a part of a body to all of it, offline"),
-    "export": ("export", "cleaned motion as BVH, GLB, CSV or TRC, for other programs"),
+    "export": ("export", "cleaned motion as BVH, GLB, VRMA, CSV or TRC"),
     "echo": ("inspect", "print the messages of a topic or recording"),
     "hz": ("inspect", "measure the rate of a topic or recording"),
     "info": ("info", "what is in a recording, or on a topic"),
@@ -30,9 +35,9 @@ COMMANDS = {
     "plot": ("plot", "what happened in a recording, as pictures"),
     "prepare": ("prepare", "motion capture into training data"),
     "train": ("train", "train a model of the prior"),
-    "evaluate": (EVALUATE, "measure steadypose beside tuned baselines, study by study (in a checkout)"),
-    "simulate": ("small", "make streams as a depth camera would see them, with their truth"),
-    "calibrate": ("calibrate", "a camera's lens and place in the world, into its launch file"),
+    "evaluate": (EVALUATE, "measure beside tuned baselines, by studies (in a checkout)"),
+    "simulate": ("small", "streams as a depth camera would see them, with their truth"),
+    "calibrate": ("calibrate", "a camera's lens, its place in the world, its own error"),
     "doctor": ("doctor", "what is missing on this machine, and how to get it"),
     "install-service": ("install_service", "run a launch file at every boot, under systemd"),
     "keys": ("small", "make CurveZMQ keys, for messages that leave this machine"),
@@ -81,6 +86,8 @@ def _main(arguments: list[str]) -> int:
                 f"steadypose {name}: the studies are not installed: expected a checkout of the project", file=sys.stderr
             )
             return USAGE_ERROR
+        from steadypose.nodes.graph.extras import extra_of, how_to_install  # numpy and more, which help does without
+
         missing = (error.name or "").partition(".")[0]
         if (extra := extra_of(missing)) is None:
             raise
@@ -95,19 +102,46 @@ def _main(arguments: list[str]) -> int:
 
 
 def _run(name: str, arguments: list[str]) -> object:
-    module, _ = COMMANDS[name]
-    place = module if "." in module else f"steadypose.nodes.commands.{module}"
-    command = getattr(importlib.import_module(place), name.replace("-", "_"))
+    place, _ = COMMANDS[name]
+    module = importlib.import_module(place if "." in place else f"steadypose.nodes.commands.{place}")
+    command = getattr(module, name.replace("-", "_"))
     if name == "node":  # reads its arguments itself: tyro would take 0.1 s and 6 MB of every node
         return command(arguments)
     import tyro
 
-    return tyro.cli(
-        command,
-        prog=f"steadypose {name}",
-        args=arguments,
-        config=(tyro.conf.PositionalRequiredArgs, tyro.conf.UseAppendAction, tyro.conf.FlagCreatePairsOff),
-    )
+    asks = not {"-h", "--help"}.isdisjoint(arguments)
+    if asks:
+        _join_lines(vars(module).values())
+    with _wrapped() if asks else nullcontext():
+        return tyro.cli(
+            command,
+            prog=f"steadypose {name}",
+            args=arguments,
+            config=(tyro.conf.PositionalRequiredArgs, tyro.conf.UseAppendAction, tyro.conf.FlagCreatePairsOff),
+        )
+
+
+def _join_lines(documented: Iterable[Any]) -> None:
+    """Give every argument of a docstring one line, for tyro keeps line breaks, which are those of 120 columns."""
+    for thing in documented:
+        doc = getattr(thing, "__doc__", None) or ""
+        if callable(thing) and "\n    Args:\n" in doc:
+            described, heading, listed = doc.partition("\n    Args:\n")
+            thing.__doc__ = described + heading + re.sub(r"\n {12}(?=\S)", " ", listed)
+
+
+@contextmanager
+def _wrapped() -> Iterator[None]:
+    """Break the paragraphs of a help between words, where the terminal ends."""
+    text = StringIO()
+    text.isatty = sys.stdout.isatty  # type: ignore[method-assign]  (tyro asks, for its colours)
+    try:
+        with redirect_stdout(text):
+            yield
+    finally:
+        width = shutil.get_terminal_size().columns
+        for line in text.getvalue().splitlines():
+            print(line if line[:1] in (" ", "│", "╭", "╰", "") else textwrap.fill(line, width, break_on_hyphens=False))
 
 
 def is_for_user(error: Exception) -> bool:

@@ -46,7 +46,7 @@ class CalibrateSensor:
     shows one person; who it is says the array 'person' of an .npz, or the folder that it lies in, or the file's name.
 
     Try:
-      steadypose calibrate sensor oak/ vicon/ --name my_oak
+      steadypose calibrate sensor oak/ vicon/ --name my_oak --install
       steadypose run oak --set prior.correct.sensor=my_oak
 
     Args:

@@ -153,3 +153,17 @@ def test_what_an_extra_brings_is_named(missing: str, extra: str, arguments: list
     assert f"needs {missing}" in done.stderr
     assert install_command(extra) in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("command", [["run"], ["train"], ["calibrate", "sensor"]])
+def test_help_fits_80_columns_and_breaks_between_words(command: list[str], monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main([*command, "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    words = {word for line in lines for word in line.split()}
+    assert words >= {"steadypose", "options"}
+    assert not any(line.strip() in ("the", "own", "any") for line in lines), "no line of a docstring shows"
+    assert main(["help"]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
