@@ -23,7 +23,6 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.settings import PriorSettings
 
 if TYPE_CHECKING:
-    from steadypose.prior.clean.batch import StreamBatch
     from steadypose.prior.clean.pipeline import PriorPipeline
     from steadypose.prior.world.pipeline import TrajectoryPipeline
 
@@ -37,7 +36,7 @@ Settings = Mapping[str, Mapping[str, Any]]
 
 
 def stream(
-    messages: Iterable[tuple[str, Message]], prior: PriorPipeline | StreamBatch, trajectory: TrajectoryPipeline
+    messages: Iterable[tuple[str, Message]], prior: PriorPipeline, trajectory: TrajectoryPipeline
 ) -> Iterator[tuple[str, Message]]:
     """All that the nodes publish when the input node publishes ``messages``: these, and the answers to each.
 

@@ -99,7 +99,7 @@ def _print_held_out(found: list[HeldOut]) -> None:
         return
     for held in found:
         print(f"  without {held.person}: {1e3 * held.observed_m:.1f} mm off, corrected {1e3 * held.corrected_m:.1f}")
-    before, after = np.mean([(held.observed_m, held.corrected_m) for held in found], axis=0)
+    before, after = np.array([[held.observed_m, held.corrected_m] for held in found]).mean(axis=0)
     print(f"mean of {len(found)} people left out: {1e3 * before:.1f} mm off, corrected {1e3 * after:.1f}")
     if after > before:
         print("warning: it makes people whom it has not seen worse; do not use it, record more people")

@@ -39,7 +39,7 @@ LEAST_MIN, ENOUGH_MIN = 0.5, 30.0
 
 
 def train(
-    model: Model,
+    model: Model,  # pyright: ignore[reportInvalidTypeForm]
     data: Path = Path("data/prepared.npz"),
     weights: Literal["default", "research", "kinect_v2"] | None = None,
     runs: Path = Path("runs"),

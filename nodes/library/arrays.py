@@ -15,14 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from steadypose.nodes.driving import NOBODY, OfflineRun
+from steadypose.nodes.driving import NOBODY, OfflineRun, Settings
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.loops import compile_missing
+from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.library.poses import Poses
 from steadypose.nodes.sources.npz import ArraySource, NpzError, as_input
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.body.layouts import CANONICAL, add_layouts
+from steadypose.prior.settings import nearest
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,6 +62,22 @@ def _callers_level() -> int:
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("steadypose."):
         level, frame = level + 1, frame.f_back
     return level
+
+
+def sections(settings: Settings | None, delay: int) -> Settings:
+    """``prior`` and ``trajectory`` as a program gives them, over ``delay``.
+
+    Raises:
+        LaunchError: there is another section.
+    """
+    given = dict(settings or {})
+    for section in given.keys() - {"prior", "trajectory"}:
+        hint = nearest(section.partition(".")[0], ("prior", "trajectory"))
+        raise LaunchError(
+            f"settings: expected sections 'prior' and 'trajectory', each with its settings, such as "
+            f"{{'prior': {{'delay': 2}}}}; got {section!r}{hint}"
+        )
+    return {"prior": {"delay": delay} | dict(given.get("prior", {})), "trajectory": given.get("trajectory", {})}
 
 
 def skeleton_name(skeleton: SkeletonLike) -> str:
@@ -102,7 +120,11 @@ def source_of(
         if told:
             raise NpzError(f"{positions}: expected no {', '.join(told)} beside a file, which says so itself")
         return open_recording(Path(positions))
+    if fps is not None and stamp_ns is not None:
+        raise NpzError("expected fps, of a regular stream, or stamp_ns, got both; leave fps out")
     if isinstance(positions, Mapping):
+        if "positions" not in positions:
+            raise NpzError(f"expected an array 'positions' among those given, got {', '.join(positions) or 'none'}")
         return ArraySource(ARRAYS, {**as_input(positions), **told})
     told = {"skeleton": np.array(CANONICAL.name), "up": np.array("z")} | told
     return ArraySource(ARRAYS, {"positions": as_array("positions", positions)} | told)
@@ -136,7 +158,7 @@ def clean(
     confidence: ArrayLike | None = None,
     up: str | None = None,
     delay: int = 4,
-    settings: Mapping[str, Mapping[str, Any]] | None = None,
+    settings: Settings | None = None,
 ) -> Poses:
     """Clean joints, offline: `steadypose clean` on arrays.
 
@@ -169,9 +191,7 @@ def clean(
     """
     compile_loops()
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
-    given = settings or {}
-    prior = {"delay": delay} | dict(given.get("prior", {}))
-    run = OfflineRun(source, {"prior": prior, "trajectory": given.get("trajectory", {})})
+    run = OfflineRun(source, sections(settings, delay))
     arrays = run.arrays()
     problems = run.diagnosis.texts or ([] if run.poses else [NOBODY])
     warn(problems)
@@ -263,6 +283,11 @@ def plot(poses: Positions, output: str | Path | None = None, *, body: int | None
     from steadypose.nodes.commands.plot import draw, save
     from steadypose.nodes.commands.plot_history import history_of_arrays, history_of_path
 
+    if not isinstance(poses, Mapping | str | os.PathLike):
+        raise NpzError(
+            f"expected what steadypose.clean, complete or fit gave, or the path of a recording, got "
+            f"{type(poses).__name__}; steadypose.plot(steadypose.clean(joints, fps=30))"
+        )
     history = history_of_arrays(poses) if isinstance(poses, Mapping) else history_of_path(Path(str(poses)))
     figure = draw(history, body)
     if output is not None:

@@ -16,7 +16,7 @@ from steadypose.nodes.driving import CHECKED, NOBODY, Diagnosis
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.graph.trajectory_node import make_trajectory
-from steadypose.nodes.library.arrays import SkeletonLike, as_array, compile_loops, skeleton_name, warn
+from steadypose.nodes.library.arrays import SkeletonLike, as_array, compile_loops, sections, skeleton_name, warn
 from steadypose.nodes.library.poses import Poses
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.clean.pipeline import load_loops
@@ -69,8 +69,9 @@ class Filter:
             raise FilterError(f"skeleton: expected one of {', '.join(SKELETONS)}, got {skeleton!r}{hint}")
         self._pose, self._calibrated = sensor_pose or Pose.from_up(up), sensor_pose is not None
         compile_loops()
-        prior = {"delay": delay} | dict((settings or {}).get("prior", {}))
-        self._prior, self._trajectory = make_prior(prior), make_trajectory((settings or {}).get("trajectory", {}))
+        given = sections(settings, delay)
+        prior = given["prior"]
+        self._prior, self._trajectory = make_prior(prior), make_trajectory(given["trajectory"])
         one_thread()
         load_loops(PriorSettings.from_dict(prior))  # now, and not when the first frame comes
         self._diagnosis = Diagnosis(PriorSettings.from_dict(prior))

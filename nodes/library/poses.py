@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import CONTACTS, JOINTS
+from steadypose.prior.settings import nearest
 
 if TYPE_CHECKING:
     import pandas  # pyright: ignore[reportMissingImports]
@@ -53,7 +54,7 @@ class ByName(NDArray[Any] if TYPE_CHECKING else np.ndarray):
         if name in self._names:
             return self._names.index(name)
         known = ", ".join(self._names) or "none: the axis of joints is gone; take the joint before computing with it"
-        raise KeyError(f"expected one of {known}; got {name!r}")
+        raise KeyError(f"no joint {name!r}{nearest(name, self._names)}; expected one of {known}")
 
 
 class Poses(dict[str, NDArray[Any]]):

@@ -139,7 +139,8 @@ class Facing:
         else:
             self._variance += self._density * (stamp_ns - self._stamp_ns) * 1e-9
             gain = self._variance / max(self._variance + sigma * sigma, 1e-12)
-            self._line = tuple(old + gain * (new - old) for old, new in zip(self._line, line, strict=True))
+            (x, y), (new_x, new_y) = self._line, line
+            self._line = (x + gain * (new_x - x), y + gain * (new_y - y))
             self._variance *= 1.0 - gain
         self._stamp_ns = stamp_ns
         return self._line, math.sqrt(self._variance)

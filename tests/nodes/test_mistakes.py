@@ -97,6 +97,21 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         "NaN",
     ),
     "a file that does not exist": (lambda j: steadypose.clean("nowhere.npz"), r"nowhere\.npz does not exist: expected"),
+    "a setting that there is not": (
+        lambda j: steadypose.clean(j, fps=30, settings={"prior": {"delya": 2}}),
+        "has no setting 'delya': did you mean 'delay'",
+    ),
+    "a section that there is not": (
+        lambda j: steadypose.Filter(settings={"prior.delay": 2}),
+        r"expected sections 'prior' and 'trajectory'.*got 'prior\.delay', did you mean 'prior'",
+    ),
+    "a rate and stamps": (
+        lambda j: steadypose.clean(j, fps=30, stamp_ns=np.arange(FRAMES) * 33_333_333),
+        "or stamp_ns, got both; leave fps out",
+    ),
+    "joints under another name": (lambda j: steadypose.clean({"joints": j}, fps=30), "expected an array 'positions'"),
+    "joints to draw that are not clean": (lambda j: steadypose.plot(j), r"steadypose\.plot\(steadypose\.clean"),
+    "a delay of seconds": (lambda j: steadypose.clean(j, fps=30, delay=0.1), "expected int such as 4, got 0.1"),
     "a frame without its time": (lambda j: steadypose.Filter()(j[0]), "t in seconds, or stamp_ns"),
     "nanoseconds as seconds": (lambda j: steadypose.Filter()(j[0], 1.7e18), "say stamp_ns= of nanoseconds"),
     "all frames at once": (lambda j: steadypose.Filter()(j.transpose(0, 2, 1), 0.0), r"expected \(22, 3\) metres"),
@@ -182,7 +197,7 @@ def test_the_command_answers_with_what_to_do(mistake: str, tmp_path: Path, monke
 
 
 def test_there_are_as_many_as_promised() -> None:
-    assert len(REFUSED) + len(WARNED) + len(ANSWERED) >= 22
+    assert len(REFUSED) + len(WARNED) >= 22, "in the library"
 
 
 def test_what_is_right_is_not_warned_of(joints: np.ndarray) -> None:
