@@ -5,7 +5,8 @@ Refine solves those of the newest frames and, if enabled, has HM-VAE refine them
 Orient solves those that are published. Two hips 18 cm apart, each with a bias, show the root's heading badly, and a
 straight limb does not show its twist. So rotations are solved for where the joints are to be expected by the whole body
 (`prior.models.posture`), each by its deviation; the root is averaged of its own joints and the whole body's posture,
-and a filter keeps the twist through straight limbs (`prior.body.twist`). Positions stay as they are.
+a filter keeps the twist through straight limbs (`prior.body.twist`), and another the usual direction of short bones
+(`prior.body.short_bones`). Positions stay as they are.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import global_rotations, heading, yaw_matrix
+from steadypose.prior.body.short_bones import follow_short_bones, unknown_turns
 from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.body.twist import follow_twist, unknown_twist
 from steadypose.prior.clean.frame import Estimate, Gated, Person
@@ -108,11 +110,11 @@ class Orient:
 
     def __init__(self, settings: OrientSettings, slots: int) -> None:
         self._posture = LivePosture.load(settings.weights)
-        self._twist = unknown_twist(slots)
+        self._twist, self._turns = unknown_twist(slots), unknown_turns(slots)
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
-        self._twist[slot] = unknown_twist(1)
+        self._twist[slot], self._turns[slot] = unknown_twist(1), unknown_turns(1)
 
     def update(self, estimate: Estimate) -> Estimate:
         """The estimate with rotations by the whole body. Frames must come in order."""
@@ -123,9 +125,10 @@ class Orient:
         expected = self._posture(positions, sigma, offsets)
         root = average_root(expected, positions, sigma, offsets)
         turned = global_rotations(solve_rotations(expected.positions, offsets, estimate.rotations[slots], root))
-        twist = self._twist[slots]
+        twist, turns = self._twist[slots], self._turns[slots]
         follow_twist(turned, offsets, sigma, twist)
-        self._twist[slots] = twist
+        follow_short_bones(turned, offsets, sigma, turns)
+        self._twist[slots], self._turns[slots] = twist, turns
         local = turned.copy()
         local[:, 1:] = turned[:, PARENT[1:]].swapaxes(-1, -2) @ turned[:, 1:]
         rotations = estimate.rotations.copy()
