@@ -1,30 +1,79 @@
-"""What every protocol has in common: its surroundings, its result, and peers and ours run over clips."""
+"""What every study has in common: its surroundings, baselines and steadypose run over clips, and the same parameter
+search for every baseline: so many evaluations, on the same clips, by the same loss."""
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rich.progress import Progress
+from scipy.stats import qmc
 
 from steadypose.benchmarks import ours
-from steadypose.benchmarks.baselines import recurrent, smoothnet, window_vaes
+from steadypose.benchmarks.baselines import recurrent, smoothnet
 from steadypose.benchmarks.baselines.filters import PEERS, Peer
-from steadypose.benchmarks.machine import ROOT
-from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_clips, prepared_set, simulated_clips
-from steadypose.benchmarks.results import Table
-from steadypose.benchmarks.tuning import Tuned, search
+from steadypose.benchmarks.motion import MotionClips, prepared_clips, simulated_clips
 from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.fit.hmvae_network import MotionVAE
+
+Parameters = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Result of a parameter search.
+
+    Attributes:
+        parameters: of the least loss.
+        tried: every point, with its figures.
+    """
+
+    parameters: Parameters
+    tried: list[dict[str, float]]
+
+
+def loss(figures: Mapping[str, float]) -> float:
+    """What tuning minimises: position error, mm, and acceleration error, mm/frame², added."""
+    return figures["position_mm"] + figures["acceleration_mm"]
+
+
+def search(
+    space: Mapping[str, tuple[float, float]], evaluate: Callable[[Parameters], dict[str, float]], budget: int
+) -> Tuned:
+    """Two thirds of the budget evenly over the space (Sobol), the rest in a quarter of its width around the best.
+
+    Args:
+        space: lowest and highest of each parameter; logarithms are searched.
+        evaluate: parameters to figures, with ``position_mm`` and ``acceleration_mm`` among them.
+        budget: how often it is called. Without parameters, once.
+    """
+    if not space:
+        return Tuned({}, [evaluate({})])
+    tried: list[dict[str, float]] = []
+    best: Parameters = {}
+    low, high = np.log(np.array(list(space.values()))).T
+    wide = budget - budget // 3
+    for centre, width, count in (((low + high) / 2, high - low, wide), (None, (high - low) / 4, budget - wide)):
+        middle = np.log(list(best.values())) if centre is None else centre
+        for point in _points(np.maximum(middle - width / 2, low), np.minimum(middle + width / 2, high), count):
+            parameters = {name: float(f"{value:.4g}") for name, value in zip(space, np.exp(point), strict=True)}
+            tried.append({**parameters, **evaluate(parameters)})
+        winner = min(tried, key=loss)
+        best = {name: winner[name] for name in space}
+    return Tuned(best, tried)
+
+
+def _points(low: np.ndarray, high: np.ndarray, count: int) -> Iterator[np.ndarray]:
+    sampler = qmc.Sobol(len(low), scramble=True, rng=0)
+    yield from low + sampler.random_base2(int(np.ceil(np.log2(max(count, 1)))))[:count] * (high - low)
+
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 DELAYS = (0, 2, 4, 8)
@@ -73,20 +122,6 @@ class Bench:
         """Training motion, of other people, for the peers that learn."""
         return self._motion("train", 90, 60 if self.quick else 1000)
 
-    def window_vae(self, name: str, frames: int) -> MotionVAE:
-        """A model of `window_vaes.MODELS`, trained on training motion, or found in ``runs`` from an earlier call."""
-        self.progress.stop()  # training draws a bar of its own
-        try:
-            if self.quick or not self.data.is_file():
-                train, val = as_set(self.training_clips()), as_set(self._motion("val", 90, 12))
-                with tempfile.TemporaryDirectory() as runs:
-                    return window_vaes.trained(name, frames, train, val, Path(runs), steps=1)
-            train, val = (prepared_set(self.data, split) for split in ("train", "val"))
-            runs = ROOT / "runs" / f"reconstruction-{digest(self.data)}"
-            return window_vaes.trained(name, frames, train, val, runs, window_vaes.STEPS[frames])
-        finally:
-            self.progress.start()
-
     def _motion(self, split: str, frames: int, most: int) -> MotionClips:
         if self.data.is_file():
             return prepared_clips(self.data, split, frames, most)
@@ -107,21 +142,6 @@ class Bench:
         """The whole-body denoiser, trained here and now."""
         track = partial(self.progress.track, description="recurrent denoiser")
         return recurrent.train(self.training_clips(), self.delays, 50 if self.quick else 3000, 0, track)
-
-
-@dataclass(frozen=True)
-class Result:
-    """What a protocol found.
-
-    Attributes:
-        tables: for people; the first is printed first.
-        data: for programs.
-        figures: by name of the file.
-    """
-
-    tables: list[Table]
-    data: dict[str, Any]
-    figures: Mapping[str, Figure] = field(default_factory=dict)
 
 
 class Answer(NamedTuple):

@@ -1,42 +1,78 @@
-"""Runs protocols and files what they find: JSON, tables for the README, pictures."""
+"""``steadypose evaluate``: runs studies, each with its baselines, and files what they find."""
 
 from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rich.console import Console
-from rich.progress import Progress
+import tyro
 
-from steadypose.benchmarks.bench import Bench, Result
-from steadypose.benchmarks.provenance import require_committed
-from steadypose.benchmarks.results import RESULTS, log_reading, save, show
-from steadypose.benchmarks.studies import PROTOCOLS, SENSORS
-from steadypose.nodes.graph.threads import one_thread
+from steadypose.benchmarks.studies import PREPARED, SENSORS, STUDIES
+from steadypose.benchmarks.systems import SYSTEMS
+
+if TYPE_CHECKING:
+    from steadypose.benchmarks.bench import Bench
+    from steadypose.benchmarks.results import Result
+
+    Name = str
+else:
+    Name = tyro.extras.literal_type_from_choices(["all", *STUDIES, *SYSTEMS])
 
 
-def evaluate(protocol: str, *, split: str, quick: bool, mocap: Path | None, data: Path, out: Path | None) -> None:
-    """Run one protocol, or all that can be run here; see ``steadypose evaluate --help``."""
-    if protocol in SENSORS and (mocap is None or not (mocap / SENSORS[protocol]).is_file()):
-        raise FileNotFoundError(f"{protocol}: expected --mocap DIR, the folder that holds {SENSORS[protocol]}")
-    if out is None and split == "test" and not quick:
+def evaluate(
+    study: Annotated[Name, tyro.conf.Positional],
+    split: Literal["val", "test"] = "val",
+    quick: bool = False,
+    mocap: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    data: Path = Path("data/prepared.npz"),
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+) -> int:
+    """Measure steadypose against its tuned baselines: choose on the split 'val', report 'test'.
+
+    Figures, tables and pictures of 'test', and of what has no split, go to benchmarks/results, if what is measured is
+    committed; others go to the folder that --out names, or nowhere. Every reading of 'test' is a line of
+    benchmarks/results/test-readings.csv.
+
+    Args:
+        study: what to measure, or 'all' that is not of a whole system (latency, scale, restart, soak, events).
+        split: of the prepared motion that is scored. Kinect, MediaPipe and force plates have none.
+        quick: a few clips and points, to see that all works.
+        mocap: folder with ui_prmd.npz, mediapipe_pose.npz and contacts_grf.npz, for the studies of these sensors;
+            without it, they are left out of 'all'.
+        data: prepared motion, as 'steadypose prepare' wrote it; without it, people of the project's own simulator
+            stand in.
+        out: folder to write to.
+    """
+    if (needed := _missing(study, mocap, data)) is not None:
+        raise FileNotFoundError(f"{study}: expected {needed}")
+    # torch, after the arguments are known to be right
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from steadypose.benchmarks.bench import Bench
+    from steadypose.benchmarks.provenance import RESULTS, require_committed
+    from steadypose.benchmarks.results import log_reading, show
+    from steadypose.nodes.graph.threads import one_thread
+
+    if out is None and not quick and (split == "test" or study in SYSTEMS):
         out = RESULTS
     if out is not None:
         require_committed(out)
     one_thread()
-    console = Console()
+    console, wrong = Console(), list[str]()
     with Progress(console=console, transient=True) as progress:
         bench = Bench(quick=quick, mocap=mocap, data=data, progress=progress, split=split)
-        for name in PROTOCOLS if protocol == "all" else (protocol,):
-            if name in SENSORS and (mocap is None or not (mocap / SENSORS[name]).is_file()):
-                console.print(f"{name}: left out, it needs {SENSORS[name]} (--mocap)", highlight=False)
+        for name in STUDIES if study == "all" else (study,):
+            if (needed := _missing(name, mocap, data)) is not None:
+                console.print(f"{name}: left out, it needs {needed}", highlight=False)
                 continue
-            if split == "test" and name not in SENSORS and data.is_file():
+            if split == "test" and name not in (*SENSORS, *SYSTEMS) and data.is_file():
                 log_reading(name)
             started = time.perf_counter()
-            module = importlib.import_module(f"steadypose.benchmarks.studies.{name}")
+            room = "systems" if name in SYSTEMS else "studies"
+            module = importlib.import_module(f"steadypose.benchmarks.{room}.{name}")
             result: Result = module.run(bench)
             seconds = time.perf_counter() - started
             for task in progress.task_ids:
@@ -45,19 +81,33 @@ def evaluate(protocol: str, *, split: str, quick: bool, mocap: Path | None, data
                 show(table, console)
             console.print(f"{name}: {seconds:.0f} s", highlight=False)
             if out is not None:
-                console.print(f"wrote {_file(name, bench, result, module.DEPENDS_ON, seconds, out)}", highlight=False)
+                console.print(f"wrote {_file(name, room, bench, result, module, seconds, out)}", highlight=False)
+            wrong += result.wrong
     if out is None:
         console.print("written nowhere: --out DIR, or --split test without --quick, writes", highlight=False)
+    for line in wrong:
+        console.print(line, markup=False)
+    return int(bool(wrong))
 
 
-def _file(name: str, bench: Bench, result: Result, depends_on: Sequence[str], seconds: float, directory: Path) -> Path:
-    options = [name, "--split", bench.split, *(["--quick"] if bench.quick else [])]
+def _missing(study: str, mocap: Path | None, data: Path) -> str | None:
+    """What this study needs and is not there."""
+    if study in PREPARED and not data.is_file():
+        return "--data FILE, prepared motion"
+    file = SENSORS.get(study)
+    return f"--mocap DIR, the folder that holds {file}" if file and not (mocap and (mocap / file).is_file()) else None
+
+
+def _file(name: str, room: str, bench: Bench, result: Result, module: Any, seconds: float, directory: Path) -> Path:
+    from steadypose.benchmarks.results import save
+
+    options = [name, *(["--split", bench.split] if room == "studies" else []), *(["--quick"] if bench.quick else [])]
     if name in SENSORS:
         options += ["--mocap", "mocap"]
     content = {
         "quick": bench.quick, "split": bench.split, "seeds": bench.seeds, "seconds": round(seconds, 1), **result.data
     }  # fmt: skip
-    path = save(name, options, result.tables, content, depends_on, directory, ("steadypose", "evaluate"))
+    path = save(name, ["steadypose", "evaluate", *options], result.tables, content, module, directory)
     for stem, figure in result.figures.items():
         figure.savefig(directory / f"{stem}.png", dpi=110)
     return path

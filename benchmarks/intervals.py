@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from steadypose.benchmarks.results import NONE
+
 DRAWS = 4000
 
 
@@ -31,7 +33,9 @@ class Interval(NamedTuple):
     people: int
 
     def text(self, digits: int, scale: float = 1.0) -> str:
-        """For a table: the mean, and in brackets the interval where there is one."""
+        """For a table: the mean, and in brackets the interval where there is one; a dash where there is no mean."""
+        if np.isnan(self.mean):
+            return NONE
         mean, low, high = (f"{scale * value:.{digits}f}" for value in self[:3])
         return f"{mean} ({low}–{high})" if np.isfinite(self.low) else mean
 

@@ -1,39 +1,68 @@
-"""What a result depends on, so that none outlives it: weights, default settings and code, as digests."""
+"""What a result depends on, so that none outlives it: the pipeline's output, weights, and the code of the study.
+
+What is measured of the product is its output, so a result records what the pipeline made of the bundled streams, not
+the code that made it: a refactoring that leaves the output as it was leaves every result as it was. Studies, baselines
+and what is trained are recorded by their definitions, whatever module they stand in, without comments, docstrings,
+annotations, and functions that only write tables and draw.
+"""
 
 from __future__ import annotations
 
 import ast
+import datetime
 import hashlib
 import json
-import sys
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, fields, is_dataclass
+import os
+import platform
+import subprocess
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from functools import cache
+from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from steadypose import PACKAGE
-from steadypose.benchmarks.machine import uncommitted
+from steadypose.msgs.types import CleanBody, PoseClean, PoseRaw, PoseWorld, WorldBody
+from steadypose.nodes.driving import stream
+from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.events.detector import EventSettings
 from steadypose.prior.fit.solve import FitSettings
 from steadypose.prior.models.weights import WEIGHTS
+from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
+ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).parent / "results"
 """Where the results lie that the README's tables are written from."""
 
-CLEAN = ("mixture weights", "occlusion weights", "hgvae weights", "posture weights", "prior settings")
+CLEAN = ("pose/clean", "mixture weights", "occlusion weights", "hgvae weights", "posture weights")
 """What `pose/clean` depends on with default settings, of what `ships`."""
 
-VARIANTS = (*CLEAN, "hmvae weights")
+VARIANTS = (*CLEAN, "pose/clean, HM-VAE", "hmvae weights")
 """The same of all variants of `benchmarks.ours`: one refines with HM-VAE, which the default does not."""
 
-WORLD = (*CLEAN, "contacts weights", "trajectory weights", "trajectory settings")
+WORLD = (*CLEAN, "pose/world", "contacts weights", "trajectory weights")
 """What `pose/world` depends on."""
 
 _WEIGHT_SETS = ("default", "kinect_v2")
 """Those that ship; others may have been installed beside them."""
+
+_FRAMES = 120
+"""Frames of each bundled stream, of which the output is recorded."""
+_PROJECTIONS = 8
+SAME_M = 1e-4
+"""Root mean square change of the output, metres, up to which it is the same: results are quoted to 0.1 mm, and floats
+differ between processors."""
+
+_PLUMBING = tuple(f"benchmarks.{name}" for name in ("evaluate", "figures", "provenance", "report", "results", "stale"))
+"""Modules that change no figure."""
+
+Output = list[float]
 
 
 class UncommittedError(RuntimeError):
@@ -42,87 +71,171 @@ class UncommittedError(RuntimeError):
 
 @cache
 def ships() -> dict[str, str]:
-    """Digests of all that a result can depend on.
-
-    By name: ``MODEL weights`` of each model, ``SECTION settings`` of each table of a launch file, such as ``prior``
-    and ``prior.impute``, and of ``offline``, the settings of ``steadypose fit``.
-    """
+    """Digests, by name: ``MODEL weights`` of each model, and ``offline settings`` of ``steadypose fit``."""
     weights: dict[str, list[Path]] = {}
     for path in sorted(WEIGHTS.iterdir()):
         model, _, rest = path.name.partition("-")
         if rest.partition(".")[0] in _WEIGHT_SETS and path.suffix in (".safetensors", ".json"):
             weights.setdefault(model, []).append(path)
-    return {
-        **{f"{model} weights": _digest(*(part for p in paths for part in (p.name.encode(), p.read_bytes())))
-           for model, paths in weights.items()},
-        **dict(_settings("prior", PriorSettings())),
-        **dict(_settings("trajectory", TrajectorySettings())),
-        **dict(_settings("events", EventSettings())),
-        **dict(_settings("offline", FitSettings())),
-    }  # fmt: skip
+    digests = {
+        f"{model} weights": _digest(part for p in paths for part in (p.name.encode(), p.read_bytes()))
+        for model, paths in weights.items()
+    }
+    return {**digests, "offline settings": _digest([json.dumps(asdict(FitSettings()), default=str).encode()])}
 
 
-def _settings(name: str, settings: Any) -> Iterator[tuple[str, str]]:
-    """The digest of a dataclass, and of each dataclass in it."""
-    yield f"{name} settings", _digest(json.dumps(asdict(settings), sort_keys=True, default=str).encode())
-    for field in fields(settings):
-        if is_dataclass(value := getattr(settings, field.name)):
-            yield from _settings(f"{name}.{field.name}", value)
-
-
-def _digest(*parts: bytes) -> str:
+def _digest(parts: Iterable[bytes]) -> str:
     digest = hashlib.sha256()
     for part in parts:
         digest.update(hashlib.sha256(part).digest())
     return digest.hexdigest()[:16]
 
 
-def code() -> dict[str, str]:
-    """Digest of every module of this project that is imported now, by name, such as ``prior.clean.fuse``."""
-    files = {name: getattr(module, "__file__", None) for name, module in sys.modules.items()}
-    ours = {name.removeprefix("steadypose."): file for name, file in files.items() if name.startswith("steadypose.")}
-    return {name: digest for name, file in sorted(ours.items()) if file and (digest := code_digest(Path(file)))}
+@cache
+def outputs() -> dict[str, Output]:
+    """By name, random projections of what the pipeline makes of the first frames of the bundled streams.
+
+    A projection on weights of 1 and -1, over the root of their number, changes by about the root mean square of the
+    change: eight numbers tell by how much 100,000 differ.
+    """
+    paths = sorted(path.parent for path in (ROOT / "sim_data").glob("*/metadata.yaml"))
+    default = [part for path in paths for part in _answers(path, PriorSettings())]
+    refining = PriorSettings.from_dict({"refine": {"enabled": True}})
+    return {
+        "pose/clean": projections(values for kind, values in default if kind is PoseClean),
+        "pose/world": projections(values for kind, values in default if kind is PoseWorld),
+        "pose/clean, HM-VAE": projections(values for kind, values in _answers(paths[0], refining) if kind is PoseClean),
+    }
+
+
+def _answers(path: Path, settings: PriorSettings) -> Iterator[tuple[type, np.ndarray]]:
+    """Positions, rotations and deviations of every body, as numbers, in order."""
+    raw = (item for item in open_recording(path) if isinstance(item[1], PoseRaw))
+    pipelines = PriorPipeline(settings), TrajectoryPipeline(TrajectorySettings())
+    for _, message in stream(islice(raw, _FRAMES), *pipelines):
+        if isinstance(message, PoseClean | PoseWorld):
+            yield type(message), np.concatenate([np.empty(0), *(_numbers(body) for body in message.bodies)])
+
+
+def _numbers(body: CleanBody | WorldBody) -> np.ndarray:
+    extra = body.contacts if isinstance(body, WorldBody) else [body.anomaly]
+    parts = body.positions, body.rotations, body.sigma, extra
+    return np.nan_to_num(np.concatenate([np.ravel(part) for part in parts]), posinf=1.0).astype(np.float64)
+
+
+def projections(parts: Iterable[np.ndarray]) -> Output:
+    """Of numbers, one after the other."""
+    values = np.concatenate(list(parts))
+    signs = np.random.default_rng(0).integers(0, 2, (_PROJECTIONS, len(values)), dtype=np.int8) * 2.0 - 1.0
+    return [round(float(p), 7) for p in signs @ values / np.sqrt(len(values))]
+
+
+def measured(depends_on: Sequence[str]) -> dict[str, Any]:
+    """What a result records: of each name an output, a digest of `ships`, or the code of a package such as
+    ``prior.fit``."""
+    found = {}
+    for name in depends_on:
+        if name.startswith("pose/"):
+            found[name] = outputs()[name]
+        else:
+            found[name] = ships()[name] if name in ships() else package_digest(name)
+    return found
 
 
 @cache
-def code_digest(path: Path) -> str:
-    """Of a module's statements, without comments and docstrings, which change no figure; empty if it is not there."""
-    if not path.is_file():
-        return ""
-    tree = ast.parse(path.read_bytes())
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            node.body = [part for part in body if not _is_text(part)]  # type: ignore[attr-defined]
-    return _digest(ast.dump(tree).encode())
+def package_digest(package: str) -> str:
+    """Of all definitions of a package or module of this project: moving one within it changes nothing."""
+    path = PACKAGE.joinpath(*package.split("."))
+    files = sorted(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
+    return _digest(sorted(digest.encode() for file in files for digest in definitions(file)))
+
+
+def code(module: str) -> list[str]:
+    """``NAME DIGEST`` of every definition in a study's module and in those of `benchmarks` that it imports."""
+    todo, modules = [module], set[str]()
+    if not _file_of(module).is_file():
+        raise FileNotFoundError(f"{module}: expected a module of this project")
+    while todo:
+        name = todo.pop()
+        if name in modules or name in _PLUMBING or not _file_of(name).is_file():
+            continue
+        modules.add(name)
+        for node in ast.walk(ast.parse(_file_of(name).read_bytes())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("steadypose.benchmarks"):
+                source = (node.module or "").removeprefix("steadypose.")
+                todo += [source, *(f"{source}.{alias.name}" for alias in node.names)]
+    return sorted({line for name in modules for line in definitions(_file_of(name))})
+
+
+def _file_of(module: str) -> Path:
+    return PACKAGE.joinpath(*module.split(".")).with_suffix(".py")
+
+
+@cache
+def definitions(path: Path) -> list[str]:
+    """``NAME DIGEST`` of every function, class and constant of a module that can change a figure."""
+    found = []
+    for node in ast.parse(path.read_bytes()).body:
+        match node:
+            case ast.FunctionDef(name=name):
+                returned = ast.unparse(node.returns) if node.returns else ""
+                if "Table" in returned or "Figure" in returned:
+                    continue
+            case (
+                ast.ClassDef(name=name)
+                | ast.Assign(targets=[ast.Name(id=name)])
+                | ast.AnnAssign(target=ast.Name(id=name))
+            ):
+                pass
+            case _:
+                continue
+        found.append(f"{name} {_digest([ast.dump(_bare(node)).encode()])[:8]}")
+    return found
+
+
+def _bare(node: ast.stmt) -> ast.stmt:
+    """Without docstrings, and without functions' annotations."""
+    for part in ast.walk(node):
+        if isinstance(body := getattr(part, "body", None), list):
+            part.body = [line for line in body if not _is_text(line)]  # type: ignore[attr-defined]
+        if isinstance(part, ast.FunctionDef):
+            part.returns = None
+        if isinstance(part, ast.arg):
+            part.annotation = None
+    return node
 
 
 def _is_text(node: ast.AST) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
+@cache
+def _known() -> frozenset[str]:
+    """``NAME DIGEST`` of every definition of `benchmarks`."""
+    return frozenset(line for path in (PACKAGE / "benchmarks").rglob("*.py") for line in definitions(path))
+
+
 def stale(result: Mapping[str, Any]) -> list[str]:
-    """What has changed since a result was measured; nothing where it holds.
+    """What has changed since a result was measured; nothing where it holds, or is frozen: a finished study, whose code
+    is gone from here and to be had at the commit that ``frozen`` names.
 
-    A result's ``measured`` has the digests of what `ships`, and its ``code`` those of the modules that ran. Results of
-    before 2026-11-23 have no ``code``.
+    Results of before 2026-11-24 recorded settings and modules, if any, and no output.
     """
-    measured = result.get("measured")
-    if measured is None:
-        return ["weights", "settings"]
-    changed = [part for part, digest in measured.items() if ships().get(part) != digest]
-    if "code" not in result:
-        return [*changed, "code (not recorded)"]
-    modules = [name for name, digest in result["code"].items() if code_digest(_file_of(name)) != digest]
-    if modules:
-        changed.append(f"code ({', '.join(modules[:3])}{', ...' * (len(modules) > 3)})")
-    return changed
+    if "frozen" in result:
+        return []
+    recorded: Mapping[str, Any] = result.get("measured", {})
+    if not isinstance(result.get("code"), list):
+        return ["output (not recorded)"]
+    now = measured(tuple(recorded))
+    changed = [name for name, was in recorded.items() if not _is_same(was, now[name])]
+    gone = [line.split()[0] for line in result["code"] if line not in _known()]
+    return [*changed, f"code ({', '.join(gone[:3])}{', ...' * (len(gone) > 3)})"] if gone else changed
 
 
-def _file_of(module: str) -> Path:
-    path = PACKAGE.joinpath(*module.split("."))
-    file = path.with_suffix(".py")
-    return file if file.is_file() else path / "__init__.py"
+def _is_same(recorded: str | Output, now: str | Output) -> bool:
+    if isinstance(recorded, str) or isinstance(now, str):
+        return recorded == now
+    return float(np.sqrt(np.mean((np.array(recorded) - np.array(now)) ** 2))) <= SAME_M
 
 
 def require_committed(directory: Path) -> None:
@@ -136,3 +249,42 @@ def require_committed(directory: Path) -> None:
             f"results are measured at a commit, but {', '.join(files[:5])}{', ...' * (len(files) > 5)} differ from it: "
             "commit first, or write elsewhere (--out DIR)"
         )
+
+
+def machine() -> dict[str, str | int | float]:
+    """CPU, cores, memory, load, versions, and the commit that was measured ("-dirty" where it is `uncommitted`)."""
+    return {
+        "cpu": _cpu(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 0,
+        "memory_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1),
+        "load_1min": round(os.getloadavg()[0], 2),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "torch": version("torch"),
+        "numpy": version("numpy"),
+        "commit": _git("rev-parse", "--short=10", "HEAD") + ("-dirty" if uncommitted() else ""),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+    }
+
+
+def uncommitted() -> list[str]:
+    """Files that differ from the commit, except results and documents, which do not change what is measured."""
+    changed = _git("diff", "--name-only", "HEAD", "--", ".", ":!benchmarks/results", ":!docs", ":!*.md")
+    return [] if changed == "unknown" else changed.split()
+
+
+def _cpu() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _git(*arguments: str) -> str:
+    try:
+        done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return done.stdout.strip()

@@ -16,8 +16,7 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from steadypose.benchmarks.machine import ROOT
-from steadypose.benchmarks.provenance import stale
+from steadypose.benchmarks.provenance import ROOT, stale
 from steadypose.benchmarks.results import RESULTS, load
 from steadypose.benchmarks.stale import STALE
 
@@ -60,6 +59,8 @@ def markdown(table: Mapping[str, Any], result: Mapping[str, Any]) -> str:
     source = f"{machine['cpu']}, {machine['cores']} cores; commit {machine['commit']}, {machine['date']}"
     if changed := stale(result):
         source += f"; **stale: measured with other {' and '.join(changed)}**"
+    if "frozen" in result:
+        source += f"; a finished study, whose code is at commit {result['frozen']}"
     return "\n".join([*lines, "", f"<sub>`{command}` · {source}</sub>", ""])
 
 

@@ -1,4 +1,4 @@
-"""Results of a benchmark: tables for people, figures for programs, in one JSON file beside the code."""
+"""Results of a study: tables for people, figures for programs, in one JSON file beside the code."""
 
 from __future__ import annotations
 
@@ -7,19 +7,24 @@ import json
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from steadypose.benchmarks.machine import ROOT, describe
-from steadypose.benchmarks.provenance import RESULTS, code, require_committed, ships
+from steadypose.benchmarks.provenance import RESULTS, code, machine, measured, require_committed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 READINGS = RESULTS / "test-readings.csv"
 """Every time that the test split was scored. A split that is read often is one that things are chosen by: who changes
 something after a reading writes what into the last column."""
+
+NONE = "–"
+"""What stands in a table where a method has no estimate."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,31 @@ class Table:
     columns: list[str]
     rows: list[list[str]]
     note: str = ""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a study found.
+
+    Attributes:
+        tables: for people; the first is printed first.
+        data: for programs.
+        figures: by name of the file.
+        wrong: what must not be, a line each; the command then fails.
+    """
+
+    tables: list[Table]
+    data: dict[str, Any]
+    figures: Mapping[str, Figure] = field(default_factory=dict)
+    wrong: Sequence[str] = ()
+
+
+class Study(Protocol):
+    """The module of a study: it has a ``run`` from a `Bench` to a `Result`, too."""
+
+    __name__: str
+    DEPENDS_ON: Sequence[str]
+    """Names of what it measures, as of `provenance.measured`: when one of these changes, its results are stale."""
 
 
 def show(table: Table, console: Console) -> None:
@@ -98,34 +128,21 @@ def _blocks(table: Table, width: int) -> list[list[int]]:
 
 def save(
     name: str,
-    arguments: list[str],
-    tables: list[Table],
-    data: dict[str, Any],
-    depends_on: Sequence[str],
+    command: Sequence[str],
+    tables: Sequence[Table],
+    data: Mapping[str, Any],
+    study: Study,
     directory: Path = RESULTS,
-    program: Sequence[str] = (),
 ) -> Path:
-    """Write ``NAME.json``: the command, the machine, the tables, and ``data``, whatever the benchmark found.
-
-    Args:
-        name: of the benchmark.
-        arguments: of the command; folders are cut to their last part.
-        tables: for people.
-        data: figures; JSON types.
-        depends_on: names of `ships`: when one of them changes, the figures are stale.
-        directory: where to.
-        program: what makes it; ``python -m steadypose.benchmarks.systems.NAME`` if left out.
+    """Write ``NAME.json``: the command, the machine, what was measured, the tables, and ``data``.
 
     Raises:
         UncommittedError: see `require_committed`, which is best asked before measuring.
     """
     require_committed(directory)
-    command = shlex.join(
-        [*(program or ("python", "-m", f"steadypose.benchmarks.systems.{name}")), *(_portable(a) for a in arguments)]
-    )
     path = directory / f"{name}.json"
-    content = {"benchmark": name, "command": command, "machine": describe()}
-    content |= {"measured": {part: ships()[part] for part in depends_on}, "code": code()}
+    content = {"benchmark": name, "command": shlex.join(command), "machine": machine()}
+    content |= {"measured": measured(study.DEPENDS_ON), "code": code(study.__name__.removeprefix("steadypose."))}
     content |= {"tables": [asdict(t) for t in tables], **data}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(_nan_to_null(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
@@ -133,24 +150,20 @@ def save(
 
 
 def load(directory: Path = RESULTS) -> dict[str, dict[str, Any]]:
-    """All results by the benchmark's name."""
-    return {
-        path.stem: json.loads(path.read_text())
-        for path in sorted(directory.glob("*.json"))
-        if path.name != "stale.json"
-    }
+    """All results by the study's name."""
+    return {path.stem: json.loads(path.read_text()) for path in sorted(directory.glob("*.json"))}
 
 
 def log_reading(study: str) -> None:
     """Append a line to `READINGS`: the test split is about to be scored by this study, whatever becomes of it."""
-    machine = describe()
+    now = machine()
     READINGS.parent.mkdir(parents=True, exist_ok=True)
     new = not READINGS.is_file()
     with READINGS.open("a", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         if new:
             writer.writerow(["date", "commit", "study", "what followed"])
-        writer.writerow([machine["date"], machine["commit"], study, ""])
+        writer.writerow([now["date"], now["commit"], study, ""])
 
 
 def _nan_to_null(value: Any) -> Any:
@@ -160,10 +173,3 @@ def _nan_to_null(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_nan_to_null(item) for item in value]
     return None if isinstance(value, float) and math.isnan(value) else value
-
-
-def _portable(argument: str) -> str:
-    path = Path(argument)
-    if not path.is_absolute():
-        return argument
-    return str(path.relative_to(ROOT)) if path.is_relative_to(ROOT) else path.name

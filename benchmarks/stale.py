@@ -1,33 +1,19 @@
-"""Results that stand although the code, weights or settings have changed since, each with the reason."""
+"""Results that stand although what they measured has changed since, each with the reason."""
 
-BEFORE = "measured before results recorded the code that ran"
-TOUCHED = "code that it imports was touched since"
-FROZEN = "a finished study, whose code is gone"
+BEFORE = "measured before results recorded the pipeline's output; to be measured again"
 
 STALE = {
-    "calibration": BEFORE,
-    "camera_rates": BEFORE,
     "completion": BEFORE,
     "contacts": BEFORE,
-    "depth_lifting": FROZEN,
-    "event_mocap": TOUCHED,
+    "event_mocap": BEFORE,
     "events": BEFORE,
-    "fuzz": BEFORE,
     "hgvae": BEFORE,
     "humor": BEFORE,
-    "identity": BEFORE,
-    "importers": FROZEN,
     "interpolation": BEFORE,
     "kinect_vicon": BEFORE,
     "latency": BEFORE,
     "mediapipe": BEFORE,
-    "memory": BEFORE,
-    "reconstruction": BEFORE,
     "restart": BEFORE,
-    "rotations": "since then films are opened too, by a module that opened its streams; they are opened as before",
     "scale": BEFORE,
-    "simulated": BEFORE,
-    "streaming": BEFORE,
-    "web_page": TOUCHED,
 }
-"""Benchmark: why its figures are kept. `tests/benchmarks/test_report.py` holds this list against the results."""
+"""Study: why its figures are kept. `tests/benchmarks/test_report.py` holds this list against the results."""

@@ -19,7 +19,7 @@ from importlib.metadata import version
 from io import StringIO
 from typing import Any
 
-EVALUATE = "steadypose.benchmarks.command"
+EVALUATE = "steadypose.benchmarks.evaluate"
 COMMANDS = {
     "run": ("run", "start a launch file's nodes, watch them, show how they do"),
     "node": ("node", "one node, for another machine or a supervisor such as systemd"),

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from steadypose.benchmarks.baselines.bank import bank
-from steadypose.benchmarks.baselines.beside import beside
+from steadypose.benchmarks.baselines.banks import bank, whole_body_bank
+from steadypose.benchmarks.baselines.body import beside
 from steadypose.benchmarks.baselines.kalman import fixed_lag, smooth
-from steadypose.benchmarks.baselines.whole_body_bank import whole_body_bank
 from steadypose.prior.arrays import Floats
 from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.timing.rate import FPS

@@ -20,12 +20,12 @@ import numpy as np
 
 from steadypose.benchmarks import ours
 from steadypose.benchmarks.baselines.filters import missing
-from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated
 from steadypose.benchmarks.intervals import interval, ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.provenance import VARIANTS, WORLD
-from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import score
 from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 from steadypose.benchmarks.studies.spoiled import Condition
@@ -44,7 +44,7 @@ from steadypose.prior.models.mixture import inference, whiteness
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
-DEPENDS_ON = tuple(dict.fromkeys((*VARIANTS, *WORLD)))
+DEPENDS_ON = (*VARIANTS, *WORLD)
 
 AS_IT_SHIPS = "as it ships"
 DELAY = 4

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from steadypose.benchmarks.baselines.conditional_gaussian import ConditionalGaussian
+from steadypose.benchmarks.baselines.body import ConditionalGaussian
 from steadypose.benchmarks.baselines.inbetween import NearestPose
-from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.intervals import ratio
 from steadypose.benchmarks.motion import as_set, prepared_set
-from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import ends_mm
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import heading
@@ -33,7 +33,7 @@ from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tr
 from steadypose.training.data.hgvae_windows import standardise
 from steadypose.training.networks.hgvae import HGVAE
 
-DEPENDS_ON = ("completer weights", "hgvae weights")
+DEPENDS_ON = ("completer weights", "hgvae weights", "prior.complete")
 
 FRAMES = 50
 

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.benchmarks.bench import Bench, Result
-from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.results import Result, Table
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, REST_HEIGHT, REST_SPEED, label_contacts
 from steadypose.prior.body.skeleton import J, finite_joints
@@ -24,7 +24,7 @@ from steadypose.prior.models.contacts import LiveContacts, contact_features
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.timing.rate import FPS
 
-DEPENDS_ON = ("mixture weights", "contacts weights")
+DEPENDS_ON = ("mixture weights", "contacts weights", "prior.models.mixture", "prior.models.contacts")
 
 LOADED_N = 30.0
 """Newtons from which on a foot bears load."""

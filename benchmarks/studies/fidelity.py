@@ -17,15 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks import figures as pictures
 from steadypose.benchmarks.baselines.filters import FILTERS, Peer
-from steadypose.benchmarks.bench import Answer, Bench, Methods, Result, answers, tune, tuning_log
-from steadypose.benchmarks.by_source import source_table
+from steadypose.benchmarks.bench import Answer, Bench, Methods, answers, tune, tuning_log
 from steadypose.benchmarks.corruption import along_sight, gaussian
 from steadypose.benchmarks.metrics import acceleration_error, position_error, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.provenance import CLEAN
-from steadypose.benchmarks.results import Table
-from steadypose.benchmarks.scores import pivot
+from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.scores import pivot, source_table
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.timing.rate import FPS

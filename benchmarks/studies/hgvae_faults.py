@@ -1,4 +1,4 @@
-"""Test cases of the anomaly score: tracking faults, and transformations of motion that are no faults."""
+"""Test cases of HG-VAE's anomaly score: tracking faults, and transformations of motion that are no faults."""
 
 from __future__ import annotations
 

@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.benchmarks import figures
-from steadypose.benchmarks.baselines.beside import beside
-from steadypose.benchmarks.baselines.conditional_gaussian import ConditionalGaussian
+from steadypose.benchmarks.baselines.body import ConditionalGaussian, beside
 from steadypose.benchmarks.baselines.filters import PEERS, Peer
-from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
 from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.provenance import VARIANTS
-from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import pivot
 from steadypose.benchmarks.studies.spoiled import (
     HOW,

@@ -2,58 +2,186 @@
 
 The figures are not comparable with the paper's, whose data are AMASS and whose body is SMPL; the order of the methods
 is. Ablations are trained alike and briefly, so the model that ships has a copy trained as briefly beside it. Contact is
-load, of eight joints; the paper's ninth, the hips, never bears any.
-"""
+load, of eight joints; the paper's ninth, the hips, never bears any."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from steadypose.benchmarks import figures, ours
-from steadypose.benchmarks.baselines.bank import bank
-from steadypose.benchmarks.bench import Bench, Result
-from steadypose.benchmarks.motion import MotionClips
-from steadypose.benchmarks.provenance import CLEAN
-from steadypose.benchmarks.results import Table
-from steadypose.benchmarks.studies.humor_credit import credit, credit_table, spoiled
+from steadypose.benchmarks import ours
+from steadypose.benchmarks.baselines.banks import bank
+from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_set
+from steadypose.benchmarks.provenance import CLEAN, ROOT
+from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.studies.humor_fits import (
     CAMERA_HEIGHT,
     HIDDEN_BELOW,
     NOISE,
     Answer,
     camera_settings,
+    credit,
+    credit_table,
     fitted,
     load_labels,
     pictures,
     scores,
     seen_joints,
+    spoiled,
     start_of,
 )
-from steadypose.benchmarks.studies.humor_models import MVAE, SHIPS, VARIANTS, model_of
-from steadypose.benchmarks.studies.humor_prediction import SAMPLES, predict, stand_still
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.kinematics import CONTACT_JOINTS
+from steadypose.prior.fit.humor_network import HumorConfig, HumorNet, Rollout, sample
+from steadypose.prior.fit.humor_state import State, states_of
 from steadypose.prior.fit.solve import FitSettings
+from steadypose.prior.fit.tensors import load_network
+from steadypose.training.data.dataset import MotionSet
+from steadypose.training.recipes.humor import Sequences, recipe_of
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+STEPS, BATCH, LEARNING_RATE, EVALUATIONS = 250, 64, 1e-3, 5
+"""Of a brief training: a forty-eighth of the sequences that what ships has seen."""
+
+SHIPS, MVAE = "HuMoR, as it ships", "MVAE-like: none of the three"
+BRIEF = "HuMoR, briefly trained"
+
+VARIANTS: Mapping[str, HumorConfig] = {
+    BRIEF: HumorConfig(),
+    "standard prior": HumorConfig(learned_prior=False),
+    "no delta": HumorConfig(residual=False),
+    "no contacts": HumorConfig(contacts=False),
+    MVAE: HumorConfig(learned_prior=False, residual=False, contacts=False),
+}
+"""As the paper names them; without SMPL, it has one more: joints that need not be those of a body."""
 
 
-DEPENDS_ON = (*CLEAN, "humor weights", "offline settings")
+def shipped() -> HumorNet:
+    """The default weights."""
+    return load_network(HumorNet, HumorConfig.from_dict, "default", "humor")
+
+
+def model_of(bench: Bench, name: str) -> HumorNet:
+    """One of `VARIANTS`, trained now, or found in ``runs`` from an earlier call; or what ships."""
+    if name == SHIPS:
+        return shipped()
+    bench.progress.stop()  # training draws a bar of its own
+    try:
+        config = VARIANTS[name]
+        if bench.quick or not bench.data.is_file():
+            motion = as_set(bench.training_clips())
+            with tempfile.TemporaryDirectory() as runs:
+                return _trained(config, motion, motion, Path(runs), name, steps=2)
+        runs = ROOT / "runs" / f"humor-{digest(bench.data)}-{STEPS}"
+        train, val = (prepared_set(bench.data, split) for split in ("train", "val"))
+        return _trained(config, train, val, runs, name, STEPS)
+    finally:
+        bench.progress.start()
+
+
+def _trained(config: HumorConfig, train: MotionSet, val: MotionSet, runs: Path, name: str, steps: int) -> HumorNet:
+    stem = name.replace(" ", "-").replace(",", "").replace(":", "")
+    path = runs / stem / f"{stem}.safetensors"
+    if not path.is_file():
+        recipe = recipe_of(config, Sequences.of(train), Sequences.of(val))
+        recipe = replace(recipe, batch=BATCH, rate=LEARNING_RATE, evaluations=EVALUATIONS)
+        torch.manual_seed(0)
+        model = HumorNet(config)
+        model.load_state_dict(dict(shipped().named_buffers()), strict=False)  # fitting them anew takes a minute
+        run = recipe.minimise(model, path.parent, steps, seed=0)
+        run.save(path, model, asdict(config), {"Training": f"{steps} steps of {BATCH} sequences, for the bench"})
+    return load_network(HumorNet, HumorConfig.from_dict, str(path), "humor")
+
+
+SAMPLES, LONG_S = 50, 5.0
+"""As in the paper."""
+
+SPARED = 4
+"""Times fewer samples are drawn of the long futures: pairs are many."""
+
+LOWEST_M, HIGHEST_M = 0.1, 1.6
+"""Of a pelvis: a future in which it is ever lower or higher has gone astray. None of the truth has."""
+
+
+def initial_states(clips: MotionClips) -> tuple[State, State, Tensor]:
+    """First states (C,), all that follow (C, T), of people on their bones, and these bones."""
+    root, rotations = (
+        torch.from_numpy(np.ascontiguousarray(values.swapaxes(0, 1))).float()
+        for values in (clips.positions[:, :, 0], clips.rotations)
+    )
+    offsets = torch.from_numpy(clips.offsets).float()
+    states = states_of(root, rotations, offsets)
+    return states[:, 0], states[:, 1:], offsets
+
+
+@torch.no_grad()
+def predict(model: HumorNet, clips: MotionClips, samples: int) -> dict[str, Any]:
+    """Figures of Table 1 for one model; clips of a little over two seconds."""
+    first, truth, offsets = initial_states(clips)
+    steps = truth.root.shape[1]
+    generator = torch.Generator().manual_seed(0)
+    futures = sample(model, _times(first, samples), steps, offsets.repeat_interleave(samples, 0), generator)
+    joints = futures.states.joints.unflatten(0, (-1, samples))
+    error = (joints - truth.joints.unsqueeze(1)).norm(dim=-1).mean(dim=-1)  # (C, S, T)
+    best = error.mean(dim=-1).argmin(dim=1)
+    rows = torch.arange(len(best))
+    few = max(samples // SPARED, 2)
+    long = sample(model, _times(first, few), int(LONG_S * 30), offsets.repeat_interleave(few, 0), generator)
+    found = {
+        "ade_mm": _mm(error.mean(dim=-1)[rows, best].mean()),
+        "fde_mm": _mm(error[rows, best, -1].mean()),
+        "apd_mm": _mm(_pairwise(long.states.joints.unflatten(0, (-1, few)))),
+        "astray_percent": round(100 * float(_astray(long)), 2),
+    }
+    likeliest = sample(model, first, steps, offsets, None)
+    found["likeliest_ade_mm"] = _mm((likeliest.states.joints - truth.joints).norm(dim=-1).mean())
+    if model.config.contacts:
+        said = futures.contacts.unflatten(0, (-1, samples))[rows, best][..., len(CONTACT_JOINTS) :] > 0
+        true = torch.from_numpy(np.ascontiguousarray(clips.contacts[2:].swapaxes(0, 1)))
+        found["contact_accuracy"] = round(float((said == true).float().mean()), 4)
+    return found
+
+
+def stand_still(clips: MotionClips) -> dict[str, Any]:
+    """The same of a body that stays as it is, the plainest guess."""
+    first, truth, _ = initial_states(clips)
+    error = (first.joints.unsqueeze(1) - truth.joints).norm(dim=-1).mean(dim=-1)
+    return {"ade_mm": _mm(error.mean()), "fde_mm": _mm(error[:, -1].mean()), "likeliest_ade_mm": _mm(error.mean())}
+
+
+def _times(state: State, count: int) -> State:
+    return state[torch.arange(len(state.root)).repeat_interleave(count)]
+
+
+def _pairwise(joints: Tensor) -> Tensor:
+    """Mean distance of joints (C, S, T, 22, 3) between all pairs of samples."""
+    first, second = torch.triu_indices(joints.shape[1], joints.shape[1], offset=1)
+    return torch.stack([(clip[first] - clip[second]).norm(dim=-1).mean() for clip in joints]).mean()
+
+
+def _astray(long: Rollout) -> Tensor:
+    height = long.states.root[..., 2]
+    return ((height < LOWEST_M) | (height > HIGHEST_M) | ~torch.isfinite(height)).any(dim=1).float().mean()
+
+
+def _mm(value: Tensor) -> float:
+    return round(float(value) * 1e3, 1)
+
+
+DEPENDS_ON = (*CLEAN, "humor weights", "offline settings", "prior.fit", "training.recipes.humor")
 
 FRAMES = 90
 DELAY = 8
 """Frames: of the live answer that fits start from."""
-CLIPS, PICTURES, FUTURES, LEVELS, CREDIT = 4, 8, 12, 2, 16
-"""Clips of Table 2, of Tables 3 and 4, of Table 1, of figure 8, and of
-`humor_credit`, taken evenly from all sources of the split."""
-
-HEIGHTS = (0.0, 0.3, 0.6, 0.9, 1.2)
-"""Metres below which joints are hidden, of figure 8."""
-NOISES = (0.0, 0.02, 0.04, 0.06, 0.08)
-"""Metres, of figure 8."""
+CLIPS, PICTURES, FUTURES, CREDIT = 4, 8, 12, 16
+"""Clips of Table 2, of Tables 3 and 4, of Table 1, and of `credit`, taken evenly from all sources of the split."""
 
 _STILL, _RAW, _TRUTH = "stands still", "as seen", "truth"
 _PER_FRAME = "per-frame fit, smoothed (stage 2)"
@@ -71,8 +199,6 @@ def run(bench: Bench) -> Result:
     clips = bench.clips(FRAMES, 2 if bench.quick else CLIPS)
     noisy = _noisy(bench, clips, models, hide=False)
     hidden = _noisy(bench, clips, models, hide=True)
-    clips = bench.clips(FRAMES, 1 if bench.quick else LEVELS)
-    levels, drawn = _levels(bench, clips, models), len(clips.offsets)
     clips = bench.clips(FRAMES, 1 if bench.quick else PICTURES)
     detector = _pictures(bench, clips, models, depth=False)
     depth = _pictures(bench, clips, models, depth=True)
@@ -89,8 +215,7 @@ def run(bench: Bench) -> Result:
     }
     return Result(
         [_futures_table(futures, count), credit_table(owed, len(clips.offsets)), *_fit_tables(records, few)],
-        {"data": clips.source, "records": records | {"levels": levels}},
-        _figure_8(levels, drawn),
+        {"data": clips.source, "records": records},
     )
 
 
@@ -111,22 +236,6 @@ def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hide: bo
         answers[name] = _fits(models, name, live[DELAY], seen)
     load, unseen = load_labels(clips), np.isnan(seen[..., 0])
     return [{"method": name, **scores(found, truth, unseen, load)} for name, found in answers.items()]
-
-
-def _levels(bench: Bench, clips: MotionClips, models: dict[str, Any]) -> list[dict[str, Any]]:
-    """Figure 8: more and more of the body hidden, and more and more noise."""
-    truth, load = clips.positions, load_labels(clips)
-    levels = [(0.0, below) for below in HEIGHTS] + [(noise, 0.0) for noise in NOISES if noise]
-    records = []
-    for noise, below in bench.progress.track(levels[4:6] if bench.quick else levels, description="figure 8"):
-        seen = spoiled(truth, noise, below, seed=0)
-        live = _live(clips, seen, DELAY)
-        answers = {name: _fits(models, name, live, seen) for name in (_PER_FRAME, MVAE, SHIPS)}
-        answers = {_TRUTH: _each(truth), f"steadypose live, delay {DELAY}": _each(live)} | answers
-        for name, found in answers.items():
-            told = scores(found, truth, np.isnan(seen[..., 0]), load)
-            records.append({"method": name, "noise_cm": 100 * noise, "below_m": below, **told})
-    return records
 
 
 def _live(clips: MotionClips, seen: Floats, delay: int) -> Floats:
@@ -162,26 +271,6 @@ def _pictures(bench: Bench, clips: MotionClips, models: dict[str, Any], *, depth
 
 def _each(positions: np.ndarray) -> list[Answer]:
     return [Answer(positions[:, c]) for c in range(positions.shape[1])]
-
-
-def _figure_8(levels: Sequence[dict[str, Any]], clips: int) -> dict[str, Figure]:
-    """Errors by what is hidden, and acceleration and errors by noise; without levels at which a body is lost."""
-    lost = {r["below_m"] for r in levels if not np.isfinite(r["acceleration_m_s2"])}
-    hidden = [r for r in levels if not r["noise_cm"] and r["below_m"] not in lost and r["method"] != _TRUTH]
-    # truth is drawn last, so that methods have the same colours in both; its error is none
-    noisy = [r for r in levels if not r["below_m"] and r["method"] != _TRUTH]
-    noisy += [r | {"all_mm": None} for r in levels if not r["below_m"] and r["method"] == _TRUTH]
-    what = f"{clips} clips of 3 s (HuMoR's figure 8)"
-    return {
-        "humor_hidden": figures.curves(
-            hidden, "below_m", {"all_mm": "all joints, mm", "hidden_mm": "hidden joints, mm"},
-            "hidden below, m", f"Hidden joints: {what}",
-        ),
-        "humor_noise": figures.curves(
-            noisy, "noise_cm", {"acceleration_m_s2": "acceleration, m/s²", "all_mm": "all joints, mm"},
-            "noise, cm", f"Noise: {what}",
-        ),
-    }  # fmt: skip
 
 
 def _futures_table(records: Sequence[dict[str, Any]], clips: int) -> Table:

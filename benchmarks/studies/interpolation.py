@@ -3,8 +3,7 @@
 The protocol of LAFAN1 (Harvey et al. 2020) on our motion, with its figures: L2Q of global rotations, L2P of global
 joints by the deviation that each has in training, NPSS. LAFAN1 itself is not our data, and its figures are of other
 motion on another skeleton; what can be compared is the ratio to slerp's and lerp's. Of a few clips, HM-VAE is searched
-too, as in the paper's section 4. Also paths: of wrists and ankles (figure 4), and of the root (figure 5): interpolated,
-completed, and integrated from the body's motion.
+too, as in the paper's section 4.
 """
 
 from __future__ import annotations
@@ -14,27 +13,24 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from steadypose.benchmarks.baselines import inbetween
-from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.metrics import contact_speed, npss, quaternion_distance
 from steadypose.benchmarks.motion import MotionClips, as_set, prepared_set
-from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.results import Result, Table
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, global_rotations, heading, quaternions, yaw_matrix
-from steadypose.prior.body.skeleton import JOINTS, J
+from steadypose.prior.body.skeleton import JOINTS
 from steadypose.prior.complete.body import Fill
 from steadypose.prior.complete.parts import PartsCompleter
-from steadypose.prior.complete.root_path import bridge
 from steadypose.prior.fit.optimise import Optimiser
 from steadypose.prior.models.completer import LiveCompleter
-from steadypose.prior.models.root_velocity import LiveRootVelocity
 from steadypose.training.data.dataset import MotionSet
 
-DEPENDS_ON = ("completer weights", "trajectory weights", "hmvae64 weights")
+DEPENDS_ON = ("completer weights", "hmvae64 weights", "prior.complete", "prior.fit")
 
 GAPS = (5, 15, 30, 45)
 BEFORE, AFTER = 10, 1
@@ -109,17 +105,13 @@ def run(bench: Bench) -> Result:
             records.append({"method": name, "gap": gap, **measure(truth, rotations, root, deviation)})
     relate(records)
     searches = search(bench, clips, completer, deviation)
-    paths = root_paths(clips, completer)
     source = {**clips.source, "gaps": GAPS, "known before and after": (BEFORE, AFTER)}
-    figures = {"interpolation_paths": draw_paths(bench, completer)}
     return Result(
         [
             _table(records, len(clips.offsets)),
             _search_table(searches),
-            _paths_table(paths, len(clips.offsets)),
         ],
-        {"data": source, "records": records, "searches": searches, "root paths": paths},
-        figures,
+        {"data": source, "records": records, "searches": searches},
     )
 
 
@@ -214,33 +206,6 @@ def search(bench: Bench, clips: MotionClips, completer: LiveCompleter, deviation
     return records
 
 
-def root_paths(clips: MotionClips, completer: LiveCompleter) -> list[dict[str, Any]]:
-    """Errors of the root in gaps: by lerp, completed, and integrated from the motion of the completed or true body."""
-    network = LiveRootVelocity.load("default")
-    records = []
-    for gap in GAPS:
-        truth = Truth.of(clips, gap)
-        rotations, completed = completer(truth.given, truth.offsets)
-        _, line = inbetween.slerp_and_lerp(truth.given, truth.rotations, truth.offsets)
-
-        def read(poses: Floats, truth: Truth = truth) -> Floats:
-            roots = truth.positions[:, :, 0].copy()
-            inside = slice(truth.gap.start - 1, truth.gap.stop + 1)
-            for clip, (turned, bones) in enumerate(zip(poses, truth.offsets, strict=True)):
-                joints = place_joints(turned, bones)
-                roots[clip, inside] = bridge(network, joints, turned[:, 0], roots[clip, inside])
-            return roots
-
-        ways = {
-            "line": line, "completer": completed, "root velocity of the body completed": read(rotations),
-            "root velocity of the true body": read(truth.rotations),
-        }  # fmt: skip
-        for name, way in ways.items():
-            error = np.linalg.norm(way - truth.positions[:, :, 0], axis=-1)[:, truth.gap].mean(axis=1)
-            records.append({"method": name, "gap": gap, "root_mm": round(float(error.mean()) * 1e3, 2)})
-    return records
-
-
 def _table(records: list[dict[str, Any]], clips: int) -> Table:
     columns: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
         "l2q": ("L2Q", lambda r: f"{r['l2q']:.3f}"),
@@ -287,56 +252,3 @@ def _search_table(records: list[dict[str, Any]]) -> Table:
         ],
         note=f"{rows[0]['clips']} of the clips; equation 14 over the latents, then equation 15 over the decoder too.",
     )  # fmt: skip
-
-
-def _paths_table(records: list[dict[str, Any]], clips: int) -> Table:
-    names = dict.fromkeys(r["method"] for r in records)
-    found = {(r["method"], r["gap"]): f"{r['root_mm']:.1f}" for r in records}
-    return Table(
-        name="interpolation-paths",
-        title="The root's way in gaps, mm (HM-VAE, figure 5)",
-        columns=["method", *(f"{gap} frames" for gap in GAPS)],
-        rows=[[name, *(found[name, gap] for gap in GAPS)] for name in names],
-        note=f"{clips} clips. Root velocities are summed up, and the way is made to meet both ends.",
-    )
-
-
-KEY_FRAMES = (30, 15, 5)
-"""Intervals of key frames in the picture, as in the paper's figure 4."""
-
-
-def draw_paths(bench: Bench, completer: LiveCompleter) -> Figure:
-    """Left wrist and right ankle about the root, from the side, of the farthest travelling clip, by key frames."""
-    clip = bench.clips(91, 24).farthest(1)
-    rotations, offsets = clip.rotations[:, 0], clip.offsets[0]
-    true = place_joints(rotations, offsets)
-    root = clip.positions[:, 0, 0]
-    turn = yaw_matrix(heading(rotations[:, 0]))
-    figure = Figure(figsize=(13, 4.4), layout="constrained")
-    for axis, step in zip(figure.subplots(1, len(KEY_FRAMES)), KEY_FRAMES, strict=True):
-        given = (true + root[:, None])[None].copy()
-        keys = np.arange(len(true)) % step == 0
-        given[:, ~keys] = np.nan
-        line, _ = inbetween.slerp_and_lerp(given, rotations[None], offsets[None])
-        ours = np.concatenate(
-            [
-                completer(given[:, a : b + 1], offsets[None])[0][0, : -1 if b < len(true) - 1 else None]
-                for a, b in zip(range(0, len(true) - 1, 30), range(30, len(true), 30), strict=True)
-            ]
-        )
-        for name, poses, colour in (
-            ("truth", rotations, "#7f7f7f"),
-            ("slerp", line[0], "#4c78a8"),
-            ("completer", ours, "#e45756"),
-        ):
-            joints = (place_joints(poses, offsets)[: len(true)] @ turn)[:, [J["left_wrist"], J["right_ankle"]]]
-            for k in range(2):
-                axis.plot(joints[:, k, 0], joints[:, k, 2], color=colour, lw=1.3, label=name if k == 0 else None)
-        shown = (true @ turn)[keys][:, [J["left_wrist"], J["right_ankle"]]]
-        axis.plot(shown[..., 0].ravel(), shown[..., 2].ravel(), "k.", ms=5)
-        axis.set(title=f"a key frame every {step}", xlabel="forward of the root, m", aspect="equal")
-        axis.grid(alpha=0.3)
-    figure.axes[0].set_ylabel("above the root, m")
-    figure.axes[0].legend(frameon=False, fontsize=8)
-    figure.suptitle("Left wrist (above) and right ankle, from the side (HM-VAE, figure 4)", fontsize=10)
-    return figure

@@ -1,14 +1,31 @@
-"""Clips of a Kinect beside Vicon (UI-PRMD), and the joints that are scored."""
+"""Clips of a Kinect beside Vicon (UI-PRMD), and scores against Vicon: one rotation and translation a clip, then a
+constant offset a joint in the trunk's frame.
+
+The offset is learned on other people: what is left of it is what differs between persons, and is most of the error of
+a method that knows nothing of it. So each clip is scored a second time with its own offset."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+from sklearn.metrics import roc_auc_score
 
+from steadypose.benchmarks.metrics import (
+    acceleration_error,
+    body_frame,
+    bootstrap,
+    length_variation,
+    position_error,
+    sigma_ratio,
+)
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, J
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
@@ -72,3 +89,147 @@ def side_by_side(clips: Sequence[Floats]) -> Floats:
     for number, clip in enumerate(clips):
         batch[: len(clip), number] = clip
     return batch
+
+
+OFF = 0.10
+"""Metres: an error that the stated standard deviation should indicate."""
+WORST = 0.1
+"""Share of frames, the worst by mean error, that the anomaly should indicate."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What a method gets, one number a clip."""
+
+    position: Floats  # (C,) metres
+    moving: Floats  # (C,) metres, with the offset of this very clip: what of the error changes with the pose
+    acceleration: Floats  # (C,) metres/frame²
+    variation: Floats  # (C,) of bone lengths, relative
+    joints: Floats  # (13,) metres, mean over the frames of all clips
+
+
+def learn_offset(truths: Sequence[Floats], aligned: Sequence[Floats]) -> Floats:
+    """(13, 3) metres in the trunk's frame: what, added to aligned estimates, brings each joint to the truth."""
+    pairs = zip(truths, aligned, strict=True)
+    return np.nanmean(np.concatenate([np.einsum("tba,tjb->tja", _trunk(a), t - a) for t, a in pairs]), axis=0)
+
+
+def score(truths: Sequence[Floats], aligned: Sequence[Floats], offset: Floats) -> Scores:
+    """Errors of each clip, of aligned estimates moved by the offset."""
+    errors, moving, acceleration, variation = [], [], [], []
+    for truth, estimate in zip(truths, aligned, strict=True):
+        placed = move(estimate, offset)
+        errors.append(position_error(placed, truth))
+        moving.append(np.nanmean(position_error(move(estimate, learn_offset([truth], [estimate])), truth)))
+        acceleration.append(np.nanmean(acceleration_error(placed, truth)))
+        variation.append(length_variation(estimate, BONES))
+    return Scores(
+        position=np.array([np.nanmean(error) for error in errors]),
+        moving=np.array(moving),
+        acceleration=np.array(acceleration),
+        variation=np.array(variation),
+        joints=np.nanmean(np.concatenate(errors), axis=0),
+    )
+
+
+def align(truths: Sequence[Floats], estimates: Sequence[Floats]) -> list[Floats]:
+    """Each clip's estimate, turned and moved as a whole to lie nearest to the truth."""
+    aligned = []
+    for truth, estimate in zip(truths, estimates, strict=True):
+        rotation, translation = rigid_alignment(estimate, truth)
+        aligned.append(estimate @ rotation.T + translation)
+    return aligned
+
+
+def move(estimate: Floats, offset: Floats) -> Floats:
+    """(T, 13, 3) the estimate with a constant offset (13, 3) in the trunk's frame."""
+    return estimate + np.einsum("tab,jb->tja", _trunk(estimate), offset)
+
+
+def _trunk(positions: Floats) -> Floats:
+    corners = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
+    return body_frame(*(positions[:, SCORED.index(name)] for name in corners))
+
+
+def quick_score(clips: Sequence[Clip], answers: Sequence[Floats]) -> dict[str, float]:
+    """Errors (mm, mm/frame²) with the offset learned on these very clips: for tuning."""
+    truths = [clip.centres for clip in clips]
+    aligned = align(truths, answers)
+    scores = score(truths, aligned, learn_offset(truths, aligned))
+    return {"position_mm": _mm(scores.position), "acceleration_mm": _mm(scores.acceleration)}
+
+
+def _mm(values: Floats) -> float:
+    return round(float(np.mean(values)) * 1000, 3)
+
+
+def summary(clips: Sequence[Clip], scores: Scores) -> dict[str, Any]:
+    """Figures of a method: millimetres, millimetres/frame², per cent; of each subject, and of movements done wrong.
+
+    Of the subjects' own figures those `OUT_OF_STEP` have theirs; all others leave them out.
+    """
+    kept, subject = in_step(clips), np.array([clip.subject for clip in clips])
+    wrong = np.array([clip.name.endswith("_inc") for clip in clips])
+    groups = {who: subject == who for who in dict.fromkeys(subject.tolist())}
+    groups |= {"done right": kept & ~wrong, "done wrong": kept & wrong}
+    return {
+        **{
+            figure: value
+            for name in ("position", "moving", "acceleration")
+            for figure, value in (
+                (f"{name}_mm", _mm(getattr(scores, name)[kept])),
+                (f"{name}_ci_mm", [round(v * 1000, 3) for v in bootstrap(getattr(scores, name)[kept])]),
+            )
+        },
+        "bone_variation_percent": round(float(scores.variation[kept].mean()) * 100, 3),
+        "joints_mm": dict(zip(SCORED, np.round(scores.joints * 1000, 2).tolist(), strict=True)),
+        "groups": {
+            name: {
+                "position_mm": _mm(scores.position[mask]),
+                "moving_mm": _mm(scores.moving[mask]),
+                "acceleration_mm": _mm(scores.acceleration[mask]),
+            }
+            for name, mask in groups.items()
+            if mask.any()
+        },
+    }
+
+
+def in_step(clips: Sequence[Clip]) -> NDArray[np.bool_]:
+    """(C,) which clips are of people whose two systems agree in time: those that means are taken over."""
+    return np.array([clip.subject not in OUT_OF_STEP for clip in clips])
+
+
+def deviation(error: Floats, sigma: Floats, anomaly: Floats, flagged: NDArray[np.bool_]) -> dict[str, float | None]:
+    """How well stated deviation and anomaly predict the error.
+
+    Args:
+        error: (N, 13) metres, NaN where Vicon has nothing.
+        sigma: (N, 13) metres, stated.
+        anomaly: (N,) score of each frame.
+        flagged: (N,) whether a frame is flagged as an anomaly.
+
+    Returns:
+        the rank correlation of sigma with the error; areas under the ROC curve of sigma for joints off by more than
+        10 cm, and for the worst tenth of the frames by mean error, of the root mean square of sigma over the joints
+        and of the anomaly (None where there is no such joint); error found by deviation stated; the share flagged.
+    """
+    known = np.isfinite(error) & np.isfinite(sigma)
+    off = error[known] > OFF
+    frames = np.isfinite(anomaly) & known.any(axis=1)
+    mean = np.nanmean(error[frames], axis=1)
+    worst = mean > np.quantile(mean, 1 - WORST)
+    squared = np.where(known, sigma, np.nan)[frames] ** 2
+    return {
+        "rank_correlation": round(float(np.corrcoef(rankdata(sigma[known]), rankdata(error[known]))[0, 1]), 3),
+        "auroc_off": _auroc(off, sigma[known]),
+        "off_percent": round(100 * float(off.mean()), 2),
+        "auroc_worst": _auroc(worst, np.sqrt(np.nanmean(squared, axis=1))),
+        "auroc_worst_anomaly": _auroc(worst, anomaly[frames]),
+        "found_by_stated": round(sigma_ratio(error, sigma), 3),
+        "flagged_percent": round(100 * float(flagged.mean()), 2),
+    }
+
+
+def _auroc(wrong: NDArray[np.bool_], score: Floats) -> float | None:
+    return round(float(roc_auc_score(wrong, score)), 3) if 0 < wrong.sum() < len(wrong) else None

@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from steadypose.benchmarks import ours
 from steadypose.benchmarks.baselines import kinect_regression, smoothnet
 from steadypose.benchmarks.baselines.filters import FILTERS, Peer
-from steadypose.benchmarks.bench import Bench, tune
-from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.bench import Bench, Tuned, loss, tune
 from steadypose.benchmarks.motion import digest
-from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED, Clip, side_by_side
-from steadypose.benchmarks.studies.kinect_scoring import quick_score
-from steadypose.benchmarks.tuning import Tuned, loss
+from steadypose.benchmarks.provenance import ROOT
+from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED, Clip, quick_score, side_by_side
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from steadypose.benchmarks.baselines.filters import FILTERS, Peer
-from steadypose.benchmarks.bench import Answer, Bench, Methods, Result, answers, tune, tuning_log
+from steadypose.benchmarks.bench import Answer, Bench, Methods, answers, tune, tuning_log
 from steadypose.benchmarks.metrics import acceleration_error, position_error
 from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.provenance import CLEAN
+from steadypose.benchmarks.results import Result
 from steadypose.benchmarks.scores import pivot
 from steadypose.benchmarks.studies.kinect_clips import side_by_side
 from steadypose.prior.arrays import Floats

@@ -12,9 +12,10 @@ import numpy as np
 
 from steadypose.benchmarks import figures
 from steadypose.benchmarks.baselines.filters import FILTERS
-from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated, gaussian, spiked, swapped
 from steadypose.benchmarks.provenance import VARIANTS
+from steadypose.benchmarks.results import Result
 from steadypose.benchmarks.scores import pivot
 from steadypose.benchmarks.studies.spoiled import (
     HOW,

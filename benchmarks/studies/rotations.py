@@ -7,38 +7,141 @@ answer to the joints without noise (`rotations_scoring.align`). It has the diffe
 rows without noise show. "Noise alone" is against that answer itself. The first two seconds of a clip are not scored.
 
 A root is a pelvis. A trunk's frame is steadier, and another thing: against the Vicon's hips its heading is that of the
-pelvis, against the mean of hips and shoulders the trunk's, which `hips and shoulders` measures by definition.
-"""
+pelvis, against the mean of hips and shoulders the trunk's, which `hips and shoulders` measures by definition."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks import ours
-from steadypose.benchmarks.bench import Bench, Result
+from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated, gaussian
 from steadypose.benchmarks.intervals import Interval, ratio
-from steadypose.benchmarks.provenance import VARIANTS
-from steadypose.benchmarks.results import Table
+from steadypose.benchmarks.motion import MotionClips
+from steadypose.benchmarks.provenance import ROOT, VARIANTS
+from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.studies.kinect_clips import side_by_side
-from steadypose.benchmarks.studies.rotations_baselines import Baseline, baselines
-from steadypose.benchmarks.studies.rotations_bundled import root_errors
-from steadypose.benchmarks.studies.rotations_scoring import align, angle, score, spread, wrapped
-from steadypose.benchmarks.studies.rotations_truth import SCORED, SKIPPED, read
+from steadypose.benchmarks.studies.rotations_truth import (
+    SCORED,
+    SKIPPED,
+    align,
+    angle,
+    read,
+    score,
+    spread,
+    tilt_between,
+    wrapped,
+)
+from steadypose.msgs.types import PoseRaw, PoseWorld
+from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.kinematics import global_rotations, heading, rotation_matrices
-from steadypose.prior.body.skeleton import J
+from steadypose.prior.body.kinematics import (
+    global_rotations,
+    heading,
+    quaternion_product,
+    rotation_matrices,
+    rotation_matrix,
+)
+from steadypose.prior.body.skeleton import REST_POSITIONS, TRUNK, J
+from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.rotations import OrientSettings
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.models.posture import RootCovariance
+from steadypose.prior.models.posture import RootCovariance, trunk_frame
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.ui_prmd import VALIDATION_SUBJECTS, load_pairs
+
+RIDGE, NOISE = 1e-3, 0.02
+"""Of standardised features, a frame; and metres along an axis, of the noise that the ridge regression is fitted in."""
+
+Baseline = Callable[[Floats], Floats]
+"""From joints (N, 22, 3) metres to root orientations (N, 3, 3), but for a constant rotation."""
+
+
+def kabsch(positions: Floats) -> Floats:
+    """(N, 3, 3) the rotation of the rest pose's trunk that lies nearest to the trunk's joints (Kabsch 1976)."""
+    trunk = list(TRUNK)
+    seen, rest = positions[:, trunk], REST_POSITIONS[trunk]
+    across = np.einsum("nja,jb->nab", seen - seen.mean(axis=1, keepdims=True), rest - rest.mean(axis=0))
+    u, _, vt = np.linalg.svd(across)
+    u[..., -1] *= np.linalg.det(u @ vt)[:, None]
+    return u @ vt
+
+
+def ridge(clips: MotionClips, seed: int) -> Baseline:
+    """`kabsch`, corrected by a ridge regression on all joints in its frame, fitted to these clips in noise."""
+    truth = clips.positions.reshape(-1, 22, 3)
+    noisy = gaussian(truth, NOISE, np.random.default_rng(seed))
+    turned = kabsch(noisy)
+    target = Rotation.from_matrix(turned.swapaxes(-1, -2) @ clips.rotations.reshape(-1, 22, 3, 3)[:, 0]).as_rotvec()
+    x = _features(noisy, turned)
+    mean, scale = x.mean(axis=0), x.std(axis=0) + 1e-6
+    x = (x - mean) / scale
+    fitted = np.linalg.solve(x.T @ x + RIDGE * len(x) * np.eye(x.shape[1]), x.T @ (target - target.mean(axis=0)))
+
+    def corrected(positions: Floats) -> Floats:
+        turned = kabsch(positions)
+        vector = (_features(positions, turned) - mean) / scale @ fitted + target.mean(axis=0)
+        return turned @ Rotation.from_rotvec(vector).as_matrix()
+
+    return corrected
+
+
+def _features(positions: Floats, turned: Floats) -> Floats:
+    """(N, 66) joints about the trunk's middle, in its frame."""
+    return ((positions - positions[:, list(TRUNK)].mean(axis=1, keepdims=True)) @ turned).reshape(len(positions), -1)
+
+
+def baselines(clips: MotionClips, seed: int) -> Mapping[str, Baseline]:
+    """By name; ``clips`` of training people."""
+    return {
+        "hips and shoulders": trunk_frame,
+        "trunk, Kabsch": kabsch,
+        "trunk, Kabsch and ridge": ridge(clips, seed),
+    }
+
+
+STREAMS = ROOT / "sim_data"
+
+
+def root_errors(methods: Mapping[str, PriorSettings]) -> dict[str, dict[str, dict[str, list[float]]]]:
+    """Degrees, median and 95th percentile, of root, heading and tilt, by stream and method."""
+    return {
+        path.parent.name: {name: _errors(path.parent, settings) for name, settings in methods.items()}
+        for path in sorted(STREAMS.glob("*/metadata.yaml"))
+    }
+
+
+def _errors(path: Path, settings: PriorSettings) -> dict[str, list[float]]:
+    prior, raw, truth = PriorPipeline(settings), [], {}
+    for _, message in open_recording(path):
+        if isinstance(message, PoseRaw):
+            raw.append(message)
+        elif isinstance(message, PoseWorld):
+            truth |= {(message.stamp_ns, body.id): body.root_orientation for body in message.bodies}
+    stamps = np.array(sorted({stamp for stamp, _ in truth}))
+    pairs: list[tuple[Floats, Floats]] = []
+    for clean in [clean for message in raw for clean in prior.process(message)] + prior.flush():
+        nearest = int(stamps[np.abs(stamps - clean.stamp_ns).argmin()])
+        if abs(nearest - clean.stamp_ns) * 1e-9 > 0.5 / FPS:
+            continue
+        for body in clean.bodies:
+            if (nearest, body.id) in truth:
+                root = quaternion_product(clean.sensor_pose.orientation, body.rotations[0].astype(np.float64))
+                pairs.append((rotation_matrix(root), rotation_matrix(truth[nearest, body.id])))
+    found, true = (np.stack(part) for part in zip(*pairs, strict=True))
+    return {
+        "root": spread(angle(found.swapaxes(-1, -2) @ true)),
+        "heading": spread(wrapped(heading(found) - heading(true))),
+        "tilt": spread(tilt_between(found, true)),
+    }
+
 
 DEPENDS_ON = VARIANTS
 

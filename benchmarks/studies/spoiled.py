@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from steadypose.benchmarks.baselines.filters import OFFLINE, PEERS, Peer, missing
 from steadypose.benchmarks.bench import RECURRENT, Answer, Bench, Methods, answers, over_seeds, tune, tuning_log
-from steadypose.benchmarks.by_source import source_table
 from steadypose.benchmarks.intervals import ratio
 from steadypose.benchmarks.metrics import position_error, reliability, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.ours import OURS
 from steadypose.benchmarks.results import Table
-from steadypose.benchmarks.scores import Scores, figures, pivot, score
+from steadypose.benchmarks.scores import Scores, figures, pivot, score, source_table
 from steadypose.prior.arrays import Floats
 
 Condition = Callable[[Floats, np.random.Generator], Floats]

@@ -2,14 +2,13 @@
 
 First: in correlated noise (2 cm), with a known floor, the error of the root, and the skating of each foot by itself (a
 measure that requires both to be still, as RoHM's, ignores walking). Second: with the trunk hidden for two seconds at a
-time, the drift of the root per 10 m of path (`benchmarks.root_drift`).
+time, the drift of the root per 10 m of path (`benchmarks.studies.root_drift`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
 
@@ -19,15 +18,14 @@ import torch
 
 from steadypose.benchmarks import ours
 from steadypose.benchmarks.baselines.filters import FILTERS, OFFLINE, Peer, missing
-from steadypose.benchmarks.bench import Bench, Result, peers_of, tune, tuning_log
-from steadypose.benchmarks.by_source import source_table
+from steadypose.benchmarks.bench import Bench, peers_of, tune, tuning_log
 from steadypose.benchmarks.corruption import correlated
 from steadypose.benchmarks.metrics import contact_speed, position_error, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
-from steadypose.benchmarks.provenance import WORLD
-from steadypose.benchmarks.results import Table
-from steadypose.benchmarks.root_drift import METHODS, Clip, Method, evaluate_fusion
-from steadypose.benchmarks.scores import ends_mm, figures, score
+from steadypose.benchmarks.provenance import VARIANTS, WORLD
+from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.scores import ends_mm, figures, score, source_table
+from steadypose.benchmarks.studies.root_drift import METHODS, Clip, evaluate_fusion
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.body.skeleton import JOINTS, limbs
@@ -37,7 +35,7 @@ from steadypose.prior.world.observe import FEET, SOLE
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
-DEPENDS_ON = (*WORLD, "hmvae weights")
+DEPENDS_ON = (*VARIANTS, *WORLD)
 
 NOISE = 0.02
 """Metres, with a correlation of 0.9 from a frame to the next."""
@@ -86,7 +84,7 @@ def run(bench: Bench) -> Result:
         name: {key: round(value, 4) for key, value in errors.summary().items()}
         for name, errors in evaluate_fusion(
             [Clip(clips.positions[:, c], quaternions[:, c], clips.contacts[:, c]) for c in range(len(clips.offsets))],
-            hidden_methods(),
+            METHODS,
         ).items()
         if name != "as observed"
     }
@@ -112,15 +110,6 @@ def run(bench: Bench) -> Result:
             "tuning": tuning_log(tuned),
         },
     )
-
-
-def hidden_methods() -> dict[str, Method]:
-    """Ours and, where there is gtsam (not for Python 3.10), a factor graph."""
-    if find_spec("gtsam") is None:
-        return {**METHODS}
-    from steadypose.benchmarks.baselines.factor_graph import follow
-
-    return {**METHODS, "gtsam: fixed-lag smoother": follow}
 
 
 @dataclass(frozen=True)

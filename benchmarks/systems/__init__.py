@@ -1,0 +1,12 @@
+"""Studies of the system at work, one module each, as in `benchmarks.studies`. They want a machine of their own."""
+
+from __future__ import annotations
+
+SYSTEMS: dict[str, str] = {
+    "latency": "computing time a frame, time from capture to pose/world, frames dropped",
+    "scale": "streams a core of a server, recordings cleaned an hour",
+    "restart": "seconds without poses at the start and after a kill",
+    "soak": "faults into nodes at work for an hour, and what became of each frame",
+    "events": "events of simulated people",
+}
+"""Module in this package: what it measures."""

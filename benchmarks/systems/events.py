@@ -6,33 +6,28 @@ with motion capture. The thresholds were chosen on other seeds and people.
 
 from __future__ import annotations
 
-import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
-from rich.console import Console
-from rich.progress import track
 
-from steadypose.benchmarks.provenance import WORLD, require_committed
-from steadypose.benchmarks.results import RESULTS, Table, save, show
-from steadypose.benchmarks.systems.event_scenes import SCENES, Label, Scene, in_view
-from steadypose.benchmarks.systems.event_scoring import Score, Told, quantile_ms, score
+from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.provenance import WORLD
+from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.systems.event_scenes import SCENES, Label, Scene, Score, Told, in_view, quantile_ms, score
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import EventKind, Phase, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.events_node import EventStream
 from steadypose.nodes.graph.prior_node import make_prior
-from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.graph.trajectory_node import make_trajectory
 from steadypose.prior.events.detector import EventSettings
 from steadypose.prior.sim.camera import Camera, film
 from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.streams import START_NS
+
+DEPENDS_ON = (*WORLD, "prior.events")
 
 CAMERA = Camera(position=(0.0, 0.0, 1.4), look_at=(2.6, 0.0, 0.95), fps=30.0, skeleton="kinect22")
 GRID_HZ = 30.0
@@ -42,18 +37,6 @@ DELAYS = (
 )
 IN_VIEW = 0.5
 """share of a body's joints in the camera's view, from which on it is there"""
-
-
-@dataclass(frozen=True)
-class Args:
-    """Events of simulated people."""
-
-    seeds: int = 4
-    """of each scene"""
-    first: int = 0
-    """of them; those from 100 on chose the thresholds"""
-    out: Path = RESULTS
-    """folder for the JSON file"""
 
 
 def worlds_of(raw: Iterable[PoseRaw]) -> Iterator[PoseClean | PoseWorld]:
@@ -100,27 +83,29 @@ def simulated(name: str, seed: int) -> tuple[Scene, list[PoseRaw]]:
     return scene, film(scene.motions, CAMERA, NoiseModel.load(KINECT_NOISE), filming, name, START_NS)
 
 
-def main(args: Args) -> None:
-    """Measure, print, write."""
-    require_committed(args.out)
-    one_thread()
+def scored(raw: Iterable[PoseRaw], scene: Scene) -> dict[EventKind, Score]:
+    """What is told of a stream against the labels of its scene."""
+    return score(told_of(worlds_of(raw), scene, EventSettings()), labels_of(scene), scene.undecided)
+
+
+def record_of(kind: EventKind, found: Score) -> dict[str, Any]:
+    """For the results file."""
+    counts = {"met": found.met, "missed": found.missed, "false": found.false}
+    return {"kind": kind.name, **counts, "delays_s": found.delays_s}
+
+
+def run(bench: Bench) -> Result:
+    """Events of simulated people; seeds from 100 on chose the thresholds."""
     totals: dict[EventKind, Score] = defaultdict(Score)
     by_scene: list[dict[str, Any]] = []
-    runs = [(name, seed) for name in SCENES for seed in range(args.first, args.first + args.seeds)]
-    for name, seed in track(runs, description="scenes"):
+    runs = [(name, seed) for name in SCENES for seed in bench.seeds]
+    for name, seed in bench.progress.track(runs, description="scenes"):
         scene, raw = simulated(name, seed)
-        scores = score(told_of(worlds_of(raw), scene, EventSettings()), labels_of(scene), scene.undecided)
-        for kind, found in scores.items():
+        for kind, found in scored(raw, scene).items():
             totals[kind].add(found)
-            counts = {"met": found.met, "missed": found.missed, "false": found.false}
-            by_scene.append({"scene": name, "seed": seed, "kind": kind.name, "delays_s": found.delays_s} | counts)
-    console = Console()
-    table = table_of(
-        "events", "Events of simulated people, filmed with a Kinect's errors, behind the whole pipeline", totals, DELAYS
-    )
-    show(table, console)
-    path = save("events", sys.argv[1:], [table], {"scenes": by_scene}, (*WORLD, "events settings"), args.out)
-    console.print(f"wrote {path}")
+            by_scene.append({"scene": name, "seed": seed, **record_of(kind, found)})
+    title = "Events of simulated people, filmed with a Kinect's errors, behind the whole pipeline"
+    return Result([table_of("events", title, totals, DELAYS)], {"scenes": by_scene})
 
 
 def table_of(name: str, title: str, totals: Mapping[EventKind, Score], note: str) -> Table:
@@ -144,7 +129,3 @@ def table_of(name: str, title: str, totals: Mapping[EventKind, Score], note: str
         ],
         note=note,
     )
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Args))

@@ -9,32 +9,26 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 from numpy.typing import ArrayLike
-from rich.console import Console
-from rich.progress import Progress
 
-from steadypose.benchmarks.machine import ROOT
-from steadypose.benchmarks.provenance import WORLD, require_committed
-from steadypose.benchmarks.results import RESULTS, Table, save, show
-from steadypose.benchmarks.running import START_S, running
+from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.provenance import ROOT, WORLD
+from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.systems.running import START_S, running
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, PoseRaw, RawBody
 from steadypose.nodes.graph.clock import FRAME_NS, Timeline
-from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.world.pipeline import TrajectoryPipeline
@@ -42,28 +36,15 @@ from steadypose.prior.world.settings import TrajectorySettings
 
 DEPENDS_ON = WORLD
 
+RECORDING = ROOT / "sim_data" / "walk_turn"
 CROWDS = (1, 4, 8)
 LIVE_CROWDS = (1, 2, 4, 8, 16, 32)
 LATEST_MS = 150.0
 """limit: 99 of 100 poses of the newest frame are no later, whatever the load"""
 SPACING = 0.8
 """metres between the copies of a body"""
-WARM_UP = 60
-"""frames before times count: the first ones load code, and fill the window"""
-
-
-@dataclass(frozen=True)
-class Args:
-    """Compute, latency and drops of the nodes, on this machine."""
-
-    recording: Path = ROOT / "sim_data" / "walk_turn"
-    """whose first body is played"""
-    seconds: float = 60.0
-    """of stream for each measurement of compute and latency"""
-    quick: bool = False
-    """10 s, to see that it works; nothing is written unless --out says where"""
-    out: Path | None = None
-    """folder for the JSON file; benchmarks/results unless --quick"""
+WARM_UP, WARM_UP_S = 60, 5.0
+"""Frames before times count, and seconds of nodes at work: the first ones load code, and fill the window."""
 
 
 def crowd(frames: list[PoseRaw], bodies: int) -> Iterator[PoseRaw]:
@@ -108,14 +89,14 @@ def compute(frames: list[PoseRaw], bodies: int, count: int, track: Callable[...,
     }
 
 
-def live(recording: Path, warm_up_s: float, seconds: float, progress: Progress, title: str) -> dict[str, Any]:
+def live(recording: Path, seconds: float, bench: Bench, title: str) -> dict[str, Any]:
     """Milliseconds from capture to arrival of ``pose/world``, less the delay, in nodes that drop what is late."""
     delay_ns = PriorSettings().delay * FRAME_NS
     timeline: Timeline | None = None
     late_ms: list[float] = []
     news: dict[str, Diagnostics] = {}
     sent_from = -1
-    bar = progress.add_task(title, total=seconds)
+    bar = bench.progress.add_task(title, total=seconds)
     bodies: list[int] = []
     most = f"prior.max_bodies={max(LIVE_CROWDS)}"
     with running(recording, lossless=False, settings=[most]) as (messages, _, _, clock, _):
@@ -125,11 +106,11 @@ def live(recording: Path, warm_up_s: float, seconds: float, progress: Progress, 
                 news[message.node] = message
                 if message.node == "pose_input":
                     timeline = Timeline.from_values(message.values) or timeline
-            elif topic == POSE_WORLD and timeline and message.stamp_ns > timeline.stamp_ns + warm_up_s * 1e9:
+            elif topic == POSE_WORLD and timeline and message.stamp_ns > timeline.stamp_ns + WARM_UP_S * 1e9:
                 sent_from = message.stamp_ns if sent_from < 0 else sent_from
                 bodies.append(len(getattr(message, "bodies", ())))
                 late_ms.append((now - timeline.wall(message.stamp_ns) - delay_ns) / 1e6)
-                progress.update(bar, completed=(message.stamp_ns - sent_from) / 1e9)
+                bench.progress.update(bar, completed=(message.stamp_ns - sent_from) / 1e9)
                 if message.stamp_ns - sent_from >= seconds * 1e9:
                     expected = round((message.stamp_ns - sent_from) / FRAME_NS) + 1
                     break
@@ -174,32 +155,27 @@ def percentiles(values: ArrayLike) -> dict[str, float]:
     return {name: round(value, 3) for name, value in (figures | {"max": float(values.max())}).items()}
 
 
-def main(args: Args) -> None:
-    """Measure, print, write."""
-    if args.out or not args.quick:
-        require_committed(args.out or RESULTS)
-    console = Console()
-    one_thread()
-    seconds = 10.0 if args.quick else args.seconds
-    warm_up_s = 5.0
-    with RecordingReader(args.recording) as reader:
-        frames = [message for _, _, message in reader.messages([POSE_RAW]) if isinstance(message, PoseRaw)]
-    with Progress(console=console) as progress, tempfile.TemporaryDirectory() as folder:
-        computed = [compute(frames, bodies, round(seconds * 30), progress.track) for bodies in CROWDS]
+def run(bench: Bench) -> Result:
+    """Compute, latency and drops of the nodes, on this machine."""
+    seconds = 10.0 if bench.quick else 60.0
+    frames = recorded()
+    with tempfile.TemporaryDirectory() as folder:
+        computed = [compute(frames, bodies, round(seconds * 30), bench.progress.track) for bodies in CROWDS]
         lived = []
         for bodies in LIVE_CROWDS:
             path = Path(folder) / f"crowd_{bodies}"
             with RecordingWriter(path) as writer:
                 # what the nodes need to come up is played to nobody
-                for raw in islice(crowd(frames, bodies), round((seconds + warm_up_s + START_S) * 30)):
+                for raw in islice(crowd(frames, bodies), round((seconds + WARM_UP_S + START_S) * 30)):
                     writer.write(POSE_RAW, raw, raw.stamp_ns)
-            lived.append({"bodies": bodies} | live(path, warm_up_s, seconds, progress, f"live, {bodies} bodies"))
-    tables = [_compute_table(computed), _live_table(lived)]
-    for table in tables:
-        show(table, console)
-    if args.out or not args.quick:
-        data = {"compute": computed, "live": lived}
-        console.print(f"wrote {save('latency', sys.argv[1:], tables, data, DEPENDS_ON, args.out or RESULTS)}")
+            lived.append({"bodies": bodies} | live(path, seconds, bench, f"live, {bodies} bodies"))
+    return Result([_compute_table(computed), _live_table(lived)], {"compute": computed, "live": lived})
+
+
+def recorded() -> list[PoseRaw]:
+    """The frames of the stream that is played."""
+    with RecordingReader(RECORDING) as reader:
+        return [message for _, _, message in reader.messages([POSE_RAW]) if isinstance(message, PoseRaw)]
 
 
 def _compute_table(results: list[dict[str, Any]]) -> Table:
@@ -245,7 +221,3 @@ def _live_table(results: list[dict[str, Any]]) -> Table:
         f"p99 of {LATEST_MS:g} ms. This machine carries "
         f"{carried(results)} bodies, all answered in 99 of 100 frames.",
     )
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Args))

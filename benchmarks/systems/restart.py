@@ -12,20 +12,16 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
-import tyro
-from rich.console import Console
 from rich.progress import Progress
 
-from steadypose.benchmarks.machine import ROOT
-from steadypose.benchmarks.provenance import WORLD, require_committed
-from steadypose.benchmarks.results import RESULTS, Table, save, show
-from steadypose.benchmarks.running import START_S, Running, running
+from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.provenance import ROOT, WORLD
+from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.systems.running import START_S, Running, running
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.transport import Subscriber
 from steadypose.nodes.graph.launch import Launch
@@ -34,6 +30,9 @@ from steadypose.nodes.graph.topology import POSE_NODES
 
 DEPENDS_ON = WORLD
 
+RECORDING = ROOT / "sim_data" / "walk_turn"
+KILLS = 20
+"""Times that each node is killed, and all are started."""
 PAUSE_S = STEADY_S / len(POSE_NODES) + 1.0
 """Between kills of different nodes: each is up for longer than `STEADY_S`, so that none is started with a pause."""
 AT_ONCE_S = 0.5
@@ -45,27 +44,8 @@ FIRST_S = 600.0
 BUSY = ", processors busy"
 
 
-@dataclass(frozen=True)
-class Args:
-    """How soon the first pose is there, and each node back after SIGKILL, on this machine."""
-
-    recording: Path = ROOT / "sim_data" / "walk_turn"
-    """what is played, again and again, at camera rate"""
-    kills: int = 20
-    """of each node, and starts of all"""
-    quick: bool = False
-    """two of each, to see that it works; nothing is written unless --out says where"""
-    out: Path | None = None
-    """folder for the JSON file; benchmarks/results unless --quick"""
-
-
-def starts(recording: Path, number: int, progress: Progress) -> list[float]:
-    """Seconds from ``steadypose run`` to the first ``pose/world``, with loops that were compiled before."""
-    return [_start(recording) for _ in progress.track(range(number), description="starts")]
-
-
 def first_start(recording: Path) -> float:
-    """As `starts`, with loops that were never compiled."""
+    """Seconds from ``steadypose run`` to the first ``pose/world``, with loops that were never compiled."""
     with tempfile.TemporaryDirectory() as folder:
         return _start(recording, {"NUMBA_CACHE_DIR": folder}, FIRST_S)
 
@@ -134,22 +114,15 @@ def longest_gap(times: Sequence[float], until_s: float) -> float:
     return round(float(np.diff(moments)[moments[:-1] <= moments[0] + until_s].max()), 3)
 
 
-def main(args: Args) -> None:
-    """Measure, print, write."""
-    if args.out or not args.quick:
-        require_committed(args.out or RESULTS)
-    console = Console()
-    number = 2 if args.quick else args.kills
-    with Progress(console=console) as progress:
-        found = {FIRST: [first_start(args.recording)], ALL: starts(args.recording, number, progress)}
-        found |= restarts(args.recording, number, progress)
-        with busy():
-            found |= {name + BUSY: gaps for name, gaps in restarts(args.recording, number, progress).items()}
-    table = _table(found)
-    show(table, console)
-    if args.out or not args.quick:
-        data: dict[str, Any] = {"seconds without pose/world": found}
-        console.print(f"wrote {save('restart', sys.argv[1:], [table], data, DEPENDS_ON, args.out or RESULTS)}")
+def run(bench: Bench) -> Result:
+    """How soon the first pose is there, and each node back after SIGKILL, on this machine."""
+    number = 2 if bench.quick else KILLS
+    starts = bench.progress.track(range(number), description="starts")
+    found = {FIRST: [first_start(RECORDING)], ALL: [_start(RECORDING) for _ in starts]}
+    found |= restarts(RECORDING, number, bench.progress)
+    with busy():
+        found |= {name + BUSY: gaps for name, gaps in restarts(RECORDING, number, bench.progress).items()}
+    return Result([_table(found)], {"seconds without pose/world": found})
 
 
 def _table(found: dict[str, list[float]]) -> Table:
@@ -164,7 +137,3 @@ def _table(found: dict[str, list[float]]) -> Table:
         note="From `steadypose run` to the first message; and SIGKILL to one node after the other, at camera rate: the "
         "longest time between two messages that arrive. Busy: as many other processes as processors.",
     )
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Args))

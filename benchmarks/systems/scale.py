@@ -8,33 +8,25 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
-from rich.console import Console
-from rich.progress import Progress
 
-from steadypose.benchmarks.machine import ROOT
-from steadypose.benchmarks.provenance import WORLD, require_committed
-from steadypose.benchmarks.results import RESULTS, Table, save, show
-from steadypose.benchmarks.running import START_S, running_nodes
-from steadypose.benchmarks.systems.latency import LATEST_MS, WARM_UP, crowd, percentiles
-from steadypose.msgs.recording import RecordingReader
+from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.provenance import WORLD
+from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.systems.latency import LATEST_MS, RECORDING, WARM_UP, WARM_UP_S, crowd, percentiles, recorded
+from steadypose.benchmarks.systems.running import START_S, running_nodes
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.commands.cleaning import clean_recording
 from steadypose.nodes.graph.clock import FRAME_NS
-from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.rate import FPS
@@ -45,25 +37,9 @@ DEPENDS_ON = WORLD
 
 KIOSKS = (1, 4, 8, 16)
 LIVE_KIOSKS = (1, 4, 8, 16, 32)
-WARM_UP_S = 5.0
-"""before messages count, in which a server that has too much to do finds that out"""
 NETWORK_NS = 3_000_000
 """what a message travels"""
 PERIOD_MS = FRAME_NS / 1e6
-
-
-@dataclass(frozen=True)
-class Args:
-    """Streams a core, and recordings cleaned an hour, on this machine."""
-
-    recording: Path = ROOT / "sim_data" / "walk_turn"
-    """whose first body is played"""
-    seconds: float = 10.0
-    """of stream for each number of kiosks"""
-    quick: bool = False
-    """2 s, to see that it works; nothing is written unless --out says where"""
-    out: Path | None = None
-    """folder for the JSON file; benchmarks/results unless --quick"""
 
 
 def serve(
@@ -161,25 +137,15 @@ def clean_rate(recording: Path) -> dict[str, float]:
     return {"stream_s": round(done.duration_s, 2), "cpu_s": round(spent, 2), "rate": round(done.duration_s / spent, 2)}
 
 
-def main(args: Args) -> None:
-    """Measure, print, write."""
-    if args.out or not args.quick:
-        require_committed(args.out or RESULTS)
-    console = Console()
-    one_thread()
-    periods = round((2.0 if args.quick else args.seconds) * 30)
-    with RecordingReader(args.recording) as reader:
-        frames = [m for _, _, m in islice(reader.messages([POSE_RAW]), 600) if isinstance(m, PoseRaw)]
-    with Progress(console=console) as progress:
-        served = [serve(frames, kiosks, on, periods, progress.track) for kiosks in KIOSKS for on in (False, True)]
+def run(bench: Bench) -> Result:
+    """Streams a core, and recordings cleaned an hour, on this machine."""
+    periods = round((2.0 if bench.quick else 10.0) * 30)
+    frames = recorded()[:600]
+    served = [serve(frames, kiosks, on, periods, bench.progress.track) for kiosks in KIOSKS for on in (False, True)]
     lived = [serve_live(frames, kiosks, periods / 30) for kiosks in LIVE_KIOSKS]
-    cleaned = clean_rate(args.recording)
-    tables = [_table(served, cleaned), _live_table(lived)]
-    for table in tables:
-        show(table, console)
-    if args.out or not args.quick:
-        data = {"served": served, "live": lived, "cleaned": cleaned, "streams_a_core": _streams_a_core(served)}
-        console.print(f"wrote {save('scale', sys.argv[1:], tables, data, DEPENDS_ON, args.out or RESULTS)}")
+    cleaned = clean_rate(RECORDING)
+    data = {"served": served, "live": lived, "cleaned": cleaned, "streams_a_core": _streams_a_core(served)}
+    return Result([_table(served, cleaned), _live_table(lived)], data)
 
 
 def _streams_a_core(served: list[dict[str, Any]]) -> dict[str, int]:
@@ -232,7 +198,3 @@ def _table(served: list[dict[str, Any]], cleaned: dict[str, float]) -> Table:
         f"{most['trajectory']} for the trajectory, which is not batched. `clean` does {cleaned['rate']:.1f} s of a "
         "stream of one body a second and core.",
     )
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Args))

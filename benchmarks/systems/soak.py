@@ -16,7 +16,6 @@ import signal
 import socket
 import struct
 import subprocess
-import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -29,14 +28,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
-from rich.console import Console
 
-from steadypose.benchmarks.machine import ROOT
-from steadypose.benchmarks.provenance import WORLD, require_committed
-from steadypose.benchmarks.results import RESULTS, Table, save, show
-from steadypose.benchmarks.running import Running, running_nodes
-from steadypose.benchmarks.systems.latency import crowd
+from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.provenance import WORLD
+from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.systems.latency import crowd, recorded
+from steadypose.benchmarks.systems.running import Running, running_nodes
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, PoseRaw
@@ -48,8 +45,10 @@ from steadypose.prior.timing.rate import FPS
 
 DEPENDS_ON = WORLD
 
+MINUTES = 60.0
+"""Of both halves together; a replay is finished."""
 FRAMES = 1200
-"""of a replay: 40 s"""
+"""Of a replay: 40 s."""
 BETWEEN_S = 6.0
 """faults"""
 BACK_S = 30.0
@@ -81,20 +80,6 @@ ROS_PORTS = range(7400 + 250 * ROS_DOMAIN, 7400 + 250 * ROS_DOMAIN + 30)
 """where RTPS of that domain is taken: discovery and data of its first participants"""
 
 
-@dataclass(frozen=True)
-class Args:
-    """Faults into nodes at work, and what comes of each frame. Exit status 1 if one is lost without a cause."""
-
-    minutes: float = 60.0
-    """of both halves together; a replay is finished"""
-    seed: int = 0
-    """of the faults and their order"""
-    quick: bool = False
-    """two minutes, to see that it works; nothing is written unless --out says where"""
-    out: Path | None = None
-    """folder for the JSON file; benchmarks/results unless --quick"""
-
-
 @dataclass
 class Replayed:
     """What is different in replays with faults, of one topic, added up.
@@ -113,39 +98,24 @@ class Replayed:
     longest_s: float = 0.0
 
 
-def main(args: Args) -> None:
-    """Break, compare, print, write."""
-    written = bool(args.out) or not args.quick
-    if written:
-        require_committed(args.out or RESULTS)
-    console, random_ = Console(), random.Random(args.seed)
-    half_s = 30.0 * (2.0 if args.quick else args.minutes)
+def run(bench: Bench) -> Result:
+    """Faults into nodes at work, and what comes of each frame; what is lost without a cause is wrong."""
+    random_, half_s = random.Random(bench.seeds[0]), 30.0 * (2.0 if bench.quick else MINUTES)
     with tempfile.TemporaryDirectory(prefix="steadypose-") as folder:
         replayed, kills = replays(Path(folder), half_s, random_)
         gaps, counts, wrong = live(Path(folder), half_s, random_)
-    tables = [_replays_table(replayed, kills), _live_table(gaps, counts)]
-    for table in tables:
-        show(table, console)
     wrong += [f"{topic}: {each.lost} lost, {each.twice} twice" for topic, each in replayed.items() if each.lost]
     wrong += [f"{fault}: no poses for {max(found):.1f} s" for fault, found in gaps.items() if max(found) > BACK_S]
-    if written:
-        data: dict[str, Any] = {
-            "replays": {topic: dataclasses.asdict(each) for topic, each in replayed.items()},
-            "kills": kills, "seconds without pose/world": gaps, "live": counts, "wrong": wrong,
-        }  # fmt: skip
-        console.print(f"wrote {save('soak', sys.argv[1:], tables, data, DEPENDS_ON, args.out or RESULTS)}")
-    if wrong:
-        console.print("\n".join(wrong), markup=False)
-        sys.exit(1)
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# What must not lose anything
+    data: dict[str, Any] = {
+        "replays": {topic: dataclasses.asdict(each) for topic, each in replayed.items()},
+        "kills": kills, "seconds without pose/world": gaps, "live": counts, "wrong": wrong,
+    }  # fmt: skip
+    return Result([_replays_table(replayed, kills), _live_table(gaps, counts)], data, wrong=wrong)
 
 
 def replays(folder: Path, seconds: float, random_: random.Random) -> tuple[dict[str, Replayed], dict[str, int]]:
     """Replays with kills and stops against one without; and how many of them there were."""
-    frames = list(islice(crowd(_frames(), 1), FRAMES))
+    frames = list(islice(crowd(recorded(), 1), FRAMES))
     _write(folder / "in", frames)
     expected = _played(folder)
     found = {topic: Replayed() for topic in expected}
@@ -224,10 +194,6 @@ def _compare(expected: dict[int, list[Any]], got: dict[int, list[Any]], found: R
             since = None
 
 
-# ---------------------------------------------------------------------------------------------------------------
-# What must account for everything
-
-
 def live(
     folder: Path, seconds: float, random_: random.Random
 ) -> tuple[dict[str, list[float]], dict[str, dict[str, int]], list[str]]:
@@ -236,7 +202,7 @@ def live(
     Returns:
         Seconds without poses after each fault; of each node what became of its frames; and what does not add up.
     """
-    _write(folder / "stepping", _stepping(list(islice(crowd(_frames(), 1), FRAMES))))
+    _write(folder / "stepping", _stepping(list(islice(crowd(recorded(), 1), FRAMES))))
     gaps: dict[str, list[float]] = defaultdict(list)
     optional = {"foxglove": "foxglove", "ros2_bridge": "cyclonedds"}
     names = [*POSE_NODES, "recorder", *(node for node, module in optional.items() if find_spec(module))]
@@ -391,11 +357,6 @@ def _settings(played: Path, out: Path, *, lossless: bool) -> list[str]:
     ]  # fmt: skip
 
 
-def _frames() -> list[PoseRaw]:
-    with RecordingReader(ROOT / "sim_data" / "walk_turn") as reader:
-        return [message for _, _, message in reader.messages([POSE_RAW]) if isinstance(message, PoseRaw)]
-
-
 def _stepping(frames: Sequence[PoseRaw]) -> list[PoseRaw]:
     """The frames of a sensor whose clock is set a few times, for good or for one frame."""
     stepped, shift_s, span = [], 0.0, len(frames) // (len(CLOCK_STEPS_S) + 1)
@@ -416,9 +377,6 @@ def _write(directory: Path, frames: Sequence[PoseRaw]) -> None:
 def _send(nodes: Running, name: str, with_: signal.Signals) -> None:
     with suppress(ProcessLookupError):
         os.kill(nodes.supervisor.children[name].pid, with_)
-
-
-# ---------------------------------------------------------------------------------------------------------------
 
 
 def _replays_table(found: dict[str, Replayed], kills: dict[str, int]) -> Table:
@@ -452,7 +410,3 @@ def _live_table(gaps: dict[str, list[float]], counts: dict[str, dict[str, int]])
         "worked on, lost in a full queue, older than they may be, dropped for a newer one, and published while nobody "
         "of that name was there.",
     )
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Args))

@@ -1,6 +1,6 @@
 """Biovision Hierarchy (.bvh) files.
 
-Written here rather than taken from a package: see `benchmarks/systems/importers.py` for what was weighed. The format
+Written here rather than taken from a package: `docs/results.md`, "Importers", has what was weighed. The format
 leaves open what a position channel means. By the original definition it is added to the joint's OFFSET; exporters
 that give every joint position channels write the whole offset into them, and there it replaces the OFFSET. Here
 it is added at a root, where the two differ by a constant shift of the world only, and replaces it elsewhere.

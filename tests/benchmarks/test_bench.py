@@ -11,19 +11,14 @@ from rich.progress import Progress
 from steadypose.benchmarks import figures, ours
 from steadypose.benchmarks.baselines import smoothnet
 from steadypose.benchmarks.baselines.filters import OFFLINE, Peer, missing
-from steadypose.benchmarks.bench import Bench, over_seeds
+from steadypose.benchmarks.bench import Bench, over_seeds, search
 from steadypose.benchmarks.corruption import gaussian, hide
 from steadypose.benchmarks.metrics import position_error
 from steadypose.benchmarks.motion import MotionClips, simulated_clips
 from steadypose.benchmarks.scores import figures as figures_of
 from steadypose.benchmarks.scores import pivot, score
-from steadypose.benchmarks.studies.reconstruction import slide
 from steadypose.benchmarks.studies.spoiled import against_best, calibration_table, reliability_bins, run_conditions
-from steadypose.benchmarks.studies.streaming import recovery
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.fit.hmvae_network import HMVAE
-from steadypose.prior.fit.tensors import load_tensors
-from steadypose.prior.models.hmvae import HMVAEConfig
 
 
 @pytest.fixture(scope="module")
@@ -106,29 +101,6 @@ def test_a_short_training_of_the_temporal_network_already_smooths(clips: MotionC
     np.testing.assert_array_equal(answer[:26], smoothnet.smooth(net, other, (4,))[0][:26])
 
 
-def test_recovery_counts_from_the_first_frame_in_sight(clips: MotionClips) -> None:
-    hidden = np.zeros(clips.positions.shape[:-1], dtype=bool)
-    limb = [J["left_elbow"], J["left_wrist"]]
-    hidden[10:20, :, limb] = True
-    answer = clips.positions + [0.01, 0.0, 0.0]
-    answer[10:26, 0, limb] += 0.1
-    answer[10:, 1, limb] += 0.1
-    np.testing.assert_allclose(recovery(answer, clips.positions, hidden)[:3], np.array([6, 25, 0]) / 30.0)
-
-
-def test_sliding_windows_keep_every_frame(clips: MotionClips) -> None:
-    import torch
-
-    state, config = load_tensors("default", "hmvae")
-    model = HMVAE(HMVAEConfig.from_dict(config))
-    model.load_state_dict(state)
-    rotations = torch.from_numpy(clips.rotations[:24]).float().transpose(0, 1)
-    decoded = slide(model.eval(), rotations)
-    assert decoded.shape == rotations.shape
-    error = torch.linalg.matrix_norm(decoded - rotations).mean()
-    assert error < 0.5 * torch.linalg.matrix_norm(rotations - torch.eye(3)).mean()
-
-
 def test_conditions_give_records_that_tables_and_pictures_are_made_of(clips: MotionClips, monkeypatch) -> None:
     monkeypatch.setattr(ours, "OURS", {"steadypose": ours.OURS["steadypose"]})
     with Progress(disable=True) as progress:
@@ -184,3 +156,30 @@ def test_seeds_are_averaged_and_their_spread_kept() -> None:
     assert merged["position_mm"] == 11.0
     assert merged["position_sd_over_seeds_mm"] == pytest.approx(1.414, abs=1e-3)
     assert merged["seeds"] == 2
+
+
+def test_every_search_spends_its_budget_and_no_more() -> None:
+    asked: list[dict[str, float]] = []
+
+    def evaluate(point: dict[str, float]) -> dict[str, float]:
+        asked.append(point)
+        return {"position_mm": np.log(point["a"] / 3.0) ** 2, "acceleration_mm": np.log(point["b"] / 0.2) ** 2}
+
+    found = search({"a": (0.01, 100.0), "b": (0.01, 10.0)}, evaluate, budget=24)
+    assert len(asked) == len(found.tried) == 24
+    assert all(0.01 <= p["a"] <= 100.0 and 0.01 <= p["b"] <= 10.0 for p in asked)
+    assert found.parameters == {key: min(found.tried, key=lambda t: t["position_mm"] + t["acceleration_mm"])[key]
+                                for key in ("a", "b")}  # fmt: skip
+
+
+def test_one_parameter_is_found_within_a_few_per_cent_of_its_range() -> None:
+    found = search(
+        {"a": (1e-3, 1e3)}, lambda p: {"position_mm": np.log(p["a"] / 7.0) ** 2, "acceleration_mm": 0.0}, budget=18
+    )
+    assert np.log(found.parameters["a"]) == pytest.approx(np.log(7.0), abs=0.04 * np.log(1e6))
+
+
+def test_what_has_no_parameters_is_tried_once() -> None:
+    found = search({}, lambda _: {"position_mm": 1.0, "acceleration_mm": 1.0}, budget=18)
+    assert found.parameters == {}
+    assert len(found.tried) == 1

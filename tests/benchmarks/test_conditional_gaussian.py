@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from steadypose.benchmarks.baselines.conditional_gaussian import ConditionalGaussian
+from steadypose.benchmarks.baselines.body import ConditionalGaussian
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 

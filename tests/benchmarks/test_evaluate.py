@@ -1,19 +1,20 @@
 from pathlib import Path
-from typing import get_args, get_type_hints
+from types import SimpleNamespace
+from typing import get_args
 
 import pytest
 
 from steadypose.benchmarks import results
-from steadypose.benchmarks.baselines import window_vaes
-from steadypose.benchmarks.bench import Bench, Result
-from steadypose.benchmarks.command import evaluate
-from steadypose.benchmarks.evaluate import evaluate as run
-from steadypose.benchmarks.machine import describe
-from steadypose.benchmarks.studies import PROTOCOLS, SENSORS
+from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.evaluate import Name, evaluate
+from steadypose.benchmarks.provenance import machine
+from steadypose.benchmarks.results import Result
+from steadypose.benchmarks.studies import PREPARED, SENSORS, STUDIES
+from steadypose.benchmarks.systems import SYSTEMS
 
 
 def test_the_command_knows_every_protocol_and_asks_for_what_it_needs() -> None:
-    assert set(get_args(get_type_hints(evaluate)["protocol"])) == {"all", *PROTOCOLS}
+    assert set(get_args(Name)) == {"all", *STUDIES, *SYSTEMS}
     with pytest.raises(FileNotFoundError, match="mocap"):
         evaluate("kinect_vicon")
 
@@ -28,8 +29,8 @@ def test_all_is_every_protocol_in_turn_without_what_is_not_here(tmp_path: Path, 
             return Result([], {})
 
     monkeypatch.setattr("importlib.import_module", lambda _: Module)
-    run("all", split="val", quick=True, mocap=None, data=tmp_path / "nowhere.npz", out=None)
-    assert len(ran) == len(PROTOCOLS) - len(SENSORS)
+    evaluate("all", quick=True, data=tmp_path / "nowhere.npz")
+    assert len(ran) == len(STUDIES) - len(SENSORS) - len(PREPARED)
     assert len(set(map(id, ran))) == 1  # what is trained for one protocol serves the others
     assert "kinect_vicon: left out" in capsys.readouterr().out
 
@@ -47,7 +48,7 @@ def test_every_reading_of_the_test_split_is_logged_and_no_other(tmp_path: Path, 
 
     def read(study: str, split: str) -> None:
         with pytest.raises(ZeroDivisionError):
-            run(study, split=split, quick=True, mocap=tmp_path, data=data, out=None)
+            evaluate(study, split, quick=True, mocap=tmp_path, data=data)
 
     read("world", "test")  # simulated people, as there is no prepared motion
     data.touch()
@@ -57,17 +58,22 @@ def test_every_reading_of_the_test_split_is_logged_and_no_other(tmp_path: Path, 
     assert not log.exists()
     read("world", "test")
     read("fidelity", "test")
-    machine = describe()
+    found = machine()
     assert log.read_text().splitlines() == [
         "date,commit,study,what followed",
-        f"{machine['date']},{machine['commit']},world,",
-        f"{machine['date']},{machine['commit']},fidelity,",
+        f"{found['date']},{found['commit']},world,",
+        f"{found['date']},{found['commit']},fidelity,",
     ]
 
 
 def test_quick_writes_only_where_it_is_told(tmp_path: Path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(window_vaes, "CONFIGS", {8: window_vaes.CONFIGS[8]})  # windows of 64 frames take longer
-    evaluate("reconstruction", quick=True, data=tmp_path / "nowhere.npz")
-    evaluate("reconstruction", quick=True, data=tmp_path / "nowhere.npz", out=tmp_path / "out")
+    study = SimpleNamespace(
+        __name__="steadypose.benchmarks.studies.completion",
+        DEPENDS_ON=(),
+        run=lambda bench: Result([], {}, wrong=["lost"]),
+    )
+    monkeypatch.setattr("importlib.import_module", lambda _: study)
+    assert evaluate("completion", quick=True, data=tmp_path / "nowhere.npz") == 1, "what is wrong fails the command"
+    evaluate("completion", quick=True, data=tmp_path / "nowhere.npz", out=tmp_path / "out")
     assert capsys.readouterr().out.count("wrote") == 1
-    assert (tmp_path / "out" / "reconstruction.json").is_file()
+    assert (tmp_path / "out" / "completion.json").is_file()

@@ -8,9 +8,8 @@ from matplotlib.figure import Figure
 from rich.progress import Progress
 
 from steadypose.benchmarks import ours
-from steadypose.benchmarks.baselines.bank import bank
+from steadypose.benchmarks.baselines.banks import bank, whole_body_bank
 from steadypose.benchmarks.baselines.filters import Peer, raw
-from steadypose.benchmarks.baselines.whole_body_bank import whole_body_bank
 from steadypose.benchmarks.bench import Answer, Bench, Methods
 from steadypose.benchmarks.corruption import along_sight
 from steadypose.benchmarks.motion import spread

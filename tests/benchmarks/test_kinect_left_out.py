@@ -16,11 +16,10 @@ import pytest
 from rich.progress import Progress
 
 from steadypose.benchmarks.baselines.filters import FILTERS
-from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.bench import Bench, Tuned
 from steadypose.benchmarks.studies import kinect_methods, kinect_vicon
 from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip
 from steadypose.benchmarks.studies.kinect_methods import KNOWN, RIDGE, TCN, UNKNOWN, Kinect, Method, Stated, run_filter
-from steadypose.benchmarks.tuning import Tuned
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
 from steadypose.training.data.ui_prmd import KinectPair

@@ -6,10 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.baselines.filters import Peer, constant_velocity, gaussian_hampel, one_euro
-from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip
+from steadypose.benchmarks.bench import Tuned
+from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip, align, deviation, learn_offset, score, summary
 from steadypose.benchmarks.studies.kinect_methods import best_without, run_filter
-from steadypose.benchmarks.studies.kinect_scoring import align, deviation, learn_offset, score, summary
-from steadypose.benchmarks.tuning import Tuned
 
 REST = np.array(
     [[0.0, 0.0, 1.6]]

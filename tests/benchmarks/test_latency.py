@@ -1,16 +1,11 @@
 import dataclasses
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from steadypose.benchmarks.systems.latency import SPACING, crowd, percentiles
-from steadypose.benchmarks.systems.memory import growth, visits
 from steadypose.benchmarks.systems.restart import longest_gap
-from steadypose.msgs.recording import RecordingReader
-from steadypose.msgs.recording_writer import RecordingWriter
-from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
 
 
@@ -44,28 +39,6 @@ def test_a_crowd_is_at_30_hz_side_by_side_and_never_jumps() -> None:
 def test_a_crowd_needs_a_body() -> None:
     with pytest.raises(ValueError, match="at least 2 frames"):
         next(crowd([dataclasses.replace(f, bodies=[]) for f in frames(5)], 1))
-
-
-def test_growth_is_the_slope_after_the_start() -> None:
-    ages = np.linspace(0, 2, 200)
-    leak = 100 + 30 * np.minimum(ages, 0.3) / 0.3 + 5 * ages
-    found = growth(list(zip(ages.tolist(), leak.tolist(), strict=True)), 2.0)
-    assert found["slope_mb_per_hour"] == pytest.approx(5.0, abs=0.01)
-    assert found["first_mb"] == 100.0
-    assert found["last_mb"] == found["most_mb"] == pytest.approx(140.0)
-    assert found["grown_percent"] == pytest.approx(100 * (139 / 133 - 1), abs=0.05)
-
-
-def test_visitors_come_one_after_the_other_and_stay_as_long_as_is_said(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "seen") as writer:
-        for frame in frames(4):
-            writer.write(POSE_RAW, frame, frame.stamp_ns)
-    day = visits(tmp_path / "seen", 0.25, tmp_path / "day")
-    with RecordingReader(day) as reader:
-        stream = [r.message for r in reader.messages([POSE_RAW]) if isinstance(r.message, PoseRaw)]
-    assert [[b.id for b in m.bodies] for m in stream[:32]] == [*[[5]] * 4, *[[]] * 12, *[[6]] * 4, *[[]] * 12]
-    assert np.mean([bool(m.bodies) for m in stream]) == 0.25
-    assert set(np.diff([m.stamp_ns for m in stream]).tolist()) == {41_000_000}
 
 
 def test_percentiles() -> None:

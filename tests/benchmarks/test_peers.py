@@ -3,8 +3,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from steadypose.benchmarks.baselines.bank import bank, noise_found
-from steadypose.benchmarks.baselines.beside import beside
+from steadypose.benchmarks.baselines.banks import bank, noise_found, whole_body_bank
+from steadypose.benchmarks.baselines.body import beside
 from steadypose.benchmarks.baselines.filters import (
     FILTERS,
     OFFLINE,
@@ -18,7 +18,6 @@ from steadypose.benchmarks.baselines.filters import (
     one_euro,
 )
 from steadypose.benchmarks.baselines.kalman import fixed_lag, process_noise, transition
-from steadypose.benchmarks.baselines.whole_body_bank import whole_body_bank
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J
 from steadypose.prior.timing.kalman import ConstantVelocityFilter
 

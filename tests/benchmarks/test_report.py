@@ -1,38 +1,48 @@
 import importlib
 import io
-import pkgutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
-from steadypose.benchmarks import provenance, studies, systems
-from steadypose.benchmarks.machine import ROOT, describe
-from steadypose.benchmarks.provenance import WORLD, UncommittedError, code_digest, ships, stale
+from steadypose.benchmarks import provenance
+from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, machine, measured, ships, stale
 from steadypose.benchmarks.report import Args, StaleError, fill, main, page
-from steadypose.benchmarks.results import Table, load, save, show
+from steadypose.benchmarks.results import Study, Table, load, save, show
 from steadypose.benchmarks.stale import STALE
+from steadypose.benchmarks.studies import STUDIES
+from steadypose.benchmarks.systems import SYSTEMS
 
 TABLE = Table("speed", "Speed, ms", ["method", "p50", "a|b"], [["raw", "1.0", "2"], ["ours", "0.5", "3"]], "A note.")
+COMMAND = ["steadypose", "evaluate", "latency", "--quick"]
 TEXT = "# Title\n<!-- results:speed -->\nold\n<!-- /results -->\ntail\n"
 
 
-def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tmp_path: Path) -> None:
-    save(
-        "latency", ["--quick", str(tmp_path / "input")], [TABLE], {"rows": [1, {"none": float("nan")}]}, WORLD, tmp_path
-    )
-    results = load(tmp_path)
-    assert results["latency"]["rows"] == [1, {"none": None}]
-    assert str(tmp_path) not in (tmp_path / "latency.json").read_text()
+PAPER = SimpleNamespace(
+    __name__="steadypose.benchmarks.studies.hidden_joints",
+    DEPENDS_ON=("humor weights", "offline settings", "prior.fit"),
+)
+"""A study, as far as `save` looks at it."""
 
+
+def saved(folder: Path, name: str = "latency", table: Table = TABLE, study: Study = PAPER) -> dict[str, Any]:
+    save(name, COMMAND, [table], {"rows": [1, {"none": float("nan")}]}, study, folder)
+    return load(folder)[name]
+
+
+def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tmp_path: Path) -> None:
+    assert saved(tmp_path)["rows"] == [1, {"none": None}]
     readme = tmp_path / "README.md"
     readme.write_text(TEXT)
     main(Args(readme, tmp_path / "page.md", tmp_path))
     once = readme.read_text()
     assert "| ours | 0.5 | 3 |" in once
     assert "| method | p50 | a\\|b |" in once
-    assert "`python -m steadypose.benchmarks.systems.latency --quick input`" in once
+    assert "`steadypose evaluate latency --quick`" in once
     assert "old" not in once
     assert once.startswith("# Title\n")
     assert once.endswith("<!-- /results -->\ntail\n")
@@ -41,39 +51,29 @@ def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tm
 
 
 def test_a_marker_without_a_result_is_an_error_that_names_those_there_are(tmp_path: Path) -> None:
-    save("latency", [], [TABLE], {}, WORLD, tmp_path)
+    saved(tmp_path)
     with pytest.raises(KeyError, match=r"results:other.*speed"):
         fill("<!-- results:other -->\n<!-- /results -->", load(tmp_path))
 
 
 def test_blocks_do_not_swallow_each_other(tmp_path: Path) -> None:
-    save("latency", [], [TABLE], {}, WORLD, tmp_path)
-    filled = fill(TEXT + "between\n" + TEXT, load(tmp_path))
+    filled = fill(TEXT + "between\n" + TEXT, {"latency": saved(tmp_path)})
     assert filled.count("| ours |") == 2
     assert "between" in filled
 
 
-def test_a_result_is_stale_when_weights_or_settings_have_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    save("latency", [], [TABLE], {}, WORLD, tmp_path)
-    save("hgvae", [], [replace(TABLE, name="levels")], {}, ("hgvae weights",), tmp_path)
-    results = load(tmp_path)
-    assert stale(results["latency"]) == stale(results["hgvae"]) == []
-    assert stale({}) == ["weights", "settings"]
-    changed = ships() | {"mixture weights": "others"}
+def test_a_stale_table_is_refused_and_with_a_reason_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = {"latency": saved(tmp_path), "hgvae": saved(tmp_path, "hgvae", replace(TABLE, name="levels"))}
+    results["hgvae"]["frozen"] = "abc1234"
+    changed = ships() | {"humor weights": "others"}
     monkeypatch.setattr(provenance, "ships", lambda: changed)
-    assert (stale(results["latency"]), stale(results["hgvae"])) == (["mixture weights"], [])
-    with pytest.raises(StaleError, match=r"systems\.latency.*mixture weights"):
+    assert stale(results["latency"]) == ["humor weights"]
+    with pytest.raises(StaleError, match=r"evaluate latency.*humor weights"):
         fill(TEXT, results, {})
-    assert "**stale: measured with other mixture weights**" in fill(TEXT, results, {"latency": "the reason"})
-    assert "stale" not in fill("<!-- results:levels -->\n<!-- /results -->", results, {})
-
-
-def test_what_a_bench_says_it_depends_on_is_something_that_ships() -> None:
-    for package in (studies, systems):
-        for name in (module.name for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}.")):
-            assert set(getattr(importlib.import_module(name), "DEPENDS_ON", ())) <= set(ships()), name
+    assert "**stale: measured with other humor weights**" in fill(TEXT, results, {"latency": "the reason"})
+    finished = fill("<!-- results:levels -->\n<!-- /results -->", results, {})
+    assert "stale" not in finished
+    assert "code is at commit abc1234" in finished
 
 
 def test_weights_that_do_not_ship_change_no_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,30 +90,57 @@ def test_what_no_commit_can_make_again_is_refused_among_the_results_alone(
 ) -> None:
     monkeypatch.setattr(provenance, "uncommitted", lambda: ["prior/clean/fuse.py"])
     with pytest.raises(UncommittedError, match=r"fuse\.py.*--out"):
-        save("latency", [], [TABLE], {}, WORLD)
-    assert save("latency", [], [TABLE], {}, WORLD, tmp_path).is_file()
+        save("latency", COMMAND, [TABLE], {}, PAPER)
+    assert saved(tmp_path)
 
 
-def test_a_result_is_stale_when_the_code_that_made_it_has_changed(tmp_path: Path) -> None:
-    save("latency", [], [TABLE], {}, (), tmp_path)
-    result = load(tmp_path)["latency"]
-    assert "benchmarks.results" in result["code"]
+def test_a_result_is_stale_when_what_made_it_is_not_there_any_more(tmp_path: Path) -> None:
+    result = saved(tmp_path)
     assert stale(result) == []
-    result["code"]["benchmarks.results"] = "other"
-    result["code"]["prior.clean.gone"] = "was there"
-    assert stale(result) == ["code (benchmarks.results, prior.clean.gone)"]
+    assert {"CONDITIONS", "run", "below", "ConditionalGaussian", "RIDGE", "search"} <= {
+        line.split()[0] for line in result["code"]
+    }, "the study's own definitions, and those of corruption, baselines and the parameter search"
+    result["code"] += ["NOISE 01234567", "gone 89abcdef"]
+    result["measured"]["prior.fit"] = "other"
+    assert stale(result) == ["prior.fit", "code (NOISE, gone)"]
     del result["code"]
-    assert stale(result) == ["code (not recorded)"]
+    assert stale(result) == ["output (not recorded)"]
 
 
-def test_only_what_runs_counts_as_code(tmp_path: Path) -> None:
-    texts = ["x = 1", '"""Text."""\nx = 1  # a comment\n', 'def f():\n    """Text."""\n', "def f():\n    return 1\n"]
-    digests = []
+def test_the_outputs_root_mean_square_change_tells_whether_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=100_000)
+    result = {"measured": {"pose/clean": provenance.projections([values])}, "code": []}
+    for change, found in ((1e-6, []), (1e-3, ["pose/clean"])):
+        now = values + change * rng.normal(size=len(values))
+        monkeypatch.setattr(provenance, "outputs", lambda now=now: {"pose/clean": provenance.projections([now])})
+        assert stale(result) == found
+
+
+def test_only_what_changes_figures_counts_as_code(tmp_path: Path) -> None:
+    texts = [
+        "X = 1\n\n\ndef f(x):\n    return x\n",
+        '"""Text."""\nimport os\nX = 1  # a comment\n"""Metres."""\n'
+        'def f(x: int) -> int:\n    """Text."""\n    return x\n'
+        "def table() -> Table:\n    return Table()\n",
+        "def f(x):\n    return x\nX = 1\n",
+        "X = 2\n\n\ndef f(x):\n    return x\n",
+        "X = 1\n\n\ndef f(x):\n    return -x\n",
+    ]
+    found = []
     for number, text in enumerate(texts):
         (tmp_path / f"{number}.py").write_text(text)
-        digests.append(code_digest(tmp_path / f"{number}.py"))
-    assert digests[0] == digests[1]
-    assert len(set(digests)) == 3
+        found.append(sorted(definitions(tmp_path / f"{number}.py")))
+    assert found[0] == found[1] == found[2]
+    assert [[line.split()[0] for line in set(found[0]) - set(other)] for other in found[3:]] == [["X"], ["f"]]
+
+
+def test_every_study_says_what_it_depends_on_and_is_made_of_code() -> None:
+    for room, names in (("studies", STUDIES), ("systems", SYSTEMS)):
+        for name in names:
+            module = importlib.import_module(f"steadypose.benchmarks.{room}.{name}")
+            assert measured(module.DEPENDS_ON).keys() == set(module.DEPENDS_ON), name
+            assert len(code(f"benchmarks.{room}.{name}")) > 10, name
 
 
 def test_every_stale_result_is_listed_with_a_reason_and_no_other() -> None:
@@ -128,11 +155,11 @@ def test_readme_and_page_hold_what_was_measured() -> None:
 
 
 def test_the_machine_is_described() -> None:
-    machine = describe()
-    assert machine["cpu"]
-    assert int(machine["cores"]) >= 1
-    assert float(machine["memory_gb"]) > 0
-    assert set(machine) >= {"load_1min", "python", "torch", "commit", "date"}
+    found = machine()
+    assert found["cpu"]
+    assert int(found["cores"]) >= 1
+    assert float(found["memory_gb"]) > 0
+    assert set(found) >= {"load_1min", "python", "torch", "commit", "date"}
 
 
 def test_show_prints_every_cell() -> None:

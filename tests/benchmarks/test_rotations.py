@@ -2,8 +2,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import waving
 
-from steadypose.benchmarks.studies.rotations_scoring import align, score
-from steadypose.benchmarks.studies.rotations_truth import SCORED
+from steadypose.benchmarks.studies.rotations_truth import SCORED, align, score
 
 FRAMES, CLIPS = 40, 2
 

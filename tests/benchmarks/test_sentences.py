@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from steadypose.benchmarks.machine import ROOT
+from steadypose.benchmarks.provenance import ROOT
 from steadypose.benchmarks.results import load
 
 Cell = tuple[str, str, str, str]

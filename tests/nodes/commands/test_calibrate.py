@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 from conftest import VirtualClock, raw, walking
+from tests.helpers.rendered_board import BOARD, depth_points, error, held_poses, look_at, picture, rays
 
-from steadypose.benchmarks.systems.calibration import BOARD, depth_points, error, held_poses, look_at, picture, rays
 from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.cli import main
 from steadypose.nodes.commands.calibrate_files import draw_floor

@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-
-from steadypose.benchmarks.systems.calibration import (
+from tests.helpers.rendered_board import (
     BOARD,
     LENS,
     corners_of,
@@ -17,6 +16,7 @@ from steadypose.benchmarks.systems.calibration import (
     picture,
     rays,
 )
+
 from steadypose.msgs.types import Pose
 from steadypose.prior.camera.calibration import (
     Board,

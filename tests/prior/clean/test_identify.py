@@ -4,8 +4,8 @@ from collections import Counter
 import numpy as np
 import pytest
 from tests.helpers.bodies import PERIOD_NS, raw, waving
+from tests.helpers.crossings import MANIFEST, all_hidden, identified, nearest, score, source, watch
 
-from steadypose.benchmarks.systems.identity import MANIFEST, all_hidden, identified, nearest, score, source, watch
 from steadypose.prior.clean.identify import Identify, IdentifySettings
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.helpers.bodies import waving
 
-from steadypose.benchmarks.baselines.beside import beside
+from steadypose.benchmarks.baselines.body import beside
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.occluded import OccludedJoints

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from steadypose.benchmarks.root_drift import Clip, observe
+from steadypose.benchmarks.studies.root_drift import Clip, observe
 from steadypose.msgs.types import Tracking
 from steadypose.prior.body.skeleton import J, limbs
 from steadypose.prior.sim.motion import Motion

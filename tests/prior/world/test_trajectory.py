@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from steadypose.benchmarks.root_drift import METHODS, SEEN_FRAMES, Clip, evaluate_fusion, observe
+from steadypose.benchmarks.studies.root_drift import METHODS, SEEN_FRAMES, Clip, evaluate_fusion, observe
 from steadypose.msgs.types import CONTACTS, JOINTS, JointState, Pose, PoseClean, PoseWorld, Tracking
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.sim.scripts import walk_turn

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib import format as npy
+from tests.helpers.motion_files import AMC, ASF, BVH, amass
 
-from steadypose.benchmarks.systems.motion_files import AMC, ASF, BVH, amass
 from steadypose.prior import npz
 from steadypose.prior.mocap.amc import read_amc, read_asf
 from steadypose.prior.mocap.bvh import read_bvh

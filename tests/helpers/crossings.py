@@ -1,53 +1,32 @@
-"""Whether people keep their ids when they cross and hide each other: `prior.clean.identify` on unnumbered bodies.
+"""People who cross and hide each other, without ids: streams of the simulator, baselines of identities, and a score.
 
-Streams are made from seeds by the project's simulator; their tracker knows who is who, so each observation's person is
-known. The methods get the bodies of each frame in random order and without ids.
+The simulated tracker knows who is who, so each observation's person is known. The methods get the bodies of each frame
+in random order and without ids.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 
-from steadypose.benchmarks.machine import ROOT
-from steadypose.benchmarks.provenance import require_committed
-from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.msgs.types import PoseRaw, PoseWorld
 from steadypose.prior.body.layouts import get_skeleton, to_canonical
 from steadypose.prior.clean.identify import Identify, IdentifySettings
-from steadypose.prior.sim.streams import Stream, make, read_manifest
+from steadypose.prior.sim.streams import Stream, make
 
-DEPENDS_ON = ("prior.identify settings",)
-
-MANIFEST = ROOT / "sim_data" / "manifest.json"
+MANIFEST = Path(__file__).parents[2] / "sim_data" / "manifest.json"
 ROWS = 16
 HIDDEN_S = 1.0
-"""the least time for which the one who is hidden is not seen"""
-
-
-@dataclass(frozen=True)
-class Args:
-    """Id switches where people cross and hide each other."""
-
-    crossings: int = 10
-    """generated, beside the crossing stream of sim_data"""
-    seed: int = 0
-    """of the first one; the others follow"""
-    out: Path = RESULTS
-    """folder for the JSON file"""
+"""Seconds, the least for which the one who is hidden is not observed."""
 
 
 @dataclass(frozen=True)
@@ -167,13 +146,6 @@ def identified(settings: IdentifySettings) -> Method:
     return lambda frame: stage.update(frame.stamp_ns, frame.bodies, frame.confidence)
 
 
-METHODS: dict[str, Callable[[], Method]] = {
-    "the source's own ids": lambda: source,
-    "nearest within 1 m": nearest,
-    "steadypose": lambda: identified(IdentifySettings(enabled=True)),
-}
-
-
 def score(frames: list[Frame], method: Method) -> dict[str, float]:
     """Id switches as CLEAR MOT counts them (Bernardin and Stiefelhagen 2008), and how much was given an id at all.
 
@@ -196,47 +168,3 @@ def score(frames: list[Frame], method: Method) -> dict[str, float]:
             last[who] = i
             owner.setdefault(i, who)
     return dict(figures)
-
-
-def _streams(args: Args) -> Iterator[tuple[str, str, list[Frame]]]:
-    filmed = read_manifest(MANIFEST)["crossing"]
-    yield "crossing of sim_data", filmed.name, watch(filmed)
-    for seed in range(args.seed, args.seed + args.crossings):
-        frames = watch(dataclasses.replace(filmed, script="hidden_crossing", seed=seed))
-        yield "one hidden", f"hidden_crossing, seed {seed}", frames
-        yield "both hidden at once", f"hidden_crossing, seed {seed}", all_hidden(frames)
-
-
-def main(args: Args) -> None:
-    """Measure, print, write."""
-    require_committed(args.out)
-    results: list[dict[str, Any]] = []
-    for scene, name, frames in track(_streams(args), total=1 + 2 * args.crossings, description="crossings"):
-        for method, start in METHODS.items():
-            results.append({"scene": scene, "stream": name, "method": method} | score(frames, start()))
-    console = Console()
-    table = _table(results)
-    show(table, console)
-    path = save("identity", sys.argv[1:], [table], {"streams": results}, DEPENDS_ON, args.out)
-    console.print(f"wrote {path}")
-
-
-def _table(results: list[dict[str, Any]]) -> Table:
-    rows = []
-    for scene in dict.fromkeys(r["scene"] for r in results):
-        for method in METHODS:
-            chosen = [r for r in results if (r["scene"], r["method"]) == (scene, method)]
-            total = {k: sum(r[k] for r in chosen) for k in ("switches", "mistaken", "sightings", "named")}
-            share = f"{total['named'] / total['sightings']:.1%}"
-            rows.append([f"{scene}: {method}", str(len(chosen)), str(total["switches"]), str(total["mistaken"]), share])
-    return Table(
-        name="identity",
-        title="Id switches where two people cross and hide each other",
-        columns=["scene and method", "streams", "switches", "of these, mistaken for the other", "sightings with an id"],
-        rows=rows,
-        note=f"Whoever goes out of sight does for {HIDDEN_S:g} s at least. Both hidden: nobody seen as one reappears.",
-    )
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Args))

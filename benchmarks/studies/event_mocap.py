@@ -8,31 +8,24 @@ is of the true motion, by the measures of `event_scenes`. What neither name nor 
 
 from __future__ import annotations
 
-import sys
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import tyro
-from rich.console import Console
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 
+from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.motion import spread
-from steadypose.benchmarks.provenance import WORLD, require_committed
-from steadypose.benchmarks.results import RESULTS, save, show
-from steadypose.benchmarks.systems.event_scenes import Label, Scene, common, lying, runs, seated
-from steadypose.benchmarks.systems.event_scoring import Score, score
-from steadypose.benchmarks.systems.events import CAMERA, DELAYS, labels_of, table_of, told_of, worlds_of
+from steadypose.benchmarks.provenance import WORLD
+from steadypose.benchmarks.results import Result
+from steadypose.benchmarks.systems.event_scenes import Label, Scene, Score, common, lying, runs, seated
+from steadypose.benchmarks.systems.events import CAMERA, DELAYS, record_of, scored, table_of
 from steadypose.msgs.types import EventKind, Hand
-from steadypose.nodes.graph.threads import one_thread
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import heading
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.events.detector import EventSettings
 from steadypose.prior.mocap.clip import person_of
 from steadypose.prior.sim.camera import film
 from steadypose.prior.sim.motion import Motion
@@ -40,7 +33,11 @@ from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.streams import START_NS
 from steadypose.prior.timing.rate import FPS
 
-SEED, ALL = 7, "all"
+DEPENDS_ON = (*WORLD, "prior.events")
+
+SEED, ALL, CLIPS = 7, "all", 2
+"""Seed of places and noise; the group of all; clips of each action of a data set, at most."""
+
 LONGEST, SHORTEST = round(15.0 * FPS), round(1.5 * FPS)
 """frames: longer takes are cut, for people walk out of a camera's view"""
 NEAREST, FARTHEST = 2.8, 4.0
@@ -197,47 +194,25 @@ def _falls(motion: Motion) -> Iterator[Label]:
             yield label._replace(kind=EventKind.FELL)
 
 
-@dataclass(frozen=True)
-class Args:
-    """Events of people in motion capture."""
-
-    data: Path = Path("data/prepared.npz")
-    """as `steadypose prepare` wrote it"""
-    clips: int = 3
-    """of each action of a data set, at most"""
-    chose: bool = False
-    """the people that chose the thresholds, in place of those that measure"""
-    out: Path = RESULTS
-    """folder for the JSON file"""
-
-
-def main(args: Args) -> None:
-    """Measure, print, write."""
-    require_committed(args.out)
-    one_thread()
+def run(bench: Bench) -> Result:
+    """Events of people in motion capture: of the split ``val`` those that chose the thresholds, else those that
+    measure."""
     totals: dict[str, dict[EventKind, Score]] = defaultdict(lambda: defaultdict(Score))
     by_clip: list[dict[str, Any]] = []
-    clips, noise = mocap_clips(args.data, not args.chose, args.clips), NoiseModel.load(KINECT_NOISE)
-    for number, clip in enumerate(track(clips, description="clips")):
+    clips, noise = (
+        mocap_clips(bench.data, bench.split == "test", 1 if bench.quick else CLIPS),
+        NoiseModel.load(KINECT_NOISE),
+    )
+    for number, clip in enumerate(bench.progress.track(clips, description="clips")):
         placing, filming = (np.random.default_rng(s) for s in np.random.SeedSequence([SEED, number]).spawn(2))
         scene = scene_of(clip, placing)
         raw = film(scene.motions, CAMERA, noise, filming, clip.action, START_NS)
-        told = told_of(worlds_of(raw), scene, EventSettings())
-        for kind, found in score(told, labels_of(scene), scene.undecided).items():
+        for kind, found in scored(raw, scene).items():
             for group in (clip.source, ALL):
                 totals[group][kind].add(found)
-            counts = {"met": found.met, "missed": found.missed, "false": found.false}
-            told_of_clip = {"action": clip.action, "person": clip.person, "kind": kind.name}
-            by_clip.append(told_of_clip | counts | {"delays_s": found.delays_s})
+            by_clip.append({"action": clip.action, "person": clip.person, **record_of(kind, found)})
     people = len({clip.person for clip in clips})
     title = f"Events in motion capture, filmed with a Kinect's errors: {len(clips)} clips of {people} people"
     tables = [table_of("event-mocap", title, totals[ALL], DELAYS)]
     tables += [table_of(f"event-mocap-{name}", name, of, "") for name, of in totals.items() if name != ALL]
-    for table in tables:
-        show(table, Console())
-    depends_on = (*WORLD, "events settings")
-    print(f"wrote {save('event_mocap', sys.argv[1:], tables, {'clips': by_clip}, depends_on, args.out)}")
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Args))
+    return Result(tables, {"clips": by_clip})

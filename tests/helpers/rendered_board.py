@@ -1,58 +1,25 @@
-"""How well `prior.camera.calibration` finds a lens and a camera's place, on rendered pictures whose truth is known.
+"""Pictures of the board that `steadypose calibrate board` prints, and depth of a room, whose camera is known.
 
-Pictures are of the board that `steadypose calibrate board` prints: perspective and lens distortion by following every
-pixel's ray, four rays a pixel; then blur, uneven light and noise.
+Perspective and lens distortion by following every pixel's ray, four rays a pixel; then blur, uneven light and noise.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import tyro
-from rich.console import Console
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 
-from steadypose.benchmarks.provenance import require_committed
-from steadypose.benchmarks.results import RESULTS, Table, save, show
 from steadypose.msgs.types import Pose
 from steadypose.prior.arrays import Floats
-from steadypose.prior.camera.calibration import (
-    Board,
-    Corners,
-    Intrinsics,
-    calibrate_lens,
-    camera_pose,
-    find_corners,
-    floor_pose,
-)
-
-DEPENDS_ON = ()
+from steadypose.prior.camera.calibration import Board, Corners, Intrinsics, find_corners
 
 LENS = Intrinsics((1280, 720), (860.0, 855.0), (645.0, 352.0), (0.05, -0.12, 0.0008, -0.0005, 0.03))
-"""of an OAK's colour camera, about; the distortion is stronger"""
+"""Lens of an OAK's colour camera, about; the distortion is stronger."""
 BOARD = Board()
 _PIXELS_PER_SQUARE = 200
-
-
-@dataclass(frozen=True)
-class Args:
-    """Errors of lens and camera pose on rendered pictures."""
-
-    cameras: int = 20
-    """places from which the board, or the floor, is looked at"""
-    pictures: int = 3
-    """of the board on the floor, each with noise of its own"""
-    views: int = 20
-    """pictures that the lens is calibrated from"""
-    out: Path = RESULTS
-    """folder for the JSON file"""
 
 
 def rays(lens: Intrinsics, finer: int = 1) -> Floats:
@@ -162,60 +129,3 @@ def depth_points(pose: Pose, rng: np.random.Generator) -> Floats:
     depth = 0.075 * 430.0 / (np.round(disparity * 8) / 8)
     keep = (depth > 0.4) & (depth < 8.0) & (rng.random(depth.shape) > 0.15)
     return (looks * depth[:, None])[keep]
-
-
-def main(args: Args) -> None:
-    """Measure, print, write."""
-    require_committed(args.out)
-    console, rng = Console(), np.random.default_rng(1)
-    looks = rays(LENS, finer=2)
-    views = [corners_of(pose, looks, rng) for pose, _ in zip(held_poses(rng), range(args.views), strict=False)]
-    lens = calibrate_lens([view for view in views if view], LENS.size)
-    found: dict[str, list[tuple[float, float]]] = {"board, lens calibrated": [], "board, lens known": [], "floor": []}
-    missed = 0
-    for pose, _ in track(zip(floor_poses(rng), range(args.cameras), strict=False), "cameras", total=args.cameras):
-        seen = [view for view in (corners_of(pose, looks, rng) for _ in range(args.pictures)) if view]
-        missed += not seen
-        if seen:
-            found["board, lens calibrated"].append(error(camera_pose(seen, lens).pose, pose))
-            found["board, lens known"].append(error(camera_pose(seen, LENS).pose, pose))
-        # gravity as an IMU of a degree tells it; the floor knows no heading and no place on it
-        up = Rotation.from_rotvec(rng.normal(0.0, np.radians(1.0), 3)).apply(
-            Rotation.from_quat(pose.orientation).inv().apply([0.0, 0.0, 1.0])
-        )
-        level = floor_pose(depth_points(pose, rng), up)[0]
-        true_up = Rotation.from_quat(pose.orientation).inv().apply([0.0, 0.0, 1.0])
-        tilt = np.arccos(np.clip(true_up @ Rotation.from_quat(level.orientation).inv().apply([0.0, 0.0, 1.0]), -1, 1))
-        found["floor"].append((1e3 * abs(level.position[2] - pose.position[2]), float(np.degrees(tilt))))
-    data = {
-        "lens": {"focal": lens.focal, "centre": lens.centre, "error_px": lens.error_px, "views": args.views},
-        "lens_truth": {"focal": LENS.focal, "centre": LENS.centre},
-        "cameras_without_the_board": missed,
-        "errors_mm_degrees": found,
-    }
-    table = _table(found, lens, missed)
-    show(table, console)
-    console.print(f"wrote {save('calibration', sys.argv[1:], [table], data, DEPENDS_ON, args.out)}")
-
-
-def _table(found: dict[str, list[tuple[float, float]]], lens: Intrinsics, missed: int) -> Table:
-    rows = []
-    for name, errors in found.items():
-        mm, degrees = np.array(errors).T
-        rows.append(
-            [name, str(len(mm)), *(f"{f(mm):.1f}" for f in (np.median, np.max))]
-            + [f"{f(degrees):.2f}" for f in (np.median, np.max)]
-        )
-    focal = max(abs(a - b) / b for a, b in zip(lens.focal, LENS.focal, strict=True))
-    return Table(
-        name="calibration",
-        title="Camera pose from rendered views, errors",
-        columns=["from", "cameras", "mm, median", "mm, worst", "degrees, median", "degrees, worst"],
-        rows=rows,
-        note=f"1280 x 720; the lens calibrated: focal length {focal:.2%} off. {missed} cameras did not see the board. "
-        "Floor: from depth and gravity; mm of height, degrees of tilt.",
-    )
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Args))
