@@ -11,30 +11,18 @@ from __future__ import annotations
 import ast
 import datetime
 import hashlib
-import json
+import math
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from steadypose import PACKAGE
-from steadypose.msgs.types import CleanBody, PoseClean, PoseRaw, PoseWorld, WorldBody
-from steadypose.nodes.driving import stream
-from steadypose.nodes.sources.recording import open_recording
-from steadypose.prior.clean.pipeline import PriorPipeline
-from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.fit.solve import FitSettings
 from steadypose.prior.models.weights import WEIGHTS
-from steadypose.prior.world.pipeline import TrajectoryPipeline
-from steadypose.prior.world.settings import TrajectorySettings
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).parent / "results"
@@ -52,17 +40,14 @@ WORLD = (*CLEAN, "pose/world", "contacts weights", "trajectory weights")
 _WEIGHT_SETS = ("default", "kinect_v2")
 """Those that ship; others may have been installed beside them."""
 
-_FRAMES = 120
-"""Frames of each bundled stream, of which the output is recorded."""
-_PROJECTIONS = 8
+_PLUMBING = tuple(
+    f"benchmarks.{name}" for name in ("evaluate", "figures", "output", "provenance", "report", "results", "stale")
+)
+"""Modules that change no figure."""
+
 SAME_M = 1e-4
 """Root mean square change of the output, metres, up to which it is the same: results are quoted to 0.1 mm, and floats
 differ between processors."""
-
-_PLUMBING = tuple(f"benchmarks.{name}" for name in ("evaluate", "figures", "provenance", "report", "results", "stale"))
-"""Modules that change no figure."""
-
-Output = list[float]
 
 
 class UncommittedError(RuntimeError):
@@ -71,17 +56,16 @@ class UncommittedError(RuntimeError):
 
 @cache
 def ships() -> dict[str, str]:
-    """Digests, by name: ``MODEL weights`` of each model, and ``offline settings`` of ``steadypose fit``."""
+    """Digest of the weights of each model, by name: ``MODEL weights``."""
     weights: dict[str, list[Path]] = {}
     for path in sorted(WEIGHTS.iterdir()):
         model, _, rest = path.name.partition("-")
         if rest.partition(".")[0] in _WEIGHT_SETS and path.suffix in (".safetensors", ".json"):
             weights.setdefault(model, []).append(path)
-    digests = {
+    return {
         f"{model} weights": _digest(part for p in paths for part in (p.name.encode(), p.read_bytes()))
         for model, paths in weights.items()
     }
-    return {**digests, "offline settings": _digest([json.dumps(asdict(FitSettings()), default=str).encode()])}
 
 
 def _digest(parts: Iterable[bytes]) -> str:
@@ -91,51 +75,14 @@ def _digest(parts: Iterable[bytes]) -> str:
     return digest.hexdigest()[:16]
 
 
-@cache
-def outputs() -> dict[str, Output]:
-    """By name, random projections of what the pipeline makes of the first frames of the bundled streams.
-
-    A projection on weights of 1 and -1, over the root of their number, changes by about the root mean square of the
-    change: eight numbers tell by how much 100,000 differ.
-    """
-    paths = sorted(path.parent for path in (ROOT / "sim_data").glob("*/metadata.yaml"))
-    default = [part for path in paths for part in _answers(path, PriorSettings())]
-    refining = PriorSettings.from_dict({"refine": {"enabled": True}})
-    return {
-        "pose/clean": projections(values for kind, values in default if kind is PoseClean),
-        "pose/world": projections(values for kind, values in default if kind is PoseWorld),
-        "pose/clean, HM-VAE": projections(values for kind, values in _answers(paths[0], refining) if kind is PoseClean),
-    }
-
-
-def _answers(path: Path, settings: PriorSettings) -> Iterator[tuple[type, np.ndarray]]:
-    """Positions, rotations and deviations of every body, as numbers, in order."""
-    raw = (item for item in open_recording(path) if isinstance(item[1], PoseRaw))
-    pipelines = PriorPipeline(settings), TrajectoryPipeline(TrajectorySettings())
-    for _, message in stream(islice(raw, _FRAMES), *pipelines):
-        if isinstance(message, PoseClean | PoseWorld):
-            yield type(message), np.concatenate([np.empty(0), *(_numbers(body) for body in message.bodies)])
-
-
-def _numbers(body: CleanBody | WorldBody) -> np.ndarray:
-    extra = body.contacts if isinstance(body, WorldBody) else [body.anomaly]
-    parts = body.positions, body.rotations, body.sigma, extra
-    return np.nan_to_num(np.concatenate([np.ravel(part) for part in parts]), posinf=1.0).astype(np.float64)
-
-
-def projections(parts: Iterable[np.ndarray]) -> Output:
-    """Of numbers, one after the other."""
-    values = np.concatenate(list(parts))
-    signs = np.random.default_rng(0).integers(0, 2, (_PROJECTIONS, len(values)), dtype=np.int8) * 2.0 - 1.0
-    return [round(float(p), 7) for p in signs @ values / np.sqrt(len(values))]
-
-
 def measured(depends_on: Sequence[str]) -> dict[str, Any]:
     """What a result records: of each name an output, a digest of `ships`, or the code of a package such as
     ``prior.fit``."""
     found = {}
     for name in depends_on:
         if name.startswith("pose/"):
+            from steadypose.benchmarks.output import outputs  # the pipelines take seconds to load
+
             found[name] = outputs()[name]
         else:
             found[name] = ships()[name] if name in ships() else package_digest(name)
@@ -144,10 +91,13 @@ def measured(depends_on: Sequence[str]) -> dict[str, Any]:
 
 @cache
 def package_digest(package: str) -> str:
-    """Of all definitions of a package or module of this project: moving one within it changes nothing."""
+    """Of all definitions of a package or module of this project, which may be gone: moving one within it changes
+    nothing."""
     path = PACKAGE.joinpath(*package.split("."))
-    files = sorted(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
-    return _digest(sorted(digest.encode() for file in files for digest in definitions(file)))
+    files = (
+        sorted(path.rglob("*.py")) if path.is_dir() else [file] if (file := path.with_suffix(".py")).is_file() else []
+    )
+    return _digest(sorted(digest.encode() for file in files if file.is_file() for digest in definitions(file)))
 
 
 def code(module: str) -> list[str]:
@@ -232,10 +182,10 @@ def stale(result: Mapping[str, Any]) -> list[str]:
     return [*changed, f"code ({', '.join(gone[:3])}{', ...' * (len(gone) > 3)})"] if gone else changed
 
 
-def _is_same(recorded: str | Output, now: str | Output) -> bool:
+def _is_same(recorded: str | list[float], now: str | list[float]) -> bool:
     if isinstance(recorded, str) or isinstance(now, str):
         return recorded == now
-    return float(np.sqrt(np.mean((np.array(recorded) - np.array(now)) ** 2))) <= SAME_M
+    return math.dist(recorded, now) <= SAME_M * math.sqrt(len(recorded))
 
 
 def require_committed(directory: Path) -> None:

@@ -175,7 +175,7 @@ def _mm(value: Tensor) -> float:
     return round(float(value) * 1e3, 1)
 
 
-DEPENDS_ON = (*CLEAN, "humor weights", "offline settings", "prior.fit", "training.recipes.humor")
+DEPENDS_ON = (*CLEAN, "humor weights", "prior.fit", "training.recipes.humor")
 
 FRAMES = 90
 DELAY = 8

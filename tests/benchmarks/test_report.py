@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from steadypose.benchmarks import provenance
+from steadypose.benchmarks import output, provenance
 from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, machine, measured, ships, stale
-from steadypose.benchmarks.report import Args, StaleError, fill, main, page
+from steadypose.benchmarks.report import Args, fill, main, page
 from steadypose.benchmarks.results import Study, Table, load, save, show
 from steadypose.benchmarks.stale import STALE
 from steadypose.benchmarks.studies import STUDIES
@@ -24,7 +24,7 @@ TEXT = "# Title\n<!-- results:speed -->\nold\n<!-- /results -->\ntail\n"
 
 PAPER = SimpleNamespace(
     __name__="steadypose.benchmarks.studies.hidden_joints",
-    DEPENDS_ON=("humor weights", "offline settings", "prior.fit"),
+    DEPENDS_ON=("humor weights", "prior.fit"),
 )
 """A study, as far as `save` looks at it."""
 
@@ -62,18 +62,24 @@ def test_blocks_do_not_swallow_each_other(tmp_path: Path) -> None:
     assert "between" in filled
 
 
-def test_a_stale_table_is_refused_and_with_a_reason_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stale_table_has_its_reason_and_a_finished_study_its_commit(tmp_path: Path) -> None:
     results = {"latency": saved(tmp_path), "hgvae": saved(tmp_path, "hgvae", replace(TABLE, name="levels"))}
     results["hgvae"]["frozen"] = "abc1234"
+    levels = "<!-- results:levels -->\n<!-- /results -->\n"
+    assert "stale" not in fill(TEXT, results, {})
+    assert "**stale: the reason**" in fill(TEXT, results, {"latency": "the reason"})
+    assert "code is at commit abc1234" in fill(levels, results, {})
+    assert "**stale: the reason**" in page(results, {"latency": "the reason"})
+
+
+def test_a_result_is_stale_when_weights_have_changed_and_a_finished_one_never(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = saved(tmp_path)
     changed = ships() | {"humor weights": "others"}
     monkeypatch.setattr(provenance, "ships", lambda: changed)
-    assert stale(results["latency"]) == ["humor weights"]
-    with pytest.raises(StaleError, match=r"evaluate latency.*humor weights"):
-        fill(TEXT, results, {})
-    assert "**stale: measured with other humor weights**" in fill(TEXT, results, {"latency": "the reason"})
-    finished = fill("<!-- results:levels -->\n<!-- /results -->", results, {})
-    assert "stale" not in finished
-    assert "code is at commit abc1234" in finished
+    assert stale(result) == ["humor weights"]
+    assert stale(result | {"frozen": "abc1234"}) == []
 
 
 def test_weights_that_do_not_ship_change_no_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,10 +116,10 @@ def test_a_result_is_stale_when_what_made_it_is_not_there_any_more(tmp_path: Pat
 def test_the_outputs_root_mean_square_change_tells_whether_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     values = rng.normal(size=100_000)
-    result = {"measured": {"pose/clean": provenance.projections([values])}, "code": []}
+    result = {"measured": {"pose/clean": output.projections([values])}, "code": []}
     for change, found in ((1e-6, []), (1e-3, ["pose/clean"])):
         now = values + change * rng.normal(size=len(values))
-        monkeypatch.setattr(provenance, "outputs", lambda now=now: {"pose/clean": provenance.projections([now])})
+        monkeypatch.setattr(output, "outputs", lambda now=now: {"pose/clean": output.projections([now])})
         assert stale(result) == found
 
 

@@ -1,0 +1,63 @@
+"""What the pipeline makes of the bundled streams, as a few numbers that tell whether it still makes the same."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from functools import cache
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from steadypose.benchmarks.provenance import ROOT
+from steadypose.msgs.types import CleanBody, PoseClean, PoseRaw, PoseWorld, WorldBody
+from steadypose.nodes.driving import stream
+from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.world.pipeline import TrajectoryPipeline
+from steadypose.prior.world.settings import TrajectorySettings
+
+FRAMES = 120
+"""Frames of each bundled stream that go in."""
+PROJECTIONS = 8
+"""Numbers that are kept of an output."""
+
+
+@cache
+def outputs() -> dict[str, list[float]]:
+    """By name, random projections of an output: with default settings, and with HM-VAE's refinement.
+
+    A projection on weights of 1 and -1, over the root of their number, changes by about the root mean square of the
+    change: eight numbers tell by how much 100,000 differ.
+    """
+    paths = sorted(path.parent for path in (ROOT / "sim_data").glob("*/metadata.yaml"))
+    default = [part for path in paths for part in _answers(path, PriorSettings())]
+    refining = PriorSettings.from_dict({"refine": {"enabled": True}})
+    return {
+        "pose/clean": projections(values for kind, values in default if kind is PoseClean),
+        "pose/world": projections(values for kind, values in default if kind is PoseWorld),
+        "pose/clean, HM-VAE": projections(values for kind, values in _answers(paths[0], refining) if kind is PoseClean),
+    }
+
+
+def _answers(path: Path, settings: PriorSettings) -> Iterator[tuple[type, np.ndarray]]:
+    raw = (item for item in open_recording(path) if isinstance(item[1], PoseRaw))
+    pipelines = PriorPipeline(settings), TrajectoryPipeline(TrajectorySettings())
+    for _, message in stream(islice(raw, FRAMES), *pipelines):
+        if isinstance(message, PoseClean | PoseWorld):
+            yield type(message), np.concatenate([np.empty(0), *(_numbers(body) for body in message.bodies)])
+
+
+def _numbers(body: CleanBody | WorldBody) -> np.ndarray:
+    """Positions, rotations, deviations, and contacts or the anomaly, in a row."""
+    last = body.contacts if isinstance(body, WorldBody) else [body.anomaly]
+    parts = body.positions, body.rotations, body.sigma, last
+    return np.nan_to_num(np.concatenate([np.ravel(part) for part in parts]), posinf=1.0).astype(np.float64)
+
+
+def projections(parts: Iterable[np.ndarray]) -> list[float]:
+    """Of numbers that come in parts."""
+    values = np.concatenate(list(parts))
+    signs = np.random.default_rng(0).integers(0, 2, (PROJECTIONS, len(values)), dtype=np.int8) * 2.0 - 1.0
+    return [round(float(p), 7) for p in signs @ values / np.sqrt(len(values))]
