@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from steadypose.prior.models.mixture.modes import body_covariance
 
 from steadypose.benchmarks.baselines.kalman import smooth
 from steadypose.prior.arrays import Floats
@@ -25,7 +26,6 @@ from steadypose.prior.models.mixture.bank import (
     new_bank,
 )
 from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
-from steadypose.prior.models.mixture.modes import body_covariance
 from steadypose.prior.timing.rate import FPS
 
 JOINT_DENSITIES = (0.05, 0.3, 1.8, 10.0, 60.0)
