@@ -4,7 +4,7 @@
 over the last 0.3 s. The measurement noise is estimated from third differences, in which motion is small: their median
 over the last second, half of it (in logarithm) shared by the joints of a body. Of the whole body: eight smoothers over
 modes instead of joints, eigenvectors of the covariance of joints' accelerations, learned once from other people's
-motion (`prior.models.mixture.modes`). In white noise it has 0.84 to 0.93 of the other's error, whoever moves; its
+motion (`prior.models.mixture.tracks`). In white noise it has 0.84 to 0.93 of the other's error, whoever moves; its
 smoothers are the product's own (`prior.models.mixture.bank`), which falls back to the same, but for an estimate of the
 noise that modes share where it is white.
 """
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from steadypose.prior.models.mixture.modes import body_covariance
 
 from steadypose.benchmarks.baselines.kalman import smooth
 from steadypose.prior.arrays import Floats
@@ -26,6 +25,7 @@ from steadypose.prior.models.mixture.bank import (
     new_bank,
 )
 from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
+from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.timing.rate import FPS
 
 JOINT_DENSITIES = (0.05, 0.3, 1.8, 10.0, 60.0)

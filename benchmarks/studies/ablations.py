@@ -40,7 +40,7 @@ from steadypose.prior.clean.reconstruct import DenoiseSettings
 from steadypose.prior.clean.rotations import OrientSettings, RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.models.mixture import inference, whiteness
+from steadypose.prior.models.mixture import inference
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
@@ -66,7 +66,9 @@ PARTS: Mapping[str, Part] = {
     "without the whole-body experts": Part(
         PriorSettings(), lambda: mock.patch.object(inference, "body_covariance", return_value=np.eye(22))
     ),
-    "without the share of white noise": Part(PriorSettings(), lambda: mock.patch.object(whiteness, "FALLBACK", 0.0)),
+    "without the share of white noise": Part(
+        PriorSettings(), lambda: mock.patch.object(inference, "fallback", lambda white, scale: np.zeros(len(white)))
+    ),
     "without slow error": Part(PriorSettings(bias_sigma=0.0)),
     "without HG-VAE's denoising": Part(PriorSettings(denoise=DenoiseSettings(enabled=False))),
     "without the person's bones": Part(PriorSettings(bones=PersonSettings(enabled=False))),
