@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from steadypose.benchmarks import figures
 from steadypose.benchmarks.baselines.body import ConditionalGaussian, beside
 from steadypose.benchmarks.baselines.filters import PEERS, Peer
+from steadypose.benchmarks.baselines.whole_body_kalman import whole_body_kalman
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
 from steadypose.benchmarks.ours import OURS
@@ -39,7 +40,8 @@ DEPENDS_ON = VARIANTS
 
 BESIDE = "held beside the body"
 GAUSSIAN = "conditional Gaussian"
-KNOW_THE_BODY = (BESIDE, GAUSSIAN)
+FILTER = "Kalman, whole body"
+KNOW_THE_BODY = (BESIDE, GAUSSIAN, FILTER)
 """Baselines that a filter of each joint is not."""
 
 NOISE = 0.01
@@ -86,7 +88,11 @@ def run(bench: Bench) -> Result:
     clips = bench.clips()
     kept = ("arm behind", "0.5 s") if bench.quick else tuple(CONDITIONS)
     gaussian = ConditionalGaussian(bench.training_clips().positions.reshape(-1, 22, 3))
-    peers = (*PEERS, Peer(GAUSSIAN, partial(given_the_seen, gaussian=gaussian), (0,)))
+    peers = (
+        *PEERS,
+        Peer(GAUSSIAN, partial(given_the_seen, gaussian=gaussian), (0,)),
+        Peer(FILTER, whole_body_kalman, (0,), {"density": (0.1, 50.0), "damping": (1.0, 30.0)}, whole_body=True),
+    )
     data = run_conditions(bench, clips, {name: CONDITIONS[name] for name in kept}, peers)
     records = data["records"]
     note = (
