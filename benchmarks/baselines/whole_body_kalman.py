@@ -15,7 +15,7 @@ import numpy as np
 from steadypose.benchmarks.baselines.body import beside
 from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
-from steadypose.prior.models.mixture.modes import body_covariance
+from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.timing.rate import FPS
 
 MIN_SIGMA = 0.01

@@ -18,6 +18,7 @@ from steadypose.prior.clean.fuse import Fuse
 from steadypose.prior.clean.gate import Gate
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.impute import impute
+from steadypose.prior.clean.occluded import Track
 from steadypose.prior.clean.reconstruct import Denoise, Reconstruct
 from steadypose.prior.clean.rotations import Orient, Refine
 from steadypose.prior.clean.score import Scorer
@@ -186,6 +187,7 @@ class CleanCore:
             self._history.unseen_s[at],
             self._history.seen_since(back),
             newest.present,
+            Track(self._history.positions, len(self._history.positions) - 1 - back, newest.gated.jitter),
         )
         estimate = replace(estimate, sigma=np.hypot(estimate.sigma, newest.left_out[:, None]))
         if self._orient:

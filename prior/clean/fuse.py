@@ -16,7 +16,7 @@ from steadypose.prior.body.skeleton import BONES_BETWEEN, PARENT
 from steadypose.prior.clean.bones import SensorBias
 from steadypose.prior.clean.frame import Estimate, Imputed, Person
 from steadypose.prior.clean.history import BRIEF_S
-from steadypose.prior.clean.occluded import OccludedJoints
+from steadypose.prior.clean.occluded import OccludedJoints, Track
 from steadypose.prior.compiled import njit
 from steadypose.prior.timing.kalman import Smoothed
 
@@ -43,6 +43,10 @@ class FuseSettings:
 MAX_SIGMA = 0.25
 """Metres along an axis: a completed joint is known while its standard deviation is at most this, however long it was
 not seen."""
+
+DERIVED_SIGMA = 0.025
+"""Metres along an axis: deviation of a joint that the sensor does not have and that follows from those around it, as a
+spine from hips and shoulders (validation: 0.019 to 0.028 of a spine, 0.016 to 0.023 of collars)."""
 
 _NEAR = 1 / (1 + BONES_BETWEEN) ** 2
 """(22, 22) weight of one joint's error in the correction of another, by the bones between them"""
@@ -94,6 +98,7 @@ class Fuse:
         unseen_s: Floats,
         seen_later: Bools,
         present: Bools,
+        track: Track,
     ) -> Estimate:
         """The estimate of one frame; frames are to be given in order.
 
@@ -106,6 +111,7 @@ class Fuse:
             unseen_s: (S, 22) seconds for which each joint had not been seen by then.
             seen_later: (S, 22) whether each was seen in one of the frames since.
             present: (S,) which slots hold a body.
+            track: the observations before and since.
         """
         s = self._settings
         slots, count = np.flatnonzero(present), len(present)
@@ -125,7 +131,9 @@ class Fuse:
                 hidden = _completable(unseen, imputed.positions[slots])
                 _complete(body, imputed.positions[slots], seen, unseen, hidden, precision.seen)
                 completed_sigma = np.where(hidden, imputed.sigma[slots], np.inf)
-            occluded = self.occluded.update(slots, seen, deviation, unseen, seen_later[slots], body, completed_sigma)
+            occluded = self.occluded.update(
+                slots, seen, deviation, unseen, seen_later[slots], body, completed_sigma, track
+            )
             if occluded is not None:
                 row, joint = occluded.joints.T
                 body[row, joint] = occluded.positions
@@ -140,7 +148,8 @@ class Fuse:
             body = fit_lengths(body, offsets, np.where(stays, _MIN_VARIANCE, variance), length_variance)
             fitted = solve_pose(body, offsets, decoded)[0]
         placed = np.isfinite(deviation).any(axis=1)
-        state, sigma = _states(unseen, known), _stated(unseen, deviation, precision)
+        derived = np.isinf(unseen) & _between(unseen)
+        state, sigma = _states(unseen, known), _stated(unseen, deviation, precision, derived)
         return Estimate(
             stamp_s=smoothed.stamp_s,
             positions=_scatter(count, slots[placed], body[placed], np.nan),
@@ -229,16 +238,12 @@ def _align(body, seen, precision):
 
 
 @njit(cache=True)
-def _completable(unseen_s, completed):
-    """(S, 22) which joints are hidden and completed.
-
-    Joints that the sensor does not have are left out where they lie between two that it has, which tell their place
-    better. So are frames that were lost whole, of which the smoother knows more.
-    """
-    hidden = np.zeros(unseen_s.shape, dtype=np.bool_)
+def _between(unseen_s):
+    """(S, 22) which joints lie between some that the sensor has: on at least two sides of each, one was seen."""
+    between = np.zeros(unseen_s.shape, dtype=np.bool_)
     below = np.empty(unseen_s.shape[1], dtype=np.int64)
     for row in range(len(unseen_s)):
-        newest, total = unseen_s[row].min(), 0
+        total = 0
         below[:] = 0
         for joint in range(len(below) - 1, -1, -1):
             known = unseen_s[row, joint] < np.inf
@@ -247,13 +252,27 @@ def _completable(unseen_s, completed):
             if joint > 0:
                 below[PARENT[joint]] += below[joint]
         for joint in range(len(below)):
-            unseen = unseen_s[row, joint]
-            if not unseen > newest or math.isnan(completed[row, joint, 0]):
-                continue
             branches = 1 if below[joint] < total else 0
             for other in range(1, len(below)):
                 branches += PARENT[other] == joint and below[other] > 0
-            hidden[row, joint] = unseen < np.inf or branches < 2
+            between[row, joint] = branches >= 2
+    return between
+
+
+@njit(cache=True)
+def _completable(unseen_s, completed):
+    """(S, 22) which joints are hidden and completed.
+
+    Joints that the sensor does not have are left out where they lie between two that it has, which tell their place
+    better. So are frames that were lost whole, of which the smoother knows more.
+    """
+    hidden, between = np.zeros(unseen_s.shape, dtype=np.bool_), _between(unseen_s)
+    for row in range(len(unseen_s)):
+        newest = unseen_s[row].min()
+        for joint in range(unseen_s.shape[1]):
+            unseen = unseen_s[row, joint]
+            if unseen > newest and not math.isnan(completed[row, joint, 0]):
+                hidden[row, joint] = unseen < np.inf or not between[row, joint]
     return hidden
 
 
@@ -293,14 +312,16 @@ def _merge(body, seen, here, precision):
 
 
 @njit(cache=True)
-def _stated(unseen_s, deviation, precision):
+def _stated(unseen_s, deviation, precision, derived):
     """(S, 22) standard deviations. Of a hidden joint, smoother and prior know the same past, so that their errors are
-    dependent: the smaller deviation of the two is stated."""
+    dependent: the smaller deviation of the two is stated. That of joints ``derived`` (S, 22) is `DERIVED_SIGMA`."""
     sigma = np.empty_like(unseen_s)
     for row in range(len(sigma)):
         for joint in range(sigma.shape[1]):
             if unseen_s[row, joint] == 0.0 and np.isfinite(deviation[row, joint]):
                 sigma[row, joint] = deviation[row, joint]
+            elif derived[row, joint]:
+                sigma[row, joint] = DERIVED_SIGMA
             else:
                 sigma[row, joint] = 1.0 / math.sqrt(max(precision.seen[row, joint], precision.prior[row, joint]))
     return sigma

@@ -1,4 +1,4 @@
-"""Occluded joints: each a weighted mean of the smoother's, the completion network's and the held position."""
+"""Occluded joints: each a weighted mean of four candidates."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.compiled import njit
-from steadypose.prior.models.occlusion.candidates import FEATURES, average, describe, forget, new_past, observe
+from steadypose.prior.models.occlusion.bridge import bridge
+from steadypose.prior.models.occlusion.candidates import FEATURES, average, describe, forget, new_past, observe, stand
 from steadypose.prior.models.occlusion.inference import LiveOcclusion, Occluded, Weighed
 
 Weigher = Callable[[Occluded], Weighed]
@@ -39,6 +40,20 @@ class Placed(NamedTuple):
     sigma: Floats
 
 
+class Track(NamedTuple):
+    """The last frames of S bodies, for joints seen again within the delay.
+
+    Attributes:
+        positions: (T, S, 22, 3) metres, as observed; NaN where they were not.
+        at: index of the frame to be answered.
+        noise: (S,) metres along an axis, of the observations.
+    """
+
+    positions: Floats
+    at: int
+    noise: Floats
+
+
 class OccludedJoints:
     """Estimates every body's occluded joints. Frames are to be given in order.
 
@@ -63,11 +78,13 @@ class OccludedJoints:
         seen_later: Bools,
         completed: Floats,
         completed_sigma: Floats | None,
+        track: Track,
     ) -> Placed | None:
         """Where B bodies' occluded joints are; None where nothing is completed.
 
         A joint is occluded if another of its body was seen since: a frame that was lost whole occludes none. One that
-        was never seen is where the completion has placed it on average of late, carried along with the body.
+        was never seen is where the completion has placed it on average of late, carried along with the body, halfway to
+        where a standing adult has it.
 
         Args:
             slots: (B,) of the bodies.
@@ -77,6 +94,7 @@ class OccludedJoints:
             seen_later: (B, 22) whether each is seen again within the delay.
             completed: (B, 22, 3) metres, by the completion network.
             completed_sigma: (B, 22) metres along an axis, inf of joints that are not completed; None without it.
+            track: of all slots, as observed.
         """
         held = np.empty_like(seen)
         _observe(self._past, slots, seen, sigma, unseen_s, held)
@@ -88,12 +106,17 @@ class OccludedJoints:
             known & (unseen_s > unseen_s.min(axis=1, keepdims=True)) & np.isfinite(unseen_s + sigma + held[..., 0])
         )
         _average(self._past, slots, never, completed, held)
-        weighed = self._weigh(slots, occluded, (seen, completed, held), sigma, completed_sigma, unseen_s, seen_later)
+        placed = held.copy()
+        _stand(never, seen, unseen_s, placed)
+        bridged, bridged_sigma = seen.copy(), sigma.copy()
+        _bridge(slots, occluded & seen_later, *track, bridged, bridged_sigma)
+        candidates, sigmas = (seen, completed, held, bridged), (completed_sigma, bridged_sigma)
+        weighed = self._weigh(slots, occluded, candidates, sigmas, sigma, unseen_s, seen_later)
         share = np.clip((unseen_s[occluded] - FORGETTING_S[0]) / (FORGETTING_S[1] - FORGETTING_S[0]), 0.0, 1.0)
         forgotten = np.hypot(weighed.sigma, share * completed_sigma[occluded])
         return Placed(
             np.concatenate([np.argwhere(occluded), np.argwhere(never)]),
-            np.concatenate([weighed.positions, held[never]]),
+            np.concatenate([weighed.positions, placed[never]]),
             np.concatenate([forgotten, (_of_legs(never) * completed_sigma)[never]]),
         )
 
@@ -101,9 +124,9 @@ class OccludedJoints:
         self,
         slots: NDArray[np.intp],
         occluded: Bools,
-        candidates: tuple[Floats, Floats, Floats],
+        candidates: tuple[Floats, ...],
+        sigmas: tuple[Floats, ...],
         sigma: Floats,
-        completed_sigma: Floats,
         unseen_s: Floats,
         seen_later: Bools,
     ) -> Weighed:
@@ -112,8 +135,9 @@ class OccludedJoints:
         if not len(body):
             return Weighed(np.empty((0, 3)), np.empty(0))
         chosen = np.stack([positions[body, joint] for positions in candidates], axis=1)
+        stated = np.stack([each[body, joint] for each in sigmas], axis=1)
         features = np.empty((len(body), FEATURES), dtype=np.float32)
-        _describe(self._past, slots, body, joint, chosen, sigma, completed_sigma, unseen_s, seen_later, features)
+        _describe(self._past, slots, body, joint, chosen, stated, sigma, unseen_s, seen_later, features)
         return self.weigher(Occluded(body, joint, chosen, features))
 
 
@@ -138,17 +162,28 @@ def _average(past, slots, never, completed, held):
 
 
 @njit(cache=True)
-def _describe(past, slots, body, joint, candidates, sigma, completed_sigma, unseen_s, seen_later, features):
+def _stand(never, seen, unseen_s, placed):
+    for row in range(len(never)):
+        stand(never[row], seen[row], unseen_s[row], placed[row])
+
+
+@njit(cache=True)
+def _bridge(slots, wanted, positions, at, noise, bridged, sigma):
+    place = np.empty(3)
+    for row, slot in enumerate(slots):
+        for joint in range(wanted.shape[1]):
+            if not wanted[row, joint]:
+                continue
+            deviation = bridge(positions[:, slot, joint], at, noise[slot], place)
+            if np.isfinite(deviation):
+                sigma[row, joint] = deviation
+                for axis in range(3):
+                    bridged[row, joint, axis] = place[axis]
+
+
+@njit(cache=True)
+def _describe(past, slots, body, joint, candidates, sigmas, sigma, unseen_s, seen_later, features):
     for row in range(len(body)):
         b, j = body[row], joint[row]
-        describe(
-            past,
-            slots[b],
-            j,
-            candidates[row],
-            sigma[b],
-            completed_sigma[b, j],
-            unseen_s[b],
-            seen_later[b, j],
-            features[row],
-        )
+        describe(past, slots[b], j, candidates[row], sigmas[row], sigma[b], unseen_s[b], seen_later[b, j],
+                 features[row])  # fmt: skip

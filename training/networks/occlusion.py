@@ -29,7 +29,7 @@ class OcclusionConfig:
         hidden: of each layer.
     """
 
-    hidden: int = 48
+    hidden: int = 96
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> OcclusionConfig:
@@ -55,7 +55,7 @@ class OcclusionNet(nn.Module):
         nn.init.constant_(self.write.bias[CANDIDATES:], FIRST_LOG_SIGMA)
 
     def forward(self, features: Tensor, joint: Tensor) -> tuple[Tensor, Tensor]:
-        """Weights (N, 3) of the candidates, and the logarithm (N,) of the standard deviation along an axis in
+        """Weights (N, 4) of the candidates, and the logarithm (N,) of the standard deviation along an axis in
         millimetres, of features (N, `FEATURES`) of joints (N,)."""
         read = torch.relu(self.read((features - self.mean) / self.deviation) + self.joint[joint])
         written = self.write(torch.relu(self.think(read)) + read)

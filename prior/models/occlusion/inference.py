@@ -24,7 +24,7 @@ class Occluded(NamedTuple):
     Attributes:
         body: (N,) row of the body.
         joint: (N,) index of the joint.
-        candidates: (N, 3, 3) metres, as `CANDIDATES` has them.
+        candidates: (N, 4, 3) metres, as `CANDIDATES` has them.
         features: (N, `FEATURES`) float32.
     """
 

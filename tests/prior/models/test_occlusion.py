@@ -10,16 +10,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.helpers.bodies import waving
 
-from steadypose.benchmarks.baselines.body import beside
+from steadypose.benchmarks.baselines.body import beside, facing
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.clean.occluded import OccludedJoints
-from steadypose.prior.models.occlusion.candidates import FEATURES
+from steadypose.prior.clean.occluded import OccludedJoints, Track
+from steadypose.prior.models.occlusion.bridge import DENSITIES, FIRST_SPEED, bridge
+from steadypose.prior.models.occlusion.candidates import FEATURES, STANDING
 from steadypose.prior.models.occlusion.inference import SIGMA_SCALE, LiveOcclusion, Occluded, Weighed
 from steadypose.training.networks.occlusion import OcclusionConfig, OcclusionNet
 from steadypose.training.weights import arrays_of
 
-FRAMES, ARM = 40, [J["left_elbow"], J["left_wrist"]]
+FRAMES, ARM, ELBOW_AT = 40, [J["left_elbow"], J["left_wrist"]], J["left_shoulder"]
 
 
 class Asked:
@@ -51,6 +53,11 @@ def occlusions(bodies: int, seed: int) -> NDArray[np.bool_]:
     return hidden
 
 
+def without_gaps(bodies: int = 1) -> Track:
+    """In which no joint is bridged."""
+    return Track(np.full((2, bodies, 22, 3), np.nan), 0, np.full(bodies, 0.005))
+
+
 def asked_of(truth: Floats, hidden: NDArray[np.bool_]) -> list[Occluded]:
     """The rows of every frame, of joints that coast where they were last seen, and are completed as they truly are."""
     bodies = truth.shape[1]
@@ -62,7 +69,9 @@ def asked_of(truth: Floats, hidden: NDArray[np.bool_]) -> list[Occluded]:
         place = np.where(gone[..., None], place, frame)
         sigma = 0.005 + unseen
         again = np.zeros(gone.shape, dtype=bool)
-        joints.update(np.arange(bodies), place, sigma, unseen, again, frame, np.full(sigma.shape, 0.03))
+        joints.update(
+            np.arange(bodies), place, sigma, unseen, again, frame, np.full(sigma.shape, 0.03), without_gaps(bodies)
+        )
     return asked.rows
 
 
@@ -94,7 +103,7 @@ def test_of_a_frame_lost_whole_nothing_is_asked() -> None:
     assert not asked_of(truth, hidden)
 
 
-def test_a_joint_never_seen_is_where_the_completion_has_it_on_average_and_goes_with_the_body() -> None:
+def test_a_joint_never_seen_is_halfway_from_its_completion_on_average_to_a_standing_body_and_goes_with_it() -> None:
     truth, rng, joints = walking(), np.random.default_rng(0), OccludedJoints("default", 1)
     joints.weigher = asked = Asked()
     unseen, sigma, off = np.zeros((1, 22)), np.full((1, 22), 0.005), []
@@ -103,13 +112,17 @@ def test_a_joint_never_seen_is_where_the_completion_has_it_on_average_and_goes_w
         seen, completed = frame.copy(), frame + 0.02 * rng.standard_normal(frame.shape)
         seen[:, ARM] = np.nan
         answer = joints.update(
-            np.arange(1), seen, sigma, unseen, np.zeros((1, 22), dtype=bool), completed, np.full((1, 22), 0.03)
-        )
+            np.arange(1), seen, sigma, unseen, np.zeros((1, 22), dtype=bool), completed, np.full((1, 22), 0.03),
+            without_gaps(),
+        )  # fmt: skip
         assert answer is not None
         assert answer.joints.tolist() == [[0, joint] for joint in ARM]
         np.testing.assert_array_equal(answer.sigma, 0.03)
-        off.append(answer.positions - frame[0, ARM])
+        yaw = facing(frame)
+        standing = frame[0, ELBOW_AT] + (STANDING[ARM] - STANDING[ELBOW_AT]) @ yaw_matrix(yaw)[0].T
+        off.append(answer.positions - 0.5 * (frame[0, ARM] + standing))
     assert not asked.rows
+    np.testing.assert_allclose(off[10:], 0.0, atol=0.05)
     shake = np.diff(off[10:], axis=0).std()
     assert shake < 0.01, "of 0.028, what differs from frame to frame in the completion"
 
@@ -122,8 +135,9 @@ def test_a_leg_that_was_never_seen_is_stated_a_fifth_less_sure_and_one_seen_in_p
     for gone in (left, part, ARM[1:]):
         unseen[:, gone], sigma[:, gone], seen[:, gone] = np.inf, np.inf, np.nan
     answer = joints.update(
-        np.arange(1), seen, sigma, unseen, np.zeros((1, 22), dtype=bool), standing, np.full((1, 22), 0.05)
-    )
+        np.arange(1), seen, sigma, unseen, np.zeros((1, 22), dtype=bool), standing, np.full((1, 22), 0.05),
+        without_gaps(),
+    )  # fmt: skip
     assert answer is not None
     stated = dict(zip(answer.joints[:, 1].tolist(), answer.sigma.tolist(), strict=True))
     expected = {joint: 0.06 if joint in left else 0.05 for joint in sorted((*left, *part, ARM[1]))}
@@ -137,12 +151,41 @@ def test_what_was_last_seen_is_forgotten_until_the_completions_deviation_is_stat
         unseen[:, ARM] = second
         answer = joints.update(
             np.arange(1), standing, 0.003 + 0.1 * unseen, unseen, np.zeros((1, 22), dtype=bool), standing,
-            np.full((1, 22), 0.1),
+            np.full((1, 22), 0.1), without_gaps(),
         )  # fmt: skip
         if second:
             assert answer is not None
             stated.append(answer.sigma.min())
     assert min(stated[10:]) >= 0.1 > stated[0]
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20, deadline=None)
+def test_a_bridged_joint_is_the_gaussian_mean_given_both_sides_of_its_gap(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    track, noise, t = np.cumsum(0.02 * rng.standard_normal((24, 3)), axis=0), 0.01, np.arange(24) / 30
+    track[12:18], at = np.nan, int(rng.integers(12, 18))
+    known = np.flatnonzero(np.isfinite(track[:, 0]))[1:]
+    x, means, likelihoods = track[known] - track[0], [], []
+    low, high = np.minimum.outer(t, t), np.maximum.outer(t, t)
+    for density in DENSITIES:
+        # of an integrated random walk that begins at the first observation
+        walk = density * low**2 * (high / 2 - low / 6) + FIRST_SPEED**2 * np.outer(t, t) + noise**2
+        covariance = walk[np.ix_(known, known)] + noise**2 * np.eye(len(known))
+        solved = np.linalg.solve(covariance, x)
+        means.append(track[0] + walk[at, known] @ solved)
+        likelihoods.append(-0.5 * (x * solved).sum() - 1.5 * np.linalg.slogdet(covariance)[1])
+    weights = np.exp(np.array(likelihoods) - max(likelihoods))
+    place = np.empty(3)
+    assert 0.0 < bridge(track, at, noise, place) < 0.2
+    np.testing.assert_allclose(place, weights @ np.array(means) / weights.sum(), atol=1e-6)
+
+
+def test_a_joint_that_is_not_seen_before_is_not_bridged() -> None:
+    track, place = np.full((8, 3), np.nan), np.zeros(3)
+    track[5:] = 1.0
+    assert bridge(track, 3, 0.01, place) == np.inf
+    assert np.isnan(place).all()
 
 
 def test_live_form_gives_what_torch_gives_between_the_candidates() -> None:
@@ -154,7 +197,7 @@ def test_live_form_gives_what_torch_gives_between_the_candidates() -> None:
         network.deviation.uniform_(0.5, 2.0)
     rng = np.random.default_rng(0)
     features, joint = rng.normal(size=(50, FEATURES)).astype(np.float32), rng.integers(0, 22, 50)
-    rows = Occluded(np.zeros(50, dtype=np.intp), joint, rng.normal(size=(50, 3, 3)), features)
+    rows = Occluded(np.zeros(50, dtype=np.intp), joint, rng.normal(size=(50, 4, 3)), features)
     live = LiveOcclusion(arrays_of(network))(rows)
     with torch.no_grad():
         weights, log_sigma = network(torch.from_numpy(features), torch.from_numpy(joint))
@@ -173,8 +216,9 @@ def test_what_ships_believes_a_foot_that_stands_more_than_its_completion() -> No
         unseen[:, feet] = max(frame - 10, 0) / 30
         sigma = 0.003 + 0.1 * unseen
         answer = joints.update(
-            np.arange(1), standing, sigma, unseen.copy(), np.zeros((1, 22), dtype=bool), wrong, np.full((1, 22), 0.1)
-        )
+            np.arange(1), standing, sigma, unseen.copy(), np.zeros((1, 22), dtype=bool), wrong, np.full((1, 22), 0.1),
+            without_gaps(),
+        )  # fmt: skip
         assert answer is not None
         if len(answer.joints):
             found.append(answer)
