@@ -1,7 +1,7 @@
 """A baseline for hidden joints: one Kalman filter of the whole body, in which they accelerate as the others do.
 
 The state is the position and velocity of 22 joints. Velocities are damped, and joints accelerate with the covariance of
-training motion (`prior.models.mixture.modes`), the only thing learned; it is the same for x, y and z, so that one
+training motion (`prior.models.mixture.tracks`), the only thing learned; it is the same for x, y and z, so that one
 covariance (44, 44) serves all three axes. A hidden joint contributes no measurement: it follows from the others'.
 """
 
