@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import cache
@@ -39,7 +40,7 @@ CATCH_UP = 3
 as the messages themselves."""
 
 
-class BodyPipeline(Generic[Key]):
+class BodyPipeline(ABC, Generic[Key]):
     """What the prior over one stream and over many share: the stages, and the slots in which bodies go through them.
 
     Attributes:
@@ -73,8 +74,9 @@ class BodyPipeline(Generic[Key]):
         """The latest estimate of the sensor's error, the median over bodies; None before the first body."""
         return self._core.sensor_noise
 
+    @abstractmethod
     def _resamplers(self) -> Iterable[Resampler]:
-        raise NotImplementedError
+        """Of all streams that are open."""
 
     def _new_identify(self) -> Identify | None:
         """A tracker of ids, if the source gives none."""
