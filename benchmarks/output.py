@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from steadypose.benchmarks.provenance import ROOT
+from steadypose import PACKAGE
 from steadypose.msgs.types import CleanBody, PoseClean, PoseRaw, PoseWorld, WorldBody
 from steadypose.nodes.driving import stream
 from steadypose.nodes.sources.recording import open_recording
@@ -31,7 +31,7 @@ def outputs() -> dict[str, list[float]]:
     A projection on weights of 1 and -1, over the root of their number, changes by about the root mean square of the
     change: eight numbers tell by how much 100,000 differ.
     """
-    paths = sorted(path.parent for path in (ROOT / "sim_data").glob("*/metadata.yaml"))
+    paths = sorted(path.parent for path in (PACKAGE / "sim_data").glob("*/metadata.yaml"))
     default = [part for path in paths for part in _answers(path, PriorSettings())]
     refining = PriorSettings.from_dict({"refine": {"enabled": True}})
     return {

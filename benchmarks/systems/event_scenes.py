@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import EventKind, Hand
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.capsules import TOE_HEIGHT, random_offsets
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.events.detector import EventSettings
 from steadypose.prior.events.features import EXTENT, HAND
-from steadypose.prior.sim.body import TOE_HEIGHT, random_offsets
 from steadypose.prior.sim.gait import RATE, Stand, Turn, Walk, minimum_jerk, plan
 from steadypose.prior.sim.motion import SIGN, ArmAction, Intent, Motion, perform
 from steadypose.prior.sim.scripts import SCRIPTS

@@ -9,7 +9,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from steadypose import PACKAGE
-from steadypose.nodes.graph.settings import LaunchError
 
 
 @dataclass(frozen=True)
@@ -50,6 +49,9 @@ def require_extra(name: str) -> None:
     """
     missing = [module for module in EXTRAS[name].modules if find_spec(module) is None]
     if missing:
+        # `doctor` names extras where not even numpy is installed
+        from steadypose.nodes.graph.settings import LaunchError
+
         raise LaunchError(f"{EXTRAS[name].purpose}: {how_to_install(missing, name)}")
 
 

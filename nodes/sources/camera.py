@@ -36,10 +36,6 @@ PAUSES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
 STREAMING = "streaming"
 
 
-class CameraError(RuntimeError):
-    """A camera that cannot be used at present. The text says what is wrong."""
-
-
 class Connection(Protocol):
     """A camera that is open."""
 
@@ -57,14 +53,6 @@ class Connection(Protocol):
     def status(self) -> dict[str, str]:
         """What there is to say of it in `diagnostics`."""
         ...
-
-
-def count_failure(counts: Counter[str], camera: str, error: Exception) -> None:
-    """Count a frame of a camera that could not be worked on, and log the first of its kind."""
-    cause = f"frame: {type(error).__name__}"
-    if cause not in counts:
-        logger.error("%s: a frame failed; more are only counted", camera, exc_info=error)
-    counts[cause] += 1
 
 
 class CameraSource(LiveSource):

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import PoseRaw, RawBody
 from steadypose.nodes.graph.clock import POLL_S, Clock
-from steadypose.nodes.sources.camera import CameraError, count_failure
-from steadypose.nodes.sources.source import OakSettings
+from steadypose.nodes.sources.source import CameraError, OakSettings, count_failure
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.camera.depth_lifting import lift

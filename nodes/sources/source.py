@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -17,6 +18,8 @@ from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.settings import LaunchError, path_setting
 from steadypose.prior.settings import check_range
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -153,3 +156,15 @@ class SourceContext:
     """for publishers on other machines"""
     clear_text: bool = False
     """whether to listen to other machines without keys"""
+
+
+class CameraError(RuntimeError):
+    """A camera that cannot be used at present. The text says what is wrong."""
+
+
+def count_failure(counts: Counter[str], camera: str, error: Exception) -> None:
+    """Count a frame of a camera that could not be worked on, and log the first of its kind."""
+    cause = f"frame: {type(error).__name__}"
+    if cause not in counts:
+        logger.error("%s: a frame failed; more are only counted", camera, exc_info=error)
+    counts[cause] += 1

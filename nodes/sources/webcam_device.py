@@ -18,8 +18,7 @@ from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_mediapipe, pinhole
-from steadypose.nodes.sources.camera import CameraError, count_failure
-from steadypose.nodes.sources.source import MODEL, CalibrationSettings, WebcamSettings
+from steadypose.nodes.sources.source import MODEL, CalibrationSettings, CameraError, WebcamSettings, count_failure
 
 Landmarker = Callable[[NDArray[Any], int], Any]
 """an RGB image (H, W, 3) and its milliseconds, which rise, to a ``PoseLandmarkerResult``"""

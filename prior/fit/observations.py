@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from steadypose.prior.body.capsules import CAPSULES, REST_HEIGHT, stature
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.fit.energy import Term, bisquare, geman_mcclure, huber
 from steadypose.prior.fit.motion import Motion
-from steadypose.prior.sim.body import CAPSULES, REST_HEIGHT, stature
 
 ROBUST = 5.0
 """Standard deviations from which on a key point or a point of the surface counts as an outlier."""

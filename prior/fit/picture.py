@@ -21,6 +21,7 @@ from scipy.ndimage import gaussian_filter1d, median_filter, percentile_filter
 from steadypose.msgs.types import JointState
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
+from steadypose.prior.body.capsules import CAPSULES
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, quaternions, yaw_matrix
 from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, SHOULDERS, J
@@ -30,7 +31,6 @@ from steadypose.prior.fit.motion import float_tensor
 from steadypose.prior.fit.observations import KeyPoints, Observed, Pinhole, SeenJoints, SurfacePoints, thinned
 from steadypose.prior.fit.solve import FitSettings, Start
 from steadypose.prior.fit.windows import FittedTrack, Track, fit_track
-from steadypose.prior.sim.body import CAPSULES
 from steadypose.prior.timing.rate import FPS
 
 _BONES = [(J[a], J[b]) for side in ("left", "right") for a, b in (

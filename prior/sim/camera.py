@@ -17,8 +17,8 @@ from scipy.special import ndtri
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.capsules import CAPSULES, REST_HEIGHT, Mount, mount, stature
 from steadypose.prior.body.skeleton import COLLARS, JOINTS, TRUNK, J
-from steadypose.prior.sim.body import CAPSULES, REST_HEIGHT, Mount, mount, stature
 from steadypose.prior.sim.motion import Motion
 from steadypose.prior.sim.noise import (
     SWAP_GROUPS,

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.capsules import CAPSULES, REST_HEIGHT, stature
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.sim.body import CAPSULES, REST_HEIGHT, stature
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.capsules import TOE_HEIGHT
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.sim.body import TOE_HEIGHT
 
 
 def minimum_jerk(progress: ArrayLike) -> Floats:

@@ -13,9 +13,9 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.capsules import TOE_HEIGHT
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, heading, yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, J
-from steadypose.prior.sim.body import TOE_HEIGHT
 from steadypose.prior.sim.gait import RATE, FootTrack, Plan, drift, foot_track
 
 Side = Literal["left", "right"]

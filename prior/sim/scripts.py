@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.capsules import random_offsets
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.sim.body import random_offsets
 from steadypose.prior.sim.gait import RATE, Key, Plan, Stand, Turn, Walk, minimum_jerk, plan, track
 from steadypose.prior.sim.motion import SIDES, SIGN, ArmAction, Intent, Motion, Side, perform
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import JointState, PoseRaw, PoseWorld, Tracking, WorldBody
-from steadypose.prior.sim.body import mount
+from steadypose.prior.body.capsules import mount
 from steadypose.prior.sim.camera import Camera, as_tracked, film, sight
 from steadypose.prior.sim.motion import Motion
 from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel

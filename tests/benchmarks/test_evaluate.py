@@ -1,6 +1,6 @@
 from pathlib import Path
 from types import SimpleNamespace
-from typing import get_args
+from typing import Literal, get_args
 
 import pytest
 
@@ -46,7 +46,7 @@ def test_every_reading_of_the_test_split_is_logged_and_no_other(tmp_path: Path, 
 
     monkeypatch.setattr("importlib.import_module", lambda _: Module)
 
-    def read(study: str, split: str) -> None:
+    def read(study: str, split: Literal["val", "test"]) -> None:
         with pytest.raises(ZeroDivisionError):
             evaluate(study, split, quick=True, mocap=tmp_path, data=data)
 

@@ -22,7 +22,7 @@ COMMAND = ["steadypose", "evaluate", "latency", "--quick"]
 TEXT = "# Title\n<!-- results:speed -->\nold\n<!-- /results -->\ntail\n"
 
 
-PAPER = SimpleNamespace(
+PAPER: Any = SimpleNamespace(
     __name__="steadypose.benchmarks.studies.hidden_joints",
     DEPENDS_ON=("humor weights", "prior.fit"),
 )

@@ -32,6 +32,6 @@ def write_motion(
         clip_start=np.cumsum([0, *map(len, clips)]),
         split=np.array(split),
         flat=np.ones(len(clips), dtype=bool) if flat is None else np.array(flat),
-        **{name: np.array([value] * len(clips)) for name, value in same.items()},
+        **{name: np.array([value] * len(clips)) for name, value in same.items()},  # type: ignore[arg-type]
     )
     return path

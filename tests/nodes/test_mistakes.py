@@ -102,7 +102,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         "has no setting 'delya': did you mean 'delay'",
     ),
     "a section that there is not": (
-        lambda j: steadypose.Filter(settings={"prior.delay": 2}),
+        lambda j: steadypose.Filter(settings={"prior.delay": 2}),  # type: ignore[arg-type]
         r"expected sections 'prior' and 'trajectory'.*got 'prior\.delay', did you mean 'prior'",
     ),
     "a rate and stamps": (
@@ -111,7 +111,10 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     ),
     "joints under another name": (lambda j: steadypose.clean({"joints": j}, fps=30), "expected an array 'positions'"),
     "joints to draw that are not clean": (lambda j: steadypose.plot(j), r"steadypose\.plot\(steadypose\.clean"),
-    "a delay of seconds": (lambda j: steadypose.clean(j, fps=30, delay=0.1), "expected int such as 4, got 0.1"),
+    "a delay of seconds": (
+        lambda j: steadypose.clean(j, fps=30, delay=0.1),  # type: ignore[arg-type]
+        "expected int such as 4, got 0.1",
+    ),
     "a frame without its time": (lambda j: steadypose.Filter()(j[0]), "t in seconds, or stamp_ns"),
     "nanoseconds as seconds": (lambda j: steadypose.Filter()(j[0], 1.7e18), "say stamp_ns= of nanoseconds"),
     "all frames at once": (lambda j: steadypose.Filter()(j.transpose(0, 2, 1), 0.0), r"expected \(22, 3\) metres"),

@@ -44,7 +44,7 @@ def test_a_replay_goes_on_at_its_pace(make_launch: Callable[..., Launch], step_n
             clock.set_ns = step_ns
         before = clock.time_ns
         node.report = lambda: None  # type: ignore[method-assign]
-        node._wait_for(frame.stamp_ns)
+        node._wait_for(frame.stamp_ns, frame.stamp_ns)
         assert clock.time_ns - before <= 40_000_000
         node._tell_pace()
         assert node.timeline is not None

@@ -28,7 +28,7 @@ from steadypose.nodes.commands.doctor import required
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2 import connection as connecting
+from steadypose.nodes.ros2 import connect as connecting
 from steadypose.nodes.ros2.connection import Connection
 from steadypose.nodes.ros2.definitions import deserialise, stamp_ns
 from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, Ros2BridgeSettings, RosOutput, check_ros2

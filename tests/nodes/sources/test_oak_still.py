@@ -13,10 +13,9 @@ from tests.helpers.fake_oak import CAMERA, Player, depth_frame, moment, readings
 from steadypose.nodes.commands.calibrate import CalibrateOak, calibrate
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.sources import oak_device
-from steadypose.nodes.sources.camera import CameraError
 from steadypose.nodes.sources.oak_device import Still, capture
 from steadypose.nodes.sources.registry import InputSettings
-from steadypose.nodes.sources.source import OakSettings
+from steadypose.nodes.sources.source import CameraError, OakSettings
 from steadypose.prior.camera.calibration import CalibrationError
 
 UP = np.array([0.0, -np.cos(0.2), np.sin(0.2)])

@@ -25,7 +25,7 @@ def noise(depth: float) -> NDArray[np.float64]:
 
 def left_out(positions: NDArray[np.float64], white: float = 0.0, estimator: DepthError | None = None) -> float:
     """At the end of the frames (T, 22, 3)."""
-    estimator = estimator or DepthError(1)
+    estimator, found = estimator or DepthError(1), np.full(1, np.nan)
     for t, frame in enumerate(positions[:, None]):
         found = estimator.update(Smoothed(t / FPS, frame, np.full((1, 22), SIGMA)), np.array([white]))
     return float(found[0])

@@ -263,9 +263,10 @@ def wave_begins(angles: list[float]) -> bool:
 def test_where_a_body_faces_is_told_through_noise_and_followed_where_there_is_none() -> None:
     rng = np.random.default_rng(0)
     noisy, sure = Facing(0.3), Facing(0.3)
-    for k in range(60):
-        line, sigma = noisy.update(START_NS + k * FRAME_NS, (0.5 + rng.normal(0.0, 0.3), rng.normal(0.0, 0.3)), 0.3)
-        (x, y), _ = sure.update(START_NS + k * FRAME_NS, (np.cos(k / 20.0), np.sin(k / 20.0)), 0.005)
+    stamps = [START_NS + k * FRAME_NS for k in range(60)]
+    line, sigma = [noisy.update(at, (0.5 + rng.normal(0.0, 0.3), rng.normal(0.0, 0.3)), 0.3) for at in stamps][-1]
+    turning = [sure.update(at, (np.cos(k / 20.0), np.sin(k / 20.0)), 0.005) for k, at in enumerate(stamps)]
+    x, y = turning[-1][0]
     assert sigma < 0.15
     assert abs(np.arctan2(line[1], line[0])) < 0.5
     assert np.arctan2(y, x) == pytest.approx(59 / 20.0, abs=0.05)

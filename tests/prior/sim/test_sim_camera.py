@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from steadypose.prior.body.capsules import mount
 from steadypose.prior.body.layouts import CANONICAL, get_skeleton, to_canonical
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
-from steadypose.prior.sim.body import mount
 from steadypose.prior.sim.camera import FRAME_ID, Camera, film, segment_gap, sight
 from steadypose.prior.sim.gait import Stand, Turn, Walk, plan
 from steadypose.prior.sim.motion import Intent, Motion, perform

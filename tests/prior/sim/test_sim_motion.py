@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from steadypose.prior.body.capsules import TOE_HEIGHT, random_offsets, stature
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, label_contacts
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, REST_OFFSETS, J
-from steadypose.prior.sim.body import TOE_HEIGHT, random_offsets, stature
 from steadypose.prior.sim.gait import RATE, Stand, Walk, plan
 from steadypose.prior.sim.motion import Intent, Motion, perform, two_bone
 from steadypose.prior.sim.scripts import SCRIPTS

@@ -68,8 +68,7 @@ def test_predict_is_what_a_missing_frame_would_give_and_its_deviation_grows() ->
     positions, stamps = stream(8)
     kalman = ConstantVelocityFilter(DENSITY)
     assert kalman.predict(0.0) is None
-    for measured, stamp in zip(positions, stamps, strict=True):
-        before = kalman.update(measured, stamp)
+    before = [kalman.update(*frame) for frame in zip(positions, stamps, strict=True)][-1]
     expected = kalman.predict(stamps[-1] + 0.2)
     coasted = kalman.update(np.full_like(positions[0], np.nan), stamps[-1] + 0.2)
     assert expected
