@@ -8,7 +8,6 @@ STALE = {
     "contacts": BEFORE,
     "event_mocap": BEFORE,
     "events": BEFORE,
-    "fidelity": WHITE,
     "hgvae": BEFORE,
     "hidden_joints": WHITE,
     "humor": BEFORE,
@@ -18,8 +17,6 @@ STALE = {
     "mediapipe": BEFORE,
     "noisy_joints": WHITE,
     "restart": BEFORE,
-    "rotations": WHITE,
     "scale": BEFORE,
-    "world": WHITE,
 }
 """Study: why its figures are kept. `tests/benchmarks/test_report.py` holds this list against the code."""
