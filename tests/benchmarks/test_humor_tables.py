@@ -67,6 +67,7 @@ def test_futures_of_any_model_are_scored(clips: MotionClips) -> None:
     assert "contact_accuracy" not in predict(HumorNet(HumorConfig(hidden=64, contacts=False)).eval(), clips, 2)
 
 
+@pytest.mark.timeout(900)  # minutes of fits, on a busy machine
 def test_the_protocol_in_small(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(humor, "VARIANTS", {name: VARIANTS[name] for name in ("no contacts", MVAE)})
     for module in (humor, fits):

@@ -36,6 +36,7 @@ compile_from_the_end()
 """
 
 
+@pytest.mark.timeout(900)  # compiles all loops
 def test_no_loop_is_left_for_a_frame_to_wait_for(tmp_path: Path) -> None:
     cold = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}  # what an earlier run compiled would hide what is missing
     root = Path(__file__).parents[2]
