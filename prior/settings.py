@@ -3,10 +3,51 @@
 from __future__ import annotations
 
 import difflib
+import logging
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from typing import Any, get_args, get_type_hints
+
+logger = logging.getLogger(__name__)
+
+RENAMED = {"prior.encode": "prior.reconstruct", "prior.bones": "prior.person", "server.kiosks": "server.clients"}
+"""Settings of version 0.2 by their former names, which 0.3 takes with a warning and 0.4 refuses."""
+
+
+def current_key(path: str) -> str:
+    """A setting's path, such as ``prior.bones.samples``, with or without its section, by its current name."""
+    for old, new in RENAMED.items():
+        for former, name in ((old, new), (old.partition(".")[2], new.partition(".")[2])):
+            if f"{path}.".startswith(f"{former}."):
+                _warn_of_former_name(old, new)
+                return name + path[len(former) :]
+    return path
+
+
+def current_keys(section: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a section of a launch file by their current names.
+
+    Raises:
+        ValueError: one has both names.
+    """
+    current: dict[str, Any] = {}
+    for key, value in settings.items():
+        name = current_key(f"{section}.{key}").rpartition(".")[2] if f"{section}.{key}" in RENAMED else key
+        if name != key and name in settings:
+            raise ValueError(f"[{section}] {key} is the former name of {name}: expected one of the two")
+        current[name] = value
+    return current
+
+
+@cache
+def _warn_of_former_name(old: str, new: str) -> None:
+    """Once in a process."""
+    section, _, key = old.partition(".")
+    logger.warning(
+        "[%s] %s is now called %s: write that; a later version refuses %s", section, key, new.partition(".")[2], key
+    )
 
 
 def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:

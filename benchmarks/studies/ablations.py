@@ -71,7 +71,7 @@ PARTS: Mapping[str, Part] = {
     ),
     "without slow error": Part(PriorSettings(bias_sigma=0.0)),
     "without HG-VAE's denoising": Part(PriorSettings(denoise=DenoiseSettings(enabled=False))),
-    "without the person's bones": Part(PriorSettings(bones=PersonSettings(enabled=False))),
+    "without the person's bones": Part(PriorSettings(person=PersonSettings(enabled=False))),
     "without the score": Part(PriorSettings(score=ScoreSettings(enabled=False))),
     "without completion": Part(PriorSettings(impute=ImputeSettings(enabled=False))),
     "without fusion": Part(PriorSettings(fuse=FuseSettings(enabled=False))),

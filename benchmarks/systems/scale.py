@@ -101,7 +101,7 @@ def serve_live(frames: list[PoseRaw], kiosks: int, seconds: float) -> dict[str, 
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="steadypose-"))
         publishers = [stack.enter_context(Publisher(f"ipc://{folder}/{k}")) for k in range(kiosks)]
         settings = [
-            f"server.kiosks={json.dumps([publisher.endpoint for publisher in publishers])}",
+            f"server.clients={json.dumps([publisher.endpoint for publisher in publishers])}",
             f"prior.max_bodies={kiosks}",
             "prior.score.enabled=false",
             "prior.impute.enabled=false",

@@ -160,7 +160,7 @@ def _usable(problems: list[Problem]) -> bool:
 
 
 class StreamChecks:
-    """The checks of all streams that a prior takes: one, or one of each kiosk, by its source.
+    """The checks of all streams that a prior takes: one, or one of each client, by its source.
 
     Args:
         max_bodies, identified: as of `StreamCheck`.

@@ -46,8 +46,8 @@ def clean(
         delay: frames at 30 Hz to wait for, 0 to 16; more is smoother. 4 unless given.
         settings: any setting of [prior] or [trajectory], such as gate.enabled=false or trajectory.contacts=false; the
             end of its name will do, where there is one such setting only. May be given again. Weights of your own
-            ('steadypose train') are settings too: smooth.weights, encode.weights, trajectory.weights=NAME, or the path
-            of a .safetensors file.
+            ('steadypose train') are settings too: smooth.weights, reconstruct.weights, trajectory.weights=NAME, or the
+            path of a .safetensors file.
         skeletons: TOML with [skeletons.NAME] of joint layouts of your own; a launch file with them will do.
         rig: TOML that says of files of motion what they do not: metres (the size of their unit), up, fps, skeleton (of
             arrays), and [canonical], which of their joints left_elbow and the others of smpl22 are.

@@ -9,7 +9,7 @@ from typing import Any
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError, ServerSettings, TransportSettings
 from steadypose.nodes.graph.topology import NODES, load
-from steadypose.prior.settings import nearest
+from steadypose.prior.settings import current_key, nearest
 
 PIPELINES = {
     "prior": "steadypose.prior.clean.settings:PriorSettings",
@@ -29,12 +29,12 @@ def full_key(override: str, sections: Mapping[str, type]) -> str:
         LaunchError: it is no setting, or the end of several.
     """
     path, separator, value = override.partition("=")
-    name = path.strip()
+    name = current_key(path.strip())
     if not separator or not name:
         raise LaunchError(f"--set: expected section.key=value, got {override!r}")
     known = [f"{section}.{key}" for section, kind in sections.items() for key in _keys(kind)]
     if name in known:
-        return override
+        return f"{name}={value}"
     found = [key for key in known if key.endswith(f".{name}")]
     if len(found) == 1:
         return f"{found[0]}={value}"
@@ -42,7 +42,7 @@ def full_key(override: str, sections: Mapping[str, type]) -> str:
         more = f" and {len(found) - 6} more" if len(found) > 6 else ""
         raise LaunchError(f"--set {name}: expected one setting, got the end of {', '.join(found[:6])}{more}")
     if any(key.startswith(f"{name}.") or name.startswith(f"{key}.") for key in known):
-        return override  # a table, or a part of one
+        return f"{name}={value}"  # a table, or a part of one
     near = nearest(name, [*known, *(key.partition(".")[2] for key in known)])
     raise LaunchError(f"--set {name}: no such setting{near}; sections are {', '.join(sections)}")
 

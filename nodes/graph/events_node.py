@@ -63,6 +63,6 @@ class EventsNode(Node):
     def _stream(self, source: str) -> EventStream:
         stream = self._streams.pop(source, None) or EventStream(self._settings)
         self._streams[source] = stream
-        if len(self._streams) > max(len(self.launch.server.kiosks), 1):  # one came back under another name
+        if len(self._streams) > max(len(self.launch.server.clients), 1):  # one came back under another name
             del self._streams[next(iter(self._streams))]
         return stream

@@ -22,7 +22,7 @@ class Inbox:
 
     Who can drop frames works on the newest first: once the oldest that waits is late, all but the newest go.
 
-    With several subscribers, as for the kiosks of a server, each has a queue of its own, and they take turns: one that
+    With several subscribers, as for the clients of a server, each has a queue of its own, and they take turns: one that
     floods the node loses only its own messages.
 
     Args:

@@ -20,7 +20,7 @@ from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.nodes.graph.settings import LaunchError, ServerSettings, TransportSettings, load_plugin, resolve_paths
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, NodeDeclaration, add_node, load
 from steadypose.prior.body.layouts import add_layouts
-from steadypose.prior.settings import build_settings, nearest
+from steadypose.prior.settings import build_settings, current_key, current_keys, nearest
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -60,10 +60,10 @@ class Launch(_EveryLaunch):
                 raise LaunchError(
                     f"nodes names {node!r}, which is no node{nearest(node, NODES)}; there are {', '.join(NODES)}"
                 )
-        if self.server.kiosks and "pose_input" in self.nodes:
-            raise LaunchError("[server] kiosks have their own pose_input: expected nodes without it, such as prior")
-        if self.server.kiosks and self.transport.lossless:
-            raise LaunchError("[server] kiosks do not wait: expected [transport] lossless = false")
+        if self.server.clients and "pose_input" in self.nodes:
+            raise LaunchError("[server] clients have their own pose_input: expected nodes without it, such as prior")
+        if self.server.clients and self.transport.lossless:
+            raise LaunchError("[server] clients do not wait: expected [transport] lossless = false")
 
     @classmethod
     def read(cls, path: str | Path, overrides: Iterable[str] = ()) -> Launch:
@@ -79,10 +79,11 @@ class Launch(_EveryLaunch):
         file = find(path)
         table = read_toml(file)
         resolve_paths(_layout(table), table, file.parent)
-        for override in overrides:
-            apply_override(table, override)
-        _add_plugins(table.get("plugins", {}))
         try:
+            table = {name: current_keys(name, part) if isinstance(part, dict) else part for name, part in table.items()}
+            for override in overrides:
+                apply_override(table, override)
+            _add_plugins(table.get("plugins", {}))
             whole = build_settings(_layout(table), table, file.name)
             sections = {name: getattr(whole, name) for name in table.keys() & _sections().keys()}
             add_layouts(whole.skeletons)
@@ -104,9 +105,9 @@ class Launch(_EveryLaunch):
         return self.sections.get(section, {})
 
     def addresses(self, node: str) -> list[str]:
-        """Where ``node`` publishes: one address, or those of all kiosks."""
-        if node == "pose_input" and self.server.kiosks:
-            return self.server.kiosks
+        """Where ``node`` publishes: one address, or those of all clients."""
+        if node == "pose_input" and self.server.clients:
+            return self.server.clients
         return [self.transport.endpoint(node)]
 
     def reliable_subscribers(self, node: str) -> frozenset[str]:
@@ -193,12 +194,13 @@ def apply_override(table: dict[str, Any], override: str) -> None:
     path, separator, text = override.partition("=")
     if not separator or not path.strip():
         raise LaunchError(f"expected section.key=value, got {override!r}")
+    path = current_key(path.strip())
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text
     except RecursionError as error:
-        raise LaunchError(f"{path.strip()}: {TOO_DEEP}") from error
+        raise LaunchError(f"{path}: {TOO_DEEP}") from error
     *sections, key = (part.strip() for part in path.split("."))
     for section in sections:
         table = table.setdefault(section, {})

@@ -204,11 +204,11 @@ class Node(ABC):
             self.report()
 
     def _addresses(self) -> Iterator[list[str]]:
-        """Addresses of the publishers to subscribe to; one subscriber for each kiosk, so that none starves another."""
-        nodes, kiosks = NODES[self.name].subscribes, self.launch.server.kiosks
+        """Addresses of the publishers to subscribe to; one subscriber for each client, so that none starves another."""
+        nodes, clients = NODES[self.name].subscribes, self.launch.server.clients
         if "pose_input" in nodes:
-            yield from ([address] for address in kiosks)
-        others = [address for node in nodes for address in self.launch.addresses(node) if address not in kiosks]
+            yield from ([address] for address in clients)
+        others = [address for node in nodes for address in self.launch.addresses(node) if address not in clients]
         if others:
             yield others
 
@@ -227,8 +227,8 @@ class Node(ABC):
         self.health.note_queue(len(self.inbox))
         topic, message = received
         if isinstance(message, Diagnostics):
-            # of several kiosks each has its own
-            if message.node == "pose_input" and not self.launch.server.kiosks:
+            # of several clients each has its own
+            if message.node == "pose_input" and not self.launch.server.clients:
                 self.timeline = Timeline.from_values(message.values)
         else:
             self.health.stamp_ns = message.stamp_ns

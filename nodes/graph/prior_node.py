@@ -37,10 +37,10 @@ def make_prior(settings: Mapping[str, Any]) -> PriorPipeline:
         return PriorPipeline(PriorSettings.from_dict(settings))
 
 
-def make_batch(settings: Mapping[str, Any], kiosks: int) -> StreamBatch:
-    """The prior of several kiosks; raises as `make_prior`."""
+def make_batch(settings: Mapping[str, Any], clients: int) -> StreamBatch:
+    """The prior of several clients; raises as `make_prior`."""
     with _launch_errors():
-        return StreamBatch(PriorSettings.from_dict(settings), kiosks)
+        return StreamBatch(PriorSettings.from_dict(settings), clients)
 
 
 @contextmanager
@@ -59,15 +59,15 @@ class PriorNode(Node):
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
         one_thread()
-        settings, kiosks = launch.table("prior"), len(launch.server.kiosks)
+        settings, clients = launch.table("prior"), len(launch.server.clients)
         with _launch_errors():
             load_loops(PriorSettings.from_dict(settings))  # first: what it takes and leaves serves the pipeline
-        self._pipeline = make_batch(settings, kiosks) if kiosks else make_prior(settings)
+        self._pipeline = make_batch(settings, clients) if clients else make_prior(settings)
         self._bodies = 0
         self._anomalies = 0
         self._answers = Answers(self._pipeline.counters)
         settings = PriorSettings.from_dict(launch.table("prior"))
-        self._checks = StreamChecks(settings.max_bodies, identified=settings.identify.enabled, streams=kiosks or 1)
+        self._checks = StreamChecks(settings.max_bodies, identified=settings.identify.enabled, streams=clients or 1)
         self._started_ns = self.clock.now_ns()
         self._limit = BodyLimit(settings.max_bodies, self.clock)
 

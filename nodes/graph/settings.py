@@ -146,10 +146,10 @@ class TransportSettings:
 
 @dataclass(frozen=True)
 class ServerSettings:
-    """``[server]``: one prior for several kiosks, whose input nodes run on machines of their own."""
+    """``[server]``: one prior for several clients, whose input nodes run on machines of their own."""
 
-    kiosks: list[str] = field(default_factory=list)
+    clients: list[str] = field(default_factory=list)
     """addresses of their input nodes (``tcp://192.168.1.21:7101``), subscribed to in place of an own one"""
 
     def __post_init__(self) -> None:
-        check_addresses("[server] kiosks", self.kiosks)
+        check_addresses("[server] clients", self.clients)

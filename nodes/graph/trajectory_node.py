@@ -37,7 +37,7 @@ class TrajectoryNode(Node):
         super().__init__(launch, clock)
         one_thread()
         self._pipeline = make_trajectory(launch.table("trajectory"))
-        self._of_kiosks: dict[str, TrajectoryPipeline] = {}
+        self._of_clients: dict[str, TrajectoryPipeline] = {}
         self._delay_frames = 0
         self._bodies = 0
 
@@ -50,18 +50,18 @@ class TrajectoryNode(Node):
             self.publish(POSE_WORLD, world, delay_ns=round(message.delay_frames * FRAME_NS))
 
     def _pipeline_of(self, source: str) -> TrajectoryPipeline:
-        """The trajectory of a stream; each kiosk has one of its own, by its source."""
-        kiosks = len(self.launch.server.kiosks)
-        if not kiosks:
+        """The trajectory of a stream; each client has one of its own, by its source."""
+        clients = len(self.launch.server.clients)
+        if not clients:
             return self._pipeline
-        pipeline = self._of_kiosks.pop(source, None) or make_trajectory(self.launch.table("trajectory"))
-        self._of_kiosks[source] = pipeline
-        if len(self._of_kiosks) > kiosks:  # one came back under another name
-            del self._of_kiosks[next(iter(self._of_kiosks))]
+        pipeline = self._of_clients.pop(source, None) or make_trajectory(self.launch.table("trajectory"))
+        self._of_clients[source] = pipeline
+        if len(self._of_clients) > clients:  # one came back under another name
+            del self._of_clients[next(iter(self._of_clients))]
         return pipeline
 
     def status(self) -> dict[str, str]:
-        counters = sum((p.counters for p in self._of_kiosks.values()), self._pipeline.counters)
+        counters = sum((p.counters for p in self._of_clients.values()), self._pipeline.counters)
         return {"bodies": str(self._bodies), "delay_frames": str(self._delay_frames)} | {
             f"refused.{cause}": str(n) for cause, n in counters.items()
         }

@@ -82,12 +82,12 @@ class CleanCore:
         self._gate = Gate(settings.gate, slots, counters)
         self._correct = Correct(settings.correct, slots) if settings.correct.sensor else None
         self._smooth = MixtureSmoother(delay, slots, settings.smooth.weights)
-        self._reconstruct = Reconstruct(settings.encode, slots) if denoise or score or impute else None
+        self._reconstruct = Reconstruct(settings.reconstruct, slots) if denoise or score or impute else None
         self._denoise = Denoise(delay, slots) if denoise else None
         self._bias = BiasEstimator(settings.bias_sigma, slots)
         self._depth_error = DepthError(slots)
-        self._person = PersonEstimator(settings.bones, slots)
-        self._score = Scorer(settings.score, settings.encode.weights, slots) if score else None
+        self._person = PersonEstimator(settings.person, slots)
+        self._score = Scorer(settings.score, settings.reconstruct.weights, slots) if score else None
         self._imputes = impute
         self.fuse = Fuse(settings.fuse, slots)
         self._orient = Orient(settings.orient, slots) if settings.orient.enabled else None

@@ -57,7 +57,7 @@ _BESIDE_PELVIS = np.array([*HIPS, J["spine1"]])
 
 @dataclass(frozen=True)
 class ReconstructSettings:
-    """Settings of the reconstruct stage (``[prior.encode]``).
+    """Settings of the reconstruct stage (``[prior.reconstruct]``).
 
     Attributes:
         weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.

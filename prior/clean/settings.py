@@ -16,7 +16,7 @@ from steadypose.prior.clean.impute import ImputeSettings
 from steadypose.prior.clean.reconstruct import DenoiseSettings, ReconstructSettings
 from steadypose.prior.clean.rotations import OrientSettings, RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
-from steadypose.prior.settings import build_settings, check_range
+from steadypose.prior.settings import build_settings, check_range, current_keys
 
 logger = logging.getLogger(__name__)
 
@@ -51,7 +51,8 @@ class PriorSettings:
         bias_sigma: metres along an axis, expected standard deviation of the sensor's bias: the prior of its
             estimate from the stream, and the least that a fault has to exceed. Depth cameras have 2 cm or more.
         identify: whether ids are the source's (the default) or assigned by the prior.
-        gate, correct, smooth, encode, denoise, bones, score, impute, refine, fuse, orient: settings of the stages.
+        gate, correct, smooth, reconstruct, denoise, person, score, impute, refine, fuse, orient: settings of the
+            stages.
     """
 
     delay: int = 4
@@ -62,9 +63,9 @@ class PriorSettings:
     gate: GateSettings = field(default_factory=GateSettings)
     correct: CorrectSettings = field(default_factory=CorrectSettings)
     smooth: SmoothSettings = field(default_factory=SmoothSettings)
-    encode: ReconstructSettings = field(default_factory=ReconstructSettings)
+    reconstruct: ReconstructSettings = field(default_factory=ReconstructSettings)
     denoise: DenoiseSettings = field(default_factory=DenoiseSettings)
-    bones: PersonSettings = field(default_factory=PersonSettings)
+    person: PersonSettings = field(default_factory=PersonSettings)
     score: ScoreSettings = field(default_factory=ScoreSettings)
     impute: ImputeSettings = field(default_factory=ImputeSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
@@ -75,8 +76,8 @@ class PriorSettings:
         check_range("[prior] delay", self.delay, 0, MAX_DELAY)
         check_range("[prior] max_bodies", self.max_bodies, 1, 256)  # as many as the bench puts side by side
         check_range("[prior] timeout", self.timeout, 0.05, 60.0)
-        check_range("[prior.bones] samples", self.bones.samples, 1, 1e6)
-        check_range("[prior.bones] every", self.bones.every, 1, 1e6)
+        check_range("[prior.person] samples", self.person.samples, 1, 1e6)
+        check_range("[prior.person] every", self.person.every, 1, 1e6)
         for section in (f.name for f in fields(self) if is_dataclass(getattr(self, f.name))):
             stage = getattr(self, section)
             for f in fields(stage):
@@ -90,6 +91,7 @@ class PriorSettings:
         Raises:
             ValueError: a key that does not exist (the message names the nearest that does) or a wrong type.
         """
+        settings = current_keys("prior", settings)
         impute = settings.get("impute")
         if isinstance(impute, Mapping) and (unused := [key for key in UNUSED if key in impute]):
             logger.warning("[prior.impute] %s: no longer used, and to be refused by a later version", ", ".join(unused))

@@ -27,7 +27,7 @@ from steadypose.nodes.graph.trajectory_node import make_trajectory
 from steadypose.nodes.sources.recording import open_recording
 
 STREAMS = sorted(path.parent for path in (Path(__file__).parents[2] / "sim_data").glob("*/metadata.yaml"))
-OFF = ("gate", "denoise", "bones", "score", "impute", "fuse")
+OFF = ("gate", "denoise", "person", "score", "impute", "fuse")
 VARIANTS: dict[str, dict[str, Any]] = {
     **{f"delay {delay}": {"delay": delay} for delay in (0, 2, 4, 16)},
     **{f"no {stage}": {stage: {"enabled": False}} for stage in OFF},

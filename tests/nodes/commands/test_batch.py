@@ -107,11 +107,11 @@ def test_what_is_done_is_not_done_again(
     here.clear()
     assert clean(source, out, settings=options) == 0
     assert not here
-    assert clean(source, out, settings=(*options, "bones.enabled=false")) == 0
+    assert clean(source, out, settings=(*options, "person.enabled=false")) == 0
     assert len(here) == 4, "other settings, other results"
     here.clear()
     monkeypatch.setattr(batch, "_models", lambda: "of another release")
-    assert clean(source, out, settings=(*options, "bones.enabled=false")) == 0
+    assert clean(source, out, settings=(*options, "person.enabled=false")) == 0
     assert len(here) == 4, "other models, other results"
 
 

@@ -93,7 +93,7 @@ def test_a_recording_and_its_npz_give_the_same_numbers(tmp_path: Path, options: 
 def test_settings_reach_the_stages(tmp_path: Path, options: tuple[str, ...]) -> None:
     source = write_npz(tmp_path / "in.npz")
     clean(source, tmp_path / "a.npz", settings=options)
-    clean(source, tmp_path / "b.npz", settings=(*options, "bones.enabled=false"))
+    clean(source, tmp_path / "b.npz", settings=(*options, "person.enabled=false"))
     clean(source, tmp_path / "c.npz", delay=0, settings=options)
     a, b, c = (load(tmp_path / f"{name}.npz")["positions"] for name in "abc")
     assert np.abs(a - b).max() > 1e-3

@@ -81,7 +81,7 @@ def test_a_bad_npz_is_said_in_a_line(capsys, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["clean", "{idle}", "{tmp}/out", "--set", "encode.weights={tmp}/text.safetensors"], "as .safetensors"),
+        (["clean", "{idle}", "{tmp}/out", "--set", "reconstruct.weights={tmp}/text.safetensors"], "as .safetensors"),
         (
             ["clean", "{idle}", "{tmp}/out", "--set", "smooth.weights={weights}/contacts-default.safetensors"],
             "of mixture",

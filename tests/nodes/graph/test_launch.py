@@ -6,10 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from steadypose.nodes.commands.setting_names import full_key, pipeline_sections
 from steadypose.nodes.graph.launch import Launch, bundled, find
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.recorder import RecorderSettings
 from steadypose.nodes.sources.registry import InputSettings
+from steadypose.prior.clean.bones import PersonSettings
+from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.settings import _warn_of_former_name
 
 
 @pytest.fixture
@@ -54,7 +58,7 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("[input.calibration]\nposition = ['a', 1, 2]", "position: expected each to be a float, got 'a'"),
         ("[input.webcam]\nbodies = 0", "bodies: expected 1 to 64, got 0"),
         ("[input.merge]\ncameras = [7111, 7112]", "cameras: expected addresses such as tcp://.*, got 7111"),
-        ("[server]\nkiosks = [7111]", "kiosks: expected addresses such as tcp://.*, got 7111"),
+        ("[server]\nclients = [7111]", "clients: expected addresses such as tcp://.*, got 7111"),
         ("[viewer]\nport = 65536", "port: expected 1 to 65535, got 65536"),
         ("[input", "is not TOML"),
     ],
@@ -102,3 +106,37 @@ def test_brackets_without_end_are_no_setting(write) -> None:
             Launch.read(write(text))
     with pytest.raises(LaunchError, match=r"input\.rate: lists or tables within lists"):
         Launch.read(write(""), ["input.rate=" + "[" * 5000])
+
+
+@pytest.mark.parametrize(
+    ("text", "override", "former"),
+    [
+        ("[prior.bones]\nevery = 4", "prior.bones.samples=40", ["bones"]),
+        ("[prior.person]\nevery = 4", "bones.samples=40", ["bones"]),
+        ("[prior.bones]\nevery = 4", "person.samples=40", ["bones"]),
+        ("[prior.bones]\nevery = 4\nsamples = 40\n[prior.encode]", "delay=4", ["bones", "encode"]),
+    ],
+)
+def test_former_names_mean_the_new_ones(
+    write, caplog: pytest.LogCaptureFixture, text: str, override: str, former: list[str]
+) -> None:
+    _warn_of_former_name.cache_clear()
+    launch = Launch.read(write(text), [full_key(override, pipeline_sections())])
+    assert PriorSettings.from_dict(launch.table("prior")).person == PersonSettings(samples=40, every=4)
+    warned = [record.getMessage().split()[1] for record in caplog.records]
+    assert sorted(warned) == former, "once each"
+
+
+def test_former_names_elsewhere(write, caplog: pytest.LogCaptureFixture) -> None:
+    _warn_of_former_name.cache_clear()
+    address = "tcp://127.0.0.1:7111"
+    file = write(f"nodes = ['prior']\n[server]\nkiosks = ['{address}']\n[transport]\nlossless = false")
+    assert Launch.read(file).server.clients == [address]
+    assert "[server] kiosks is now called clients" in caplog.text
+    assert Launch.read(file, ["server.clients=[]"]).server.clients == []
+    settings = PriorSettings.from_dict({"bones": {"samples": 40}})
+    assert settings.person.samples == 40
+    with pytest.raises(LaunchError, match="bones is the former name of person: expected one of the two"):
+        Launch.read(write("[prior.bones]\nsamples = 40\n[prior.person]\nsamples = 40"))
+    with pytest.raises(ValueError, match="did you mean 'person'"):
+        PriorSettings.from_dict({"persn": {}})

@@ -41,7 +41,7 @@ def test_two_kiosks_and_a_server(
         launch = make_launch(
             weights,
             nodes='["prior", "trajectory"]',
-            server__kiosks=str([door.endpoint, desk.endpoint]),
+            server__clients=str([door.endpoint, desk.endpoint]),
             transport__lossless="false",
             transport__queue=100,
             transport__keys=tmp_path / "keys" if secret else "",
@@ -84,7 +84,7 @@ def test_two_kiosks_and_a_server(
 )
 def test_what_a_server_cannot_be(make_launch: Callable[..., Launch], settings: dict[str, str], expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
-        make_launch(server__kiosks='["tcp://127.0.0.1:1"]', **({"transport__lossless": "false"} | settings))
+        make_launch(server__clients='["tcp://127.0.0.1:1"]', **({"transport__lossless": "false"} | settings))
 
 
 def test_the_launch_files_belong_together() -> None:

@@ -112,7 +112,7 @@ def test_the_weights_that_ship_find_the_wrist_of_which_the_last_answer_is_repeat
     moving += np.random.default_rng(0).normal(0.0, 0.005, moving.shape)
     frozen = moving.copy()
     frozen[60:, J["left_wrist"]] = moving[59, J["left_wrist"]]
-    gate_off = {"gate": {"enabled": False}, "bones": {"enabled": False}}
+    gate_off = {"gate": {"enabled": False}, "person": {"enabled": False}}
     clean, spoilt = scored(moving, **gate_off)[-1], scored(frozen, **gate_off)[-1]
     assert spoilt.anomaly > clean.anomaly + 1
     assert np.nanargmax(spoilt.joint_anomaly) == J["left_wrist"]
@@ -130,7 +130,7 @@ def test_exchanged_arms_raise_the_flag_which_goes_down_after_they_are_over() -> 
     spoilt = waving(200)
     arms = [J[f"{side}_{n}"] for n in ("elbow", "wrist") for side in ("left", "right")]
     spoilt[60:100, arms] = spoilt[60:100][:, MIRROR[arms]]
-    bodies = scored(spoilt, gate={"enabled": False}, bones={"enabled": False})
+    bodies = scored(spoilt, gate={"enabled": False}, person={"enabled": False})
     flags = np.array([b.anomaly_flag for b in bodies])
     assert not flags[:60].any()
     assert flags[60:90].any()

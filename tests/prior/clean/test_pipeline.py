@@ -67,7 +67,7 @@ def test_a_delay_longer_than_the_mixture_has_learned_is_refused() -> None:
 
 
 def test_with_a_longer_delay_a_frame_keeps_what_it_was_decoded_to_as_the_centre() -> None:
-    settings = {"fuse": {"enabled": False}, "bones": {"enabled": False}, "refine": {"enabled": True}}
+    settings = {"fuse": {"enabled": False}, "person": {"enabled": False}, "refine": {"enabled": True}}
     messages = stream(waving(30))
     centre, late = (clean(messages, delay=delay, **settings)[0] for delay in (4, 10))
     for a, b in list(zip(centre, late, strict=True))[:20]:
@@ -308,7 +308,7 @@ def test_end_of_stream_flushes_and_is_passed_on() -> None:
     assert pipeline.flush() == []
 
 
-@pytest.mark.parametrize(("stage", "enabled"), [("gate", False), ("bones", False), ("refine", True), ("fuse", False)])
+@pytest.mark.parametrize(("stage", "enabled"), [("gate", False), ("person", False), ("refine", True), ("fuse", False)])
 def test_each_stage_can_be_switched(stage: str, enabled: bool) -> None:
     cleaned, _ = clean(stream(noisy(60)), **{stage: {"enabled": enabled}})
     assert np.isfinite(positions(cleaned)).all()
