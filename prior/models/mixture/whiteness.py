@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import medians
 from steadypose.prior.body.skeleton import PARENTS
 
 MEMORY, LEAST = 45, 10
@@ -72,9 +73,7 @@ class Whiteness:
         self._change += share * (np.where(known, change, 0.0) - self._change)
         counts = (self._frames >= LEAST) & (self._variance > STILL**2)
         ratio = np.where(counts, np.minimum(self._change / np.maximum(self._variance, STILL**2), 1.0), np.nan)
-        white = np.zeros(len(positions))
-        some = counts.any(axis=1)
-        white[some] = np.nanmedian(ratio[some], axis=1)
+        white = np.where(counts.any(axis=1), medians(ratio, axis=1), 0.0)
         frames = self._frames.max(axis=1)
         return white * frames / (frames + START)
 

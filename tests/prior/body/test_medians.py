@@ -1,4 +1,4 @@
-"""The checks' medians."""
+"""Medians without what is missing."""
 
 import numpy as np
 import pytest
@@ -12,4 +12,5 @@ def test_medians_are_numpys_without_what_is_missing(count: int) -> None:
     rng = np.random.default_rng(count)
     values = rng.normal(size=(count, 40))
     values[rng.random(values.shape) < rng.random(40)] = np.nan
-    assert np.array_equal(medians(values), np.nanmedian(values, axis=0), equal_nan=True)
+    for axis in (0, 1):
+        assert np.array_equal(medians(values, axis), np.nanmedian(values, axis=axis), equal_nan=True)
