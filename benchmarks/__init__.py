@@ -1,1 +1,1 @@
-"""Benchmarks: protocols, peers, and the last results: ``python -m steadypose.benchmarks.NAME --help``."""
+"""Benchmarks: protocols, baselines, and the last results: ``python -m steadypose.benchmarks.NAME --help``."""

@@ -13,9 +13,9 @@ import numpy as np
 from rich.progress import Progress
 from scipy.stats import qmc
 
-from steadypose.benchmarks import ours
+from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines import recurrent, smoothnet
-from steadypose.benchmarks.baselines.filters import PEERS, Peer
+from steadypose.benchmarks.baselines.filters import BASELINES, Baseline
 from steadypose.benchmarks.motion import MotionClips, prepared_clips, simulated_clips
 from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.settings import PriorSettings
@@ -111,7 +111,7 @@ class Bench:
 
     @property
     def budget(self) -> int:
-        """Evaluations that each peer's search may spend, for each delay."""
+        """Evaluations that each baseline's search may spend, for each delay."""
         return 6 if self.quick else 18
 
     def clips(self, frames: int = 90, most: int = 32) -> MotionClips:
@@ -119,7 +119,7 @@ class Bench:
         return self._motion(self.split, frames, min(most, 12) if self.quick else most)
 
     def training_clips(self) -> MotionClips:
-        """Training motion, of other people, for the peers that learn."""
+        """Training motion, of other people, for the baselines that learn."""
         return self._motion("train", 90, 60 if self.quick else 1000)
 
     def _motion(self, split: str, frames: int, most: int) -> MotionClips:
@@ -159,28 +159,28 @@ class Methods(NamedTuple):
     """What is compared.
 
     Attributes:
-        peers: those without training.
-        ours: steadypose's variants.
+        baselines: those without training.
+        product: steadypose's variants.
         delays: frames.
-        networks: whether the peers that are trained here take part.
+        networks: whether the baselines that are trained here take part.
     """
 
-    peers: Sequence[Peer]
-    ours: Mapping[str, PriorSettings]
+    baselines: Sequence[Baseline]
+    product: Mapping[str, PriorSettings]
     delays: Sequence[int]
     networks: bool = True
 
     @classmethod
-    def all(cls, bench: Bench, peers: Sequence[Peer] = PEERS) -> Methods:
-        """These peers, and every variant of ours."""
-        return cls(peers, ours.OURS, bench.delays)
+    def all(cls, bench: Bench, baselines: Sequence[Baseline] = BASELINES) -> Methods:
+        """These baselines, and every variant of steadypose."""
+        return cls(baselines, product.PRODUCT, bench.delays)
 
 
-def peers_of(peers: Sequence[Peer], delays: Sequence[int]) -> Iterator[tuple[Peer, int]]:
-    """Every peer with every delay that it has."""
-    for peer in peers:
-        for delay in delays if peer.delays is None else peer.delays:
-            yield peer, delay
+def baselines_of(baselines: Sequence[Baseline], delays: Sequence[int]) -> Iterator[tuple[Baseline, int]]:
+    """Every baseline with every delay that it has."""
+    for baseline in baselines:
+        for delay in delays if baseline.delays is None else baseline.delays:
+            yield baseline, delay
 
 
 def answers(
@@ -195,9 +195,9 @@ def answers(
     methods = methods or Methods.all(bench)
     delays = methods.delays
 
-    def by_peer(peer: Peer, delay: int) -> list[Answer]:
-        parameters = tuned[peer.name, delay].parameters
-        return [Answer(peer.name, delay, stamps_s, peer.run(seen, stamps_s, delay, **parameters), parameters)]
+    def by_baseline(baseline: Baseline, delay: int) -> list[Answer]:
+        parameters = tuned[baseline.name, delay].parameters
+        return [Answer(baseline.name, delay, stamps_s, baseline.run(seen, stamps_s, delay, **parameters), parameters)]
 
     def by_network(number: int) -> list[Answer]:
         found = smoothnet.smooth(bench.smoothnets[number], seen, delays)
@@ -210,18 +210,20 @@ def answers(
         found = zip(delays, recurrent.smooth(bench.recurrent, seen), strict=True)
         return [Answer(RECURRENT, delay, stamps_s, positions, {}) for delay, positions in found]
 
-    def by_us(name: str, delay: int) -> list[Answer]:
-        cleaned = ours.run(methods.ours[name], seen, stamps_s, delay)
+    def by_product(name: str, delay: int) -> list[Answer]:
+        cleaned = product.run(methods.product[name], seen, stamps_s, delay)
         return [Answer(name, delay, cleaned.stamps_s, cleaned.positions, {}, cleaned.sigma)]
 
-    jobs: list[Callable[[], list[Answer]]] = [partial(by_peer, *one) for one in peers_of(methods.peers, delays)]
+    jobs: list[Callable[[], list[Answer]]] = [
+        partial(by_baseline, *one) for one in baselines_of(methods.baselines, delays)
+    ]
     if methods.networks:
         jobs += [*(partial(by_network, number) for number in range(len(bench.seeds))), by_recurrent]
     jobs += [
-        partial(by_us, name, delay)
-        for name, settings in methods.ours.items()
+        partial(by_product, name, delay)
+        for name, settings in methods.product.items()
         for delay in delays
-        if ours.available(settings, delay)
+        if product.available(settings, delay)
     ]
     for job in bench.progress.track(jobs, description=title):
         yield from job()
@@ -229,18 +231,18 @@ def answers(
 
 def tune(
     bench: Bench,
-    evaluate: Callable[[Peer, int, Mapping[str, float]], dict[str, float]],
+    evaluate: Callable[[Baseline, int, Mapping[str, float]], dict[str, float]],
     title: str,
-    peers: Sequence[Peer] = PEERS,
+    baselines: Sequence[Baseline] = BASELINES,
     delays: Sequence[int] | None = None,
 ) -> dict[tuple[str, int], Tuned]:
-    """The same search for every peer at every delay; ``evaluate`` gives the figures of a peer's parameters."""
-    every = list(peers_of(peers, bench.delays if delays is None else delays))
+    """The same search for every baseline at every delay; ``evaluate`` gives the figures of a baseline's parameters."""
+    every = list(baselines_of(baselines, bench.delays if delays is None else delays))
     return {
-        (peer.name, delay): search(peer.space, partial(evaluate, peer, delay), bench.budget)
-        for peer, delay in bench.progress.track(every, description=f"tuning: {title}")
-        if peer.space
-    } | {(peer.name, delay): Tuned({}, []) for peer, delay in every if not peer.space}
+        (baseline.name, delay): search(baseline.space, partial(evaluate, baseline, delay), bench.budget)
+        for baseline, delay in bench.progress.track(every, description=f"tuning: {title}")
+        if baseline.space
+    } | {(baseline.name, delay): Tuned({}, []) for baseline, delay in every if not baseline.space}
 
 
 def tuning_log(tuned: Mapping[tuple[str, int], Tuned]) -> list[dict[str, Any]]:

@@ -50,10 +50,10 @@ def curves(
             mine = [r for r in records if r["method"] == method and r.get(x) is not None and r.get(key) is not None]
             points = sorted((r[x], r[key]) for r in mine)
             if points:
-                ours = method.startswith(("steadypose", "HM-VAE"))
+                own = method.startswith(("steadypose", "HM-VAE"))
                 axis.plot(
                     *zip(*points, strict=True), label=method, color=COLOURS.get(method), marker="o", ms=4,
-                    lw=2.2 if ours else 1.2, zorder=3 if ours else 2,
+                    lw=2.2 if own else 1.2, zorder=3 if own else 2,
                 )  # fmt: skip
         axis.set(xlabel=label, ylabel=text)
         if log:

@@ -32,7 +32,7 @@ CLEAN = ("pose/clean", "mixture weights", "occlusion weights", "hgvae weights", 
 """What `pose/clean` depends on with default settings, of what `ships`."""
 
 VARIANTS = (*CLEAN, "pose/clean, HM-VAE", "hmvae weights")
-"""The same of all variants of `benchmarks.ours`: one refines with HM-VAE, which the default does not."""
+"""The same of all variants of `benchmarks.product`: one refines with HM-VAE, which the default does not."""
 
 WORLD = (*CLEAN, "pose/world", "contacts weights", "trajectory weights")
 """What `pose/world` depends on."""

@@ -1,8 +1,8 @@
-"""Filters that are freely available, as peers.
+"""Filters that are freely available, as baselines.
 
-A peer takes clips side by side, (T, ..., 3) metres with NaN where a joint is missing, and their stamps, and gives each
-frame's answer as it stands ``delay`` frames later; at the end of a clip, with the frames there are. All use the real
-time between frames, where time enters at all.
+A baseline takes clips side by side, (T, ..., 3) metres with NaN where a joint is missing, and their stamps, and gives
+each frame's estimate as it stands ``delay`` frames later; at the end of a clip, with the frames there are. All use the
+real time between frames, where time enters at all.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MEASUREMENT_SIGMA = 0.02  # metres, as `fixed_lag` has it
 
 
 @dataclass(frozen=True)
-class Peer:
+class Baseline:
     """A method and the range of its parameters.
 
     Attributes:
@@ -154,23 +154,27 @@ def butterworth(seen: Floats, stamps_s: Floats, delay: int, cutoff_hz: float) ->
     return answers
 
 
-PEERS: tuple[Peer, ...] = (
-    Peer("raw", raw, (0,)),
-    Peer("hold last", hold_last, (0,)),
-    Peer("held beside the body", beside, (0,)),
-    Peer("linear interpolation", interpolate),
-    Peer("One-Euro", one_euro, (0,), {"min_cutoff_hz": (0.1, 10.0), "beta": (0.05, 30.0)}),
-    Peer("Kalman, constant velocity", constant_velocity, None, {"density": (0.002, 50.0)}),
-    Peer("Kalman, a density a joint", constant_velocity_by_joint, None, {"density": (0.002, 50.0)}, whole_body=True),
-    Peer("Kalman, constant acceleration", constant_acceleration, None, {"density": (0.05, 5e4)}),
-    Peer("Gaussian + Hampel", gaussian_hampel, None, {"sigma_s": (0.01, 0.4), "threshold": (2.0, 12.0)}),
-    Peer("bank of smoothers", bank),
-    Peer("whole-body bank", whole_body_bank, whole_body=True),
-    Peer("Butterworth, offline", butterworth, (OFFLINE,), {"cutoff_hz": (0.5, 12.0)}),
+BASELINES: tuple[Baseline, ...] = (
+    Baseline("raw", raw, (0,)),
+    Baseline("hold last", hold_last, (0,)),
+    Baseline("held beside the body", beside, (0,)),
+    Baseline("linear interpolation", interpolate),
+    Baseline("One-Euro", one_euro, (0,), {"min_cutoff_hz": (0.1, 10.0), "beta": (0.05, 30.0)}),
+    Baseline("Kalman, constant velocity", constant_velocity, None, {"density": (0.002, 50.0)}),
+    Baseline(
+        "Kalman, a density a joint", constant_velocity_by_joint, None, {"density": (0.002, 50.0)}, whole_body=True
+    ),
+    Baseline("Kalman, constant acceleration", constant_acceleration, None, {"density": (0.05, 5e4)}),
+    Baseline("Gaussian + Hampel", gaussian_hampel, None, {"sigma_s": (0.01, 0.4), "threshold": (2.0, 12.0)}),
+    Baseline("bank of smoothers", bank),
+    Baseline("whole-body bank", whole_body_bank, whole_body=True),
+    Baseline("Butterworth, offline", butterworth, (OFFLINE,), {"cutoff_hz": (0.5, 12.0)}),
 )
 """Those without training. With a delay, a Kalman filter is the fixed-lag RTS smoother of its model."""
 
-FILTERS: tuple[Peer, ...] = tuple(peer for peer in PEERS if peer.run not in (hold_last, interpolate, beside))
+FILTERS: tuple[Baseline, ...] = tuple(
+    baseline for baseline in BASELINES if baseline.run not in (hold_last, interpolate, beside)
+)
 """Where every joint is always given, there are no gaps to fill."""
 
 

@@ -1,4 +1,4 @@
-"""Peers of completion: fill gaps, or hidden parts of a body, without a network.
+"""Baselines of completion: fill gaps, or hidden parts of a body, without a network.
 
 Each returns local rotations and the root of whole windows, as `prior.complete.body.Fill`.
 """

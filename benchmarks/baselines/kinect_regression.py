@@ -1,4 +1,4 @@
-"""Peers that learn a Kinect's error from recordings with a reference, trained in seconds.
+"""Baselines that learn a Kinect's error from recordings with a reference, trained in seconds.
 
 Both read poses in the frame of the trunk, smoothed by a constant-velocity Kalman filter, and predict a correction of
 the 13 scored joints of that smoother: a ridge regression on one frame (66 inputs), and a temporal convolution over 24

@@ -1,8 +1,8 @@
-"""A whole-body denoiser as a peer: a recurrent network over all joints at once, causal, trained like the others.
+"""A whole-body denoiser as a baseline: a recurrent network over all joints at once, causal, trained like the others.
 
 A GRU of 256 units sees the joints about the last pelvis, in the frame of the last hips, those missing held; which are
 missing; and what each moved since the frame before. It gives what to add to the held joint of each frame that a delay
-asks for. Spoiled motion is that of the SmoothNet-style peer, turned about the vertical at random, and mirrored.
+asks for. Corrupted motion is that of the SmoothNet-style baseline, turned about the vertical at random, and mirrored.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from steadypose.benchmarks.baselines.filters import hold_last, missing
-from steadypose.benchmarks.baselines.smoothnet import spoil
+from steadypose.benchmarks.baselines.smoothnet import corrupt
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, J
@@ -58,7 +58,7 @@ def train(
     seed: int,
     track: Callable[[Iterable[int]], Iterable[int]] = lambda x: x,
 ) -> RecurrentDenoiser:
-    """Train on clips spoiled anew in every step."""
+    """Train on clips corrupted anew in every step."""
     torch.manual_seed(seed)
     rng = np.random.default_rng((seed, 1))
     net = RecurrentDenoiser(delays)
@@ -70,7 +70,7 @@ def train(
         rows = rng.integers(frames - length, endpoint=True, size=_BATCH) + np.arange(length)[:, None]
         truth = _turned(motion.positions[rows, rng.integers(clips, size=_BATCH)], rng)
         wanted = net.at_delay(_batch_first(truth))
-        error = net(*_inputs(spoil(truth, rng))) - wanted
+        error = net(*_inputs(corrupt(truth, rng))) - wanted
         loss = error.abs().mean() + error.diff(n=2, dim=1).abs().mean()
         optimiser.zero_grad()
         loss.backward()

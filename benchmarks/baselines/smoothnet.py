@@ -1,9 +1,9 @@
-"""A SmoothNet-style peer: a small network along time alone, the same for every coordinate of every joint.
+"""A SmoothNet-style baseline: a small network along time alone, the same for every coordinate of every joint.
 
 After Zeng et al., "SmoothNet: A Plug-and-Play Network for Refining Human Poses in Videos", ECCV 2022: fully connected
 residual blocks over a window of 32 frames, losses on positions and accelerations. Here it also sees which frames a
-joint was missing in, and is trained on this project's motion spoiled in the ways of the protocols. One training serves
-every delay: of the 32 frames that a window gives, a delay of k keeps the one k before the newest.
+joint was missing in, and is trained on this project's motion, corrupted as the protocols do. One training serves every
+delay: of the 32 frames that a window gives, a delay of k keeps the one k before the newest.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class SmoothNet(nn.Module):
 def train(
     motion: MotionClips, steps: int, seed: int, track: Callable[[Iterable[int]], Iterable[int]] = lambda x: x
 ) -> SmoothNet:
-    """Train on clips spoiled anew in every step."""
+    """Train on clips corrupted anew in every step."""
     torch.manual_seed(seed)
     rng = np.random.default_rng((seed, 1))
     net = SmoothNet()
@@ -59,7 +59,7 @@ def train(
     for _ in track(range(steps)):
         rows = rng.integers(frames - WINDOW, endpoint=True, size=_BATCH) + np.arange(WINDOW)[:, None]
         truth = motion.positions[rows, rng.integers(clips, size=_BATCH)]
-        held, gone = _inputs(spoil(truth, rng))
+        held, gone = _inputs(corrupt(truth, rng))
         wanted = torch.from_numpy(np.moveaxis(truth, 0, -1)).float()
         answer = net(held, gone)
         position = (answer - wanted).abs().mean()
@@ -94,7 +94,7 @@ def _inputs(seen: Floats) -> tuple[Tensor, Tensor]:
     return tuple(torch.from_numpy(np.moveaxis(x, 0, -1)).float().contiguous() for x in (held, gone))  # type: ignore[return-value]
 
 
-def spoil(truth: Floats, rng: np.random.Generator) -> Floats:
+def corrupt(truth: Floats, rng: np.random.Generator) -> Floats:
     """Each window with a noise of its own, (T, B, 22, 3): 0.5 to 8 cm, independent or correlated; spikes in a third
     of them; in half, a limb away, but never from the start."""
     size = np.exp(rng.uniform(np.log(0.005), np.log(0.08), truth.shape[1]))[:, None, None]

@@ -18,7 +18,7 @@ from unittest import mock
 
 import numpy as np
 
-from steadypose.benchmarks import ours
+from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines.filters import missing
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated
@@ -28,7 +28,7 @@ from steadypose.benchmarks.provenance import VARIANTS, WORLD
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import score
 from steadypose.benchmarks.studies import hidden_joints, noisy_joints
-from steadypose.benchmarks.studies.spoiled import Condition
+from steadypose.benchmarks.studies.corrupted import Condition
 from steadypose.benchmarks.studies.world import chain, measure
 from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.bones import PersonSettings
@@ -103,12 +103,12 @@ def run(bench: Bench) -> Result:
     clips = bench.clips(FRAMES, 4 if bench.quick else CLIPS)
     cost = costs(clips)
     records: list[dict[str, Any]] = []
-    for number, (condition, spoil) in enumerate(CONDITIONS.items()):
-        seen = spoil(clips.positions, np.random.default_rng(number))
+    for number, (condition, corrupt) in enumerate(CONDITIONS.items()):
+        seen = corrupt(clips.positions, np.random.default_rng(number))
         hidden = missing(seen)
         for name, part in bench.progress.track(PARTS.items(), description=condition):
             with part.replaced():
-                answer = ours.run(part.settings, seen, clips.stamps_s, DELAY).positions
+                answer = product.run(part.settings, seen, clips.stamps_s, DELAY).positions
             found = score(answer, clips.positions, hidden, align=False)
             errors = found.hidden if hidden.any() else found.position
             records.append(_record(condition, name, errors, found.acceleration_error))
@@ -142,7 +142,7 @@ def costs(clips: MotionClips) -> dict[str, float]:
 
     def frames(part: Part) -> Floats:
         with part.replaced():
-            return _laps(ours.stream(PriorPipeline(replace(part.settings, delay=DELAY)), seen, clips.stamps_s))
+            return _laps(product.stream(PriorPipeline(replace(part.settings, delay=DELAY)), seen, clips.stamps_s))
 
     return _least({name: partial(frames, part) for name, part in PARTS.items()})
 
@@ -151,7 +151,7 @@ def world_costs(clips: MotionClips) -> dict[str, float]:
     """The same of `PARTS_OF_THE_WORLD`, without what the prior before it takes."""
     seen = hidden_joints.CONDITIONS["arm never"](clips.positions[:, :1], np.random.default_rng(0))
     prior = PriorPipeline(PriorSettings(delay=DELAY))
-    messages = list(ours.stream(prior, seen, clips.stamps_s, calibrated=True))
+    messages = list(product.stream(prior, seen, clips.stamps_s, calibrated=True))
 
     def frames(settings: TrajectorySettings) -> Floats:
         trajectory = TrajectoryPipeline(settings)

@@ -1,6 +1,6 @@
 """Parts of the body that are hidden for a whole window, from the rest: legs, arms, all but a few joints.
 
-Peers are the mean pose, the conditional mean of one Gaussian over training poses (with the true heading of every
+Baselines are the mean pose, the conditional mean of one Gaussian over training poses (with the true heading of every
 frame), the nearest training window, and HG-VAE's completion, which the live node uses. Joints are compared about the
 root, which is known; windows are of 50 frames, as HG-VAE's.
 """
@@ -100,14 +100,14 @@ def run(bench: Bench) -> Result:
     ratios = [
         {
             "hidden": part,
-            "peer": peer,
-            "ratio": [round(v, 3) for v in ratio(errors[part, _NETWORK], errors[part, peer], clips.person)[:3]],
+            "baseline": baseline,
+            "ratio": [round(v, 3) for v in ratio(errors[part, _NETWORK], errors[part, baseline], clips.person)[:3]],
         }
         for part in HIDDEN
-        for peer in methods
-        if peer != _NETWORK
+        for baseline in methods
+        if baseline != _NETWORK
     ]
-    data = {"data": clips.source, "records": records, "completer over peer": ratios}
+    data = {"data": clips.source, "records": records, "completer over baseline": ratios}
     return Result([_table(records, ratios, len(clips.offsets))], data)
 
 
@@ -137,7 +137,7 @@ def by_hgvae(model: HGVAE, given: Floats, offsets: Floats) -> Floats:
 def _table(records: list[dict[str, Any]], ratios: list[dict[str, Any]], clips: int) -> Table:
     methods = list(dict.fromkeys(r["method"] for r in records))
     found = {(r["hidden"], r["method"]): r for r in records}
-    share = {(r["hidden"], r["peer"]): f"{r['ratio'][0]:.2f}" for r in ratios}
+    share = {(r["hidden"], r["baseline"]): f"{r['ratio'][0]:.2f}" for r in ratios}
     rows = [
         [
             part,

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks import figures as pictures
-from steadypose.benchmarks.baselines.filters import FILTERS, Peer
+from steadypose.benchmarks.baselines.filters import FILTERS, Baseline
 from steadypose.benchmarks.bench import Answer, Bench, Methods, answers, tune, tuning_log
 from steadypose.benchmarks.corruption import along_sight, gaussian
 from steadypose.benchmarks.metrics import acceleration_error, position_error, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
-from steadypose.benchmarks.ours import OURS
+from steadypose.benchmarks.product import PRODUCT
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import pivot, source_table
@@ -86,7 +86,7 @@ def _noise_name(level: float) -> str:
 
 def methods(bench: Bench) -> Methods:
     """Filters, and what ships; the other variants are in the other protocols."""
-    return Methods(FILTERS, {"steadypose": OURS["steadypose"]}, (0, 4) if bench.quick else DELAYS, networks=False)
+    return Methods(FILTERS, {"steadypose": PRODUCT["steadypose"]}, (0, 4) if bench.quick else DELAYS, networks=False)
 
 
 def run(bench: Bench) -> Result:
@@ -96,8 +96,8 @@ def run(bench: Bench) -> Result:
     truth = clips.positions - (middle + CAMERA)[:, None]
     speed = np.linalg.norm(np.gradient(truth, 1 / FPS, axis=0), axis=-1)
     compared, records, tried = methods(bench), [], {}
-    for number, (name, spoil) in enumerate(conditions(bench.quick).items()):
-        answered, tried[name] = _answered(bench, compared, truth, spoil, number, name)
+    for number, (name, corrupt) in enumerate(conditions(bench.quick).items()):
+        answered, tried[name] = _answered(bench, compared, truth, corrupt, number, name)
         records += [
             {"condition": name, **_by_speed(answer, truth, speed), **_by_clip(answer, truth)} for answer in answered
         ]
@@ -114,20 +114,20 @@ def _answered(
     bench: Bench,
     compared: Methods,
     truth: Floats,
-    spoil: Callable[[Floats, np.random.Generator], Floats],
+    corrupt: Callable[[Floats, np.random.Generator], Floats],
     number: int,
     title: str,
 ) -> tuple[list[Answer], list[dict[str, Any]]]:
-    """All methods, peers tuned on every third clip with other noise; and what was tried."""
+    """All methods, baselines tuned on every third clip with other noise; and what was tried."""
     stamps = np.arange(len(truth)) / FPS
     some = truth[:, ::3]
-    tuning_seen = spoil(some, np.random.default_rng((number, 1)))
+    tuning_observed = corrupt(some, np.random.default_rng((number, 1)))
 
-    def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
-        return _errors(peer.run(tuning_seen, stamps, delay, **parameters), some)
+    def evaluate(baseline: Baseline, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
+        return _errors(baseline.run(tuning_observed, stamps, delay, **parameters), some)
 
-    tuned = tune(bench, evaluate, title, compared.peers, compared.delays)
-    seen = spoil(truth, np.random.default_rng((number, 0)))
+    tuned = tune(bench, evaluate, title, compared.baselines, compared.delays)
+    seen = corrupt(truth, np.random.default_rng((number, 0)))
     return list(answers(bench, seen, stamps, tuned, title, compared)), tuning_log(tuned)
 
 
@@ -229,7 +229,7 @@ def _tables(
 ) -> list[Table]:
     note = (
         f"{len(clips.offsets)} clips of {FRAMES} frames of the {bench.split} split, by the true speed of the joint. "
-        "Peers tuned for each noise and delay on every third of these clips with other noise; the banks have no "
+        "Baselines tuned for each noise and delay on every third of these clips with other noise; the banks have no "
         "setting. Best filter: the tuned one of the least error in that very cell, of at most that delay."
     )
     tables = [_summary_table(records, note), *(_source_table(records, delay, clips) for delay in SUMMARISED)]
@@ -291,7 +291,7 @@ def _source_table(records: Sequence[Mapping[str, Any]], delay: int, clips: Motio
 
 
 def _speed_table(records: Sequence[Mapping[str, Any]], delay: int, note: str) -> Table:
-    """Raw, the best tuned filter, the banks and ours, by noise and speed."""
+    """Raw, the best tuned filter, the banks and steadypose, by noise and speed."""
     bins = list(dict.fromkeys(name for record in records for name in record["by_speed"]))
     rows: list[list[str]] = []
     for condition in dict.fromkeys(record["condition"] for record in records):

@@ -52,8 +52,8 @@ def anomalies(bench: Bench, model: HGVAE, motion: MotionSet) -> Result:
             if name == HELD:
                 seen, holds = held(with_sensor_error(other, sigma, rng), other, rng)
             else:
-                spoilt, holds = fault(other, rng)
-                seen = with_sensor_error(spoilt, sigma, rng)
+                corrupted, holds = fault(other, rng)
+                seen = with_sensor_error(corrupted, sigma, rng)
             seen = seen[holds]
             loud = score_windows(network, model, seen, other_sizes[holds], sigma).odds.max(axis=1)
             paper = -_paper_score(model, seen, other_sizes[holds])
@@ -75,10 +75,10 @@ def anomalies(bench: Bench, model: HGVAE, motion: MotionSet) -> Result:
     tables = [
         Table(
             "hgvae-anomaly", "HG-VAE: area under the ROC curve, by fault",
-            ["fault", f"ours, {first}", f"ours, {second}", f"log p(z given x), {first}", f"log p(z given x), {second}"],
+            ["fault", *(f"{method}, {s}" for method in ("steadypose", "log p(z given x)") for s in (first, second))],
             [[name, *(f"{by[name, s]['auroc']:.3f}" for s in SENSORS),
               *(f"{by[name, s]['auroc_paper']:.3f}" for s in SENSORS)] for name in FAULTS],
-            f"{count} clean windows of validation people against as many spoilt ones, both as a sensor of that error "
+            f"{count} clean windows of validation people against as many corrupted ones, as a sensor of that error "
             "sees them; a joint counts as frozen, and a limb as exchanged, only where it is 10 cm off then. A frozen "
             "joint repeats what was last seen; one at rest stays where it was, under the sensor's noise. Last two "
             "columns: the paper's score.",

@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from steadypose.benchmarks import figures
 from steadypose.benchmarks.baselines.body import ConditionalGaussian, beside
-from steadypose.benchmarks.baselines.filters import PEERS, Peer
+from steadypose.benchmarks.baselines.filters import BASELINES, Baseline
 from steadypose.benchmarks.baselines.whole_body_kalman import whole_body_kalman
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
-from steadypose.benchmarks.ours import OURS
+from steadypose.benchmarks.product import PRODUCT
 from steadypose.benchmarks.provenance import VARIANTS
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import pivot
-from steadypose.benchmarks.studies.spoiled import (
+from steadypose.benchmarks.studies.corrupted import (
     HOW,
     Condition,
     by_source,
@@ -88,12 +88,12 @@ def run(bench: Bench) -> Result:
     clips = bench.clips()
     kept = ("arm behind", "0.5 s") if bench.quick else tuple(CONDITIONS)
     gaussian = ConditionalGaussian(bench.training_clips().positions.reshape(-1, 22, 3))
-    peers = (
-        *PEERS,
-        Peer(GAUSSIAN, partial(given_the_seen, gaussian=gaussian), (0,)),
-        Peer(FILTER, whole_body_kalman, (0,), {"density": (0.1, 50.0), "damping": (1.0, 30.0)}, whole_body=True),
+    baselines = (
+        *BASELINES,
+        Baseline(GAUSSIAN, partial(given_the_seen, gaussian=gaussian), (0,)),
+        Baseline(FILTER, whole_body_kalman, (0,), {"density": (0.1, 50.0), "damping": (1.0, 30.0)}, whole_body=True),
     )
-    data = run_conditions(bench, clips, {name: CONDITIONS[name] for name in kept}, peers)
+    data = run_conditions(bench, clips, {name: CONDITIONS[name] for name in kept}, baselines)
     records = data["records"]
     note = (
         f"{clips.positions.shape[1]} clips of {len(clips.positions)} frames, 22 joints, 1 cm of noise on those seen; "
@@ -137,7 +137,7 @@ def given_the_seen(seen: Floats, stamps_s: Floats, delay: int, gaussian: Conditi
 
 
 def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
-    """The peer nearest to the truth that does not know the body, those that do, and ours: hidden joints, mm."""
+    """Hidden joints, mm: the nearest baseline that does not know the body, those that do, and steadypose."""
     conditions = list(dict.fromkeys(r["condition"] for r in records))
     rows: list[list[str]] = []
     for delay in (0, 4):
@@ -146,7 +146,7 @@ def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
             for condition in conditions:
                 mine = [r for r in records if r["condition"] == condition and 0 <= r["delay"] <= delay]
                 if name == "best filter":
-                    mine = [r for r in mine if r["method"] not in (*OURS, *KNOW_THE_BODY)]
+                    mine = [r for r in mine if r["method"] not in (*PRODUCT, *KNOW_THE_BODY)]
                 else:
                     mine = [r for r in mine if r["method"] == name and r["delay"] in (delay, 0)][-1:]
                 found = [r["hidden_mm"] for r in mine if "hidden_mm" in r]  # raw has no answer

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steadypose.benchmarks import ours
+from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines.banks import bank
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_set
@@ -28,6 +28,7 @@ from steadypose.benchmarks.studies.humor_fits import (
     NOISE,
     Answer,
     camera_settings,
+    corrupted,
     credit,
     credit_table,
     fitted,
@@ -35,7 +36,6 @@ from steadypose.benchmarks.studies.humor_fits import (
     pictures,
     scores,
     seen_joints,
-    spoiled,
     start_of,
 )
 from steadypose.prior.arrays import Floats
@@ -222,7 +222,7 @@ def run(bench: Bench) -> Result:
 def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hide: bool) -> list[dict[str, Any]]:
     """Table 2: all joints with noise; or with ``hide``, without noise, those below `HIDDEN_BELOW` hidden."""
     truth = clips.positions
-    seen = spoiled(truth, *((0.0, HIDDEN_BELOW) if hide else (NOISE, 0.0)), seed=0)
+    seen = corrupted(truth, *((0.0, HIDDEN_BELOW) if hide else (NOISE, 0.0)), seed=0)
     live = {delay: _live(clips, seen, delay) for delay in (4, DELAY)}
     answers: dict[str, list[Answer]] = {
         _TRUTH: _each(truth),
@@ -240,7 +240,7 @@ def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hide: bo
 
 def _live(clips: MotionClips, seen: Floats, delay: int) -> Floats:
     """What `clean` says of clips (T, C, 22, 3) as they come in."""
-    return ours.run(ours.OURS["steadypose"], seen, clips.stamps_s, delay).positions[-FRAMES:]
+    return product.run(product.PRODUCT["steadypose"], seen, clips.stamps_s, delay).positions[-FRAMES:]
 
 
 def _fits(models: dict[str, Any], name: str, start: Floats, seen: Floats) -> list[Answer]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from steadypose.benchmarks import ours
+from steadypose.benchmarks import product
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.intervals import interval
 from steadypose.benchmarks.metrics import acceleration_error, position_error
@@ -213,10 +213,10 @@ def credit(bench: Bench, model: HumorNet, clips: MotionClips) -> list[dict[str, 
     """A record for each condition and variant: millimetres a person, and what it adds to the fit as it ships."""
     records = []
     for condition, (noise, below) in CONDITIONS.items():
-        seen, tuning = (spoiled(clips.positions, noise, below, seed) for seed in (0, 1))
+        seen, tuning = (corrupted(clips.positions, noise, below, seed) for seed in (0, 1))
         some = range(0, len(clips.offsets), 3)
         starts, tuning_starts = (
-            ours.run(ours.OURS["steadypose"], one, clips.stamps_s, DELAY).positions[-len(one) :]
+            product.run(product.PRODUCT["steadypose"], one, clips.stamps_s, DELAY).positions[-len(one) :]
             for one in (seen, tuning)
         )
         stage_2 = min(
@@ -245,7 +245,7 @@ def credit(bench: Bench, model: HumorNet, clips: MotionClips) -> list[dict[str, 
     return records
 
 
-def spoiled(truth: Floats, noise: float, below: float, seed: int) -> Floats:
+def corrupted(truth: Floats, noise: float, below: float, seed: int) -> Floats:
     """(T, C, 22, 3) with noise, metres, and NaN where truth is lower than ``below``, metres."""
     seen = truth + noise * np.random.default_rng(seed).standard_normal(truth.shape)
     seen[truth[..., 2] < below] = np.nan

@@ -1,4 +1,4 @@
-"""What is compared on a Kinect: filters, peers that learn, and ours, each for the person who is left out."""
+"""What is compared on a Kinect: filters, baselines that learn, and steadypose, each for the person who is left out."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.benchmarks import ours
+from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines import kinect_regression, smoothnet
-from steadypose.benchmarks.baselines.filters import FILTERS, Peer
+from steadypose.benchmarks.baselines.filters import FILTERS, Baseline
 from steadypose.benchmarks.bench import Bench, Tuned, loss, tune
 from steadypose.benchmarks.motion import digest
 from steadypose.benchmarks.provenance import ROOT
@@ -49,7 +49,7 @@ class Method:
     Attributes:
         name: in tables.
         delay: frames.
-        run: clips to (T, 13, 3) metres each, and what ours states of them.
+        run: clips to (T, 13, 3) metres each, and what steadypose states of them.
         parameters: found by tuning.
     """
 
@@ -80,7 +80,7 @@ def run_ours(clips: Sequence[Clip], settings: PriorSettings, delay: int) -> tupl
     absence and not with the stream (0.05 mm of a clip's mean, up to 4 mm in its last frame).
     """
     batch = side_by_side([clip.kinect for clip in clips])
-    cleaned = ours.run(settings, batch, np.arange(len(batch)) / FPS, delay, "kinect22")
+    cleaned = product.run(settings, batch, np.arange(len(batch)) / FPS, delay, "kinect22")
     scored = [J[name] for name in SCORED]
     positions, sigma = cleaned.positions[:, :, scored], cleaned.sigma[:, :, scored]
     lengths = [len(clip.kinect) for clip in clips]
@@ -98,7 +98,7 @@ class Kinect:
         bench: where this runs.
         data: ``ui_prmd.npz``.
         clips: of all people.
-        taught: of all people, the clips that peers learn from.
+        taught: of all people, the clips that baselines learn from.
     """
 
     bench: Bench
@@ -111,9 +111,13 @@ class Kinect:
         """One parameter search for each filter and delay on the clips of all people, with figures for each subject."""
         groups = {subject: [c for c in on if c.subject == subject] for subject in dict.fromkeys(c.subject for c in on)}
 
-        def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
+        def evaluate(baseline: Baseline, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
             answers = dict(
-                zip((c.name for c in on), run_filter(on, _at(peer, delay, parameters), peer.whole_body), strict=True)
+                zip(
+                    (c.name for c in on),
+                    run_filter(on, _at(baseline, delay, parameters), baseline.whole_body),
+                    strict=True,
+                )
             )
             found = {s: quick_score(some, [answers[c.name] for c in some]) for s, some in groups.items()}
             figures = {f"{s} {key}": value for s, some in found.items() for key, value in some.items()}
@@ -125,11 +129,11 @@ class Kinect:
         """All methods, tuned and trained without this person."""
         densities: dict[int, float] = {}
         for (name, delay), search in tuned.items():
-            peer = next(p for p in FILTERS if p.name == name)
-            parameters = best_without(left_out, search, peer)
+            baseline = next(p for p in FILTERS if p.name == name)
+            parameters = best_without(left_out, search, baseline)
             if name == "Kalman, constant velocity":
                 densities[delay] = parameters["density"]
-            run = partial(_filtered, run=_at(peer, delay, parameters), whole_body=peer.whole_body)
+            run = partial(_filtered, run=_at(baseline, delay, parameters), whole_body=baseline.whole_body)
             yield Method(
                 name, delay, partial(self._once, name=(name, delay, *parameters.values()), run=run), parameters
             )
@@ -178,7 +182,7 @@ class Kinect:
         return [own for own, _ in found], told or None
 
 
-def best_without(left_out: str, search: Tuned, peer: Peer) -> dict[str, float]:
+def best_without(left_out: str, search: Tuned, baseline: Baseline) -> dict[str, float]:
     """Of the points that a search tried, the parameters that are best for the others."""
     if not search.tried:
         return search.parameters
@@ -189,11 +193,11 @@ def best_without(left_out: str, search: Tuned, peer: Peer) -> dict[str, float]:
         return loss({key: float(np.mean([v for k, v in others.items() if k.endswith(key)])) for key in keys})
 
     winner = min(search.tried, key=of_others)
-    return {name: winner[name] for name in peer.space}
+    return {name: winner[name] for name in baseline.space}
 
 
 class Learners:
-    """The peers that learn from the Kinect beside Vicon; their clips, smoothed once for each delay."""
+    """The baselines that learn from the Kinect beside Vicon; their clips, smoothed once for each delay."""
 
     def __init__(self, clips: Sequence[Clip], densities: Mapping[int, float], steps: int) -> None:
         self._densities, self._steps = densities, steps
@@ -223,8 +227,8 @@ class Learners:
         return kinect_regression.smoothed([clip.kinect for clip in clips], scored, delay, ahead, self._densities[delay])
 
 
-def _at(peer: Peer, delay: int, parameters: Mapping[str, float]) -> Callable[[Floats, Floats], Floats]:
-    return partial(peer.run, delay=delay, **parameters)
+def _at(baseline: Baseline, delay: int, parameters: Mapping[str, float]) -> Callable[[Floats, Floats], Floats]:
+    return partial(baseline.run, delay=delay, **parameters)
 
 
 def _by_network(seen: Floats, stamps_s: Floats, net: smoothnet.SmoothNet, delay: int) -> Floats:

@@ -4,13 +4,13 @@ Protocol, the same for every method. The Kinect's 22 joints at 30 Hz go in; 13 j
 elbows, wrists, hips, knees, ankles) against the Vicon's joint centres (`prior.mocap.plug_in_gait`). Each clip is
 aligned by one rotation and one translation. Then a constant offset a joint, in the frame of the trunk that hips and
 shoulders span, is added: two systems do not mean the same point by "hip". For each of the eight people, each method's
-offset is learned on its own output on the others, peers are tuned and trained on the others, and so is the correction
-of "sensor known". At a delay of k frames a frame is answered with k later ones known; at the end of a clip, with those
-there are.
+offset is learned on its own output on the others, and so are the parameters of baselines and the correction of "sensor
+known". At a delay of k frames a frame is estimated with k later ones known; at the end of a clip, with those there are.
 
 Of the networks that ship, the smoother's mixture was trained on what the Kinect made of s01 to s06, beside the Vicon,
 and chosen on s07 and s08; the others have seen the Vicon's motion of s01 to s06. So "each person left out" holds for
-offsets, peers and the correction, not for our smoother: its rows flatter it by what people it was fitted to are worth.
+offsets, baselines and the correction, not for steadypose's smoother: its rows flatter it by what people it was fitted
+to are worth.
 
 s01's two systems are out of step: its column stands, no mean counts it. More than half of a method's error here is a
 constant that differs between persons and definitions of a joint, which none can know: the second figure of position,
@@ -168,7 +168,7 @@ def _ratios(
     """Errors by those of the best filter up to this delay (least sum of errors) and of the temporal convolution at it:
     with their intervals over all clips in step, and position for each person."""
     kept = in_step(clips)
-    names = {peer.name for peer in FILTERS}
+    names = {baseline.name for baseline in FILTERS}
     filters = {k: s for k, s in scored.items() if k[0] in names and OFFLINE < k[1] <= delay}
 
     def both(scores: Scores) -> float:

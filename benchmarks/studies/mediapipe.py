@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from steadypose.benchmarks.baselines.filters import FILTERS, Peer
+from steadypose.benchmarks.baselines.filters import FILTERS, Baseline
 from steadypose.benchmarks.bench import Answer, Bench, Methods, answers, tune, tuning_log
 from steadypose.benchmarks.metrics import acceleration_error, position_error
-from steadypose.benchmarks.ours import OURS
+from steadypose.benchmarks.product import PRODUCT
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Result
 from steadypose.benchmarks.scores import pivot
@@ -78,13 +78,13 @@ def run(bench: Bench) -> Result:
     streams = read_streams(bench.mocap / "mediapipe_pose.npz")
     seen = side_by_side([stream.seen for stream in streams])
     stamps = np.arange(len(seen)) / FPS
-    methods = Methods(FILTERS, {"steadypose": OURS["steadypose"]}, bench.delays)
+    methods = Methods(FILTERS, {"steadypose": PRODUCT["steadypose"]}, bench.delays)
 
-    def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
-        answer = peer.run(seen, stamps, delay, **parameters)
+    def evaluate(baseline: Baseline, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
+        answer = baseline.run(seen, stamps, delay, **parameters)
         return _mean([error_of(answer[: len(s.seen), c], s) for c, s in enumerate(streams)])
 
-    tuned = tune(bench, evaluate, "MediaPipe", methods.peers, methods.delays)
+    tuned = tune(bench, evaluate, "MediaPipe", methods.baselines, methods.delays)
     records = [
         record
         for answer in answers(bench, seen, stamps, tuned, "MediaPipe", methods)
@@ -93,7 +93,7 @@ def run(bench: Bench) -> Result:
     note = (
         f"{len(streams)} streams of {len(streams[0].seen)} frames, one person, relative to the hips' middle, one "
         f"rotation and a constant offset a joint; in {EXCHANGED} a third of the frames have left and right exchanged. "
-        "Peers are tuned on these very streams. For validation: the reference shares MediaPipe's idea of a joint."
+        "Baselines are tuned on these very streams. For validation: the reference shares MediaPipe's idea of a joint."
     )
     tables = [
         pivot(records, "camera", "position_mm", "mediapipe", "MediaPipe beside four cameras: position error, mm", note),

@@ -17,7 +17,7 @@ from steadypose.benchmarks.corruption import correlated, gaussian, spiked, swapp
 from steadypose.benchmarks.provenance import VARIANTS
 from steadypose.benchmarks.results import Result
 from steadypose.benchmarks.scores import pivot
-from steadypose.benchmarks.studies.spoiled import (
+from steadypose.benchmarks.studies.corrupted import (
     HOW,
     Condition,
     by_source,

@@ -11,16 +11,16 @@ pelvis, against the mean of hips and shoulders the trunk's, which `hips and shou
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from steadypose.benchmarks import ours
+from steadypose.benchmarks import product
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated, gaussian
 from steadypose.benchmarks.intervals import Interval, ratio
@@ -148,11 +148,11 @@ DEPENDS_ON = VARIANTS
 DELAY = PriorSettings().delay
 LASTING_S = 0.5
 """Seconds in which the correlation of noise that lasts falls to 1 / e."""
-PERFECT, AIMED, OURS = "none", "aimed bones", "steadypose"
+PERFECT, AIMED, STEADYPOSE = "none", "aimed bones", "steadypose"
 METHODS: Mapping[str, PriorSettings] = {
     AIMED: PriorSettings(orient=OrientSettings(enabled=False)),
-    "HM-VAE, one pass": ours.OURS["HM-VAE"],
-    OURS: PriorSettings(),
+    "HM-VAE, one pass": product.PRODUCT["HM-VAE"],
+    STEADYPOSE: PriorSettings(),
 }
 
 
@@ -200,7 +200,7 @@ def run(bench: Bench) -> Result:
                 _rounded(ratio(off, plain, clips.person)) if condition != PERFECT else None
             )
             records.append(record)
-    kinect, bundled = _kinect(bench, roots), root_errors({name: METHODS[name] for name in (AIMED, OURS)})
+    kinect, bundled = _kinect(bench, roots), root_errors({name: METHODS[name] for name in (AIMED, STEADYPOSE)})
     data = {"clips": {source: int((clips.source == source).sum()) for source in np.unique(clips.source)},
             "people": len(set(clips.person)), "records": records, "kinect": kinect, "bundled": bundled}  # fmt: skip
     tables = [_table(records, tuple(roots)), _bends(records), _kinect_table(kinect), _bundled_table(bundled)]
@@ -216,20 +216,20 @@ def _answers(seen: Floats, roots: Mapping[str, Baseline]) -> dict[str, _Turned]:
     found: dict[str, _Turned] = {}
     joints = seen
     for name, settings in METHODS.items():
-        cleaned = ours.run(settings, seen, np.arange(len(seen)) / FPS, DELAY)
+        cleaned = product.run(settings, seen, np.arange(len(seen)) / FPS, DELAY)
         turned = global_rotations(_matrices(cleaned.rotations))[:, :, list(SCORED)]
         found[name] = _Turned(
-            turned, _covariance(cleaned, turned) if name == OURS else np.full((*turned.shape[:2], 3, 3), np.nan)
+            turned, _covariance(cleaned, turned) if name == STEADYPOSE else np.full((*turned.shape[:2], 3, 3), np.nan)
         )
-        joints = cleaned.positions if name == OURS else joints
-    for name, root in roots.items():  # of the root alone, from the joints that ours publishes
+        joints = cleaned.positions if name == STEADYPOSE else joints
+    for name, root in roots.items():  # of the root alone, from the joints that steadypose publishes
         turned = found[AIMED].orientations.copy()
         turned[:, :, 0] = root(joints.reshape(-1, 22, 3)).reshape(turned[:, :, 0].shape)
         found[name] = _Turned(turned, np.full((*turned.shape[:2], 3, 3), np.nan))
     return found
 
 
-def _covariance(cleaned: ours.Cleaned, turned: Floats) -> Floats:
+def _covariance(cleaned: product.Cleaned, turned: Floats) -> Floats:
     """(T, C, 3, 3) of the roots of orientations (T, C, 17, 3, 3)."""
     parts = cleaned.positions.reshape(-1, 22, 3), cleaned.sigma.reshape(-1, 22), turned[:, :, 0].reshape(-1, 3, 3)
     return RootCovariance()(*parts).reshape(turned[:, :, 0].shape)
@@ -259,13 +259,13 @@ def _kinect(bench: Bench, roots: Mapping[str, Baseline]) -> dict[str, dict[str, 
     seen = side_by_side([pair.kinect for pair in pairs])
     off: dict[str, dict[str, list[Floats]]] = {}
     for name, settings in METHODS.items():
-        cleaned = ours.run(settings, seen, np.arange(len(seen)) / FPS, DELAY, "kinect22")
+        cleaned = product.run(settings, seen, np.arange(len(seen)) / FPS, DELAY, "kinect22")
         for clip, pair in enumerate(pairs):
             length = len(pair.kinect)
             mine = {name: _matrices(cleaned.rotations[:length, clip, 0])}
-            if name == OURS:
+            if name == STEADYPOSE:
                 mine |= {other: root(cleaned.positions[:length, clip]) for other, root in roots.items()}
-            for (of, parts), (method, turned) in product(_PARTS.items(), mine.items()):
+            for (of, parts), (method, turned) in itertools.product(_PARTS.items(), mine.items()):
                 apart = wrapped(heading(turned) - _heading(pair.vicon, parts))
                 off.setdefault(of, {}).setdefault(method, []).append(apart - np.nanmedian(apart))
     return {of: {method: spread(np.concatenate(parts)) for method, parts in each.items()} for of, each in off.items()}

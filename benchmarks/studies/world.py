@@ -16,9 +16,9 @@ import numpy as np
 import roma
 import torch
 
-from steadypose.benchmarks import ours
-from steadypose.benchmarks.baselines.filters import FILTERS, OFFLINE, Peer, missing
-from steadypose.benchmarks.bench import Bench, peers_of, tune, tuning_log
+from steadypose.benchmarks import product
+from steadypose.benchmarks.baselines.filters import FILTERS, OFFLINE, Baseline, missing
+from steadypose.benchmarks.bench import Bench, baselines_of, tune, tuning_log
 from steadypose.benchmarks.corruption import correlated
 from steadypose.benchmarks.metrics import contact_speed, position_error, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
@@ -54,25 +54,25 @@ def run(bench: Bench) -> Result:
     """The whole chain beside filters, then the fusion without a root."""
     clips = bench.clips(FRAMES, 400).farthest(4 if bench.quick else 24)
     some = clips.every(3)
-    tuning_seen = correlated(some.positions, NOISE, np.random.default_rng(1))
+    tuning_observed = correlated(some.positions, NOISE, np.random.default_rng(1))
     seen = correlated(clips.positions, NOISE, np.random.default_rng(0))
-    peers = tuple(peer for peer in FILTERS if peer.delays != (OFFLINE,))
+    baselines = tuple(baseline for baseline in FILTERS if baseline.delays != (OFFLINE,))
 
-    def evaluate(peer: Peer, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
-        answer = peer.run(tuning_seen, clips.stamps_s, delay, **parameters)
-        found = figures(score(answer, some.positions, missing(tuning_seen), align=False))
+    def evaluate(baseline: Baseline, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
+        answer = baseline.run(tuning_observed, clips.stamps_s, delay, **parameters)
+        found = figures(score(answer, some.positions, missing(tuning_observed), align=False))
         return {key: found[key] for key in ("position_mm", "acceleration_mm")}
 
-    tuned = tune(bench, evaluate, "world", peers)
+    tuned = tune(bench, evaluate, "world", baselines)
     records: list[dict[str, Any]] = [{"method": "truth", "delay": 0, **measure(clips, clips.positions)}]
     errors: dict[str, Floats] = {}
-    for peer, delay in peers_of(peers, bench.delays):
-        answer = peer.run(seen, clips.stamps_s, delay, **tuned[peer.name, delay].parameters)
-        records.append({"method": peer.name, "delay": delay, **measure(clips, answer)})
+    for baseline, delay in baselines_of(baselines, bench.delays):
+        answer = baseline.run(seen, clips.stamps_s, delay, **tuned[baseline.name, delay].parameters)
+        records.append({"method": baseline.name, "delay": delay, **measure(clips, answer)})
         if delay == DELAY:
-            errors[peer.name] = _per_clip(clips, answer)
+            errors[baseline.name] = _per_clip(clips, answer)
     by_speed: dict[str, dict[str, float]] = {}
-    for name, settings in bench.progress.track(ours.OURS.items(), description="world"):
+    for name, settings in bench.progress.track(product.PRODUCT.items(), description="world"):
         clean, world, roots = chain(settings, seen, clips.stamps_s)
         records.append({"method": f"{name}: pose/clean", "delay": DELAY, **measure(clips, clean)})
         records.append({"method": f"{name}: pose/world", "delay": DELAY, **measure(clips, world)})
@@ -89,7 +89,9 @@ def run(bench: Bench) -> Result:
         if name != "as observed"
     }
     source = {**clips.source, "scored clips": len(clips.offsets)}
-    best = min((peer.name for peer in peers if peer.name in errors), key=lambda name: errors[name].mean())
+    best = min(
+        (baseline.name for baseline in baselines if baseline.name in errors), key=lambda name: errors[name].mean()
+    )
     sources = source_table(
         "world-sources", f"In the world, through noise of 2 cm that lasts: joints by source, mm, delay {DELAY}",
         {("no alignment", name): found for name, found in errors.items()}, clips, best,
@@ -127,15 +129,15 @@ class Roots:
 
 
 def chain(
-    settings: ours.PriorSettings, seen: Floats, stamps_s: Floats, world_settings: TrajectorySettings | None = None
+    settings: product.PriorSettings, seen: Floats, stamps_s: Floats, world_settings: TrajectorySettings | None = None
 ) -> tuple[Floats, Floats, Roots]:
     """Clips (T, C, 22, 3) through prior and trajectory, calibrated: pose/clean and pose/world, (T, C, 22, 3)."""
     count = seen.shape[1]
-    prior = PriorPipeline(replace(settings, delay=DELAY, max_bodies=ours.SLOTS_A_CLIP * count))
+    prior = PriorPipeline(replace(settings, delay=DELAY, max_bodies=product.SLOTS_A_CLIP * count))
     trajectory = TrajectoryPipeline(world_settings or TrajectorySettings(weights=settings.refine.weights))
     clean, world = np.full(seen.shape, np.nan), np.full(seen.shape, np.nan)
     velocities, spreads = np.full((*seen.shape[:2], 3), np.nan), np.full((*seen.shape[:2], 6), np.nan)
-    for row, message in enumerate(ours.stream(prior, seen, stamps_s, calibrated=True)):
+    for row, message in enumerate(product.stream(prior, seen, stamps_s, calibrated=True)):
         for body in message.bodies:
             clean[row, body.id] = body.positions
         for answer in trajectory.process(message):
@@ -206,7 +208,7 @@ def measure(clips: MotionClips, answer: Floats) -> dict[str, Any]:
 
 def _summary(records: list[dict[str, Any]], hidden: Mapping[str, Mapping[str, float]]) -> Table:
     """What ships beside the best filter: of at most `DELAY`, by position."""
-    filters = [r for r in records if r["method"] in {peer.name for peer in FILTERS} and r["delay"] <= DELAY]
+    filters = [r for r in records if r["method"] in {baseline.name for baseline in FILTERS} and r["delay"] <= DELAY]
     best = min(filters, key=lambda r: r["position_mm"])
     by_method = {r["method"]: r for r in records}
     rows: list[list[str]] = []
@@ -257,7 +259,7 @@ def _table(records: list[dict[str, Any]], clips: int) -> Table:
             "Feet: mean horizontal speed of ankle and toe in frames in which they stand in truth; skating: faster than "
             f"{SKATING:.2f} m/s; under the floor: frames in which a sole (heel {1e3 * SOLE[0]:.0f}, toe "
             f"{1e3 * SOLE[2]:.0f} mm under its joint) is, by more than {1e3 * UNDER:.0f} mm. "
-            "Peers tuned on every third clip with other noise."
+            "Baselines tuned on every third clip with other noise."
         ),
     )
 

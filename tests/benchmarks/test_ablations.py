@@ -2,7 +2,7 @@ from dataclasses import asdict, fields, is_dataclass, replace
 
 import numpy as np
 
-from steadypose.benchmarks import ours
+from steadypose.benchmarks import product
 from steadypose.benchmarks.motion import simulated_clips
 from steadypose.benchmarks.studies.ablations import AS_IT_SHIPS, PARTS, PARTS_OF_THE_WORLD, _record, _table
 from steadypose.prior.clean.settings import PriorSettings
@@ -26,7 +26,7 @@ def test_what_has_no_setting_is_replaced_only_while_it_is_measured() -> None:
     seen = clips.positions + np.random.default_rng(0).normal(0.0, 0.02, clips.positions.shape)
 
     def positions() -> np.ndarray:
-        return ours.run(PriorSettings(), seen, clips.stamps_s, 4).positions
+        return product.run(PriorSettings(), seen, clips.stamps_s, 4).positions
 
     shipped = positions()
     for name in REPLACED:

@@ -8,16 +8,16 @@ import pytest
 from matplotlib.figure import Figure
 from rich.progress import Progress
 
-from steadypose.benchmarks import figures, ours
+from steadypose.benchmarks import figures, product
 from steadypose.benchmarks.baselines import smoothnet
-from steadypose.benchmarks.baselines.filters import OFFLINE, Peer, missing
+from steadypose.benchmarks.baselines.filters import OFFLINE, Baseline, missing
 from steadypose.benchmarks.bench import Bench, over_seeds, search
 from steadypose.benchmarks.corruption import gaussian, hide
 from steadypose.benchmarks.metrics import position_error
 from steadypose.benchmarks.motion import MotionClips, simulated_clips
 from steadypose.benchmarks.scores import figures as figures_of
 from steadypose.benchmarks.scores import pivot, score
-from steadypose.benchmarks.studies.spoiled import against_best, calibration_table, reliability_bins, run_conditions
+from steadypose.benchmarks.studies.corrupted import against_best, calibration_table, reliability_bins, run_conditions
 from steadypose.prior.body.skeleton import J
 
 
@@ -52,7 +52,7 @@ def test_steadypose_takes_noise_away_and_answers_for_hidden_joints(clips: Motion
     hidden = np.zeros(clips.positions.shape[:-1], dtype=bool)
     hidden[20:35, ::2, [J["left_elbow"], J["left_wrist"]]] = True
     seen = hide(gaussian(clips.positions, 0.02, rng), hidden)
-    cleaned = ours.run(ours.OURS["steadypose"], seen, clips.stamps_s, 4)
+    cleaned = product.run(product.PRODUCT["steadypose"], seen, clips.stamps_s, 4)
     np.testing.assert_allclose(cleaned.stamps_s, clips.stamps_s, atol=1e-6)
     scores = score(cleaned.positions, clips.positions, hidden)
     raw = score(seen, clips.positions, hidden)
@@ -67,14 +67,14 @@ def test_steadypose_takes_noise_away_and_answers_for_hidden_joints(clips: Motion
 
 def test_clips_side_by_side_are_cleaned_as_if_alone(clips: MotionClips) -> None:
     seen, stamps = gaussian(clips.positions[:20, :3], 0.01, np.random.default_rng(1)), clips.stamps_s[:20]
-    together = ours.run(ours.OURS["steadypose"], seen, stamps, 2)
-    alone = ours.run(ours.OURS["steadypose"], seen[:, 1:2], stamps, 2)
+    together = product.run(product.PRODUCT["steadypose"], seen, stamps, 2)
+    alone = product.run(product.PRODUCT["steadypose"], seen[:, 1:2], stamps, 2)
     np.testing.assert_allclose(together.positions[:, 1], alone.positions[:, 0], atol=1e-3)
 
 
 def test_a_delay_beyond_the_models_window_is_not_available() -> None:
-    assert ours.available(ours.OURS["steadypose"], 4)
-    assert not ours.available(ours.OURS["steadypose"], 80)
+    assert product.available(product.PRODUCT["steadypose"], 4)
+    assert not product.available(product.PRODUCT["steadypose"], 80)
 
 
 def test_an_undisturbed_answer_scores_zero_and_groups_are_told_apart(clips: MotionClips) -> None:
@@ -102,13 +102,13 @@ def test_a_short_training_of_the_temporal_network_already_smooths(clips: MotionC
 
 
 def test_conditions_give_records_that_tables_and_pictures_are_made_of(clips: MotionClips, monkeypatch) -> None:
-    monkeypatch.setattr(ours, "OURS", {"steadypose": ours.OURS["steadypose"]})
+    monkeypatch.setattr(product, "PRODUCT", {"steadypose": product.PRODUCT["steadypose"]})
     with Progress(disable=True) as progress:
         bench = Bench(quick=True, mocap=None, data=Path("nowhere.npz"), progress=progress)
         monkeypatch.setitem(bench.__dict__, "smoothnets", [smoothnet.SmoothNet()])
-        peers = (Peer("raw", lambda seen, _, delay: seen, (0,)),)
+        baselines = (Baseline("raw", lambda seen, _, delay: seen, (0,)),)
         three = replace(clips, person=np.repeat(["a", "b", "c"], 2))
-        data = run_conditions(bench, three, {"4 cm": lambda truth, rng: gaussian(truth, 0.04, rng)}, peers)
+        data = run_conditions(bench, three, {"4 cm": lambda truth, rng: gaussian(truth, 0.04, rng)}, baselines)
     records = {(r["method"], r["delay"]): r for r in data["records"]}
     assert set(records) == {
         ("raw", 0),
@@ -119,7 +119,7 @@ def test_conditions_give_records_that_tables_and_pictures_are_made_of(clips: Mot
     assert np.mean(record["clips_mm"]["position"]) == pytest.approx(record["position_mm"], abs=1e-3)
     low, high = record["position_ci_mm"]
     assert low < record["position_mm"] < high
-    ratio, low, high = records["steadypose", 4]["against_best_peer"]["position"]["ratio"]
+    ratio, low, high = records["steadypose", 4]["against_best_baseline"]["position"]["ratio"]
     assert low < ratio < high
     assert ratio < 0.95
     assert [0.2 < row["seen"]["ratio"] < 4.0 for row in data["calibration"]] == [True, True]
@@ -146,8 +146,8 @@ def test_the_best_peer_is_another_for_each_error(clips: MotionClips) -> None:
     mine = Answer("steadypose", 4, clips.stamps_s, clips.positions + [0.02, 0.0, 0.0], {})
     scored = [(a, score(a.positions, clips.positions, hidden)) for a in (*answers.values(), mine)]
     found = against_best(mine, scored[-1][1], scored, clips.person)
-    assert found["position"]["peer"] == "shaking, delay 0"
-    assert found["acceleration_error"]["peer"] == "still, delay 0"
+    assert found["position"]["baseline"] == "shaking, delay 0"
+    assert found["acceleration_error"]["baseline"] == "still, delay 0"
 
 
 def test_seeds_are_averaged_and_their_spread_kept() -> None:

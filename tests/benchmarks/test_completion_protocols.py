@@ -1,4 +1,4 @@
-"""Interpolation and completion: figures that say what they should, peers that do what their names say."""
+"""Interpolation and completion: figures that say what they should, baselines that do what their names say."""
 
 from __future__ import annotations
 

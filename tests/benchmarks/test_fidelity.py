@@ -7,9 +7,9 @@ import pytest
 from matplotlib.figure import Figure
 from rich.progress import Progress
 
-from steadypose.benchmarks import ours
+from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines.banks import bank, whole_body_bank
-from steadypose.benchmarks.baselines.filters import Peer, raw
+from steadypose.benchmarks.baselines.filters import Baseline, raw
 from steadypose.benchmarks.bench import Answer, Bench, Methods
 from steadypose.benchmarks.corruption import along_sight
 from steadypose.benchmarks.motion import spread
@@ -71,9 +71,9 @@ def test_clips_are_taken_evenly_from_people_as_far_as_these_go() -> None:
 
 
 def test_the_protocol_gives_tables_and_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    banks = Peer("bank of smoothers", bank), Peer("whole-body bank", whole_body_bank)
-    peers = (Peer("raw", raw, (0,)), *banks, Peer("half", lambda seen, _, delay: seen * 0.5))
-    methods = Methods(peers, {"steadypose": ours.OURS["steadypose"]}, (0, 4), networks=False)
+    banks = Baseline("bank of smoothers", bank), Baseline("whole-body bank", whole_body_bank)
+    baselines = (Baseline("raw", raw, (0,)), *banks, Baseline("half", lambda seen, _, delay: seen * 0.5))
+    methods = Methods(baselines, {"steadypose": product.PRODUCT["steadypose"]}, (0, 4), networks=False)
     monkeypatch.setattr(fidelity, "methods", lambda _: methods)
     with Progress(disable=True) as progress:
         result = fidelity.run(Bench(quick=True, mocap=None, data=Path("nowhere.npz"), progress=progress))

@@ -30,45 +30,45 @@ FRAMES = 20
 STANDING = np.random.default_rng(7).normal(0.0, 0.4, (22, 3))
 
 
-def pair(subject: str, take: int, spoiled: str) -> KinectPair:
-    """A clip of a body that sways, as both systems have it; another where the person is the one spoiled."""
-    rng = np.random.default_rng((int(subject[1:]), take, subject == spoiled))
+def pair(subject: str, take: int, corrupted: str) -> KinectPair:
+    """A clip of a body that sways, as both systems have it; another where the person is the one corrupted."""
+    rng = np.random.default_rng((int(subject[1:]), take, subject == corrupted))
     sway = np.sin(np.linspace(0, 3, FRAMES)[:, None, None] + rng.uniform(0, 6, (22, 3)))
     kinect = STANDING + 0.1 * sway
     vicon = to_canonical(KINECT22, kinect)[0] + rng.normal(0, 0.05, (22, 3))
     return KinectPair(f"m01_{subject}_e{take:02}", subject, "m01", 30.0, kinect, vicon, np.zeros((FRAMES, 39, 3)))
 
 
-def clip(subject: str, take: int, spoiled: str) -> Clip:
-    one = pair(subject, take, spoiled)
+def clip(subject: str, take: int, corrupted: str) -> Clip:
+    one = pair(subject, take, corrupted)
     scored = [J[name] for name in SCORED]
     raw = to_canonical(KINECT22, one.kinect)[0][:, scored]
     truth = np.nan_to_num(one.vicon[:, scored])
     return Clip(one.name, subject, one.kinect, raw, truth, truth)
 
 
-def clips(spoiled: str) -> list[Clip]:
-    return [clip(subject, take, spoiled) for subject in PEOPLE for take in range(2)]
+def clips(corrupted: str) -> list[Clip]:
+    return [clip(subject, take, corrupted) for subject in PEOPLE for take in range(2)]
 
 
 def load_pairs(path: Path, subjects: Collection[str]) -> list[KinectPair]:
     return [pair(subject, take, path.stem) for subject in sorted(subjects) for take in range(2)]
 
 
-def tuned(spoiled: str) -> dict[tuple[str, int], Tuned]:
+def tuned(corrupted: str) -> dict[tuple[str, int], Tuned]:
     """A search of two points a filter, of which each person prefers one."""
     found = {}
-    for peer in FILTERS:
+    for baseline in FILTERS:
         tried = []
         for side in (0, 1):
             figures = {
-                f"{who} {key}": float((n + (who == spoiled)) % 2 == side) * (1 + n)
+                f"{who} {key}": float((n + (who == corrupted)) % 2 == side) * (1 + n)
                 for n, who in enumerate(PEOPLE)
                 for key in ("position_mm", "acceleration_mm")
             }
-            tried.append({**{name: ends[side] for name, ends in peer.space.items()}, **figures})
+            tried.append({**{name: ends[side] for name, ends in baseline.space.items()}, **figures})
         for delay in (0, 4):
-            found[peer.name, delay] = Tuned(dict.fromkeys(peer.space, 1.0), tried if peer.space else [])
+            found[baseline.name, delay] = Tuned(dict.fromkeys(baseline.space, 1.0), tried if baseline.space else [])
     return found
 
 
@@ -93,15 +93,15 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     return made
 
 
-def learned(bench: Bench, left_out: str, spoiled: str) -> dict[tuple[str, int], bytes]:
+def learned(bench: Bench, left_out: str, corrupted: str) -> dict[tuple[str, int], bytes]:
     """What each method has learned: its parameters, its answer to one clip, or the weights of its correction."""
     assert bench.mocap is not None
-    data = bench.mocap / f"{spoiled}.npz"
-    data.write_text(spoiled)
+    data = bench.mocap / f"{corrupted}.npz"
+    data.write_text(corrupted)
     asked = [clip("s09", 0, "")]
-    kinect = Kinect(bench, data, [*clips(spoiled), *asked], clips(spoiled))
+    kinect = Kinect(bench, data, [*clips(corrupted), *asked], clips(corrupted))
     found: dict[tuple[str, int], bytes] = {}
-    for method in kinect.methods(left_out, tuned(spoiled)):
+    for method in kinect.methods(left_out, tuned(corrupted)):
         if method.name == UNKNOWN:
             continue
         if method.name == KNOWN:
@@ -114,7 +114,7 @@ def learned(bench: Bench, left_out: str, spoiled: str) -> dict[tuple[str, int], 
 @pytest.mark.parametrize("left_out", PEOPLE)
 def test_no_left_out_person_reaches_what_is_learned(bench: Bench, left_out: str) -> None:
     plain, others = learned(bench, left_out, ""), learned(bench, left_out, left_out)
-    assert {RIDGE, TCN, KNOWN, *(peer.name for peer in FILTERS)} == {name for name, _ in plain}
+    assert {RIDGE, TCN, KNOWN, *(baseline.name for baseline in FILTERS)} == {name for name, _ in plain}
     assert [key for key in plain if plain[key] != others[key]] == []
     taught = learned(bench, left_out, next(who for who in PEOPLE if who != left_out))
     assert [name for name in (RIDGE, TCN, KNOWN) if plain[name, 4] == taught[name, 4]] == []

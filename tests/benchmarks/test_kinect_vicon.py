@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from steadypose.benchmarks.baselines.filters import Peer, constant_velocity, gaussian_hampel, one_euro
+from steadypose.benchmarks.baselines.filters import Baseline, constant_velocity, gaussian_hampel, one_euro
 from steadypose.benchmarks.bench import Tuned
 from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip, align, deviation, learn_offset, score, summary
 from steadypose.benchmarks.studies.kinect_methods import best_without, run_filter
@@ -108,15 +108,15 @@ def test_what_is_stated_is_held_against_the_error() -> None:
 
 
 def test_a_filter_is_chosen_by_the_others_figures() -> None:
-    peer = Peer("filter", lambda seen, _, delay: seen, None, {"density": (0.1, 10.0)})
+    baseline = Baseline("filter", lambda seen, _, delay: seen, None, {"density": (0.1, 10.0)})
     tried = [
         {"density": d, **{f"{s} position_mm": p for s, p in zip(("s01", "s02", "s03"), of, strict=True)},
          **{f"{s} acceleration_mm": 0.0 for s in ("s01", "s02", "s03")}, "position_mm": 0.0, "acceleration_mm": 0.0}
         for d, of in ((0.5, (1.0, 9.0, 9.0)), (5.0, (9.0, 4.0, 8.0)))
     ]  # fmt: skip
     found = Tuned({"density": 0.5}, tried)
-    assert [best_without(s, found, peer)["density"] for s in ("s01", "s02", "s03")] == [5.0, 0.5, 0.5]
-    assert best_without("s01", Tuned({}, []), peer) == {}
+    assert [best_without(s, found, baseline)["density"] for s in ("s01", "s02", "s03")] == [5.0, 0.5, 0.5]
+    assert best_without("s01", Tuned({}, []), baseline) == {}
 
 
 def test_what_moves_is_what_is_left_without_the_clips_own_constant_offset() -> None:

@@ -1,4 +1,4 @@
-"""The whole-body denoiser among the peers."""
+"""The whole-body denoiser among the baselines."""
 
 import numpy as np
 import pytest

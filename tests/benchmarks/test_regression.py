@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from steadypose.benchmarks import ours
+from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines.filters import missing
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.motion import MotionClips
@@ -37,7 +37,7 @@ def clips() -> MotionClips:
 @pytest.mark.parametrize("condition", GOLDEN)
 def test_the_pipeline_is_as_good_as_it_was(clips: MotionClips, condition: str) -> None:
     seen = CONDITIONS[condition](clips.positions, np.random.default_rng(0))
-    cleaned = ours.run(ours.OURS["steadypose"], seen, clips.stamps_s, delay=4)
+    cleaned = product.run(product.PRODUCT["steadypose"], seen, clips.stamps_s, delay=4)
     found = figures(score(cleaned.positions, clips.positions, missing(seen)))
     for name, golden in zip(("position_mm", "hidden_mm", "acceleration_mm"), GOLDEN[condition], strict=True):
         if golden is not None:

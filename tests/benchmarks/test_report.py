@@ -17,7 +17,9 @@ from steadypose.benchmarks.stale import STALE
 from steadypose.benchmarks.studies import STUDIES
 from steadypose.benchmarks.systems import SYSTEMS
 
-TABLE = Table("speed", "Speed, ms", ["method", "p50", "a|b"], [["raw", "1.0", "2"], ["ours", "0.5", "3"]], "A note.")
+TABLE = Table(
+    "speed", "Speed, ms", ["method", "p50", "a|b"], [["raw", "1.0", "2"], ["steadypose", "0.5", "3"]], "A note."
+)
 COMMAND = ["steadypose", "evaluate", "latency", "--quick"]
 TEXT = "# Title\n<!-- results:speed -->\nold\n<!-- /results -->\ntail\n"
 
@@ -40,7 +42,7 @@ def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tm
     readme.write_text(TEXT)
     main(Args(readme, tmp_path / "page.md", tmp_path))
     once = readme.read_text()
-    assert "| ours | 0.5 | 3 |" in once
+    assert "| steadypose | 0.5 | 3 |" in once
     assert "| method | p50 | a\\|b |" in once
     assert "`steadypose evaluate latency --quick`" in once
     assert "old" not in once
@@ -58,7 +60,7 @@ def test_a_marker_without_a_result_is_an_error_that_names_those_there_are(tmp_pa
 
 def test_blocks_do_not_swallow_each_other(tmp_path: Path) -> None:
     filled = fill(TEXT + "between\n" + TEXT, {"latency": saved(tmp_path)})
-    assert filled.count("| ours |") == 2
+    assert filled.count("| steadypose |") == 2
     assert "between" in filled
 
 

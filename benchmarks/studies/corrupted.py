@@ -1,4 +1,4 @@
-"""What the protocols on spoiled joints share: conditions over validation motion, every method in each of them."""
+"""What the protocols on corrupted joints share: conditions over validation motion, every method in each of them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.benchmarks.baselines.filters import OFFLINE, PEERS, Peer, missing
+from steadypose.benchmarks.baselines.filters import BASELINES, OFFLINE, Baseline, missing
 from steadypose.benchmarks.bench import RECURRENT, Answer, Bench, Methods, answers, over_seeds, tune, tuning_log
 from steadypose.benchmarks.intervals import ratio
 from steadypose.benchmarks.metrics import position_error, reliability, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
-from steadypose.benchmarks.ours import OURS
+from steadypose.benchmarks.product import PRODUCT
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import Scores, figures, pivot, score, source_table
 from steadypose.prior.arrays import Floats
@@ -22,13 +22,13 @@ Condition = Callable[[Floats, np.random.Generator], Floats]
 """Truth (T, C, 22, 3) to what is seen of it."""
 
 TUNED_ON = 3
-"""Peers are tuned on every third of the very clips that are scored, with other noise: this favours them."""
+"""Baselines are tuned on every third of the very clips that are scored, with other noise: this favours them."""
 
 HOW = (
-    "Peers are tuned on every third of these very clips with other noise, each with the same number of evaluations, "
-    "for the least sum of position error (mm) and acceleration error (mm/frame²); steadypose runs as it ships. A "
+    "Baselines are tuned on every third of these clips with other noise, each with the same number of evaluations, for "
+    "the least sum of position error (mm) and acceleration error (mm/frame²); steadypose runs as it ships. A "
     "delayed Kalman filter is a fixed-lag RTS smoother. SmoothNet-style and GRU: trained on motion that steadypose is "
-    "trained on, spoiled in these ways; the first a mean over seeds."
+    "trained on, corrupted in these ways; the first a mean over seeds."
 )
 
 
@@ -50,37 +50,37 @@ def by_source(
 
 
 def run_conditions(
-    bench: Bench, clips: MotionClips, conditions: Mapping[str, Condition], peers: Sequence[Peer] = PEERS
+    bench: Bench, clips: MotionClips, conditions: Mapping[str, Condition], baselines: Sequence[Baseline] = BASELINES
 ) -> dict[str, Any]:
     """Every method in every condition: records, calibration, what was tried.
 
-    The records carry ``condition``, ``method``, ``delay``, and `figures`; ours, where a peer runs at their delay,
-    also the ratio of their errors to those of the best such peer.
+    The records carry ``condition``, ``method``, ``delay``, and `figures`; those of steadypose, where a baseline runs at
+    their delay, also the ratio of their errors to those of the best such baseline.
     """
     records: list[dict[str, Any]] = []
     calibration: list[dict[str, Any]] = []
     tried: dict[str, Any] = {}
-    for number, (name, spoil) in enumerate(conditions.items()):
+    for number, (name, corrupt) in enumerate(conditions.items()):
         some = clips.every(TUNED_ON)
-        tuning_seen = spoil(some.positions, np.random.default_rng((number, 1)))
+        tuning_observed = corrupt(some.positions, np.random.default_rng((number, 1)))
 
         def evaluate(
-            peer: Peer,
+            baseline: Baseline,
             delay: int,
             parameters: Mapping[str, float],
             truth: Floats = some.positions,
-            tuning_seen: Floats = tuning_seen,
+            tuning_observed: Floats = tuning_observed,
         ) -> dict[str, float]:
-            answer = peer.run(tuning_seen, clips.stamps_s, delay, **parameters)
-            found = figures(score(answer, truth, missing(tuning_seen), align=False))
+            answer = baseline.run(tuning_observed, clips.stamps_s, delay, **parameters)
+            found = figures(score(answer, truth, missing(tuning_observed), align=False))
             return {key: found[key] for key in ("position_mm", "acceleration_mm")}
 
-        tuned = tune(bench, evaluate, name, peers)
+        tuned = tune(bench, evaluate, name, baselines)
         tried[name] = tuning_log(tuned)
-        seen = spoil(clips.positions, np.random.default_rng((number, 0)))
+        seen = corrupt(clips.positions, np.random.default_rng((number, 0)))
         hidden = missing(seen)
         scored: list[tuple[Answer, Scores]] = []
-        for answer in answers(bench, seen, clips.stamps_s, tuned, name, Methods.all(bench, peers)):
+        for answer in answers(bench, seen, clips.stamps_s, tuned, name, Methods.all(bench, baselines)):
             scored.append((answer, score(answer.positions, clips.positions, hidden)))
             if answer.sigma is not None:
                 error = position_error(answer.positions, clips.positions)
@@ -107,30 +107,30 @@ def _record(
     if answer.method in BY_SOURCE:
         by_clip = {"position": scores.position, "hidden": scores.hidden}
         record["clips_mm"] = {key: np.round(1e3 * values, 3).tolist() for key, values in by_clip.items()}
-    if answer.method in OURS:
-        record["against_best_peer"] = against_best(answer, scores, scored, people)
+    if answer.method in PRODUCT:
+        record["against_best_baseline"] = against_best(answer, scores, scored, people)
     return record
 
 
 def against_best(
     answer: Answer, scores: Scores, scored: Sequence[tuple[Answer, Scores]], people: NDArray[np.str_]
 ) -> dict[str, Any]:
-    """Ratios of errors, with their 95 % intervals over people, to the best peer that needs no longer delay.
+    """Ratios of errors, with their 95 % intervals over people, to the best baseline that needs no longer delay.
 
-    Best is the one with the least of that very error, so that it may be another peer for each.
+    Best is the one with the least of that very error, so that it may be another baseline for each.
     """
-    rivals = [(a, s) for a, s in scored if a.method not in OURS and a.delay <= answer.delay and a.delay != OFFLINE]
+    rivals = [(a, s) for a, s in scored if a.method not in PRODUCT and a.delay <= answer.delay and a.delay != OFFLINE]
     ratios: dict[str, Any] = {}
     for name in ("position", "seen", "hidden", "acceleration_error"):
         mine = getattr(scores, name)
         usable = [(a, getattr(s, name)) for a, s in rivals]
         known = np.isfinite(mine)
-        # a peer that leaves a joint without an answer is not the best at answering
+        # a baseline that leaves a joint without an answer is not the best at answering
         usable = [(a, theirs) for a, theirs in usable if known.any() and np.isfinite(theirs[known]).all()]
         if usable:
             rival, theirs = min(usable, key=lambda pair: float(pair[1][known].mean()))
             found = ratio(mine, theirs, people)[:3]
-            ratios[name] = {"peer": f"{rival.method}, delay {rival.delay}", "ratio": [round(v, 4) for v in found]}
+            ratios[name] = {"baseline": f"{rival.method}, delay {rival.delay}", "ratio": [round(v, 4) for v in found]}
     return ratios
 
 

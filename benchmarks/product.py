@@ -20,7 +20,7 @@ from steadypose.prior.clean.rotations import OrientSettings, RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
 from steadypose.prior.clean.settings import PriorSettings
 
-OURS: Mapping[str, PriorSettings] = {
+PRODUCT: Mapping[str, PriorSettings] = {
     "HM-VAE": PriorSettings(
         denoise=DenoiseSettings(enabled=False),
         score=ScoreSettings(enabled=False),

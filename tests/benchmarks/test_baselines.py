@@ -6,9 +6,9 @@ import pytest
 from steadypose.benchmarks.baselines.banks import bank, noise_found, whole_body_bank
 from steadypose.benchmarks.baselines.body import beside
 from steadypose.benchmarks.baselines.filters import (
+    BASELINES,
     FILTERS,
     OFFLINE,
-    PEERS,
     butterworth,
     constant_velocity,
     constant_velocity_by_joint,
@@ -108,21 +108,21 @@ def test_butterworth_has_no_lag_and_bridges_gaps() -> None:
     assert np.abs(answer - truth)[20:100].max() < 0.02
 
 
-ONLINE = [peer for peer in PEERS if peer.delays != (OFFLINE,)]
+ONLINE = [baseline for baseline in BASELINES if baseline.delays != (OFFLINE,)]
 
 
-@pytest.mark.parametrize("peer", ONLINE, ids=lambda peer: peer.name)
-def test_no_answer_knows_more_than_its_delay(peer) -> None:
-    delay = 0 if peer.delays else 3
+@pytest.mark.parametrize("baseline", ONLINE, ids=lambda baseline: baseline.name)
+def test_no_answer_knows_more_than_its_delay(baseline) -> None:
+    delay = 0 if baseline.delays else 3
     seen = motion(np.random.default_rng(4), joints=len(JOINTS))
     seen[12:16, 0] = np.nan
     seen[12:16, 1, 4:9] = np.nan
-    parameters = {name: float(np.sqrt(low * high)) for name, (low, high) in peer.space.items()}
-    whole = peer.run(seen, STAMPS, delay, **parameters)
+    parameters = {name: float(np.sqrt(low * high)) for name, (low, high) in baseline.space.items()}
+    whole = baseline.run(seen, STAMPS, delay, **parameters)
     other = seen.copy()
     other[25:] += 1.0
     np.testing.assert_array_equal(
-        whole[: 25 - delay], peer.run(other, STAMPS, delay, **parameters)[: 25 - delay], err_msg=peer.name
+        whole[: 25 - delay], baseline.run(other, STAMPS, delay, **parameters)[: 25 - delay], err_msg=baseline.name
     )
     assert whole.shape == seen.shape
 
@@ -134,7 +134,7 @@ def test_tuned_filters_beat_raw_on_noise_that_they_are_made_for() -> None:
     error = np.abs(seen - truth).mean()
     assert np.abs(constant_velocity(seen, STAMPS, 4, 1.0) - truth).mean() < 0.5 * error
     fill_gaps = {"hold last", "held beside the body", "linear interpolation"}
-    assert {peer.name for peer in PEERS} - {peer.name for peer in FILTERS} == fill_gaps
+    assert {baseline.name for baseline in BASELINES} - {baseline.name for baseline in FILTERS} == fill_gaps
 
 
 def test_the_bank_is_true_to_what_is_clean_and_smooths_what_is_noisy_without_being_told() -> None:
