@@ -1,4 +1,5 @@
-"""What the pipeline makes of the bundled streams, as a few numbers that tell whether it still makes the same."""
+"""What the pipeline and the completer make of the bundled streams, as a few numbers that tell whether they still make
+the same."""
 
 from __future__ import annotations
 
@@ -15,6 +16,10 @@ from steadypose.nodes.driving import stream
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.complete.body import Uncertainty
+from steadypose.prior.complete.parts import PartsCompleter
+from steadypose.prior.complete.stream import complete_raws
+from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
@@ -26,7 +31,7 @@ PROJECTIONS = 8
 
 @cache
 def outputs() -> dict[str, list[float]]:
-    """By name, random projections of an output: with default settings, and with HM-VAE's refinement.
+    """By name, random projections of an output: with default settings, with HM-VAE's refinement, and of `complete`.
 
     A projection on weights of 1 and -1, over the root of their number, changes by about the root mean square of the
     change: eight numbers tell by how much 100,000 differ.
@@ -38,7 +43,17 @@ def outputs() -> dict[str, list[float]]:
         "pose/clean": projections(values for kind, values in default if kind is PoseClean),
         "pose/world": projections(values for kind, values in default if kind is PoseWorld),
         "pose/clean, HM-VAE": projections(values for kind, values in _answers(paths[0], refining) if kind is PoseClean),
+        "complete": projections(_completed(path) for path in paths[:2]),
     }
+
+
+def _completed(path: Path) -> np.ndarray:
+    """Every body of a stream of which a second is left out, completed."""
+    raws = [message for _, message in islice(open_recording(path), FRAMES) if isinstance(message, PoseRaw)]
+    del raws[40:70]
+    completer = LiveCompleter.load("default")
+    done = complete_raws(path.name, raws, PartsCompleter(completer), Uncertainty(completer.config.never_sigma, 1)).done
+    return np.concatenate([np.ravel(completed.positions[np.isfinite(completed.positions)]) for _, completed in done])
 
 
 def _answers(path: Path, settings: PriorSettings) -> Iterator[tuple[type, np.ndarray]]:

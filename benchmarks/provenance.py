@@ -37,6 +37,9 @@ VARIANTS = (*CLEAN, "pose/clean, HM-VAE", "hmvae weights")
 WORLD = (*CLEAN, "pose/world", "contacts weights", "trajectory weights")
 """What `pose/world` depends on."""
 
+COMPLETE = "complete"
+"""What `steadypose complete` makes of streams with a gap."""
+
 _WEIGHT_SETS = ("default", "kinect_v2")
 """Those that ship; others may have been installed beside them."""
 
@@ -80,7 +83,7 @@ def measured(depends_on: Sequence[str]) -> dict[str, Any]:
     ``prior.fit``."""
     found = {}
     for name in depends_on:
-        if name.startswith("pose/"):
+        if name == COMPLETE or name.startswith("pose/"):
             from steadypose.benchmarks.output import outputs  # the pipelines take seconds to load
 
             found[name] = outputs()[name]

@@ -18,6 +18,7 @@ from steadypose.benchmarks.baselines.inbetween import NearestPose
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.intervals import ratio
 from steadypose.benchmarks.motion import as_set, prepared_set
+from steadypose.benchmarks.provenance import COMPLETE
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import ends_mm
 from steadypose.prior.arrays import Floats
@@ -33,7 +34,7 @@ from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tr
 from steadypose.training.data.hgvae_windows import standardise
 from steadypose.training.networks.hgvae import HGVAE
 
-DEPENDS_ON = ("completer weights", "hgvae weights", "prior.complete")
+DEPENDS_ON = (COMPLETE, "completer weights", "hgvae weights")
 
 FRAMES = 50
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.provenance import WORLD
 from steadypose.benchmarks.results import Result, Table
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, REST_HEIGHT, REST_SPEED, label_contacts
@@ -24,7 +25,7 @@ from steadypose.prior.models.contacts import LiveContacts, contact_features
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.timing.rate import FPS
 
-DEPENDS_ON = ("mixture weights", "contacts weights", "prior.models.mixture", "prior.models.contacts")
+DEPENDS_ON = WORLD
 
 LOADED_N = 30.0
 """Newtons from which on a foot bears load."""

@@ -19,6 +19,7 @@ from steadypose.benchmarks.baselines import inbetween
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.metrics import contact_speed, npss, quaternion_distance
 from steadypose.benchmarks.motion import MotionClips, as_set, prepared_set
+from steadypose.benchmarks.provenance import COMPLETE
 from steadypose.benchmarks.results import Result, Table
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import place_joints
@@ -30,7 +31,7 @@ from steadypose.prior.fit.optimise import Optimiser
 from steadypose.prior.models.completer import LiveCompleter
 from steadypose.training.data.dataset import MotionSet
 
-DEPENDS_ON = ("completer weights", "hmvae64 weights", "prior.complete", "prior.fit")
+DEPENDS_ON = (COMPLETE, "completer weights", "hmvae64 weights", "prior.fit.optimise")
 
 GAPS = (5, 15, 30, 45)
 BEFORE, AFTER = 10, 1
