@@ -25,7 +25,7 @@ from steadypose.benchmarks.systems.running import START_S, running_nodes
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.commands.cleaning import clean_recording
+from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.settings import PriorSettings

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import Pose, PoseRaw
-from steadypose.nodes.checks.problem import Problem, error, warning
-from steadypose.nodes.checks.window import tracks
+from steadypose.nodes.checks.problem import Problem, error, tracks, warning
 from steadypose.prior.arrays import Floats, medians
 from steadypose.prior.body.kinematics import SensorFrame
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical

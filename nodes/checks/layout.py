@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.checks.problem import Problem, error, warning
-from steadypose.nodes.checks.window import bodies
+from steadypose.nodes.checks.problem import Problem, bodies, error, warning
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
 from steadypose.prior.body.likeness import likenesses
 from steadypose.prior.settings import nearest

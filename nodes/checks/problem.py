@@ -1,11 +1,17 @@
-"""A problem with a stream, as reported in `diagnostics`, on the console and by `steadypose doctor --live`."""
+"""What all checks share: a problem, as `diagnostics`, the console and `steadypose doctor --live` report it, and the
+last second of a stream, which they examine.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from steadypose.msgs.types import Level
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.types import Level, PoseRaw, RawBody
 
 PREFIX = "problem."
 """of the keys in `diagnostics` whose values are problems"""
@@ -42,3 +48,54 @@ def as_values(problems: Iterable[Problem]) -> dict[str, str]:
 def from_values(values: Mapping[str, str]) -> dict[str, str]:
     """The problems in `diagnostics`: texts by cause."""
     return {key.removeprefix(PREFIX): text for key, text in values.items() if key.startswith(PREFIX)}
+
+
+LENGTH_NS = 1_500_000_000
+LONGEST = 90
+"""messages"""
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A message, and when it came."""
+
+    at_ns: int
+    """wall time"""
+    raw: PoseRaw
+
+
+class Window:
+    """The messages of the last second, with their times of arrival."""
+
+    def __init__(self) -> None:
+        self._arrivals: deque[Arrival] = deque(maxlen=LONGEST)
+        self.received = 0
+        """messages, ever"""
+        self.inhabited = 0
+        """messages with a body in them, ever"""
+
+    def add(self, raw: PoseRaw, at_ns: int) -> None:
+        self.received += 1
+        self.inhabited += bool(raw.bodies)
+        self._arrivals.append(Arrival(at_ns, raw))
+
+    def arrivals(self, now_ns: int) -> list[Arrival]:
+        """Those of the window that ends now, oldest first."""
+        return [arrival for arrival in self._arrivals if now_ns - arrival.at_ns <= LENGTH_NS]
+
+    @property
+    def last(self) -> Arrival | None:
+        return self._arrivals[-1] if self._arrivals else None
+
+
+def bodies(messages: Sequence[PoseRaw]) -> Iterator[RawBody]:
+    """All bodies of all messages."""
+    for raw in messages:
+        yield from raw.bodies
+
+
+def tracks(messages: Sequence[PoseRaw], joints: int) -> NDArray[np.float64]:
+    """(N, J, 3) the joints of all bodies that have as many as the layout; NaN where not finite."""
+    found = [body.positions for body in bodies(messages) if len(body.positions) == joints]
+    stacked = np.array(found, np.float64).reshape(-1, joints, 3)
+    return np.where(np.isfinite(stacked).all(axis=-1, keepdims=True), stacked, np.nan)

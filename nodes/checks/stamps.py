@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from steadypose.nodes.checks.problem import Problem, error, warning
-from steadypose.nodes.checks.window import Arrival
+from steadypose.nodes.checks.problem import Arrival, Problem, error, warning
 
 SECOND_NS = 1_000_000_000
 ENOUGH = 10

@@ -13,9 +13,8 @@ import numpy as np
 from steadypose.msgs.types import Level, PoseClean, PoseRaw
 from steadypose.nodes.checks.geometry import check_geometry, check_jumps, check_speed
 from steadypose.nodes.checks.layout import check_layout
-from steadypose.nodes.checks.problem import Problem, error, warning
+from steadypose.nodes.checks.problem import Problem, Window, error, warning
 from steadypose.nodes.checks.stamps import check_stamps
-from steadypose.nodes.checks.window import Window
 
 ENOUGH = 20
 """bodies between two checks, at least, for a judgement"""

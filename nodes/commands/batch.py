@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.nodes.cli import is_for_user
-from steadypose.nodes.commands.cleaning import clean_recording
+from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.driving import NOBODY
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.process import own_command, own_environment

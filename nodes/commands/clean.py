@@ -10,11 +10,9 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
-from steadypose.nodes.commands.cleaning import clean_recording
-from steadypose.nodes.commands.output import check_format, check_output, printable
-from steadypose.nodes.commands.setting_names import check_settings, full_key, pipeline_sections
+from steadypose.nodes.commands.output import check_format, check_output, clean_recording, printable
 from steadypose.nodes.driving import NOBODY
-from steadypose.nodes.graph.launch import apply_override, read_toml
+from steadypose.nodes.graph.launch import apply_override, check_settings, full_key, pipeline_sections, read_toml
 from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.prior.body.layouts import add_layouts

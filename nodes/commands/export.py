@@ -123,7 +123,7 @@ def retarget(
     from steadypose.nodes.graph.prior_node import make_prior
     from steadypose.nodes.graph.threads import one_thread
     from steadypose.nodes.graph.trajectory_node import make_trajectory
-    from steadypose.nodes.sinks.retargeter import Follower, Retargeter
+    from steadypose.nodes.sinks.retarget import Follower, Retargeter
     from steadypose.nodes.sinks.robot import load_robot
 
     given = {}

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 from steadypose.nodes.graph.extras import install_command
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2.connection import Connection
+from steadypose.nodes.ros2.definitions import Connection
 
 
 def check_ros() -> None:

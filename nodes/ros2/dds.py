@@ -30,8 +30,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
 
-from steadypose.nodes.ros2.connection import DEPTH, Publish
-from steadypose.nodes.ros2.definitions import ros_types, type_hash
+from steadypose.nodes.ros2.definitions import DEPTH, Publish, ros_types, type_hash
 
 LOCALHOST = """<CycloneDDS><Domain>
 <General><Interfaces><NetworkInterface address="127.0.0.1" multicast="false"/></Interfaces>

@@ -16,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2.connection import DEPTH, Publish
+from steadypose.nodes.ros2.definitions import DEPTH, Publish
 
 
 class RclpyConnection:

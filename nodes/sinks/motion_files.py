@@ -1,6 +1,7 @@
 """One cleaned body at a steady rate, on bones that keep their lengths, as BVH, CSV or TRC.
 
-BVH: centimetres, y up, the rest pose a T that faces +z. CSV: as `nodes.sources.csv` reads it. TRC: as OpenSim does.
+BVH: centimetres, y up, the rest pose a T that faces +z. CSV: as `nodes.sources.recording` reads it. TRC: as
+OpenSim does.
 """
 
 from __future__ import annotations

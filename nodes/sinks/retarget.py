@@ -1,23 +1,36 @@
-"""The retargeting sink: the newest pose of a robot, as a JSON datagram for each message of ``pose/world``."""
+"""A person's motion as a robot's, frame by frame: inverse kinematics by one small quadratic program a frame (mink).
+
+Directions of limbs, orientations of pelvis, chest and feet are the person's; lengths are the robot's, and so is the
+ground that is covered, in proportion to the legs. A foot that stands is held where it is, flat, until it lifts.
+Position and speed limits are constraints of the program, not penalties: they hold for every frame. The sink sends the
+newest pose as a JSON datagram for each message of ``pose/world``.
+"""
+
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+# an optional extra, which need not be installed; MuJoCo's module has no stubs
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, NamedTuple
 
-from steadypose.msgs.types import PoseWorld
+import numpy as np
+
+from steadypose.msgs.types import CONTACTS, PoseWorld, WorldBody
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError, path_setting
 from steadypose.nodes.graph.threads import one_thread
-from steadypose.nodes.sinks.datagrams import DatagramNode, DatagramSettings
-from steadypose.nodes.sinks.robot import load_robot
-
-if TYPE_CHECKING:
-    from steadypose.nodes.sinks.retargeter import RobotPose
+from steadypose.nodes.sinks.datagrams import DatagramNode, DatagramSettings, Followed
+from steadypose.nodes.sinks.robot import Robot, load_robot
+from steadypose.prior.arrays import Floats
+from steadypose.prior.body.kinematics import global_rotations, rotation_matrices, rotation_matrix, yaw_matrix
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.sim.gait import minimum_jerk
 
 
 @dataclass(frozen=True)
@@ -71,8 +84,6 @@ class RetargetNode(DatagramNode):
 
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
-        from steadypose.nodes.sinks.retargeter import Follower, Retargeter
-
         one_thread()
         self._settings = settings = launch.settings(RetargetSettings)
         self._robot = load_robot(Path(settings.urdf), settings.links)
@@ -81,3 +92,260 @@ class RetargetNode(DatagramNode):
     def datagrams(self, world: PoseWorld) -> Sequence[bytes]:
         pose = self._follower.process(world)
         return [] if pose is None else [datagram(pose, self._robot.joints)]
+
+
+SIDES = ("left", "right")
+ANKLE = 0.07
+"""metres of a person's ankle above the floor it stands on"""
+CROUCH = 0.98
+"""share of the legs' length that the robot stands with: straight knees are singular"""
+EASE_S = 1.0
+"""to begin, and to stop"""
+RELEASE_S = 0.15
+"""in which a foot that lifts goes over from where it stood to where the person's is"""
+STANDS, LIFTS = 0.6, 0.4
+"""probability of contact from which on a foot stands, and below which it lifts"""
+TOO_FAR = 0.3
+"""metres between a standing foot and the person's, at which it is let go all the same"""
+MARGIN = 1e-4
+"""radians or metres that stay between a joint and its limit, for rounding"""
+
+
+class RobotPose(NamedTuple):
+    """A robot at one moment."""
+
+    stamp_ns: int
+    root: Floats
+    """(7,) metres and xyzw: the root link in the world"""
+    joints: Floats
+    """(N,) radians or metres, in the order of `Robot.joints`"""
+    stands: tuple[bool, bool]
+    """which feet are held where they stand: left, right"""
+
+
+class _Foot:
+    """One foot: where it stands, or how far it is on its way."""
+
+    def __init__(self) -> None:
+        self.stood: tuple[Floats, Floats] | None = None
+        self.stands = False
+        self.free = 1.0
+
+    def reset(self) -> None:
+        self.stood, self.stands, self.free = None, False, 1.0
+
+
+class Retargeter:
+    """Follows one person.
+
+    Args:
+        robot: that does as they do.
+        sole: metres from the floor to the origins of its foot links, when they stand.
+    """
+
+    def __init__(self, robot: Robot, sole: float = 0.0) -> None:
+        import mink
+
+        self.robot, self._sole, self._mink = robot, sole, mink
+        model = robot.model
+        self._configuration = mink.Configuration(model)
+        self._q_indices = np.array([model.joint(name).qposadr[0] for name in robot.joints])
+        self._v_indices = np.array([model.joint(name).dofadr[0] for name in robot.joints])
+        self._home = model.qpos0.copy()
+        self._home[self._q_indices] = np.clip(0.0, robot.lower + MARGIN, robot.upper - MARGIN)
+        for k, name in enumerate(robot.joints):
+            model.jnt_range[model.joint(name).id] = robot.lower[k] + MARGIN, robot.upper[k] - MARGIN
+            model.jnt_limited[model.joint(name).id] = 1
+        self._limits = [
+            mink.ConfigurationLimit(model, gain=1.0),
+            mink.VelocityLimit(model, dict(zip(robot.joints, robot.speed.tolist(), strict=True))),
+        ]
+        self._configuration.update(self._home)
+        self._rest = {part: self._frame(part) for part in robot.links}
+        self._leg = [self._length(f"{side}_hip", f"{side}_knee", f"{side}_foot") for side in SIDES]
+        self._arm = [self._length(f"{side}_shoulder", f"{side}_elbow", f"{side}_wrist") for side in SIDES]
+        hips = 0.5 * (self._rest["left_hip"][1] + self._rest["right_hip"][1])
+        self._hips_from_pelvis = self._rest["pelvis"][0].T @ (hips - self._rest["pelvis"][1])
+        self._tasks = self._make_tasks()
+        self._feet = (_Foot(), _Foot())
+        self._stamp_ns: int | None = None
+        self._began_ns = 0
+        self._velocity = np.zeros(model.nv)
+        self._scale = 1.0
+
+    def _make_tasks(self) -> dict[str, Any]:
+        task = self._mink.FrameTask
+        costs = {"pelvis": (2.0, 1.0), "torso": (0.0, 1.0)}
+        for side in SIDES:
+            costs |= {f"{side}_knee": (0.5, 0.0), f"{side}_foot": (100.0, 10.0)}
+            costs |= {f"{side}_elbow": (1.0, 0.0), f"{side}_wrist": (1.0, 0.0)}
+        tasks = {part: task(self.robot.links[part], "body", *cost, lm_damping=1e-3) for part, cost in costs.items()}
+        tasks["posture"] = self._mink.PostureTask(self.robot.model, cost=0.02)
+        tasks["posture"].set_target(self._home)
+        tasks["damping"] = self._mink.DampingTask(self.robot.model, cost=0.2)
+        return tasks
+
+    def reset(self) -> None:
+        """Forget the person: the next is begun with anew."""
+        self._stamp_ns = None
+        self._velocity[:] = 0.0
+        for foot in self._feet:
+            foot.reset()
+
+    def follow(self, stamp_ns: int, body: WorldBody) -> RobotPose | None:
+        """The robot's pose for the person's at ``stamp_ns``; None of a pose that is not known, or not later."""
+        if not np.isfinite(body.positions).all() or not np.isfinite(body.rotations).all():
+            return None
+        if self._stamp_ns is None:
+            self._begin(stamp_ns, body)
+        dt = (stamp_ns - (self._stamp_ns or 0)) / 1e9
+        if self._stamp_ns is None or dt > EASE_S:
+            self._stamp_ns, dt = stamp_ns, 0.0
+        elif dt <= 0.0:
+            return None
+        else:
+            self._stamp_ns = stamp_ns
+            share = float(minimum_jerk((stamp_ns - self._began_ns) / 1e9 / EASE_S))
+            self._aim(body, dt, begun=share >= 1.0)
+            self._step(dt, share)
+        return self._pose(stamp_ns)
+
+    def coast(self, stamp_ns: int) -> RobotPose | None:
+        """The pose at ``stamp_ns`` when there is nobody to follow: the robot comes to rest, and stays."""
+        if self._stamp_ns is None or stamp_ns <= self._stamp_ns:
+            return None
+        dt = min((stamp_ns - self._stamp_ns) / 1e9, EASE_S)
+        self._velocity *= np.exp(-5.0 * dt / EASE_S)
+        self._stamp_ns = self._began_ns = stamp_ns  # who comes back is eased into
+        for foot in self._feet:
+            foot.reset()
+        self._integrate(self._velocity, dt)
+        return self._pose(stamp_ns)
+
+    def _begin(self, stamp_ns: int, body: WorldBody) -> None:
+        """Stand where the person is, turned as they are; the joints go on from where they are."""
+        p = body.positions.astype(np.float64)
+        human = np.mean([_length(p, f"{side}_hip", f"{side}_knee", f"{side}_ankle") for side in SIDES])
+        self._scale = float(np.mean([sum(leg) for leg in self._leg]) / max(human, 0.1))
+        forward = rotation_matrix(body.root_orientation)[:, 0]
+        yaw = np.arctan2(forward[1], forward[0])
+        q = self._configuration.q.copy()  # at first as at home; with the next person, as it is
+        low = min(self._rest[f"{side}_foot"][1][2] for side in SIDES)
+        q[:3] = [*(self._scale * p[0, :2]), self._sole - low + self._home[2]]
+        q[3:7] = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+        self._configuration.update(q)
+        self._began_ns = stamp_ns
+
+    def _aim(self, body: WorldBody, dt: float, *, begun: bool) -> None:
+        """Set the targets of all links."""
+        p = body.positions.astype(np.float64)
+        turns = global_rotations(rotation_matrices(body.rotations.astype(np.float64)))
+        hips = 0.5 * (p[J["left_hip"]] + p[J["right_hip"]])
+        at = self._to_robot(hips) - [0.0, 0.0, (1.0 - CROUCH) * float(np.mean([sum(leg) for leg in self._leg]))]
+        turn = turns[J["pelvis"]] @ self._rest["pelvis"][0]
+        self._set("pelvis", turn, at - turn @ self._hips_from_pelvis)
+        self._set("torso", turns[J["spine3"]] @ self._rest["torso"][0], np.zeros(3))
+        for k, side in enumerate(SIDES):
+            hip = self._frame(f"{side}_hip")[1]
+            self._set(f"{side}_knee", None, hip + self._leg[k][0] * _direction(p, f"{side}_hip", f"{side}_knee"))
+            shoulder = self._frame(f"{side}_shoulder")[1]
+            elbow = shoulder + self._arm[k][0] * _direction(p, f"{side}_shoulder", f"{side}_elbow")
+            self._set(f"{side}_elbow", None, elbow)
+            self._set(f"{side}_wrist", None, elbow + self._arm[k][1] * _direction(p, f"{side}_elbow", f"{side}_wrist"))
+            touching = max(body.contacts[CONTACTS.index(f"{side}_{part}")] for part in ("ankle", "foot"))
+            turn, place = self._foot_target(turns[J[f"{side}_ankle"]], p[J[f"{side}_ankle"]], k)
+            self._set(f"{side}_foot", *self._held(k, turn, place, float(touching), dt, begun=begun))
+
+    def _to_robot(self, point: Floats) -> Floats:
+        """A point (3,) of the person's in the robot's smaller, or larger, world."""
+        return self._scale * (point - [0.0, 0.0, ANKLE]) + [0.0, 0.0, self._sole]
+
+    def _foot_target(self, turn: Floats, ankle: Floats, k: int) -> tuple[Floats, Floats]:
+        place = self._to_robot(ankle)
+        place[2] = max(place[2], self._sole)
+        return turn @ self._rest[f"{SIDES[k]}_foot"][0], place
+
+    def _held(
+        self, k: int, turn: Floats, place: Floats, touching: float, dt: float, *, begun: bool
+    ) -> tuple[Floats, Floats]:
+        """Where a foot is to be: where it stands, or where the person's is, or on the way there."""
+        foot = self._feet[k]
+        far = foot.stood is not None and float(np.linalg.norm((foot.stood[1] - place)[:2])) > TOO_FAR
+        stands = begun and not far and touching > (LIFTS if foot.stands else STANDS)
+        if stands and not foot.stands:
+            now, at = self._frame(f"{SIDES[k]}_foot")
+            forward = (now @ self._rest[f"{SIDES[k]}_foot"][0].T)[:, 0]
+            flat = yaw_matrix(np.arctan2(forward[1], forward[0])) @ self._rest[f"{SIDES[k]}_foot"][0]
+            foot.stood, foot.free = (flat, np.array([at[0], at[1], self._sole])), 0.0
+        foot.stands = stands
+        if stands and foot.stood:
+            return foot.stood
+        foot.free = min(1.0, foot.free + dt / RELEASE_S)
+        if foot.stood is None or foot.free >= 1.0:
+            foot.stood = None
+            return turn, place
+        return turn, foot.stood[1] + float(minimum_jerk(foot.free)) * (place - foot.stood[1])
+
+    def _step(self, dt: float, share: float) -> None:
+        wanted = self._mink.solve_ik(
+            self._configuration, list(self._tasks.values()), dt, "daqp", damping=1e-4, limits=self._limits
+        )
+        self._velocity = share * wanted
+        self._integrate(self._velocity, dt)
+
+    def _integrate(self, velocity: Floats, dt: float) -> None:
+        q = self._configuration.integrate(velocity, dt)
+        before = self._configuration.q[self._q_indices]
+        most = self.robot.speed * dt
+        q[self._q_indices] = np.clip(
+            np.clip(q[self._q_indices], before - most, before + most), self.robot.lower, self.robot.upper
+        )
+        self._configuration.update(q)
+
+    def _set(self, part: str, turn: Floats | None, place: Floats) -> None:
+        rotation = self._mink.SO3.identity() if turn is None else self._mink.SO3.from_matrix(turn)
+        self._tasks[part].set_target(self._mink.SE3.from_rotation_and_translation(rotation, place))
+
+    def _frame(self, part: str) -> tuple[Floats, Floats]:
+        """Rotation (3, 3) and position (3,) of a part's link, world."""
+        link = self._configuration.data.body(self.robot.links[part])
+        return link.xmat.reshape(3, 3).copy(), link.xpos.copy()
+
+    def _length(self, *parts: str) -> tuple[float, float]:
+        a, b, c = (self._rest[part][1] for part in parts)
+        return float(np.linalg.norm(b - a)), float(np.linalg.norm(c - b))
+
+    def _pose(self, stamp_ns: int) -> RobotPose:
+        q = self._configuration.q
+        root = q[[0, 1, 2, 4, 5, 6, 3]].copy()
+        return RobotPose(stamp_ns, root, q[self._q_indices].copy(), (self._feet[0].stands, self._feet[1].stands))
+
+
+def _direction(p: Floats, start: str, end: str) -> Floats:
+    along = p[J[end]] - p[J[start]]
+    return along / max(float(np.linalg.norm(along)), 1e-6)
+
+
+def _length(p: Floats, *joints: str) -> float:
+    return float(sum(np.linalg.norm(p[J[b]] - p[J[a]]) for a, b in pairwise(joints)))
+
+
+class Follower:
+    """The robot's poses for a stream of ``pose/world``: as one person, until they are gone.
+
+    Args:
+        retargeter: of the robot.
+        body: the id of the one to follow; None: the first who is there, then the next.
+    """
+
+    def __init__(self, retargeter: Retargeter, body: int | None = None) -> None:
+        self._retargeter, self._followed = retargeter, Followed(body)
+
+    def process(self, world: PoseWorld) -> RobotPose | None:
+        """The pose at a message's moment; None before there was anybody."""
+        before = self._followed.id
+        body = self._followed.update(world)
+        if self._followed.id != before:
+            self._retargeter.reset()
+        pose = None if body is None else self._retargeter.follow(world.stamp_ns, body)
+        return pose or self._retargeter.coast(world.stamp_ns)

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from steadypose.msgs.recording import RecordingError, RecordingReader
 from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
-from steadypose.msgs.types import Diagnostics, Message, PoseRaw
+from steadypose.msgs.types import Diagnostics, Message, Pose, PoseRaw, RawBody
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sources.csv import CsvSource
 from steadypose.nodes.sources.npz import MotionSource, NpzSource, holds_motion
 from steadypose.nodes.sources.source import CalibrationSettings, RecordedSource, WebcamSettings
+from steadypose.prior.body.layouts import SKELETONS, Skeleton
 
 NO_RIG: Mapping[str, Any] = MappingProxyType({})
 _FILES = ".csv, .npz, .bvh, .trc, .c3d or .npy"
@@ -106,3 +112,125 @@ def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Mes
 def end_of(last: PoseRaw) -> PoseRaw:
     """The mark of the end of a stream, after its last message."""
     return dataclasses.replace(last, bodies=[], end_of_stream=True)
+
+
+AXES = ("x", "y", "z")
+LATEST_S = 2.0**31
+"""of a stamp, as ROS 2 counts seconds"""
+
+
+class CsvError(ValueError):
+    """A CSV that does not hold poses. The text says what was expected, what was found, and what to do."""
+
+
+class CsvSource:
+    """The frames of a CSV as messages; a source for the input node and for ``steadypose clean``.
+
+    A header and one row for each frame or, with several bodies, for each body in it::
+
+        stamp, left_shoulder_x, left_shoulder_y, left_shoulder_z, left_elbow_x, ...
+        0.000, 0.183, 1.402, 2.918, 0.301, ...
+
+    ``stamp`` is in seconds, of capture; positions in metres, empty or ``nan`` where missing. Joints have the names of a
+    skeleton (`prior.body.layouts`), in any order; those without columns are unobserved. Further columns:
+    ``JOINT_confidence``, 0 to 1, and ``body``, an integer id of each body of a stamp. Lines before the header may say
+    ``# skeleton: NAME``, where the joints' names fit several, and ``# up: z`` (the default), ``y`` or ``-y``.
+
+    Rows that cannot be read are counted in ``refused`` and left out.
+
+    Raises:
+        CsvError: the header, or all of the file, does not hold poses.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.refused: Counter[str] = Counter()
+        try:
+            lines = path.read_text(encoding="utf-8-sig").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise CsvError(f"{path}: cannot be read as text: {error}") from error
+        notes = [line[1:].partition(":") for line in lines if line.startswith("#")]
+        header = {key.strip(): value.strip() for key, _, value in notes}
+        rows = csv.reader(line for line in lines if line.strip() and not line.startswith("#"))
+        try:
+            columns = [name.strip() for name in next(rows, [])]
+            cells = list(rows)
+        except csv.Error as error:
+            raise CsvError(f"{path}: cannot be read as CSV: {error}") from error
+        self._skeleton = _skeleton(path, columns, header.get("skeleton"))
+        try:
+            self._sensor_pose = Pose.from_up(header.get("up", "z"))
+        except ValueError as error:
+            raise CsvError(f"{path}: {error}") from error
+        self._frames = self._read(cells, columns)
+        if not self._frames:
+            raise CsvError(f"{path}: expected at least one row of numbers after the header, got none that can be read")
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __iter__(self) -> Iterator[tuple[str, Message]]:
+        for stamp_ns, bodies in self._frames:
+            message = PoseRaw(
+                stamp_ns, "sensor", self.path.stem, self._skeleton.name, self._sensor_pose, False, list(bodies)
+            )
+            yield POSE_RAW, message
+
+    def _read(self, rows: list[list[str]], columns: list[str]) -> list[tuple[int, list[RawBody]]]:
+        """Each frame's stamp and bodies, in the order of the file."""
+        positions = _columns(columns, self._skeleton, AXES)
+        confidence = _columns(columns, self._skeleton, ("confidence",))
+        stamp, body = columns.index("stamp"), columns.index("body") if "body" in columns else None
+        read: list[tuple[int, RawBody]] = []
+        for row in rows:
+            if len(row) != len(columns):
+                self.refused["rows of another length than the header"] += 1
+                continue
+            try:
+                # the last number is what a missing column refers to
+                numbers = np.array([*(float(cell) if cell.strip() else math.nan for cell in row), math.nan])
+                seconds = numbers[stamp]
+                if not 0 <= seconds < LATEST_S:
+                    self.refused["rows without a stamp of 0 s or more"] += 1
+                    continue
+                id = 0.0 if body is None else float(numbers[body])
+                if not id.is_integer():
+                    self.refused["rows of which the body is no whole number"] += 1
+                    continue
+                joints, confidences = numbers[positions], numbers[confidence][:, 0]
+                confidences = np.where(np.isnan(confidences), np.isfinite(joints).all(axis=-1), confidences)
+                with np.errstate(over="ignore"):
+                    read.append((round(seconds * 1e9), RawBody(int(id), joints, confidences)))
+            except ValueError:
+                self.refused["rows with something else than numbers"] += 1
+        return [(stamp_ns, [one for _, one in group]) for stamp_ns, group in groupby(read, key=lambda pair: pair[0])]
+
+
+def _skeleton(path: Path, columns: list[str], named: str | None) -> Skeleton:
+    """The skeleton that has all the joints of the header."""
+    if "stamp" not in columns:
+        raise CsvError(f"{path}: expected a header with a column 'stamp', in seconds; got {', '.join(columns[:8])} ...")
+    if len(set(columns)) != len(columns):
+        twice = [name for name, times in Counter(columns).items() if times > 1]
+        raise CsvError(f"{path}: expected each column once, got {', '.join(twice)} again")
+    joints = {name[:-2] for name in columns if name.endswith(tuple(f"_{axis}" for axis in AXES))}
+    lone = [f"{joint}_{axis}" for joint in sorted(joints) for axis in AXES if f"{joint}_{axis}" not in columns]
+    if not joints or lone:
+        raise CsvError(
+            f"{path}: expected columns JOINT_x, JOINT_y and JOINT_z for each joint; "
+            f"{'missing: ' + ', '.join(lone[:5]) if lone else 'got none'}"
+        )
+    if named is not None and named not in SKELETONS:
+        raise CsvError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {named!r}")
+    for skeleton in [SKELETONS[named]] if named else SKELETONS.values():
+        if joints <= set(skeleton.joints):
+            return skeleton
+    closest = max([SKELETONS[named]] if named else SKELETONS.values(), key=lambda s: len(joints & set(s.joints)))
+    strange = ", ".join(sorted(joints - set(closest.joints))[:5])
+    raise CsvError(f"{path}: expected the joints of one skeleton; {closest.name} is closest, but has no {strange}")
+
+
+def _columns(columns: list[str], skeleton: Skeleton, endings: tuple[str, ...]) -> NDArray[np.intp]:
+    """(J, len(endings)) where each joint's columns are; -1 where it has none."""
+    place = {name: index for index, name in enumerate(columns)}
+    return np.array([[place.get(f"{joint}_{ending}", -1) for ending in endings] for joint in skeleton.joints])

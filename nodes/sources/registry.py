@@ -12,8 +12,7 @@ from steadypose.nodes.graph.clock import Clock, SystemClock
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError, load_plugin, path_setting
-from steadypose.nodes.sources.camera import open_oak, open_webcam
-from steadypose.nodes.sources.merge import MergeSettings, MergeSource
+from steadypose.nodes.sources.camera import MergeSettings, MergeSource, open_oak, open_webcam
 from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source, TfSettings, TfSource
 from steadypose.nodes.sources.source import (
     CalibrationSettings,

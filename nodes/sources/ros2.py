@@ -19,8 +19,7 @@ from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.graph.clock import POLL_S, Clock
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.ros2.connect import check_ros, connect
-from steadypose.nodes.ros2.connection import Connection
-from steadypose.nodes.ros2.definitions import deserialise, stamp_ns
+from steadypose.nodes.ros2.definitions import Connection, deserialise, stamp_ns
 from steadypose.nodes.sources.adapters import from_azure_kinect, from_pose_array
 from steadypose.nodes.sources.source import LiveSource, SourceContext
 from steadypose.prior.arrays import Floats

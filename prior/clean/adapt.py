@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from steadypose.msgs.contract import broken
+from steadypose.msgs.topics import broken
 from steadypose.msgs.types import CleanBody, PoseClean, PoseRaw, RawBody
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import SensorFrame, quaternions
@@ -114,7 +114,7 @@ def _is_too_large(positions: Floats) -> bool:
 def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int]) -> dict[int, CleanBody]:
     """The bodies of a moment, by slot, as that sensor sees them; ``ids`` from slots to what they are called.
 
-    One that breaks what `msgs.contract` promises is not among them.
+    One that breaks what `msgs.topics` promises is not among them.
     """
     estimate, score = frame.estimate, frame.score
     bodies: dict[int, CleanBody] = {}

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.contract import are_unit
+from steadypose.msgs.topics import are_unit
 from steadypose.msgs.types import JointState, Tracking, WorldBody
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, limbs

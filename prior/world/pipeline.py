@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from steadypose.msgs.contract import broken
+from steadypose.msgs.topics import broken
 from steadypose.msgs.types import CleanBody, PoseClean, PoseWorld, WorldBody
 from steadypose.prior.world.compose import compose
 from steadypose.prior.world.core import BodyEstimate, Scene, WorldCore

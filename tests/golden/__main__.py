@@ -20,7 +20,7 @@ import numpy as np
 
 from steadypose.msgs.codec import encode
 from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.commands.cleaning import clean_recording
+from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.prior_node import make_batch, make_prior
 from steadypose.nodes.graph.trajectory_node import make_trajectory

@@ -10,7 +10,7 @@ import pytest
 from tests.nodes.conftest import walk
 
 import steadypose
-from steadypose.nodes.commands.cleaning import clean_recording
+from steadypose.nodes.commands.output import clean_recording
 from steadypose.prior.body.layouts import SKELETONS, add_layouts
 
 ROOT = Path(__file__).parents[2]

@@ -18,8 +18,7 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.ros2.connect import check_ros, connect
-from steadypose.nodes.ros2.connection import Connection, Publish
-from steadypose.nodes.ros2.definitions import ros_types
+from steadypose.nodes.ros2.definitions import Connection, Publish, ros_types
 from steadypose.nodes.sinks.ros2.settings import HOST, FoxgloveSettings, Ros2BridgeSettings
 
 if TYPE_CHECKING:

@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.web.form import hello
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -56,6 +55,7 @@ class WebServer:
         host, port: to serve at; port 0 is any that is free.
         names: by which it may be called, beside its host, and beside this machine's names for itself.
         token: that a client must know.
+        greeting: what each client gets first.
 
     Attributes:
         url: of the page, with the token.
@@ -66,8 +66,8 @@ class WebServer:
         LaunchError: the port cannot be opened.
     """
 
-    def __init__(self, host: str, port: int, names: Collection[str], token: str) -> None:
-        self._token = token
+    def __init__(self, host: str, port: int, names: Collection[str], token: str, greeting: str) -> None:
+        self._token, self._greeting = token, greeting
         self._clients: set[_Client] = set()
         self._latest: dict[str, str] = {}
         self.dropped = 0
@@ -134,7 +134,7 @@ class WebServer:
         for stream, text in self._latest.items():
             client.offer(stream, text, True)
         self._clients.add(client)
-        feeding = asyncio.create_task(_feed(connection, client))
+        feeding = asyncio.create_task(_feed(connection, client, self._greeting))
         try:
             await connection.wait_closed()
         finally:
@@ -198,9 +198,9 @@ class _Client:
         return self._queue.popleft() if self._queue else self._newest.pop(next(iter(self._newest)))
 
 
-async def _feed(connection: ServerConnection, client: _Client) -> None:
+async def _feed(connection: ServerConnection, client: _Client, greeting: str) -> None:
     """Send what waits, until the connection is closed."""
-    await connection.send(hello())
+    await connection.send(greeting)
     while True:
         await connection.send(await client.next())
 

@@ -19,7 +19,7 @@ from steadypose.msgs.types import JOINTS
 from steadypose.nodes.commands import batch
 from steadypose.nodes.commands.batch import Job, _Worker, find_recordings, is_folder_of_recordings, on_cores, plan, work
 from steadypose.nodes.commands.clean import clean
-from steadypose.nodes.commands.cleaning import clean_recording
+from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.graph.settings import LaunchError
 
 FRAMES = 15
@@ -159,7 +159,7 @@ def test_an_output_is_whole_or_not_there(tmp_path: Path, settings, monkeypatch: 
     def fail(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("steadypose.nodes.commands.cleaning.RecordingWriter.write", fail)
+    monkeypatch.setattr("steadypose.nodes.commands.output.RecordingWriter.write", fail)
     with pytest.raises(OSError, match="no space"):
         clean_recording(source, tmp_path / "out", settings, replace=True)
     with pytest.raises(LaunchError, match="or --force to replace it"):

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from steadypose.nodes.commands.setting_names import full_key, pipeline_sections
-from steadypose.nodes.graph.launch import Launch, bundled, find
+from steadypose.nodes.graph.launch import Launch, bundled, find, full_key, pipeline_sections
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.recorder import RecorderSettings
 from steadypose.nodes.sources.registry import InputSettings

@@ -13,8 +13,7 @@ from conftest import raw, walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from steadypose.msgs.contract import are_unit, broken
-from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.topics import POSE_RAW, are_unit, broken
 from steadypose.msgs.types import JointState, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.prior_node import make_prior

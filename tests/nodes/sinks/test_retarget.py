@@ -24,8 +24,7 @@ from steadypose.prior.sim.streams import make, read_manifest
 pytest.importorskip("mink", reason="the extra 'retarget' is not installed")
 
 from steadypose.nodes.sinks.datagrams import GONE_NS
-from steadypose.nodes.sinks.retarget import RetargetNode
-from steadypose.nodes.sinks.retargeter import EASE_S, SIDES, Follower, Retargeter, RobotPose
+from steadypose.nodes.sinks.retarget import EASE_S, SIDES, Follower, Retargeter, RetargetNode, RobotPose
 from steadypose.nodes.sinks.robot import Robot, load_robot
 
 URDF = PACKAGE / "launch" / "robots" / "humanoid29.urdf"

@@ -29,8 +29,7 @@ from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.ros2 import connect as connecting
-from steadypose.nodes.ros2.connection import Connection
-from steadypose.nodes.ros2.definitions import deserialise, stamp_ns
+from steadypose.nodes.ros2.definitions import Connection, deserialise, stamp_ns
 from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, Ros2BridgeSettings, RosOutput, check_ros2
 from steadypose.nodes.sinks.ros2.messages import BodyTopics
 from steadypose.nodes.sinks.ros2.rep155 import JOINTS, LINKS, frames

@@ -22,8 +22,7 @@ from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import EventKind, JointState
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.web.form import hello, to_json
-from steadypose.nodes.sinks.web.node import WebNode, WebSettings, kept_token
+from steadypose.nodes.sinks.web.node import WebNode, WebSettings, hello, kept_token, to_json
 from steadypose.nodes.sinks.web.server import FILES, MAX_CLIENTS, STATIC, WebServer
 
 pytest.importorskip("websockets", reason="the extra 'web' is not installed")
@@ -33,7 +32,7 @@ TOKEN = "a-token-of-this-test"
 
 @pytest.fixture
 def server() -> Iterator[WebServer]:
-    server = WebServer("127.0.0.1", 0, ["kiosk.local"], TOKEN)
+    server = WebServer("127.0.0.1", 0, ["kiosk.local"], TOKEN, hello())
     yield server
     server.close()
 
@@ -136,7 +135,7 @@ def test_there_are_no_more_clients_than_there_is_room_for(server: WebServer) -> 
 
 def test_a_port_that_is_taken_is_named(server: WebServer) -> None:
     with pytest.raises(LaunchError, match=f"port {server.port} at 127.0.0.1 is not to be had"):
-        WebServer("127.0.0.1", server.port, [], TOKEN)
+        WebServer("127.0.0.1", server.port, [], TOKEN, hello())
 
 
 def test_messages_as_json() -> None:

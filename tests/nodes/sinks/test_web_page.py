@@ -18,7 +18,7 @@ from tests.helpers.synthetic_poses import messages
 
 from steadypose.msgs.topics import POSE_EVENTS, POSE_WORLD
 from steadypose.msgs.types import Event, EventKind, Hand, Message, Phase, PoseEvents
-from steadypose.nodes.sinks.web.form import to_json
+from steadypose.nodes.sinks.web.node import hello, to_json
 from steadypose.nodes.sinks.web.server import WebServer
 
 pytest.importorskip("websockets", reason="the extra 'web' is not installed")
@@ -40,7 +40,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def server() -> Iterator[WebServer]:
-    server = WebServer("127.0.0.1", 0, [], "a-token-of-this-test")
+    server = WebServer("127.0.0.1", 0, [], "a-token-of-this-test", hello())
     yield server
     server.close()
 
@@ -91,7 +91,7 @@ def test_the_page_draws_bodies_and_says_what_they_do_and_how_the_nodes_are(serve
 
 
 def test_the_last_poses_stay_when_the_stream_has_ended_and_the_server_with_it(browser: Any) -> None:
-    server = WebServer("127.0.0.1", 0, [], "a-token-of-this-test")
+    server = WebServer("127.0.0.1", 0, [], "a-token-of-this-test", hello())
     page = browser.new_page(viewport={"width": 1000, "height": 600})
     page.goto(server.url)
     last = worlds()[-1]
@@ -146,14 +146,14 @@ def test_four_bodies_are_drawn_thirty_times_a_second_in_bounded_memory(server: W
 
 
 def test_a_lost_connection_is_said_and_made_again(browser: Any) -> None:
-    first = WebServer("127.0.0.1", 0, [], "a-token-of-this-test")
+    first = WebServer("127.0.0.1", 0, [], "a-token-of-this-test", hello())
     page = browser.new_page()
     page.goto(first.url)
     until(lambda: page.text_content("#notice") == "", timeout_s=SOON_S)
     until(lambda: first.clients == 1)
     first.close()
     until(lambda: page.text_content("#notice").startswith("no connection"), timeout_s=SOON_S)
-    again = WebServer("127.0.0.1", first.port, [], "a-token-of-this-test")
+    again = WebServer("127.0.0.1", first.port, [], "a-token-of-this-test", hello())
     until(lambda: page.text_content("#notice") == "", timeout_s=SOON_S)
     page.close()
     again.close()

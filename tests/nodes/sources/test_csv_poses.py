@@ -9,8 +9,7 @@ import pytest
 from conftest import walk
 
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.sources.csv import CsvError, CsvSource
-from steadypose.nodes.sources.recording import open_recording
+from steadypose.nodes.sources.recording import CsvError, CsvSource, open_recording
 from steadypose.prior.body.skeleton import JOINTS
 
 HEADER = "stamp," + ",".join(f"{joint}_{axis}" for joint in JOINTS for axis in "xyz")

@@ -14,8 +14,8 @@ from tests.helpers.fake_oak import CAMERA, moment
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.commands.cleaning import clean_recording
-from steadypose.nodes.sources.csv import CsvSource
+from steadypose.nodes.commands.output import clean_recording
+from steadypose.nodes.sources.recording import CsvSource
 
 DOCS = Path(__file__).parents[3] / "docs"
 BLOCKS = dict(

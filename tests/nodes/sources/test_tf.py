@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2.connection import Connection, Publish
-from steadypose.nodes.ros2.definitions import serialise
+from steadypose.nodes.ros2.definitions import Connection, Publish, serialise
 from steadypose.nodes.sinks.ros2.messages import tf_message, transform
 from steadypose.nodes.sources import ros2 as module
 from steadypose.nodes.sources.registry import InputSettings, open_input

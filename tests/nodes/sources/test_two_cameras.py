@@ -18,7 +18,7 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
-from steadypose.nodes.sources.merge import MergeSettings, MergeSource
+from steadypose.nodes.sources.camera import MergeSettings, MergeSource
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.nodes.sources.source import CalibrationSettings, SourceContext
