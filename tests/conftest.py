@@ -11,21 +11,26 @@ from hypothesis import settings
 from steadypose.prior.body import layouts
 
 NEEDS_TORCH = re.compile(r"^\s*(?:from|import) (?:torch|steadypose\.(?:training|benchmarks|prior\.fit))\b", re.M)
-SLOW = (
-    "test_batch.py", "test_docs.py", "test_packaging.py", "test_processes.py", "test_run.py", "test_starts.py",
-    "test_tf2.py", "test_warm_up.py",
-)  # fmt: skip
-"""of the whole suite alone: they start many processes, or take seconds each"""
+ALL_SLOW = re.compile(r"^pytestmark = .*pytest\.mark\.slow\b", re.M)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--fast", action="store_true", help="leave out what needs torch, and what takes long")
+    parser.addoption("--fast", action="store_true", help="leave out what needs torch, and what is marked slow")
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Files that are left out whole are not even imported."""
     if not config.getoption("--fast") or collection_path.suffix != ".py" or collection_path.name == "conftest.py":
         return None
-    return collection_path.name in SLOW or bool(NEEDS_TORCH.search(collection_path.read_text())) or None
+    source = collection_path.read_text()
+    return bool(NEEDS_TORCH.search(source) or ALL_SLOW.search(source)) or None
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--fast"):
+        slow = [item for item in items if item.get_closest_marker("slow")]
+        items[:] = [item for item in items if item not in slow]
+        config.hook.pytest_deselected(items=slow)
 
 
 # a busy machine is no failure

@@ -30,6 +30,8 @@ import pytest
 from steadypose import PACKAGE
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PART = re.compile(

@@ -13,6 +13,8 @@ import pytest
 
 from steadypose import PACKAGE
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 
 

@@ -30,6 +30,8 @@ from steadypose.nodes.sinks.ros2.messages import tf_message, transform
 from steadypose.nodes.sinks.ros2.rep155 import LINKS, body_name, frames
 from steadypose.nodes.sources.ros2 import TransformBuffer, TransformError
 
+pytestmark = pytest.mark.slow
+
 SYSTEM_PYTHON = Path("/usr/bin/python3")
 TF2 = """
 import json, sys

@@ -14,6 +14,8 @@ import pytest
 
 from steadypose.prior.loop_cache import LOOPS
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = """
 import sys
 sys.path[:0] = sys.argv[1:]

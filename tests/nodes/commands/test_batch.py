@@ -22,6 +22,8 @@ from steadypose.nodes.commands.clean import clean
 from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.graph.settings import LaunchError
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 15
 
 

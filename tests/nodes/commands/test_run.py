@@ -23,6 +23,8 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import RUN
 from steadypose.nodes.graph.supervisor import BACKOFF_S, HUNG_S, STALE_S, STEADY_S, TRIES, Child, Supervisor
 
+pytestmark = pytest.mark.slow
+
 FOREVER = "import signal; signal.pause()"
 Start = Callable[[str], Child]
 

@@ -22,6 +22,8 @@ from steadypose.msgs.types import PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.graph.run_state import HEALTH_FILE
 from steadypose.nodes.sources.pose_input import LOOP_PAUSE_NS
 
+pytestmark = pytest.mark.slow
+
 
 class Run:
     """`steadypose run` in a process, and what it says of itself.

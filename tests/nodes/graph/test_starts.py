@@ -28,6 +28,8 @@ from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sinks.recorder import free_directory
 from steadypose.nodes.sources.pose_input import PoseInputNode
 
+pytestmark = pytest.mark.slow
+
 INPUT_ALONE = ("--set", 'nodes=["pose_input"]')
 
 
