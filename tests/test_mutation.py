@@ -36,6 +36,7 @@ def test_every_place_that_a_test_can_hold_is_changed_once(tmp_path: Path) -> Non
         assert mutant.source.decode() != CODE
 
 
+@pytest.mark.slow
 def test_tests_that_are_not_there_kill_nothing(tmp_path: Path) -> None:
     (tmp_path / "test_it.py").write_text("def test_it():\n    assert 1 + 1 == 2\n")
     assert mutation.passes(["test_it.py"], tmp_path)

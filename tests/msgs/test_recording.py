@@ -237,7 +237,7 @@ def test_an_error_while_recording_completes_it(tmp_path: Path):
 
 
 @given(data=st.data())
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_a_truncated_recording_gives_what_is_there(
     data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
 ):
@@ -256,7 +256,7 @@ def test_a_truncated_recording_gives_what_is_there(
 
 
 @given(data=st.data())
-@settings(max_examples=80)
+@settings(max_examples=40)
 def test_a_damaged_recording_is_an_error_and_never_another_message(
     data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
 ):
@@ -388,7 +388,7 @@ def test_messages_that_cannot_be_decoded_are_counted(tmp_path: Path):
 
 
 @given(data=st.data())
-@settings(max_examples=100)
+@settings(max_examples=40)
 def test_one_flipped_bit_costs_one_chunk_at_most(
     data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
 ):

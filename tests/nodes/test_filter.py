@@ -17,7 +17,7 @@ from steadypose.nodes.graph.trajectory_node import make_trajectory
 from steadypose.nodes.library.poses import ByName, Poses
 from steadypose.nodes.sources.npz import ArraySource
 
-FRAMES, DELAY = 40, 2
+FRAMES, DELAY = 30, 2
 STAMPS = 10**18 + np.round(np.arange(FRAMES) * 1e9 / 30).astype(np.int64)
 NODES = Path(__file__).parents[2] / "nodes"
 
@@ -132,7 +132,7 @@ def test_what_is_probably_wrong_is_warned_of_once(joints: np.ndarray) -> None:
     filter = steadypose.Filter()
 
     def misuse() -> None:
-        for k in range(100):
+        for k in range(40):
             filter(1000 * joints[k % FRAMES, 0], k / 30)
         filter.flush()
 

@@ -10,12 +10,13 @@ import pytest
 from tests.nodes.conftest import walk
 
 import steadypose
+from steadypose.nodes.cli import main
 from steadypose.nodes.commands.output import clean_recording
 from steadypose.prior.body.layouts import SKELETONS, add_layouts
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "library.md").read_text(), re.MULTILINE | re.DOTALL)
-FRAMES = 60
+FRAMES = 45
 
 
 def walked() -> np.ndarray:
@@ -88,8 +89,7 @@ def test_it_is_a_dictionary_still_and_knows_its_arrays_by_name(tmp_path: Path) -
 
 
 def test_as_a_table_and_as_a_dataset() -> None:
-    joints = np.stack([walked(), walked() + [3.0, 0.0, 0.0]], axis=1)
-    poses = steadypose.clean(joints, fps=30.0)
+    poses = steadypose.clean(np.stack([walked(), walked() + [3.0, 0.0, 0.0]], axis=1), fps=30.0)
     table = poses.to_pandas()
     assert len(table) == 2 * FRAMES
     second = table[table["body"] == 1]
@@ -129,9 +129,8 @@ def test_key_frames_are_completed_and_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_fit_is_that_of_the_command(tmp_path: Path) -> None:
-    from steadypose.nodes.cli import main
-
     joints = walked()[:40]
     np.savez(tmp_path / "in.npz", positions=joints, skeleton="smpl22", fps=30.0)
     assert main(["fit", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 0

@@ -218,6 +218,7 @@ def test_without_torch_a_fit_says_what_to_install(joints: np.ndarray, monkeypatc
         steadypose.fit(joints, fps=30)
 
 
+@pytest.mark.slow
 def test_a_recording_with_nobody_in_it_is_not_clean(tmp_path: Path, capsys) -> None:
     """Alone, and in a folder: the exit status says so."""
     (tmp_path / "in").mkdir()

@@ -18,7 +18,7 @@ from steadypose.nodes.graph.launch import Launch, tomllib
 
 PACKAGE = Path(__file__).parents[2] / "ros2/steadypose_ros"
 PROGRAM = Path(sys.executable).parent / "steadypose"
-pytestmark = pytest.mark.usefixtures("ros")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("ros")]
 
 
 @pytest.fixture

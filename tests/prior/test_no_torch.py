@@ -37,6 +37,7 @@ main()
 """
 
 
+@pytest.mark.slow
 def test_a_stream_is_cleaned_without_torch(tmp_path: Path) -> None:
     positions = waving(60)
     positions[20:40, 20] = np.nan  # a hidden wrist: completed, imputed

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -26,36 +27,29 @@ from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
 from steadypose.nodes.sources.recording import open_recording
-from steadypose.prior.body.layouts import CANONICAL, SKELETONS, Skeleton
+from steadypose.prior.body.layouts import CANONICAL, SKELETONS
 
 SECOND_NS = 1_000_000_000
 SOON_S = 3.0
 START_NS = 1_763_000_000 * SECOND_NS
 STREAMS = sorted(path.parent.name for path in (PACKAGE / "sim_data").glob("*/*.mcap"))
 
-Frames = list[PoseRaw]
+Frames = Sequence[PoseRaw]
 Spoil = Callable[[PoseRaw, int], PoseRaw]
 
 
-def walk(seconds: float = SOON_S, skeleton: Skeleton = CANONICAL, *, fps: float = 30.0) -> Frames:
+@cache
+def walk(seconds: float = SOON_S, layout: str = CANONICAL.name, *, fps: float = 30.0) -> Frames:
     """Somebody who walks, as a tracker of that layout with a centimetre of noise gives it, in a world with z up."""
+    skeleton = SKELETONS[layout]
     lift = np.linalg.pinv(skeleton.to_canonical)
     frames = []
     for index in range(round(seconds * fps)):
         joints, _, _ = walker(index / fps)
         noise = np.random.default_rng(index).normal(0.0, 0.01, (len(skeleton.joints), 3))
         body = RawBody(1, lift @ joints + noise, np.full(len(skeleton.joints), 0.9))
-        frames.append(
-            PoseRaw(
-                START_NS + round(index * SECOND_NS / fps),
-                "camera",
-                "mine",
-                skeleton.name,
-                Pose.identity(),
-                False,
-                [body],
-            )
-        )
+        stamp_ns = START_NS + round(index * SECOND_NS / fps)
+        frames.append(PoseRaw(stamp_ns, "camera", "mine", layout, Pose.identity(), False, [body]))
     return frames
 
 
@@ -232,21 +226,14 @@ def told(frames: Frames, *, max_bodies: int = 8, live: bool = True) -> dict[str,
 
 
 @pytest.mark.parametrize("misuse", MISUSES)
-def test_it_is_named_within_three_seconds(misuse: str) -> None:
+def test_it_is_named_within_three_seconds_and_nothing_else_is(misuse: str) -> None:
     spoil, cause, words = MISUSES[misuse]
     found = told([spoil(raw, index) for index, raw in enumerate(walk())])
-    assert cause in found, found
+    assert set(found) == {cause}
     after_s, _, text = found[cause]
     assert after_s <= SOON_S
     assert words in text
     assert "expected" in text
-
-
-def test_nothing_else_is_named() -> None:
-    """One thing that is wrong is not told as five."""
-    for misuse, (spoil, cause, _) in MISUSES.items():
-        found = told([spoil(raw, index) for index, raw in enumerate(walk())])
-        assert set(found) <= {cause}, misuse
 
 
 def test_the_table_is_long_enough() -> None:
@@ -255,7 +242,7 @@ def test_the_table_is_long_enough() -> None:
 
 @pytest.mark.parametrize("skeleton", SKELETONS)
 def test_a_good_stream_has_no_problem(skeleton: str) -> None:
-    good = walk(skeleton=SKELETONS[skeleton])
+    good = walk(layout=skeleton)
     assert not told(good)
 
 
@@ -267,7 +254,7 @@ def test_recorded_streams_have_no_problem(name: str) -> None:
 
 @pytest.mark.parametrize(("named", "meant"), [("coco17", "h36m17"), ("h36m17", "coco17"), ("kinect22", "smpl22")])
 def test_a_layout_for_another_of_as_many_joints(named: str, meant: str) -> None:
-    frames = [dataclasses.replace(raw, skeleton=named) for raw in walk(skeleton=SKELETONS[meant])]
+    frames = [dataclasses.replace(raw, skeleton=named) for raw in walk(layout=meant)]
     assert f"expected skeleton {meant!r}" in told(frames)["wrong_order"][2]
 
 

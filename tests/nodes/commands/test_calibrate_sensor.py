@@ -34,6 +34,7 @@ def write(folder: Path, person: str, scale: float, seed: int) -> tuple[Path, Pat
     return paths
 
 
+@pytest.mark.slow
 def test_the_bias_is_learned_and_helps_somebody_else(tmp_path: Path, capsys) -> None:
     for seed, (person, scale) in enumerate((("ann", 1.0), ("bob", 0.93), ("cid", 1.06))):
         write(tmp_path, person, scale, seed)

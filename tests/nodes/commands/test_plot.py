@@ -33,9 +33,10 @@ def record(directory: Path, topics: Collection[str], seconds: float = 3.0, **opt
 @pytest.mark.parametrize(
     "topics",
     [
-        {POSE_RAW},
-        {POSE_CLEAN},
-        {POSE_WORLD, POSE_TRUTH},
+        *(
+            pytest.param(topics, marks=pytest.mark.slow)
+            for topics in ({POSE_RAW}, {POSE_CLEAN}, {POSE_WORLD, POSE_TRUTH})
+        ),
         {POSE_RAW, POSE_CLEAN, POSE_WORLD, POSE_TRUTH},
     ],
     ids=lambda topics: "+".join(sorted(topic.removeprefix("pose/") for topic in topics)),
@@ -47,7 +48,7 @@ def test_draws_what_there_is(tmp_path: Path, topics: set[str]) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("frames", [1, 2])
+@pytest.mark.parametrize("frames", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_draws_a_recording_of_a_frame_or_two(tmp_path: Path, frames: int) -> None:
     recording = record(tmp_path / "bag", {POSE_RAW, POSE_CLEAN, POSE_WORLD, POSE_TRUTH}, (4 + frames) / 30)
     plot(recording, tmp_path / "picture.png")

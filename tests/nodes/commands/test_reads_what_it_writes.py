@@ -63,6 +63,7 @@ def test_it_is_completed_where_it_was_imputed(cleaned: Path, name: str, tmp_path
     assert len(open_recording(tmp_path / "whole.csv")) == FRAMES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["walk", "walk.npz", "walk.csv"])
 def test_it_is_drawn(cleaned: Path, name: str, tmp_path: Path) -> None:
     assert main(["plot", str(cleaned / name), "-o", str(tmp_path / "picture.png")]) == 0
@@ -91,7 +92,9 @@ def test_several_bodies_have_a_row_each(tmp_path: Path) -> None:
     assert [body.id for body in raws[0].bodies] == [0]
 
 
-@pytest.mark.parametrize(("name", "start"), [("walk.gif", b"GIF89a"), ("walk.mp4", b"")])
+@pytest.mark.parametrize(
+    ("name", "start"), [("walk.gif", b"GIF89a"), pytest.param("walk.mp4", b"", marks=pytest.mark.slow)]
+)
 def test_a_video_has_every_second_pose(cleaned: Path, name: str, start: bytes, tmp_path: Path) -> None:
     frames = write_video(history_of_path(cleaned / "walk"), tmp_path / name)
     assert frames == pytest.approx(FRAMES / 2, abs=1)

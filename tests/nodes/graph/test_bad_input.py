@@ -21,7 +21,7 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode, make_prior
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode, make_trajectory
 
-BEFORE, AFTER = 10, 12
+BEFORE, SPOILT, AFTER = 6, 3, 8
 SECOND_NS = 1_000_000_000
 
 
@@ -35,9 +35,9 @@ def good(start: int, count: int) -> list[PoseRaw]:
 
 
 def spoil(change: Callable[[PoseRaw], PoseRaw]) -> list[PoseRaw]:
-    """Good frames, five spoilt ones, good frames."""
-    spoilt = [change(frame) for frame in good(BEFORE, 5)]
-    return [*good(0, BEFORE), *spoilt, *good(BEFORE + 5, AFTER)]
+    """Good frames, some spoilt ones, good frames."""
+    spoilt = [change(frame) for frame in good(BEFORE, SPOILT)]
+    return [*good(0, BEFORE), *spoilt, *good(BEFORE + SPOILT, AFTER)]
 
 
 def with_body(positions: object, confidence: object = None) -> Callable[[PoseRaw], PoseRaw]:
@@ -212,4 +212,4 @@ def test_clean_counts_and_goes_on(tmp_path: Path, weights: dict[str, str], capsy
     with np.load(tmp_path / "out.npz") as out:
         assert len(out["stamp_ns"]) == len(frames)
         assert np.isfinite(out["positions"][-1]).all()
-    assert "unknown_skeleton: 5" in capsys.readouterr().err
+    assert f"unknown_skeleton: {SPOILT}" in capsys.readouterr().err

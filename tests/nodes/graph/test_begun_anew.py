@@ -15,7 +15,7 @@ from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
-KILLED, FRAMES = 180, 300
+KILLED, FRAMES = 150, 200
 
 
 def positions(messages: list[PoseClean] | list[PoseWorld]) -> NDArray[np.float32]:

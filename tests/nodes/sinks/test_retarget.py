@@ -57,7 +57,9 @@ def followed(robot: Robot, stream: list[PoseWorld]) -> tuple[list[RobotPose], ND
     return poses, np.array(away)
 
 
-@pytest.mark.parametrize("name", ["walk_turn", "sit_rise", "wave_hidden_arm"])
+@pytest.mark.parametrize(
+    "name", ["walk_turn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sit_rise", "wave_hidden_arm"))]
+)
 def test_limits_hold_in_every_frame_and_feet_that_stand_stay_within_2_cm(robot: Robot, name: str) -> None:
     poses, away = followed(robot, worlds(name))
     joints = np.array([pose.joints for pose in poses])
@@ -184,7 +186,7 @@ def test_the_node_sends_datagrams(make_launch: Callable[..., Launch]) -> None:
 
 
 def test_the_command_writes_csv_and_npz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    p = np.stack([world.bodies[0].positions for world in worlds("idle")[:60]])
+    p = np.stack([world.bodies[0].positions for world in worlds("idle")[:30]])
     np.savez(tmp_path / "in.npz", positions=p, skeleton="smpl22", fps=30.0)
     given = ["--urdf", str(URDF)]
     for name in ("out.csv", "out.npz"):

@@ -14,6 +14,7 @@ import sys
 import threading
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +129,7 @@ def test_a_body_that_left_is_cleared(view: PoseView, log: Log) -> None:
 
 
 def test_tracking_and_path_are_told_in_the_world(view: PoseView, log: Log) -> None:
-    stream = only(messages(14.0), POSE_WORLD)
+    stream = only(messages(PATH_SECONDS + 1.0), POSE_WORLD)
     stream[-1][1].bodies[0].tracking = Tracking.COASTING  # type: ignore[union-attr]
     for topic, message in stream:
         view.log(topic, message)
@@ -222,11 +223,15 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+@pytest.fixture(scope="module")
+def server() -> Iterator[ViewerServer]:
+    with ViewerServer(free_port()) as server:
+        yield server
+
+
 def test_the_server_shows_a_page_on_this_machine_alone() -> None:
     port = free_port()
-    with ViewerServer(port) as server:
-        page = urllib.request.urlopen(server.url, timeout=10).read()
-        assert b"rerun" in page.lower()
+    with ViewerServer(port):
         for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
             address, state = line.split()[1], line.split()[3]
             if state == "0A" and int(address.split(":")[1], 16) == port:
@@ -306,11 +311,12 @@ def test_without_rerun_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) 
         ViewerNode(Launch())
 
 
-def test_the_page_may_call_nobody_but_this_server() -> None:
+def test_the_page_may_call_nobody_but_this_server(server: ViewerServer) -> None:
     """By itself Rerun's page sends telemetry and asks for news; its policy has the browser refuse that."""
-    port = free_port()
-    with ViewerServer(port) as server, urllib.request.urlopen(server.url, timeout=20) as answer:
-        assert b"<html" in answer.read().lower()
+    with urllib.request.urlopen(server.url, timeout=20) as answer:
+        page = answer.read().lower()
+        assert b"<html" in page
+        assert b"rerun" in page
         rules = dict(rule.strip().split(" ", 1) for rule in answer.headers["Content-Security-Policy"].split(";"))
     assert rules["connect-src"].split() == ["'self'", "blob:", "data:"]
     assert not [word for rule in rules.values() for word in rule.split() if word in ("*", "http:", "https:")]
@@ -325,17 +331,16 @@ def asked(url: str, host: str | None = None) -> int:
         return error.code
 
 
-def test_who_does_not_know_the_token_sees_no_drawings() -> None:
-    with ViewerServer(free_port()) as server:
-        recording = viewer_node.connect(server)
-        recording.log("a", rr.TextLog("somebody"))
-        with urllib.request.urlopen(server.data_url, timeout=20) as answer:
-            assert answer.read(3) == b"RRF"
-        at, token, name = server.data_url.rsplit("/", 2)
-        for guess in ("", f"/{name}", f"/{'x' * len(token)}/{name}", f"/{token[:-1]}/{name}", f"/{token}/./{name}"):
-            with contextlib.suppress(urllib.error.HTTPError), urllib.request.urlopen(at + guess, timeout=20) as answer:
-                assert not answer.read().startswith(b"RRF"), guess
-        recording.disconnect()
+def test_who_does_not_know_the_token_sees_no_drawings(server: ViewerServer) -> None:
+    recording = viewer_node.connect(server)
+    recording.log("a", rr.TextLog("somebody"))
+    with urllib.request.urlopen(server.data_url, timeout=20) as answer:
+        assert answer.read(3) == b"RRF"
+    at, token, name = server.data_url.rsplit("/", 2)
+    for guess in ("", f"/{name}", f"/{'x' * len(token)}/{name}", f"/{token[:-1]}/{name}", f"/{token}/./{name}"):
+        with contextlib.suppress(urllib.error.HTTPError), urllib.request.urlopen(at + guess, timeout=20) as answer:
+            assert not answer.read().startswith(b"RRF"), guess
+    recording.disconnect()
 
 
 @pytest.mark.parametrize(
@@ -350,11 +355,10 @@ def test_a_page_of_another_name_is_nobodys(host: str, status: int) -> None:
     assert is_own_name(host, frozenset({"localhost", socket.gethostname().lower()})) == (status == 200)
 
 
-def test_a_name_that_was_made_to_lead_here_gets_nothing() -> None:
-    with ViewerServer(free_port()) as server:
-        for url in (server.url, server.data_url):
-            assert asked(url, host="evil.example") == 403
-        assert asked(server.url) == 200
+def test_a_name_that_was_made_to_lead_here_gets_nothing(server: ViewerServer) -> None:
+    for url in (server.url, server.data_url):
+        assert asked(url, host="evil.example") == 403
+    assert asked(server.url) == 200
 
 
 def test_a_browser_that_comes_late_gets_the_beginning_and_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,6 +41,7 @@ def is_drawn(screenshot: bytes) -> bool:
     return sides and pixels(screenshot, 2, CONTACT_RGB) > 10
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; on Debian: apt-get install chromium")
 def test_the_page_draws_three_panels_and_reaches_nobody_but_this_machine() -> None:
     with ViewerServer(free_port()) as server, playwright.sync_playwright() as play:

@@ -25,7 +25,7 @@ pytest.importorskip("websockets", reason="the extra 'web' is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="the extra 'dev' is not installed")
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; on Debian: apt-get install chromium")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")]
 LEFT, RIGHT, BACKGROUND = (0x56, 0xB4, 0xE9), (0xF0, 0x8C, 0x2E), (0x12, 0x14, 0x1A)
 SOON_S = 60.0
 

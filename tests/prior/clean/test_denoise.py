@@ -21,21 +21,21 @@ def error_mm(found: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(found - truth, axis=-1)[30:].mean() * 1000)
 
 
-@pytest.mark.parametrize(("delay", "share"), [(0, 0.95), (4, 0.95)])
-def test_in_noise_the_answer_is_nearer_to_the_truth(delay: int, share: float) -> None:
-    truth = waving(120)
+@pytest.mark.parametrize("delay", [0, 4])
+def test_in_noise_the_answer_is_nearer_to_the_truth(delay: int) -> None:
+    truth = waving(100)
     seen = truth + np.random.default_rng(0).normal(0.0, 0.04, truth.shape)
     with_it = error_mm(answers(seen, delay), truth)
-    assert with_it < share * error_mm(answers(seen, delay, denoise={"enabled": False}), truth)
+    assert with_it < 0.95 * error_mm(answers(seen, delay, denoise={"enabled": False}), truth)
 
 
 def test_without_noise_the_smoother_is_left_alone() -> None:
-    truth = waving(90)
+    truth = waving(60)
     np.testing.assert_allclose(answers(truth), answers(truth, denoise={"enabled": False}), atol=1e-3)
 
 
 def test_the_last_frames_are_denoised_as_the_others() -> None:
-    truth = waving(100)
+    truth = waving(70)
     seen = truth + np.random.default_rng(1).normal(0.0, 0.04, truth.shape)
     found = answers(seen)
     assert len(found) == len(truth)
@@ -54,10 +54,10 @@ def test_lost_frames_do_not_make_the_answer_flicker() -> None:
     def shaken(found: np.ndarray) -> float:
         return float(np.linalg.norm(np.diff(found - truth, n=2, axis=0), axis=-1)[30:].mean())
 
-    steady = answers(seen)
-    assert len(answers(flickering)) == len(truth)
-    assert shaken(answers(flickering)) < 2.3 * shaken(steady)
-    assert error_mm(answers(flickering), truth) < 1.15 * error_mm(steady, truth)
+    steady, found = answers(seen), answers(flickering)
+    assert len(found) == len(truth)
+    assert shaken(found) < 2.3 * shaken(steady)
+    assert error_mm(found, truth) < 1.15 * error_mm(steady, truth)
 
 
 def test_the_weight_is_that_of_least_variance() -> None:

@@ -31,8 +31,7 @@ def noisy(frames: int, sigma: float = 0.02) -> np.ndarray:
     return waving(frames) + np.random.default_rng(0).normal(size=(frames, 22, 3)) * sigma
 
 
-@pytest.mark.parametrize("delay", [0, 1, 4, 12])
-@pytest.mark.parametrize("frames", [1, 3, 8, 30])
+@pytest.mark.parametrize(("delay", "frames"), [(0, 1), (0, 8), (1, 3), (4, 1), (4, 3), (4, 20), (12, 8), (12, 20)])
 def test_every_frame_is_answered_once_in_order_however_short_the_stream(delay: int, frames: int) -> None:
     messages = stream(waving(frames))
     cleaned, _ = clean(messages, delay=delay)
@@ -50,11 +49,10 @@ def test_an_answer_leaves_exactly_its_delay_after_its_frame(delay: int) -> None:
         )
 
 
-@pytest.mark.parametrize("delay", [0, 1, 2, 4])
-@pytest.mark.parametrize("lost", [1, 3, 5])
+@pytest.mark.parametrize(("delay", "lost"), [(0, 1), (0, 5), (1, 3), (4, 1), (4, 5)])
 def test_without_any_network_of_windows_frames_may_be_lost(delay: int, lost: int) -> None:
     off = {name: {"enabled": False} for name in ("denoise", "score", "impute")}
-    truth = waving(40)
+    truth = waving(30)
     messages = [m for k, m in enumerate(stream(truth)) if not 20 <= k < 20 + lost]
     cleaned, _ = clean(messages, delay=delay, **off)
     assert [c.stamp_ns for c in cleaned] == [m.stamp_ns for m in stream(truth)]
@@ -75,7 +73,7 @@ def test_with_a_longer_delay_a_frame_keeps_what_it_was_decoded_to_as_the_centre(
 
 
 def test_the_same_stream_gives_the_same_bytes() -> None:
-    messages = stream(noisy(60))
+    messages = stream(noisy(30))
     a, b = (b"".join(encode(c) for c in clean(messages)[0]) for _ in range(2))
     assert a == b
 
@@ -108,9 +106,9 @@ def test_settings_may_say_that_sensor_and_prior_are_never_wrong() -> None:
 
 
 def test_noise_shrinks_and_bones_stand_still() -> None:
-    truth, seen = waving(420), noisy(420)
+    truth, seen = waving(240), noisy(240)
     cleaned, _ = clean(stream(seen))
-    settled = slice(340, None)
+    settled = slice(180, None)
     got = positions(cleaned)[settled]
     before = np.linalg.norm(seen - truth, axis=-1)[settled].mean()
     assert np.linalg.norm(got - truth[settled], axis=-1).mean() < 0.6 * before
@@ -123,7 +121,7 @@ def test_noise_shrinks_and_bones_stand_still() -> None:
 
 @pytest.mark.parametrize("delay", [0, 4, 16])
 def test_a_perfect_input_stays_what_it_is(delay: int) -> None:
-    truth = waving(90)
+    truth = waving(50)
     cleaned, _ = clean(stream(truth), delay=delay)
     apart = np.linalg.norm(positions(cleaned) - truth[: len(cleaned)], axis=-1)
     assert apart.mean() < 0.001
@@ -132,7 +130,7 @@ def test_a_perfect_input_stays_what_it_is(delay: int) -> None:
 
 def test_rotations_and_bones_place_the_joints_where_they_are_said_to_be() -> None:
     """To what the person's bones are off by: joints seen stay where they are seen."""
-    cleaned, _ = clean(stream(waving(90)))
+    cleaned, _ = clean(stream(waving(40)))
     body = cleaned[-1].bodies[0]
     assert np.allclose(body.bone_lengths[0], 0)
     rotations = Rotation.from_quat(body.rotations).as_matrix()
@@ -153,9 +151,9 @@ def test_the_answer_is_in_the_sensors_frame(up: str) -> None:
 
 
 def test_a_hidden_arm_is_imputed_near_the_truth_and_says_it_is_less_sure() -> None:
-    truth = waving(120)
+    truth = waving(85)
     arm = [J["left_elbow"], J["left_wrist"]]
-    seen = noisy(120, 0.01)
+    seen = noisy(85, 0.01)
     seen[60:75][:, arm] = np.nan
     cleaned, _ = clean(stream(seen))
     hidden = [c.bodies[0] for c in cleaned[60:75]]
@@ -168,12 +166,12 @@ def test_a_hidden_arm_is_imputed_near_the_truth_and_says_it_is_less_sure() -> No
 
 
 def test_a_joint_hidden_for_seconds_is_known_as_long_as_it_is_completed() -> None:
-    seen = waving(150)
-    seen[30:, J["left_wrist"]] = np.nan
+    seen = waving(120)
+    seen[10:, J["left_wrist"]] = np.nan
     for imputes, at_last in ((True, JointState.IMPUTED), (False, JointState.UNKNOWN)):
         cleaned, _ = clean(stream(seen), impute={"enabled": imputes})
         assert cleaned[60].bodies[0].state[J["left_wrist"]] == JointState.IMPUTED
-        assert cleaned[149].bodies[0].state[J["left_wrist"]] == at_last
+        assert cleaned[119].bodies[0].state[J["left_wrist"]] == at_last
 
 
 def test_legs_that_were_never_seen_are_where_a_standing_body_has_them() -> None:
@@ -206,11 +204,11 @@ def test_what_a_sensor_lacks_is_held_between_its_neighbours_or_completed() -> No
 
 
 def test_bodies_do_not_disturb_each_other() -> None:
-    a, b = noisy(60), noisy(60) + [2.0, 0, 0]
-    together = [raw(10**18 + k * PERIOD_NS, {1: a[k], 2: b[k]}) for k in range(60)]
-    alone, _ = clean([raw(10**18 + k * PERIOD_NS, {1: a[k]}) for k in range(60)])
+    a, b = noisy(30), noisy(30) + [2.0, 0, 0]
+    together = [raw(10**18 + k * PERIOD_NS, {1: a[k], 2: b[k]}) for k in range(30)]
+    alone, _ = clean([raw(10**18 + k * PERIOD_NS, {1: a[k]}) for k in range(30)])
     both, _ = clean(together)
-    assert [[x.id for x in c.bodies] for c in both] == [[1, 2]] * 60
+    assert [[x.id for x in c.bodies] for c in both] == [[1, 2]] * 30
     assert np.allclose(positions(both), positions(alone), atol=1e-5)
 
 
@@ -265,7 +263,7 @@ class TestBadInput:
 
     @pytest.mark.parametrize(("jump_s", "cause"), [(-3600, "stamp_jumped_back"), (10, "stream_gap")])
     def test_a_jump_of_the_stamps_ends_one_stream_and_starts_another(self, jump_s: int, cause: str) -> None:
-        first, second = stream(waving(30)), stream(waving(30), start_ns=10**18 + PERIOD_NS * 30 + jump_s * 10**9)
+        first, second = stream(waving(15)), stream(waving(15), start_ns=10**18 + PERIOD_NS * 15 + jump_s * 10**9)
         cleaned, pipeline = clean(first + second)
         assert [c.stamp_ns for c in cleaned] == [m.stamp_ns for m in first + second]
         assert b"".join(map(encode, cleaned)) == b"".join(map(encode, clean(first)[0] + clean(second)[0]))
@@ -288,10 +286,10 @@ class TestBadInput:
 
 @pytest.mark.parametrize("delay", [0, 4])
 def test_to_keep_only_stamps_while_nobody_is_there_changes_nothing(delay: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = noisy(30)
+    seen = noisy(20)
     visits = [[{id_: frame} for frame in seen] for id_ in (3, 4)]
-    nobody = [{}] * 150
-    people = [*nobody, *visits[0], *nobody, *visits[1], *visits[0], *nobody[:100]]
+    nobody = [{}] * 100
+    people = [*visits[0], *nobody, *visits[1], *visits[0], *nobody]
     messages = [raw(10**9 + k * PERIOD_NS, present) for k, present in enumerate(people)]
     idle = [encode(c) for c in clean(messages, delay=delay)[0]]
     monkeypatch.setattr(core, "IDLE_S", np.inf)
@@ -310,9 +308,9 @@ def test_end_of_stream_flushes_and_is_passed_on() -> None:
 
 @pytest.mark.parametrize(("stage", "enabled"), [("gate", False), ("person", False), ("refine", True), ("fuse", False)])
 def test_each_stage_can_be_switched(stage: str, enabled: bool) -> None:
-    cleaned, _ = clean(stream(noisy(60)), **{stage: {"enabled": enabled}})
+    cleaned, _ = clean(stream(noisy(30)), **{stage: {"enabled": enabled}})
     assert np.isfinite(positions(cleaned)).all()
-    assert len(cleaned) == 60
+    assert len(cleaned) == 30
 
 
 def test_settings_are_read_strictly() -> None:
@@ -336,11 +334,11 @@ def test_a_body_wholly_hidden_for_a_moment_stays_about_where_it_was() -> None:
     assert error[30:42].max() < 0.4
 
 
-@pytest.mark.parametrize("sigma", [0.0, 0.005, 0.02])
+@pytest.mark.parametrize("sigma", [0.0, 0.02])
 def test_the_noise_of_the_sensor_is_found(sigma: float) -> None:
     pipeline = PriorPipeline(PriorSettings())
     assert pipeline.sensor_noise is None
-    for message in stream(noisy(240, sigma)):
+    for message in stream(noisy(210, sigma)):
         pipeline.process(message)
     found = pipeline.sensor_noise
     assert found is not None
