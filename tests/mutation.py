@@ -1,7 +1,8 @@
-"""Mutation testing: ``python -m tests.mutation FOLDER_OR_FILE... --tests TESTS [--sample N] [--seed S]``.
+"""Mutation testing: ``python -m tests.mutation FOLDER_OR_FILE... [--tests TESTS] [--sample N] [--seed S]``.
 
 A mutant is the code with one operator, number, order or statement changed. Tests that pass on a mutant do not hold that
-place: it survived, and is printed. The checkout stays as it is, as mutants live in a copy. Exit status 0 if at least
+place: it survived, and is printed. Unless tests are named, a mutant meets those aimed at its file: the ones that import
+it, or where none does, that import the modules that import it. The checkout stays as it is, as mutants live in a copy. Exit status 0 if at least
 `GOAL` of the mutants were killed, 1 if fewer, 2 if the tests fail without any mutation.
 """
 
@@ -19,6 +20,7 @@ import time
 from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -121,13 +123,48 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
             return
 
 
+def aimed_at(file: Path, root: Path = ROOT) -> list[str]:
+    """Test files, relative to ``root``, aimed at a file of the package.
+
+    Raises:
+        ValueError: no test imports the file's module, nor what imports it.
+    """
+    modules = {
+        ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
+        for room in ("msgs", "prior", "training", "nodes", "benchmarks")
+        for path in (root / room).rglob("*.py")
+    }
+    tests = {path: _imports(path) for path in sorted((root / "tests").rglob("test_*.py"))}
+    sought, seen = {name for name, path in modules.items() if path == root / file}, set()
+    while sought:
+        found = [path for path, names in tests.items() if names & sought]
+        if near := [path for path in found if (root / "tests" / file).parent in path.parents]:
+            found = near  # those of the same room, where there are any
+        if found:
+            return [str(path.relative_to(root)) for path in found]
+        seen |= sought
+        sought = {name for name, path in modules.items() if name not in seen and _imports(path) & sought}
+    raise ValueError(f"{file}: expected a module of the package that a test imports, if only by another")
+
+
+@cache
+def _imports(path: Path) -> set[str]:
+    """Names without ``steadypose.``: of modules, and of what is taken from them."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("steadypose."):
+            module = (node.module or "").removeprefix("steadypose.")
+            names |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
+    return names
+
+
 def passes(tests: Sequence[str], root: Path, limit_s: float | None = None) -> bool:
     """Whether the tests pass on the copy of the checkout at ``root``; those that do not end in time do not.
 
     Raises:
         ValueError: there are no such tests.
     """
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests]
     # no bytecode: two mutants of one second and one size would be taken for one another
     environment = {**os.environ, "PYTHONPATH": str(root / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
     try:
@@ -143,7 +180,7 @@ def main() -> int:
     """Mutate, test, count."""
     parser = ArgumentParser("python -m tests.mutation", description=__doc__)
     parser.add_argument("code", nargs="+", type=Path, help="files, or folders of them")
-    parser.add_argument("--tests", nargs="+", required=True, help="what pytest is to run")
+    parser.add_argument("--tests", nargs="+", help="what pytest is to run; those aimed at each file if left out")
     parser.add_argument("--sample", type=int, help="so many mutants, drawn at random; all of them if left out")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -151,18 +188,22 @@ def main() -> int:
     files = [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
     every = [mutant for file in files for mutant in mutants(file.relative_to(ROOT))]
     drawn = random.Random(options.seed).sample(every, min(options.sample or len(every), len(every)))
+    drawn.sort(key=lambda mutant: mutant.file)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "checkout"
         shutil.copytree(ROOT, root, symlinks=True, ignore=shutil.ignore_patterns(*ELSEWHERE))
-        started = time.monotonic()
-        if not passes(options.tests, root):
-            print("the tests fail without any mutation: nothing can be said of them")
-            return 2
-        limit_s = 10.0 + 5.0 * (time.monotonic() - started)
         survived = 0
+        limits_s: dict[tuple[str, ...], float] = {}
         for mutant in drawn:
+            tests = tuple(options.tests or aimed_at(mutant.file))
+            if tests not in limits_s:
+                started = time.monotonic()
+                if not passes(tests, root):
+                    print(f"the tests fail without any mutation, nothing can be said of them: {' '.join(tests)}")
+                    return 2
+                limits_s[tests] = 10.0 + 5.0 * (time.monotonic() - started)
             (root / mutant.file).write_bytes(mutant.source)
-            survives = passes(options.tests, root, limit_s)
+            survives = passes(tests, root, limits_s[tests])
             (root / mutant.file).write_bytes((ROOT / mutant.file).read_bytes())
             survived += survives
             print("survived" if survives else "killed  ", mutant, flush=True)
