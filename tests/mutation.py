@@ -2,7 +2,7 @@
 
 A mutant is the code with one operator, number, order or statement changed. Tests that pass on a mutant do not hold that
 place: it survived, and is printed. Unless tests are named, a mutant meets those aimed at its file: the ones that import
-it, or where none does, that import the modules that import it; none that is marked slow. The checkout stays as it is, as
+it, or where none does, that import the modules that import it; none that is marked slow. The checkout stays as it is:
 mutants live in a copy. Exit status 0 if at least `GOAL` of the mutants were killed, 1 if fewer, 2 if the tests fail
 without any mutation.
 """
