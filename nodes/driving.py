@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import Message, PoseClean, PoseRaw
+from steadypose.nodes.checks.problem import Problem
+from steadypose.nodes.checks.stamps import check_length
 from steadypose.nodes.checks.stream import StreamCheck
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.graph.settings import LaunchError
@@ -62,16 +64,31 @@ class Diagnosis:
     def __init__(self, settings: PriorSettings) -> None:
         self.problems: dict[str, str] = {}
         self._check = StreamCheck(settings.max_bodies, identified=settings.identify.enabled)
+        self._delay_frames = settings.delay
+        self._first_ns: int | None = None
+        self._last_ns = 0
         self.frames = 0
 
     def see(self, raw: PoseRaw) -> None:
         """Take the next frame, without looking at it yet."""
         self._check.see(raw, self.frames * CHECKED_NS // CHECKED)
+        self._first_ns = raw.stamp_ns if self._first_ns is None else self._first_ns
+        self._last_ns = raw.stamp_ns
         self.frames += 1
 
     def look(self) -> list[str]:
         """Examine the last of them; returns what is newly wrong, a line each."""
-        found = self._check.problems((self.frames - 1) * CHECKED_NS // CHECKED, live=False)
+        return self._note(self._check.problems((self.frames - 1) * CHECKED_NS // CHECKED, live=False))
+
+    def end(self) -> list[str]:
+        """The stream has ended, and another may begin; returns as `look`, and whether it was long enough."""
+        new = self.look()
+        if self._first_ns is not None and not self.problems:
+            new += self._note(check_length(self._first_ns, self._last_ns, self._delay_frames))
+        self._first_ns = None
+        return new
+
+    def _note(self, found: Iterable[Problem]) -> list[str]:
         new = {problem.cause: problem.text for problem in found if problem.cause not in self.problems}
         self.problems |= new
         return [f"{cause}: {text}" for cause, text in new.items()]
@@ -120,8 +137,7 @@ class OfflineRun:
             elif isinstance(message, PoseClean):
                 self.poses += len(message.bodies)
             yield topic, message
-        if self.diagnosis.frames % CHECKED:
-            self.diagnosis.look()
+        self.diagnosis.end()
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from steadypose.nodes.checks.problem import Arrival, Problem, error, warning
+from steadypose.nodes.graph.clock import FRAME_NS
 
 SECOND_NS = 1_000_000_000
 ENOUGH = 10
@@ -68,6 +69,17 @@ def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem
         )
     if live:
         yield from _against_clock(arrivals, stamps)
+
+
+def check_length(first_ns: int, last_ns: int, delay_frames: int) -> Iterator[Problem]:
+    """The problem with a stream that ends before the delay is filled, given its first and last stamp."""
+    if last_ns - first_ns < (delay_frames - 0.5) * FRAME_NS:  # stamps are rounded
+        yield warning(
+            "short",
+            f"the stream lasts {(last_ns - first_ns) / SECOND_NS:.2f} s, less than the delay of {delay_frames} frames: "
+            "its deviations leave out the sensor's error in depth, which bones show later; expected a longer stream, "
+            "or a shorter delay",
+        )
 
 
 def _unit(stamps: np.ndarray) -> Problem | None:

@@ -141,7 +141,7 @@ class Filter:
             return []
         end = replace(self._last, bodies=[], end_of_stream=True)
         poses, self._last = self._poses(self._prior.process(end)), None
-        warn(self._diagnosis.look())
+        warn(self._diagnosis.end())
         if not self._recognised and not self.problems:
             cause, _, text = NOBODY.partition(": ")
             self._diagnosis.problems[cause] = text

@@ -140,6 +140,10 @@ WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         lambda j: steadypose.clean(j, fps=300),
         r"frames are 3\.33 ms apart: .* give fps the rate at which the recording was made",
     ),
+    "shorter than the delay": (
+        lambda j: steadypose.clean(j[:4], fps=30),
+        "lasts 0.10 s, less than the delay of 4 frames",
+    ),
     "nothing but NaN": (lambda j: steadypose.clean(np.full_like(j, np.nan), fps=30), "all joints .* are NaN"),
     "nobody": (lambda j: steadypose.clean(np.full((FRAMES, 2, 22, 3), np.nan), fps=30), "no body in any frame"),
     "confidence in per cent": (
