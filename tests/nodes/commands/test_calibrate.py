@@ -37,6 +37,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_board_lens_and_pose_end_in_the_launch_file(
     pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -86,6 +87,7 @@ def test_the_floor_seen_in_depth_tells_height_and_tilt(tmp_path: Path) -> None:
     assert pose.position == pytest.approx([0.0, 0.0, EYE.position[2]], abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_printed_board_is_the_one_that_is_looked_for_at_its_true_size(tmp_path: Path) -> None:
     assert main(["calibrate", "board", str(tmp_path / "board.png"), "--paper", "a4"]) == 0
     page = cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_GRAYSCALE)

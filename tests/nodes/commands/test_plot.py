@@ -47,8 +47,9 @@ def test_draws_what_there_is(tmp_path: Path, topics: set[str]) -> None:
     assert (tmp_path / "picture.png").read_bytes().startswith(PICTURE)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("frames", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("frames", [1, 2])
 def test_draws_a_recording_of_a_frame_or_two(tmp_path: Path, frames: int) -> None:
     recording = record(tmp_path / "bag", {POSE_RAW, POSE_CLEAN, POSE_WORLD, POSE_TRUTH}, (4 + frames) / 30)
     plot(recording, tmp_path / "picture.png")

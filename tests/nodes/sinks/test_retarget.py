@@ -71,6 +71,7 @@ def test_limits_hold_in_every_frame_and_feet_that_stand_stay_within_2_cm(robot: 
     assert away.max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_raised_hand_is_raised_and_a_sitting_person_sits(robot: Robot) -> None:
     retargeter = Retargeter(robot)
     raised, lowest = 0.0, 1.0

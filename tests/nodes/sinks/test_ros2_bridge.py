@@ -91,6 +91,7 @@ def stream() -> tuple[list[PoseClean], list[PoseWorld]]:
     return cleans[-20:], worlds[-20:]  # type: ignore[return-value]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ros")
 def test_a_ros_node_hears_bodies(
     make_launch: Callable[..., Launch], tmp_path: Path, stream: tuple[list[PoseClean], list[PoseWorld]]

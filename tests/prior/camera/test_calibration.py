@@ -50,6 +50,7 @@ def view(pose: Pose, rng: np.random.Generator, noise: float = 0.05) -> Corners:
     return Corners(INNER, project(pose, INNER) + rng.normal(0.0, noise, (len(INNER), 2)))
 
 
+@pytest.mark.slow
 def test_a_rendered_board_on_the_floor_tells_the_cameras_place_within_5_mm_and_03_degrees() -> None:
     rng, looks = np.random.default_rng(0), rays(LENS, finer=2)
     for pose, _ in zip(floor_poses(rng), range(1), strict=False):

@@ -131,6 +131,7 @@ def test_the_pipeline_gives_unnumbered_bodies_ids_and_passes_a_trackers_on() -> 
     assert len({tuple(i) for i in run()}) > 1, "the source's ids are passed on as they are"
 
 
+@pytest.mark.slow
 def test_nobody_changes_ids_in_the_crossing_streams() -> None:
     """That of sim_data, and one in which the hindmost is hidden for two seconds and, then, both at once."""
     filmed = read_manifest(MANIFEST)["crossing"]
