@@ -195,20 +195,49 @@ def _rotation(quaternion: bytes) -> Floats:
 
 def from_rotation_vectors(vectors: Floats) -> Floats:
     """(..., 3, 3) rotations by vectors (..., 3), radians about their directions (Rodrigues)."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    cross = np.zeros((*vectors.shape, 3))
-    cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = -vectors[..., 2], vectors[..., 1], -vectors[..., 0]
-    cross -= cross.swapaxes(-1, -2)
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * (cross @ cross)
+    rotations = np.empty((*vectors.shape, 3))
+    _rodrigues(np.ascontiguousarray(vectors).reshape(-1, 3), rotations.reshape(-1, 3, 3))
+    return rotations
+
+
+@njit(cache=True)
+def _rodrigues(vectors, rotations):
+    for row in range(len(vectors)):
+        v, r = vectors[row], rotations[row]
+        square = v[0] ** 2 + v[1] ** 2 + v[2] ** 2
+        angle = math.sqrt(square)
+        sine = math.sin(angle) / angle if angle > 1e-9 else 1.0
+        half = math.sin(0.5 * angle) / (0.5 * angle) if angle > 1e-9 else 1.0
+        turn = 0.5 * half * half
+        for i in range(3):
+            for j in range(3):
+                r[i, j] = turn * v[i] * v[j]
+            r[i, i] += 1.0 - turn * square
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            r[a, b] -= sine * v[i]
+            r[b, a] += sine * v[i]
 
 
 def to_rotation_vectors(rotations: Floats) -> Floats:
     """(..., 3) radians, of rotations (..., 3, 3) by less than a half turn."""
-    skew = 0.5 * (rotations - rotations.swapaxes(-1, -2))
-    vector = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
-    sine = np.linalg.norm(vector, axis=-1)
-    angle = np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1.0))
-    return vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0)[..., None]
+    vectors = np.empty(rotations.shape[:-1])
+    _rotation_vectors(np.ascontiguousarray(rotations).reshape(-1, 3, 3), vectors.reshape(-1, 3))
+    return vectors
+
+
+@njit(cache=True)
+def _rotation_vectors(rotations, vectors):
+    for row in range(len(rotations)):
+        r, v = rotations[row], vectors[row]
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            v[i] = 0.5 * (r[b, a] - r[a, b])
+        sine = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+        if sine > 1e-9:
+            angle = math.atan2(sine, 0.5 * (r[0, 0] + r[1, 1] + r[2, 2] - 1.0))
+            for i in range(3):
+                v[i] *= angle / sine
 
 
 def rigid_alignment(source: NDArray[np.floating], target: NDArray[np.floating]) -> tuple[Floats, Floats]:

@@ -15,6 +15,7 @@ from steadypose.prior.body.kinematics import SensorFrame, quaternions
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, finite_joints
 from steadypose.prior.clean.frame import CleanFrame
+from steadypose.prior.compiled import median
 
 MAX_DISTANCE = 30.0
 """Metres from the sensor beyond which a joint is no observation."""
@@ -100,15 +101,15 @@ def _canonical(body: RawBody, layout: Skeleton, counters: Counter[str]) -> tuple
     if far.any():
         counters["joints_too_far"] += int(far.sum())
         joints[far] = np.nan
-    confidence = np.nan_to_num(body.confidence.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
-    return to_canonical(layout, joints, np.clip(confidence, 0.0, 1.0))
+    confidence = np.fmin(np.fmax(body.confidence.astype(np.float64), 0.0), 1.0)  # NaN becomes 0
+    return to_canonical(layout, joints, confidence)
 
 
 def _is_too_large(positions: Floats) -> bool:
     """Whether joints (22, 3) are nobody's: one such frame would be learned from for seconds."""
     lengths = np.linalg.norm(positions[1:] - positions[PARENT[1:]], axis=1)
     seen = np.isfinite(lengths)
-    return bool(seen.sum() >= MIN_BONES and np.median(lengths[seen] / _REST_LENGTHS[seen]) > MAX_SIZE)
+    return bool(seen.sum() >= MIN_BONES and median(lengths[seen] / _REST_LENGTHS[seen]) > MAX_SIZE)
 
 
 def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int]) -> dict[int, CleanBody]:

@@ -71,7 +71,6 @@ class CleanCore:
 
     Attributes:
         fuse: the last stage.
-        sensor_noise: latest estimate of the sensor's error, the median over the bodies present.
     """
 
     def __init__(self, settings: PriorSettings, counters: Counter[str]) -> None:
@@ -101,7 +100,12 @@ class CleanCore:
         self._unpublished = np.zeros(slots, dtype=np.int64)  # frames in a row
         self._nobody = 0  # frames in a row without a body
         self._last: CleanFrame | None = None
-        self.sensor_noise: SensorNoise | None = None
+        self._noise: tuple[Floats, Floats] | None = None  # jitter and bias of the bodies present
+
+    @property
+    def sensor_noise(self) -> SensorNoise | None:
+        """The latest estimate of the sensor's error, the median over the bodies present; None before the first."""
+        return self._noise and SensorNoise(*(float(np.median(sigma)) for sigma in self._noise))
 
     def step(self, observation: Observation) -> CleanFrame | None:
         """Take in a frame of the grid; returns the output for the one ``delay`` before, or None while there is none."""
@@ -136,8 +140,7 @@ class CleanCore:
         imputed = impute(windows, gated.jitter, self._delay + 1) if self._imputes else None
         rotations = self._refine.update(gated, person)
         if present.any():
-            sigmas = gated.jitter[present], bias.bias_sigma[present]
-            self.sensor_noise = SensorNoise(*(float(np.median(sigma)) for sigma in sigmas))
+            self._noise = gated.jitter[present], bias.bias_sigma[present]
         self._newest = newest = _Newest(gated, present, person, bias, left_out, rotations, score, imputed)
         return None if smoothed is None else self._fused(smoothed, newest, self._delay)
 

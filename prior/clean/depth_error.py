@@ -9,10 +9,13 @@ second says how much is left out; where the camera is, need not be known.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.compiled import njit
 from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
 
@@ -29,7 +32,6 @@ LEFT_OUT = 3.0
 """Variance along an axis that is left out, relative to the difference of the eigenvalues: what lasts longer than the
 mean of the lengths does not vary them, nor do errors that both ends share."""
 
-_BONES = np.arange(1, 22)
 _PARENTS = np.array(PARENTS[1:])
 _ENTRIES = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 """Of the symmetric matrix, in the vector of its six different entries."""
@@ -45,7 +47,7 @@ class DepthError:
     """
 
     def __init__(self, slots: int) -> None:
-        self._frames, self._length = np.zeros((2, slots, len(_BONES)))
+        self._frames, self._length = np.zeros((2, slots, len(_PARENTS)))
         self._normal, self._right = np.zeros((slots, 6, 6)), np.zeros((slots, 6))
         self._total = np.zeros((2, slots))  # of bones, and of halves of their squared residuals
 
@@ -64,25 +66,45 @@ class DepthError:
         """
         if smoothed is None:
             return np.zeros(len(white))
-        bone = smoothed.positions[:, _BONES] - smoothed.positions[:, _PARENTS]
-        length = np.linalg.norm(bone, axis=-1)
-        known = np.isfinite(length) & (np.maximum(smoothed.sigma[:, _BONES], smoothed.sigma[:, _PARENTS]) < MAX_SIGMA)
-        self._frames += known
-        share = known / np.clip(self._frames, 1.0, MEMORY)
-        length = np.where(known, length, self._length)
-        self._length += share * (length - self._length)
-        square = 0.5 * np.minimum(np.square(length - self._length), MAX_RESIDUAL**2) * known
-        x, y, z = np.moveaxis(np.where(known[..., None], bone, 0.0) / np.maximum(length, 1e-6)[..., None], -1, 0)
-        direction = np.stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z], axis=-1)
-        keep = 1.0 - 1.0 / MEMORY
-        self._normal = keep * self._normal + np.einsum("sbi,sbj->sij", direction, direction)
-        self._right = keep * self._right + np.einsum("sbi,sb->si", direction, square)
-        self._total = keep * self._total + np.stack([known.sum(axis=1), square.sum(axis=1)])
+        _take_in(smoothed.positions, smoothed.sigma, self._frames, self._length, self._normal, self._right, self._total)
         count, squares = self._total
-        ridge = RIDGE * count + PRIOR * len(_BONES)
+        ridge = RIDGE * count + PRIOR * len(_PARENTS)
         mean = squares / np.maximum(count, 1.0)
         normal = self._normal + ridge[:, None, None] * np.diag(_TWICE)
         form = np.linalg.solve(normal, (self._right + (ridge * mean)[:, None] * _ISOTROPIC)[..., None])[..., 0]
         eigenvalues = np.linalg.eigvalsh(form[:, _ENTRIES])
         left_out = LEFT_OUT * (1.0 - white) * (eigenvalues[:, 2] - eigenvalues[:, 1])
         return np.sqrt(np.maximum(left_out, 0.0))
+
+
+@njit(cache=True)
+def _take_in(positions, sigma, frames, length, normal, right, total):
+    """Take joints (S, 22, 3) and their deviations (S, 22) into the moments of `DepthError`."""
+    keep, entries = 1.0 - 1.0 / MEMORY, np.empty(6)
+    for slot in range(len(positions)):
+        for i in range(6):
+            right[slot, i] *= keep
+            for j in range(6):
+                normal[slot, i, j] *= keep
+        total[0, slot] *= keep
+        total[1, slot] *= keep
+        for k in range(len(_PARENTS)):
+            joint, above = k + 1, _PARENTS[k]
+            x = positions[slot, joint, 0] - positions[slot, above, 0]
+            y = positions[slot, joint, 1] - positions[slot, above, 1]
+            z = positions[slot, joint, 2] - positions[slot, above, 2]
+            long = math.sqrt(x * x + y * y + z * z)
+            if not (math.isfinite(long) and max(sigma[slot, joint], sigma[slot, above]) < MAX_SIGMA):
+                continue
+            frames[slot, k] += 1.0
+            length[slot, k] += (long - length[slot, k]) / min(frames[slot, k], MEMORY)
+            square = 0.5 * min((long - length[slot, k]) ** 2, MAX_RESIDUAL**2)
+            x, y, z = x / max(long, 1e-6), y / max(long, 1e-6), z / max(long, 1e-6)
+            entries[0], entries[1], entries[2] = x * x, y * y, z * z
+            entries[3], entries[4], entries[5] = 2 * x * y, 2 * x * z, 2 * y * z
+            for i in range(6):
+                right[slot, i] += entries[i] * square
+                for j in range(6):
+                    normal[slot, i, j] += entries[i] * entries[j]
+            total[0, slot] += 1.0
+            total[1, slot] += square

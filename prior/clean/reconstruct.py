@@ -170,22 +170,42 @@ class Denoise:
         seen |= ~seen.any(axis=1, keepdims=True)
         # and between two observations that are near
         seen |= history.seen_since(back) & (history.unseen_s[-1 - back] < BRIEF_S)
-        known = seen & np.isfinite(reconstructed[..., 0] + smoothed.sigma)
-        moved = np.where(known[..., None], reconstructed - smoothed.positions, 0.0)
-        square = np.square(moved).mean(axis=-1)
-        self._frames += known
-        self._apart += known * (square - self._apart) / np.clip(self._frames, 1, MEMORY)
-        gained = (1.0 - NOISE_LEFT) * np.square(np.where(known, np.minimum(smoothed.sigma, jitter[:, None]), 0.0))
-        own = np.maximum(np.maximum(self._apart, square / SUDDEN) - gained, MODEL_SIGMA**2)
-        late_s = np.interp(back, (0, SETTLED), (LATE_NEWEST_S, LATE_S))
-        step = np.nan_to_num(smoothed.positions - self._before)  # one frame
-        own += (late_s * FPS) ** 2 * np.square(step).mean(axis=-1)
+        late = np.interp(back, (0, SETTLED), (LATE_NEWEST_S, LATE_S)) * FPS
+        positions, sigma = smoothed.positions.copy(), smoothed.sigma.copy()
+        _denoise(positions, sigma, seen, reconstructed, jitter, late, self._apart, self._frames, self._before)
         self._before = smoothed.positions
-        share = gained / (gained + own)
-        return smoothed._replace(
-            positions=smoothed.positions + share[..., None] * moved,
-            sigma=smoothed.sigma * np.sqrt(1.0 - share * (1.0 - NOISE_LEFT)),
-        )
+        return smoothed._replace(positions=positions, sigma=sigma)
+
+
+@njit(cache=True)
+def _denoise(positions, sigma, seen, reconstructed, jitter, late, apart, frames, before):
+    """As `Denoise._denoised`: moves the joints (S, 22, 3) that are ``seen`` (S, 22), and their deviations, in place.
+
+    Args:
+        late: frames by which HG-VAE lags.
+        apart, frames: (S, 22) of the running mean of the squared distance between the two estimates, updated.
+        before: (S, 22, 3) metres, the smoother's estimate one frame earlier.
+    """
+    moved = np.empty(3)
+    for slot in range(len(positions)):
+        for joint in range(positions.shape[1]):
+            square = speed = 0.0
+            for axis in range(3):
+                moved[axis] = reconstructed[slot, joint, axis] - positions[slot, joint, axis]
+                square += moved[axis] * moved[axis]
+                step = positions[slot, joint, axis] - before[slot, joint, axis]
+                speed += step * step if math.isfinite(step) else 0.0
+            square /= 3.0
+            if not (seen[slot, joint] and math.isfinite(square + sigma[slot, joint])):
+                continue
+            frames[slot, joint] += 1.0
+            apart[slot, joint] += (square - apart[slot, joint]) / min(frames[slot, joint], MEMORY)
+            gained = (1.0 - NOISE_LEFT) * min(sigma[slot, joint], jitter[slot]) ** 2
+            own = max(max(apart[slot, joint], square / SUDDEN) - gained, MODEL_SIGMA**2) + late**2 * (speed / 3.0)
+            share = gained / (gained + own)
+            for axis in range(3):
+                positions[slot, joint, axis] += share * moved[axis]
+            sigma[slot, joint] *= math.sqrt(1.0 - share * (1.0 - NOISE_LEFT))
 
 
 @njit(cache=True)

@@ -25,6 +25,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import from_rotation_vectors, to_rotation_vectors
 from steadypose.prior.body.pelvis import rigid_covariance, rigid_pelvis
 from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, SHOULDERS
+from steadypose.prior.compiled import njit
 from steadypose.prior.models.weights import Arrays, load_weights
 
 DIMENSIONS, TURNS = 66, 3
@@ -37,7 +38,6 @@ MIN_SIGMA, MAX_SIGMA = 1e-5, 0.5
 LENGTH_SIGMA = 0.01
 """Metres: assumed error of a person's bone lengths."""
 _ROUNDS = 2
-_ENDS = np.arange(1, len(PARENT))
 
 LEAST_SIGMA = math.radians(0.5)
 """Radians about an axis: lower bound of a root's deviation, whatever the sensor."""
@@ -48,7 +48,7 @@ WITHIN = np.radians((1.5, 4.0, 5.0))
 DEPENDENT = 1.7
 """Factor on the covariance of the average of the two estimates, which share most of their noise (validation people)."""
 
-_CORNERS = [*HIPS, *SHOULDERS]
+_CORNERS = (*HIPS, *SHOULDERS)
 _REST_SIZE = float(np.linalg.norm(REST_OFFSETS, axis=-1).sum())
 
 
@@ -57,15 +57,11 @@ class Expected(NamedTuple):
 
     Attributes:
         positions: (B, 22, 3) metres.
-        covariance: (B, 66, 66) m² of these, in the axes of ``frame``.
-        frame: (B, 3, 3) forward, left and up of the trunk, as columns.
         root: (B, 3, 3) orientations of the pelvis.
         root_covariance: (B, 3, 3) rad² about the pelvis' axes, as far as the noise of joints causes it.
     """
 
     positions: Floats
-    covariance: Floats
-    frame: Floats
     root: Floats
     root_covariance: Floats
 
@@ -88,7 +84,7 @@ class LivePosture:
     def __call__(self, positions: Floats, sigma: Floats, offsets: Floats) -> Expected:
         """What to expect of joints (B, 22, 3) metres, each with an error of ``sigma`` (B, 22) metres along an axis, of
         people with bones ``offsets`` (B, 22, 3)."""
-        frame, middle, size = trunk_frame(positions), positions[:, _CORNERS].mean(axis=1), body_size(offsets)
+        frame, middle, size = trunk_frame(positions), positions[:, list(_CORNERS)].mean(axis=1), body_size(offsets)
         scale = size[:, None, None]
         local = (positions - middle[:, None]) @ frame / scale
         noise = np.repeat(np.square(np.fmax(np.fmin(sigma, MAX_SIGMA), MIN_SIGMA) / size[:, None]), 3, axis=1)
@@ -101,7 +97,7 @@ class LivePosture:
         off = (expected / scale).reshape(len(local), -1) - self._mean
         root = frame @ from_rotation_vectors(self._turn + off @ self._turned_by.T)
         turned = self._turned_by @ left @ self._turned_by.T / scale**2
-        return Expected(expected @ frame.swapaxes(-1, -2) + middle[:, None], left, frame, root, turned)
+        return Expected(expected @ frame.swapaxes(-1, -2) + middle[:, None], root, turned)
 
 
 def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: Floats) -> Floats:
@@ -162,36 +158,105 @@ def on_bones(mean: Floats, covariance: Floats, lengths: Floats) -> tuple[Floats,
     Returns:
         Mean and covariance, given these.
     """
-    prior, left = mean.reshape(len(mean), DIMENSIONS), covariance
-    slope = np.zeros((len(mean), len(_ENDS), *mean.shape[1:]))
-    for _ in range(_ROUNDS):
-        bone = mean[:, 1:] - mean[:, PARENT[1:]]
-        length = np.maximum(np.linalg.norm(bone, axis=-1), 1e-6)
-        slope[:, _ENDS - 1, _ENDS] = bone / length[..., None]
-        slope[:, _ENDS - 1, PARENT[1:]] = -bone / length[..., None]
-        flat = slope.reshape(len(mean), -1, DIMENSIONS)
-        across = flat @ covariance
-        innovation = across @ flat.swapaxes(-1, -2) + LENGTH_SIGMA**2 * np.eye(len(_ENDS))
-        gain = np.linalg.solve(innovation, across).swapaxes(-1, -2)
-        off = lengths - length + (flat @ (mean.reshape(prior.shape) - prior)[..., None])[..., 0]
-        mean = (prior + (gain @ off[..., None])[..., 0]).reshape(mean.shape)
-        left = covariance - gain @ across
-    return mean, left
+    given, left = mean.copy(), covariance.copy()
+    _on_bones(mean, covariance, lengths, given, left)
+    return given, left
+
+
+@njit(cache=True)
+def _on_bones(prior, covariance, lengths, mean, left):
+    """As `on_bones`; ``mean`` and ``left`` come as ``prior`` and ``covariance``, and leave as results.
+
+    With the Cholesky factor L of the innovations' covariance, `across` and `off` are kept as L^-1 of themselves: their
+    product is then the gain times the innovation, and the square of `across` what lengths take off the covariance.
+    """
+    bones = lengths.shape[1]
+    slope, off, across = np.empty((bones, 3)), np.empty(bones), np.empty((bones, DIMENSIONS))
+    factor = np.empty((bones, bones))
+    for b in range(len(prior)):
+        for _ in range(_ROUNDS):
+            for k in range(bones):
+                joint, above = k + 1, PARENT[k + 1]
+                square = 0.0
+                for axis in range(3):
+                    slope[k, axis] = mean[b, joint, axis] - mean[b, above, axis]
+                    square += slope[k, axis] ** 2
+                length = max(math.sqrt(square), 1e-6)
+                off[k] = lengths[b, k] - length
+                for c in range(DIMENSIONS):
+                    across[k, c] = 0.0
+                for axis in range(3):
+                    along = slope[k, axis] = slope[k, axis] / length
+                    moved = mean[b, joint, axis] - prior[b, joint, axis]
+                    off[k] += along * (moved - mean[b, above, axis] + prior[b, above, axis])
+                    for c in range(DIMENSIONS):
+                        across[k, c] += along * (
+                            covariance[b, 3 * joint + axis, c] - covariance[b, 3 * above + axis, c]
+                        )
+            for k in range(bones):
+                for j in range(k + 1):
+                    entry = LENGTH_SIGMA**2 if j == k else 0.0
+                    for axis in range(3):
+                        entry += slope[j, axis] * (across[k, 3 * j + 3 + axis] - across[k, 3 * PARENT[j + 1] + axis])
+                    factor[k, j] = entry
+            for k in range(bones):
+                for j in range(k + 1):
+                    entry = factor[k, j]
+                    for i in range(j):
+                        entry -= factor[k, i] * factor[j, i]
+                    factor[k, j] = entry / factor[j, j] if j < k else math.sqrt(entry)
+                for j in range(k):
+                    off[k] -= factor[k, j] * off[j]
+                    for c in range(DIMENSIONS):
+                        across[k, c] -= factor[k, j] * across[j, c]
+                off[k] /= factor[k, k]
+                for c in range(DIMENSIONS):
+                    across[k, c] /= factor[k, k]
+            for joint in range(mean.shape[1]):
+                for axis in range(3):
+                    mean[b, joint, axis] = prior[b, joint, axis]
+                    for k in range(bones):
+                        mean[b, joint, axis] += across[k, 3 * joint + axis] * off[k]
+        for k in range(bones):
+            for row in range(DIMENSIONS):
+                for c in range(DIMENSIONS):
+                    left[b, row, c] -= across[k, row] * across[k, c]
 
 
 def trunk_frame(positions: Floats) -> Floats:
     """Axes forward, left, up as columns (B, 3, 3), of hips and shoulders of joints (B, 22, 3)."""
-    left_hip, right_hip, left_shoulder, right_shoulder = positions[:, _CORNERS].swapaxes(0, 1)
-    up = _unit(left_shoulder + right_shoulder - left_hip - right_hip)
-    left = left_shoulder - right_shoulder + left_hip - right_hip
-    left = _unit(left - (left * up).sum(axis=-1, keepdims=True) * up)
-    return np.stack([np.cross(left, up), left, up], axis=-1)
+    frame = np.empty((len(positions), 3, 3))
+    _trunk_frame(np.ascontiguousarray(positions), frame)
+    return frame
+
+
+@njit(cache=True)
+def _trunk_frame(positions, frame):
+    up, left = np.empty(3), np.empty(3)
+    left_hip, right_hip, left_shoulder, right_shoulder = _CORNERS
+    for row in range(len(positions)):
+        p = positions[row]
+        for axis in range(3):
+            up[axis] = p[left_shoulder, axis] + p[right_shoulder, axis] - p[left_hip, axis] - p[right_hip, axis]
+            left[axis] = p[left_shoulder, axis] - p[right_shoulder, axis] + p[left_hip, axis] - p[right_hip, axis]
+        _to_unit(up)
+        along = left[0] * up[0] + left[1] * up[1] + left[2] * up[2]
+        for axis in range(3):
+            left[axis] -= along * up[axis]
+        _to_unit(left)
+        for axis in range(3):
+            a, b = (axis + 1) % 3, (axis + 2) % 3
+            frame[row, axis, 0] = left[a] * up[b] - left[b] * up[a]
+            frame[row, axis, 1], frame[row, axis, 2] = left[axis], up[axis]
+
+
+@njit(cache=True)
+def _to_unit(vector):
+    length = max(math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2), 1e-9)
+    for axis in range(3):
+        vector[axis] /= length
 
 
 def body_size(offsets: Floats) -> Floats:
     """(B,) the sum of bones (B, 22, 3), relative to the rest skeleton's."""
     return np.linalg.norm(offsets, axis=-1).sum(axis=-1) / _REST_SIZE
-
-
-def _unit(vectors: Floats) -> Floats:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

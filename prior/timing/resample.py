@@ -6,6 +6,7 @@ than the grid, frames between grid times are not thrown away: they take noise of
 
 from __future__ import annotations
 
+import statistics
 from collections import deque
 from typing import NamedTuple
 
@@ -221,7 +222,7 @@ class DecimationFilter:
         """Follow the stream's rate; whether the factor has changed."""
         if len(self._periods) < PERIODS:
             return False
-        ratio = min(1e9 / FPS / float(np.median(self._periods)) - ROUNDED, MAX_FACTOR)
+        ratio = min(1e9 / FPS / statistics.median(self._periods) - ROUNDED, MAX_FACTOR)
         if abs(ratio - self._factor) < KEPT:
             return False
         factor = round(ratio)

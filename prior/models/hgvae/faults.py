@@ -189,7 +189,11 @@ def pace(mean: Floats) -> Floats:
     Neither a single limb at fault nor the sensor's noise changes it much.
     """
     steps = np.diff(mean.reshape(len(mean), -1, 3, mean.shape[-1]), axis=-1) * FPS
-    return np.quantile(np.sqrt((steps**2).sum(axis=2).mean(axis=-1)), 0.75, axis=1)
+    speeds = np.sort(np.sqrt((steps**2).sum(axis=2).mean(axis=-1)), axis=1)
+    # as numpy.quantile, which takes a quarter of a millisecond: of 22 joints, between the 16th and the 17th
+    place, share = divmod(0.75 * (speeds.shape[1] - 1), 1.0)
+    low, high = speeds[:, int(place)], speeds[:, int(place) + 1]
+    return high - (high - low) * (1.0 - share)
 
 
 def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Floats:

@@ -7,11 +7,13 @@ real sensors have it, that estimate follows, and there the learned weights stay.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import medians
 from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.compiled import median, njit
 
 MEMORY, LEAST = 45, 10
 """Frames over which a bone's length is observed, and after which it counts."""
@@ -30,7 +32,6 @@ in much less, half in much more, where what is known of people helps."""
 STILL = 1e-3
 """Metres: a bone that varies by less has no noise to speak of."""
 
-_BONES = np.arange(1, 22)
 _PARENTS = np.array(PARENTS[1:])
 
 
@@ -45,8 +46,8 @@ class Whiteness:
     """
 
     def __init__(self, slots: int) -> None:
-        self._last = np.full((slots, len(_BONES)), np.nan)
-        self._frames, self._mean, self._variance, self._change = np.zeros((4, slots, len(_BONES)))
+        self._last = np.full((slots, len(_PARENTS)), np.nan)
+        self._frames, self._mean, self._variance, self._change = np.zeros((4, slots, len(_PARENTS)))
 
     def forget(self, slot: NDArray[np.bool_]) -> None:
         """Forget the bodies in these slots (S,)."""
@@ -60,22 +61,37 @@ class Whiteness:
 
     def update(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Take in joints as `share`; whiteness (S,) from 0, lasting or not known, to 1."""
-        length = np.linalg.norm(positions[:, _BONES] - positions[:, _PARENTS], axis=-1)
-        change = 0.5 * (length - self._last) ** 2
-        self._last = length
-        known = np.isfinite(change)
-        self._frames[known] += 1
-        share = known / np.clip(self._frames, 1, MEMORY)
-        off = np.where(known, length - self._mean, 0.0)
-        off[self._frames == 1] = 0.0
-        self._mean = np.where(known & (self._frames == 1), length, self._mean + share * off)
-        self._variance = (1.0 - share) * (self._variance + share * off * off)
-        self._change += share * (np.where(known, change, 0.0) - self._change)
-        counts = (self._frames >= LEAST) & (self._variance > STILL**2)
-        ratio = np.where(counts, np.minimum(self._change / np.maximum(self._variance, STILL**2), 1.0), np.nan)
-        white = np.where(counts.any(axis=1), medians(ratio, axis=1), 0.0)
+        white = np.zeros(len(positions))
+        _update(positions, self._last, self._frames, self._mean, self._variance, self._change, white)
         frames = self._frames.max(axis=1)
         return white * frames / (frames + START)
+
+
+@njit(cache=True)
+def _update(positions, last, frames, mean, variance, change, white):
+    """Take joints (S, 22, 3) into the moments of `Whiteness`; writes the median ``white`` (S,) of bones' ratios."""
+    ratios = np.empty(len(_PARENTS))
+    for slot in range(len(positions)):
+        count = 0
+        for k in range(len(_PARENTS)):
+            square = 0.0
+            for axis in range(3):
+                square += (positions[slot, k + 1, axis] - positions[slot, _PARENTS[k], axis]) ** 2
+            length = math.sqrt(square)
+            changed = 0.5 * (length - last[slot, k]) ** 2
+            last[slot, k] = length
+            if math.isfinite(changed):
+                frames[slot, k] += 1.0
+                share = 1.0 / min(frames[slot, k], MEMORY)
+                off = length - mean[slot, k] if frames[slot, k] > 1.0 else 0.0
+                mean[slot, k] = mean[slot, k] + share * off if frames[slot, k] > 1.0 else length
+                variance[slot, k] = (1.0 - share) * (variance[slot, k] + share * off * off)
+                change[slot, k] += share * (changed - change[slot, k])
+            if frames[slot, k] >= LEAST and variance[slot, k] > STILL**2:
+                ratios[count] = min(change[slot, k] / max(variance[slot, k], STILL**2), 1.0)
+                count += 1
+        if count > 0:
+            white[slot] = median(ratios[:count])
 
 
 def fallback(white: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,159 @@
+"""Compiled loops against the same written as array expressions, whichever joints are missing."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from tests.helpers.bodies import waving
+from tests.helpers.values import gated
+
+from steadypose.prior.body.skeleton import PARENTS, REST_POSITIONS
+from steadypose.prior.clean import depth_error, reconstruct
+from steadypose.prior.clean.depth_error import DepthError
+from steadypose.prior.clean.history import History
+from steadypose.prior.clean.reconstruct import Denoise
+from steadypose.prior.models import posture
+from steadypose.prior.models.mixture import whiteness
+from steadypose.prior.models.mixture.whiteness import Whiteness
+from steadypose.prior.timing.kalman import Smoothed
+from steadypose.prior.timing.rate import FPS
+
+Floats = NDArray[np.float64]
+SLOTS, FRAMES = 2, 24
+SEEDS = st.integers(0, 2**32 - 1)
+MISSING = st.floats(0.0, 0.9)
+
+
+def observed(rng: np.random.Generator, missing: float) -> Floats:
+    """(T, S, 22, 3) metres, with noise and with joints missing; the second body is away at first."""
+    frames = np.stack([waving(FRAMES), waving(FRAMES) + [1.0, 0.5, 0.0]], axis=1)
+    frames += rng.normal(0.0, 0.01, frames.shape)
+    frames[rng.random(frames.shape[:3]) < missing] = np.nan
+    frames[:5, 1] = np.nan
+    return frames
+
+
+def bones_of(frames: Floats) -> Floats:
+    return frames[..., 1:, :] - frames[..., list(PARENTS[1:]), :]
+
+
+@settings(deadline=None, max_examples=20)
+@given(SEEDS, MISSING)
+def test_whiteness_is_the_median_over_bones_of_von_neumanns_ratio(seed: int, missing: float) -> None:
+    frames = observed(np.random.default_rng(seed), missing)
+    found, lengths = Whiteness(SLOTS), np.linalg.norm(bones_of(frames), axis=-1)
+    count, mean, variance, change = np.zeros((4, SLOTS, 21))
+    for t, frame in enumerate(frames):
+        white = found.update(frame)
+        step = 0.5 * (lengths[t] - lengths[t - 1]) ** 2 if t else np.full((SLOTS, 21), np.nan)
+        for slot, bone in np.argwhere(np.isfinite(step)):
+            at = slot, bone
+            count[at] += 1
+            share = 1.0 / min(count[at], whiteness.MEMORY)
+            off = lengths[t][at] - mean[at] if count[at] > 1 else 0.0
+            mean[at] = mean[at] + share * off if count[at] > 1 else lengths[t][at]
+            variance[at] = (1 - share) * (variance[at] + share * off**2)
+            change[at] += share * (step[at] - change[at])
+        for slot in range(SLOTS):
+            counts = (count[slot] >= whiteness.LEAST) & (variance[slot] > whiteness.STILL**2)
+            ratio = np.minimum(change[slot, counts] / variance[slot, counts], 1.0)
+            most = count[slot].max()
+            expected = np.median(ratio) * most / (most + whiteness.START) if len(ratio) else 0.0
+            np.testing.assert_allclose(white[slot], expected, rtol=1e-9)
+
+
+@settings(deadline=None, max_examples=20)
+@given(SEEDS, MISSING)
+def test_errors_along_a_direction_are_those_of_a_least_squares_fit(seed: int, missing: float) -> None:
+    rng = np.random.default_rng(seed)
+    frames, found = observed(rng, missing), DepthError(SLOTS)
+    sigmas = rng.uniform(0.0, 1.2 * depth_error.MAX_SIGMA, frames.shape[:3])
+    rows: list[list[tuple[Floats, float, int]]] = [[] for _ in range(SLOTS)]
+    count, mean = np.zeros((2, SLOTS, 21))
+    left_out = np.zeros(SLOTS)
+    for t, frame in enumerate(frames):
+        left_out = found.update(Smoothed(t / FPS, frame, sigmas[t]), np.zeros(SLOTS))
+        bones, ends = bones_of(frame), np.maximum(sigmas[t][:, 1:], sigmas[t][:, list(PARENTS[1:])])
+        for slot, bone in np.argwhere(np.isfinite(bones[..., 0]) & (ends < depth_error.MAX_SIGMA)):
+            at, length = (slot, bone), float(np.linalg.norm(bones[slot, bone]))
+            count[at] += 1
+            mean[at] += (length - mean[at]) / count[at]
+            residual = min((length - mean[at]) ** 2, depth_error.MAX_RESIDUAL**2)
+            x, y, z = bones[at] / length
+            direction = np.array([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z])
+            rows[slot].append((direction, 0.5 * residual, t))
+    for slot in range(SLOTS):
+        forgotten = np.array([(1 - 1 / depth_error.MEMORY) ** (FRAMES - 1 - t) for _, _, t in rows[slot]])
+        directions = np.array([direction for direction, _, _ in rows[slot]]).reshape(-1, 6)
+        squares = np.array([square for _, square, _ in rows[slot]])
+        total = forgotten.sum()
+        ridge = depth_error.RIDGE * total + depth_error.PRIOR * 21
+        isotropic = ridge * (forgotten @ squares) / max(total, 1.0)
+        normal = (directions.T * forgotten) @ directions + ridge * np.diag([1.0, 1, 1, 2, 2, 2])
+        form = np.linalg.solve(
+            normal, (directions.T * forgotten) @ squares + isotropic * np.array([1.0, 1, 1, 0, 0, 0])
+        )
+        a, b, c, d, e, f = form
+        values = np.linalg.eigvalsh([[a, d, e], [d, b, f], [e, f, c]])
+        np.testing.assert_allclose(left_out[slot] ** 2, depth_error.LEFT_OUT * (values[2] - values[1]), atol=1e-12)
+
+
+@settings(deadline=None, max_examples=20)
+@given(SEEDS)
+def test_joints_on_bones_are_those_of_an_iterated_extended_kalman_filter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    prior = (REST_POSITIONS + rng.normal(0.0, 0.03, REST_POSITIONS.shape)).ravel()
+    factor = 0.02 * rng.normal(size=(66, 66))
+    covariance, lengths = factor @ factor.T, rng.uniform(0.05, 0.5, 21)
+    mean, left = prior.copy(), covariance
+    for _ in range(posture._ROUNDS):
+        slope, bones = np.zeros((21, 22, 3)), bones_of(mean.reshape(22, 3))
+        long = np.linalg.norm(bones, axis=-1)
+        for k, above in enumerate(PARENTS[1:]):
+            slope[k, k + 1], slope[k, above] = bones[k] / long[k], -bones[k] / long[k]
+        slope = slope.reshape(21, 66)
+        gain = covariance @ slope.T @ np.linalg.inv(slope @ covariance @ slope.T + posture.LENGTH_SIGMA**2 * np.eye(21))
+        mean = prior + gain @ (lengths - long + slope @ (mean - prior))
+        left = covariance - gain @ slope @ covariance
+    given_mean, given_left = posture.on_bones(prior.reshape(1, 22, 3), covariance[None], lengths[None])
+    np.testing.assert_allclose(given_mean.ravel(), mean, atol=1e-9)
+    np.testing.assert_allclose(given_left[0], left, atol=1e-9)
+
+
+@settings(deadline=None, max_examples=20)
+@given(SEEDS, MISSING, st.integers(0, 4))
+def test_denoising_weighs_two_estimates_of_which_one_has_part_of_the_others_noise(
+    seed: int, missing: float, back: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    frames, stage, history = observed(rng, missing), Denoise(back, SLOTS), History(8, SLOTS)
+    jitter = rng.uniform(0.0, 0.02, SLOTS)
+    apart, count, before = np.zeros((SLOTS, 22)), np.zeros((SLOTS, 22)), np.full((SLOTS, 22, 3), np.nan)
+    late = np.interp(back, (0, reconstruct.SETTLED), (reconstruct.LATE_NEWEST_S, reconstruct.LATE_S)) * FPS
+    for frame in frames:
+        history.append(gated(frame))
+        stage._reconstructed[:] = frame + rng.normal(0.0, 0.02, frame.shape)
+        smoothed = Smoothed(0.0, frame, np.where(np.isnan(frame[..., 0]), np.inf, 0.01))
+        found = stage._denoised(smoothed, history, jitter, back)
+        seen = np.isfinite(history.positions[-1 - back][..., 0])
+        seen |= ~seen.any(axis=1, keepdims=True)
+        seen |= history.seen_since(back) & (history.unseen_s[-1 - back] < reconstruct.BRIEF_S)
+        moved = stage._reconstructed[-1 - back] - frame
+        square = np.square(moved).mean(axis=-1)
+        for slot, joint in np.ndindex(SLOTS, 22):
+            at = slot, joint
+            position, sigma = frame[at].copy(), smoothed.sigma[at]
+            if seen[at] and np.isfinite(square[at]):
+                count[at] += 1
+                apart[at] += (square[at] - apart[at]) / min(count[at], reconstruct.MEMORY)
+                gained = (1 - reconstruct.NOISE_LEFT) * min(sigma, jitter[slot]) ** 2
+                own = max(max(apart[at], square[at] / reconstruct.SUDDEN) - gained, reconstruct.MODEL_SIGMA**2)
+                own += late**2 * np.square(np.nan_to_num(frame[at] - before[at])).mean()
+                share = gained / (gained + own)
+                position += share * moved[at]
+                sigma *= np.sqrt(1 - share * (1 - reconstruct.NOISE_LEFT))
+            np.testing.assert_allclose(found.positions[at], position, rtol=1e-12)
+            np.testing.assert_allclose(found.sigma[at], sigma, rtol=1e-12)
+        before = frame
