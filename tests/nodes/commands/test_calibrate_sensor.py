@@ -13,6 +13,8 @@ from steadypose.nodes.cli import USAGE_ERROR, main
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.models.sensor_bias import trunk_frame
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 240
 BIAS = np.zeros((22, 3))
 BIAS[[J["left_wrist"], J["right_wrist"], J["head"]]] = [0.08, 0.0, 0.03]
@@ -34,7 +36,6 @@ def write(folder: Path, person: str, scale: float, seed: int) -> tuple[Path, Pat
     return paths
 
 
-@pytest.mark.slow
 def test_the_bias_is_learned_and_helps_somebody_else(tmp_path: Path, capsys) -> None:
     for seed, (person, scale) in enumerate((("ann", 1.0), ("bob", 0.93), ("cid", 1.06))):
         write(tmp_path, person, scale, seed)

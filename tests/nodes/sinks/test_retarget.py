@@ -187,7 +187,7 @@ def test_the_node_sends_datagrams(make_launch: Callable[..., Launch]) -> None:
 
 
 def test_the_command_writes_csv_and_npz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    p = np.stack([world.bodies[0].positions for world in worlds("idle")[:30]])
+    p = np.stack([world.bodies[0].positions for world in worlds("idle")[:60]])
     np.savez(tmp_path / "in.npz", positions=p, skeleton="smpl22", fps=30.0)
     given = ["--urdf", str(URDF)]
     for name in ("out.csv", "out.npz"):
