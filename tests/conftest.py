@@ -27,10 +27,13 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    slow = [item for item in items if item.get_closest_marker("slow")]
     if config.getoption("--fast"):
-        slow = [item for item in items if item.get_closest_marker("slow")]
         items[:] = [item for item in items if item not in slow]
         config.hook.pytest_deselected(items=slow)
+    # files that take long come first: of two processes, the one would wait for the other's last file
+    long = {item.path for item in slow}
+    items.sort(key=lambda item: item.path not in long)
 
 
 # a busy machine is no failure
