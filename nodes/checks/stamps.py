@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from steadypose.nodes.checks.problem import Arrival, Problem, error, warning
-from steadypose.nodes.graph.clock import FRAME_NS
+from steadypose.prior.timing.rate import FPS
 
 SECOND_NS = 1_000_000_000
 ENOUGH = 10
@@ -73,7 +73,7 @@ def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem
 
 def check_length(first_ns: int, last_ns: int, delay_frames: int) -> Iterator[Problem]:
     """The problem with a stream that ends before the delay is filled, given its first and last stamp."""
-    if last_ns - first_ns < (delay_frames - 0.5) * FRAME_NS:  # stamps are rounded
+    if last_ns - first_ns < (delay_frames - 0.5) * SECOND_NS / FPS:  # stamps are rounded
         yield warning(
             "short",
             f"the stream lasts {(last_ns - first_ns) / SECOND_NS:.2f} s, less than the delay of {delay_frames} frames: "
