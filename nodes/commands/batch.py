@@ -128,7 +128,7 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
     manifest = Manifest(out, folder, settings)
     waiting = [replace(job, replace=manifest.made(job.out)) for job in found if not manifest.is_done(job)]
     if known := len(found) - len(waiting):
-        console.print(f"{known} of {len(found)} are done already; see {manifest.path}", highlight=False)
+        console.print(f"{known} of {len(found)} are done already; see {manifest.path}")
     for job in waiting:
         if job.replace or not os.path.lexists(job.out):
             manifest.add(job, {"state": "started"})
@@ -142,19 +142,18 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
             if result["state"] == "failed":
                 failed += 1
                 cause = str(result["error"]).removeprefix(f"{job.source}: ")
-                console.print(f"{job.source}: {cause}", style="red", markup=False, highlight=False, soft_wrap=True)
+                console.print(f"{job.source}: {cause}", style="red")
             elif result["unread"]:
                 damaged += 1
                 causes = ", ".join(f"{cause}: {n}" for cause, n in result["unread"].items())
-                console.print(f"{job.source}: damaged; {causes}", style="red", markup=False, highlight=False)
+                console.print(f"{job.source}: damaged; {causes}", style="red")
             elif not result["poses"]:
                 empty += 1
-                console.print(f"{job.source}: {NOBODY}", style="red", markup=False, highlight=False, soft_wrap=True)
+                console.print(f"{job.source}: {NOBODY}", style="red")
             for problem in result.get("problems", ()):
-                text = f"{job.source}: {problem}"
-                console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
+                console.print(f"{job.source}: {problem}", style="yellow")
     nobody = f"; {empty} of them without anybody in it" if empty else ""
-    console.print(f"{out}: {len(found) - failed} of {len(found)} recordings are clean{nobody}", highlight=False)
+    console.print(f"{out}: {len(found) - failed} of {len(found)} recordings are clean{nobody}")
     return 1 if failed or damaged or empty else 0
 
 

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
-from steadypose.nodes.commands.output import check_format, check_output, clean_recording, printable
+from steadypose.nodes.commands.output import check_format, check_output, clean_recording, console, printable
 from steadypose.nodes.driving import NOBODY
 from steadypose.nodes.graph.launch import apply_override, check_settings, full_key, pipeline_sections, read_toml
 from steadypose.nodes.graph.loops import compile_missing
@@ -69,13 +68,13 @@ def clean(
         table["rig"] = read_toml(rig)
     check_format(out)
     check_output(source, out)
-    console = Console(stderr=True)
-    compile_missing(lambda line: console.print(printable(line), markup=False, highlight=False, soft_wrap=True))
+    terminal = console()
+    compile_missing(lambda line: terminal.print(printable(line)))
     if is_folder_of_recordings(source):
-        return clean_folder(source, out, table, jobs, ray, console)
+        return clean_folder(source, out, table, jobs, ray, terminal)
     if ray or jobs is not None:
         raise LaunchError(f"--{'ray' if ray else 'jobs'}: expected a folder of recordings as IN; {source} is one alone")
-    with Progress(console=console, disable=not console.is_terminal) as progress:
+    with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
         bar = progress.add_task(source.name, total=None)
         done = clean_recording(
             source,
@@ -86,14 +85,13 @@ def clean(
             advanced=lambda: progress.advance(bar),
         )
     spent = f"{done.duration_s:.1f} s, cleaned in {done.spent_s:.1f} s"
-    console.print(f"{out}: {done.frames} frames, {spent}", highlight=False)
+    terminal.print(f"{out}: {done.frames} frames, {spent}")
     for cause, count in done.refused.items():
-        console.print(f"  refused or dropped, {cause}: {count}", highlight=False)
+        terminal.print(f"  refused or dropped, {cause}: {count}")
     for problem in done.problems:
-        console.print(f"  {problem}", highlight=False, markup=False, soft_wrap=True, style="yellow")
+        terminal.print(f"  {problem}", style="yellow")
     if not done.poses:
-        hint = f"steadypose info {source} says what it holds"
-        console.print(f"  {NOBODY}; {hint}", style="red", highlight=False, markup=False, soft_wrap=True)
+        terminal.print(f"  {NOBODY}; steadypose info {source} says what it holds", style="red")
     if done.unread:
-        console.print(f"  {source} is damaged: what could be read of it is clean", style="red", highlight=False)
+        terminal.print(f"  {source} is damaged: what could be read of it is clean", style="red")
     return 1 if done.unread or not done.poses else 0

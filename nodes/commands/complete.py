@@ -9,21 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JOINTS, JointState, Message, PoseRaw
 from steadypose.nodes.commands.output import (
-    ARRAY_FILES,
     check_format,
     check_output,
     check_replaceable,
+    console,
     plural,
-    put_in_place,
-    unfinished,
-    write_arrays,
-    write_recording,
+    write_output,
 )
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.settings import LaunchError
@@ -100,8 +96,8 @@ def complete(
         from steadypose.prior.fit.optimise import Optimiser
 
         fill = Optimiser.load("default", fill)
-    console = Console(stderr=True)
-    with Progress(console=console, disable=not console.is_terminal) as progress:
+    terminal = console()
+    with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
         bar = progress.add_task(source.name, total=None)
         completed = complete_source(
             open_recording(source, read_toml(rig) if rig else NO_RIG),
@@ -111,34 +107,23 @@ def complete(
             began=lambda frames: progress.update(bar, total=frames),
             advanced=lambda frame: progress.update(bar, completed=frame),
         )
-    with unfinished(out) as part:
-        if out.suffix in ARRAY_FILES:
-            write_arrays(part, completed.arrays())
-        else:
-            every = [*((POSE_RAW, message) for message in completed.raws), *completed.answers]
-            write_recording(part, sorted(every, key=lambda pair: pair[1].stamp_ns))
-        put_in_place(part, out)
+    write_output(out, completed.arrays, completed.messages)
     completion = completed.completion
     people = len({stretch.body for stretch, _ in completion.done})
     longest = max(done.span for _, done in completion.done) / FPS
-    console.print(
+    terminal.print(
         f"{out}: {len(completion.clean) - 1} frames of {plural(people, 'body', 'bodies')}; {completion.given:.0%} of "
-        f"their joints were given, the rest completed; the longest gap was {longest:.1f} s",
-        highlight=False,
+        f"their joints were given, the rest completed; the longest gap was {longest:.1f} s"
     )
     if completion.unreached:
-        console.print(
-            f"  left out, for nothing near them is known: {completion.unreached} joints",
-            highlight=False,
-            style="yellow",
-        )
+        terminal.print(f"  left out, for nothing near them is known: {completion.unreached} joints", style="yellow")
     for body in completion.centred:
-        console.print(f"  body {body} stands on its pelvis: its way is read from its motion", highlight=False)
+        terminal.print(f"  body {body} stands on its pelvis: its trajectory is predicted from its motion")
     for cause, count in completed.refused.items():
-        console.print(f"  refused or dropped, {cause}: {count}", highlight=False)
+        terminal.print(f"  refused or dropped, {cause}: {count}")
     if picture is not None:
         draw(completion, source.name, picture)
-        console.print(f"wrote {picture}", highlight=False)
+        terminal.print(f"wrote {picture}")
     return 0
 
 
@@ -152,6 +137,11 @@ class CompletedSource(NamedTuple):
     completion: Completion
     refused: dict[str, int]
     """what was refused or dropped, by cause"""
+
+    def messages(self) -> list[tuple[str, Message]]:
+        """All messages, by their stamps."""
+        every = [*((POSE_RAW, message) for message in self.raws), *self.answers]
+        return sorted(every, key=lambda pair: pair[1].stamp_ns)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of ``clean``, with a row for each frame of the grid on which there is a body."""

@@ -7,10 +7,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tyro
-from rich.console import Console
 
 from steadypose.msgs.types import PoseRaw, PoseWorld
-from steadypose.nodes.commands.output import check_output, check_replaceable, unfinished
+from steadypose.nodes.commands.output import ARRAY_FILES, check_file, console, unfinished
 from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
@@ -50,13 +49,9 @@ def export(
         body: id of the body, of several; that which is there longest unless given.
         force: replace what is at OUT.
     """
-    check_output(source, out)
-    if out.suffix not in FORMATS:
-        raise LaunchError(f"{out}: expected a name ending in {', '.join(FORMATS)}, got {out.suffix or 'none'}")
+    check_file(source, out, FORMATS, replace=force)
     if names != "smpl22" and out.suffix not in NAMED:
         raise LaunchError(f"--names {names}: expected OUT to end in {' or '.join(NAMED)}, got {out.suffix}")
-    if out.exists() and not force:
-        raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
     if not source.exists():
         raise LaunchError(f"{source} does not exist: expected a recording with pose/world, or an .npz of 'clean'")
     if out.suffix in (".glb", ".vrma"):
@@ -73,11 +68,10 @@ def export(
         content = to_bvh(motion, AVATAR_NAMES[names])
     else:
         content = {".csv": to_csv, ".trc": to_trc}[out.suffix](motion)
-    partial = out.with_name(f".{out.name}.part")
-    partial.write_bytes(content)
-    partial.replace(out)
-    length = f"{len(motion.root)} frames at {motion.fps:g} Hz"
-    Console(stderr=True).print(f"{out}: {length}", highlight=False, markup=False, soft_wrap=True)
+    with unfinished(out) as part:
+        part.write_bytes(content)
+        part.replace(out)
+    console().print(f"{out}: {len(motion.root)} frames at {motion.fps:g} Hz")
     return 0
 
 
@@ -112,13 +106,9 @@ def retarget(
         body: the id of the one to follow; the first who is there unless given.
         force: replace what is at OUT.
     """
-    if out.suffix not in (".csv", ".npz"):
-        raise LaunchError(f"expected OUT to end in .csv or .npz, got {out}")
+    check_file(source, out, ARRAY_FILES, replace=force)
     if urdf is None:
         raise LaunchError("expected --urdf FILE, the robot's; launch/robots/humanoid29.urdf is one to try with")
-    check_output(source, out)
-    if not (force and out.is_file()):
-        check_replaceable(out, replace=False)
     require_extra("retarget")
     from steadypose.nodes.graph.prior_node import make_prior
     from steadypose.nodes.graph.threads import one_thread

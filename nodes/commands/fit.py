@@ -12,18 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 import tyro
 from numpy.typing import ArrayLike, NDArray
-from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.msgs.types import JOINTS, Message, PoseRaw
 from steadypose.nodes.commands.output import (
-    ARRAY_FILES,
     check_format,
     check_output,
     check_replaceable,
-    put_in_place,
-    write_arrays,
-    write_recording,
+    console,
+    write_output,
 )
 from steadypose.nodes.driving import clean_joints, stream
 from steadypose.nodes.graph.extras import require_extra
@@ -91,10 +88,10 @@ def fit(
     shape = SmplShape.read(smpl) if smpl else None
     torch.set_num_threads(max((os.cpu_count() or 2) // 2, 1))
     model = load_transitions(weights)
-    console, started = Console(stderr=True), time.perf_counter()
+    terminal, started = console(), time.perf_counter()
     folder = out.with_name(f".{out.name}.fit")
     folder.mkdir(exist_ok=True)
-    with Progress(console=console, disable=not console.is_terminal) as progress:
+    with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
         if two_d:
             frames, tracks, lines = _fit_picture(source, out, model, folder, progress)
         else:
@@ -103,9 +100,9 @@ def fit(
         lines += _write_smpl(out, shape, tracks)
     shutil.rmtree(folder)
     spent = time.perf_counter() - started
-    console.print(f"{out}: {frames} frames, fitted in {spent:.1f} s", highlight=False, soft_wrap=True)
+    terminal.print(f"{out}: {frames} frames, fitted in {spent:.1f} s")
     for line in lines:
-        console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
+        terminal.print(f"  {line}")
     return 0
 
 
@@ -123,14 +120,7 @@ def _fit_poses(
         began=lambda bodies: progress.update(bar, total=sum(len(window_bounds(len(b.bodies))) for b in bodies)),
         advanced=lambda: progress.advance(bar),
     )  # fmt: skip
-    part = folder / out.name
-    if out.suffix in ARRAY_FILES:
-        write_arrays(part, fitted.arrays())
-    else:
-        if part.exists():  # of a call that was killed
-            shutil.rmtree(part)
-        write_recording(part, fitted.messages)
-    put_in_place(part, out)
+    write_output(out, fitted.arrays, lambda: fitted.messages)
     fits = fitted.fits
     _explain(out, [(fit.seen.id, fit.seen.stamps_ns, fit.misfit, fit.track) for fit in fits], "m")
     return len(fitted.stamps_ns), [fit.track for fit in fits], [_line(fit) for fit in fits]
@@ -159,10 +149,7 @@ def _fit_picture(
         raise NpzError(f"{source}: expected {MIN_FRAMES} frames at 30 Hz or more, got {frames}")
     bar = progress.add_task(source.name, total=len(window_bounds(frames)))
     track = fit_key_points(model, recording, PICTURES, folder, clean_joints, lambda: progress.advance(bar))
-    part = folder / out.name
-    arrays: dict[str, Any] = with_bones(arrays_of_fit(recording, track), track)
-    np.savez(part, **arrays)
-    part.replace(out)
+    write_output(out, lambda: with_bones(arrays_of_fit(recording, track), track), tuple)
     misfit = track.misfit[0]
     _explain(out, [(0, recording.stamps_ns, misfit, track)], "pixels")
     return frames, [track], [f"key points lie {np.nanmedian(misfit):.1f} pixels off in the median"]

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 
 from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.recording_writer import recorded_parts
@@ -55,6 +56,17 @@ def check_format(out: Path) -> None:
             f"{out}: expected .npz or .csv for arrays, or a name without ending for a recording, got {out.suffix}; "
             "`steadypose export` writes .bvh, .glb and .trc"
         )
+
+
+def check_file(source: Path, out: Path, endings: tuple[str, ...], *, replace: bool) -> None:
+    """Raises:
+    LaunchError: a file cannot be written so: its ending is none of these, or as `check_output`; or it is there.
+    """
+    check_output(source, out)
+    if out.suffix not in endings:
+        raise LaunchError(f"{out}: expected a name ending in {', '.join(endings)}, got {out.suffix or 'none'}")
+    if os.path.lexists(out) and not (replace and out.is_file()):
+        raise LaunchError(f"{out} exists: expected a new path, or --force to replace a file")
 
 
 def check_replaceable(out: Path, *, replace: bool) -> None:
@@ -110,11 +122,28 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         np.savez(path, **named)
 
 
+def write_output(
+    out: Path, arrays: Callable[[], Mapping[str, NDArray[Any]]], messages: Callable[[], Iterable[tuple[str, Message]]]
+) -> None:
+    """Write arrays or messages, as the name's ending says; the output is there whole, or not at all."""
+    with unfinished(out) as part:
+        if out.suffix in ARRAY_FILES:
+            write_arrays(part, arrays())
+        else:
+            write_recording(part, messages())
+        put_in_place(part, out)
+
+
 def put_in_place(part: Path, out: Path) -> None:
     """Move what was written to ``part``, in the same file system, to ``out``; a recording there is replaced."""
     if out.suffix not in ARRAY_FILES and out.exists():
         shutil.rmtree(out)
     part.replace(out)
+
+
+def console() -> Console:
+    """Of standard error, for lines as they are, however long."""
+    return Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
 
 
 def printable(text: str) -> str:

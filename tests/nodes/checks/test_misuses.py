@@ -319,7 +319,9 @@ def test_the_page_has_every_cause() -> None:
     )
     causes = set(re.findall(r'(?:error|warning)\(\s*"(\w+)"', code))
     assert causes >= {cause for _, cause, _ in MISUSES.values()}
-    assert causes == {cause for cell in re.findall(r"^\| ([^|]+) \|", page, re.MULTILINE) for cause in re.findall(r"`(\w+)`", cell)}
+    assert causes == {
+        cause for cell in re.findall(r"^\| ([^|]+) \|", page, re.MULTILINE) for cause in re.findall(r"`(\w+)`", cell)
+    }
 
 
 def test_answers_that_are_of_no_use() -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.commands import doctor_live as live
+from steadypose.nodes.commands import doctor as live
 from steadypose.nodes.graph.clock import SystemClock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
