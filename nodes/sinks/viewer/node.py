@@ -16,6 +16,7 @@ from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.settings import check_host_and_port
+from steadypose.nodes.sinks.serving import LOCAL_NAMES
 from steadypose.prior.clean.settings import PriorSettings
 
 if TYPE_CHECKING:
@@ -46,14 +47,14 @@ class ViewerNode(Node):
     def run(self) -> None:
         # not for those who only read a launch file
         from steadypose.nodes.sinks.viewer.scene import PoseView
-        from steadypose.nodes.sinks.viewer.server import LOOPBACK, ViewerServer
+        from steadypose.nodes.sinks.viewer.server import ViewerServer
 
         settings = self.launch.settings(ViewerSettings)
         with ViewerServer(settings.port, settings.host) as self._server:
             recording = connect(self._server)
             self._view = PoseView(recording, flagged_from(self.launch))
             print(f"viewer: {self._server.url}", flush=True)
-            if settings.host not in (LOOPBACK, "localhost", "::1"):
+            if settings.host not in LOCAL_NAMES:
                 print(f"viewer: who listens on the network of {settings.host} sees the people here", flush=True)
             try:
                 super().run()

@@ -1,16 +1,10 @@
-"""Keeps the last minutes of drawings and serves them with Rerun's page, to browsers that came here under a name of this
-machine and have the token.
-
-A picture of people is not for everybody with a login: any user of the machine can connect to its loopback ports, and
-any page in a browser can, once its own name is made to lead to 127.0.0.1 (DNS rebinding). So drawings need a token, and
-no request is answered that names another host. A Content-Security-Policy restricts the page's connections to here.
+"""Keeps the last minutes of drawings and serves them with Rerun's page, to browsers that may see them
+(`nodes.sinks.serving`). A Content-Security-Policy restricts the page's connections to here.
 """
 
 from __future__ import annotations
 
 import ctypes
-import hmac
-import ipaddress
 import secrets
 import shutil
 import signal
@@ -27,6 +21,8 @@ from typing import TYPE_CHECKING
 from urllib.error import HTTPError, URLError
 from urllib.parse import quote, urlsplit
 from urllib.request import urlopen
+
+from steadypose.nodes.sinks.serving import called, is_token, own_names, port_taken, shown
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -95,19 +91,6 @@ DRAWINGS = "drawings.rrd"
 """the last part of the drawings' path, after the token"""
 
 
-def is_own_name(host: str | None, names: frozenset[str]) -> bool:
-    """Whether a request's ``Host`` is this machine: an address, which leads where it says, or one of ``names``."""
-    try:
-        name = urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return False
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return name in names
-    return True
-
-
 class PageServer:
     """Serves another server's pages and the drawings, in threads.
 
@@ -119,12 +102,12 @@ class PageServer:
     """
 
     def __init__(self, host: str, port: int, origin: str, token: str, drawings: Drawings) -> None:
-        names = frozenset({"localhost", host.lower(), socket.gethostname().lower(), socket.getfqdn().lower()})
-        own_path = f"/{token}/{DRAWINGS}".encode()
+        names = own_names(host, socket.getfqdn())
+        own_path = f"/{token}/{DRAWINGS}"
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                if not is_own_name(self.headers.get("Host"), names):
+                if called(self.headers.get("Host"), names) is None:
                     self.send_error(403, "expected this machine's own name or address")
                     return
                 try:
@@ -137,7 +120,7 @@ class PageServer:
                     pass  # the browser has gone
 
             def _send_drawings(self, path: str) -> None:
-                if not hmac.compare_digest(path.encode(), own_path):
+                if not is_token(path, own_path):
                     self.send_error(403, "expected the address that was printed, with its token")
                     return
                 self.send_response(200)
@@ -209,9 +192,8 @@ class ViewerServer:
         import rerun_cli
 
         _refuse_used(host, port)
-        shown = socket.gethostname() if host in ("0.0.0.0", "::") else host
         inner, unused, token = _free_port(), _free_port(), secrets.token_urlsafe(24)
-        at = f"http://{shown}:{port}"
+        at = f"http://{shown(host)}:{port}"
         self.data_url = f"{at}/{token}/{DRAWINGS}"
         self.url = f"{at}/?theme=dark&url={quote(self.data_url, safe='')}"
         binary = Path(next(iter(rerun_cli.__path__)), "rerun")
@@ -284,10 +266,7 @@ def _refuse_used(host: str, port: int) -> None:
         try:
             probe.bind((host, port))
         except OSError as error:
-            raise ViewerError(
-                f"port {port} is not to be had ({error.strerror}): another viewer may be running; "
-                "close it, or set another [viewer] port"
-            ) from error
+            raise ViewerError(port_taken("viewer", host, port, error)) from error
 
 
 def _free_port() -> int:

@@ -34,6 +34,7 @@ from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.settings import LaunchError, check_host_and_port
+from steadypose.nodes.sinks.serving import LOCAL_NAMES
 from steadypose.prior.body.skeleton import PARENTS
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ class WebNode(Node):
         return self._server.url if self._server else ""
 
     def work(self) -> None:
-        from steadypose.nodes.sinks.web.server import LOCAL_NAMES, WebServer  # not to read a launch file
+        from steadypose.nodes.sinks.web.server import WebServer  # not to read a launch file
 
         s = self._settings
         token = s.token or kept_token(self.launch.transport.ipc_directory / TOKEN_FILE)

@@ -1,8 +1,7 @@
 """Serves the page, and its WebSocket, from a thread of its own.
 
-**Who may.** The WebSocket takes a token, which the printed address has after a ``#``, so that it is in no log and no
-``Referer``. Nothing is served under a name that is not this server's, or any page in a browser could reach it by a name
-that it has pointed at this machine (DNS rebinding). The page and the script hold nothing secret.
+**Who may** (`nodes.sinks.serving`). The WebSocket takes a token, which the printed address has after a ``#``, so that
+it is in no log and no ``Referer``. The page and the script hold nothing secret.
 
 **Who is slow.** A client has room for the newest message of each stream, and for some events; what it does not take
 before the next comes is dropped, and counted. So it is never behind by more than what its connection holds.
@@ -11,11 +10,8 @@ before the next comes is dropped, and counted. So it is never behind by more tha
 from __future__ import annotations
 
 import asyncio
-import hmac
-import ipaddress
 import logging
 import mimetypes
-import socket
 import threading
 from collections import deque
 from collections.abc import Collection
@@ -26,6 +22,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
 from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.serving import called, is_token, own_names, port_taken, shown
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -45,7 +42,6 @@ EVENTS_KEPT = 64
 """events are not replaced by newer ones: messages of them that a client may have waiting"""
 STREAMS_KEPT = 64
 """streams of which the newest message is kept for who connects later"""
-LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
 
 
 class WebServer:
@@ -71,20 +67,16 @@ class WebServer:
         self._clients: set[_Client] = set()
         self._latest: dict[str, str] = {}
         self.dropped = 0
-        self._names = {host, *names, *LOCAL_NAMES, *([socket.gethostname()] if _is_any(host) else [])}
+        self._names = own_names(host, *names)
         started: Future[Server] = Future()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._serve(host, port, started)), daemon=True)
         self._thread.start()
         try:
             server = started.result(20)
         except OSError as error:
-            raise LaunchError(
-                f"[web] port {port} at {host} is not to be had ({error.strerror}): another server may be running; "
-                "close it, or set another [web] port"
-            ) from error
+            raise LaunchError(port_taken("web", host, port, error)) from error
         self.port = next(iter(server.sockets)).getsockname()[1]
-        shown = socket.gethostname() if _is_any(host) else _in_url(host)
-        self.url = f"http://{shown}:{self.port}/#{token}"
+        self.url = f"http://{shown(host)}:{self.port}/#{token}"
 
     @property
     def clients(self) -> int:
@@ -145,11 +137,8 @@ class WebServer:
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to a request; None lets it become a WebSocket."""
         host = request.headers.get("Host", "")
-        try:
-            called, port = urlsplit(f"//{host}").hostname, urlsplit(f"//{host}").port
-        except ValueError:
-            called = port = None
-        if called is None or called not in self._names:
+        own = called(host, self._names)
+        if own is None:
             return connection.respond(
                 HTTPStatus.MISDIRECTED_REQUEST,
                 f"not served under the name {host!r}: add it to [web] names if browsers reach this machine by it\n",
@@ -159,10 +148,10 @@ class WebServer:
             return self._admit(connection, parse_qs(url.query).get("token", [""])[0])
         if url.path not in FILES:
             return connection.respond(HTTPStatus.NOT_FOUND, f"there are {', '.join(FILES)}, and the WebSocket /ws\n")
-        return _file(FILES[url.path], f"{_in_url(called)}:{port or 80}")
+        return _file(FILES[url.path], own)
 
     def _admit(self, connection: ServerConnection, token: str) -> Response | None:
-        if not hmac.compare_digest(token.encode(), self._token.encode()):
+        if not is_token(token, self._token):
             return connection.respond(
                 HTTPStatus.UNAUTHORIZED, "expected /ws?token=TOKEN, with the token after the # of the printed address\n"
             )
@@ -225,14 +214,3 @@ def _file(name: str, host: str) -> Response:
     if name.startswith("steadypose."):
         headers["Access-Control-Allow-Origin"] = "*"  # a page of somebody's own, from elsewhere, imports it
     return Response(HTTPStatus.OK, "OK", headers, body)
-
-
-def _in_url(host: str) -> str:
-    return f"[{host}]" if ":" in host else host
-
-
-def _is_any(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_unspecified
-    except ValueError:
-        return False

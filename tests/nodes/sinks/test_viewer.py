@@ -28,13 +28,14 @@ from steadypose.msgs.types import Diagnostics, JointState, Level, Pose, PoseClea
 from steadypose.nodes.graph import extras
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError, TransportSettings
+from steadypose.nodes.sinks.serving import called, own_names
 from steadypose.nodes.sinks.viewer import node as viewer_node
 from steadypose.nodes.sinks.viewer import server as drawings
 from steadypose.nodes.sinks.viewer import server as viewer_server
 from steadypose.nodes.sinks.viewer.layout import FAINT_RGB, SIDE_RGB
 from steadypose.nodes.sinks.viewer.node import ViewerNode, ViewerSettings
 from steadypose.nodes.sinks.viewer.scene import PATH_SECONDS, PoseView
-from steadypose.nodes.sinks.viewer.server import LOOPBACK, Drawings, ViewerError, ViewerServer, is_own_name
+from steadypose.nodes.sinks.viewer.server import LOOPBACK, Drawings, ViewerError, ViewerServer
 
 rr = pytest.importorskip("rerun", reason="the optional extra `view` is not installed")
 
@@ -236,7 +237,7 @@ def test_the_server_shows_a_page_on_this_machine_alone() -> None:
             address, state = line.split()[1], line.split()[3]
             if state == "0A" and int(address.split(":")[1], 16) == port:
                 assert address.startswith("0100007F"), "listens beyond 127.0.0.1"
-        with pytest.raises(ViewerError, match=f"port {port} is not to be had"):
+        with pytest.raises(ViewerError, match=f"port {port} at 127.0.0.1 is not to be had"):
             ViewerServer(port)
     ViewerServer(port).close()
 
@@ -352,7 +353,7 @@ def test_who_does_not_know_the_token_sees_no_drawings(server: ViewerServer) -> N
     ],
 )  # fmt: skip
 def test_a_page_of_another_name_is_nobodys(host: str, status: int) -> None:
-    assert is_own_name(host, frozenset({"localhost", socket.gethostname().lower()})) == (status == 200)
+    assert (called(host, own_names("127.0.0.1")) is not None) == (status == 200)
 
 
 def test_a_name_that_was_made_to_lead_here_gets_nothing(server: ViewerServer) -> None:
