@@ -31,7 +31,7 @@ from steadypose import PACKAGE
 
 logger = logging.getLogger(__name__)
 
-LOOPS = 140
+LOOPS = 150
 """entries that the nodes take with the settings that ship"""
 COMPLETE = "complete"
 """beside the entries: the digest of the sources that all of them are there for"""

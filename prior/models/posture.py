@@ -88,12 +88,10 @@ class LivePosture:
         scale = size[:, None, None]
         local = (positions - middle[:, None]) @ frame / scale
         noise = np.repeat(np.square(np.fmax(np.fmin(sigma, MAX_SIGMA), MIN_SIGMA) / size[:, None]), 3, axis=1)
-        seen = self._covariance + noise[:, :, None] * np.eye(DIMENSIONS)
-        off = local.reshape(len(local), -1) - self._mean
-        gain = np.linalg.inv(seen)
-        moved = (noise * (gain @ off[..., None])[..., 0]).reshape(local.shape)
-        left = noise[:, :, None] * (np.eye(DIMENSIONS) - gain * noise[:, None, :])
-        expected, left = on_bones((local - moved) * scale, left * scale**2, np.linalg.norm(offsets[:, 1:], axis=-1))
+        off, left = local.reshape(len(local), -1) - self._mean, np.empty((len(local), DIMENSIONS, DIMENSIONS))
+        _condition(self._covariance, noise, off, left)
+        local = (self._mean + off).reshape(local.shape)
+        expected, left = on_bones(local * scale, left * scale**2, np.linalg.norm(offsets[:, 1:], axis=-1))
         off = (expected / scale).reshape(len(local), -1) - self._mean
         root = frame @ from_rotation_vectors(self._turn + off @ self._turned_by.T)
         turned = self._turned_by @ left @ self._turned_by.T / scale**2
@@ -143,6 +141,32 @@ class RootCovariance:
         rigid = _rigid_covariance(sigma, bones @ root)
         covariance = DEPENDENT * known @ np.linalg.inv(known + rigid) @ rigid + LEAST_SIGMA**2 * np.eye(3)
         return root @ covariance @ root.swapaxes(-1, -2)
+
+
+@njit(cache=True)
+def _condition(covariance, noise, off, left):
+    """A Gaussian of ``covariance`` (66, 66) about 0, given ``off`` (B, 66), observed with variances ``noise`` (B, 66).
+
+    Observation by observation, as their errors are independent. Writes the expectation to ``off``, and the covariance
+    to ``left`` (B, 66, 66).
+    """
+    column, expected = np.empty(DIMENSIONS), np.empty(DIMENSIONS)
+    for b in range(len(off)):
+        for i in range(DIMENSIONS):
+            expected[i] = 0.0
+            for j in range(DIMENSIONS):
+                left[b, i, j] = covariance[i, j]
+        for k in range(DIMENSIONS):
+            innovation, variance = off[b, k] - expected[k], left[b, k, k] + noise[b, k]
+            for i in range(DIMENSIONS):
+                column[i] = left[b, k, i]
+            for i in range(DIMENSIONS):
+                gain = column[i] / variance
+                expected[i] += gain * innovation
+                for j in range(DIMENSIONS):
+                    left[b, i, j] -= gain * column[j]
+        for i in range(DIMENSIONS):
+            off[b, i] = expected[i]
 
 
 def on_bones(mean: Floats, covariance: Floats, lengths: Floats) -> tuple[Floats, Floats]:

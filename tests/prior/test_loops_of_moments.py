@@ -102,6 +102,19 @@ def test_errors_along_a_direction_are_those_of_a_least_squares_fit(seed: int, mi
 
 @settings(deadline=None, max_examples=20)
 @given(SEEDS)
+def test_one_observation_after_the_other_tells_what_all_of_them_tell(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    factor, noise = 0.1 * rng.normal(size=(66, 66)), 10.0 ** rng.uniform(-10.0, -1.0, 66)
+    covariance, off = factor @ factor.T, rng.normal(0.0, 0.1, 66)
+    gain = covariance @ np.linalg.inv(covariance + np.diag(noise))
+    expected, left = off[None].copy(), np.empty((1, 66, 66))
+    posture._condition(covariance, noise[None], expected, left)
+    np.testing.assert_allclose(expected[0], gain @ off, atol=1e-8)
+    np.testing.assert_allclose(left[0], covariance - gain @ covariance, atol=1e-8)
+
+
+@settings(deadline=None, max_examples=20)
+@given(SEEDS)
 def test_joints_on_bones_are_those_of_an_iterated_extended_kalman_filter(seed: int) -> None:
     rng = np.random.default_rng(seed)
     prior = (REST_POSITIONS + rng.normal(0.0, 0.03, REST_POSITIONS.shape)).ravel()

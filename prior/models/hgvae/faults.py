@@ -8,7 +8,6 @@ score at least as high. An anomaly of 2 occurs in one of a hundred clean windows
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,34 +73,18 @@ def fault_features(
         the RMS second difference of the newest frames (near 0 if a tracker repeats its output); the sensor's error.
     """
     count, tracks, frames = x.shape
-    features = np.empty((count, tracks, 4 * frames + 2), dtype=np.float32)
-    _write_features(x, reconstructed, sigma, observed, mean, features)
+    features, seen = np.empty((count, tracks, 4 * frames + 2), dtype=np.float32), observed > 0
+    features[..., :frames] = np.where(seen, (x - mean[:, None]) / SCALE, 0.0)
+    features[..., frames : 2 * frames] = np.arcsinh(np.where(seen, (x - reconstructed) / OFF_SCALE, 0.0))
+    features[..., 2 * frames : 3 * frames] = np.log(sigma / OFF_SCALE)
+    features[..., 3 * frames : -2] = seen
+    newest, last = x[..., -RECENT - 2 :], seen[..., -RECENT - 2 :]
+    shown = last[..., 2:] & last[..., 1:-1] & last[..., :-2]
+    rough = np.where(shown, newest[..., 2:] - 2 * newest[..., 1:-1] + newest[..., :-2], 0.0)
+    square = np.square(rough).sum(axis=-1) / np.maximum(shown.sum(axis=-1), 1)
+    features[..., -2] = 0.5 * np.log(square / ROUGH_SCALE**2 + 1e-3)
     features[..., -1] = np.reshape(np.log(np.asarray(sensor_sigma) / SENSOR_SCALE), (-1, 1))
     return features
-
-
-@njit(cache=True)
-def _write_features(x, reconstructed, sigma, observed, mean, features):
-    count, tracks, frames = x.shape
-    for b in range(count):
-        for track in range(tracks):
-            row = features[b, track]
-            square, shown = 0.0, 0
-            for t in range(frames):
-                seen = observed[b, track, t] > 0
-                row[t] = (x[b, track, t] - mean[track]) / SCALE if seen else 0.0
-                row[frames + t] = math.asinh((x[b, track, t] - reconstructed[b, track, t]) / OFF_SCALE) if seen else 0.0
-                row[2 * frames + t] = math.log(sigma[b, track, t] / OFF_SCALE)
-                row[3 * frames + t] = 1.0 if seen else 0.0
-                if (
-                    t >= max(frames - RECENT, 2)
-                    and seen
-                    and observed[b, track, t - 1] > 0
-                    and observed[b, track, t - 2] > 0
-                ):
-                    square += (x[b, track, t] - 2 * x[b, track, t - 1] + x[b, track, t - 2]) ** 2
-                    shown += 1
-            row[4 * frames] = 0.5 * math.log(square / max(shown, 1) / ROUGH_SCALE**2 + 1e-3)
 
 
 class LiveFaultNet:
