@@ -127,8 +127,9 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
                 changed.elts[0], changed.elts[-1] = last, first
                 yield changed
         case ast.Call(args=[first, *_, last]) if not any(isinstance(end, ast.Starred) for end in (first, last)):
-            changed.args[0], changed.args[-1] = last, first
-            yield changed
+            if ast.dump(first) != ast.dump(last):
+                changed.args[0], changed.args[-1] = last, first
+                yield changed
         case ast.Expr(value=ast.Call()) | ast.AugAssign() | ast.Raise():
             yield ast.Pass()
         case ast.Return(value=ast.expr()):
