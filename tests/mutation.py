@@ -2,8 +2,8 @@
 
 A mutant is the code with one operator, number, order or statement changed. Tests that pass on a mutant do not hold that
 place: it survived, and is printed. Unless tests are named, a mutant meets those aimed at its file: the ones that import
-it, or where none does, that import the modules that import it; none that is marked slow. The checkout stays as it is:
-mutants live in a copy. Exit status 0 if at least `GOAL` of the mutants were killed, 1 if fewer, 2 if the tests fail
+it, or where none does, that import the modules that import it; then all of its room, none that is marked slow. The
+checkout stays as it is: mutants live in a copy. Exit status 0 if at least `GOAL` of the mutants were killed, 1 if fewer, 2 if the tests fail
 without any mutation.
 """
 
@@ -224,15 +224,18 @@ def main() -> int:
         survived = 0
         limits_s: dict[tuple[str, ...], float] = {}
         for mutant in drawn:
-            tests = tuple(options.tests or aimed_at(mutant.file))
-            if tests not in limits_s:
-                started = time.monotonic()
-                if not passes(tests, root):
-                    print(f"the tests fail without any mutation, nothing can be said of them: {' '.join(tests)}")
-                    return 2
-                limits_s[tests] = 10.0 + 5.0 * (time.monotonic() - started)
+            room = Path("tests", mutant.file.parent)
+            further = [(str(room),)] if not options.tests and (root / room).is_dir() else []
+            rings = [tuple(options.tests or aimed_at(mutant.file)), *further]
+            for tests in rings:
+                if tests not in limits_s:
+                    started = time.monotonic()
+                    if not passes(tests, root):
+                        print(f"the tests fail without any mutation, nothing can be said of them: {' '.join(tests)}")
+                        return 2
+                    limits_s[tests] = 10.0 + 5.0 * (time.monotonic() - started)
             (root / mutant.file).write_bytes(mutant.source)
-            survives = passes(tests, root, limits_s[tests])
+            survives = all(passes(tests, root, limits_s[tests]) for tests in rings)
             (root / mutant.file).write_bytes((ROOT / mutant.file).read_bytes())
             survived += survives
             print("survived" if survives else "killed  ", mutant, flush=True)

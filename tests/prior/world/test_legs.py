@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from steadypose.prior.body.kinematics import forward_kinematics
@@ -50,8 +51,11 @@ def test_joints_and_lengths_that_are_not_known_are_left_out():
     np.testing.assert_array_equal(fitted, positions + 0.01)
 
 
-def test_rotations_go_with_the_legs():
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_rotations_go_with_the_legs(sign: float):
+    """A quaternion and its negative are the same rotation."""
     rotations, positions = pose(4)
+    rotations *= sign
     moved = positions.copy()
     for side in ("left", "right"):
         moved[J[f"{side}_knee"]] += [0.02, 0.01, 0.0]

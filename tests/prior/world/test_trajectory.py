@@ -75,8 +75,14 @@ def test_message_is_complete():
         assert ((body.contacts >= 0) & (body.contacts <= 1)).all()
         np.testing.assert_allclose(body.positions[0], body.root_position, atol=1e-5)
         np.testing.assert_allclose(body.covariance, body.covariance.T)
+        assert body.sigma[0] ** 2 == pytest.approx(np.trace(body.covariance[:3, :3]) / 3)
         assert np.linalg.eigvalsh(body.covariance).min() > 0
         np.testing.assert_allclose(np.linalg.norm(body.root_orientation), 1.0, atol=1e-6)
+
+
+def test_of_a_body_known_by_its_positions_alone_no_joint_is_turned():
+    (world,) = run([changed(stream()[0], {"rotations": np.zeros((22, 4))})])
+    np.testing.assert_array_equal(world.bodies[0].rotations[1:], np.tile([0.0, 0.0, 0.0, 1.0], (21, 1)))
 
 
 def test_coasts_while_the_root_is_hidden_and_says_so():
