@@ -3,8 +3,8 @@
 A mutant is the code with one operator, number, order or statement changed. Tests that pass on a mutant do not hold that
 place: it survived, and is printed. Unless tests are named, a mutant meets those aimed at its file: the ones that import
 it, or where none does, that import the modules that import it; then all of its room, none that is marked slow. The
-checkout stays as it is: mutants live in a copy. Exit status 0 if at least `GOAL` of the mutants were killed, 1 if fewer, 2 if the tests fail
-without any mutation.
+checkout stays as it is: mutants live in a copy. Exit status 0 if at least `GOAL` of the mutants were killed, 1 if fewer,
+or if the tests fail without any mutation.
 """
 
 from __future__ import annotations
@@ -221,24 +221,26 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "checkout"
         shutil.copytree(ROOT, root, symlinks=True, ignore=shutil.ignore_patterns(*ELSEWHERE))
-        survived = 0
         limits_s: dict[tuple[str, ...], float] = {}
+
+        def survives(mutant: Mutant, tests: tuple[str, ...]) -> bool:
+            if tests not in limits_s:
+                started = time.monotonic()
+                if not passes(tests, root):
+                    sys.exit(f"the tests fail without any mutation, nothing can be said of them: {' '.join(tests)}")
+                limits_s[tests] = 10.0 + 5.0 * (time.monotonic() - started)
+            (root / mutant.file).write_bytes(mutant.source)
+            passed = passes(tests, root, limits_s[tests])
+            (root / mutant.file).write_bytes((ROOT / mutant.file).read_bytes())
+            return passed
+
+        survived = 0
         for mutant in drawn:
             room = Path("tests", mutant.file.parent)
             further = [(str(room),)] if not options.tests and (root / room).is_dir() else []
-            rings = [tuple(options.tests or aimed_at(mutant.file)), *further]
-            for tests in rings:
-                if tests not in limits_s:
-                    started = time.monotonic()
-                    if not passes(tests, root):
-                        print(f"the tests fail without any mutation, nothing can be said of them: {' '.join(tests)}")
-                        return 2
-                    limits_s[tests] = 10.0 + 5.0 * (time.monotonic() - started)
-            (root / mutant.file).write_bytes(mutant.source)
-            survives = all(passes(tests, root, limits_s[tests]) for tests in rings)
-            (root / mutant.file).write_bytes((ROOT / mutant.file).read_bytes())
-            survived += survives
-            print("survived" if survives else "killed  ", mutant, flush=True)
+            alive = all(survives(mutant, ring) for ring in [tuple(options.tests or aimed_at(mutant.file)), *further])
+            survived += alive
+            print("survived" if alive else "killed  ", mutant, flush=True)
     killed = len(drawn) - survived
     print(f"{killed} of {len(drawn)} mutants killed ({len(every)} in all), {100 * killed / max(len(drawn), 1):.0f} %")
     return 0 if killed >= GOAL * len(drawn) else 1
