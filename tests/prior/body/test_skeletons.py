@@ -7,7 +7,7 @@ from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS
 EXPECTED_COUNTS = {
     "smpl22": 22, "coco17": 17, "blazepose33": 33, "h36m17": 17, "kinect22": 22, "azure_kinect32": 32, "zed38": 38,
     "openpose25": 25, "kinect25": 25, "smpl24": 24, "coco_wholebody23": 23, "halpe26": 26, "zed18": 18, "zed34": 34,
-    "mhr70": 70,
+    "mhr70": 70, "soma77": 77,
 }  # fmt: skip
 
 
