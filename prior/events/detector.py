@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import Event, EventKind, Hand, Phase, PoseWorld, Tracking, WorldBody
 from steadypose.prior.events.features import Arm, Features, facing_away, features
-from steadypose.prior.events.trigger import Facing, Trigger, Wave
+from steadypose.prior.events.trigger import RandomWalk, Trigger, Wave
 from steadypose.prior.settings import check_range
 
 
@@ -46,6 +46,8 @@ class EventSettings:
     """height of the hips above the lower ankle, in lengths of the leg, from which on one stands"""
     stands_margin: float = 0.2
     """the same, less by which one no longer stands"""
+    stands_change: float = 0.3
+    """lengths of the leg by which that height changes in a second, root mean square"""
     sits: float = 0.95
     """radians of the more upright thigh from the vertical, from which on one sits"""
     sits_margin: float = 0.25
@@ -155,7 +157,7 @@ class _Body:
             self._triggers[EventKind.WAVES, hand] = trigger(0.5, 0.0, 0.0)
             self._triggers[EventKind.POINTS, hand] = trigger(s.point_elbow, s.point_elbow_margin, s.point_hold)
         self._waves = {hand: Wave(s.wave_swing, s.wave_within) for hand in (Hand.LEFT, Hand.RIGHT)}
-        self._facing = Facing(s.faces_turn)
+        self._facing, self._extension = RandomWalk(s.faces_turn), RandomWalk(s.stands_change)
         self._heights: deque[tuple[int, float]] = deque()
         self._falls: deque[tuple[int, float]] = deque()
         self._wrists: deque[tuple[int, tuple[list[float], ...]]] = deque()
@@ -206,7 +208,8 @@ class _Body:
         lies = take(EventKind.LIES, none, -seen.extent.value, seen.extent.sigma)
         upright = not seen.trunk < UPRIGHT  # nor if it is not known
         sits = take(EventKind.SITS, none, *seen.thigh, possible=upright and not lies)
-        stands = take(EventKind.STANDS, none, *seen.extension, possible=not lies and not sits)
+        (extension,), extension_sigma = self._extension.update(now, (seen.extension.value,), seen.extension.sigma)
+        stands = take(EventKind.STANDS, none, extension, extension_sigma, possible=not lies and not sits)
         fastest = self._fastest_fall(now, seen.neck)
         fallen = self._triggers[EventKind.FELL, none].active
         take(
@@ -221,7 +224,7 @@ class _Body:
         take(EventKind.FACES_SENSOR, none, -turned.value, turned.sigma, possible=not lies)
         speeds = self._wrist_speeds(now, seen.arms)
         for hand, arm, speed in zip((Hand.LEFT, Hand.RIGHT), seen.arms, speeds, strict=True):
-            take(EventKind.HAND_RAISED, hand, *arm.raised, possible=not lies)
+            take(EventKind.HAND_RAISED, hand, *arm.raised, possible=upright and not lies)
             waving = self._waves[hand].update(now, arm.swing, arm.upright and not lies, arm.up and not lies)
             take(EventKind.WAVES, hand, float(waving), CERTAIN)
             still = speed < s.point_speed and arm.lift > s.point_lift

@@ -43,7 +43,7 @@ class Arm(NamedTuple):
     lift: float
     """radians between shoulder to wrist and the nearer vertical"""
     swing: float
-    """radians of the forearm from upright, towards the body's left"""
+    """radians of the forearm from upright, towards the body's left; NaN where it is not observed, for guesses shake"""
     up: bool
     """the hand is no lower than the chest"""
     upright: bool
@@ -83,6 +83,7 @@ class Features(NamedTuple):
 def features(body: WorldBody, sensor: NDArray[np.float64]) -> Features:
     """Of one body, as seen from a sensor at (3,) metres, world."""
     known = body.state != JointState.UNKNOWN
+    observed: list[bool] = np.isin(body.state, (JointState.SEEN, JointState.REFINED)).tolist()
     p: list[Point] = np.where(known[:, None], body.positions, np.nan).tolist()
     s: list[float] = body.sigma.tolist()
     hips = _middle(p[J["left_hip"]], p[J["right_hip"]])
@@ -115,7 +116,7 @@ def features(body: WorldBody, sensor: NDArray[np.float64]) -> Features:
         extent,
         p[J["neck"]][2],
         (p[J["neck"]][2] - p[J["pelvis"]][2]) / max(math.dist(p[J["neck"]], p[J["pelvis"]]), 0.1),
-        (_arm(p, s, left, "left"), _arm(p, s, left, "right")),
+        (_arm(p, s, observed, left, "left"), _arm(p, s, observed, left, "right")),
     )
 
 
@@ -144,7 +145,7 @@ def _thigh(p: list[Point], s: list[float], side: str) -> Quantity:
     return Quantity(_angle_to_up(p[knee], p[hip]), math.hypot(s[hip], s[knee]) / max(length, 0.1))
 
 
-def _arm(p: list[Point], s: list[float], left: list[float], side: str) -> Arm:
+def _arm(p: list[Point], s: list[float], observed: list[bool], left: list[float], side: str) -> Arm:
     shoulder, elbow, wrist = (J[f"{side}_{part}"] for part in ("shoulder", "elbow", "wrist"))
     neck, head = J["neck"], J["head"]
     upper, lower = _distance(p[shoulder], p[elbow]), _distance(p[elbow], p[wrist])
@@ -160,7 +161,7 @@ def _arm(p: list[Point], s: list[float], left: list[float], side: str) -> Arm:
         Quantity(p[wrist][2] + HAND * forearm[2] / max(lower, 0.1) - p[neck][2], math.hypot(s[wrist], s[neck])),
         Quantity(inner, math.hypot(s[elbow], s[wrist]) / max(min(upper, lower), 0.1)),
         min(from_up, math.pi - from_up),
-        math.atan2(aside, forearm[2]),
+        math.atan2(aside, forearm[2]) if observed[elbow] and observed[wrist] else math.nan,
         p[wrist][2] > p[J["spine3"]][2],
         forearm[2] > 0.5 * lower and p[wrist][2] > p[J["spine3"]][2],
         p[wrist],

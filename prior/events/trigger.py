@@ -70,7 +70,7 @@ SWINGS = 2
 """Number of swings of a wave: out and back, and once more where it is not about upright, for so an arm that is raised
 aside and lowered again begins as well."""
 CENTRED = 0.4
-"""Angle in radians of the middle of a swing from upright, up to which it is about upright."""
+"""Angle in radians of the middle of a swing, or of its last part, from upright, up to which it is about upright."""
 
 
 class Wave:
@@ -88,59 +88,65 @@ class Wave:
     def _reset(self) -> None:
         self._low, self._high = math.inf, -math.inf
         self._about_upright = False
+        self._extreme = math.nan
         self._side = self._turns = self._turned_ns = 0
 
     def update(self, stamp_ns: int, angle: float, upright: bool, up: bool) -> bool:
         """Whether it waves, with the forearm's next angle in radians to one side of upright.
 
         It begins while the forearm is ``upright``, and goes on while the hand is ``up``: who waves with the whole arm
-        comes near level at each end.
+        comes near level at each end. Where the angle is NaN, as of an arm that is not observed, nothing swings.
         """
-        if not (up if self._turns else upright) or math.isnan(angle):
+        if not (up if self._turns else upright):
             self._reset()
             return False
         if self._turns and stamp_ns - self._turned_ns > self._within_ns:
             self._reset()
+        if math.isnan(angle):
+            return self._waves()
         self._low, self._high = min(self._low, angle), max(self._high, angle)
         if self._side <= 0 and angle - self._low > self._swing:
-            self._turn(1, stamp_ns, angle, self._low)
+            self._turn(1, stamp_ns, angle, self._low, self._high)
         elif self._side >= 0 and self._high - angle > self._swing:
-            self._turn(-1, stamp_ns, angle, self._high)
+            self._turn(-1, stamp_ns, angle, self._high, self._low)
+        return self._waves()
+
+    def _waves(self) -> bool:
         return self._turns > SWINGS or (self._turns == SWINGS and self._about_upright)
 
-    def _turn(self, side: int, stamp_ns: int, angle: float, extreme: float) -> None:
-        self._about_upright = abs(angle + extreme) < 2.0 * CENTRED
+    def _turn(self, side: int, stamp_ns: int, angle: float, extreme: float, before: float) -> None:
+        whole = extreme + (self._extreme if self._turns else before)
+        self._about_upright = min(abs(whole), abs(extreme + angle)) < 2.0 * CENTRED
+        self._extreme = extreme
         self._side = side
         self._low = self._high = angle
         self._turns += 1
         self._turned_ns = stamp_ns
 
 
-class Facing:
-    """Where a body faces: a Kalman filter of the line from its right to its left, each of two coordinates alike.
-
-    A sensor's noise turns hips and shoulders by more than what a threshold asks for; people turn slower than that.
+class RandomWalk:
+    """A Kalman filter of what a sensor shakes by more than people change it, each of its coordinates alike: the
+    surer the observations, the less it waits for the next ones.
 
     Args:
-        turn: metres by which the line changes in a second, root mean square.
+        change: by which a coordinate changes in a second, root mean square, in its unit.
     """
 
-    def __init__(self, turn: float) -> None:
-        self._density = turn * turn
-        self._stamp_ns, self._line, self._variance = NEVER, (math.nan, math.nan), math.inf
+    def __init__(self, change: float) -> None:
+        self._density = change * change
+        self._stamp_ns, self._value, self._variance = NEVER, (math.nan,), math.inf
 
-    def update(self, stamp_ns: int, line: tuple[float, float], sigma: float) -> tuple[tuple[float, float], float]:
-        """The line (2,) and its standard deviation, in metres, with the next observation of it; NaN where unknown."""
-        if math.isnan(line[0]) or math.isnan(line[1]):
+    def update(self, stamp_ns: int, value: tuple[float, ...], sigma: float) -> tuple[tuple[float, ...], float]:
+        """The coordinates and their standard deviation, with the next observation of them; NaN where unknown."""
+        if any(map(math.isnan, value)):
             self._stamp_ns = NEVER
-            return line, math.nan
+            return value, math.nan
         if self._stamp_ns == NEVER:
-            self._line, self._variance = line, sigma * sigma
+            self._value, self._variance = value, sigma * sigma
         else:
             self._variance += self._density * (stamp_ns - self._stamp_ns) * 1e-9
             gain = self._variance / max(self._variance + sigma * sigma, 1e-12)
-            (x, y), (new_x, new_y) = self._line, line
-            self._line = (x + gain * (new_x - x), y + gain * (new_y - y))
+            self._value = tuple(old + gain * (new - old) for old, new in zip(self._value, value, strict=True))
             self._variance *= 1.0 - gain
         self._stamp_ns = stamp_ns
-        return self._line, math.sqrt(self._variance)
+        return self._value, math.sqrt(self._variance)

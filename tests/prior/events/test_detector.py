@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from steadypose.msgs.types import Event, EventKind, Hand, JointState, Phase, PoseWorld, Tracking, WorldBody
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.events.detector import EventDetector, EventSettings
-from steadypose.prior.events.trigger import Facing, Trigger, Wave
+from steadypose.prior.events.features import features
+from steadypose.prior.events.trigger import RandomWalk, Trigger, Wave
 
 FRAME_NS = 33_333_333
 START_NS = 1_000_000_000
@@ -262,7 +263,7 @@ def wave_begins(angles: list[float]) -> bool:
 
 def test_where_a_body_faces_is_told_through_noise_and_followed_where_there_is_none() -> None:
     rng = np.random.default_rng(0)
-    noisy, sure = Facing(0.3), Facing(0.3)
+    noisy, sure = RandomWalk(0.3), RandomWalk(0.3)
     stamps = [START_NS + k * FRAME_NS for k in range(60)]
     line, sigma = [noisy.update(at, (0.5 + rng.normal(0.0, 0.3), rng.normal(0.0, 0.3)), 0.3) for at in stamps][-1]
     turning = [sure.update(at, (np.cos(k / 20.0), np.sin(k / 20.0)), 0.005) for k, at in enumerate(stamps)]
@@ -272,6 +273,40 @@ def test_where_a_body_faces_is_told_through_noise_and_followed_where_there_is_no
     assert np.arctan2(y, x) == pytest.approx(59 / 20.0, abs=0.05)
     assert np.isnan(noisy.update(START_NS + 61 * FRAME_NS, (np.nan, 0.0), 0.3)[0][0])
     assert noisy.update(START_NS + 62 * FRAME_NS, (0.0, 1.0), 0.3)[0] == (0.0, 1.0), "what was unknown begins anew"
+
+
+def test_a_swing_that_is_not_observed_is_none() -> None:
+    """What a guess of a hidden forearm does waves at nobody; a wave that is hidden for a moment goes on."""
+    wave = Wave(0.36, 0.8)
+    angles = [0.5 * np.sin(9 * k / 30) for k in range(60)]
+    waves = [
+        wave.update(k * FRAME_NS, np.nan if 3 < k % 20 < 12 else angle, True, True) for k, angle in enumerate(angles)
+    ]
+    assert waves[-1]
+    body = message(0, raised(standing(), "left", swing=0.5)).bodies[0]
+    assert features(body, np.zeros(3)).arms[0].swing == pytest.approx(-0.5, abs=0.01)
+    body.state[J["left_elbow"]] = JointState.IMPUTED
+    assert np.isnan(features(body, np.zeros(3)).arms[0].swing)
+
+
+def test_who_stands_is_told_through_noise_that_no_single_frame_decides() -> None:
+    """Legs of a runner: each frame's height is uncertain by more than it is above the threshold, all together not."""
+    rng = np.random.default_rng(1)
+    poses = [standing() for _ in range(30)]
+    for pose in poses:
+        pose[[J["left_ankle"], J["right_ankle"]], 2] += 0.09 + rng.normal(0.0, 0.02)
+    begins = first(changes(poses, sigma=0.1), EventKind.STANDS)
+    assert begins is not None
+    assert begins < 15
+
+
+def test_a_hand_before_a_body_that_bends_down_is_not_raised() -> None:
+    """Above the neck it is, but so is every hand that is held forward."""
+    bent = raised(standing())
+    hips = bent[J["pelvis"]].copy()
+    upper = [J[name] for name in ("spine1", "spine2", "spine3", "neck", "head")]
+    bent[upper] = hips + (bent[upper] - hips) @ np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    assert first(changes([*STILL, *[bent] * 20]), EventKind.HAND_RAISED) is None
 
 
 def test_who_waves_with_the_whole_arm_begins_to_wave_once() -> None:
