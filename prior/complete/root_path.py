@@ -8,7 +8,7 @@ import numpy as np
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, heading, yaw_matrix
 from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity
+from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity, velocity_features
 from steadypose.prior.timing.rate import FPS
 
 STILL_M, MOVING_M = 1e-3, 0.03
@@ -33,14 +33,17 @@ def velocities(network: LiveRootVelocity, joints: Floats, root_rotations: Floats
     """(T, 3) m/s, world: velocities of the root.
 
     Args:
-        network: run on every frame with its context; before the first frame that is the first, repeated.
+        network: run on one frame after the other.
         joints: (T, 22, 3) metres from the root, z up.
         root_rotations: (T, 3, 3) to the world.
     """
-    turn = yaw_matrix(heading(root_rotations))
-    rows = np.maximum(np.arange(len(joints))[:, None] + np.arange(1 - network.config.context, 1), 0)
-    predicted = network(joints[rows] @ turn[:, None])
-    return (turn @ predicted.velocity[..., None].astype(np.float64))[..., 0]
+    yaw = heading(root_rotations)
+    features = velocity_features(joints, np.concatenate([joints[:1], joints[:-1]]), FRAME_S, yaw)
+    state, predicted = network.start(1), np.empty((len(joints), 3))
+    for t, frame in enumerate(features):
+        velocity, _, state = network(frame[None], state)
+        predicted[t] = velocity[0]
+    return (yaw_matrix(yaw) @ predicted[..., None])[..., 0]
 
 
 def root_path(network: LiveRootVelocity, joints: Floats, root_rotations: Floats) -> Floats:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from steadypose.prior.arrays import Floats, Floats32
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT
 from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.models.layers import dense
+from steadypose.prior.models.recurrent import LiveRecurrent, sigmoid
 from steadypose.prior.models.weights import Arrays, load_weights
 
 OF_JOINT = 12
@@ -100,10 +100,8 @@ class LiveContacts:
     """
 
     def __init__(self, weights: Arrays) -> None:
-        self._input = weights["unit.weight_ih_l0"], weights["unit.bias_ih_l0"]
-        self._kept = weights["unit.weight_hh_l0"], weights["unit.bias_hh_l0"]
-        self._head = weights["head.weight"], weights["head.bias"]
-        self.hidden = weights["head.weight"].shape[1]
+        self._net = LiveRecurrent(weights, "unit")
+        self.hidden = self._net.hidden
 
     @classmethod
     def load(cls, weights: str) -> LiveContacts:
@@ -112,13 +110,6 @@ class LiveContacts:
 
     def __call__(self, features: NDArray[np.float32], state: NDArray[np.float32]) -> Contacts:
         """One frame: features (B, `FEATURES`) and what was remembered, (B, `hidden`)."""
-        reset_in, update_in, new_in = np.split(dense(features, *self._input), 3, axis=-1)
-        reset_kept, update_kept, new_kept = np.split(dense(state, *self._kept), 3, axis=-1)
-        new = np.tanh(new_in + _sigmoid(reset_in + reset_kept) * new_kept)
-        state = new + _sigmoid(update_in + update_kept) * (state - new)
-        predicted = _sigmoid(dense(state, *self._head))
+        outputs, state = self._net(features, state)
+        predicted = sigmoid(outputs)
         return Contacts(predicted[:, : len(CONTACT_JOINTS)], predicted[:, len(CONTACT_JOINTS) :], state)
-
-
-def _sigmoid(x: Floats32) -> Floats32:
-    return (1.0 / (1.0 + np.exp(-x))).astype(np.float32)

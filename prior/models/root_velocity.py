@@ -1,7 +1,7 @@
-"""Root velocity of the newest frame as the live node asks for it: `TrajectoryNet`, without torch.
+"""Root velocity of a body, read from its own motion (HM-VAE, section 3.3), as the live node runs it, without torch.
 
-Frames that the last one does not depend on are left out; pooling, which is linear, is folded into the convolution
-before it, and the convolution is a product of matrices: for so few frames, a library's convolutions are slower.
+A recurrent network takes the place of the paper's convolutions over the skeleton, which saw 25 frames: it strays less
+on everybody, and takes a tenth of the time (benchmarks/NOTEBOOK.md).
 """
 
 from __future__ import annotations
@@ -13,23 +13,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats32
-from steadypose.prior.body.skeleton import PARENTS
-from steadypose.prior.models.layers import dense, leaky_relu, mix_edges, pool_matrix, pooling_levels
-from steadypose.prior.models.weights import Arrays, load_weights, part
+from steadypose.prior.arrays import Floats, Floats32
+from steadypose.prior.body.kinematics import yaw_matrix
+from steadypose.prior.models.recurrent import LiveRecurrent
+from steadypose.prior.models.weights import Arrays, load_weights
 from steadypose.prior.timing.rate import FPS
 
 FRAME_S = 1.0 / FPS
 """Seconds between the frames that the network sees."""
 
-JOINT_FEATURES = 6
-"""A joint's features: position and velocity."""
+FEATURES = 22 * 6
+"""Numbers of a frame: place from the root and velocity against it, of each joint."""
 
-OUTPUTS = 6
-"""Velocity and logarithm of its standard deviation; the network's other outputs, contacts, only train it."""
-
-CHANNELS = (JOINT_FEATURES, 6, 12, 24, 48)
-"""of an edge, before the first convolution and after each"""
+FROM_ROOT, SPEED, FASTEST = 0.5, 2.0, 6.0
+"""Metres and m/s by which places and velocities are divided, and m/s at which velocities are clipped."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +34,13 @@ class TrajectoryConfig:
     """The size of the network, and what validation measured of its errors.
 
     Attributes:
-        kernel: frames that each of the four convolutions sees.
+        hidden: numbers that the network remembers of a body.
         sigma_scale: (horizontal, vertical) by which the predicted standard deviation is too small.
         correlation_s: (horizontal, vertical) seconds for which an error of the velocity lasts: twice the integral of
             its normalised autocorrelation.
     """
 
-    kernel: int = 7
+    hidden: int = 128
     sigma_scale: tuple[float, float] = (1.0, 1.0)
     correlation_s: tuple[float, float] = (FRAME_S, FRAME_S)
 
@@ -53,40 +50,47 @@ class TrajectoryConfig:
         pairs = {name: tuple(config[name]) for name in ("sigma_scale", "correlation_s")}
         return cls(**{**config, **pairs})
 
-    @property
-    def context(self) -> int:
-        """Frames that the newest output depends on."""
-        return 4 * (self.kernel - 1) + 1
-
 
 class NewestMotion(NamedTuple):
-    """The network's output for the newest frame, in the frame of its input.
+    """The network's output for a frame, in the frame of its input.
 
     Attributes:
         velocity: (B, 3) m/s, of the root.
         log_sigma: (B, 3) log of the standard deviation of that along each axis, m/s.
+        state: (B, hidden) what to remember for the next frame.
     """
 
     velocity: Floats32
     log_sigma: Floats32
+    state: Floats32
+
+
+def velocity_features(joints: Floats, before: Floats, dt: Floats | float, yaw: Floats) -> NDArray[np.float32]:
+    """(B, `FEATURES`) of B frames, turned so that each body faces +x.
+
+    Args:
+        joints: (B, 22, 3) metres from the root, z up.
+        before: (B, 22, 3) the same of the frame before.
+        dt: (B,) or a number, seconds between them.
+        yaw: (B,) radians, where the body looks.
+    """
+    turn, step = yaw_matrix(yaw), np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(joints),))[:, None, None]
+    velocity = np.clip((joints - before) / step @ turn, -FASTEST, FASTEST) / SPEED
+    features = np.concatenate([joints @ turn / FROM_ROOT, velocity], axis=-1)
+    return features.reshape(len(joints), FEATURES).astype(np.float32)
 
 
 class LiveRootVelocity:
-    """A trained `TrajectoryNet` at the last frame only.
+    """A trained `TrajectoryNet`.
 
     Args:
-        config: its size.
-        weights: its state dict, which is folded.
+        config: its size and errors.
+        weights: its state dict.
     """
 
     def __init__(self, config: TrajectoryConfig, weights: Arrays) -> None:
         self.config = config
-        self._layers = []
-        for k, level in enumerate(pooling_levels(PARENTS)):
-            conv, pool = part(weights, f"blocks.{k}.conv"), pool_matrix(level.groups)
-            weight = mix_edges(pool, conv["weight"]).swapaxes(1, 2)  # (out, kernel, in): frames side by side
-            self._layers.append((weight.reshape(len(weight), -1), mix_edges(pool, conv["bias"])))
-        self._head = weights["head.weight"][:OUTPUTS], weights["head.bias"][:OUTPUTS]
+        self._net = LiveRecurrent(weights, "motion")
 
     @classmethod
     def load(cls, weights: str) -> LiveRootVelocity:
@@ -94,20 +98,11 @@ class LiveRootVelocity:
         arrays, config = load_weights(weights, "trajectory")
         return cls(TrajectoryConfig.from_dict(config), arrays)
 
-    def __call__(self, joints: NDArray[np.floating]) -> NewestMotion:
-        """Of the last frame of joints (B, `context`, 22, 3), metres from the root, as `TrajectoryNet` takes them.
+    def start(self, count: int) -> Floats32:
+        """(count, hidden) what is remembered of bodies before their first frame."""
+        return np.zeros((count, self._net.hidden), dtype=np.float32)
 
-        The frame before the first is taken to have been the same.
-        """
-        joints = joints.astype(np.float32)
-        velocity = np.diff(joints, axis=1, prepend=joints[:, :1]) / np.float32(FRAME_S)
-        features = np.concatenate([joints, velocity], axis=-1).reshape(*joints.shape[:2], -1)
-        for weight, bias in self._layers:
-            taps = weight.shape[1] // features.shape[2]
-            frames = features.shape[1] - taps + 1
-            windows = np.stack([features[:, k : k + frames] for k in range(taps)], axis=2)
-            features = leaky_relu(dense(windows.reshape(-1, weight.shape[1]), weight, bias))
-            features = features.reshape(len(joints), frames, -1)
-        weight, bias = self._head
-        outputs = dense(features[:, 0], weight, bias)
-        return NewestMotion(outputs[:, :3], outputs[:, 3:])
+    def __call__(self, features: NDArray[np.float32], state: Floats32) -> NewestMotion:
+        """One frame: `velocity_features` (B, `FEATURES`) and what was remembered, (B, hidden)."""
+        outputs, state = self._net(features, state)
+        return NewestMotion(outputs[:, :3], outputs[:, 3:6], state)

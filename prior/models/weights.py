@@ -37,7 +37,7 @@ _PARTS = {
     "mixture": "body_memory deepen deviation gather joint joint_mix mean mix own_memory read remember tell think write",
     "occlusion": "deviation joint mean read think write",
     "posture": "factor mean",
-    "trajectory": "blocks head",
+    "trajectory": "head motion",
 }
 """Top-level names of each model's state dict, by which a file of another model is recognised."""
 

@@ -15,7 +15,7 @@ from steadypose.prior.world.floor import Floor
 from steadypose.prior.world.kalman import BodyNoise
 from steadypose.prior.world.observe import BodyObservation
 from steadypose.prior.world.settings import TrajectorySettings
-from steadypose.prior.world.velocity import MotionWindow, RootVelocity, VelocityNetwork
+from steadypose.prior.world.velocity import MotionMemory, RootVelocity, VelocityNetwork
 
 _NO_STANCE = Stance(np.zeros(4), np.zeros(4))
 
@@ -46,7 +46,7 @@ class BodyStages:
     """The stages' state of one body, made afresh for each: nothing of another can be left in it."""
 
     observed: BodyObservation
-    window: MotionWindow
+    motion: MotionMemory
     contacts: ContactMemory
     filter: RootFilter
     feet: Feet = field(default_factory=Feet)
@@ -99,7 +99,7 @@ class WorldCore:
         bodies = [self._stages(scene, o) for o in observed]
         velocities: Sequence[RootVelocity | None] = [None] * len(bodies)
         if self._settings.network:
-            velocities = self._velocity.update([body.window for body in bodies], observed)
+            velocities = self._velocity.update([body.motion for body in bodies], observed)
         contacts = self._contacts.update([body.contacts for body in bodies], observed, scene.floor)
         of_bodies = zip(bodies, observed, velocities, contacts, strict=True)
         return [self._estimate(scene.floor, *of_body) for of_body in of_bodies]
@@ -119,7 +119,7 @@ class WorldCore:
         body = scene.bodies.get(observed.body.id)
         if body is None:
             body = scene.bodies[observed.body.id] = BodyStages(
-                observed, MotionWindow(self._velocity.context), self._contacts.memory(),
+                observed, self._velocity.memory(), self._contacts.memory(),
                 RootFilter(observed, self._noise),
             )  # fmt: skip
         body.observed = observed

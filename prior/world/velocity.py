@@ -10,7 +10,7 @@ import numpy as np
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import REST_POSITIONS
-from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity
+from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity, velocity_features
 from steadypose.prior.world.observe import BodyObservation
 
 CAMERA_ERROR, CAMERA_MEMORY_S = 2.0, 0.3
@@ -35,33 +35,27 @@ class RootVelocity(NamedTuple):
     sigma: Floats
 
 
-class MotionWindow:
-    """The last frames of a body, at the network's rate; ``context`` of them."""
+class MotionMemory:
+    """What is kept of a body from frame to frame: its joints, and the network's state (hidden,)."""
 
-    def __init__(self, context: int) -> None:
-        self._context, self._newest_ns = context, 0
-        self._frames: Floats | None = None
+    def __init__(self, hidden: int) -> None:
+        self._hidden = hidden
+        self.local: Floats | None = None
+        self.state = np.zeros(hidden, dtype=np.float32)
 
-    def update(self, observed: BodyObservation) -> Floats:
-        """(context, 22, 3) metres from the root, turned so that the body now faces +x.
+    def update(self, observed: BodyObservation) -> tuple[Floats, Floats, float]:
+        """Joints (22, 3) metres from the root, world axes, those of the frame before, and seconds between them.
 
-        Motion is interpolated linearly between messages, and begins anew after a gap. A joint without a position stays
-        where it last was from the root.
+        Motion begins anew after a gap. A joint without a position stays where it last was from the root.
         """
-        turn = yaw_matrix(observed.yaw)
-        last = REST_POSITIONS @ turn.T if self._frames is None else self._frames[-1]
+        before = self.local
+        last = REST_POSITIONS @ yaw_matrix(observed.yaw).T if before is None else before
         local = observed.positions - observed.positions[0]
-        local = np.where(np.isfinite(local), local, last)
-        steps = round((observed.stamp_ns - self._newest_ns) * 1e-9 / FRAME_S)
-        if self._frames is None or observed.after_gap:
-            self._frames = np.repeat(local[None], self._context, axis=0)
-        else:
-            between = np.linspace(0.0, 1.0, steps + 1)[1:, None, None]
-            self._frames = np.concatenate([self._frames, last + between * (local - last)])[-self._context :]
-            self._frames[-1] = local
-        if steps:
-            self._newest_ns = observed.stamp_ns
-        return self._frames @ turn
+        self.local = local = np.where(np.isfinite(local), local, last)
+        if before is None or observed.after_gap:
+            self.state = np.zeros(self._hidden, dtype=np.float32)
+            return local, local, FRAME_S
+        return local, last, max(observed.dt, FRAME_S)
 
 
 class VelocityNetwork:
@@ -71,7 +65,6 @@ class VelocityNetwork:
         weights: the weight set, or a path to a ``.safetensors`` file.
 
     Attributes:
-        context: frames of motion that it looks at.
         memory_s: (3,) seconds, time constants of the velocity's errors.
     """
 
@@ -79,15 +72,23 @@ class VelocityNetwork:
         self._net = LiveRootVelocity.load(weights)
         config, horizontal_first = self._net.config, [0, 0, 1]
         self._scale = CAMERA_ERROR * np.array(config.sigma_scale)[horizontal_first]
-        self.context = config.context
         self.memory_s = np.maximum(np.array(config.correlation_s)[horizontal_first] / 2.0, CAMERA_MEMORY_S)
 
-    def update(self, windows: Sequence[MotionWindow], observed: Sequence[BodyObservation]) -> list[RootVelocity]:
-        """Of each body, by its window, which takes in its observation."""
+    def memory(self) -> MotionMemory:
+        """That of a new body."""
+        return MotionMemory(self._net.config.hidden)
+
+    def update(self, memories: Sequence[MotionMemory], observed: Sequence[BodyObservation]) -> list[RootVelocity]:
+        """Of each body, by its memory, which takes in its observation."""
         if not observed:
             return []
-        motion = np.stack([window.update(each) for window, each in zip(windows, observed, strict=True)])
-        velocity, log_sigma = self._net(motion)
+        parts = zip(*(memory.update(each) for memory, each in zip(memories, observed, strict=True)), strict=True)
+        local, before, dt = (np.array(part) for part in parts)
+        yaw = np.array([each.yaw for each in observed])
+        state = np.array([memory.state for memory in memories])
+        velocity, log_sigma, states = self._net(velocity_features(local, before, dt, yaw), state)
+        for memory, after in zip(memories, states, strict=True):
+            memory.state = after
         variance = np.exp(2.0 * log_sigma)
         variance[:, :2] = variance[:, :2].mean(axis=1, keepdims=True)  # the filter's noise must not know the heading
         speed = np.linalg.norm(velocity[:, :2], axis=1, keepdims=True)

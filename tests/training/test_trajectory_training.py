@@ -43,24 +43,28 @@ def test_where_somebody_climbs_contacts_are_not_learned(prepared: Path):
     assert (len(everything.clip_start) - 1, len(flat.clip_start) - 1) == (4, 3)
 
 
-def test_windows_show_the_body_facing_forward(prepared: Path):
+def test_windows_show_the_body_facing_forward(prepared: Path, monkeypatch: pytest.MonkeyPatch):
     """Whatever way a clip goes, in the frame of the input the body moves along +x, and its left is at +y."""
+    monkeypatch.setattr(training, "WINDOW", 40)
+    monkeypatch.setattr(training, "_SPAN", 84)
     motion = MotionSet.load(prepared, "default", "train")
-    windows = training._sample(motion, *training._chances(motion), 32, np.random.default_rng(0))
-    forward, sideways = windows.velocity[..., 0], windows.velocity[..., 1]
+    sampled = training._sample(motion, *training._chances(motion), 32, np.random.default_rng(0))
+    windows = training._windows(sampled, np.random.default_rng(1), noise_sd=0.0)
+    velocity = (windows.velocity[:, :, None] @ windows.turn)[:, :, 0]
+    forward, sideways = velocity[..., 0], velocity[..., 1]
     assert (forward.mean(dim=1) > 2 * sideways.mean(dim=1).abs()).all()
-    assert (windows.joints[:, :, 16, 1] > windows.joints[:, :, 17, 1]).all()
+    places = windows.features.unflatten(2, (22, 6))
+    assert (places[:, :, 16, 1] > places[:, :, 17, 1]).all()
     assert (windows.velocity.diff(dim=1).abs() < 1e-3).all()
 
 
 def test_mirroring_exchanges_left_and_right():
-    joints = torch.randn(2, 5, 22, 3)
-    contacts = (torch.rand(2, 5, 8) > 0.5).float()
-    windows = training._Windows(joints, joints[:, :, 3], torch.randn(2, 5, 8, 3), contacts)
-    mirrored = training._mirror_half(windows)
-    torch.testing.assert_close(mirrored.joints[0, :, 7], joints[0, :, 8] * torch.tensor([1.0, -1.0, 1.0]))
+    positions, yaw, contacts = torch.randn(2, 7, 22, 3), torch.randn(2, 5), (torch.rand(2, 5, 8) > 0.5).float()
+    mirrored = training._mirror_half(training._Motion(positions, yaw, contacts))
+    torch.testing.assert_close(mirrored.positions[0, :, 7], positions[0, :, 8] * torch.tensor([1.0, -1.0, 1.0]))
+    torch.testing.assert_close(mirrored.yaw[0], -yaw[0])
     torch.testing.assert_close(mirrored.contacts[0, :, 2], contacts[0, :, 3])
-    torch.testing.assert_close(mirrored.joints[1], joints[1])
+    torch.testing.assert_close(mirrored.positions[1], positions[1])
 
 
 def test_corruption_keeps_the_root_at_the_origin():
@@ -71,17 +75,16 @@ def test_corruption_keeps_the_root_at_the_origin():
 
 @torch.no_grad()
 def test_calibration_finds_the_size_of_the_errors(prepared: Path, monkeypatch: pytest.MonkeyPatch):
-    """Errors of independent frames, twice as large as said, last a frame; lasting ones longer."""
-    motion = MotionSet.load(prepared, "default", "val")
-    model = TrajectoryNet(TrajectoryConfig(kernel=3))
-    said, windows = training._validate(model, motion, training.WINDOW, count=64)
-    shape = (256, *said.velocity.shape[1:])
+    """Errors of independent frames, twice as large as stated, last a frame; lasting ones longer."""
+    motion, frames = MotionSet.load(prepared, "default", "val"), training.WARM_UP + 60
+    shape = (256, frames, 3)
     noise = torch.randn(shape, generator=torch.Generator().manual_seed(0))
+    turn = torch.eye(3).expand(256, frames, 3, 3)
     for error, lasts in ((2.0 * noise, 1 / 30), (2.0 * noise[:, :1].expand(shape), 1.0)):
-        answer = training.RootMotion(error, torch.zeros(shape), torch.zeros(*shape[:2], 8))
-        truth = training._Windows(error, torch.zeros(shape), windows.joint_velocity, windows.contacts)
-        monkeypatch.setattr(training, "_validate", lambda *_, a=answer, t=truth, **__: (a, t))
-        config = training.calibrate(model, motion)
+        predicted = training.RootMotion(error, torch.zeros(shape), torch.zeros(256, frames, 8))
+        truth = training._Windows(torch.empty(0), turn, torch.zeros(shape), torch.empty(0))
+        monkeypatch.setattr(training, "_validate", lambda *_, p=predicted, t=truth, **__: (p, t))
+        config = training.calibrate(TrajectoryNet(TrajectoryConfig(hidden=3)), motion)
         assert config.sigma_scale == pytest.approx((2.0, 2.0), rel=0.1)
         assert config.correlation_s == pytest.approx((lasts, lasts), rel=0.25)
 
@@ -89,6 +92,8 @@ def test_calibration_finds_the_size_of_the_errors(prepared: Path, monkeypatch: p
 def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("steadypose.prior.models.weights.WEIGHTS", tmp_path / "weights")
     monkeypatch.setattr(training, "BATCH", 4)
+    monkeypatch.setattr(training, "WINDOW", 40)
+    monkeypatch.setattr(training, "_SPAN", 84)
     whole = training.train_trajectory(TrainingOptions(prepared, tmp_path / "a", iterations=4))
     state, config = load_tensors(str(whole), "trajectory")
     TrajectoryNet(TrajectoryConfig.from_dict(config)).load_state_dict(state)

@@ -15,6 +15,7 @@ from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.root_path import bridge, is_root_centred, root_path
 from steadypose.prior.complete.views import LONGEST, LONGEST_GAP, gaps, views
 from steadypose.prior.models.completer import LiveCompleter
+from steadypose.prior.models.root_velocity import NewestMotion
 
 LEGS = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
 
@@ -134,16 +135,14 @@ def test_doubt_grows_from_what_is_known() -> None:
 
 
 class Walks:
-    """A network that says that everybody walks forward at 1 m/s."""
+    """A network that predicts of everybody that they walk forward at 1 m/s."""
 
-    class config:
-        context = 5
+    def start(self, count: int) -> np.ndarray:
+        return np.zeros((count, 0))
 
-    def __call__(self, joints: np.ndarray) -> object:
-        class Said:
-            velocity = np.tile(np.array([1.0, 0.0, 0.0], np.float32), (len(joints), 1))
-
-        return Said
+    def __call__(self, features: np.ndarray, state: np.ndarray) -> NewestMotion:
+        velocity = np.tile(np.array([1.0, 0.0, 0.0], np.float32), (len(features), 1))
+        return NewestMotion(velocity, np.zeros_like(velocity), state)
 
 
 def test_a_way_is_read_from_motion_and_meets_its_ends() -> None:

@@ -50,15 +50,6 @@ def test_training_never_wakes_a_masked_weight() -> None:
     assert torch.equal(conv(x), conv.eval()(x))
 
 
-def test_causal_padding_sees_no_future() -> None:
-    conv = SkeletonConv(2, 2, pooling_levels(PARENTS)[0].neighbours, kernel=5, padding="causal")
-    x = torch.randn(1, 44, 12)
-    later = x.clone()
-    later[..., 7:] = 0
-    assert torch.equal(conv(x)[..., :7], conv(later)[..., :7])
-    assert conv(x).shape[-1] == 12
-
-
 def test_pooling_means_and_unpooling_copies() -> None:
     groups = [[0], [1, 2]]
     x = torch.arange(3 * 2 * 4, dtype=torch.float32).reshape(1, 6, 4)

@@ -1,59 +1,52 @@
-"""The trajectory network sees no future, and its live form says the same."""
+"""The trajectory network's live form predicts what was trained, frame by frame."""
 
 from __future__ import annotations
 
-import pytest
+import json
+from dataclasses import asdict
+
+import numpy as np
 import torch
 
-from steadypose.prior.models.root_velocity import LiveRootVelocity, TrajectoryConfig
-from steadypose.training.recipes.root_velocity import RootMotion, TrajectoryNet
+from steadypose.prior.body.kinematics import yaw_matrix
+from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity, TrajectoryConfig, velocity_features
+from steadypose.training.recipes.root_velocity import TrajectoryNet, _features
 from steadypose.training.weights import arrays_of
 
 
-@pytest.fixture
-def net() -> TrajectoryNet:
+@torch.no_grad()
+def test_frame_by_frame_it_predicts_as_over_a_whole_clip() -> None:
     torch.manual_seed(0)
-    return TrajectoryNet(TrajectoryConfig(kernel=5)).eval()
+    rng, net = np.random.default_rng(0), TrajectoryNet(TrajectoryConfig(hidden=16)).eval()
+    joints, yaw = rng.normal(0.0, 0.3, (2, 9, 22, 3)), rng.uniform(-3, 3, (2, 9))
+    whole = net(_features(torch.from_numpy(joints).float(), torch.from_numpy(yaw_matrix(yaw)).float()))
+    live = LiveRootVelocity(net.config, arrays_of(net))
+    state = live.start(2)
+    for t in range(9):
+        features = velocity_features(joints[:, t], joints[:, max(t - 1, 0)], FRAME_S, yaw[:, t])
+        velocity, log_sigma, state = live(features, state)
+        np.testing.assert_allclose(velocity, whole.velocity[:, t], atol=1e-5)
+        np.testing.assert_allclose(log_sigma, whole.log_sigma[:, t], atol=1e-5)
 
 
-def window(net: TrajectoryNet, count: int, more: int = 0) -> torch.Tensor:
-    return torch.randn(count, net.config.context + more, 22, 3, generator=torch.Generator().manual_seed(1))
+def test_features_do_not_know_which_way_the_body_faces() -> None:
+    rng = np.random.default_rng(1)
+    joints, before, yaw = rng.normal(0.0, 0.3, (1, 22, 3)), rng.normal(0.0, 0.3, (1, 22, 3)), np.array([0.4])
+    turn = yaw_matrix(1.1).T
+    np.testing.assert_allclose(
+        velocity_features(joints, before, 0.1, yaw),
+        velocity_features(joints @ turn, before @ turn, 0.1, yaw + 1.1),
+        atol=1e-5,
+    )
 
 
-@torch.no_grad()
-def test_sees_no_future(net: TrajectoryNet):
-    joints = window(net, 2, more=6)
-    changed = joints.clone()
-    changed[:, 10:] += 1.0
-    before, after = net(joints), net(changed)
-    for field in RootMotion._fields:
-        torch.testing.assert_close(getattr(before, field)[:, :10], getattr(after, field)[:, :10])
-    assert not torch.allclose(before.velocity[:, 10], after.velocity[:, 10])
+def test_velocities_are_divided_by_the_time_between_frames() -> None:
+    before, joints = np.zeros((1, 22, 3)), np.full((1, 22, 3), 0.2)
+    once, twice = (velocity_features(joints, before, dt, np.zeros(1)).reshape(22, 6) for dt in (0.1, 0.2))
+    np.testing.assert_allclose(once[:, 3:], 2.0 * twice[:, 3:])
+    np.testing.assert_array_equal(once[:, :3], twice[:, :3])
 
 
-@torch.no_grad()
-def test_depends_on_its_context_and_nothing_before(net: TrajectoryNet):
-    joints = window(net, 1, more=1)
-    first, second = joints.clone(), joints.clone()
-    first[:, 0] += 1.0
-    second[:, 1] += 1.0
-    end = net(joints).velocity[:, -1]
-    # The velocity of the first frame of a context needs the frame before it, which counts as standing still.
-    assert not torch.equal(net(second).velocity[:, -1], end)
-    torch.testing.assert_close(net(first[:, 1:]).velocity[:, -1], net(joints[:, 1:]).velocity[:, -1])
-
-
-@torch.no_grad()
-def test_newest_frame_says_the_same(net: TrajectoryNet):
-    joints = window(net, 3)
-    whole, newest = net(joints), LiveRootVelocity(net.config, arrays_of(net))(joints.numpy())
-    for live, trained in zip(newest, whole[:2], strict=True):  # contacts only train it
-        torch.testing.assert_close(torch.from_numpy(live), trained[:, -1], atol=1e-4, rtol=1e-4)
-
-
-def test_config_survives_json(net: TrajectoryNet):
-    import json
-    from dataclasses import asdict
-
-    config = TrajectoryConfig(kernel=5, sigma_scale=(1.1, 0.9), correlation_s=(0.4, 0.2))
+def test_config_survives_json() -> None:
+    config = TrajectoryConfig(hidden=5, sigma_scale=(1.1, 0.9), correlation_s=(0.4, 0.2))
     assert TrajectoryConfig.from_dict(json.loads(json.dumps(asdict(config)))) == config
