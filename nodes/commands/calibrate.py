@@ -45,6 +45,9 @@ PAPERS_MM = {"a4": (297.0, 210.0), "a3": (420.0, 297.0), "letter": (279.4, 215.9
 GOOD_SIGMA_M = 0.005
 """a place less sure than this is worth another try"""
 DPI = 300
+LaunchFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
+Pictures = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PICTURE ...")]
+FloorPicture = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 _MARGIN_MM = 8.0
 _INCH_MM = 25.4
 
@@ -116,8 +119,8 @@ class CalibrateLens:
         rows: squares along the left edge.
     """
 
-    launch: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
-    pictures: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PICTURE ...")]
+    launch: LaunchFile
+    pictures: Pictures
     square: float = Board.square
     columns: int = Board.columns
     rows: int = Board.rows
@@ -168,12 +171,12 @@ class CalibratePose:
         picture: where to write what the camera sees with the floor's grid; beside the launch file if left out.
     """
 
-    launch: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
-    pictures: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PICTURE ...")]
+    launch: LaunchFile
+    pictures: Pictures
     square: float = Board.square
     columns: int = Board.columns
     rows: int = Board.rows
-    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    picture: FloorPicture = None
 
     def run(self) -> None:
         lens = lens_of(self.launch)
@@ -221,10 +224,10 @@ class CalibrateFloor:
         picture: where to write the depth image with the floor's grid; beside the launch file if left out.
     """
 
-    launch: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
+    launch: LaunchFile
     depth: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DEPTH")]
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)
-    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    picture: FloorPicture = None
 
     def run(self) -> None:
         lens = lens_of(self.launch)
@@ -251,7 +254,7 @@ class CalibrateOak:
         out: name of the files to write, without ending: NAME.png and NAME.depth.png.
     """
 
-    launch: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
+    launch: LaunchFile
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
 
     def run(self) -> None:

@@ -25,7 +25,7 @@ from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.sinks.arrays import NpzCollector
-from steadypose.nodes.sinks.drawing import ALL_BONES, STATE_COLOURS, facing
+from steadypose.nodes.sinks.drawing import ALL_BONES, STATE_COLOURS
 from steadypose.nodes.sources.recording import NO_RIG, open_recording, with_end
 from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.body.layouts import add_layouts
@@ -189,8 +189,9 @@ def draw(completion: Completion, title: str, path: Path) -> None:
     """Write the picture of the longest stretch that was completed: joints given when, stick figures, the trajectory."""
     import matplotlib
 
+    from steadypose.nodes.commands.plot_panels import draw_bones, side_by_side
+
     matplotlib.use("Agg")
-    from matplotlib.collections import LineCollection
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
@@ -202,16 +203,9 @@ def draw(completion: Completion, title: str, path: Path) -> None:
     grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.2], width_ratios=[2.2, 1])
     sticks = figure.add_subplot(grid[0, :])
     chosen = there[np.linspace(0, len(there) - 1, min(FIGURES, len(there))).round().astype(int)]
-    front = next((f for row in chosen if (f := facing(joints[row])) is not None), np.array([1.0, 0.0, 0.0]))
-    across = np.array([-front[1], front[0], 0.0])
-    for place, row in enumerate(chosen):
-        beside = joints[row] - joints[row, 0]
-        flat = np.stack([place + beside @ across, beside[:, 2]], axis=1)
+    for row, flat in zip(chosen, *side_by_side(sticks, chosen / FPS, joints[chosen]), strict=True):
         colours = [_GIVEN if known[row, list(ends)].all() else _COMPLETED for ends in ALL_BONES]
-        sticks.add_collection(LineCollection(list(flat[ALL_BONES]), colors=colours, linewidths=2.0))
-        sticks.text(place, -1.13, f"{row / FPS:.1f} s", ha="center", fontsize=8)
-    sticks.set(aspect="equal", xlim=(-0.6, FIGURES - 0.4), ylim=(-1.2, 0.85))
-    sticks.axis("off")
+        draw_bones(sticks, flat, ALL_BONES, colours, width=2.0)
     which = figure.add_subplot(grid[1, 0])
     shown = np.where(np.isfinite(joints[..., 0]), np.where(known, 1, 2), 0)
     which.imshow(

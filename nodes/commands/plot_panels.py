@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from steadypose.nodes.sinks.drawing import (
     bones,
     facing,
 )
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
 
 if TYPE_CHECKING:
@@ -216,44 +217,55 @@ def draw_stick_figures(ax: Axes, history: History, body: int) -> None:
     )
     raw_bones = bones(history.observable)
     chosen = np.linspace(0, len(track.time) - 1, min(FIGURES, len(track.time))).round().astype(int)
-    front = next((f for row in chosen if (f := facing(track.positions[row])) is not None), np.array([1.0, 0.0, 0.0]))
+    if clean is None:
+        (figures,) = side_by_side(ax, track.time[chosen], track.positions[chosen])
+        for points in figures:
+            draw_bones(ax, points, raw_bones, RAW_COLOUR, width=2.5)
+        return
+    figures, behind = side_by_side(ax, track.time[chosen], track.positions[chosen], clean.raw[chosen])
+    for row, points, raw in zip(chosen, figures, behind, strict=True):
+        draw_bones(ax, raw, raw_bones, RAW_COLOUR, width=5.0, alpha=0.55)
+        colours = [STATE_COLOURS[JointState(state)] for state in bone_states(clean.state[row])]
+        draw_bones(ax, points, ALL_BONES, colours, width=2.0)
+
+
+def side_by_side(ax: Axes, seconds: Floats, joints: Floats, *others: Floats) -> list[Floats]:
+    """Where N figures lie in a picture on which they stand in a row, seen from the front; writes the second of each.
+
+    Args:
+        ax: of the picture.
+        seconds: (N,) of each figure.
+        joints: (N, 22, 3) metres, world.
+        others: the same figures otherwise, drawn in the same place.
+
+    Returns:
+        (N, 22, 2) of ``joints`` and of each of ``others``.
+    """
+    front = next((f for points in joints if (f := facing(points)) is not None), np.array([1.0, 0.0, 0.0]))
     across = np.array([-front[1], front[0], 0.0])
-
-    def flat(points: NDArray[np.float64], pelvis: NDArray[np.float64], place: float) -> NDArray[np.float64]:
-        return np.stack([place + (points - pelvis) @ across, points[:, 2] - pelvis[2]], axis=1)
-
-    for place, row in enumerate(chosen):
-        points = track.positions[row]
-        pelvis = points[0] if np.isfinite(points[0]).all() else np.nanmean(points, axis=0)
-        if clean is not None:
-            _sticks(ax, flat(clean.raw[row], pelvis, place), raw_bones, RAW_COLOUR, width=5.0, alpha=0.55)
-            colours = [STATE_COLOURS[JointState(state)] for state in bone_states(clean.state[row])]
-            _sticks(ax, flat(points, pelvis, place), ALL_BONES, colours, width=2.0)
-        else:
-            _sticks(ax, flat(points, pelvis, place), raw_bones, RAW_COLOUR, width=2.5)
-        ax.text(place, -1.13, f"{track.time[row]:.1f} s", ha="center", fontsize=8)
-    ax.set_aspect("equal")
-    ax.set_xlim(-0.6, FIGURES - 0.4)
-    ax.set_ylim(-1.2, 0.85)
+    pelvis = joints[:, :1]
+    pelvis = np.where(np.isfinite(pelvis).all(axis=-1, keepdims=True), pelvis, nan_mean(joints, axis=1)[:, None])
+    places = np.arange(len(joints))
+    for place, second in zip(places, seconds, strict=True):
+        ax.text(place, -1.13, f"{second:.1f} s", ha="center", fontsize=8)
+    ax.set(aspect="equal", xlim=(-0.6, max(FIGURES, len(joints)) - 0.4), ylim=(-1.2, 0.85))
     ax.axis("off")
+    centred = [points - pelvis for points in (joints, *others)]
+    return [np.stack([places[:, None] + points @ across, points[..., 2]], axis=-1) for points in centred]
 
 
-def _sticks(
-    ax: Axes,
-    points: NDArray[np.float64],
-    pairs: NDArray[np.intp],
-    colours: str | list[str],
-    *,
-    width: float,
-    alpha: float = 1.0,
+def draw_bones(
+    ax: Axes, points: Floats, pairs: NDArray[np.intp], colours: str | list[str], *, width: float, alpha: Any = 1.0
 ) -> None:
+    """Draw the bones ``pairs`` (B, 2) whose ends of points (J, 2) are known; colours, and alpha, may be of each."""
     from matplotlib.collections import LineCollection
 
     lines = points[pairs]
-    shown = np.isfinite(lines).all(axis=(1, 2))
-    picked = colours if isinstance(colours, str) else [colours[bone] for bone in np.flatnonzero(shown)]
+    shown = np.flatnonzero(np.isfinite(lines).all(axis=(1, 2)))
+    picked = colours if isinstance(colours, str) else [colours[bone] for bone in shown]
+    opacity = alpha if np.isscalar(alpha) else [alpha[bone] for bone in shown]
     ax.add_collection(
-        LineCollection(list(lines[shown]), colors=picked, linewidths=width, alpha=alpha, capstyle="round")
+        LineCollection(list(lines[shown]), colors=picked, linewidths=width, alpha=opacity, capstyle="round")
     )
 
 

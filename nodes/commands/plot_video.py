@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JointState
 from steadypose.nodes.commands.plot_history import History, PlotError, Track, body_of
+from steadypose.nodes.commands.plot_panels import draw_bones
 from steadypose.nodes.graph.extras import how_to_install
 from steadypose.nodes.sinks.drawing import (
     ALL_BONES,
@@ -181,8 +182,8 @@ def _stage(world: Track, at: NDArray[np.intp], view: View) -> Callable[[Axes, in
 
 def _raw(ax: Axes, view: View, clean: Track, row: int, shown: NDArray[np.intp]) -> None:
     """What went in, over what came out of it."""
-    _lines(ax, view(clean.positions[row]), ALL_BONES, [GHOST] * len(ALL_BONES), 2.0, np.ones(len(ALL_BONES)))
-    _lines(ax, view(clean.raw[row]), shown, _sides(shown), 3.0, np.ones(len(shown)))
+    draw_bones(ax, view(clean.positions[row]), ALL_BONES, GHOST, width=2.0)
+    draw_bones(ax, view(clean.raw[row]), shown, _sides(shown), width=3.0)
 
 
 def _sticks(ax: Axes, view: View, track: Track, row: int, shown: NDArray[np.intp] = ALL_BONES) -> None:
@@ -190,26 +191,11 @@ def _sticks(ax: Axes, view: View, track: Track, row: int, shown: NDArray[np.intp
     if track.state.size:
         observed = np.isin(track.state[row], (JointState.SEEN, JointState.REFINED))
         opacity = np.where(observed[shown].all(axis=1), 1.0, FAINT)
-    _lines(ax, view(track.positions[row]), shown, _sides(shown), 3.0, opacity)
+    draw_bones(ax, view(track.positions[row]), shown, _sides(shown), width=3.0, alpha=opacity)
 
 
 def _sides(shown: NDArray[np.intp]) -> list[str]:
     return [SIDE_COLOURS[side] for side in SIDES[shown[:, 1]]]
-
-
-def _lines(ax: Axes, flat: Floats, pairs: NDArray[np.intp], colours: list[str], width: float, opacity: Floats) -> None:
-    from matplotlib.collections import LineCollection
-
-    there = np.flatnonzero(np.isfinite(flat[pairs]).all(axis=(1, 2)))
-    ax.add_collection(
-        LineCollection(
-            list(flat[pairs[there]]),
-            colors=[colours[bone] for bone in there],
-            alpha=opacity[there].tolist(),
-            linewidths=width,
-            capstyle="round",
-        )
-    )
 
 
 def _smooth(path: Floats, frames: int = 15) -> Floats:

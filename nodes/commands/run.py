@@ -58,7 +58,8 @@ def run(
 
     Args:
         launch: a launch file, or the name of one of the project's own, such as replay, oak, ros2 or server.
-        input: the recording, .npz or .csv to play in place of the launch file's; or a film, for the webcam's eyes.
+        input: the recording, .npz or .csv to play in place of the launch file's; or a video, in which MediaPipe finds
+            people.
         rate: times real time; 0 is as fast as it goes.
         loop: play it again and again.
         record: a recording to make of all topics.
@@ -70,7 +71,7 @@ def run(
     if input is not None and input.suffix.lower() in VIDEOS:
         launch = "webcam" if launch == REPLAY else launch
         overrides += ['input.source="webcam"', f"input.webcam.video={_toml(input.resolve())}"]
-        overrides.append("transport.lossless=true")  # a film can wait
+        overrides.append("transport.lossless=true")  # a video can wait
     elif input is not None:
         overrides += ['input.source="recording"', f"input.recording={_toml(input.resolve())}"]
     if rate is not None:

@@ -64,15 +64,15 @@ def table(
         if latest and causes and (summary or latest.level != Level.OK):
             notes.append(Text(printable(f"{name}: {', '.join(causes)}"), style="yellow"))
     grid = Table(box=None, header_style="bold", pad_edge=False)
-    told = [heading for heading in rows[0] if any(row[heading] not in ("", "0") for row in rows)]
+    shown = [heading for heading in rows[0] if any(row[heading] not in ("", "0") for row in rows)]
     for least in LEAST:
         wide = (
-            max(len(line) for cell in (key, *(row[key] for row in rows)) for line in cell.split("\n")) for key in told
+            max(len(line) for cell in (key, *(row[key] for row in rows)) for line in cell.split("\n")) for key in shown
         )
-        if sum(wide) + 2 * len(told) <= width:
+        if sum(wide) + 2 * len(shown) <= width:
             break
-        told = [heading for heading in told if heading != least]
-    for heading in told:
+        shown = [heading for heading in shown if heading != least]
+    for heading in shown:
         grid.add_column(heading, justify="left" if heading in ("node", "state") else "right", no_wrap=True)
     for row in rows:
         grid.add_row(*(row[str(column.header)] for column in grid.columns))

@@ -144,7 +144,7 @@ class Node(ABC):
 
     @property
     def stopping(self) -> bool:
-        """Whether the node was requested_at to end."""
+        """Whether the node was asked to end."""
         return self._stopping
 
     def run(self) -> None:

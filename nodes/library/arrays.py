@@ -113,21 +113,21 @@ def source_of(
         ValueError: it cannot be used; says what was expected.
     """
     given = {"fps": fps, "stamp_ns": stamp_ns, "confidence": confidence, "up": up}
-    told = {name: as_array(name, value) for name, value in given.items() if value is not None}
+    stated = {name: as_array(name, value) for name, value in given.items() if value is not None}
     if skeleton is not None:
-        told["skeleton"] = np.array(skeleton_name(skeleton))
+        stated["skeleton"] = np.array(skeleton_name(skeleton))
     if isinstance(positions, (str, os.PathLike)):
-        if told:
-            raise NpzError(f"{positions}: expected no {', '.join(told)} beside a file, which says so itself")
+        if stated:
+            raise NpzError(f"{positions}: expected no {', '.join(stated)} beside a file, which says so itself")
         return open_recording(Path(positions))
     if fps is not None and stamp_ns is not None:
         raise NpzError("expected fps, of a regular stream, or stamp_ns, got both; leave fps out")
     if isinstance(positions, Mapping):
         if "positions" not in positions:
             raise NpzError(f"expected an array 'positions' among those given, got {', '.join(positions) or 'none'}")
-        return ArraySource(ARRAYS, {**as_input(positions), **told})
-    told = {"skeleton": np.array(CANONICAL.name), "up": np.array("z")} | told
-    return ArraySource(ARRAYS, {"positions": as_array("positions", positions)} | told)
+        return ArraySource(ARRAYS, {**as_input(positions), **stated})
+    stated = {"skeleton": np.array(CANONICAL.name), "up": np.array("z")} | stated
+    return ArraySource(ARRAYS, {"positions": as_array("positions", positions)} | stated)
 
 
 def as_array(name: str, value: ArrayLike) -> NDArray[Any]:

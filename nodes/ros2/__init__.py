@@ -1,1 +1,63 @@
-"""ROS 2 without ROS: its messages, its topics over plain DDS or a sourced ROS's rclpy, and its transforms."""
+"""ROS 2 without ROS: its messages, its topics over plain DDS or a sourced ROS's rclpy, and its transforms.
+
+`connect` joins the ROS domain.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+from steadypose.nodes.graph.extras import install_command
+from steadypose.nodes.graph.settings import LaunchError
+
+if TYPE_CHECKING:
+    from steadypose.nodes.ros2.definitions import Connection
+
+
+def check_ros() -> None:
+    """Raises:
+    LaunchError: neither a sourced ROS 2 nor Cyclone DDS is there.
+    """
+    if not has_sourced_ros() and find_spec("cyclonedds") is None:
+        raise LaunchError(
+            f"ROS 2: needs Cyclone DDS, which comes with the extra 'ros2' (x86-64): {install_command('ros2')}; "
+            "or a ROS 2 that is sourced, with a Python of the same version"
+        )
+
+
+def has_sourced_ros() -> bool:
+    """Whether a whole ROS 2 is there, not only what PyPI has of it."""
+    return all(find_spec(package) is not None for package in ("rclpy", "tf2_msgs"))
+
+
+def connect(name: str, namespace: str = "") -> Connection:
+    """Join the ROS domain: through the rclpy of a ROS that is sourced, or else over plain DDS.
+
+    Args:
+        name: of the node, which only rclpy's are seen to have.
+        namespace: of the node; topics are named in full.
+
+    Raises:
+        LaunchError: nothing that can do so is installed.
+    """
+    check_ros()
+    if has_sourced_ros():
+        try:
+            from steadypose.nodes.ros2.rclpy_connection import RclpyConnection
+        except ImportError as error:
+            why = f"Python {sys.version_info[0]}.{sys.version_info[1]} cannot import the sourced rclpy: "
+            why += str(error).partition("\n")[0]
+            if find_spec("cyclonedds") is None:
+                raise LaunchError(
+                    f"ROS 2: {why}; expected the Python that ROS is built for (Humble 3.10, Jazzy 3.12), which "
+                    "`./steadypose` takes if ROS is sourced when there is no .venv yet, and PyYAML, which comes with "
+                    "the extra 'ros2'"
+                ) from error
+            print(f"ROS 2 over plain DDS: {why}", flush=True)
+        else:
+            return RclpyConnection(name, namespace)
+    from steadypose.nodes.ros2.dds import DdsConnection
+
+    return DdsConnection()

@@ -140,6 +140,17 @@ class ImuReader(dai.node.HostNode):
             self._level.update(self._turn @ np.array([acceleration.x, acceleration.y, acceleration.z]), stamp_ns)
 
 
+def _pairs(pipeline: dai.Pipeline, **outputs: dai.Node.Output) -> dai.Node.Output:
+    """What was captured at one moment, by name."""
+    # a host node's own pairing wants it within 10 ms, and would wait for ever
+    sync = pipeline.create(dai.node.Sync)
+    sync.setRunOnHost(True)
+    sync.setSyncThreshold(SYNC_THRESHOLD)
+    for name, output in outputs.items():
+        output.link(sync.inputs[name])
+    return sync.out
+
+
 class Host:
     """What runs on this machine for one camera: takes the outputs of its nodes and gives skeletons.
 
@@ -165,13 +176,8 @@ class Host:
         self._pipeline = pipeline
         self._clock = clock
         epoch_ns = clock.now_ns() - _nanoseconds(dai.Clock.now())  # pyright: ignore[reportCallIssue] (static)
-        # a host node's own pairing wants both within 10 ms, and would wait for ever
-        sync = pipeline.create(dai.node.Sync)
-        sync.setRunOnHost(True)
-        sync.setSyncThreshold(SYNC_THRESHOLD)
-        detections.link(sync.inputs["detections"])
-        depth.link(sync.inputs["depth"])
-        self._skeletons = pipeline.create(Skeletons).build(sync.out, self.level, source, epoch_ns)
+        pairs = _pairs(pipeline, detections=detections, depth=depth)
+        self._skeletons = pipeline.create(Skeletons).build(pairs, self.level, source, epoch_ns)
         if readings:
             pipeline.create(ImuReader).build(readings[0], self.level, readings[1])
 
@@ -324,12 +330,7 @@ def capture(
     Raises:
         CameraError: none comes.
     """
-    sync = pipeline.create(dai.node.Sync)
-    sync.setRunOnHost(True)
-    sync.setSyncThreshold(SYNC_THRESHOLD)
-    colour.link(sync.inputs["colour"])
-    depth.link(sync.inputs["depth"])
-    pairs = pipeline.create(Pairs).build(sync.out)
+    pairs = pipeline.create(Pairs).build(_pairs(pipeline, colour=colour, depth=depth))
     level = GravityEstimator()
     if readings:
         pipeline.create(ImuReader).build(readings[0], level, readings[1])

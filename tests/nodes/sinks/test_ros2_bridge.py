@@ -24,11 +24,11 @@ from steadypose.msgs.codec import decode
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseWorld, Tracking
+from steadypose.nodes import ros2 as connecting
 from steadypose.nodes.commands.doctor import required
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.ros2 import connect as connecting
 from steadypose.nodes.ros2.definitions import Connection, deserialise, stamp_ns
 from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, Ros2BridgeSettings, RosOutput, check_ros2
 from steadypose.nodes.sinks.ros2.messages import BodyTopics
