@@ -1,14 +1,13 @@
-"""People who cross and hide each other, without ids: streams of the simulator, baselines of identities, and a score.
+"""People who cross and hide each other, without ids: streams of the simulator, and a score of who is taken for whom.
 
-The simulated tracker knows who is who, so each observation's person is known. The methods get the bodies of each frame
-in random order and without ids.
+The simulated tracker knows who is who, so each observation's person is known. The bodies of each frame come in random
+order and without ids.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -38,17 +37,12 @@ class Frame:
         bodies: (N, 22, 3) metres, world.
         confidence: (N, 22).
         people: (N,) who is seen.
-        source_ids: (N,) what the tracker of the source calls them.
     """
 
     stamp_ns: int
     bodies: NDArray[np.float64]
     confidence: NDArray[np.float64]
     people: list[int]
-    source_ids: list[int]
-
-
-Method = Callable[[Frame], list[int | None]]
 
 
 def watch(stream: Stream) -> list[Frame]:
@@ -77,7 +71,6 @@ def watch(stream: Stream) -> list[Frame]:
                 np.array([p for p, _ in joints]).reshape(-1, 22, 3) @ turn.T + np.array(eye),
                 np.array([c for _, c in joints]).reshape(-1, 22),
                 [seen[k][1] for k in order],
-                [seen[k][0].id for k in order],
             )
         )
     return frames
@@ -95,7 +88,7 @@ def all_hidden(frames: list[Frame]) -> list[Frame]:
 
 
 def _nobody() -> dict[str, Any]:
-    return {"bodies": np.zeros((0, 22, 3)), "confidence": np.zeros((0, 22)), "people": [], "source_ids": []}
+    return {"bodies": np.zeros((0, 22, 3)), "confidence": np.zeros((0, 22)), "people": []}
 
 
 def _people(raw: list[PoseRaw], truth: list[PoseWorld]) -> dict[int, int]:
@@ -114,57 +107,18 @@ def _people(raw: list[PoseRaw], truth: list[PoseWorld]) -> dict[int, int]:
     return {i: votes.most_common(1)[0][0] for i, votes in away.items()}
 
 
-def source(frame: Frame) -> list[int | None]:
-    """The tracker's own ids."""
-    return [*frame.source_ids]
-
-
-def nearest() -> Method:
-    """Each body gets the id of the nearest one of the last second within a metre."""
-    known: dict[int, tuple[int, NDArray[np.float64]]] = {}
-
-    def identify(frame: Frame) -> list[int | None]:
-        ids: list[int | None] = []
-        for body in frame.bodies:
-            place = np.nanmedian(body, axis=0)
-            away = {
-                i: float(np.linalg.norm(at - place))
-                for i, (stamp_ns, at) in known.items()
-                if i not in ids and frame.stamp_ns - stamp_ns < 1.2e9
-            }
-            best = min(away, key=lambda i: away[i], default=None)
-            ids.append(best if best is not None and away[best] < 1.0 else len(known) + 1)
-            known[ids[-1] or 0] = frame.stamp_ns, place
-        return ids
-
-    return identify
-
-
-def identified(settings: IdentifySettings) -> Method:
-    """Ids by `prior.clean.identify`."""
-    stage = Identify(settings, ROWS, Counter())
-    return lambda frame: stage.update(frame.stamp_ns, frame.bodies, frame.confidence)
-
-
-def score(frames: list[Frame], method: Method) -> dict[str, float]:
-    """Id switches as CLEAR MOT counts them (Bernardin and Stiefelhagen 2008), and how much was given an id at all.
-
-    A switch is an observation of a person under another id than this person's last. ``mistaken`` are those under an id
-    that was another person's; the others are people taken to be new.
+def score(frames: list[Frame], settings: IdentifySettings) -> tuple[int, float]:
+    """Id switches of `prior.clean.identify` as CLEAR MOT counts them (Bernardin and Stiefelhagen 2008), and the share
+    of observations that got an id. A switch is an observation of a person under another id than this person's last.
     """
-    last: dict[int, int] = {}
-    owner: dict[int, int] = {}
-    figures = Counter(switches=0, mistaken=0, sightings=0, named=0)
+    stage, last = Identify(settings, ROWS, Counter()), dict[int, int]()
+    observations = named = switches = 0
     for frame in frames:
-        ids = method(frame)
+        ids = stage.update(frame.stamp_ns, frame.bodies, frame.confidence)
         for who, i in zip(frame.people, ids, strict=True):
-            figures["sightings"] += 1
-            if i is None:
-                continue
-            figures["named"] += 1
-            if last.setdefault(who, i) != i:
-                figures["switches"] += 1
-                figures["mistaken"] += owner.get(i, who) != who
-            last[who] = i
-            owner.setdefault(i, who)
-    return dict(figures)
+            observations += 1
+            if i is not None:
+                named += 1
+                switches += last.get(who, i) != i
+                last[who] = i
+    return switches, named / observations

@@ -66,12 +66,14 @@ def test_nothing_else_is_served(server: WebServer, path: str) -> None:
     assert get(server, path)[0] == 404
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "localhost:8766", "[::1]:1", "kiosk.local"])
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost:8766", "[::1]:1", "192.168.1.7", "kiosk.local"])
 def test_names_of_its_own_are_answered(server: WebServer, host: str) -> None:
     assert get(server, "/", host)[0] == 200
 
 
-@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "", "localhost:x", "evil.example:80"])
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1.evil.example", "", "localhost:x", "evil.example:80", "[evil"]
+)
 @pytest.mark.parametrize("path", ["/", f"/ws?token={TOKEN}"])
 def test_names_that_others_have_pointed_here_are_not(server: WebServer, path: str, host: str) -> None:
     assert get(server, path, host)[0] == 421
