@@ -11,11 +11,11 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, NamedTuple
 
 import zmq
 
+from steadypose.msgs import Closing
 from steadypose.msgs.codec import check_size, encode, typestore
 from steadypose.msgs.delivery import MAX_FRAME, PREFIX, VERSION, Deliveries, Listener, read_subscription, read_taken
 from steadypose.msgs.security import (
@@ -32,7 +32,6 @@ from steadypose.msgs.topics import TOPICS, check_topic
 from steadypose.msgs.types import Message
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
     from zmq.auth.thread import ThreadAuthenticator
 
 SEND_HIGH_WATER = 1000
@@ -61,7 +60,7 @@ class Resume(NamedTuple):
     """of each topic, the sequence of the first message that not all reliable subscribers had taken"""
 
 
-class Publisher:
+class Publisher(Closing):
     """Publishes messages at an address. A context manager.
 
     `publish` waits only for subscribers that are named in `reliable` and request it; any other that does not read loses
@@ -314,12 +313,6 @@ class Publisher:
         if self._authenticator:
             self._authenticator.stop()
         self._context.term()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
 
 
 KEEPALIVE = {

@@ -11,20 +11,17 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from mcap.records import Channel, Schema
 from rosbags.typesys import TypesysError, get_types_from_msg
 
+from steadypose.msgs import Closing
 from steadypose.msgs.codec import DecodeError, decode, typestore, wire_type
 from steadypose.msgs.mcap_file import BROKEN, McapFile
 from steadypose.msgs.recording_writer import RecordingError, RecordingWriter, definition
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.types import Message
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 __all__ = ["Recorded", "RecordingError", "RecordingReader", "RecordingWriter"]
 
@@ -37,7 +34,7 @@ class Recorded(NamedTuple):
     message: Message
 
 
-class RecordingReader:
+class RecordingReader(Closing):
     """Reads a recording: one made here, complete or cut short, or one of `ros2 bag record` with the same types.
 
     A context manager. Iterating gives every message of the project's topics, in the order of their stamps; other
@@ -161,12 +158,6 @@ class RecordingReader:
 
     def close(self) -> None:
         self._files.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
 
 
 def _topic(channel: Channel) -> str:

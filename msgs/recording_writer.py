@@ -15,20 +15,17 @@ from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
+from steadypose.msgs import Closing
 from steadypose.msgs.codec import encode, typestore, wire_type
 from steadypose.msgs.mcap_file import BROKEN, McapFile
 from steadypose.msgs.topics import TOPICS, check_topic
 from steadypose.msgs.types import Message
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 CHUNK_NS = 500_000_000
 CHUNK_BYTES = 2**18
@@ -61,7 +58,7 @@ class PartInfo:
         return cls(path)
 
 
-class RecordingWriter:
+class RecordingWriter(Closing):
     """Writes messages to a rosbag2 directory. A context manager; leaving it completes the recording."""
 
     def __init__(
@@ -202,12 +199,6 @@ class RecordingWriter:
         with unfinished.open("w") as file:
             yaml.dump({"rosbag2_bagfile_information": information}, file)
         unfinished.replace(self.directory / METADATA)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
 
 
 class _Part:

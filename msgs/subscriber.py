@@ -10,20 +10,16 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING
 
 import zmq
 
+from steadypose.msgs import Closing
 from steadypose.msgs.codec import DecodeError, decode, typestore
 from steadypose.msgs.delivery import MAX_FRAME, PREFIX, VERSION, Listener, Principals, Taken
 from steadypose.msgs.publisher import KEEPALIVE, milliseconds
 from steadypose.msgs.security import Keys, TransportError, check_private, is_local, loopback_keys, parse
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.types import Diagnostics, Message
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 HIGH_WATER = 1000
 """messages a subscriber holds unread, unless it says otherwise"""
@@ -45,7 +41,7 @@ _HANDSHAKES = (
 _RETRIES = zmq.EVENT_CONNECT_DELAYED | zmq.EVENT_CONNECT_RETRIED | zmq.EVENT_CONNECTED
 
 
-class Subscriber:
+class Subscriber(Closing):
     """Receives messages from publishers. A context manager.
 
     What cannot be used is counted, never raised: `dropped` counts by topic the messages that were published and
@@ -318,12 +314,6 @@ class Subscriber:
         self._monitor.close(0)
         self.socket.close()
         self._context.term()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
 
 
 def _check(endpoint: str, keys: Keys | None, clear_text: bool) -> None:

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     )
     from steadypose.nodes.library.arrays import InputWarning, clean, complete, fit, plot
     from steadypose.nodes.library.filter import Filter
-    from steadypose.nodes.library.poses import Poses
-    from steadypose.nodes.library.sample import sample
+    from steadypose.nodes.library.poses import Poses, sample
     from steadypose.prior.body.layouts import SKELETONS
 
     __version__: str
@@ -77,9 +76,8 @@ _MODULES = {
     **dict.fromkeys(("Publisher", "Subscriber"), "msgs.transport"),
     **dict.fromkeys(("InputWarning", "clean", "complete", "fit", "plot"), "nodes.library.arrays"),
     "Filter": "nodes.library.filter",
-    "Poses": "nodes.library.poses",
+    **dict.fromkeys(("Poses", "sample"), "nodes.library.poses"),
     "SKELETONS": "prior.body.layouts",
-    "sample": "nodes.library.sample",
 }
 """where each public name is"""
 

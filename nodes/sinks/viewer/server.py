@@ -22,6 +22,7 @@ from urllib.error import HTTPError, URLError
 from urllib.parse import quote, urlsplit
 from urllib.request import urlopen
 
+from steadypose.msgs import Closing
 from steadypose.nodes.sinks.serving import called, is_token, own_names, port_taken, shown
 
 if TYPE_CHECKING:
@@ -167,7 +168,7 @@ class ViewerError(RuntimeError):
     """The viewer cannot start. The text says what to do."""
 
 
-class ViewerServer:
+class ViewerServer(Closing):
     """Keeps the drawings and serves them, with the page that shows them, to browsers that know the token.
 
     It listens on this machine alone, unless set otherwise: a picture of people in a room is not for whoever shares
@@ -242,12 +243,6 @@ class ViewerServer:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-
-    def __enter__(self) -> ViewerServer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _wait_for(self, port: int, timeout_s: float = 20.0) -> None:
         deadline = time.monotonic() + timeout_s
