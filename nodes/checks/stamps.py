@@ -92,6 +92,8 @@ def _unit(stamps: np.ndarray) -> Problem | None:
             "the picture was taken",
         )
     step = float(np.median(rising[rising > 0])) if (rising > 0).any() else 0.0
+    if not step and (rising < 0).any():
+        return None  # they fall
     if not (stamps % SECOND_NS).any() and (step == 0 or step >= SECOND_NS):
         return error(
             "stamps_whole_seconds",

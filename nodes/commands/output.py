@@ -98,6 +98,8 @@ def unfinished(out: Path) -> Iterator[Path]:
         folder.mkdir(parents=True)
     except FileExistsError as error:
         raise LaunchError(f"{folder} is in the way, and was not made here: expected it not to exist") from error
+    except OSError as error:
+        raise LaunchError(f"{out}: expected a folder that can be written to, got one that cannot: {error}") from error
     try:
         mark.touch()
         yield folder / out.name

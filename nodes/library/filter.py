@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from steadypose.msgs.codec import MAX_BODIES
 from steadypose.msgs.types import JOINTS, CleanBody, Pose, PoseClean, PoseRaw, RawBody, WorldBody
 from steadypose.nodes.checks.layout import axes_hint, skeleton_hint
 from steadypose.nodes.driving import CHECKED, NOBODY, Diagnosis
@@ -183,6 +184,11 @@ class Filter:
                 f"{positions.dtype} of shape {positions.shape}{hint}"
             )
         positions = positions.reshape(-1, *wanted)
+        if len(positions) > MAX_BODIES:
+            raise FilterError(
+                f"joints: expected {MAX_BODIES} bodies of one moment at most, got {len(positions)}; frames go one by "
+                "one, and a whole recording into steadypose.clean"
+            )
         if confidence is None:
             sure = np.asarray(np.isfinite(positions).all(axis=-1), np.float32)
         else:

@@ -210,7 +210,10 @@ def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, N
 
 def _array(path: Path, arrays: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
     if name not in arrays:
-        raise NpzError(f"{path}: expected an array {name!r}; it has {', '.join(arrays) or 'none that are known'}")
+        raise NpzError(
+            f"{path}: expected an array {name!r}; it has {', '.join(arrays) or 'none that are known'}; needed are "
+            "positions (T, J, 3), skeleton, and fps or stamp_ns"
+        )
     return arrays[name]
 
 

@@ -25,7 +25,7 @@ from steadypose.nodes.sources.source import CalibrationSettings, RecordedSource,
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
 
 NO_RIG: Mapping[str, Any] = MappingProxyType({})
-_FILES = ".csv, .npz, .bvh, .trc, .c3d or .npy"
+_FILES = ".csv, .npz, .bvh, .trc, .c3d, .npy"
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
 """videos, in which MediaPipe finds the skeletons"""
 
@@ -66,12 +66,13 @@ class RecordingSource:
             self.refused.update({f"{UNDECODABLE} {topic}": n for topic, n in recording.refused.items()})
 
 
-def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG) -> RecordedSource:
+def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, picture: Path | None = None) -> RecordedSource:
     """The recording at ``path``: a rosbag2 directory, ``.mcap``, ``.npz`` or ``.csv``, a file of motion, or a video.
 
     Args:
         path: of the recording.
         rig: what a file of motion does not say (`prior.mocap.files.Description`).
+        picture: file that the newest image of a video is kept in, for the viewer.
 
     Raises:
         LaunchError: there is nothing at the path, or it is a video and MediaPipe is not installed.
@@ -79,23 +80,27 @@ def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG) -> Recorde
             to do.
     """
     if not str(path):
-        raise LaunchError(f"[input] recording: expected a recording or {_FILES} to play, got none; give --input")
+        raise LaunchError(
+            f"[input] recording: expected a recording, {_FILES} or a video to play, got none; give --input"
+        )
     path = Path(path)
     if not path.exists():
-        raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, or {_FILES}")
+        raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, {_FILES}, or a video")
     if path.suffix.lower() in VIDEOS:
-        return _open_film(path)
+        return _open_video(path, picture)
     if holds_motion(path):
         return MotionSource(path, rig)
+    if path.is_file() and path.suffix not in (".npz", ".csv", ".mcap"):
+        raise LaunchError(f"{path}: expected a rosbag2 directory, an .mcap, {_FILES}, or a video, got {path.suffix!r}")
     formats: Mapping[str, Callable[[Path], RecordedSource]] = {".npz": NpzSource, ".csv": CsvSource}
     return formats.get(path.suffix, RecordingSource)(path)
 
 
-def _open_film(path: Path) -> RecordedSource:
+def _open_video(path: Path, picture: Path | None) -> RecordedSource:
     require_extra("webcam")
     from steadypose.nodes.sources.webcam_device import VideoSource  # OpenCV
 
-    return VideoSource(WebcamSettings(video=str(path)), CalibrationSettings())
+    return VideoSource(WebcamSettings(video=str(path)), CalibrationSettings(), picture=picture)
 
 
 def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:
@@ -209,7 +214,10 @@ class CsvSource:
 def _skeleton(path: Path, columns: list[str], named: str | None) -> Skeleton:
     """The skeleton that has all the joints of the header."""
     if "stamp" not in columns:
-        raise CsvError(f"{path}: expected a header with a column 'stamp', in seconds; got {', '.join(columns[:8])} ...")
+        raise CsvError(
+            f"{path}: expected a header with a column 'stamp', in seconds; got {', '.join(columns[:8]) or 'none'} ...; "
+            "rename another program's columns to stamp, JOINT_x, JOINT_y, JOINT_z (docs/sources.md)"
+        )
     if len(set(columns)) != len(columns):
         twice = [name for name, times in Counter(columns).items() if times > 1]
         raise CsvError(f"{path}: expected each column once, got {', '.join(twice)} again")

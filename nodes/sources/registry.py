@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 from steadypose.msgs.security import Keys
@@ -44,10 +45,10 @@ def _declare(
     return {_SOURCE: SourceDeclaration(opens, extra)}
 
 
-def _open_recording(path: str, _: SourceContext) -> RecordedSource:
+def _open_recording(path: str, context: SourceContext) -> RecordedSource:
     from steadypose.nodes.sources.recording import open_recording  # 3 MB, which nodes that play none do without
 
-    return open_recording(path)
+    return open_recording(path, picture=context.picture)
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,8 @@ class InputSettings:
     """times real time; 0 is as fast as the subscribers take it"""
     loop: bool = False
     """repeat the recording endlessly, with stamps that keep increasing"""
+    picture: bool = False
+    """show the viewer of this machine and user the newest image of a webcam or a video, at most 15 a second"""
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     tf: TfSettings = field(default_factory=TfSettings)
 
@@ -91,7 +94,12 @@ SOURCES: Mapping[str, SourceDeclaration] = {
 
 
 def open_input(
-    settings: InputSettings, clock: Clock, keys: Keys | None = None, *, clear_text: bool = False
+    settings: InputSettings,
+    clock: Clock,
+    keys: Keys | None = None,
+    *,
+    clear_text: bool = False,
+    picture: Path | None = None,
 ) -> RecordedSource | LiveSource:
     """The source that ``[input]`` names.
 
@@ -100,6 +108,7 @@ def open_input(
         clock: of the node.
         keys: for cameras on other machines.
         clear_text: whether to listen to these without keys.
+        picture: file for the newest image, if ``[input] picture`` asks for it.
 
     Raises:
         LaunchError, RecordingError, NpzError, CsvError: a setting, or the recording, cannot be used.
@@ -110,7 +119,7 @@ def open_input(
         declared, own = SOURCES[settings.source], getattr(settings, settings.source)
     if declared.extra:
         require_extra(declared.extra)
-    source = declared.opens(own, SourceContext(clock, settings.calibration, keys, clear_text))
+    source = declared.opens(own, SourceContext(clock, settings.calibration, keys, clear_text, picture))
     if not settings.tf.fixed_frame:
         return source
     if not isinstance(source, LiveSource):

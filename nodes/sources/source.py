@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -156,6 +157,8 @@ class SourceContext:
     """for publishers on other machines"""
     clear_text: bool = False
     """whether to listen to other machines without keys"""
+    picture: Path | None = None
+    """file that the newest image is kept in, for the viewer"""
 
 
 class CameraError(RuntimeError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +18,7 @@ from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_mediapipe, pinhole
+from steadypose.nodes.sources.picture import PictureWriter
 from steadypose.nodes.sources.source import MODEL, CalibrationSettings, CameraError, WebcamSettings, count_failure
 
 Landmarker = Callable[[NDArray[Any], int], Any]
@@ -69,11 +70,17 @@ class PoseFinder:
     """
 
     def __init__(
-        self, name: str, landmarker: Landmarker, settings: WebcamSettings, calibration: CalibrationSettings
+        self,
+        name: str,
+        landmarker: Landmarker,
+        settings: WebcamSettings,
+        calibration: CalibrationSettings,
+        picture: Path | None = None,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._name, self._landmarker = name, landmarker
         self._settings, self._calibration = settings, calibration
+        self._picture = PictureWriter(picture) if picture else None
         self._lens: Lens | None = None
         self._started_ns: int | None = None
         self._last_ms = -1
@@ -87,12 +94,18 @@ class PoseFinder:
         if self._lens is None or self._lens.size != size:
             self._lens = Lens(size, self._settings.field_of_view, self._calibration)
         try:
-            image = cv2.cvtColor(self._lens.undistort(image), cv2.COLOR_BGR2RGB)
-            result = self._landmarker(image, self._last_ms)
+            straight = self._lens.undistort(image)
+            if self._picture:
+                self._picture.put(straight, stamp_ns, self._lens.intrinsics)
+            result = self._landmarker(cv2.cvtColor(straight, cv2.COLOR_BGR2RGB), self._last_ms)
             return from_mediapipe(result, stamp_ns, size, self._lens.intrinsics, self._name)
         except (cv2.error, ValueError) as error:  # an image of another kind, a result that is none
             count_failure(self.counts, self._name, error)
             return None
+
+    def close(self) -> None:
+        if self._picture:
+            self._picture.close()
 
 
 class Webcam:
@@ -187,6 +200,7 @@ def connect(
     calibration: CalibrationSettings,
     clock: Clock,
     make_landmarker: Callable[[WebcamSettings], AbstractContextManager[Landmarker]] = mediapipe_landmarker,
+    picture: Path | None = None,
 ) -> Iterator[Webcam]:
     """Open the camera and the landmarker.
 
@@ -201,7 +215,8 @@ def connect(
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest image, not the oldest that waits
         with make_landmarker(settings) as landmarker:
             name = f"webcam-{settings.camera}"
-            yield Webcam(capture, PoseFinder(name, landmarker, settings, calibration), name, clock)
+            with closing(PoseFinder(name, landmarker, settings, calibration, picture)) as finder:
+                yield Webcam(capture, finder, name, clock)
     finally:
         capture.release()
 
@@ -218,9 +233,11 @@ class VideoSource:
         settings: WebcamSettings,
         calibration: CalibrationSettings,
         make_landmarker: Callable[[WebcamSettings], AbstractContextManager[Landmarker]] = mediapipe_landmarker,
+        picture: Path | None = None,
     ) -> None:
         self.refused: Counter[str] = Counter()
         self._settings, self._calibration, self._make_landmarker = settings, calibration, make_landmarker
+        self._picture = picture
         video = cv2.VideoCapture(settings.video)
         if not video.isOpened():
             raise LaunchError(f"[input.webcam] video: expected a video that OpenCV can read, got {settings.video!r}")
@@ -236,8 +253,10 @@ class VideoSource:
         name = Path(self._settings.video).stem
         stamp_ns = -1
         try:
-            with self._make_landmarker(self._settings) as landmarker:
-                finder = PoseFinder(name, landmarker, self._settings, self._calibration)
+            with (
+                self._make_landmarker(self._settings) as landmarker,
+                closing(PoseFinder(name, landmarker, self._settings, self._calibration, self._picture)) as finder,
+            ):
                 while video.grab():
                     reported_ns = round(video.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
                     # some containers state the frame rate alone

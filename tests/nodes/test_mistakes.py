@@ -117,6 +117,10 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     ),
     "a frame without its time": (lambda j: steadypose.Filter()(j[0]), "t in seconds, or stamp_ns"),
     "nanoseconds as seconds": (lambda j: steadypose.Filter()(j[0], 1.7e18), "say stamp_ns= of nanoseconds"),
+    "many frames at once": (
+        lambda j: steadypose.Filter()(np.concatenate([j, j, j]), 0.0),
+        r"got 150; frames go one by one, and a whole recording into steadypose\.clean",
+    ),
     "all frames at once": (lambda j: steadypose.Filter()(j.transpose(0, 2, 1), 0.0), r"expected \(22, 3\) metres"),
 }
 
@@ -135,6 +139,10 @@ WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     "milliseconds, frame by frame": (
         lambda j: frame_by_frame(j, 1e3 * seconds()),
         "they seem to be milliseconds taken for seconds",
+    ),
+    "the last frame first": (
+        lambda j: steadypose.clean(j, stamp_ns=np.arange(FRAMES)[::-1] * 33_333_333),
+        "stamps that rise; publish frames in the order of their capture",
     ),
     "ten times the rate": (
         lambda j: steadypose.clean(j, fps=300),
@@ -158,7 +166,13 @@ ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
     "a CSV without a header": (
         ["clean", "in.csv", "out.npz"],
         {"in.csv": "0.0, 1.0, 2.0, 3.0\n"},
-        "expected a header with a column 'stamp', in seconds",
+        "rename another program's columns to stamp, JOINT_x",
+    ),
+    "a picture": (["clean", "in.png", "out.npz"], {"in.png": "x"}, "or a video, got '.png'"),
+    "a folder that cannot be written to": (
+        ["clean", "in.csv", "/proc/out.npz"],
+        {"in.csv": "stamp,left_hip_x,left_hip_y,left_hip_z\n0,0,0,0\n"},
+        "expected a folder that can be written to",
     ),
     "an output of another kind": (
         ["clean", "in.csv", "out.json"],

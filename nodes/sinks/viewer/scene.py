@@ -43,6 +43,8 @@ from steadypose.prior.body.skeleton import HIPS, SHOULDERS, J
 if TYPE_CHECKING:
     import rerun as rr
 
+    from steadypose.nodes.sources.picture import Picture
+
 PATH_SECONDS = 10.0
 """of a body's path over the floor that are drawn"""
 CONTACT_PROBABILITY = 0.5
@@ -54,6 +56,9 @@ BELOW_TRUNK = 0.25
 """metres from the middle of the trunk down to the middle of a standing body"""
 BACK_JUMP_NS = 1_000_000_000
 """a stamp so far behind the last one is a stream that starts again"""
+
+MOST_PICTURES = 30
+"""that wait for the poses of their moment: two seconds"""
 
 OBSERVED = (JointState.SEEN, JointState.REFINED)
 
@@ -81,6 +86,8 @@ class PoseView:
         self._eye: Eye | None = None
         self._calibrated = True
         self._scored = False
+        self._pictures: deque[Picture] = deque(maxlen=MOST_PICTURES)
+        self._pictured = False
         self._focus: dict[str, NDArray[np.float64]] = {}
         self._drawn: dict[str, set[str]] = {}
         self._paths: dict[str, deque[tuple[int, NDArray[np.float64]]]] = {}
@@ -104,11 +111,36 @@ class PoseView:
             drawn = dict(self._draw_raw(message))
         elif isinstance(message, PoseClean):
             drawn = dict(self._draw_clean(message))
+            self._draw_picture(message)
         else:
             drawn = dict(self._draw_world(message, truth=topic == POSE_TRUTH))
         self._clear_absent(f"{topic}/{message.source}", set(drawn))
         if topic != POSE_TRUTH:
             self._follow(topic, list(drawn.values()), calibrated=getattr(message, "calibrated", True))
+
+    def keep(self, picture: Picture) -> None:
+        """Draw an image of the camera once the clean poses of its moment have come."""
+        self._pictures.append(picture)
+
+    def _draw_picture(self, message: PoseClean) -> None:
+        """The newest image that is not ahead of the poses, where its camera stands: the poses lie over it."""
+        import rerun as rr
+
+        newest: Picture | None = None
+        while self._pictures and self._pictures[0].stamp_ns <= message.stamp_ns:
+            newest = self._pictures.popleft()
+        if newest is None:
+            return
+        if not self._pictured:
+            self._pictured = True
+            self._send_layout()
+        pose = message.sensor_pose
+        self._log("camera", rr.Transform3D(translation=pose.position, quaternion=pose.orientation))
+        lens = rr.Pinhole(
+            image_from_camera=newest.intrinsics, resolution=newest.size, camera_xyz=rr.ViewCoordinates.RDF
+        )
+        self._log("camera/image", lens)
+        self._log("camera/image", rr.EncodedImage(contents=newest.jpeg, media_type="image/jpeg"))
 
     def _draw_rates(self, message: Diagnostics) -> None:
         """The nodes' own counts, drawn at the time of the newest pose: the viewer may skip frames, they do not."""
@@ -236,7 +268,9 @@ class PoseView:
         self._drawn[key] = drawn
 
     def _send_layout(self) -> None:
-        self._recording.send_blueprint(blueprint(self._eye, calibrated=self._calibrated, scored=self._scored))
+        self._recording.send_blueprint(
+            blueprint(self._eye, calibrated=self._calibrated, scored=self._scored, pictured=self._pictured)
+        )
 
     def _set_time(self, topic: str, stamp_ns: int) -> None:
         """Draw from now on at that moment; where a topic's stamps jump back, its time goes on from where it was."""

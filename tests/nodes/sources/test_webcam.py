@@ -21,6 +21,7 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.sources import camera, webcam_device
 from steadypose.nodes.sources.camera import PAUSES_S, CameraSource
+from steadypose.nodes.sources.picture import PictureReader
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import CalibrationSettings, SourceContext, WebcamSettings
@@ -227,3 +228,25 @@ def test_mediapipe_itself_refuses_a_file_that_is_no_model(model: str) -> None:
         webcam_device.mediapipe_landmarker(WebcamSettings(model=model)),
     ):
         pass
+
+
+def test_the_newest_image_is_kept_for_the_viewer_and_none_is_left_behind(
+    video: Path, model: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "picture"
+    reader = PictureReader(file)
+    settings = WebcamSettings(video=str(video), model=model)
+    shown = []
+    for _ in VideoSource(settings, NOT_CALIBRATED, Seen().landmarker, file):
+        shown.append(reader.next())
+        assert reader.next() is None, "once"
+        assert file.stat().st_mode & 0o077 == 0, "of this user alone"
+    assert not list(tmp_path.glob("picture*"))
+    pictures = [picture for picture in shown if picture]
+    assert 1 < len(pictures) < FRAMES, "half of the frames of 30 Hz"
+    image = cv2.imdecode(np.frombuffer(pictures[-1].jpeg, np.uint8), cv2.IMREAD_COLOR)
+    height, width = image.shape[:2]
+    assert pictures[-1].size == (width, height)
+    focal = width / 2 / np.tan(WebcamSettings.field_of_view / 2)
+    np.testing.assert_allclose(pictures[-1].intrinsics[[0, 1], [0, 1]], focal, rtol=0.01)
+    assert [picture.stamp_ns for picture in pictures] == sorted({picture.stamp_ns for picture in pictures})

@@ -1,0 +1,87 @@
+"""The newest image of a camera for the viewer: a file of this user, beside the sockets. Off unless ``[input] picture``.
+
+A file and no message, because images of people belong in no recording, and on no network.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.prior.arrays import Floats
+
+NAME = "picture"
+"""of the file, in the directory of the sockets"""
+PERIOD_NS = 66_000_000
+"""Time between images in nanoseconds: half the frames of a camera are enough to see what it sees."""
+WIDTH = 480
+"""Width of a kept image in pixels, at most."""
+_HEAD = struct.Struct("<q2I4d")
+
+
+class Picture(NamedTuple):
+    """An image, and how points in its camera's optical frame come into it."""
+
+    stamp_ns: int
+    size: tuple[int, int]
+    """width and height in pixels"""
+    intrinsics: Floats
+    """(3, 3) pixels"""
+    jpeg: bytes
+
+
+class PictureWriter:
+    """Keeps the newest image in a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._stamp_ns: int | None = None
+
+    def put(self, image: NDArray[Any], stamp_ns: int, intrinsics: Floats) -> None:
+        """Keep an image (H, W, 3), BGR, without distortion, unless the last one is younger than `PERIOD_NS`."""
+        if self._stamp_ns is not None and 0 <= stamp_ns - self._stamp_ns < PERIOD_NS:
+            return
+        import cv2  # of the sources that have images
+
+        self._stamp_ns = stamp_ns
+        height, width = image.shape[:2]
+        size = (min(width, WIDTH), round(height * min(1.0, WIDTH / width)))
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 75])
+        scale = size[0] / width
+        lens = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] * scale
+        part = self._path.with_suffix(".part")
+        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+            file.write(_HEAD.pack(stamp_ns, *size, *lens) + jpeg.tobytes())
+        part.replace(self._path)
+
+    def close(self) -> None:
+        """Leave no image behind."""
+        self._path.unlink(missing_ok=True)
+
+
+class PictureReader:
+    """Reads what a `PictureWriter` of the same machine and user keeps."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._changed_ns = 0
+
+    def next(self) -> Picture | None:
+        """The newest image, once."""
+        try:
+            changed_ns = self._path.stat().st_mtime_ns
+            if changed_ns == self._changed_ns:
+                return None
+            data = self._path.read_bytes()
+        except FileNotFoundError:
+            return None
+        self._changed_ns = changed_ns
+        stamp_ns, width, height, fx, fy, cx, cy = _HEAD.unpack_from(data)
+        intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return Picture(stamp_ns, (width, height), intrinsics, data[_HEAD.size :])
