@@ -122,8 +122,9 @@ def _frames(history: History, body: int, lead: Track, step: int) -> Iterator[NDA
             Line2D([], [], color=LEFT_COLOUR, lw=3, label="left"),
             Line2D([], [], color=RIGHT_COLOUR, lw=3, label="right"),
             Line2D([], [], color=MIDDLE_COLOUR, lw=3, alpha=FAINT, label="faint: not observed"),
+            *([Line2D([], [], color=CONTACT_COLOUR, marker="o", lw=0, label="contact")] if world is not None else []),
         ],
-        loc="lower center", ncols=3, frameon=False, fontsize=9, borderaxespad=0.1,
+        loc="lower center", ncols=4, frameon=False, fontsize=9, borderaxespad=0.1,
     )  # fmt: skip
     for row in range(0, len(lead.time), step):
         for ax, draw in zip(axes, draws.values(), strict=True):

@@ -124,8 +124,8 @@ def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool, pictured: bool
         rrb.Vertical(
             rrb.Horizontal(
                 *([over_picture] if pictured else []),
-                scene("raw", "raw: as the sensor gives it", distance=1.78, height=0.3, floor=calibrated),
-                scene("clean", "clean: faint is inferred", distance=1.78, height=0.3, floor=calibrated),
+                scene("raw", "raw: as the sensor gives it", distance=2.0, height=0.3, floor=calibrated),
+                scene("clean", "clean: faint is inferred", distance=2.0, height=0.3, floor=calibrated),
                 scene("world", "world: path and contacts", distance=2.3, height=0.8, floor=True),
             ),
             rrb.Horizontal(
