@@ -246,12 +246,13 @@ def side_by_side(ax: Axes, seconds: Floats, joints: Floats, *others: Floats) -> 
     pelvis = joints[:, :1]
     pelvis = np.where(np.isfinite(pelvis).all(axis=-1, keepdims=True), pelvis, nan_mean(joints, axis=1)[:, None])
     places = np.arange(len(joints))
-    for place, second in zip(places, seconds, strict=True):
+    for place, second in enumerate(seconds):
         ax.text(place, -1.13, f"{second:.1f} s", ha="center", fontsize=8)
     ax.set(aspect="equal", xlim=(-0.6, max(FIGURES, len(joints)) - 0.4), ylim=(-1.2, 0.85))
     ax.axis("off")
     centred = [points - pelvis for points in (joints, *others)]
-    return [np.stack([places[:, None] + points @ across, points[..., 2]], axis=-1) for points in centred]
+    places = np.arange(len(joints))[:, None]
+    return [np.stack([places + points @ across, points[..., 2]], axis=-1) for points in centred]
 
 
 def draw_bones(
