@@ -155,7 +155,6 @@ def aimed_at(file: Path, root: Path = ROOT) -> list[str]:
         found = [path for path, names in tests.items() if names & sought]
         if near := [path for path in found if (root / "tests" / file).parent in path.parents]:
             found = near  # those of the same room, where there are any
-        found = [path for path in found if path.stem == f"test_{file.stem}"] or found
         if found:
             return [str(path.relative_to(root)) for path in found]
         seen |= sought

@@ -5,8 +5,8 @@ Refine solves those of the newest frames and, if enabled, has HM-VAE refine them
 Orient solves those that are published. Two hips 18 cm apart, each with a bias, show the root's heading badly, and a
 straight limb does not show its twist. So rotations are solved for where the joints are to be expected by the whole body
 (`prior.models.posture`), each by its deviation; the root is averaged of its own joints and the whole body's posture,
-a filter keeps the twist through straight limbs (`prior.body.twist`), and another the usual direction of short bones
-(`prior.body.short_bones`). Positions stay as they are.
+filters keep the twist through straight limbs, and the usual direction of short bones (`prior.body.rotation_filters`).
+Positions stay as they are.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import global_rotations, heading, yaw_matrix
-from steadypose.prior.body.short_bones import follow_short_bones, unknown_turns
+from steadypose.prior.body.rotation_filters import follow_short_bones, follow_twist, unknown_turns, unknown_twist
 from steadypose.prior.body.skeleton import PARENT
-from steadypose.prior.body.twist import follow_twist, unknown_twist
 from steadypose.prior.clean.frame import Estimate, Gated, Person
 from steadypose.prior.clean.history import Ring
 from steadypose.prior.compiled import njit

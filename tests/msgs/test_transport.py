@@ -35,7 +35,7 @@ from steadypose.msgs.transport import MAX_FRAME, VERSION, Publisher, Subscriber,
 
 SOON_S = 20.0
 """for what must happen; the machine may be busy"""
-NEVER_S = 0.15
+NEVER_S = 0.3
 """for what must not happen"""
 BIG = raw(joints=100, bodies=100)
 """160 kB, so that the kernel's buffers hold few"""

@@ -1,4 +1,8 @@
-"""Training of the occlusion network: ``steadypose train occlusion --data MOCAP``, resumable.
+"""The occlusion network and its training: ``steadypose train occlusion --data MOCAP``, resumable.
+
+It weighs the candidates for an occluded joint's position, and states a standard deviation. Stacked generalisation
+(Wolpert 1992): the weights of several models are learned from their errors where they have to answer. A convex
+combination of the candidates is never farther off than the worst of them.
 
 Clips of true motion go through simulated sensors, lose joints, and go through the pipeline itself. The candidates and
 features of its occluded joints, with the truth, are the training data.
@@ -7,7 +11,7 @@ features of its occluded joints, with the truth, are the training data.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +19,24 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.progress import track
-from torch import Tensor
+from torch import Tensor, nn
 
 from steadypose.prior.arrays import Bools, Floats
-from steadypose.prior.body.skeleton import J, limbs
+from steadypose.prior.body.skeleton import PARENTS, J, limbs
 from steadypose.prior.clean.core import CleanCore
 from steadypose.prior.clean.frame import Observation
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.models.occlusion.inference import Occluded, Weighed
-from steadypose.prior.models.weights import LICENCES
+from steadypose.prior.models.occlusion.candidates import CANDIDATES, FEATURES
+from steadypose.prior.models.occlusion.inference import MAX_LOG_SIGMA, MIN_LOG_SIGMA, Occluded, Weighed
 from steadypose.prior.sim.camera import segment_gap
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.recordings import load_kinect, load_motion, write_arrays
 from steadypose.training.data.sensors import Sensors
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS
-from steadypose.training.loop import TrainingOptions, TrainingRun
-from steadypose.training.networks.occlusion import OcclusionConfig, OcclusionNet
-from steadypose.training.weights import save_weights, started
+from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
-Rng = np.random.Generator
+FIRST_LOG_SIGMA = 4.0
+"""Initial logarithm of the standard deviation in millimetres."""
 
 ITERATIONS, BATCH, LEARNING_RATE, WEIGHT_DECAY = 800, 4096, 3e-3, 0.1
 """Occluded joints a step; AdamW's rate at the start, which falls along a cosine, and its weight decay. More steps fit
@@ -73,6 +76,47 @@ _OCCLUSIONS: tuple[tuple[float, list[int]], ...] = (
     (1.0, [joint for name, joint in J.items() if joint > J["spine2"] or name == "spine2"]),
 )  # fmt: skip
 """Joints that are hidden together, with their relative frequency."""
+
+
+@dataclass(frozen=True)
+class OcclusionConfig:
+    """Sizes.
+
+    Attributes:
+        hidden: of each layer.
+    """
+
+    hidden: int = 96
+
+    @classmethod
+    def from_dict(cls, config: dict[str, Any]) -> OcclusionConfig:
+        """From the JSON of a weights file."""
+        return cls(**config)
+
+
+class OcclusionNet(nn.Module):
+    """Two hidden layers; the bias of the first is the joint's."""
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, config: OcclusionConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.register_buffer("mean", torch.zeros(FEATURES))
+        self.register_buffer("deviation", torch.ones(FEATURES))
+        self.joint = nn.Parameter(torch.zeros(len(PARENTS), config.hidden))
+        self.read = nn.Linear(FEATURES, config.hidden)
+        self.think = nn.Linear(config.hidden, config.hidden)
+        self.write = nn.Linear(config.hidden, CANDIDATES + 1)
+        nn.init.constant_(self.write.bias[CANDIDATES:], FIRST_LOG_SIGMA)
+
+    def forward(self, features: Tensor, joint: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights (N, 4) of the candidates, and the logarithm (N,) of the standard deviation along an axis in
+        millimetres, of features (N, `FEATURES`) of joints (N,)."""
+        read = torch.relu(self.read((features - self.mean) / self.deviation) + self.joint[joint])
+        written = self.write(torch.relu(self.think(read)) + read)
+        return written[:, :CANDIDATES].softmax(dim=-1), written[:, CANDIDATES].clamp(MIN_LOG_SIGMA, MAX_LOG_SIGMA)
 
 
 @dataclass(frozen=True)
@@ -195,55 +239,47 @@ def train_occlusion(options: TrainingOptions) -> Path:
 
     They are those of the mixture that are free for products; its prepared arrays serve too.
     """
-    iterations, seed, path = options.iterations or ITERATIONS, options.seed, options.path("occlusion")
-    directory = path.parent
-    arrays = directory / "arrays"
-    if not (arrays / "pairs.npz").is_file():
-        write_arrays(options.data, arrays)
-    torch.manual_seed(seed)
-    model = OcclusionNet(OcclusionConfig())
-    origin = started(model, "occlusion", options.start)
-    rows = {split: _rows(directory, model, split, seed) for split in RECORDED}
+    directory = options.path("occlusion").parent
+    if not (directory / "arrays" / "pairs.npz").is_file():
+        write_arrays(options.data, directory / "arrays")
+    rows = {split: _rows(directory, split, options.seed) for split in RECORDED}
     train, val = ({key: torch.from_numpy(value) for key, value in vars(rows[split]).items()} for split in RECORDED)
-    if options.start is None:
-        model.mean.copy_(train["features"].mean(dim=0))
-        model.deviation.copy_(train["features"].std(dim=0).clamp(min=0.05))
-    optimiser = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=LEARNING_RATE / 100)
-    run = TrainingRun(directory, model, schedule, iterations, evaluations=20)
 
-    def loss_of_step(count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+    def loss(network: OcclusionNet, count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         drawn = torch.from_numpy(rng.integers(len(train["joint"]), size=count))
-        total, error, best = loss_of(model, {key: value[drawn] for key, value in train.items()})
+        total, error, best = loss_of(network, {key: value[drawn] for key, value in train.items()})
         return total, {"loss": total.item(), "mm": error.mean().item(), "best": best.mean().item()}
 
-    def evaluate() -> dict[str, float]:
-        total, error, best = loss_of(model, val)
+    def evaluate(network: OcclusionNet) -> dict[str, float]:
+        total, error, best = loss_of(network, val)
         return {"val": total.item(), "val mm": error.mean().item(), "val best": best.mean().item()}
 
-    run.minimise(loss_of_step, evaluate, BATCH, seed, clip=1.0)
-    return run.save(path, model, asdict(model.config), {
-        "Model": "weights of four candidates for an occluded joint's position, and its standard deviation",
-        "Data": "as the mixture's, through simulated sensors, occlusions and the pipeline itself",
-        "Licence": LICENCES[options.weights],
-        "Training": f"`steadypose train occlusion --iterations {iterations}`: {BATCH} of {len(train['joint'])} "
-        f"occluded joints a step, AdamW {LEARNING_RATE:g}, seed {seed}{origin}",
-    })  # fmt: skip
+    def measure_features(network: OcclusionNet) -> None:
+        network.mean.copy_(train["features"].mean(dim=0))
+        network.deviation.copy_(train["features"].std(dim=0).clamp(min=0.05))
+
+    recipe = Recipe(
+        "occlusion", lambda: OcclusionNet(OcclusionConfig()), loss, evaluate, ITERATIONS, BATCH, LEARNING_RATE,
+        f"of {len(train['joint'])} occluded joints", decay=WEIGHT_DECAY, evaluations=20,
+    )  # fmt: skip
+    return recipe.train(
+        options,
+        "weights of four candidates for an occluded joint's position, and its standard deviation",
+        "as the mixture's, through simulated sensors, occlusions and the pipeline itself",
+        started_anew=measure_features,
+    )
 
 
-def _rows(directory: Path, untrained: OcclusionNet, split: str, seed: int) -> Rows:
-    """Those of a split, recorded once, whatever the weights of the network under training."""
-    path, weights = directory / f"rows-{split}.npz", directory / "untrained.safetensors"
+def _rows(directory: Path, split: str, seed: int) -> Rows:
+    """Those of a split, recorded once; a recorder stands in the network's place, so that any weights serve."""
+    path = directory / f"rows-{split}.npz"
     if not path.is_file():
-        save_weights(weights, untrained, asdict(untrained.config), {})
-        settings = PriorSettings()
-        settings = replace(settings, fuse=replace(settings.fuse, weights=str(weights)))
         pairs = load_kinect(directory / "arrays" / "pairs.npz").of(
             TRAIN_SUBJECTS if split == "train" else ("s07", "s08")
         )
         sensors = Sensors(load_motion(directory / "arrays" / f"motion-{split}.npz"), pairs, FRAMES)
         part = path.with_suffix(".part.npz")
-        np.savez(part, **vars(record(sensors, settings, RECORDED[split], seed, split)))
+        np.savez(part, **vars(record(sensors, PriorSettings(), RECORDED[split], seed, split)))
         part.replace(path)
     with np.load(path) as arrays:
         return Rows(**arrays)

@@ -3,7 +3,7 @@
 The smoother lets a joint coast, which is right for a foot that stands. The completion network places it from the rest
 of the body, which is right for an arm that swings. A joint may keep its offset from the nearest joint seen, turned with
 the trunk, which is right for an arm that rests. And one that is seen again within the delay is smoothed by itself, over
-the gap (`bridge`). `training.networks.occlusion` weighs the four by `FEATURES` numbers that are invariant to the body's
+the gap (`bridge`). `training.recipes.occlusion` weighs the four by `FEATURES` numbers that are invariant to the body's
 position and heading.
 """
 

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.occlusion.candidates import CANDIDATES
-from steadypose.prior.models.occlusion.form import MAX_LOG_SIGMA, MIN_LOG_SIGMA
 from steadypose.prior.models.weights import Arrays, load_weights
+
+MIN_LOG_SIGMA, MAX_LOG_SIGMA = -3.0, 7.0
+"""Range of the logarithm of the network's standard deviation, in units of a millimetre."""
 
 SIGMA_SCALE = 1.1
 """Factor on the network's standard deviation, which holds for the people it was trained on: of others it is 1.0 to 1.3

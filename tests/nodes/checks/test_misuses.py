@@ -236,6 +236,10 @@ def test_it_is_named_within_three_seconds_and_nothing_else_is(misuse: str) -> No
     assert "expected" in text
 
 
+def test_the_table_is_long_enough() -> None:
+    assert len(MISUSES) >= 25
+
+
 @pytest.mark.parametrize("skeleton", SKELETONS)
 def test_a_good_stream_has_no_problem(skeleton: str) -> None:
     good = walk(layout=skeleton)

@@ -56,7 +56,9 @@ def test_every_command_is_where_it_is_said_to_be() -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
+        (["cleen"], "did you mean 'clean'"),
         (["xyzzy"], "there are run, node"),
+        (["clean", "nowhere.npz", "out.npz"], "nowhere.npz does not exist"),
         (["run", "nolaunch"], "no launch file 'nolaunch'"),
         (["run", "--input", "nowhere"], "does not exist"),
         (["run", "--set", "input.rat=3"], "did you mean 'rate'"),
@@ -68,6 +70,12 @@ def test_what_cannot_be_done_is_said_in_a_line(capsys, arguments: list[str], exp
     err = capsys.readouterr().err
     assert expected in err
     assert "Traceback" not in err
+
+
+def test_a_bad_npz_is_said_in_a_line(capsys, tmp_path: Path) -> None:
+    np.savez(tmp_path / "in.npz", positions=np.zeros((3, 22)), skeleton="smpl22", fps=30)
+    assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == USAGE_ERROR
+    assert "for smpl22, got (3, 22)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -123,6 +131,14 @@ def test_a_reader_that_has_seen_enough_is_no_error() -> None:
     command = f"{sys.executable} -m steadypose.nodes.cli --help | true"
     done = subprocess.run(["bash", "-o", "pipefail", "-c", command], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_keys_are_made_once(capsys, tmp_path: Path) -> None:
+    assert main(["keys", str(tmp_path / "keys")]) == 0
+    secret = tmp_path / "keys" / "own.key_secret"
+    assert secret.stat().st_mode & 0o077 == 0
+    assert main(["keys", str(tmp_path / "keys")]) == USAGE_ERROR
+    assert "exists already" in capsys.readouterr().err
 
 
 def test_what_an_extra_brings_is_named() -> None:

@@ -40,7 +40,7 @@ class Tracker(Node):
 def file(make_launch: Callable[..., Launch], tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     path = tmp_path / "launch.toml"
     path.write_text(f'[transport]\ndirectory = "{folder}"\nlossless = false\n')
-    monkeypatch.setattr(live, "LISTEN_NS", 400_000_000)
+    monkeypatch.setattr(live, "LISTEN_NS", 800_000_000)
     return str(path)
 
 

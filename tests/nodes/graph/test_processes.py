@@ -30,16 +30,19 @@ class Run:
     Args:
         folder: of its sockets.
         arguments: of the command.
+        where: the working directory.
     """
 
-    def __init__(self, folder: Path, *arguments: str) -> None:
+    def __init__(self, folder: Path, *arguments: str, where: Path | None = None) -> None:
         self._health = folder / "steadypose" / HEALTH_FILE
         self._output = (folder / "output").open("w+")
         self.process = subprocess.Popen(
             [sys.executable, "-m", "steadypose.nodes.cli", "run", *arguments],
             stdout=self._output,
             stderr=subprocess.STDOUT,
-            env=os.environ | {"XDG_RUNTIME_DIR": str(folder)},
+            # the command itself is started by a script of the environment, which does not look there either
+            env=os.environ | {"XDG_RUNTIME_DIR": str(folder), "PYTHONSAFEPATH": "1"},
+            cwd=where,
         )
 
     def nodes(self) -> dict[str, Any]:
@@ -84,8 +87,8 @@ class Run:
 def start(folder: Path) -> Iterator[Any]:
     runs: list[Run] = []
 
-    def start(*arguments: str) -> Run:
-        runs.append(Run(folder, *arguments))
+    def start(*arguments: str, where: Path | None = None) -> Run:
+        runs.append(Run(folder, *arguments, where=where))
         return runs[-1]
 
     yield start
@@ -162,6 +165,17 @@ def test_an_input_that_is_killed_goes_on_where_it_was(start: Any, tmp_path: Path
     assert stamps == sorted(set(stamps[:-1])) + stamps[-1:], "none twice, none back, but for the mark of the end"
     assert len(stamps) == 151, "not one went with the process"
     assert stamps[-1] == frames[-1].stamp_ns
+
+
+def test_modules_in_the_working_directory_are_nobodys_business(start: Any, recording: Path, tmp_path: Path) -> None:
+    where = tmp_path / "where"
+    where.mkdir()
+    for name in ("zmq", "numpy", "socket"):
+        (where / f"{name}.py").write_text(f"open({str(tmp_path / 'was run')!r}, 'w')\nraise SystemExit(3)\n")
+    run: Run = start("--input", str(recording), "--set", 'nodes=["pose_input"]', where=where)
+    status, output = run.wait()
+    assert status == 0, output
+    assert not (tmp_path / "was run").exists()
 
 
 def test_systemd_is_told_when_all_are_ready_and_that_they_live(

@@ -254,10 +254,18 @@ def hostile(tmp_path: Path) -> Path:
         ("run", "--input", "{in}/a", *INPUT_ALONE),
         ("clean", "{in}/a", "{out}/a.npz"),
         ("clean", "{in}", "{out}/all", "--jobs", "2"),
+        ("info", "{in}/a"),
+        ("echo", "{in}/a"),
+        ("hz", "{in}/a"),
+        ("repair", "{in}/a", "{out}/repaired"),
         ("plot", "{in}/a", "-o", "{out}/a.png"),
+        ("keys", "{out}/keys"),
         ("doctor",),
         ("install-service", "replay", "--dry-run", "--user", "root"),
-        ("train", "--help"),
+        *(
+            (name, "--help")
+            for name in ("fit", "complete", "prepare", "train", "evaluate", "simulate", "calibrate", "node")
+        ),
     ],
     ids=" ".join,
 )

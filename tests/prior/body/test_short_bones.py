@@ -1,7 +1,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from steadypose.prior.body.short_bones import follow_short_bones, unknown_turns
+from steadypose.prior.body.rotation_filters import follow_short_bones, unknown_turns
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 
 SHORT = [J[name] for name in ("spine2", "neck", "left_collar", "right_collar")]

@@ -6,8 +6,8 @@ from tests.helpers.bodies import fk
 
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.kinematics import global_rotations
+from steadypose.prior.body.rotation_filters import follow_twist, unknown_twist
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, J
-from steadypose.prior.body.twist import follow_twist, unknown_twist
 
 OFFSETS = REST_OFFSETS[None]
 EXACT = np.full((1, 22), 1e-5)

@@ -276,6 +276,13 @@ class TestBadInput:
         assert len(cleaned[0].bodies) == 1
         assert pipeline.counters["body_id_repeated"] == 1
 
+    def test_confidences_that_are_no_numbers(self) -> None:
+        messages = stream(waving(10))
+        messages[5].bodies[0].confidence[:] = [np.nan, np.inf, -np.inf, -1, 2, *[1.0] * 17]
+        cleaned, _ = clean(messages)
+        assert len(cleaned) == 10
+        assert np.isfinite(positions(cleaned)).all()
+
 
 @pytest.mark.parametrize("delay", [0, 4])
 def test_to_keep_only_stamps_while_nobody_is_there_changes_nothing(delay: int, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,10 +10,9 @@ from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
-from steadypose.prior.complete.body import Uncertainty, complete, frames_apart
+from steadypose.prior.complete.body import LONGEST, LONGEST_GAP, Uncertainty, complete, frames_apart, gaps, views
 from steadypose.prior.complete.parts import PartsCompleter
-from steadypose.prior.complete.root_path import bridge, is_root_centred, root_path
-from steadypose.prior.complete.views import LONGEST, LONGEST_GAP, gaps, views
+from steadypose.prior.complete.stream import bridge, is_root_centred, root_path
 from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.root_velocity import NewestMotion
 

@@ -14,11 +14,10 @@ from steadypose.benchmarks.baselines.body import beside, facing
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.clean.occluded import OccludedJoints, Track
-from steadypose.prior.models.occlusion.bridge import DENSITIES, FIRST_SPEED, bridge
+from steadypose.prior.clean.occluded import DENSITIES, FIRST_SPEED, OccludedJoints, Track, bridge
 from steadypose.prior.models.occlusion.candidates import FEATURES, STANDING
 from steadypose.prior.models.occlusion.inference import SIGMA_SCALE, LiveOcclusion, Occluded, Weighed
-from steadypose.training.networks.occlusion import OcclusionConfig, OcclusionNet
+from steadypose.training.recipes.occlusion import OcclusionConfig, OcclusionNet
 from steadypose.training.weights import arrays_of
 
 FRAMES, ARM, ELBOW_AT = 40, [J["left_elbow"], J["left_wrist"]], J["left_shoulder"]

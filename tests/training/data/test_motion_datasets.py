@@ -15,8 +15,7 @@ from steadypose.prior.body.layouts import CANONICAL
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.prior.mocap.cmu import CMU_AMC, CMU_BVH
-from steadypose.training.data.cmu import REPEATS
-from steadypose.training.data.datasets import DATA_SETS
+from steadypose.training.data.datasets import DATA_SETS, REPEATS
 from steadypose.training.data.readers import Dropped, amc_motions, bvh_motion, members
 
 # A body of ReActIdle's family, y up, facing +z, left +x: name, depth, offset, end site.
