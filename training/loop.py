@@ -4,6 +4,7 @@ progress bar, curves drawn as it goes, and a card beside the weights.
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import os
@@ -87,6 +88,7 @@ class Recipe(Generic[Network]):
         evaluations: number of evaluations and checkpoints.
         clip: maximum norm of the gradient.
         parameters: of the network, which are trained; all of them, if left out.
+        average: decay of the exponential moving average of the parameters, which then is what is evaluated and saved.
     """
 
     model: str
@@ -103,18 +105,25 @@ class Recipe(Generic[Network]):
     evaluations: int = 40
     clip: float = 1.0
     parameters: Callable[[Network], list[nn.Parameter]] | None = None
+    average: float | None = None
 
     def minimise(self, network: Network, directory: Path, iterations: int, seed: int) -> TrainingRun:
         """Train ``network`` in place, in the folder of a run; a checkpoint there is resumed."""
+        mean = network if self.average is None else copy.deepcopy(network)
+        kept = network if mean is network else nn.ModuleDict({"network": network, "mean": mean})
         parameters = network.parameters() if self.parameters is None else self.parameters(network)
         optimiser = self.optimiser(parameters, lr=self.rate, weight_decay=self.decay)
         make = self.schedule or (lambda optimiser, steps: CosineAnnealingLR(optimiser, steps, self.rate / 100))
-        run = TrainingRun(directory, network, make(optimiser, iterations), iterations, self.evaluations)
+        run = TrainingRun(directory, kept, make(optimiser, iterations), iterations, self.evaluations)
+        if self.average is not None:
+            optimiser.register_step_post_hook(lambda *_: _move_average(mean, network, self.average or 0.0, run.step))
 
         def loss(count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
             return self.loss(network, count, done, rng)
 
-        run.minimise(loss, lambda: self.evaluate(network), self.batch, seed, self.clip)
+        run.minimise(loss, lambda: self.evaluate(mean), self.batch, seed, self.clip)
+        if mean is not network:
+            network.load_state_dict(mean.state_dict())
         return run
 
     def train(
@@ -156,6 +165,13 @@ class Recipe(Generic[Network]):
             "Training": f"`steadypose train {self.model} --weights {options.weights} --iterations {iterations}`: "
             f"{self.batch} {self.sample} a step, {self.optimiser.__name__} {self.rate:g}, seed {options.seed}{origin}",
         })  # fmt: skip
+
+
+@torch.no_grad()
+def _move_average(mean: nn.Module, network: nn.Module, decay: float, step: int) -> None:
+    """Update the moving average of parameters; of the first steps it is nearly their plain mean."""
+    for average, new in zip(mean.parameters(), network.parameters(), strict=True):
+        average.lerp_(new, 1.0 - min(decay, (step + 1) / (step + 10)))
 
 
 class TrainingRun:

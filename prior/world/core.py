@@ -83,12 +83,15 @@ class Scene:
 class WorldCore:
     """From observations to estimates; keeps no state but the networks.
 
+    What a message tells of a body goes through the stages in the order of `step`; each stage's state is in the body's
+    `BodyStages`, so that to forget a body is to drop that one object.
+
     Raises:
         FileNotFoundError: a weight set that does not exist; says which do.
     """
 
     def __init__(self, settings: TrajectorySettings) -> None:
-        self._settings = settings
+        self._predicts, self._anchors = settings.network, settings.contacts
         self._velocity = VelocityNetwork(settings.weights)
         self._contacts = ContactNetwork(settings.contact_weights)
         self._noise = BodyNoise(settings.acceleration, network_memory_s=self._velocity.memory_s)
@@ -98,29 +101,24 @@ class WorldCore:
         observed = [o for o in observations if o.root_known or o.body.id in scene.bodies]
         bodies = [self._stages(scene, o) for o in observed]
         velocities: Sequence[RootVelocity | None] = [None] * len(bodies)
-        if self._settings.network:
+        if self._predicts:
             velocities = self._velocity.update([body.motion for body in bodies], observed)
-        contacts = self._contacts.update([body.contacts for body in bodies], observed, scene.floor)
-        of_bodies = zip(bodies, observed, velocities, contacts, strict=True)
-        return [self._estimate(scene.floor, *of_body) for of_body in of_bodies]
-
-    def _estimate(
-        self, floor: Floor, body: BodyStages, observed: BodyObservation, velocity: RootVelocity | None,
-        contacts: Contacts,
-    ) -> BodyEstimate:  # fmt: skip
-        holding = stance(contacts, observed, body.filter.feet_off) if self._settings.contacts else _NO_STANCE
-        floor.update(observed, holding.rest)
-        root = body.filter.update(observed, velocity, holding, floor)
-        feet = body.feet.update(observed, root, holding.rest, floor)
-        return BodyEstimate(observed, velocity, contacts, holding, root, feet)
+        all_contacts = self._contacts.update([body.contacts for body in bodies], observed, scene.floor)
+        estimates = []
+        for body, now, velocity, contacts in zip(bodies, observed, velocities, all_contacts, strict=True):
+            holding = stance(contacts, now, body.filter.feet_off) if self._anchors else _NO_STANCE
+            scene.floor.update(now, holding.rest)
+            root = body.filter.update(now, velocity, holding, scene.floor)
+            feet = body.feet.update(now, root, holding.rest, scene.floor)
+            estimates.append(BodyEstimate(now, velocity, contacts, holding, root, feet))
+        return estimates
 
     def _stages(self, scene: Scene, observed: BodyObservation) -> BodyStages:
         """Those of a body, new ones for one that is new."""
         body = scene.bodies.get(observed.body.id)
         if body is None:
-            body = scene.bodies[observed.body.id] = BodyStages(
-                observed, self._velocity.memory(), self._contacts.memory(),
-                RootFilter(observed, self._noise),
-            )  # fmt: skip
+            motion, contacts = self._velocity.memory(), self._contacts.memory()
+            body = BodyStages(observed, motion, contacts, RootFilter(observed, self._noise))
+            scene.bodies[observed.body.id] = body
         body.observed = observed
         return body

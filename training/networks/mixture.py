@@ -172,7 +172,7 @@ def answer(
         scale: (...) metres along an axis, estimated noise.
         gap: (..., 22) frames to the nearest observation of each joint.
         between: (..., 22) metres along an axis, deviation of the multiple-model estimate in gaps between two
-            sightings; otherwise 0.
+            observations; otherwise 0.
         fallback: (...) share of the multiple-model estimate in what is not the raw joint's (`whiteness.fallback`).
     """
     logits, reach, correction, log_sigma = outputs.split([EXPERTS, EXPERTS, 3, 1], dim=-1)

@@ -8,14 +8,15 @@ so that no kind of sensor or motion dominates. The standard deviation is trained
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
+from torch.optim.lr_scheduler import LambdaLR
 
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
@@ -32,30 +33,29 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.recordings import load_kinect, load_motion, write_arrays
 from steadypose.training.data.sensors import Sensed, Sensors
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS
-from steadypose.training.loop import TrainingOptions, TrainingRun
+from steadypose.training.loop import Recipe, Rng, TrainingOptions
 from steadypose.training.networks.mixture import MixtureConfig, MixtureNet, answer
-from steadypose.training.weights import started
 
-RATE = 2e-3
-"""Initial learning rate."""
+ITERATIONS, RATE = 6000, 2e-3
+"""Number of optimiser steps, and the initial learning rate."""
 
 FRAMES = 90
-"""Frames of a clip, which begins as a stream begins"""
+"""Number of frames of a clip, which begins as a stream begins."""
 
 CLIPS, DELAYS_A_STEP = 16, 2
-"""Clips of each delay, and delays, in an optimiser step"""
+"""Number of clips of each delay, and of delays, in an optimiser step."""
 
 DELAYS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16])
 DELAY_SHARES = np.array([0.22, 0.08, 0.12, 0.05, 0.17, 0.03, 0.04, 0.13, 0.03, 0.03, 0.10])
 
 MIN_MM = 1.0
-"""Added to the best expert's position error in the denominator, so that a perfect input does not dominate."""
+"""Error added to the best expert's position error in the denominator, so that a perfect input does not dominate, mm."""
 
 SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.25, 0.4, 0.8, 2.0, 3.0)
 """Weight of the acceleration error, by delay in frames: without delay, smoothness costs lag."""
 
 MIN_SMOOTH_MM = 0.5
-"""mm/frame², the same of the acceleration error."""
+"""The same of the acceleration error, mm/frame²."""
 
 SPEED_WEIGHT, MAX_SPEED_WEIGHT = 0.5, 60.0
 """Weight of a joint's position error: 1 + (speed / SPEED_WEIGHT m/s)², at most MAX_SPEED_WEIGHT. Joints are fast in few
@@ -163,7 +163,7 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
     known = batch.truth.isfinite().all(dim=-1) & batch.experts.isfinite().all(dim=(-1, -2))
     experts = torch.where(known[..., None, None], batch.experts, 0.0)
     places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.gap, batch.between, batch.fallback)
-    weight = known / (1.0 + batch.gap.clamp(min=0))  # far from any sighting nothing can be learned
+    weight = known / (1.0 + batch.gap.clamp(min=0))  # far from any observation nothing can be learned
     seen = known * (batch.gap == 0).float()
     own = errors(places, batch.truth, weight, batch.counts)
     with torch.no_grad():
@@ -180,55 +180,6 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
     return Loss(total, relative, own, likelihood)
 
 
-def train(
-    network: MixtureNet,
-    sensors: Sensors,
-    val: Sensors,
-    directory: Path,
-    steps: int,
-    seed: int,
-    rate: float = 2e-3,
-    fresh: bool = True,
-) -> TrainingRun:
-    """Train ``network`` (unless ``fresh``, from its present weights), and load the moving average of its weights into
-    it."""
-    mean = MixtureNet(network.config)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.LambdaLR(
-        optimiser,
-        lambda s: min(1.0, (s + 1) / 100) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(s / steps, 1.0)))),
-    )
-    both = nn.ModuleDict({"network": network, "mean": mean})
-    run = TrainingRun(directory, both, schedule, steps, evaluations=20)
-    if run.step == 0:
-        if fresh:
-            _measure_features(network, sensors, seed)
-        mean.load_state_dict(network.state_dict())
-    watched = [(delay, through_bank(val.draw(40, np.random.default_rng((1, delay))), delay)) for delay in (0, 4)]
-    recent = {"loss": 0.0}
-
-    @torch.no_grad()
-    def average(*_: object) -> None:
-        keep = min(AVERAGE, (run.step + 1) / (run.step + 10))
-        for kept, new in zip(mean.parameters(), network.parameters(), strict=True):
-            kept.lerp_(new, 1 - keep)
-
-    def loss_of_step(clips: int, _: float, rng: np.random.Generator) -> tuple[Tensor, dict[str, float]]:
-        delays = [int(delay) for delay in rng.choice(DELAYS, DELAYS_A_STEP, p=DELAY_SHARES)]
-        batches = [(through_bank(sensors.draw(clips, rng), delay), delay) for delay in delays]
-        total = torch.stack([loss_of(network, batch, delay).total for batch, delay in batches]).mean()
-        recent["loss"] += 0.02 * (total.item() - recent["loss"]) if run.step else total.item()
-        return total, recent
-
-    def evaluate() -> dict[str, float]:
-        return {f"val, delay {delay}": loss_of(mean, batch, delay).relative.mean().item() for delay, batch in watched}
-
-    optimiser.register_step_post_hook(average)
-    run.minimise(loss_of_step, evaluate, CLIPS, seed, clip=1.0)
-    network.load_state_dict(mean.state_dict())
-    return run
-
-
 def _measure_features(network: MixtureNet, sensors: Sensors, seed: int) -> None:
     """Set the mean and standard deviation by which features are normalised."""
     rng = np.random.default_rng((seed, 7))
@@ -242,27 +193,44 @@ def train_mixture(options: TrainingOptions) -> Path:
 
     Prepared arrays, at several speeds, lie in the run's folder. From ``options.start`` the rate is half.
     """
-    iterations, seed, start = options.iterations or 6000, options.seed, options.start
-    path = options.path("mixture")
-    directory = path.parent
-    arrays = directory / "arrays"
+    arrays = options.path("mixture").parent / "arrays"
     if not (arrays / "pairs.npz").is_file():
         write_arrays(options.data, arrays)
-    torch.manual_seed(seed)
     pairs = load_kinect(arrays / "pairs.npz")
     sensors = Sensors(load_motion(arrays / "motion-train.npz"), pairs.of(TRAIN_SUBJECTS), FRAMES)
     val = Sensors(load_motion(arrays / "motion-val.npz"), pairs.of(("s07", "s08")), FRAMES)
-    network = MixtureNet(MixtureConfig())
-    began = started(network, "mixture", start)
-    rate = RATE if start is None else RATE / 2
-    run = train(network, sensors, val, directory, iterations, seed, rate, fresh=start is None)
-    card = {
-        "Model": "weights that a network gives to a bank of fixed-lag smoothers, joint by joint",
-        "Data": "CMU (AMC 01; BVH 06, 07; 08 to 14 and others; expmap; salsa), ReActIdle, UI-PRMD s01-s06 (Vicon, and "
+    watched = [(delay, through_bank(val.draw(40, np.random.default_rng((1, delay))), delay)) for delay in (0, 4)]
+    recent = {"loss": 0.0}
+
+    def loss(network: MixtureNet, clips: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+        delays = [int(delay) for delay in rng.choice(DELAYS, DELAYS_A_STEP, p=DELAY_SHARES)]
+        batches = [(through_bank(sensors.draw(clips, rng), delay), delay) for delay in delays]
+        total = torch.stack([loss_of(network, batch, delay).total for batch, delay in batches]).mean()
+        recent["loss"] += 0.02 * (total.item() - recent["loss"]) if done else total.item()
+        return total, recent
+
+    def evaluate(network: MixtureNet) -> dict[str, float]:
+        return {
+            f"val, delay {delay}": loss_of(network, batch, delay).relative.mean().item() for delay, batch in watched
+        }
+
+    recipe = Recipe(
+        "mixture", lambda: MixtureNet(MixtureConfig()), loss, evaluate, ITERATIONS, CLIPS,
+        RATE if options.start is None else RATE / 2, f"clips of each of {DELAYS_A_STEP} delays", decay=1e-4,
+        schedule=lambda optimiser, steps: LambdaLR(optimiser, lambda step: _rate_factor(step, steps)),
+        evaluations=20, average=AVERAGE,
+    )  # fmt: skip
+    return recipe.train(
+        options,
+        "weights that a network gives to a bank of fixed-lag smoothers, joint by joint",
+        "CMU (AMC 01; BVH 06, 07; 08 to 14 and others; expmap; salsa), ReActIdle, UI-PRMD s01-s06 (Vicon, and "
         "Kinect beside it), at 1 to 2.5 times its speed, through simulated sensors; validated on CMU 02, ReActIdle "
         "013-015, UI-PRMD s07, s08",
-        "Licence": LICENCES["default"],
-        "Seed": str(seed),
-        "Training": f"`steadypose train mixture --iterations {iterations} --seed {seed}`{began}",
-    }
-    return run.save(path, network, asdict(network.config), card)
+        licence=LICENCES["default"],
+        started_anew=lambda network: _measure_features(network, sensors, options.seed),
+    )
+
+
+def _rate_factor(step: int, steps: int) -> float:
+    """Factor on the learning rate: a rise over 100 steps, then along a cosine to a hundredth."""
+    return min(1.0, (step + 1) / 100) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(step / steps, 1.0))))
