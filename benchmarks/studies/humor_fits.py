@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from steadypose.benchmarks import product
 from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.depth_camera import Stereo, corrupt, render
 from steadypose.benchmarks.intervals import interval
 from steadypose.benchmarks.metrics import acceleration_error, position_error
 from steadypose.benchmarks.motion import MotionClips
@@ -31,7 +32,6 @@ from steadypose.prior.fit.observations import Observed, Pinhole, SeenJoints
 from steadypose.prior.fit.picture import track_of_picture
 from steadypose.prior.fit.solve import PICTURES, FitSettings, Start, fit_window
 from steadypose.prior.fit.windows import Track, load_of
-from steadypose.prior.sim.depth import Stereo, corrupt, render
 from steadypose.prior.timing.rate import FPS
 
 NOISE, HIDDEN_BELOW = 0.04, 0.9

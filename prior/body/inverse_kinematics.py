@@ -13,6 +13,20 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import CHILDREN, COLLARS, HIPS, PARENT, PARENTS, SHOULDERS, J, finite_joints
+from steadypose.prior.body.vectors import (
+    cross,
+    difference,
+    dot,
+    frame_axes,
+    middle_of,
+    normalised,
+    point,
+    rotated,
+    rotated_back,
+    write_product,
+    write_rotation,
+    write_swing,
+)
 from steadypose.prior.compiled import njit
 
 # What shows the frame of pelvis and chest, best first: a left-right pair, and a place above, the middle of two joints.
@@ -58,11 +72,11 @@ def _aims() -> NDArray[np.intp]:
 _AIM = _aims()
 
 # The hinge axes in the rest pose, about which elbows and knees flex (right-hand rule, flexion positive).
-_HINGE = np.zeros((len(PARENTS), 3))
-_HINGE[list(HIPS)] = (0.0, 1.0, 0.0)
-_HINGE[SHOULDERS[0]] = (0.0, 0.0, -1.0)
-_HINGE[SHOULDERS[1]] = (0.0, 0.0, 1.0)
-_HINGED = np.array([hinge.any() for hinge in _HINGE])
+HINGE = np.zeros((len(PARENTS), 3))
+HINGE[list(HIPS)] = (0.0, 1.0, 0.0)
+HINGE[SHOULDERS[0]] = (0.0, 0.0, -1.0)
+HINGE[SHOULDERS[1]] = (0.0, 0.0, 1.0)
+_HINGED = np.array([hinge.any() for hinge in HINGE])
 # The sine of the bend below which the plane of a limb shows nothing of its twist, and above which it shows all.
 _BEND_NONE, _BEND_FULL = 0.1, 0.35
 
@@ -167,110 +181,6 @@ def _frames(values: NDArray[np.floating], shape: tuple[int, ...]) -> Floats:
     return frames.reshape(-1, *shape[-2:])
 
 
-# ---------------------------------------------------------------------------------------------------------------
-# Vectors (x, y, z) are tuples: each assignment of an array to a part of another takes a second more to compile.
-
-
-@njit(cache=True)
-def _at(points, joint):
-    return points[joint, 0], points[joint, 1], points[joint, 2]
-
-
-@njit(cache=True)
-def _less(a, b):
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
-@njit(cache=True)
-def _middle(points, joints):
-    (ax, ay, az), (bx, by, bz) = _at(points, joints[0]), _at(points, joints[1])
-    return (ax + bx) / 2.0, (ay + by) / 2.0, (az + bz) / 2.0
-
-
-@njit(cache=True)
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(cache=True)
-def _cross(a, b):
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@njit(cache=True)
-def _normalised(v):
-    length = max(math.sqrt(_dot(v, v)), 1e-9)
-    return v[0] / length, v[1] / length, v[2] / length
-
-
-@njit(cache=True)
-def _turned(m, v):
-    """``m @ v``"""
-    return (
-        m[0, 0] * v[0] + m[0, 1] * v[1] + m[0, 2] * v[2],
-        m[1, 0] * v[0] + m[1, 1] * v[1] + m[1, 2] * v[2],
-        m[2, 0] * v[0] + m[2, 1] * v[1] + m[2, 2] * v[2],
-    )
-
-
-@njit(cache=True)
-def _turned_back(m, v):
-    """``m.T @ v``"""
-    return (
-        m[0, 0] * v[0] + m[1, 0] * v[1] + m[2, 0] * v[2],
-        m[0, 1] * v[0] + m[1, 1] * v[1] + m[2, 1] * v[2],
-        m[0, 2] * v[0] + m[1, 2] * v[1] + m[2, 2] * v[2],
-    )
-
-
-@njit(cache=True)
-def write_product(a, b, out):
-    """Write ``a @ b``, both (3, 3)."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
-
-
-@njit(cache=True)
-def _axes(left, up):
-    """Of a right-handed frame, forward, left and up: y along ``left``, z in the plane of ``up``."""
-    y = _normalised(left)
-    x = _normalised(_cross(y, up))
-    return x, y, _cross(x, y)
-
-
-@njit(cache=True)
-def write_rotation(axis, sine, cosine, rest, out):
-    """Write Rodrigues' rotation: ``sine`` times the cross product with ``axis``, ``cosine`` times the identity, and
-    ``rest`` times the outer product of ``axis`` with itself."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = rest * axis[i] * axis[j]
-        out[i, i] += cosine
-    out[0, 1] -= sine * axis[2]
-    out[0, 2] += sine * axis[1]
-    out[1, 0] += sine * axis[2]
-    out[1, 2] -= sine * axis[0]
-    out[2, 0] -= sine * axis[1]
-    out[2, 1] += sine * axis[0]
-
-
-@njit(cache=True)
-def write_swing(a, b, out):
-    """Write the smallest rotation (3, 3) that turns direction ``a`` into ``b``."""
-    a, b = _normalised(a), _normalised(b)
-    cosine = _dot(a, b)
-    if cosine < -1.0 + 1e-8:  # opposite directions have no smallest rotation: any half turn will do
-        other = (1.0, 0.0, 0.0) if abs(a[0]) < 0.9 else (0.0, 1.0, 0.0)
-        write_rotation(_normalised(_cross(a, other)), 0.0, -1.0, 2.0, out)
-    else:
-        write_rotation(_cross(a, b), 1.0, cosine, 1.0 / (1.0 + cosine), out)
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# A frame
-
-
 @njit(cache=True)
 def _write_rest(offsets, rest):
     """Write where the joints (22, 3) of the rest pose are, on these bones."""
@@ -284,11 +194,11 @@ def _write_rest(offsets, rest):
 def _pelvis(p, seen, rest):
     """The pelvis: seen, between the hips, or upright below the highest part of the trunk seen."""
     if seen[0]:
-        return _at(p, 0)
+        return point(p, 0)
     for k in range(len(_BELOW)):
         if seen[_BELOW[k, 0]] and seen[_BELOW[k, 1]]:
-            place = _middle(p, _BELOW[k])
-            return place[0], place[1], place[2] - _middle(rest, _BELOW[k])[2]
+            place = middle_of(p, _BELOW[k])
+            return place[0], place[1], place[2] - middle_of(rest, _BELOW[k])[2]
     return 0.0, 0.0, 0.0
 
 
@@ -301,11 +211,12 @@ def _write_trunk(which, p, seen, rest, here, above, out):
         for m in range(len(_PART_UP[which])):
             a, b = _PART_UP[which, m]
             if seen[left] and seen[right] and seen[a] and seen[b]:
-                shown = _axes(_less(_at(p, left), _at(p, right)), _less(_middle(p, (a, b)), here))
-                resting = _axes(
-                    _less(_at(rest, left), _at(rest, right)), _less(_middle(rest, (a, b)), _at(rest, joint))
+                shown = frame_axes(difference(point(p, left), point(p, right)), difference(middle_of(p, (a, b)), here))
+                resting = frame_axes(
+                    difference(point(rest, left), point(rest, right)),
+                    difference(middle_of(rest, (a, b)), point(rest, joint)),
                 )
-                x, y, z = _turned_back(above, shown[0]), _turned_back(above, shown[1]), _turned_back(above, shown[2])
+                x, y, z = rotated_back(above, shown[0]), rotated_back(above, shown[1]), rotated_back(above, shown[2])
                 for i in range(3):
                     for j in range(3):
                         out[i, j] = x[i] * resting[0][j] + y[i] * resting[1][j] + z[i] * resting[2][j]
@@ -322,14 +233,14 @@ def _constrain(positions, offsets, mobility, length_variance):
         p, yields, compliance = positions[frame], mobility[frame], length_variance[frame]
         _write_rest(offsets[frame], rest)
         for k in range(len(RIGID)):
-            bone = _less(_at(rest, RIGID[k, 0]), _at(rest, RIGID[k, 1]))
-            length[k] = math.sqrt(_dot(bone, bone))
+            bone = difference(point(rest, RIGID[k, 0]), point(rest, RIGID[k, 1]))
+            length[k] = math.sqrt(dot(bone, bone))
             force[k] = 0.0
         for _ in range(_SWEEPS):
             for k in range(len(RIGID)):
                 a, b = RIGID[k]
-                apart = _less(_at(p, a), _at(p, b))
-                now = max(math.sqrt(_dot(apart, apart)), 1e-9)
+                apart = difference(point(p, a), point(p, b))
+                now = max(math.sqrt(dot(apart, apart)), 1e-9)
                 pull = (now - length[k] - compliance[k] * force[k]) / (yields[a] + yields[b] + compliance[k])
                 force[k] += pull
                 for i in range(3):
@@ -345,11 +256,11 @@ def _twist(joint, p, seen, above, turn, bone):
     middle, end = _AIM[joint, 0], _AIM[joint, 1]
     if not (seen[middle] and seen[end]):
         return 0.0
-    normal = _cross(bone, _normalised(_turned_back(above, _less(_at(p, end), _at(p, middle)))))
-    share = (math.sqrt(_dot(normal, normal)) - _BEND_NONE) / (_BEND_FULL - _BEND_NONE)
+    normal = cross(bone, normalised(rotated_back(above, difference(point(p, end), point(p, middle)))))
+    share = (math.sqrt(dot(normal, normal)) - _BEND_NONE) / (_BEND_FULL - _BEND_NONE)
     share = min(max(share, 0.0), 1.0)
-    hinge = _turned(turn, _at(_HINGE, joint))
-    angle = math.atan2(_dot(_cross(hinge, normal), bone), _dot(hinge, normal))
+    hinge = rotated(turn, point(HINGE, joint))
+    angle = math.atan2(dot(cross(hinge, normal), bone), dot(hinge, normal))
     return angle * share * share * (3.0 - 2.0 * share)
 
 
@@ -370,8 +281,8 @@ def _solve(positions, observed, offsets, local, placed, root_known):
                 above, here = upright, _pelvis(p, seen, rest)
             else:
                 above = world[PARENT[joint]]
-                bone = _turned(above, _at(bones, joint))
-                start = _at(placed[frame], PARENT[joint])
+                bone = rotated(above, point(bones, joint))
+                start = point(placed[frame], PARENT[joint])
                 here = (start[0] + bone[0], start[1] + bone[1], start[2] + bone[2])
             for i in range(3):
                 placed[frame, joint, i] = here[i]
@@ -381,9 +292,9 @@ def _solve(positions, observed, offsets, local, placed, root_known):
             for k in range(_AIM.shape[1]):
                 target = _AIM[joint, k]
                 if target >= 0 and seen[target]:
-                    direction = _turned_back(above, _less(_at(p, target), here))
-                    write_swing(_less(_at(rest, target), _at(rest, joint)), direction, turn)
-                    direction = _normalised(direction)
+                    direction = rotated_back(above, difference(point(p, target), here))
+                    write_swing(difference(point(rest, target), point(rest, joint)), direction, turn)
+                    direction = normalised(direction)
                     angle = _twist(joint, p, seen, above, turn, direction) if _HINGED[joint] else 0.0
                     write_rotation(direction, math.sin(angle), math.cos(angle), 1.0 - math.cos(angle), twist)
                     write_product(twist, turn, local[frame, joint])
@@ -402,7 +313,7 @@ def _place(local, offsets, placed):
                 world[0, i, j] = local[frame, 0, i, j]
         for joint in range(1, len(PARENT)):
             above = world[PARENT[joint]]
-            bone = _turned(above, _at(offsets[frame], joint))
+            bone = rotated(above, point(offsets[frame], joint))
             for i in range(3):
                 placed[frame, joint, i] = placed[frame, PARENT[joint], i] + bone[i]
             write_product(above, local[frame, joint], world[joint])

@@ -16,28 +16,28 @@ import math
 import numpy as np
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.inverse_kinematics import (
-    _HINGE,
-    _at,
-    _cross,
-    _dot,
-    _normalised,
-    _turned,
-    _turned_back,
+from steadypose.prior.body.inverse_kinematics import HINGE
+from steadypose.prior.body.kinematics import from_rotation_vectors, to_rotation_vectors
+from steadypose.prior.body.skeleton import CHILDREN, COLLARS, HIPS, PARENT, SHOULDERS, J
+from steadypose.prior.body.vectors import (
+    cross,
+    dot,
+    normalised,
+    point,
+    rotated,
+    rotated_back,
     write_product,
     write_rotation,
     write_swing,
 )
-from steadypose.prior.body.kinematics import from_rotation_vectors, to_rotation_vectors
-from steadypose.prior.body.skeleton import CHILDREN, COLLARS, HIPS, PARENT, SHOULDERS, J
 from steadypose.prior.compiled import njit
 from steadypose.prior.timing.rate import FPS
 
 TWIST_RANGE, TWIST_MEMORY_S = 0.3, 0.3
-"""Radians, the standard deviation of a twist that nothing shows, and seconds in which it returns to the middle."""
+"""Standard deviation of a twist that nothing shows, radians, and time in which it returns to the middle, seconds."""
 _TWIST_KEPT = math.exp(-1.0 / (TWIST_MEMORY_S * FPS))
 UNBENT = 0.2
-"""Metres: what a perfect joint errs about the plane in which knee or elbow bends, which is no perfect hinge."""
+"""Error of a perfect joint about the plane in which knee or elbow bends, which is no perfect hinge, metres."""
 
 LIMBS = len(HIPS) + len(SHOULDERS)
 _BALL = np.array([*HIPS, *SHOULDERS])
@@ -49,17 +49,18 @@ _SHORT = [J["spine2"], J["neck"], *COLLARS]
 _SHORT_END = [J["spine3"], J["head"], *SHOULDERS]
 
 TURN_RANGE = np.radians((3.0, 25.0, 16.0, 16.0))
-"""Radians about an axis, by which each of them turns about what is usual of a body, as a standard deviation."""
+"""Standard deviations about an axis by which each of them turns about what is usual of a body, radians."""
 
 BODIES, TURN_MEMORY_S = math.radians(20.0), 60.0
-"""Radians about an axis, by which what is usual differs between bodies, and seconds in which it is forgotten."""
+"""Standard deviation about an axis by which what is usual differs between bodies, radians, and time in which it is
+forgotten, seconds."""
 _TURN_KEPT = math.exp(-1.0 / (TURN_MEMORY_S * FPS))
 
 CORRELATED = 60.0
-"""Frames that count as one in the estimate of what is usual, as noise and posture last."""
+"""Number of frames that count as one in the estimate of what is usual, as noise and posture last."""
 
 MAX_SIGMA = 0.5
-"""Metres: standard deviation of a joint that is not known."""
+"""Standard deviation of a joint that is not known, metres."""
 _LEAST_LENGTH = 0.03  # metres, of a bone
 
 
@@ -90,19 +91,19 @@ def _follow(orientations, offsets, sigma, state):
         world, bones = orientations[row], offsets[row]
         for limb in range(LIMBS):
             ball, middle, end = _BALL[limb], _MIDDLE[limb], _END[limb]
-            upper = _normalised(_turned(world[ball], _at(bones, middle)))
-            lower = _normalised(_turned(world[middle], _at(bones, end)))
+            upper = normalised(rotated(world[ball], point(bones, middle)))
+            lower = normalised(rotated(world[middle], point(bones, end)))
             above = world[PARENT[ball]]
-            write_swing(_at(bones, middle), _turned_back(above, upper), swing)
+            write_swing(point(bones, middle), rotated_back(above, upper), swing)
             write_product(above, swing, turn)
-            normal = _cross(upper, lower)
-            bent = math.sqrt(_dot(normal, normal))
-            hinge = _turned(turn, _at(_HINGE, ball))
-            shown = math.atan2(_dot(_cross(hinge, normal), upper), _dot(hinge, normal))
+            normal = cross(upper, lower)
+            bent = math.sqrt(dot(normal, normal))
+            hinge = rotated(turn, point(HINGE, ball))
+            shown = math.atan2(dot(cross(hinge, normal), upper), dot(hinge, normal))
             square = 0.0
             for joint in (ball, middle, end):
                 square = max(square, min(sigma[row, joint], 1.0) ** 2)
-            across = math.sqrt(_dot(_at(bones, end), _at(bones, end))) * bent
+            across = math.sqrt(dot(point(bones, end), point(bones, end))) * bent
             noise = 2.0 * square / max(across * across, 1e-8) + (UNBENT / max(bent, 1e-3)) ** 8
             angle, variance = state[row, limb]
             angle, variance = _TWIST_KEPT * angle, _TWIST_KEPT**2 * variance + (1.0 - _TWIST_KEPT**2) * TWIST_RANGE**2
@@ -118,7 +119,7 @@ def _follow(orientations, offsets, sigma, state):
             write_rotation(upper, math.sin(angle), math.cos(angle), 1.0 - math.cos(angle), twist)
             write_product(twist, turn, world[ball])
             # knee and elbow swing from the upper bone as it is turned now, and carry what hangs on them
-            write_swing(_at(bones, end), _turned_back(world[ball], lower), swing)
+            write_swing(point(bones, end), rotated_back(world[ball], lower), swing)
             write_product(world[ball], swing, world[middle])
             last = _CHAIN_END[limb]
             for i in range(3):
@@ -127,8 +128,8 @@ def _follow(orientations, offsets, sigma, state):
                     for k in range(3):
                         turn[i, j] += before[1, k, i] * before[2, k, j]
             if last >= 0:
-                toe = _turned(before[2], _at(bones, last))
-                write_swing(_at(bones, last), _turned_back(world[middle], toe), turn)
+                toe = rotated(before[2], point(bones, last))
+                write_swing(point(bones, last), rotated_back(world[middle], toe), turn)
             write_product(world[middle], turn, world[end])
             if last >= 0:
                 for i in range(3):

@@ -11,8 +11,6 @@ import numpy as np
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.clean.bones import BiasEstimator, PersonEstimator, SensorBias
-from steadypose.prior.clean.correct import Correct
-from steadypose.prior.clean.depth_error import DepthError
 from steadypose.prior.clean.frame import CleanFrame, Gated, Imputed, Observation, Person, Score, SensorNoise
 from steadypose.prior.clean.fuse import Fuse
 from steadypose.prior.clean.gate import Gate
@@ -22,6 +20,7 @@ from steadypose.prior.clean.occluded import Track
 from steadypose.prior.clean.reconstruct import Denoise, Reconstruct
 from steadypose.prior.clean.rotations import Orient, Refine
 from steadypose.prior.clean.score import Scorer
+from steadypose.prior.clean.sensor_error import Correct, DepthError
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.timing.kalman import Smoothed
@@ -159,6 +158,7 @@ class CleanCore:
         """Forget the bodies in these slots (S,)."""
         for stage in self._stages:
             stage.forget(slot)
+        self._unpublished[slot] = 0
         if self._newest is not None:
             self._newest = self._newest._replace(present=self._newest.present & ~slot)
 
@@ -175,7 +175,6 @@ class CleanCore:
         invalid = self._unpublished > UNPUBLISHED_S * FPS
         if invalid.any():
             self._counters["body_begun_anew"] += int(invalid.sum())
-            self._unpublished[invalid] = 0
             self.forget(invalid)
 
     def _fused(self, smoothed: Smoothed, newest: _Newest, back: int) -> CleanFrame:

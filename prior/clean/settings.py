@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 from steadypose.prior.clean.bones import PersonSettings
-from steadypose.prior.clean.correct import CorrectSettings
 from steadypose.prior.clean.fuse import FuseSettings
 from steadypose.prior.clean.gate import GateSettings
 from steadypose.prior.clean.identify import IdentifySettings
@@ -16,6 +15,7 @@ from steadypose.prior.clean.impute import ImputeSettings
 from steadypose.prior.clean.reconstruct import DenoiseSettings, ReconstructSettings
 from steadypose.prior.clean.rotations import OrientSettings, RefineSettings
 from steadypose.prior.clean.score import ScoreSettings
+from steadypose.prior.clean.sensor_error import CorrectSettings
 from steadypose.prior.settings import build_settings, check_range, current_keys
 
 logger = logging.getLogger(__name__)

@@ -1,5 +1,6 @@
-"""CMU's motion capture where topology alone (`prior.body.rigs`) does not tell the skeleton: its own, and its commonest
-conversion, which has lost bones; and clips of the latter as exponential maps.
+"""CMU's motion capture: Acclaim skeletons (.asf) and their motion (.amc), as the Graphics Lab distributes them; rigs
+where topology alone (`prior.body.rigs`) does not tell the skeleton: its own, and its commonest conversion, which has
+lost bones; and clips of the latter as exponential maps.
 
 Training needs complete bodies, so the tables place the joints that a file lacks within a bone that is there, at the
 height the rest skeleton has them. Figures in comments are centimetres above the hips, where the rest skeleton has
@@ -9,7 +10,8 @@ pelvis 7.5, spine1 18.5, spine2 31.5, spine3 37.5, collar 48.5, shoulder 51.5, n
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import IO
 
 import numpy as np
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.prior.body.rigs import UNITS, Rig, collar, skeleton
-from steadypose.prior.mocap.clip import forward
+from steadypose.prior.mocap.clip import MotionError, documented, forward
 from steadypose.prior.npz import open_npz
 
 # Joints are the far ends of bones. root 10, lowerback 22, upperback 33, thorax 45 (where the clavicles start, 5
@@ -80,6 +82,9 @@ CMU_BVH = Rig(
     lost_bones={"Neck": 1.0, "LeftShoulder": 1.0, "RightShoulder": 1.0, "LeftFingerBase": 0.5, "RightFingerBase": 0.5},
 )
 
+INCH = 0.0254
+"""Length of an inch, metres: an ASF gives lengths in inches times its ``length`` unit."""
+
 
 def read_expmap(file: IO[bytes]) -> Iterator[tuple[float, str, float, NDArray[np.float64]]]:
     """CMU clips as root translations and exponential maps (``cmu_expmap.npz``).
@@ -107,3 +112,181 @@ def read_expmap(file: IO[bytes]) -> Iterator[tuple[float, str, float, NDArray[np
             steps = np.tile(offsets, (len(values), 1, 1))
             steps[:, 0] = values[:, :3] * UNITS["CMU"]
             yield done / len(names), name, fps, forward(parents, steps, local)[0][:, wanted]
+
+
+@dataclass(frozen=True)
+class Asf:
+    """An Acclaim skeleton. A joint here is the *far end* of the bone whose name it carries; ``root`` is first.
+
+    Attributes:
+        joints: ``root`` and the bones, parents first.
+        parents: index of each joint's parent; -1 for the root.
+        offsets: (J, 3) metres in the skeleton's own axes (y up), from the parent in the pose with all angles 0.
+        axes: (J, 3, 3) the frame in which each bone's angles turn.
+        freedoms: the angles each bone has, such as ``('rx', 'rz')``; for the root all six in the file's order.
+        metres: the size of the file's unit.
+    """
+
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    freedoms: tuple[tuple[str, ...], ...]
+    metres: float
+
+
+@dataclass
+class _Bone:
+    offset: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    freedoms: tuple[str, ...]
+
+
+@documented
+def read_asf(text: str) -> Asf:
+    """Read an Acclaim skeleton.
+
+    Raises:
+        MotionError: a section is missing or cannot be read.
+    """
+    sections = _sections(text)
+    for name in ("units", "root", "bonedata", "hierarchy"):
+        if name not in sections:
+            raise MotionError(f"expected a section ':{name}' in the skeleton, found {sorted(sections)}")
+    units = _entries(sections["units"])
+    root = _entries(sections["root"])
+    if units.get("angle") != ["deg"]:
+        raise MotionError(f"expected angles in degrees, found {units.get('angle')}")
+    metres = INCH / _floats(units.get("length", ["1"]))[0]
+    order = tuple(o.lower() for o in root.get("order", []))
+    if sorted(order) != ["rx", "ry", "rz", "tx", "ty", "tz"]:
+        raise MotionError(f"expected a root with six freedoms, found {order}")
+    turned = _floats(root.get("orientation", ["0"] * 3))
+    bones = {"root": _Bone(np.zeros(3), _axis(turned, root.get("axis", ["XYZ"])[0]), order)}
+    bones |= _bones(sections["bonedata"], metres)
+
+    joints, parents = ["root"], [-1]
+    for line in sections["hierarchy"]:
+        parent, *children = line.split()
+        if parent in ("begin", "end"):
+            continue
+        if parent not in joints or not bones.keys() >= set(children):
+            raise MotionError(f"the hierarchy names a bone not known before it: '{line.strip()}'")
+        joints += children
+        parents += [joints.index(parent)] * len(children)
+    return Asf(
+        joints=tuple(joints),
+        parents=tuple(parents),
+        offsets=np.array([bones[j].offset for j in joints]),
+        axes=np.array([bones[j].axis for j in joints]),
+        freedoms=tuple(bones[j].freedoms for j in joints),
+        metres=metres,
+    )
+
+
+@documented
+def read_amc(text: str, skeleton: Asf) -> NDArray[np.float64]:
+    """Read an Acclaim motion.
+
+    Args:
+        text: the file's contents. It does not tell its frame rate; CMU's are 120 Hz.
+        skeleton: of the same subject.
+
+    Returns:
+        (T, J, 3) metres, the skeleton's axes (y up in CMU's).
+
+    Raises:
+        MotionError: it is no AMC, or its bones are not the skeleton's.
+    """
+    angles = _frames(text)
+    frames = len(angles["root"]) if "root" in angles else 0
+    if not frames:
+        raise MotionError("expected frames that move 'root', found none")
+    count = len(skeleton.joints)
+    steps = np.empty((frames, count, 3))
+    local = np.empty((frames, count, 3, 3))
+    for j, (name, freedoms) in enumerate(zip(skeleton.joints, skeleton.freedoms, strict=True)):
+        values = angles.get(name, np.zeros((frames, 0)))
+        if values.shape != (frames, len(freedoms)):
+            raise MotionError(f"bone '{name}': expected {len(freedoms)} angles a frame, got {values.shape[1]}")
+        at = {freedom: values[:, i] for i, freedom in enumerate(freedoms)}
+        zero = np.zeros(frames)
+        degrees = np.stack([at.get(f"r{a}", zero) for a in "xyz"], axis=-1)
+        turn = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+        axis = skeleton.axes[j]
+        local[:, j] = axis @ turn @ axis.T
+        if name == "root":
+            steps[:, j] = np.stack([at[f"t{a}"] for a in "xyz"], axis=-1) * skeleton.metres
+        else:
+            # A bone turns about its near end, so its own rotation already moves its far end.
+            steps[:, j] = local[:, j] @ skeleton.offsets[j]
+    return forward(skeleton.parents, steps, local)[0]
+
+
+def _sections(text: str) -> dict[str, list[str]]:
+    sections: dict[str, list[str]] = {}
+    lines: list[str] = []
+    for line in text.splitlines():
+        if line.startswith(":"):
+            name, *rest = line[1:].split(maxsplit=1)
+            lines = sections.setdefault(name.lower(), list(rest))
+        elif line.strip() and not line.startswith("#"):
+            lines.append(line)
+    return sections
+
+
+def _entries(lines: list[str]) -> dict[str, list[str]]:
+    return {words[0].lower(): words[1:] for line in lines if (words := line.split())}
+
+
+def _floats(words: list[str]) -> list[float]:
+    try:
+        return [float(w) for w in words]
+    except ValueError as error:
+        raise MotionError(f"expected numbers in the skeleton, found '{' '.join(words)}'") from error
+
+
+def _axis(degrees: list[float], order: str) -> NDArray[np.float64]:
+    # 'XYZ' turns about the fixed x axis first: lower case in scipy.
+    return Rotation.from_euler(order.lower(), degrees, degrees=True).as_matrix()
+
+
+def _bones(lines: list[str], metres: float) -> dict[str, _Bone]:
+    bones: dict[str, _Bone] = {}
+    for block in "\n".join(lines).split("begin")[1:]:
+        entry = _entries(block.splitlines())
+        try:
+            direction = np.array(_floats(entry["direction"]))
+            *degrees, order = entry["axis"]
+            bones[entry["name"][0]] = _Bone(
+                offset=direction * _floats(entry["length"])[0] * metres,
+                axis=_axis(_floats(degrees), order),
+                freedoms=tuple(f.lower() for f in entry.get("dof", [])),
+            )
+        except (KeyError, ValueError, IndexError) as error:
+            raise MotionError(f"a bone cannot be read ({error}): '{' '.join(block.split())[:80]}'") from error
+    return bones
+
+
+def _frames(text: str) -> Mapping[str, NDArray[np.float64]]:
+    """For each bone, its numbers (T, D). All frames must move the same bones in the same order."""
+    lines = [s for line in text.splitlines() if (s := line.strip()) and s[0] not in "#:"]
+    starts = [i for i, line in enumerate(lines) if line.isdigit()]
+    if not starts or starts[0] != 0:
+        raise MotionError("expected frames, each opened by its number")
+    height = (starts[1] if len(starts) > 1 else len(lines)) - starts[0]
+    if len(lines) != height * len(starts):
+        raise MotionError(f"expected {height - 1} bones in each of {len(starts)} frames; the file is cut or mixed")
+    return dict(_columns(lines, height))
+
+
+def _columns(lines: list[str], height: int) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    for row in range(1, height):
+        words = [line.split() for line in lines[row::height]]
+        name, width = words[0][0], len(words[0])
+        if any(w[0] != name or len(w) != width for w in words):
+            raise MotionError(f"expected bone '{name}' in the same place in every frame")
+        try:
+            yield name, np.array([w[1:] for w in words], dtype=np.float64).reshape(len(words), width - 1)
+        except ValueError as error:
+            raise MotionError(f"bone '{name}': {error}") from error

@@ -8,14 +8,21 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from steadypose.prior.models.contacts import Contacts
-from steadypose.prior.world.contacts import ContactMemory, ContactNetwork, Stance, stance
 from steadypose.prior.world.feet import Feet, FeetState
 from steadypose.prior.world.filter import RootFilter, RootState
 from steadypose.prior.world.floor import Floor
 from steadypose.prior.world.kalman import BodyNoise
+from steadypose.prior.world.networks import (
+    ContactMemory,
+    ContactNetwork,
+    MotionMemory,
+    RootVelocity,
+    Stance,
+    VelocityNetwork,
+    stance,
+)
 from steadypose.prior.world.observe import BodyObservation
 from steadypose.prior.world.settings import TrajectorySettings
-from steadypose.prior.world.velocity import MotionMemory, RootVelocity, VelocityNetwork
 
 _NO_STANCE = Stance(np.zeros(4), np.zeros(4))
 

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import limbs
-from steadypose.prior.world.contacts import Stance
 from steadypose.prior.world.floor import SOLE_SIGMA, STANDING, Floor
 from steadypose.prior.world.kalman import BodyFilter, BodyNoise
+from steadypose.prior.world.networks import RootVelocity, Stance
 from steadypose.prior.world.observe import FEET, SOLE, BodyObservation
-from steadypose.prior.world.velocity import RootVelocity
 
 Sigma = TypeVar("Sigma", float, NDArray[np.float64])
 

@@ -17,12 +17,12 @@ os.environ.setdefault("DEPTHAI_LEVEL", "error")
 
 import depthai as dai
 
+from steadypose.benchmarks.depth_camera import Stereo, render, room
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.sources.oak_device import Host
 from steadypose.nodes.sources.source import OakSettings
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.sim.depth import Stereo, render, room
 
 CAMERA = Stereo()
 NETWORK_SIZE = (512, 288)

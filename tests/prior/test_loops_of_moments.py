@@ -10,10 +10,10 @@ from tests.helpers.bodies import waving
 from tests.helpers.values import gated
 
 from steadypose.prior.body.skeleton import PARENTS, REST_POSITIONS
-from steadypose.prior.clean import depth_error, reconstruct
-from steadypose.prior.clean.depth_error import DepthError
+from steadypose.prior.clean import reconstruct, sensor_error
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.reconstruct import Denoise
+from steadypose.prior.clean.sensor_error import DepthError
 from steadypose.prior.models import posture
 from steadypose.prior.models.mixture import whiteness
 from steadypose.prior.models.mixture.whiteness import Whiteness
@@ -69,27 +69,27 @@ def test_whiteness_is_the_median_over_bones_of_von_neumanns_ratio(seed: int, mis
 def test_errors_along_a_direction_are_those_of_a_least_squares_fit(seed: int, missing: float) -> None:
     rng = np.random.default_rng(seed)
     frames, found = observed(rng, missing), DepthError(SLOTS)
-    sigmas = rng.uniform(0.0, 1.2 * depth_error.MAX_SIGMA, frames.shape[:3])
+    sigmas = rng.uniform(0.0, 1.2 * sensor_error.MAX_SIGMA, frames.shape[:3])
     rows: list[list[tuple[Floats, float, int]]] = [[] for _ in range(SLOTS)]
     count, mean = np.zeros((2, SLOTS, 21))
     left_out = np.zeros(SLOTS)
     for t, frame in enumerate(frames):
         left_out = found.update(Smoothed(t / FPS, frame, sigmas[t]), np.zeros(SLOTS))
         bones, ends = bones_of(frame), np.maximum(sigmas[t][:, 1:], sigmas[t][:, list(PARENTS[1:])])
-        for slot, bone in np.argwhere(np.isfinite(bones[..., 0]) & (ends < depth_error.MAX_SIGMA)):
+        for slot, bone in np.argwhere(np.isfinite(bones[..., 0]) & (ends < sensor_error.MAX_SIGMA)):
             at, length = (slot, bone), float(np.linalg.norm(bones[slot, bone]))
             count[at] += 1
             mean[at] += (length - mean[at]) / count[at]
-            residual = min((length - mean[at]) ** 2, depth_error.MAX_RESIDUAL**2)
+            residual = min((length - mean[at]) ** 2, sensor_error.MAX_RESIDUAL**2)
             x, y, z = bones[at] / length
             direction = np.array([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z])
             rows[slot].append((direction, 0.5 * residual, t))
     for slot in range(SLOTS):
-        forgotten = np.array([(1 - 1 / depth_error.MEMORY) ** (FRAMES - 1 - t) for _, _, t in rows[slot]])
+        forgotten = np.array([(1 - 1 / sensor_error.MEMORY) ** (FRAMES - 1 - t) for _, _, t in rows[slot]])
         directions = np.array([direction for direction, _, _ in rows[slot]]).reshape(-1, 6)
         squares = np.array([square for _, square, _ in rows[slot]])
         total = forgotten.sum()
-        ridge = depth_error.RIDGE * total + depth_error.PRIOR * 21
+        ridge = sensor_error.RIDGE * total + sensor_error.PRIOR * 21
         isotropic = ridge * (forgotten @ squares) / max(total, 1.0)
         normal = (directions.T * forgotten) @ directions + ridge * np.diag([1.0, 1, 1, 2, 2, 2])
         form = np.linalg.solve(
@@ -97,7 +97,7 @@ def test_errors_along_a_direction_are_those_of_a_least_squares_fit(seed: int, mi
         )
         a, b, c, d, e, f = form
         values = np.linalg.eigvalsh([[a, d, e], [d, b, f], [e, f, c]])
-        np.testing.assert_allclose(left_out[slot] ** 2, depth_error.LEFT_OUT * (values[2] - values[1]), atol=1e-12)
+        np.testing.assert_allclose(left_out[slot] ** 2, sensor_error.LEFT_OUT * (values[2] - values[1]), atol=1e-12)
 
 
 @settings(deadline=None, max_examples=20)

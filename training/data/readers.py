@@ -14,10 +14,9 @@ import numpy as np
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import CANONICAL, Skeleton, to_canonical
 from steadypose.prior.body.rigs import Rig, RigError, up_axis
-from steadypose.prior.mocap.amc import Asf, read_amc, read_asf
 from steadypose.prior.mocap.bvh import Bvh, read_bvh
 from steadypose.prior.mocap.clip import TO_Z_UP, Clip, MotionError
-from steadypose.prior.mocap.cmu import CMU_AMC
+from steadypose.prior.mocap.cmu import CMU_AMC, Asf, read_amc, read_asf
 from steadypose.prior.mocap.files import SUFFIXES, UNDESCRIBED, Description, file_rig, read_motion
 
 REST_POSE_SPEED = 30.0

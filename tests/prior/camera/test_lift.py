@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from steadypose.benchmarks.depth_camera import Stereo, corrupt, render, room
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
 from steadypose.prior.camera.depth_lifting import MIN_CONFIDENCE, lift
-from steadypose.prior.sim.depth import Stereo, corrupt, render, room
 
 CAMERA = Stereo()
 K = {name: index for index, name in enumerate(COCO17.joints)}

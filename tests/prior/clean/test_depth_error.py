@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.helpers.bodies import waving
 
-from steadypose.prior.clean.depth_error import DepthError
+from steadypose.prior.clean.sensor_error import DepthError
 from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS

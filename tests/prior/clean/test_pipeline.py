@@ -1,5 +1,6 @@
 import dataclasses
 import sys
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -13,8 +14,10 @@ from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.clean import core
+from steadypose.prior.clean.frame import Observation
 from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
 from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.timing.rate import FPS
 
 
 def clean(messages: list[PoseRaw], **settings) -> tuple[list[PoseClean], PriorPipeline]:
@@ -344,3 +347,16 @@ def test_the_noise_of_the_sensor_is_found(sigma: float) -> None:
     assert found is not None
     assert found.jitter_sigma == pytest.approx(sigma, rel=0.4, abs=0.002)
     assert found.bias_sigma < 0.006
+
+
+def test_a_body_does_not_inherit_how_long_the_one_before_in_its_slot_went_unpublished() -> None:
+    counters: Counter[str] = Counter()
+    stages, half = core.CleanCore(PriorSettings(delay=0, max_bodies=1), counters), round(0.6 * core.UNPUBLISHED_S * FPS)
+    everybody = np.ones(1, dtype=bool)
+    for t, positions in enumerate(waving(2 * half)):
+        if t == half:
+            stages.forget(everybody)
+        frame = stages.step(Observation(t / FPS, positions[None], np.ones((1, 22)), everybody, np.zeros(3)))
+        assert frame is not None
+        stages.note_published(frame, published=())
+    assert counters["body_begun_anew"] == 0

@@ -17,9 +17,9 @@ from numpy.lib import format as npy
 from tests.helpers.motion_files import AMC, ASF, BVH, amass
 
 from steadypose.prior import npz
-from steadypose.prior.mocap.amc import read_amc, read_asf
 from steadypose.prior.mocap.bvh import read_bvh
 from steadypose.prior.mocap.clip import MotionError
+from steadypose.prior.mocap.cmu import read_amc, read_asf
 from steadypose.prior.mocap.files import read_amass
 from steadypose.prior.npz import check_arrays
 

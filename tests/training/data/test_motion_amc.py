@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from tests.training.data.test_motion_bvh import turn
 
-from steadypose.prior.mocap.amc import read_amc, read_asf
 from steadypose.prior.mocap.clip import MotionError
+from steadypose.prior.mocap.cmu import read_amc, read_asf
 
 ASF = """# comment
 :version 1.10

@@ -1,4 +1,5 @@
-"""Estimate, from bones, of how much more a sensor errs along one direction: its line of sight.
+"""Systematic errors of sensors: the correct stage, which subtracts a known sensor's from the observed joints, and the
+estimate, from bones, of how much more an unknown one errs along one direction: its line of sight.
 
 No filter averages out what lasts, so the smoother's deviations leave part of it out: of simulated monocular estimators,
 whose errors lie in depth, they are 1.7 to 2.1 times too small. But errors in depth vary the lengths of bones that point
@@ -10,23 +11,30 @@ second says how much is left out; where the camera is, need not be known.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from steadypose.prior.arrays import Bools, Floats
-from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.body.skeleton import PARENTS, finite_joints
+from steadypose.prior.clean.frame import Gated
+from steadypose.prior.clean.history import Ring
 from steadypose.prior.compiled import njit
-from steadypose.prior.timing.kalman import Smoothed
+from steadypose.prior.models.sensor_bias import HISTORY, SMOOTHER_DENSITY, LiveCorrection, features, recall, trunk_frame
+from steadypose.prior.timing.kalman import ConstantVelocityFilter, Smoothed
 from steadypose.prior.timing.rate import FPS
 
+FADE = 0.9
+"""Decay per frame of the last correction while none can be computed, because the trunk is hidden."""
+
 MEMORY = round(10.0 * FPS)
-"""Frames of the running means."""
+"""Number of frames of the running means of bones' lengths."""
 
 PRIOR, RIDGE = 8.0, 0.05
-"""Frames, and share of all frames, that count as isotropic: bodies that stand show few directions."""
+"""Number of frames, and share of all frames, that count as isotropic: bodies that stand show few directions."""
 
 MAX_SIGMA, MAX_RESIDUAL = 0.05, 0.05
-"""Metres: joints of a larger standard deviation do not count for lengths, and larger residuals as this."""
+"""Largest standard deviation of a joint that counts for lengths, and bound of their residuals, metres."""
 
 LEFT_OUT = 3.0
 """Variance along an axis that is left out, relative to the difference of the eigenvalues: what lasts longer than the
@@ -37,6 +45,51 @@ _ENTRIES = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 """Of the symmetric matrix, in the vector of its six different entries."""
 _ISOTROPIC = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 _TWICE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+
+
+@dataclass(frozen=True)
+class CorrectSettings:
+    """Settings of the correct stage.
+
+    Attributes:
+        sensor: ``kinect_v2``, or empty for a sensor whose error is not known. A property of the sensor, not of its
+            joint layout: another camera with the same joints has other errors.
+    """
+
+    sensor: str = ""
+
+
+class Correct:
+    """Adds `CorrectionNet`'s correction to each observed joint, without delay."""
+
+    def __init__(self, settings: CorrectSettings, slots: int) -> None:
+        self._net = LiveCorrection.load(settings.sensor, slots)
+        self._smoother = ConstantVelocityFilter(SMOOTHER_DENSITY)
+        self._history = Ring(HISTORY[-1] + 1, (slots, 22, 3))
+        self._correction = np.zeros((slots, 22, 3))
+
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
+        if slot.all():
+            self._smoother.reset()  # a new stream: its stamps may be earlier
+        self._smoother.forget(np.repeat(slot[:, None], 22, axis=1))
+        self._history.clear(slot)
+        self._correction[slot] = 0.0
+
+    def update(self, gated: Gated) -> Gated:
+        """The newest frame, corrected."""
+        newest, observation = gated.positions, gated.observation
+        smoothed = self._smoother.update(newest, observation.stamp_s)
+        self._history.push(np.where(finite_joints(newest)[..., None], smoothed.positions, np.nan))
+        slots = np.flatnonzero(observation.present)
+        history = recall(self._history.all[:, slots])
+        frames = trunk_frame(history[0])
+        known = np.isfinite(frames).all(axis=(1, 2))
+        self._correction[slots[~known]] *= FADE
+        if known.any():
+            x = features(history[:, known], observation.sensor_position)
+            self._correction[slots[known]] = self._net(x) @ frames[known].swapaxes(-1, -2)
+        return replace(gated, positions=newest + self._correction)
 
 
 class DepthError:

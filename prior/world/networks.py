@@ -1,0 +1,185 @@
+"""What recurrent networks predict of bodies in the world: root velocity from a body's own motion (the task of HM-VAE,
+section 3.3), and contacts: what bears load, what rests, and which feet may hold a root.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from steadypose.prior.arrays import Floats
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
+from steadypose.prior.body.skeleton import REST_POSITIONS
+from steadypose.prior.models.contacts import Contacts, LiveContacts, contact_features
+from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity, velocity_features
+from steadypose.prior.world.floor import Floor
+from steadypose.prior.world.observe import FEET, BodyObservation
+
+CAMERA_ERROR, CAMERA_MEMORY_S = 1.2, 0.3
+"""Ratio of the velocity's error on poses from a camera to validation's on motion capture, and the least time constant
+of it, seconds: chosen by how far hidden roots of validation people stray; on simulated streams half of an error was
+still there after 0.5 s."""
+
+SCALE_FACTOR_ERROR = 0.2
+"""Standard deviation of the predicted speed's scale factor, which the network does not state."""
+
+MOVED_SIGMAS = 3.0
+"""Distance between a standing foot and where it is observed from which on it has evidently moved, standard
+deviations: it stands anew."""
+
+_FOOT_CONTACTS = [CONTACT_JOINTS.index(joint) for joint in FEET]
+
+
+class RootVelocity(NamedTuple):
+    """A body's root velocity as predicted, in the world.
+
+    Attributes:
+        velocity: (3,) m/s.
+        sigma: (3,) m/s, standard deviation, as validation measured it.
+    """
+
+    velocity: Floats
+    sigma: Floats
+
+
+class MotionMemory:
+    """What is kept of a body from frame to frame: its joints, and the network's state (hidden,)."""
+
+    def __init__(self, hidden: int) -> None:
+        self._hidden = hidden
+        self.local: Floats | None = None
+        self.state = np.zeros(hidden, dtype=np.float32)
+
+    def update(self, observed: BodyObservation) -> tuple[Floats, Floats, float]:
+        """Joints (22, 3) metres from the root, world axes, those of the frame before, and seconds between them.
+
+        Motion begins anew after a gap. A joint without a position stays where it last was from the root.
+        """
+        before = self.local
+        last = REST_POSITIONS @ yaw_matrix(observed.yaw).T if before is None else before
+        local = observed.positions - observed.positions[0]
+        self.local = local = np.where(np.isfinite(local), local, last)
+        if before is None or observed.after_gap:
+            self.state = np.zeros(self._hidden, dtype=np.float32)
+            return local, local, FRAME_S
+        return local, last, max(observed.dt, FRAME_S)
+
+
+class VelocityNetwork:
+    """Predicts the root velocity of all bodies of a message at once.
+
+    Args:
+        weights: the weight set, or a path to a ``.safetensors`` file.
+
+    Attributes:
+        memory_s: (3,) seconds, time constants of the velocity's errors.
+    """
+
+    def __init__(self, weights: str) -> None:
+        self._net = LiveRootVelocity.load(weights)
+        config, horizontal_first = self._net.config, [0, 0, 1]
+        self._scale = CAMERA_ERROR * np.array(config.sigma_scale)[horizontal_first]
+        self.memory_s = np.maximum(np.array(config.correlation_s)[horizontal_first] / 2.0, CAMERA_MEMORY_S)
+
+    def memory(self) -> MotionMemory:
+        """That of a new body."""
+        return MotionMemory(self._net.config.hidden)
+
+    def update(self, memories: Sequence[MotionMemory], observed: Sequence[BodyObservation]) -> list[RootVelocity]:
+        """Of each body, by its memory, which takes in its observation."""
+        if not observed:
+            return []
+        parts = zip(*(memory.update(each) for memory, each in zip(memories, observed, strict=True)), strict=True)
+        local, before, dt = (np.array(part) for part in parts)
+        yaw = np.array([each.yaw for each in observed])
+        state = np.array([memory.state for memory in memories])
+        velocity, log_sigma, states = self._net(velocity_features(local, before, dt, yaw), state)
+        for memory, after in zip(memories, states, strict=True):
+            memory.state = after
+        variance = np.exp(2.0 * log_sigma)
+        variance[:, :2] = variance[:, :2].mean(axis=1, keepdims=True)  # the filter's noise must not know the heading
+        speed = np.linalg.norm(velocity[:, :2], axis=1, keepdims=True)
+        sigma = np.hypot(np.sqrt(variance) * self._scale, SCALE_FACTOR_ERROR * speed)
+        return [RootVelocity(yaw_matrix(o.yaw) @ v, s) for o, v, s in zip(observed, velocity, sigma, strict=True)]
+
+
+class Stance(NamedTuple):
+    """Feet that may hold the root.
+
+    Attributes:
+        load: (4,) probabilities that `FEET` bear load; 0 of those that may not hold it.
+        rest: (4,) that they stand still, likewise.
+    """
+
+    load: Floats
+    rest: Floats
+
+
+def stance(contacts: Contacts, observed: BodyObservation, feet_off: Floats) -> Stance:
+    """Which feet may hold a root.
+
+    Not those of a body without a root; nor those that nobody observed, if nobody observed the root; nor those that
+    were last ``feet_off`` (4,) standard deviations off, if that is too far.
+    """
+    holds = (observed.feet_observed | observed.root_observed) & (feet_off < MOVED_SIGMAS) & observed.root_known
+    return Stance(*(holds * p[_FOOT_CONTACTS].astype(np.float64) for p in (contacts.load, contacts.rest)))
+
+
+class ContactMemory:
+    """What is kept of a body from frame to frame: its last observation, and the network's state (hidden,)."""
+
+    def __init__(self, hidden: int) -> None:
+        self.observed: BodyObservation | None = None
+        self.state = np.zeros(hidden, dtype=np.float32)
+
+
+class ContactNetwork:
+    """Predicts the contacts of all bodies of a message at once.
+
+    Args:
+        weights: the weight set, or a path to a ``.safetensors`` file.
+    """
+
+    def __init__(self, weights: str) -> None:
+        self._net = LiveContacts.load(weights)
+
+    def memory(self) -> ContactMemory:
+        """That of a new body."""
+        return ContactMemory(self._net.hidden)
+
+    def update(
+        self, memories: Sequence[ContactMemory], observed: Sequence[BodyObservation], floor: Floor
+    ) -> list[Contacts]:
+        """Of each body: load (8,), rest (8,) and the state (hidden,) that its memory then keeps."""
+        if not observed:
+            return []
+        before, states, dt = [], [], []
+        for memory, now in zip(memories, observed, strict=True):
+            anew = memory.observed is None or now.after_gap
+            before.append(now if anew else memory.observed)
+            states.append(np.zeros_like(memory.state) if anew else memory.state)
+            dt.append(FRAME_S if anew else now.dt)
+        roots = [now.root_observed and last.root_observed for now, last in zip(observed, before, strict=True)]
+        features = contact_features(
+            np.array([now.positions for now in observed]), np.array([last.positions for last in before]),
+            np.array(dt), np.array([now.yaw for now in observed]), np.array([now.sigma for now in observed]),
+            root_seen=np.array(roots, dtype=float),
+            ground=np.array([_under(now, floor, known) for now, known in zip(observed, roots, strict=True)]),
+        )  # fmt: skip
+        contacts = [Contacts(*rows) for rows in zip(*self._net(features, np.array(states)), strict=True)]
+        for memory, now, after in zip(memories, observed, contacts, strict=True):
+            memory.observed, memory.state = now, after.state
+        return contacts
+
+
+def _under(observed: BodyObservation, floor: Floor, known: bool) -> Floats:
+    """(8,) metres, the height of what is under each contact joint: under a foot, or else under the lowest; NaN where
+    not ``known``."""
+    under = np.full(len(CONTACT_JOINTS), np.nan)
+    if known:
+        soles = observed.soles
+        under[:] = floor.under(soles[np.argmin(np.nan_to_num(soles[:, 2], nan=np.inf))])
+        under[_FOOT_CONTACTS] = np.fmax([floor.under(sole) for sole in soles], under[_FOOT_CONTACTS])
+    return under
