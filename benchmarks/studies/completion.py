@@ -31,7 +31,7 @@ from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.completer_features import read_window
 from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig
 from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tracks
-from steadypose.training.data.dataset import standardise
+from steadypose.training.data.hgvae_windows import standardise
 from steadypose.training.networks.hgvae import HGVAE
 
 DEPENDS_ON = (COMPLETE, "completer weights", "hgvae weights")

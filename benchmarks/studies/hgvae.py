@@ -24,7 +24,8 @@ from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig
 from steadypose.prior.models.hgvae.faults import Calibration, decimals
 from steadypose.prior.models.hgvae.features import to_tracks
 from steadypose.training.data.corruption import with_sensor_error
-from steadypose.training.data.dataset import Batch, MotionSet, Windows, standardise
+from steadypose.training.data.dataset import MotionSet
+from steadypose.training.data.hgvae_windows import Batch, Windows, standardise
 from steadypose.training.networks.graph import FaultNet, load_fault_net
 from steadypose.training.networks.hgvae import HGVAE
 from steadypose.training.recipes.hgvae import evidence
@@ -145,7 +146,7 @@ def _above(scores: Floats, limits: Floats) -> dict[str, float]:
     return {f"at_{rate:g}": float((scores > limit).mean()) for rate, limit in zip(RATES, limits, strict=True)}
 
 
-DEPENDS_ON = ("hgvae weights", "training.data.dataset", "training.networks.hgvae", "prior.models.hgvae")
+DEPENDS_ON = ("hgvae weights", "training.data.hgvae_windows", "training.networks.hgvae", "prior.models.hgvae")
 """No table runs `pose/clean`."""
 
 

@@ -26,7 +26,8 @@ from steadypose.prior.clean.impute import completed_tracks
 from steadypose.prior.models.hgvae.config import SCALE
 from steadypose.prior.models.hgvae.features import Tracks, from_tracks, in_frame_of, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
-from steadypose.training.data.dataset import Batch, MotionSet, Windows, standardise
+from steadypose.training.data.dataset import MotionSet
+from steadypose.training.data.hgvae_windows import Batch, Windows, standardise
 from steadypose.training.networks.hgvae import HGVAE
 from steadypose.training.weights import arrays_of
 

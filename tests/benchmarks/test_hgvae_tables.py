@@ -8,7 +8,8 @@ from steadypose.benchmarks.studies.hgvae_faults import BEGINS, FAULTS, MIN_MOTIO
 from steadypose.prior.body.skeleton import MIRROR, REST_OFFSETS, J
 from steadypose.prior.models.hgvae.config import JOINT_NODES, HGVAEConfig, Level
 from steadypose.prior.models.hgvae.features import in_frame_of, to_tracks
-from steadypose.training.data.dataset import MotionSet, Windows, mean_tracks, standardise
+from steadypose.training.data.dataset import MotionSet
+from steadypose.training.data.hgvae_windows import Windows, mean_tracks, standardise
 from steadypose.training.networks.hgvae import HGVAE
 
 SMALL = HGVAEConfig(features=16, levels=(Level(1, 8), Level(JOINT_NODES, 2)))

@@ -13,15 +13,16 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from tests.prior.models.test_hgvae import SMALL
 from torch import Tensor, nn
 
 from steadypose.benchmarks.motion import as_set, simulated_clips
 from steadypose.prior.fit.hmvae_network import HMVAE
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
 from steadypose.prior.fit.humor_state import State
-from steadypose.prior.models.hgvae.config import CompletionConfig, HGVAEConfig, Level
 from steadypose.prior.models.hmvae import HMVAEConfig
-from steadypose.training.data.dataset import MotionSet, Windows
+from steadypose.training.data.dataset import MotionSet
+from steadypose.training.data.hgvae_windows import Windows
 from steadypose.training.networks.hgvae import HGVAE
 from steadypose.training.recipes import hgvae, hmvae
 from steadypose.training.recipes.humor import Batch, Sequences, transition_loss
@@ -129,15 +130,6 @@ def test_hmvaes_kl_is_to_the_standard_normal_and_the_local_one_comes_late(motion
         assert loss - value(free, done)[0] == pytest.approx(beta, rel=1e-2)
     assert hmvae.Hyperparameters(1, 1, 1.0).kl_weight == 0.003
     assert hmvae.SHORT.kl_weight == hmvae.LONG.kl_weight == hmvae.ABOUT_MEAN_KL_WEIGHT > 0
-
-
-SMALL = HGVAEConfig(
-    frames=12,
-    coefficients=6,
-    features=8,
-    levels=(Level(1, 4), Level(5, 3), Level(66, 2)),
-    completion=CompletionConfig(patch=4, features=8, blocks=1),
-)
 
 
 def small_hgvae() -> HGVAE:

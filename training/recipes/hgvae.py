@@ -30,7 +30,7 @@ from steadypose.training.data.corruption import (
     vary_builds,
     with_faults,
 )
-from steadypose.training.data.dataset import STRIDES, Batch, Windows, mean_tracks
+from steadypose.training.data.hgvae_windows import STRIDES, Batch, Windows, mean_tracks
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 from steadypose.training.networks.graph import CompletionNet
 from steadypose.training.networks.hgvae import HGVAE, HGVAEOutput

@@ -52,7 +52,7 @@ from steadypose.training.data.corruption import (
     with_drifting_error,
     with_faults,
 )
-from steadypose.training.data.dataset import STRIDES, Windows, standardise
+from steadypose.training.data.hgvae_windows import STRIDES, Windows, standardise
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 from steadypose.training.networks.graph import FaultNet
 from steadypose.training.networks.hgvae import HGVAE

@@ -17,7 +17,7 @@ from steadypose.prior.models.hgvae.live_completion import (
     Features,
     completion_features,
 )
-from steadypose.training.data.dataset import Windows
+from steadypose.training.data.hgvae_windows import Windows
 from steadypose.training.networks.graph import CompletionNet, certainty_of
 from steadypose.training.recipes.hgvae import completion_recipe
 
