@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 from rich.progress import Progress
 
 from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
-from steadypose.nodes.commands.output import check_format, check_output, clean_recording, console, printable
+from steadypose.nodes.commands.output import (
+    File,
+    In,
+    Out,
+    check_format,
+    check_output,
+    clean_recording,
+    console,
+    printable,
+)
 from steadypose.nodes.driving import NOBODY
 from steadypose.nodes.graph.launch import apply_override, check_settings, full_key, pipeline_sections, read_toml
 from steadypose.nodes.graph.loops import compile_missing
@@ -18,12 +26,12 @@ from steadypose.prior.body.layouts import add_layouts
 
 
 def clean(
-    source: Annotated[Path, tyro.conf.arg(name="in", metavar="IN")],
-    out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
+    source: In,
+    out: Out,
     delay: Annotated[int | None, tyro.conf.arg(metavar="K")] = None,
     settings: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="STAGE.OPTION=VALUE")] = (),
-    skeletons: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
-    rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    skeletons: File = None,
+    rig: File = None,
     jobs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     ray: bool = False,
     force: bool = False,

@@ -14,9 +14,10 @@ from rich.progress import Progress
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JOINTS, JointState, Message, PoseRaw
 from steadypose.nodes.commands.output import (
-    check_format,
-    check_output,
-    check_replaceable,
+    File,
+    In,
+    Out,
+    check_poses_file,
     console,
     plural,
     write_output,
@@ -45,13 +46,13 @@ _GIVEN, _COMPLETED = STATE_COLOURS[JointState.SEEN], STATE_COLOURS[JointState.IM
 
 
 def complete(
-    source: Annotated[Path, tyro.conf.arg(name="in", metavar="IN")],
-    out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
+    source: In,
+    out: Out,
     optimise: bool = False,
     weights: Annotated[str, tyro.conf.arg(metavar="NAME")] = "default",
-    skeletons: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
-    rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
-    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    skeletons: File = None,
+    rig: File = None,
+    picture: File = None,
     force: bool = False,
 ) -> int:
     """Complete recorded poses: motion between key frames, and unobserved parts of a body.
@@ -85,11 +86,9 @@ def complete(
     """
     if skeletons is not None:
         add_layouts(read_toml(skeletons).get("skeletons", {}))
-    check_format(out)
-    check_output(source, out, *([picture] if picture else []))
+    check_poses_file(source, out, *([picture] if picture else []), replace=force)
     if picture is not None and picture.suffix not in (".png", ".svg", ".pdf"):
         raise LaunchError(f"--picture: expected a name ending in .png, .svg or .pdf, got {picture}")
-    check_replaceable(out, replace=force)
     one_thread()
     fill, uncertainty = load_completer(weights)
     if optimise:

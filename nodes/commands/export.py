@@ -9,7 +9,7 @@ import numpy as np
 import tyro
 
 from steadypose.msgs.types import PoseRaw, PoseWorld
-from steadypose.nodes.commands.output import ARRAY_FILES, check_file, console, unfinished
+from steadypose.nodes.commands.output import ARRAY_FILES, File, In, Out, check_file, console, unfinished
 from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
@@ -22,8 +22,8 @@ NAMED = (".bvh", ".glb")
 
 
 def export(
-    source: Annotated[Path, tyro.conf.arg(name="in", metavar="IN")],
-    out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
+    source: In,
+    out: Out,
     body: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None,
     names: Literal["smpl22", "vrm", "mixamo"] = "smpl22",
     force: bool = False,
@@ -81,7 +81,7 @@ ROOT = ("root_x", "root_y", "root_z", "root_qx", "root_qy", "root_qz", "root_qw"
 def retarget(
     source: Annotated[Path, tyro.conf.arg(metavar="IN")],
     out: Path,
-    urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    urdf: File = None,
     links: Annotated[tuple[str, ...], tyro.conf.arg(name="link", metavar="PART=LINK")] = (),
     sole: float = 0.0,
     body: int | None = None,

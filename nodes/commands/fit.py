@@ -16,9 +16,9 @@ from rich.progress import Progress
 
 from steadypose.msgs.types import JOINTS, Message, PoseRaw
 from steadypose.nodes.commands.output import (
-    check_format,
-    check_output,
-    check_replaceable,
+    In,
+    Out,
+    check_poses_file,
     console,
     write_output,
 )
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 
 def fit(
-    source: Annotated[Path, tyro.conf.arg(name="in", metavar="IN")],
-    out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
+    source: In,
+    out: Out,
     weights: Annotated[str, tyro.conf.arg(metavar="NAME")] = "default",
     delay: Annotated[int, tyro.conf.arg(metavar="K")] = 8,
     smpl: Annotated[Path | None, tyro.conf.arg(metavar="MODEL.npz")] = None,
@@ -74,9 +74,7 @@ def fit(
     """
     if not source.exists():
         raise LaunchError(f"{source} does not exist: expected a recording, an .npz or a .csv")
-    check_format(out)
-    check_output(source, out)
-    check_replaceable(out, replace=force)
+    check_poses_file(source, out, replace=force)
     two_d = has_key_points(source)
     if two_d and out.suffix != ".npz":
         raise LaunchError(f"{out}: expected an .npz, for key points have no recording to go with; got {out.name}")

@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 from rich.console import Console
 
@@ -27,6 +28,9 @@ from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.layouts import add_layouts
 
+In = Annotated[Path, tyro.conf.arg(name="in", metavar="IN")]
+Out = Annotated[Path, tyro.conf.arg(metavar="OUT")]
+File = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 ARRAY_FILES = (".npz", ".csv")
 """endings of outputs that are one file of arrays"""
 OTHER_FORMATS = {
@@ -67,6 +71,15 @@ def check_file(source: Path, out: Path, endings: tuple[str, ...], *, replace: bo
         raise LaunchError(f"{out}: expected a name ending in {', '.join(endings)}, got {out.suffix or 'none'}")
     if os.path.lexists(out) and not (replace and out.is_file()):
         raise LaunchError(f"{out} exists: expected a new path, or --force to replace a file")
+
+
+def check_poses_file(source: Path, out: Path, *others: Path, replace: bool) -> None:
+    """Raises:
+    LaunchError: poses cannot be written to ``out``, or a file to one of the others.
+    """
+    check_format(out)
+    check_output(source, out, *others)
+    check_replaceable(out, replace=replace)
 
 
 def check_replaceable(out: Path, *, replace: bool) -> None:
