@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -28,6 +31,15 @@ def test_uncalibrated_floor_is_unknown_then_found():
     assert floor.height == pytest.approx(-1.2, abs=0.01)
     assert floor.sigma < 0.01
     np.testing.assert_allclose(floor.plane, [0, 0, 1, -floor.height])
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_it_is_guessed_from_feet_that_are_seen(seen: bool):
+    floor, soles = Floor(calibrated=False), np.array([[0.0, 0.0, height] for height in (-1.1, -1.2, -1.2, -1.15)])
+    observed: Any = SimpleNamespace(feet_observed=np.full(4, seen), soles=soles, root_observed=False)
+    floor.update(observed, np.ones(4))
+    assert floor.known == seen
+    assert floor.height == (-1.2 if seen else 0.0)
 
 
 def test_once_sure_it_is_slow():
