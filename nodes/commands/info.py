@@ -104,7 +104,7 @@ class _Contents:
 
     def _text(self) -> str:
         parts = [f"{what} {', '.join(names)}" for what, names in self._names.items()]
-        return "; ".join([*parts, f"bodies {_enumerate(sorted(self._bodies))}"] if self._bodies else parts)
+        return "; ".join([*parts, f"body ids {_enumerate(sorted(self._bodies))}"] if self._bodies else parts)
 
 
 def _enumerate(ids: list[int], limit: int = 8) -> str:
@@ -183,7 +183,7 @@ def describe_file(path: Path) -> Iterator[str]:
     rate = Rate.of(stamps)
     share = f"{np.mean(seen):.0%} of their joints observed" if seen else "nobody in any frame"
     yield f"{rate.count} frames{rate.brief}, {stamps[-1] - stamps[0]:.2f} s; skeleton {', '.join(skeletons)}"
-    yield f"bodies {', '.join(map(str, sorted(ids))) or 'none'}; {share}"
+    yield f"body ids {', '.join(map(str, sorted(ids))) or 'none'}; {share}"
     for cause, count in source.refused.items():
         yield f"refused, {cause}: {count}"
     yield from diagnosis.look()

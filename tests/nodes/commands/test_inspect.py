@@ -129,7 +129,7 @@ def test_info_of_a_recording(recording: Path, capsys: pytest.CaptureFixture[str]
     assert info(str(recording)) == 0
     out = capsys.readouterr().out
     assert "pose/raw: steadypose_msgs/msg/PoseRaw\n    30 messages, 30.00 Hz, longest gap 33 ms" in out
-    assert "source made-up; frame camera; skeleton azure_kinect32; bodies 0, 1" in out
+    assert "source made-up; frame camera; skeleton azure_kinect32; body ids 0, 1" in out
     assert "delay 4 frames" in out
     assert "diagnostics: diagnostic_msgs/msg/DiagnosticArray\n    1 message\n    nodes prior" in out
 
