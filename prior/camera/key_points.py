@@ -1,4 +1,4 @@
-"""Key points of one person in the picture of one camera, with what it measures in depth."""
+"""Key points of one person in one camera's image, with what it measures in depth."""
 
 from __future__ import annotations
 

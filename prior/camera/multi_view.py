@@ -1,8 +1,9 @@
 """Several calibrated cameras as one: their bodies at one moment, matched by place and merged joint by joint.
 
-Cameras do not take their pictures at the same moments: each one's bodies are first interpolated to a common grid. What
-they say of a joint is then weighed by confidence, by distance, and by direction, for a depth camera errs more along its
-line of sight than across; the weights are inverse covariances, and the mean is that of independent measurements.
+Cameras do not take their images at the same moments: each one's bodies are first interpolated to a common grid. Their
+observations of a joint are then weighted by confidence, by distance, and by direction, for a depth camera errs more
+along its line of sight than across; the weights are inverse covariances, and the mean is that of independent
+measurements.
 """
 
 from __future__ import annotations
@@ -23,21 +24,23 @@ from steadypose.prior.timing.rate import FPS
 PERIOD_NS = round(1e9 / FPS)
 SOURCE, FRAME_ID = "merged", "world"
 MATCH_RADIUS_M = 0.4
-"""Metres, the median over the joints: observations of one body by two cameras are nearer than this."""
+"""Largest distance of two cameras' observations of one body, the median over the joints, metres."""
 CONFLICT_M = 0.25
-"""Metres: observations of a joint farther apart contradict each other, and the one of less variance is taken."""
+"""Distance of two observations of a joint beyond which they contradict each other, metres: the one of less variance is
+taken."""
 DEPTH_ERROR_RATIO = 2.0
-"""The error along the line of sight, over that across it."""
+"""Ratio of the error along the line of sight to that across it."""
 MAX_WAIT_NS = 100_000_000
-"""How long a camera is waited for before the others are merged without it."""
+"""Time for which a camera is waited for before the others are merged without it, nanoseconds."""
 CAMERA_TIMEOUT_NS = 500_000_000
-"""A camera without a picture for so long is not waited for."""
+"""Time without an image after which a camera is not waited for, nanoseconds."""
 MAX_GAP_NS = 150_000_000
-"""Between pictures of a camera; longer gaps are not interpolated."""
+"""Longest gap between images of a camera that is interpolated, nanoseconds."""
 CLOCK_RESET_FRAMES = 30
-"""Consecutive pictures of all cameras that come too late: the clocks were set, and the merged stream starts anew."""
+"""Number of consecutive images of all cameras that come too late after which the merged stream starts anew: the clocks
+were set."""
 MAX_BODIES = 16
-"""In a message; a camera sees fewer."""
+"""Largest number of bodies of a message that are merged; a camera observes fewer."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class CameraFrame:
 class Merge:
     """Merges the ``pose/raw`` of several cameras into one, on a 30 Hz grid of capture times.
 
-    A frame is published when every camera that is there has sent its picture, or `MAX_WAIT_NS` later. Only stamps
+    A frame is published when every camera that is there has sent its image, or `MAX_WAIT_NS` later. Only stamps
     count, so the cameras' clocks must agree (on several machines by NTP or PTP); what comes too late is counted.
 
     Attributes:
@@ -79,23 +82,23 @@ class Merge:
 
     def update(self, raw: PoseRaw) -> list[PoseRaw]:
         """Take a camera's message; returns the merged messages that it completes, oldest first."""
-        seen = self._frame(raw)
-        if seen is None:
+        frame = self._frame(raw)
+        if frame is None:
             return []
         before = self._last.get(raw.source)
-        late = seen.stamp_ns <= max(self._given_ns, before.stamp_ns if before else -1)
+        late = frame.stamp_ns <= max(self._given_ns, before.stamp_ns if before else -1)
         self._late = self._late + 1 if late else 0
         if late:
             self.counters[f"late or repeated, {raw.source}"] += 1
             if self._late >= CLOCK_RESET_FRAMES:
                 self._reset()
             return []
-        self._last[raw.source] = seen
-        if before and seen.stamp_ns - before.stamp_ns > MAX_GAP_NS:
-            before = None  # too long ago to say where bodies were in between
-        for tick in _ticks(before.stamp_ns if before else seen.stamp_ns - PERIOD_NS, seen.stamp_ns):
+        self._last[raw.source] = frame
+        if before and frame.stamp_ns - before.stamp_ns > MAX_GAP_NS:
+            before = None  # too long ago to interpolate bodies in between
+        for tick in _ticks(before.stamp_ns if before else frame.stamp_ns - PERIOD_NS, frame.stamp_ns):
             if tick > self._given_ns:
-                self._waiting.setdefault(tick, []).append(_interpolated(before, seen, tick))
+                self._waiting.setdefault(tick, []).append(_interpolated(before, frame, tick))
         return self._complete()
 
     def _frame(self, raw: PoseRaw) -> CameraFrame | None:
@@ -119,11 +122,11 @@ class Merge:
         return None
 
     def _complete(self) -> list[PoseRaw]:
-        newest_ns = max(seen.stamp_ns for seen in self._last.values())
+        newest_ns = max(frame.stamp_ns for frame in self._last.values())
         merged = []
         for tick in sorted(self._waiting):
-            expected = [seen for seen in self._last.values() if abs(newest_ns - seen.stamp_ns) <= CAMERA_TIMEOUT_NS]
-            if any(seen.stamp_ns < tick for seen in expected) and newest_ns < tick + MAX_WAIT_NS:
+            expected = [f for f in self._last.values() if abs(newest_ns - f.stamp_ns) <= CAMERA_TIMEOUT_NS]
+            if any(frame.stamp_ns < tick for frame in expected) and newest_ns < tick + MAX_WAIT_NS:
                 break
             merged.append(self._message(tick, self._waiting.pop(tick)))
             self._given_ns = tick
@@ -136,7 +139,7 @@ class Merge:
 
 @dataclass(frozen=True)
 class CameraBody:
-    """One body as one camera sees it.
+    """One body as one camera observes it.
 
     Attributes:
         joints: (22, 3) metres, world; NaN where unobserved.
@@ -154,7 +157,7 @@ def match_views(views: list[CameraFrame]) -> list[list[CameraBody]]:
     groups: list[list[CameraBody]] = []
     for view in sorted(views, key=lambda view: -len(view.joints)):
         own = [CameraBody(j, c, view.eye) for j, c in zip(view.joints, view.confidence, strict=True)]
-        # a body is where the camera that has it first sees it
+        # a body is where the first camera that has it observes it
         firsts = np.array([group[0].joints for group in groups]).reshape(-1, 22, 3)
         pairs = {body: group for group, body in match_bodies(firsts, view.joints)}
         for body, observed in enumerate(own):
@@ -177,7 +180,7 @@ def match_bodies(some: Floats, others: Floats) -> list[tuple[int, int]]:
 
 
 def merge_joints(bodies: list[CameraBody]) -> tuple[Floats, Floats]:
-    """Joints (22, 3) and their confidence (22,) of a body that several cameras see.
+    """Joints (22, 3) and their confidence (22,) of a body that several cameras observe.
 
     The precision of an observation, up to a factor, is ``c² / d² (I + (1 / ALONG² - 1) r rᵀ)`` for confidence c,
     distance d and line of sight r; the confidence that all were wrong is the product.
@@ -186,8 +189,8 @@ def merge_joints(bodies: list[CameraBody]) -> tuple[Floats, Floats]:
     confidence = np.array([observed.confidence for observed in bodies])
     ray = joints - np.array([observed.eye for observed in bodies])[:, None]
     reach = np.maximum(np.linalg.norm(ray, axis=-1), 0.1)
-    seen = finite_joints(joints) & (confidence > 0)
-    weight = np.where(seen, (confidence / np.where(seen, reach, 1.0)) ** 2, 0.0)
+    valid = finite_joints(joints) & (confidence > 0)
+    weight = np.where(valid, (confidence / np.where(valid, reach, 1.0)) ** 2, 0.0)
     surest = np.take_along_axis(joints, weight.argmax(axis=0)[None, :, None], axis=0)
     weight[~(np.linalg.norm(joints - surest, axis=-1) < CONFLICT_M)] = 0.0
     used = weight > 0
@@ -209,7 +212,7 @@ def _ticks(after_ns: int, until_ns: int) -> range:
 
 
 def _interpolated(before: CameraFrame | None, after: CameraFrame, tick: int) -> CameraFrame:
-    """What a camera saw at a moment between two of its pictures; bodies of the later one where there is no earlier."""
+    """A camera's observations at a moment between two images; those of the later one where there is no earlier."""
     joints, confidence = after.joints.copy(), after.confidence.copy()
     if before:
         share = (tick - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)

@@ -22,9 +22,10 @@ MAX_DISTANCE = 30.0
 MAX_PLACE = 10_000.0
 """Metres from the world's origin beyond which no sensor stands: joints lose their millimetres."""
 MAX_SIZE, MIN_BONES = 2.5, 4
-"""Of a body of which so many bones are seen, and in the middle are so many times the mean person's: nobody is."""
+"""Least number of observed bones by which a body is refused, and ratio of their median to the mean person's from which
+on it is: nobody is so large."""
 UNIT_TOLERANCE = 0.01
-"""How far from 1 the norm of a sensor pose's quaternion may be."""
+"""Largest distance from 1 of the norm of a sensor pose's quaternion."""
 
 _REST_LENGTHS = np.linalg.norm(REST_OFFSETS[1:], axis=1)
 
@@ -44,8 +45,8 @@ class BodyJoints(NamedTuple):
 def stacked(bodies: Collection[BodyJoints]) -> BodyJoints:
     """N bodies as one: (N, 22, 3) and (N, 22)."""
     return BodyJoints(
-        np.array([seen.positions for seen in bodies]).reshape(-1, 22, 3),
-        np.array([seen.confidence for seen in bodies]).reshape(-1, 22),
+        np.array([body.positions for body in bodies]).reshape(-1, 22, 3),
+        np.array([body.confidence for body in bodies]).reshape(-1, 22),
     )
 
 
@@ -108,8 +109,8 @@ def _canonical(body: RawBody, layout: Skeleton, counters: Counter[str]) -> tuple
 def _is_too_large(positions: Floats) -> bool:
     """Whether joints (22, 3) are nobody's: one such frame would be learned from for seconds."""
     lengths = np.linalg.norm(positions[1:] - positions[PARENT[1:]], axis=1)
-    seen = np.isfinite(lengths)
-    return bool(seen.sum() >= MIN_BONES and median(lengths[seen] / _REST_LENGTHS[seen]) > MAX_SIZE)
+    observed = np.isfinite(lengths)
+    return bool(observed.sum() >= MIN_BONES and median(lengths[observed] / _REST_LENGTHS[observed]) > MAX_SIZE)
 
 
 def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int]) -> dict[int, CleanBody]:

@@ -35,11 +35,13 @@ from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.resample import PERIOD_NS, Resampler
 
 PATIENCE_NS = 2 * PERIOD_NS
-"""How long a frame waits for the other streams: a period, as their phases differ, and another for the network."""
+"""Time that a frame waits for the other streams, nanoseconds: a period, as their phases differ, and another for the
+network."""
 DRIFT = 200e-6
-"""Relative drift allowed between two clocks: twice that of two poor quartz oscillators."""
+"""Largest relative drift between two clocks: twice that of two poor quartz oscillators."""
 LATE_IN_A_ROW = 15
-"""Late frames in a row (half a second) after which a stream starts anew: its clock was set, or its latency grew."""
+"""Number of late frames in a row (half a second) after which a stream starts anew: its clock was set, or its latency
+grew."""
 
 
 @dataclass
@@ -196,7 +198,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             stream.late += 1
             return
         stream.last, stream.time_ns = raw, time_ns
-        # levelled, but seen from where the sensor stands: the streams have no world in common
+        # levelled, but observed from where the sensor stands: the streams have no world in common
         sensor = SensorFrame.of(raw.sensor_pose).levelled()
         joints = self._arranged(raw, layout, sensor, stream.identify, lambda body_id: (raw.source, body_id))
         for tick_ns, *ready in stream.resampler.update(time_ns, *joints):

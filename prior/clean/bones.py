@@ -1,4 +1,4 @@
-"""What bone lengths tell: this person's bones, and the sensor's bias.
+"""Estimates from bone lengths: this person's bones, and the sensor's bias.
 
 Bones are measured for the first ten seconds, with human proportions as a prior.
 

@@ -124,8 +124,8 @@ class Fuse:
         well = _align(body, seen, precision)
         if self.occluded:
             # Hidden joints follow from the observed ones by the prior's rotations.
-            hung = solve_pose(well, offsets, decoded)[1]
-            body = np.where(np.isfinite(well[:, :1, :1]), hung, body)
+            placed = solve_pose(well, offsets, decoded)[1]
+            body = np.where(np.isfinite(well[:, :1, :1]), placed, body)
             completed_sigma = None
             if imputed is not None:
                 hidden = _completable(unseen, imputed.positions[slots])
@@ -263,7 +263,7 @@ def _between(unseen_s):
 def _completable(unseen_s, completed):
     """(S, 22) which joints are hidden and completed.
 
-    Joints that the sensor does not have are left out where they lie between two that it has, which tell their place
+    Joints that the sensor does not have are left out where they lie between two that it has, which give their place
     better. So are frames that were lost whole, of which the smoother knows more.
     """
     hidden, between = np.zeros(unseen_s.shape, dtype=np.bool_), _between(unseen_s)

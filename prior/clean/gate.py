@@ -54,8 +54,8 @@ class Gate:
     """Outlier rejection: a refused joint becomes unobserved, exchanged limbs are put back.
 
     Predictions are those of a constant-velocity Kalman filter, updated with what passes. A joint far from its own that
-    kept the lengths of its bones moved, where lengths tell. No jump is refused for longer than ``patience``: then the
-    prediction is wrong, not the sensor. Bone lengths are tested by `BoneOutliers`.
+    kept the lengths of its bones moved, where lengths show it. No jump is refused for longer than ``patience``: then
+    the prediction is wrong, not the sensor. Bone lengths are tested by `BoneOutliers`.
     """
 
     def __init__(self, settings: GateSettings, slots: int, counters: Counter[str]) -> None:

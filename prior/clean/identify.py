@@ -25,7 +25,7 @@ class IdentifySettings:
 
     Attributes:
         enabled: whether ids are assigned here and the source's ignored; off, the source's are passed on.
-        birth: seconds for which an unknown body must be seen before it gets an id.
+        birth: seconds for which an unknown body must be observed before it gets an id.
         death: seconds without an observation after which a person is forgotten, and gets a new id on return.
     """
 
@@ -43,14 +43,16 @@ class IdentifySettings:
 
 
 RECENT_S = 0.25
-"""A body seen within this time is matched by position from frame to frame; after longer, it must be recognised."""
+"""Time since a body was observed up to which it is matched by position from frame to frame, seconds; after longer, it
+must be recognised."""
 ACCELERATION = 1.0
 """m²/s³, density of the white acceleration noise of a visible body."""
 SPEED, SPEED_MEMORY_S = 0.6, 1.0
 """m/s and seconds: standard deviation and correlation time of the velocity of a body out of sight, an
 Ornstein-Uhlenbeck process: a person who stops behind a pillar must not be expected in the next room."""
 PLACE_SIGMA, HEIGHT_SIGMA = 0.1, 0.3
-"""Metres: deviation of a body's position in one frame, along an axis; upper bound of that of its height, unseen."""
+"""Standard deviation of a body's position in one frame along an axis, and upper bound of that of its height while it is
+not observed, metres."""
 NEWCOMERS = 0.01
 """Density of new people per m³, relative to one person who reappears (a tenth in a room of 20 m²)."""
 LENGTH_SIGMA, LENGTH_MEMORY_S = 0.05, 1.0
@@ -85,9 +87,9 @@ class Identify:
     """Assigns an id to each body of a frame.
 
     A row holds a track: a person, or a tentative track that has no id yet. A constant-velocity Kalman filter predicts
-    each track's position; bodies are first matched to tracks seen within `RECENT_S`, by position. What remains starts
-    tentative tracks, which after ``birth`` seconds, or as soon as the score is decisive, are recognised as a person out
-    of sight or become a new one: bone lengths from several frames are better than from one.
+    each track's position; bodies are first matched to tracks observed within `RECENT_S`, by position. What remains
+    starts tentative tracks, which after ``birth`` seconds, or as soon as the score is decisive, are recognised as a
+    person out of sight or become a new one: bone lengths from several frames are better than from one.
 
     Args:
         settings: of this stage.
@@ -109,7 +111,7 @@ class Identify:
         self._place = np.full((rows, 3), np.nan)
         self._pose = np.full((rows, 22, 3), np.nan)
         self._first_s = np.zeros(rows)
-        self._seen_s = np.zeros(rows)
+        self._observed_s = np.zeros(rows)
         self._lengths = np.zeros((rows, len(_BONES)))
         self._lengths_s = np.zeros((rows, len(_BONES)))
 
@@ -131,20 +133,20 @@ class Identify:
         if count > self._rows:
             self._counters["too_many_bodies"] += count - self._rows
         bodies, confidence = bodies[: self._rows], confidence[: self._rows]
-        unseen_s = now - self._seen_s
-        self._forget((unseen_s > self._settings.death) | ((self._id == _TENTATIVE) & (unseen_s > RECENT_S)))
+        unobserved_s = now - self._observed_s
+        self._forget((unobserved_s > self._settings.death) | ((self._id == _TENTATIVE) & (unobserved_s > RECENT_S)))
         row_of, places, score = self._follow(bodies, now)
         self._start_tracks(bodies, row_of, places, now)
-        seen = np.flatnonzero(row_of >= 0)
+        observed = np.flatnonzero(row_of >= 0)
         lengths = _bone_lengths(bodies, confidence)
-        self._update_tracks(row_of[seen], bodies[seen], places[seen], lengths[seen], now, step)
+        self._update_tracks(row_of[observed], bodies[observed], places[observed], lengths[observed], now, step)
         self._assign_ids(row_of, places, score, now)
         return [int(self._id[row]) if row >= 0 and self._id[row] > 0 else None for row in row_of] + [None] * (
             count - len(row_of)
         )
 
     def _follow(self, bodies: Floats, now: float) -> tuple[NDArray[np.intp], Floats, Floats]:
-        """Match bodies to tracks seen within `RECENT_S`.
+        """Match bodies to tracks observed within `RECENT_S`.
 
         Returns:
             (N,) row of each body or -1, (N, 3) its position in metres, and (rows, N) score of all pairs by position.
@@ -155,12 +157,12 @@ class Identify:
         rows = np.flatnonzero(self._id != _FREE)
         if expected is None or not len(rows) or not len(bodies):
             return row_of, places, score
-        # a body's position: the median displacement of its joints from the pose last seen
+        # a body's position: the median displacement of its joints from the pose last observed
         place = medians(bodies[None] - self._pose[rows, None], axis=-2)
-        unseen_s = now - self._seen_s[rows]
-        there, sigma = _out_of_sight(self._place[rows], expected.positions[rows], expected.sigma[rows], unseen_s)
+        unobserved_s = now - self._observed_s[rows]
+        there, sigma = _unobserved(self._place[rows], expected.positions[rows], expected.sigma[rows], unobserved_s)
         score[rows] = _place_score(place - there[:, None], sigma[:, None])
-        recent = np.flatnonzero(unseen_s <= RECENT_S)
+        recent = np.flatnonzero(unobserved_s <= RECENT_S)
         for k, body in _best(score[rows[recent]]):
             row_of[body], places[body] = rows[recent[k]], place[recent[k], body]
         return row_of, places, score
@@ -186,7 +188,7 @@ class Identify:
         self._place[rows] = estimate.positions[rows]
         pose = bodies - places[:, None]
         self._pose[rows] = np.where(np.isfinite(pose), pose, self._pose[rows])
-        self._seen_s[rows] = now
+        self._observed_s[rows] = now
         weight = np.isfinite(lengths) * np.clip(step, _MIN_STEP_S, RECENT_S)
         self._lengths_s[rows] += weight
         share = weight / np.maximum(self._lengths_s[rows], _MIN_STEP_S)
@@ -194,8 +196,8 @@ class Identify:
 
     def _assign_ids(self, row_of: NDArray[np.intp], places: Floats, place_score: Floats, now: float) -> None:
         """Recognise tentative tracks as people out of sight, or give them new ids."""
-        seen = np.flatnonzero(row_of >= 0)
-        tentative = seen[self._id[row_of[seen]] == _TENTATIVE]
+        observed = np.flatnonzero(row_of >= 0)
+        tentative = observed[self._id[row_of[observed]] == _TENTATIVE]
         if not len(tentative):
             return
         old_enough = now - self._first_s[row_of[tentative]] >= self._settings.birth
@@ -208,7 +210,7 @@ class Identify:
                 self._recognise(int(row_of[tentative[k]]), int(away[person]))
             waiting[k] = True
         for k in np.flatnonzero(~waiting):
-            named = seen[self._id[row_of[seen]] > 0]
+            named = observed[self._id[row_of[observed]] > 0]
             if (np.linalg.norm(places[named] - places[tentative[k]], axis=1) > APART).all():
                 self._id[row_of[tentative[k]]] = self._next_id
                 self._next_id += 1
@@ -248,32 +250,32 @@ _GENERIC_LENGTHS = np.array([0.415, 0.41, 0.275, 0.25, 0.36, 0.50])
 
 
 def _bone_lengths(bodies: Floats, confidence: Floats) -> Floats:
-    """(N, B) metres of bodies (N, 22, 3), the mean of both sides; NaN where neither was well seen."""
+    """(N, B) metres of bodies (N, 22, 3), the mean of both sides; NaN where neither was well observed."""
     ends = np.where((confidence >= MIN_CONFIDENCE)[..., None], bodies, np.nan)[:, _ENDS]
     lengths = np.linalg.norm(ends[..., 0, :] - ends[..., 1, :], axis=-1)
-    seen = np.isfinite(lengths) & (lengths < 2 * _GENERIC_LENGTHS[:, None])
-    sides = seen.sum(axis=-1)
-    return np.where(sides > 0, np.where(seen, lengths, 0.0).sum(axis=-1) / np.maximum(sides, 1), np.nan)
+    observed = np.isfinite(lengths) & (lengths < 2 * _GENERIC_LENGTHS[:, None])
+    sides = observed.sum(axis=-1)
+    return np.where(sides > 0, np.where(observed, lengths, 0.0).sum(axis=-1) / np.maximum(sides, 1), np.nan)
 
 
 def _middle(body: Floats) -> Floats:
-    """(3,) metres, median of the joints of a body's trunk, or of all joints (22, 3) where none of the trunk is seen."""
+    """(3,) metres, median of the joints of a body's trunk, or of all joints (22, 3) where the trunk is not observed."""
     trunk = medians(body[list(TRUNK_LANDMARKS)])
     return trunk if np.isfinite(trunk).all() else medians(body)
 
 
-def _out_of_sight(last: Floats, coasting: Floats, sigma: Floats, unseen_s: Floats) -> tuple[Floats, Floats]:
+def _unobserved(last: Floats, coasting: Floats, sigma: Floats, unobserved_s: Floats) -> tuple[Floats, Floats]:
     """Prediction of bodies out of sight: an Ornstein-Uhlenbeck velocity in place of a constant one.
 
     Args:
-        last: (R, 3) metres, last position seen.
+        last: (R, 3) metres, last position observed.
         coasting: (R, 3) metres, predicted at constant velocity, with ``sigma`` (R,) along an axis.
-        unseen_s: (R,) seconds since.
+        unobserved_s: (R,) seconds since.
 
     Returns:
         (R, 3) metres, and the standard deviation along an axis (R,).
     """
-    age = np.maximum(unseen_s / SPEED_MEMORY_S, 1e-6)
+    age = np.maximum(unobserved_s / SPEED_MEMORY_S, 1e-6)
     forgotten = 1.0 - np.exp(-age)
     spread = SPEED * SPEED_MEMORY_S * np.sqrt(2.0 * (age - forgotten))
     return last + (forgotten / age)[:, None] * (coasting - last), np.minimum(sigma, np.hypot(PLACE_SIGMA, spread))

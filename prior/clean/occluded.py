@@ -3,7 +3,7 @@
 One of them bridges a gap that has ended within the delay: the joint's own observations on either side place it. The
 estimate is that of a bank of constant-velocity Kalman filters, each with the position at the time in question as a
 further state (fixed-point smoothing), weighted by their likelihoods. Nothing else of the body enters: over 0.2 s that
-is nearer than what the body tells.
+is nearer than an estimate from the body.
 """
 
 from __future__ import annotations
@@ -154,9 +154,9 @@ class OccludedJoints:
         if not len(body):
             return Weighed(np.empty((0, 3)), np.empty(0))
         chosen = np.stack([positions[body, joint] for positions in candidates], axis=1)
-        stated = np.stack([each[body, joint] for each in sigmas], axis=1)
+        deviations = np.stack([each[body, joint] for each in sigmas], axis=1)
         features = np.empty((len(body), FEATURES), dtype=np.float32)
-        _describe(self._past, slots, body, joint, chosen, stated, sigma, unseen_s, seen_later, features)
+        _describe(self._past, slots, body, joint, chosen, deviations, sigma, unseen_s, seen_later, features)
         return self.weigher(Occluded(body, joint, chosen, features))
 
 

@@ -1,7 +1,7 @@
 """Outliers among a body's joints that need no prediction: by the lengths of its bones, and by exact repetition.
 
 The error of a measured length depends on the sensor, the bone and the person: a network that estimates depth from one
-picture varies bones all the time, a marker system hardly. So each bone is compared with its own running mean and
+image varies bones all the time, a marker system hardly. So each bone is compared with its own running mean and
 standard deviation. A wrist that collapses onto the elbow is detected at any speed of the body; a test for jumps alone
 takes it for motion. And a joint that is thrown about with all its bones as long as ever has moved, not jumped, if the
 sensor is one whose bones are constant.
@@ -36,10 +36,10 @@ INTACT_DEVIATIONS, INTACT = 2.0, 0.01
 """A bone is as long as ever within these standard deviations, or metres."""
 
 TELLING = 0.03
-"""Share of a joint's distance to its prediction: a bone that varies by more cannot tell a jump from motion."""
+"""Share of a joint's distance to its prediction: a bone that varies by more does not distinguish a jump from motion."""
 
 MAX_OUTLIERS = 0.5
-"""Share of the limbs' bones seen beyond which it is another body, which is measured anew."""
+"""Share of the limbs' bones observed beyond which it is another body, which is measured anew."""
 
 RECENT = 15
 """Frames in which a joint that repeats itself must do so mostly."""
@@ -92,7 +92,7 @@ class BoneOutliers:
         return bad
 
     def intact(self, positions: Floats, distance: Floats) -> Bools:
-        """Joints that move with their limb: all their bones are as long as ever, of a sensor whose bones tell.
+        """Joints that move with their limb: all their bones are as long as ever, of a sensor whose bones show jumps.
 
         Args:
             positions: (S, 22, 3) metres, NaN where unobserved.

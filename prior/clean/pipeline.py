@@ -34,10 +34,10 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.prior.timing.resample import Frame, Resampler
 
 BACKWARDS_NS = 1_000_000_000
-"""A stamp this far before the last starts a new stream; one nearer is a frame out of order."""
+"""Distance before the last stamp from which on a new stream starts, nanoseconds; one nearer is a frame out of order."""
 CATCH_UP = 3
-"""Grid frames that one message completes at most where messages before it were dropped: all of them would take as long
-as the messages themselves."""
+"""Largest number of grid frames that one message completes where messages before it were dropped: all of them would
+take as long as the messages themselves."""
 
 
 class BodyPipeline(ABC, Generic[Key]):
@@ -133,7 +133,7 @@ class PriorPipeline(BodyPipeline[int]):
         """Take a ``pose/raw`` message and give the ``pose/clean`` messages it completes, oldest first.
 
         A message that cannot be used is counted in `counters` and otherwise ignored; one whose stamp jumps waits until
-        it is seen whether that lasts.
+        the next ones show whether that lasts.
 
         Args:
             raw: the message.

@@ -1,4 +1,4 @@
-"""The quantities of one pose that tell what its person does, each with its standard deviation.
+"""The quantities of one pose that show what its person does, each with its standard deviation.
 
 All are differences of joints of the same body, in the world's z-up frame: no floor is needed, and a place in the world
 that drifts moves none of them but the distance to the sensor.

@@ -1,4 +1,4 @@
-"""Observations as terms of the energy: joints in space, key points of a picture, points of a body's surface."""
+"""Observations as terms of the energy: joints in space, key points of an image, points of a body's surface."""
 
 from __future__ import annotations
 
@@ -99,12 +99,12 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class KeyPoints:
-    """E_data of key points in a picture, weighted by their confidence, under Geman's and McClure's kernel.
+    """E_data of key points in an image, weighted by their confidence, under Geman's and McClure's kernel.
 
     Attributes:
         pixels: (T, 22, 2); NaN where not found.
         confidence: (T, 22) 0 to 1, a weight as in the paper; its square is the official code's.
-        camera: of the picture.
+        camera: of the image.
         sigma: pixels along an axis.
     """
 

@@ -59,7 +59,7 @@ class FitSettings:
 
 
 PICTURES = FitSettings(bones_sigma=0.03, pose_steps=120, motion_steps=200)
-"""For key points of a picture, which say less of how large a person is, and start farther off."""
+"""Settings for key points of an image, which determine a person's size less, and start farther off."""
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,13 @@ Arrays: TypeAlias = Mapping[str, NDArray[np.float32]]
 """A network's weights by name, as its state dict has them: ``blocks.0.first.weight``."""
 
 WEIGHTS = PACKAGE / "prior" / "weights"
-"""Where the weights lie: ``MODEL-SET.safetensors``, each with ``MODEL-SET.md``, its card."""
+"""Folder of the weights: ``MODEL-SET.safetensors``, each with ``MODEL-SET.md``, its card."""
 
 LICENCES = {
     "default": "Apache-2.0; trained only on data free for products",
     "research": "non-commercial use only: trained on CC BY-NC 4.0 data too",
 }
-"""of each weight set, as its cards state it"""
+"""Licence of each weight set, as on its cards."""
 
 _PARTS = {
     "body_modes": "covariance",

@@ -21,7 +21,7 @@ from steadypose.prior.world.core import BodyEstimate
 from steadypose.prior.world.observe import FEET
 
 LENGTH_SIGMA = 0.025
-"""Metres, how well a bone of the legs is known: measured through a sensor's slow error, or a generic adult's."""
+"""Standard deviation of the length of a leg's bone, measured through a sensor's bias or a generic adult's, metres."""
 
 _SWEEPS = 4
 _LEGS = np.array(limbs(("hip", "knee", "ankle", "foot")))

@@ -90,8 +90,8 @@ class Scene:
 class WorldCore:
     """From observations to estimates; keeps no state but the networks.
 
-    What a message tells of a body goes through the stages in the order of `step`; each stage's state is in the body's
-    `BodyStages`, so that to forget a body is to drop that one object.
+    A message's observation of a body goes through the stages in the order of `step`; each stage's state is in the
+    body's `BodyStages`, so that to forget a body is to drop that one object.
 
     Raises:
         FileNotFoundError: a weight set that does not exist; says which do.
@@ -104,7 +104,7 @@ class WorldCore:
         self._noise = BodyNoise(settings.acceleration, network_memory_s=self._velocity.memory_s)
 
     def step(self, scene: Scene, observations: Sequence[BodyObservation]) -> list[BodyEstimate]:
-        """What a message tells of its bodies, one after the other; without those that had no root so far."""
+        """Estimates of a message's bodies, in its order; without those that had no root so far."""
         observed = [o for o in observations if o.root_known or o.body.id in scene.bodies]
         bodies = [self._stages(scene, o) for o in observed]
         velocities: Sequence[RootVelocity | None] = [None] * len(bodies)

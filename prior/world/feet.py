@@ -43,7 +43,7 @@ OUTLIER = 0.05
 """Probability that the floor is not where it is estimated to be."""
 
 LYING_M = 0.25
-"""Height of the pelvis above the floor up to which the floor says nothing of a body's feet, metres: it lies."""
+"""Height of the pelvis above the floor up to which the floor does not measure a body's feet, metres: it lies."""
 
 DEADBAND = 0.5
 """Distance from its estimate at which a foot may be published, standard deviations."""
@@ -139,7 +139,7 @@ class Soles:
             floor: (4,) metres, world, under each; NaN where none is known.
             floor_sigma: metres, its standard deviation.
             rest: (4,) the probability that each rests.
-            known: (4,) the probability that the floor, if any, says something of a foot of such a body.
+            known: (4,) the probability that the floor, if any, measures a foot of such a body.
             dt: seconds since the last call.
 
         Returns:

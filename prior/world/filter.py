@@ -25,7 +25,7 @@ FIRST_SIGMA = 1.0
 """Standard deviation of a first root that rests on no observation, metres."""
 
 JITTER_SHARE = 0.3
-"""Share of the standard deviation of a joint or velocity that is new in each frame; the rest is a slow error."""
+"""Share of the standard deviation of a joint or velocity that is new in each frame; the rest is slow bias."""
 
 INFERRED_LEGS_SPEED = 0.5
 """Standard deviation added to the predicted velocity's as the legs that it is read from are themselves inferred,
@@ -190,5 +190,5 @@ class RootFilter:
 
 
 def _split(sigma: Sigma) -> tuple[Sigma, Sigma]:
-    """The standard deviations of the jitter and of the slow error that make up ``sigma``."""
+    """The standard deviations of the jitter and of the slow bias that make up ``sigma``."""
     return JITTER_SHARE * sigma, math.sqrt(1.0 - JITTER_SHARE**2) * sigma

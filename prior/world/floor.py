@@ -1,6 +1,6 @@
 """What feet stand on, in a gravity-aligned frame: the floor, and the steps and platforms above it.
 
-HuMoR's ground is one plane. A kiosk's floor is; a robot's has steps. Ground here is horizontal, at several heights: the
+HuMoR's ground is one plane. That of a hall is; a robot's has steps. Ground here is horizontal, at several heights: the
 floor, which reaches everywhere, and levels, each as far as feet have stood on it.
 """
 
@@ -82,7 +82,7 @@ class Level:
         return self.stood_s > STOOD_S and bool(inside)
 
     def observe(self, height: float, sigma: float, place: Floats, dt: float) -> None:
-        """Take its height in metres as one foot that stands at ``place`` tells it; see `Floor.observe`."""
+        """Update by the height in metres that one foot standing at ``place`` measures; see `Floor.observe`."""
         self.variance += CREEP**2 * dt
         gain = self.variance / (self.variance + sigma**2 * max(MEMORY_S / dt, 1.0))
         self.height += gain * (height - self.height)
@@ -143,7 +143,7 @@ class Floor:
         return near if sole[2] - near < STEP_M else math.nan
 
     def update(self, observed: BodyObservation, rest: Floats) -> None:
-        """Take what one body's observed feet tell of the floor; (4,) ``rest`` are their probabilities of rest."""
+        """Update by one body's observed feet; (4,) ``rest`` are their probabilities of rest."""
         if not self.known and observed.feet_observed.any():
             self.guess(float(np.nanmin(observed.soles[:, 2])))
         if not observed.root_observed:
@@ -159,7 +159,7 @@ class Floor:
             self._height, self._variance = lowest, GUESS_SIGMA**2
 
     def observe(self, sole: Floats, sigma: float, dt: float) -> None:
-        """Take the ground's height as one standing foot tells it, with its standard deviation.
+        """Update by the ground's height that one standing foot measures, with its standard deviation.
 
         Args:
             sole: (3,) metres, world: the joint, less its height above the sole.

@@ -1,7 +1,7 @@
 """The Kalman filter behind a body's place in the world: root position and velocity, and where its feet are.
 
-Neither what the sensor nor what the network says errs independently from frame to frame, so all slow errors are in
-the state: a root seen for long is not taken to be known ever better, and one that coasts strays as errors that last
+Neither the sensor's observations nor the network's predictions err independently from frame to frame, so all biases are
+in the state: a root seen for long is not taken to be known ever better, and one that coasts strays as errors that last
 make it. So are the places of the feet, as in contact-aided filters of legged robots (Bloesch et al., "State Estimation
 for Legged Robots", RSS 2012). A foot that rests stays where it is; what it seems to move is the sensor's error, which
 the filter so learns, and forgets when the foot lifts: a planted foot is an anchor that is eased in and out. Against a
@@ -9,7 +9,7 @@ hidden root the same foot measures how far the root has moved: the zero-velocity
 errors from adding up are one measurement, and the covariance knows that an anchor is no better placed than it was
 seen.
 
-What is seen has been smoothed, so its errors are smooth as well: each is the second-order Gauss-Markov process of a
+Observations have been smoothed, so their errors are smooth as well: each is the second-order Gauss-Markov process of a
 critically damped spring, (1 + wt) exp(-wt) of it left after t. The axes are independent: the noise is the same in both
 horizontal directions, so no correlation between axes arises, and the filter turns with the world.
 """
@@ -34,7 +34,7 @@ _FOOT, _FOOT_ERROR, _FOOT_RATE, _OF_FOOT = 0, 1, 2, 3
 
 @dataclass(frozen=True)
 class BodyNoise:
-    """How root and feet move, and for how long what tells of them errs.
+    """How root and feet move, and for how long measurements of them err.
 
     Attributes:
         acceleration: density of the white-noise acceleration of a root at rest, m/s² over √Hz.
@@ -74,13 +74,13 @@ class BodyNoise:
 
 
 class BodyFilter:
-    """Root position and velocity, the places of ``feet`` points of the feet, and slow errors.
+    """Root position and velocity, the places of ``feet`` points of the feet, and biases.
 
     Args:
         noise: of all but the measurements.
         position: (3,) metres, where the root is first seen.
         jitter: metres, the standard deviation of the sensor's error from frame to frame.
-        bias: metres, the standard deviation of its slow error.
+        bias: metres, the standard deviation of its slow bias.
         velocity: (3,) m/s, what the root is taken to do there.
         feet: how many points of the feet there are.
     """
@@ -162,24 +162,24 @@ class BodyFilter:
         Args:
             position: with both errors of the sensor.
             jitter: metres, the standard deviation of its error from frame to frame.
-            bias: metres, that of its slow error.
+            bias: metres, that of its slow bias.
         """
         self._correct({_POSITION: 1.0, _SENSOR: bias}, position, jitter)
 
     def observe_velocity(self, velocity: Floats, jitter: ArrayLike, bias: ArrayLike) -> None:
-        """Take a root velocity (3,) in m/s as the network says it.
+        """Take a root velocity (3,) in m/s as the network predicts it.
 
         Args:
             velocity: with both errors of the network.
             jitter: (3,) or a number, m/s, the standard deviation of its error from frame to frame.
-            bias: (3,) or a number, m/s, that of its slow error.
+            bias: (3,) or a number, m/s, that of its slow bias.
         """
         self._correct({_VELOCITY: 1.0, _NETWORK: bias}, velocity, jitter)
 
     def observe_foot(self, foot: int, place: Floats, jitter: float, bias: float, *, from_root: bool) -> None:
         """Take the place (3,) metres of a foot, in the world or from the root, with both errors of the sensor.
 
-        Against the root these are other errors than in the world: what was learned of the ones tells nothing of the
+        Against the root these are other errors than in the world: what was learned of the ones does not hold for the
         others.
         """
         if not self._placed[foot]:

@@ -1,7 +1,7 @@
 """Corruption of clean windows for training: a tracker's noise, its faults, and hidden joints.
 
 A sensor's error has two parts, as `prior.clean.frame.SensorNoise` has it: jitter, independent from frame to frame, and
-a slow error (bias), constant or slowly varying. Windows are (B, T, 22, 3) metres, and are not changed in place.
+bias, constant or slowly varying. Windows are (B, T, 22, 3) metres, and are not changed in place.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Fault = Callable[[Floats, slice, list[int], Floats, Rng], None]
 window (T, 22, 3) is of another person, for faults that mix two bodies."""
 
 SLOW_HZ = 0.7
-"""Largest frequency of a sensor's bias, Hz."""
+"""Largest frequency of a sensor's bias, hertz."""
 
 _LIMBS = limbs(
     ("wrist",), ("elbow", "wrist"), ("shoulder", "elbow", "wrist"),
@@ -34,17 +34,17 @@ ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_col
 
 
 def draw_bias_sigma(count: int, rng: Rng) -> Floats:
-    """(B,) metres along an axis, standard deviations of slow errors to train on: 0 in 30 % of windows, up to 3 cm."""
+    """(B,) metres along an axis, standard deviations of biases to train on: 0 in 30 % of windows, up to 3 cm."""
     return 0.03 * rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.7)
 
 
 def add_noise(positions: Floats, rng: Rng, bias_sigma: Floats) -> Floats:
-    """Windows with jitter of up to 10 cm, of another deviation at each joint, and with a slow error.
+    """Windows with jitter of up to 10 cm, of another deviation at each joint, and with a slow bias.
 
     Args:
         positions: (B, T, 22, 3) metres.
         rng: source.
-        bias_sigma: (B,) metres along an axis, of the slow error, such as `draw_bias_sigma`; half of the windows in
+        bias_sigma: (B,) metres along an axis, of the bias, such as `draw_bias_sigma`; half of the windows in
             which it is 0 get no jitter either.
     """
     count, frames, joints, _ = positions.shape
@@ -79,7 +79,7 @@ def vary_builds(positions: Floats, length_sigma: float, turn_sigma: float, rng: 
 
 
 JITTER_SHARE = 0.5
-"""Default share of jitter in the variance of a sensor's error; the rest is slow"""
+"""Share of jitter in the variance of a sensor's error; the rest is bias."""
 
 
 def with_sensor_error(positions: Floats, sigma: Floats | float, rng: Rng) -> Floats:
@@ -93,7 +93,7 @@ def with_sensor_error(positions: Floats, sigma: Floats | float, rng: Rng) -> Flo
 
 
 def with_drifting_error(positions: Floats, sigma: Floats, rng: Rng, jitter_share: Floats) -> Floats:
-    """Windows with jitter and a slow error that drifts: an AR(1) process, in half of them larger at some joints.
+    """Windows with jitter and a bias that drifts: an AR(1) process, in half of them larger at some joints.
 
     Args:
         positions: (B, T, 22, 3) metres.

@@ -234,7 +234,7 @@ def sound(pairs: Pairs, threshold: float = 0.05) -> NDArray[np.bool_]:
 
 
 def _confidences(count: int, frames: int, rng: Rng) -> Floats:
-    """(C, T, 22) stated confidences: 1 in 70 % of clips, in others different for each joint and slowly varying."""
+    """(C, T, 22) confidences: 1 in 70 % of clips, in others different for each joint and slowly varying."""
     time = 2 * np.pi * rng.uniform(0.0, 0.5, (count, 1, 22)) * np.arange(frames)[:, None] / FPS
     middle = rng.uniform(0.3, 1.0, (count, 1, 22))
     unsure = np.clip(middle + 0.2 * np.cos(time + rng.uniform(0, 2 * np.pi, (count, 1, 22))), 0.1, 1.0)

@@ -123,7 +123,7 @@ class HGVAE(nn.Module):
         Args:
             x: (B, N, T) tracks; unobserved entries hold the interpolation of `features.to_tracks`.
             observed: (B, N, T) 1 where observed, else 0.
-            bias_sigma: (B,) metres along an axis, the sensor's slow error.
+            bias_sigma: (B,) metres along an axis, of the sensor's bias.
         """
         if self.completion is None:
             return x, observed

@@ -89,7 +89,7 @@ def _errors(model: HGVAE, seen: Floats, truth: Floats, sizes: Floats, bias_sigma
         seen: (B, T, 22, 3) metres, NaN where hidden.
         truth: (B, T, 22, 3) metres.
         sizes: (B,) of the bodies.
-        bias_sigma: (B,) metres along an axis, the sensor's slow error.
+        bias_sigma: (B,) metres along an axis, of the sensor's bias.
 
     Returns:
         Three times (B, 66, T): error, log-variance, and whether an entry was hidden since the body's first observation.

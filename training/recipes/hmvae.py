@@ -173,8 +173,8 @@ def corrupt(rotations: Tensor, offsets: Tensor, rng: Rng, noise: float | None = 
     if noise is None:
         sigma = rng.uniform(0.0, NOISE, (count, 1, 1, 1)) * (rng.random((count, 1, 1, 1)) < NOISY)
         slow = rng.random((count, 1, 1, 1))
-        lasting = rng.standard_normal((count, 1, 22, 3))
-        joints += sigma * (np.sqrt(1.0 - slow) * rng.standard_normal(joints.shape) + np.sqrt(slow) * lasting)
+        constant = rng.standard_normal((count, 1, 22, 3))
+        joints += sigma * (np.sqrt(1.0 - slow) * rng.standard_normal(joints.shape) + np.sqrt(slow) * constant)
         for row in np.flatnonzero((rng.random(count) < HELD) & (sigma[:, 0, 0, 0] > 0)):
             limb = _LIMBS[int(rng.integers(len(_LIMBS)))]
             first = int(rng.integers(1, frames))
