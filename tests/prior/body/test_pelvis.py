@@ -2,8 +2,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import fk, random_pose
 
-from steadypose.prior.body.pelvis import rigid_covariance, rigid_pelvis
 from steadypose.prior.body.skeleton import REST_OFFSETS
+from steadypose.prior.models.posture import rigid_covariance, rigid_pelvis
 
 COUNT = 4000
 

@@ -4,7 +4,6 @@ from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import fk, random_pose
 
 from steadypose.prior.body.kinematics import to_rotation_vectors
-from steadypose.prior.body.pelvis import rigid_pelvis
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, J
 from steadypose.prior.models.posture import (
     LEAST_SIGMA,
@@ -13,6 +12,7 @@ from steadypose.prior.models.posture import (
     RootCovariance,
     average_root,
     on_bones,
+    rigid_pelvis,
 )
 
 BODIES = 60
