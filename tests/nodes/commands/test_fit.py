@@ -115,6 +115,8 @@ def test_key_points_become_a_motion_in_the_cameras_frame(pictured: Path, tmp_pat
         assert np.nanmedian(np.linalg.norm(projected - told["keypoints"], axis=-1)) < 40.0
         normal = out["ground_plane"][:3]
         assert normal[2] > 0.95
+        way = np.gradient(out["world_positions"][:, 0], 1 / 30, axis=0)
+        np.testing.assert_allclose(out["root_velocity"], way, atol=1e-3)
 
 
 def test_points_of_the_surface_say_where_somebody_is(tmp_path: Path) -> None:
