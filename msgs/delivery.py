@@ -89,7 +89,7 @@ def read_taken(frame: bytes, topics: Collection[str]) -> Taken | None:
 WINDOW = 256
 """messages of a topic that a reliable subscriber may be behind before it is waited for; with what is sent beside them,
 and with `MAX_CONTEXT`, below the messages that ZeroMQ holds for a subscriber, so that it never drops one"""
-MAX_CONTEXT = 256
+MAX_CONTEXT = 512
 """messages before those that somebody can ask for"""
 DEAF_S = 10.0
 """without a sign of life for so long, a subscriber that has something to read is not waited for any more"""

@@ -35,8 +35,10 @@ class Progress(NamedTuple):
     """what the node itself notes of the last message: `Node.mark`"""
 
 
-CONTEXT = 128
-"""messages: the four seconds of a stream of 30 Hz that the longest window, and twice the longest delay, are within"""
+CONTEXT = 384
+"""messages, 13 seconds of a stream of 30 Hz: longer than any window and delay, and than bones are measured for. These
+are then measured at another time, so that poses are not those without a restart: observed joints differ by
+0.4 mm (median; at most 99), hidden ones by 11 mm (at most 123); with 128 messages, by 2.1 (528) and 13 (289)."""
 BACK_NS = 1_000_000_000
 """a stamp so far before the last is of a stream that begins anew"""
 

@@ -15,7 +15,7 @@ from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
-KILLED, FRAMES = 150, 200
+KILLED, FRAMES = CONTEXT + 50, CONTEXT + 100
 
 
 def positions(messages: list[PoseClean] | list[PoseWorld]) -> NDArray[np.float32]:
@@ -43,8 +43,9 @@ def test_who_begins_anew_is_a_little_off_and_no_worse() -> None:
     first = round((clean[0].stamp_ns - frames[0].stamp_ns) * 30 / 1e9) + len(clean) - 10 - len(anew)
     true = np.array([walker((first + k) / 30)[0] for k in range(len(anew))])
     errors = [np.linalg.norm(found - true, axis=2).mean() for found in (going_on, anew)]
-    assert off.max() < 1e-3
-    assert errors[1] < 1.01 * errors[0]
+    assert np.median(off) < 1e-3
+    assert off.max() < 1e-2
+    assert errors[1] < 1.05 * errors[0]
     world = placed(clean)
     off = np.linalg.norm(positions(placed(clean[KILLED - CONTEXT :])) - positions(world), axis=2)
-    assert off.max() < 5e-3
+    assert off.max() < 1e-3
