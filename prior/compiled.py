@@ -11,6 +11,8 @@ import numba
 import numpy as np
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
+from numba.core.environment import Environment
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 from steadypose.prior import loop_cache
@@ -25,7 +27,7 @@ class _LoopCache(_Cache):
     def load_overload(  # pyright: ignore[reportIncompatibleMethodOverride]  (numba's own gives one too)
         self, sig: Any, target_context: Any
     ) -> CompileResult | None:
-        target_context.refresh()
+        rtsys.initialize(target_context)  # not all that a compiler needs, which takes half a second
         key = self._key(sig, target_context.codegen())
         payload = loop_cache.load(self._name(key), key)
         if payload is None:
@@ -36,7 +38,9 @@ class _LoopCache(_Cache):
     def save_overload(self, sig: Any, data: Any) -> None:
         if not data.library.has_dynamic_globals:  # addresses of this process
             key = self._key(sig, data.codegen)
-            loop_cache.save(self._name(key), dumps((key, data._reduce())))
+            *parts, environments = data._reduce()
+            kept = (*parts, tuple(map(_without_globals, environments)))
+            loop_cache.save(self._name(key), dumps((key, kept)))
 
     @property
     def cache_path(self) -> Any:
@@ -53,6 +57,13 @@ class _LoopCache(_Cache):
 
     def _name(self, key: tuple[object, ...]) -> str:
         return f"{self._dispatcher.__name__}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}"
+
+
+def _without_globals(environment: Environment) -> Environment:
+    """What a loop needs of a function that it calls: not its module, of which the compiler's take 0.3 s to import."""
+    kept = Environment({"__name__": "numba"})
+    kept.consts[:], kept.env_name = environment.consts, environment.env_name
+    return kept
 
 
 def njit(*signature: str, cache: bool, **options: Any) -> Callable[[Callable[..., Any]], Any]:

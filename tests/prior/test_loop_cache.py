@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from numba.core import event
 
@@ -139,3 +143,24 @@ def test_all_are_there_until_a_source_changes(folder: Path, monkeypatch: pytest.
     assert kept.exists()
     monkeypatch.setattr(loop_cache, "_sources", lambda: "others")
     assert not loop_cache.is_complete()
+
+
+USES = """
+import sys
+import numpy as np
+from steadypose.prior.body.kinematics import from_rotation_vectors
+from steadypose.prior.clean.gate import _apart
+print(_apart(np.zeros((1, 1, 3)), np.ones((1, 1, 3)))[0, 0], from_rotation_vectors(np.zeros(3)).trace())
+print(*(name for name in sys.modules if name in ("numba.np.arrayobj", "numba.cpython.unicode")))
+"""
+
+
+def test_what_is_compiled_is_loaded_without_the_modules_of_a_compiler(tmp_path: Path) -> None:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    outputs = [
+        subprocess.run([sys.executable, "-c", USES], env=environment, capture_output=True, text=True, check=True)
+        for _ in range(2)
+    ]
+    assert [output.stdout.split("\n")[0] for output in outputs] == [f"{np.sqrt(3.0)} 3.0"] * 2
+    assert "numba.np.arrayobj" in outputs[0].stdout
+    assert outputs[1].stdout.split("\n")[1] == ""
