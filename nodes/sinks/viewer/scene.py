@@ -135,7 +135,7 @@ class PoseView:
             self._pictured = True
             self._send_layout()
         pose = message.sensor_pose
-        self._log("camera", rr.Transform3D(translation=pose.position, quaternion=pose.orientation))
+        self._log("camera", rr.Transform3D(translation=pose.position, quaternion=rr.Quaternion(xyzw=pose.orientation)))
         lens = rr.Pinhole(
             image_from_camera=newest.intrinsics, resolution=newest.size, camera_xyz=rr.ViewCoordinates.RDF
         )

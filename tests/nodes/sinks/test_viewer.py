@@ -35,6 +35,7 @@ from steadypose.nodes.sinks.viewer.layout import FAINT_RGB, SIDE_RGB
 from steadypose.nodes.sinks.viewer.node import ViewerNode, ViewerSettings
 from steadypose.nodes.sinks.viewer.scene import PATH_SECONDS, PoseView
 from steadypose.nodes.sinks.viewer.server import LOOPBACK, Drawings, ViewerError, ViewerServer
+from steadypose.nodes.sources.picture import Picture
 
 rr = pytest.importorskip("rerun", reason="the optional extra `view` is not installed")
 
@@ -371,3 +372,18 @@ def test_a_browser_that_comes_late_gets_the_beginning_and_what_is_kept(monkeypat
 def test_a_host_that_is_none() -> None:
     with pytest.raises(LaunchError, match="host: expected an address"):
         ViewerSettings(host="")
+
+
+def test_an_image_is_drawn_with_the_clean_poses_of_its_moment_and_not_before(log: Log) -> None:
+    view = PoseView(log)  # type: ignore[arg-type]
+    cleaned = [message for topic, message in messages(1.0) if topic == POSE_CLEAN]
+    layouts = log.blueprints
+    view.keep(Picture(cleaned[1].stamp_ns, (480, 360), np.eye(3), b"a jpeg"))
+    view.log(POSE_CLEAN, cleaned[0])
+    assert not log.times("camera/image")
+    view.log(POSE_CLEAN, cleaned[1])
+    assert len(log.times("camera/image")) == 2, "a lens, and an image"
+    assert set(log.times("camera/image")) == {log.times("camera")[-1]}
+    assert log.blueprints > layouts, "a panel of its own"
+    view.log(POSE_CLEAN, cleaned[2])
+    assert len(log.times("camera/image")) == 2

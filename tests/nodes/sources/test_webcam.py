@@ -245,6 +245,7 @@ def test_the_newest_image_is_kept_for_the_viewer_and_none_is_left_behind(
     pictures = [picture for picture in shown if picture]
     assert 1 < len(pictures) < FRAMES, "half of the frames of 30 Hz"
     image = cv2.imdecode(np.frombuffer(pictures[-1].jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
     height, width = image.shape[:2]
     assert pictures[-1].size == (width, height)
     focal = width / 2 / np.tan(WebcamSettings.field_of_view / 2)
