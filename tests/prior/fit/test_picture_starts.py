@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from steadypose.prior.body.inverse_kinematics import place_joints
-from steadypose.prior.body.kinematics import yaw_matrix
+from steadypose.prior.body.kinematics import heading, yaw_matrix
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.fit.observations import Pinhole
 from steadypose.prior.fit.picture import lift, starts_of_key_points
@@ -57,6 +57,7 @@ def test_toes_say_which_side_is_the_far_one(yaw: float) -> None:
     told = pixels(truth)
     (start,) = starts_of_key_points(told, camera(), REST_OFFSETS, -HEIGHT, floor_known=True)
     assert off(start, truth) < 0.25
+    assert np.cos(heading(start.rotations[:, 0].double().numpy()) - yaw).min() > np.cos(0.4)
     told[:, TOES] = np.nan
     starts = starts_of_key_points(told, camera(), REST_OFFSETS, -HEIGHT, floor_known=True)
     assert len(starts) == 2
