@@ -94,13 +94,13 @@ def through_bank(sensed: Sensed, delay: int) -> Batch:
     experts = np.empty((kept, clips, 22, EXPERTS, 3))
     heading, (scale, share) = np.empty((kept, clips, 2)), np.empty((2, kept, clips))
     gap, between = np.empty((2, kept, clips, 22))
-    bank, whiteness, covariance = new_bank(clips, delay), Whiteness(clips), body_covariance()
+    bank, whiteness, covariance = new_bank(clips, delay), Whiteness(clips, delay), body_covariance()
     for t in range(frames):
         advance(bank, t, 1 / FPS, sensed.seen[:, t], sensed.confidence[:, t], DENSITIES, MEASUREMENT_SIGMA, covariance)
         at, white = t - delay, whiteness.share(sensed.seen[:, t])
         if at >= 0:
             describe(bank, t + 1, delay, PARENT, white, experts[at], features[at], scale[at], gap[at], between[at])
-            heading[at], share[at] = bank.heading, fallback(white, scale[at])
+            heading[at], share[at] = bank.heading, fallback(white, scale[at], delay)
     middle = sensed.truth[:, :1, :1]
     middle = np.where(np.isfinite(middle), middle, 0.0)  # so that single precision is enough
     arrays = (

@@ -61,7 +61,7 @@ class MixtureSmoother:
         shapes = (joints, joints, body, body, (slots, 22, OUTPUTS))
         self._memory = _Memory(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
         self._bank = new_bank(slots, delay)
-        self._whiteness, self.white = Whiteness(slots), np.zeros(slots)
+        self._whiteness, self.white = Whiteness(slots, delay), np.zeros(slots)
         self._covariance = body_covariance()
         self._experts = np.empty((slots, 22, EXPERTS, 3))
         self._features = np.empty((slots, 22, FEATURES), dtype=np.float32)
@@ -117,7 +117,7 @@ class MixtureSmoother:
         bank = self._bank
         described = self._experts, self._features, self._scale, self._gap, self._between
         describe(bank, self._count, back, PARENT, self.white, *described)
-        share = fallback(self.white, self._scale)
+        share = fallback(self.white, self._scale, self.delay)
         places, sigma = np.full((self._slots, 22, 3), np.nan), np.full((self._slots, 22), np.inf)
         for slot in np.flatnonzero((self._gap >= 0).any(axis=1)):
             outputs = _outputs(self._features[slot], self._net, self._memory, slot)

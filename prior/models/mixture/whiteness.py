@@ -15,19 +15,25 @@ from numpy.typing import NDArray
 from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.compiled import median, njit
 
-MEMORY, LEAST = 45, 10
+MEMORY, LEAST = 45, 5
 """Frames over which a bone's length is observed, and after which it counts."""
 
-START = 15
-"""Frames of observation that count as much as having none."""
+START, START_NEWEST = 5, 15
+"""Frames of observation that count as much as having none; the second without delay, where the network gains more on
+the multiple-model estimate."""
 
 SHARE = 1.5
 """White share of the noise, times the square of the whiteness, and at most all. On validation people the whiteness is
-0.8 in independent noise, and 0.03 to 0.2 on a Kinect, on MediaPipe and in noise of half a second."""
+0.95 in independent noise, 0.5 in errors in depth that last for 0.05 s, and 0 to 0.1 on a Kinect, on MediaPipe and in
+noise of half a second."""
 
-LARGE = 0.01
+OWN = 3e-3
+"""Metres, standard deviation of the slow variation of a bone's length that is not taken for the sensor's: joints that
+stem from markers on skin are no rigid bones' ends (UI-PRMD's vary by 2.5 mm in the median)."""
+
+LARGE, LARGE_NEWEST = 0.014, 0.01
 """Metres along an axis, white noise in which the multiple-model estimate has at most three quarters of the weight: all
-in much less, half in much more, where what is known of people helps."""
+in much less, half in much more, where what is known of people helps; the second without delay."""
 
 STILL = 1e-3
 """Metres: a bone that varies by less has no noise to speak of."""
@@ -36,23 +42,28 @@ _PARENTS = np.array(PARENTS[1:])
 
 
 class Whiteness:
-    """Keeps the moments of each bone's length: its variance, and that of its change from frame to frame.
+    """Keeps the moments of each bone's length: its variance, and those of its changes from frame to frame.
 
-    In white noise half the mean square of the change is the variance (von Neumann's ratio, 1941); in noise that lasts
-    it is a small part of it.
+    In white noise half the mean square of the change is the variance (von Neumann's ratio, 1941), and each change is
+    half undone by the next one. For noise with a correlation of r from frame to frame either ratio is 1 - r. A slow
+    variation adds to the variance alone, so that it lowers the first ratio; motion of a sensor that smooths lowers the
+    second one. The smaller of the two is the whiteness.
 
     Args:
         slots: bodies.
+        delay: frames.
     """
 
-    def __init__(self, slots: int) -> None:
-        self._last = np.full((slots, len(_PARENTS)), np.nan)
+    def __init__(self, slots: int, delay: int) -> None:
+        self._start = START if delay else START_NEWEST
+        self._last, self._step = np.full((2, slots, len(_PARENTS)), np.nan)
         self._frames, self._mean, self._variance, self._change = np.zeros((4, slots, len(_PARENTS)))
+        self._pairs, self._undone = np.zeros((2, slots, len(_PARENTS)))
 
     def forget(self, slot: NDArray[np.bool_]) -> None:
         """Forget the bodies in these slots (S,)."""
-        self._last[slot] = np.nan
-        for moment in (self._frames, self._mean, self._variance, self._change):
+        self._last[slot] = self._step[slot] = np.nan
+        for moment in (self._frames, self._mean, self._variance, self._change, self._pairs, self._undone):
             moment[slot] = 0.0
 
     def share(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -62,13 +73,16 @@ class Whiteness:
     def update(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Take in joints as `share`; whiteness (S,) from 0, lasting or not known, to 1."""
         white = np.zeros(len(positions))
-        _update(positions, self._last, self._frames, self._mean, self._variance, self._change, white)
+        _update(
+            positions, self._last, self._step, self._frames, self._mean, self._variance, self._change, self._pairs,
+            self._undone, white,
+        )  # fmt: skip
         frames = self._frames.max(axis=1)
-        return white * frames / (frames + START)
+        return white * frames / (frames + self._start)
 
 
 @njit(cache=True)
-def _update(positions, last, frames, mean, variance, change, white):
+def _update(positions, last, step, frames, mean, variance, change, pairs, undone, white):
     """Take joints (S, 22, 3) into the moments of `Whiteness`; writes the median ``white`` (S,) of bones' ratios."""
     ratios = np.empty(len(_PARENTS))
     for slot in range(len(positions)):
@@ -78,8 +92,9 @@ def _update(positions, last, frames, mean, variance, change, white):
             for axis in range(3):
                 square += (positions[slot, k + 1, axis] - positions[slot, _PARENTS[k], axis]) ** 2
             length = math.sqrt(square)
-            changed = 0.5 * (length - last[slot, k]) ** 2
-            last[slot, k] = length
+            moved = length - last[slot, k]
+            changed, back = 0.5 * moved * moved, -moved * step[slot, k]
+            last[slot, k], step[slot, k] = length, moved
             if math.isfinite(changed):
                 frames[slot, k] += 1.0
                 share = 1.0 / min(frames[slot, k], MEMORY)
@@ -87,18 +102,25 @@ def _update(positions, last, frames, mean, variance, change, white):
                 mean[slot, k] = mean[slot, k] + share * off if frames[slot, k] > 1.0 else length
                 variance[slot, k] = (1.0 - share) * (variance[slot, k] + share * off * off)
                 change[slot, k] += share * (changed - change[slot, k])
+            if math.isfinite(back):
+                pairs[slot, k] += 1.0
+                undone[slot, k] += (back - undone[slot, k]) / min(pairs[slot, k], MEMORY)
             if frames[slot, k] >= LEAST and variance[slot, k] > STILL**2:
-                ratios[count] = min(change[slot, k] / max(variance[slot, k], STILL**2), 1.0)
+                opposed = min(max(undone[slot, k] / change[slot, k], 0.0), 1.0) if change[slot, k] > 0.0 else 0.0
+                # white noise may lie on top of a bone that varies by itself
+                own = min(max(variance[slot, k] - change[slot, k], 0.0), OWN**2)
+                ratios[count] = min(change[slot, k] / max(variance[slot, k] - own, STILL**2), opposed)
                 count += 1
         if count > 0:
             white[slot] = median(ratios[:count])
 
 
-def fallback(white: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+def fallback(white: NDArray[np.float64], scale: NDArray[np.float64], delay: int) -> NDArray[np.float64]:
     """The share (S,) of the multiple-model estimate.
 
     Args:
         white: (S,) share of the noise that is white.
         scale: (S,) metres along an axis, estimated noise.
+        delay: frames.
     """
-    return np.minimum(white, 0.5 + 0.5 / (1.0 + np.square(scale / LARGE)))
+    return np.minimum(white, 0.5 + 0.5 / (1.0 + np.square(scale / (LARGE if delay else LARGE_NEWEST))))

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.helpers.bodies import waving
 
-from steadypose.prior.models.mixture.whiteness import LARGE, SHARE, Whiteness, fallback
+from steadypose.prior.models.mixture.whiteness import LARGE, LARGE_NEWEST, SHARE, Whiteness, fallback
 
 FRAMES, SIGMA = 90, 0.01
 
@@ -19,15 +19,39 @@ def lasting(shape: tuple[int, ...], seconds: float) -> NDArray[np.float64]:
     return SIGMA * noise
 
 
-def whiteness_of(positions: NDArray[np.float64]) -> float:
-    whiteness = Whiteness(1)
+def whiteness_of(positions: NDArray[np.float64], delay: int = 4) -> float:
+    whiteness = Whiteness(1, delay)
     return float([whiteness.update(frame[None]) for frame in positions][-1][0])
 
 
 @pytest.mark.parametrize(("seconds", "least", "most"), [(0.0, 0.7, 1.0), (0.5, 0.0, 0.2), (2.0, 0.0, 0.1)])
 def test_noise_that_lasts_is_told_from_noise_that_does_not(seconds: float, least: float, most: float) -> None:
     truth = waving(FRAMES)
-    assert least < whiteness_of(truth + lasting(truth.shape, seconds)) < most
+    assert least <= whiteness_of(truth + lasting(truth.shape, seconds)) < most
+
+
+def test_a_body_whose_bones_vary_by_themselves_is_one_of_white_noise_still() -> None:
+    """Between markers on skin bones are not rigid; a sensor that errs by as much is another matter."""
+    time = np.arange(FRAMES)[:, None, None] / 30
+    by_itself = 1 + np.sin(2 * np.pi * 0.4 * time + np.arange(22)[None, :, None]) * (1.0, 0.3, -0.5)
+    noise = 0.2 * lasting((FRAMES, 22, 3), 0.0)
+    skin, sensor = (whiteness_of(waving(FRAMES) + size * by_itself + noise) for size in (0.002, 0.02))
+    assert skin > 0.85
+    assert sensor < 0.2
+
+
+def test_what_a_sensor_smooths_itself_is_not_white() -> None:
+    white = lasting((FRAMES, 22, 3), 0.0)
+    smoothed = white.copy()
+    smoothed[1:] = (white[1:] + white[:-1]) / 2
+    assert whiteness_of(waving(FRAMES) + smoothed) < 0.1
+
+
+def test_white_noise_is_known_within_a_third_of_a_second() -> None:
+    truth = waving(10)
+    assert whiteness_of(truth + lasting(truth.shape, 0.0)) > 0.5
+    assert whiteness_of(truth + lasting(truth.shape, 0.0), delay=0) < 0.4  # where the network is far better
+    assert whiteness_of(truth + lasting(truth.shape, 0.5)) < 0.2
 
 
 def test_motion_without_noise_is_not_white() -> None:
@@ -38,18 +62,22 @@ def test_missing_joints_and_a_forgotten_body_count_for_nothing() -> None:
     seen = waving(FRAMES) + lasting((FRAMES, 22, 3), 0.0)
     seen[::3, 5:12] = np.nan
     assert 0.6 < whiteness_of(seen) < 1.0
-    whiteness = Whiteness(2)
+    whiteness = Whiteness(2, 4)
     for frame in seen:
         whiteness.update(np.stack([frame, frame]))
     whiteness.forget(np.array([True, False]))
     first, second = whiteness.update(np.stack([seen[0], seen[0]]))
     assert first == 0.0
     assert second > 0.6
+    new = Whiteness(1, 4)
+    new.update(seen[:1])
+    for frame in waving(FRAMES) + lasting((FRAMES, 22, 3), 0.1):
+        assert whiteness.update(np.stack([frame, frame]))[0] == new.update(frame[None])[0]
 
 
 def test_the_share_rises_with_the_square_and_is_at_most_all() -> None:
     seen = waving(FRAMES) + lasting((FRAMES, 22, 3), 0.0)
-    one, other = Whiteness(1), Whiteness(1)
+    one, other = Whiteness(1, 4), Whiteness(1, 4)
     for frame in seen:
         white, share = one.update(frame[None])[0], other.share(frame[None])[0]
         assert share == pytest.approx(min(1.0, SHARE * white**2))
@@ -57,4 +85,5 @@ def test_the_share_rises_with_the_square_and_is_at_most_all() -> None:
 
 def test_the_estimate_by_likelihood_has_all_of_little_noise_and_half_of_much() -> None:
     scale = np.array([1e-4, LARGE, 100 * LARGE, LARGE])
-    np.testing.assert_allclose(fallback(np.array([1.0, 1.0, 1.0, 0.3]), scale), [1.0, 0.75, 0.5, 0.3], atol=1e-3)
+    np.testing.assert_allclose(fallback(np.array([1.0, 1.0, 1.0, 0.3]), scale, 4), [1.0, 0.75, 0.5, 0.3], atol=1e-3)
+    assert fallback(np.ones(1), np.array([LARGE_NEWEST]), 0) == 0.75
