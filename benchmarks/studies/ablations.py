@@ -67,7 +67,7 @@ PARTS: Mapping[str, Part] = {
         PriorSettings(), lambda: mock.patch.object(inference, "body_covariance", return_value=np.eye(22))
     ),
     "without the share of white noise": Part(
-        PriorSettings(), lambda: mock.patch.object(inference, "fallback", lambda white, scale: np.zeros(len(white)))
+        PriorSettings(), lambda: mock.patch.object(inference, "fallback", lambda white, *_: np.zeros(len(white)))
     ),
     "without slow error": Part(PriorSettings(bias_sigma=0.0)),
     "without HG-VAE's denoising": Part(PriorSettings(denoise=DenoiseSettings(enabled=False))),
