@@ -17,12 +17,11 @@ from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity, vel
 from steadypose.prior.world.floor import Floor
 from steadypose.prior.world.observe import FEET, BodyObservation
 
-CAMERA_ERROR, CAMERA_MEMORY_S = 1.2, 0.3
+CAMERA_ERROR, CAMERA_MEMORY_S = 2.0, 0.3
 """Ratio of the velocity's error on poses from a camera to validation's on motion capture, and the least time constant
-of it, seconds: chosen by how far hidden roots of validation people stray; on simulated streams half of an error was
-still there after 0.5 s."""
+of it, seconds: on simulated streams half of an error was still there after 0.5 s."""
 
-SCALE_FACTOR_ERROR = 0.2
+SCALE_FACTOR_ERROR = 0.35
 """Standard deviation of the predicted speed's scale factor, which the network does not state."""
 
 MOVED_SIGMAS = 3.0
