@@ -70,7 +70,7 @@ def check_file(source: Path, out: Path, endings: tuple[str, ...], *, replace: bo
     if out.suffix not in endings:
         raise LaunchError(f"{out}: expected a name ending in {', '.join(endings)}, got {out.suffix or 'none'}")
     if os.path.lexists(out) and not (replace and out.is_file()):
-        raise LaunchError(f"{out} exists: expected a new path, or --force to replace a file")
+        raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
 
 
 def check_poses_file(source: Path, out: Path, *others: Path, replace: bool) -> None:

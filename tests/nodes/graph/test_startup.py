@@ -14,7 +14,7 @@ from steadypose.nodes.commands import node
 from steadypose.nodes.graph.node import Node
 
 def run(self):
-    print(gc.isenabled(), gc.get_freeze_count() > 100_000, *(m for m in sys.argv[2:] if m in sys.modules))
+    print(gc.isenabled(), gc.get_freeze_count() > 50_000, *(m for m in sys.argv[2:] if m in sys.modules))
 
 Node.run = run
 node.node([sys.argv[1]])
