@@ -4,9 +4,6 @@ BEFORE = "measured before results recorded the pipeline's output; to be measured
 WHITE = "measured before white noise was one for all modes of a body; to be measured again"
 
 STALE = {
-    "event_mocap": BEFORE,
-    "events": "measured before the whiteness of noise had two ratios; to be measured again",
-    "hidden_joints": WHITE,
     "humor": BEFORE,
     "kinect_vicon": BEFORE,
     "latency": BEFORE,
