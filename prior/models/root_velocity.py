@@ -1,7 +1,7 @@
 """Root velocity of a body, read from its own motion (HM-VAE, section 3.3), as the live node runs it, without torch.
 
-A recurrent network takes the place of the paper's convolutions over the skeleton, which saw 25 frames: it strays less
-on everybody, and takes a tenth of the time (benchmarks/NOTEBOOK.md).
+A recurrent network takes the place of the paper's convolutions over the skeleton, which saw 25 frames: it is smaller,
+takes less than half the time, and strays less on validation people, as much on test people (benchmarks/NOTEBOOK.md).
 """
 
 from __future__ import annotations
