@@ -12,7 +12,9 @@ EXPECTED_COUNTS = {
 
 
 def test_every_promised_skeleton_is_there_with_its_joints() -> None:
-    assert {name: len(s.joints) for name, s in SKELETONS.items()} == EXPECTED_COUNTS
+    # another test of this process may have added a layout of its own
+    ours = {name: skeleton for name, skeleton in SKELETONS.items() if not name.startswith("own_")}
+    assert {name: len(s.joints) for name, s in ours.items()} == EXPECTED_COUNTS
     for skeleton in SKELETONS.values():
         assert len(set(skeleton.joints)) == len(skeleton.joints)
 
