@@ -1,6 +1,6 @@
 """Throughput: streams per core of a server, and hours of recordings cleaned per hour.
 
-A server's kiosks are copies of one recorded body, each with a clock of its own and captured at another time of the
+A server's clients are copies of one recorded body, each with a clock of its own and captured at another time of the
 frame's period. Times are the thread's processor time, which other processes of the machine do not lengthen.
 """
 
@@ -35,35 +35,35 @@ from steadypose.prior.world.settings import TrajectorySettings
 
 DEPENDS_ON = WORLD
 
-KIOSKS = (1, 4, 8, 16)
-LIVE_KIOSKS = (1, 4, 8, 16, 32)
+CLIENTS = (1, 4, 8, 16)
+LIVE_CLIENTS = (1, 4, 8, 16, 32)
 NETWORK_NS = 3_000_000
 """what a message travels"""
 PERIOD_MS = FRAME_NS / 1e6
 
 
 def serve(
-    frames: list[PoseRaw], kiosks: int, hgvae: bool, periods: int, track: Callable[..., Iterable[int]]
+    frames: list[PoseRaw], clients: int, hgvae: bool, periods: int, track: Callable[..., Iterable[int]]
 ) -> dict[str, Any]:
-    """Milliseconds of a 30 Hz period that the prior, and the trajectories, of so many kiosks take.
+    """Milliseconds of a 30 Hz period that the prior, and the trajectories, of so many clients take.
 
     Args:
-        frames: what each kiosk sees.
-        kiosks: how many.
+        frames: what each client sees.
+        clients: how many.
         hgvae: whether windows are scored and hidden joints imputed.
         periods: to measure.
         track: progress over a range.
     """
     switched = {stage: {"enabled": hgvae} for stage in ("score", "impute")}
-    prior = StreamBatch(PriorSettings.from_dict({"max_bodies": kiosks} | switched), kiosks)
-    trajectories = [TrajectoryPipeline(TrajectorySettings()) for _ in range(kiosks)]
-    names = [f"kiosk {k}" for k in range(kiosks)]
+    prior = StreamBatch(PriorSettings.from_dict({"max_bodies": clients} | switched), clients)
+    trajectories = [TrajectoryPipeline(TrajectorySettings()) for _ in range(clients)]
+    names = [f"client {k}" for k in range(clients)]
     spent: dict[str, list[float]] = {"prior": [], "trajectory": []}
     answers = 0
-    for period, raw in zip(track(range(periods + WARM_UP), description=f"{kiosks} kiosks"), crowd(frames, 1)):  # noqa: B905
+    for period, raw in zip(track(range(periods + WARM_UP), description=f"{clients} clients"), crowd(frames, 1)):  # noqa: B905
         cost = {"prior": 0.0, "trajectory": 0.0}
         for k, name in enumerate(names):
-            captured_ns = raw.stamp_ns + round(k * FRAME_NS / kiosks)
+            captured_ns = raw.stamp_ns + round(k * FRAME_NS / clients)
             # hours apart, as clocks that nobody set
             message = dataclasses.replace(raw, source=name, stamp_ns=captured_ns + k * 3_600_000_000_000)
             started = time.thread_time()
@@ -78,31 +78,31 @@ def serve(
             for node, samples in spent.items():
                 samples.append(cost[node])
     return {
-        "kiosks": kiosks,
+        "clients": clients,
         "hgvae": hgvae,
         "periods": periods,
-        "answered": answers / (kiosks * (periods + WARM_UP)),
+        "answered": answers / (clients * (periods + WARM_UP)),
         "refused": {cause: n for cause, n in prior.counters.items() if n},
         **{f"{node}_ms": percentiles(samples) for node, samples in spent.items()},
     }
 
 
-def serve_live(frames: list[PoseRaw], kiosks: int, seconds: float) -> dict[str, Any]:
+def serve_live(frames: list[PoseRaw], clients: int, seconds: float) -> dict[str, Any]:
     """Milliseconds from capture to arrival of ``pose/world``, less the delay, of a server's nodes; and what is lost.
 
-    The kiosks are publishers of this process, one body each, at 30 Hz, captured one after the other within the period.
+    The clients are publishers of this process, one body each, at 30 Hz, captured one after the other within the period.
     """
-    names = [f"kiosk {k}" for k in range(kiosks)]
+    names = [f"client {k}" for k in range(clients)]
     stream = crowd(frames, 1)
     delay_ns = PriorSettings().delay * FRAME_NS
     late_ms: list[float] = []
     sent = answered = 0
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="steadypose-"))
-        publishers = [stack.enter_context(Publisher(f"ipc://{folder}/{k}")) for k in range(kiosks)]
+        publishers = [stack.enter_context(Publisher(f"ipc://{folder}/{k}")) for k in range(clients)]
         settings = [
             f"server.clients={json.dumps([publisher.endpoint for publisher in publishers])}",
-            f"prior.max_bodies={kiosks}",
+            f"prior.max_bodies={clients}",
             "prior.score.enabled=false",
             "prior.impute.enabled=false",
             "transport.lossless=false",
@@ -115,16 +115,16 @@ def serve_live(frames: list[PoseRaw], kiosks: int, seconds: float) -> dict[str, 
         for period in range(round((WARM_UP_S + seconds) * FPS)):
             raw = next(stream)
             for k, publisher in enumerate(publishers):
-                stamp_ns = began_ns + round((period + k / kiosks) * FRAME_NS)
+                stamp_ns = began_ns + round((period + k / clients) * FRAME_NS)
                 nodes.clock.sleep(stamp_ns - nodes.clock.now_ns())
-                if nodes.clock.now_ns() - stamp_ns < FRAME_NS:  # else this process has no time to be a kiosk
+                if nodes.clock.now_ns() - stamp_ns < FRAME_NS:  # else this process has no time to be a client
                     publisher.publish(POSE_RAW, dataclasses.replace(raw, source=names[k], stamp_ns=stamp_ns))
                     sent += period >= WARM_UP_S * FPS
             while received := nodes.subscriber.receive(0):
                 if period >= WARM_UP_S * FPS and received[0] == POSE_WORLD:
                     late_ms.append((nodes.clock.now_ns() - received[1].stamp_ns - delay_ns) / 1e6)
                     answered += bool(getattr(received[1], "bodies", ()))
-    return {"kiosks": kiosks, "sent": sent, "answered": answered, "latency_ms": percentiles(late_ms or [np.nan])}
+    return {"clients": clients, "sent": sent, "answered": answered, "latency_ms": percentiles(late_ms or [np.nan])}
 
 
 def clean_rate(recording: Path) -> dict[str, float]:
@@ -141,18 +141,18 @@ def run(bench: Bench) -> Result:
     """Streams a core, and recordings cleaned an hour, on this machine."""
     periods = round((2.0 if bench.quick else 10.0) * 30)
     frames = recorded()[:600]
-    served = [serve(frames, kiosks, on, periods, bench.progress.track) for kiosks in KIOSKS for on in (False, True)]
-    lived = [serve_live(frames, kiosks, periods / 30) for kiosks in LIVE_KIOSKS]
+    served = [serve(frames, clients, on, periods, bench.progress.track) for clients in CLIENTS for on in (False, True)]
+    lived = [serve_live(frames, clients, periods / 30) for clients in LIVE_CLIENTS]
     cleaned = clean_rate(RECORDING)
     data = {"served": served, "live": lived, "cleaned": cleaned, "streams_a_core": _streams_a_core(served)}
     return Result([_table(served, cleaned), _live_table(lived)], data)
 
 
 def _streams_a_core(served: list[dict[str, Any]]) -> dict[str, int]:
-    """The most kiosks measured that a node can serve on one core: 99 of 100 periods end in time."""
+    """The most clients measured that a node can serve on one core: 99 of 100 periods end in time."""
 
     def most(node: str, hgvae: bool) -> int:
-        in_time = (s["kiosks"] for s in served if s["hgvae"] == hgvae and s[f"{node}_ms"]["p99"] < PERIOD_MS)
+        in_time = (s["clients"] for s in served if s["hgvae"] == hgvae and s[f"{node}_ms"]["p99"] < PERIOD_MS)
         return max(in_time, default=0)
 
     return {"prior": most("prior", True), "prior without": most("prior", False), "trajectory": most("trajectory", True)}
@@ -161,18 +161,18 @@ def _streams_a_core(served: list[dict[str, Any]]) -> dict[str, int]:
 def _live_table(lived: list[dict[str, Any]]) -> Table:
     return Table(
         name="scale_live",
-        title="A server's kiosks, from capture to pose/world at 30 Hz, less the delay, ms",
-        columns=["kiosks", "p50", "p95", "p99", "longest", "answered, %", "in time"],
+        title="A server's clients, from capture to pose/world at 30 Hz, less the delay, ms",
+        columns=["clients", "p50", "p95", "p99", "longest", "answered, %", "in time"],
         rows=[
             [
-                str(r["kiosks"]),
+                str(r["clients"]),
                 *(f"{r['latency_ms'][p]:.1f}" for p in ("p50", "p95", "p99", "max")),
                 f"{100 * r['answered'] / r['sent']:.1f}",
                 "yes" if r["latency_ms"]["p99"] <= LATEST_MS else "no",
             ]
             for r in lived
         ],
-        note="One body a kiosk, score and imputation off. Answered: messages of a kiosk that came back with its body. "
+        note="One body a client, score and imputation off. Answered: a client's messages that came back with its body. "
         f"In time: a p99 of {LATEST_MS:g} ms, for what is answered.",
     )
 
@@ -182,19 +182,19 @@ def _table(served: list[dict[str, Any]], cleaned: dict[str, float]) -> Table:
     return Table(
         name="scale",
         title="A server's processor time a period of 33.3 ms, ms",
-        columns=["kiosks", "score, impute", "prior, p50", "prior, p99", "a kiosk", "trajectory, p50", "p99"],
+        columns=["clients", "score, impute", "prior, p50", "prior, p99", "a client", "trajectory, p50", "p99"],
         rows=[
             [
-                str(s["kiosks"]),
+                str(s["clients"]),
                 "on" if s["hgvae"] else "off",
                 *(f"{s['prior_ms'][p]:.1f}" for p in ("p50", "p99")),
-                f"{s['prior_ms']['p50'] / s['kiosks']:.2f}",
+                f"{s['prior_ms']['p50'] / s['clients']:.2f}",
                 *(f"{s['trajectory_ms'][p]:.1f}" for p in ("p50", "p99")),
             ]
             for s in served
         ],
-        note="One body a kiosk. In time 99 of 100 periods, on a core: "
-        f"{most['prior without']} kiosks for the prior without score and imputation, {most['prior']} with, and "
+        note="One body a client. In time 99 of 100 periods, on a core: "
+        f"{most['prior without']} clients for the prior without score and imputation, {most['prior']} with, and "
         f"{most['trajectory']} for the trajectory, which is not batched. `clean` does {cleaned['rate']:.1f} s of a "
         "stream of one body a second and core.",
     )

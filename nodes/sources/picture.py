@@ -1,4 +1,4 @@
-"""The newest image of a camera for the viewer: a file of this user, beside the sockets. Off unless ``[input] picture``.
+"""The newest image of a camera for the viewer: a file of this user, beside the sockets. Off unless ``[input] image``.
 
 A file and no message, because images of people belong in no recording, and on no network.
 """

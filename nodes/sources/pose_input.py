@@ -58,7 +58,7 @@ class PoseInputNode(Node):
             self.clock,
             transport.curve_keys(),
             clear_text=transport.clear_text,
-            picture=transport.ipc_directory / PICTURE if settings.picture else None,
+            picture=transport.ipc_directory / PICTURE if settings.image else None,
         )
         self._rate = settings.rate
         self._loop = settings.loop

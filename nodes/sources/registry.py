@@ -64,7 +64,7 @@ class InputSettings:
     """times real time; 0 is as fast as the subscribers take it"""
     loop: bool = False
     """repeat the recording endlessly, with stamps that keep increasing"""
-    picture: bool = False
+    image: bool = False
     """show the viewer of this machine and user the newest image of a webcam or a video, at most 15 a second"""
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     tf: TfSettings = field(default_factory=TfSettings)
@@ -108,7 +108,7 @@ def open_input(
         clock: of the node.
         keys: for cameras on other machines.
         clear_text: whether to listen to these without keys.
-        picture: file for the newest image, if ``[input] picture`` asks for it.
+        picture: file for the newest image, if ``[input] image`` asks for it.
 
     Raises:
         LaunchError, RecordingError, NpzError, CsvError: a setting, or the recording, cannot be used.

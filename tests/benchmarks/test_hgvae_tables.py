@@ -32,27 +32,27 @@ def windows() -> Windows:
 def test_a_fault_changes_windows_and_leaves_the_clean_ones_alone(name: str) -> None:
     clean = np.stack([waving(50, speed=s) for s in (1.0, 1.5, 2.0)])
     kept = clean.copy()
-    spoilt, holds = FAULTS[name](clean, np.random.default_rng(0))
+    corrupted, holds = FAULTS[name](clean, np.random.default_rng(0))
     np.testing.assert_array_equal(clean, kept)
     assert holds.any()
-    assert all(np.abs(spoilt[k] - clean[k]).max() > 0 for k in np.flatnonzero(holds))
+    assert all(np.abs(corrupted[k] - clean[k]).max() > 0 for k in np.flatnonzero(holds))
 
 
 def test_a_joint_counts_as_frozen_only_where_it_would_have_moved() -> None:
     still = np.repeat(waving(1)[None], 50, axis=1)
-    spoilt, holds = FAULTS["a joint frozen"](
+    corrupted, holds = FAULTS["a joint frozen"](
         np.concatenate([still, waving(50, speed=3)[None]]), np.random.default_rng(0)
     )
     assert holds.tolist() == [False, True]
-    stopped = np.ptp(spoilt[1, BEGINS - 1 :], axis=0).max(axis=-1) == 0
+    stopped = np.ptp(corrupted[1, BEGINS - 1 :], axis=0).max(axis=-1) == 0
     assert stopped.sum() == 1
-    assert np.linalg.norm(spoilt[1] - waving(50, speed=3), axis=-1)[:, stopped].max() > MIN_MOTION
+    assert np.linalg.norm(corrupted[1] - waving(50, speed=3), axis=-1)[:, stopped].max() > MIN_MOTION
 
 
 def test_left_for_right_is_the_other_sides_joint() -> None:
     clean = waving(50)[None]
-    spoilt, _ = FAULTS["left taken for right"](clean, np.random.default_rng(0))
-    np.testing.assert_array_equal(spoilt[0, :, J["left_wrist"]], clean[0, :, MIRROR[J["left_wrist"]]])
+    corrupted, _ = FAULTS["left taken for right"](clean, np.random.default_rng(0))
+    np.testing.assert_array_equal(corrupted[0, :, J["left_wrist"]], clean[0, :, MIRROR[J["left_wrist"]]])
 
 
 def test_every_method_gives_back_what_was_seen_and_peers_are_what_they_are_called() -> None:

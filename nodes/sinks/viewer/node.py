@@ -52,7 +52,7 @@ class ViewerNode(Node):
         from steadypose.nodes.sources.registry import InputSettings
 
         settings = self.launch.settings(ViewerSettings)
-        asked = self.launch.settings(InputSettings).picture
+        asked = self.launch.settings(InputSettings).image
         self._pictures = PictureReader(self.launch.transport.ipc_directory / NAME) if asked else None
         with ViewerServer(settings.port, settings.host) as self._server:
             recording = connect(self._server)
