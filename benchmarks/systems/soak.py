@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -209,10 +210,12 @@ def live(
     os.environ |= {"ROS_DOMAIN_ID": str(ROS_DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with _small_disk(folder / "disk") as disk, _free_port() as port:
         settings = [*_settings(folder / "stepping", disk / "out", lossless=False), f"foxglove.port={port}"]
-        with running_nodes(names, settings) as nodes:
+        # faults take their time, while poses go on to be read
+        with running_nodes(names, settings) as nodes, ThreadPoolExecutor(1) as another:
             ledger, reports = Ledger(Launch.read("replay", settings)), {}
             faults = _faults(nodes, disk, port, random_)
-            ended, due, fault, last_s = time.monotonic() + seconds, time.monotonic() + 2 * BETWEEN_S, "", 0.0
+            ended, fault, last_s = time.monotonic() + seconds, "", 0.0
+            pending: Future[None] = another.submit(time.sleep, 2 * BETWEEN_S)
             for topic, message in nodes.messages:
                 now = time.monotonic()
                 if isinstance(message, Diagnostics):
@@ -222,17 +225,23 @@ def live(
                     if fault and last_s:  # not for want of the first pose
                         gaps[fault][-1] = max(gaps[fault][-1], round(now - last_s, 3))
                     last_s = now
-                if now > due:
+                if pending.done():
+                    pending.result()
                     if now > ended:
                         break
                     fault = random_.choice(list(faults))
                     gaps[fault].append(0.0)
-                    faults[fault]()
-                    due = time.monotonic() + BETWEEN_S + (HUNG_S if fault.startswith("hang") else 0.0)
+                    pause_s = BETWEEN_S + (HUNG_S if fault.startswith("hang") else 0.0)
+                    pending = another.submit(_befall, faults[fault], pause_s)
             deaths = {name: child.restarts for name, child in nodes.supervisor.children.items()}
             counts, wrong = _accounts(ledger, reports, deaths)
             failed = nodes.supervisor.failed
     return dict(gaps), counts, wrong + [f"{name} has failed" for name in failed]
+
+
+def _befall(fault: Callable[[], None], pause_s: float) -> None:
+    fault()
+    time.sleep(pause_s)
 
 
 def _faults(nodes: Running, disk: Path, port: int, random_: random.Random) -> dict[str, Callable[[], None]]:
