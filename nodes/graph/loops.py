@@ -40,7 +40,8 @@ def compile_from_the_beginning() -> None:
 
 
 def compile_from_the_end() -> None:
-    """Describe, ask the pose solver and each network, and import the trajectory, whose loops are compiled by that.
+    """Run each network, the smoother's features, the pose solver and orientations by themselves, and import the
+    trajectory, whose loops are compiled by that.
 
     In an order in which the other process, whose first great loop is the bank of smoothers, finds each done.
     """
@@ -48,25 +49,31 @@ def compile_from_the_end() -> None:
 
     from steadypose.prior.body.inverse_kinematics import fit_lengths, solve_pose
     from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS
+    from steadypose.prior.clean.frame import Estimate
+    from steadypose.prior.clean.rotations import Orient, OrientSettings
     from steadypose.prior.models.hgvae.faults import LiveFaultNet
     from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tracks
     from steadypose.prior.models.hgvae.inference import LiveHGVAE
     from steadypose.prior.models.mixture.inference import MixtureSmoother
 
-    smoother = MixtureSmoother(delay=1, slots=1)
-    smoother.skip(0.0)
-    smoother.flush()
-    _, placed = solve_pose(REST_POSITIONS, REST_OFFSETS)
-    fit_lengths(placed, REST_OFFSETS, np.ones(22))
     size, sigma = body_size(REST_OFFSETS[None]), np.array([0.02])
     hgvae = LiveHGVAE.load("default", max_batch=1)
     windows = np.tile(REST_POSITIONS, (1, hgvae.frames, 1, 1))
     windows[:, -5:, -1] = np.nan
     tracks = to_tracks(windows, size)
     found = hgvae.reconstruct(tracks.x, tracks.observed, sigma)
-    LiveFaultNet.load("default", max_batch=1)(tracks.x, found.mean, found.sigma, tracks.observed, sigma)
     from_tracks(found.mean, tracks, size)
+    rotations, placed = solve_pose(REST_POSITIONS, REST_OFFSETS)
+    fit_lengths(placed, REST_OFFSETS, np.ones(22))
+    smoother = MixtureSmoother(delay=1, slots=1)
+    smoother.skip(0.0)
+    smoother.flush()
+    LiveFaultNet.load("default", max_batch=1)(tracks.x, found.mean, found.sigma, tracks.observed, sigma)
     import steadypose.nodes.graph.trajectory_node  # noqa: F401
+
+    deviations, state = np.full((1, 22), 0.02), np.zeros((1, 22), dtype=np.uint8)
+    at_rest = Estimate(0.0, REST_POSITIONS[None], rotations[None], REST_OFFSETS[None], deviations, state)
+    Orient(OrientSettings(), slots=1).update(at_rest)
 
 
 def compile_part() -> None:
