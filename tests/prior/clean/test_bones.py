@@ -14,6 +14,7 @@ from steadypose.prior.clean.bones import (
     PersonSettings,
     SensorBias,
 )
+from steadypose.prior.clean.frame import Person
 from steadypose.prior.timing.kalman import Smoothed
 
 BONES = np.tile(REST_OFFSETS, (1, 1, 1))
@@ -105,9 +106,25 @@ def test_in_a_crowd_everybodys_bones_are_renewed_as_often_as_those_of_one_of_eig
 
     def renewals(slots: int) -> np.ndarray:
         stage, present = PersonEstimator(PersonSettings(), slots), np.ones(slots, dtype=bool)
-        for frame in waving(120):
+        for number, frame in enumerate(waving(120, 0.85)):
             smoothed = Smoothed(0.0, np.tile(frame, (slots, 1, 1)), np.full((slots, 22), 0.02))
-            stage.update(smoothed, np.full(slots, BIAS), present)
+            person = stage.update(smoothed, np.full(slots, BIAS), present)
+            if number == 0:
+                assert (lengths(person.offsets)[:, 1:] < 0.98 * lengths(REST_OFFSETS)[1:]).any(axis=1).all()
         return stage._used
 
     assert renewals(8).min() == renewals(64).min() > 12
+
+
+def test_who_comes_after_somebody_else_has_generic_bones() -> None:
+    stage, both = PersonEstimator(PersonSettings(), 2), np.array([True, True])
+    for frame in waving(60, 0.85):
+        before = stage.update(Smoothed(0.0, np.tile(frame, (2, 1, 1)), np.full((2, 22), 0.02)), np.full(2, BIAS), both)
+    stage.forget(np.array([True, False]))
+    for own, generic, kept in zip(
+        vars(stage.current).values(), vars(Person.generic(2)).values(), vars(before).values(), strict=True
+    ):
+        np.testing.assert_array_equal(own[0], generic[0])
+        np.testing.assert_array_equal(own[1], kept[1])
+    assert before.measured.all()
+    assert before.length_variance.min(axis=0)[1:].all()

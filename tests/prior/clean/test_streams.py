@@ -157,6 +157,16 @@ def test_all_fall_silent_and_come_back() -> None:
     assert len(stamps) >= 20 + 30 - 5
 
 
+def test_messages_that_change_places_are_dropped_and_counted() -> None:
+    arrivals = kiosk("a", 40)
+    for k in (10, 20):
+        (before_ns, before), (after_ns, after) = arrivals[k : k + 2]
+        arrivals[k : k + 2] = [(before_ns, after), (after_ns, before)]
+    answers, batch = serve(arrivals)
+    assert batch.counters["stamp_out_of_order"] == 2
+    assert len(answers["a"]) >= 32
+
+
 @pytest.mark.parametrize(
     ("clock_ns", "way_ns", "until"),
     [(-400_000_000, 0, 90), (400_000_000, 0, 31), (0, 150_000_000, 90)],
