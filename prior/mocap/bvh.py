@@ -15,7 +15,38 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from steadypose.prior.body.rigs import UNITS, Rig, collar, skeleton
 from steadypose.prior.mocap.clip import MotionError, documented, forward
+
+# CMU's motion in its commonest conversion (B. Hahne's, cgspeed.com, and what derives from it): topology alone does not
+# tell the skeleton, for the length of each bone with several children is lost, of the thorax (12 cm, as long as the
+# upper back in the ASF) and the wrist's part of the forearm (9 cm, half of the radius there).
+CMU_BVH = Rig(
+    skeleton(
+        "cmu_bvh",
+        {
+            "pelvis": "Hips",
+            "spine1": "Spine",
+            "spine2": {"Spine": 0.32, "Spine1": 0.68},
+            "spine3": "Spine1",
+            "neck": "Neck1",
+            "head": {"Head": 0.8, "Head_end": 0.2},
+        },
+        {
+            "hip": "LeftUpLeg",
+            "knee": "LeftLeg",
+            "ankle": "LeftFoot",
+            "foot": "LeftToeBase",
+            "collar": collar("Spine1", "Neck1", "LeftArm"),
+            "shoulder": "LeftArm",
+            "elbow": "LeftForeArm",
+            "wrist": "LeftFingerBase",
+        },
+        lambda joint: joint.replace("Left", "Right"),
+    ),
+    metres=UNITS["CMU"],
+    lost_bones={"Neck": 1.0, "LeftShoulder": 1.0, "RightShoulder": 1.0, "LeftFingerBase": 0.5, "RightFingerBase": 0.5},
+)
 
 
 @dataclass
@@ -55,7 +86,7 @@ class Bvh:
         """(T, J, 3) in the file's unit and axes, by forward kinematics.
 
         Args:
-            lost_bones: see `prior.mocap.cmu.Rig`; given back their length where the file has none.
+            lost_bones: see `prior.body.rigs.Rig`; given back their length where the file has none.
         """
         offsets = self.offsets.copy()
         for name, multiple in (lost_bones or {}).items():

@@ -20,9 +20,8 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.rigs import Rig, RigError, Tree, recognise, recognise_points, up_axis
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS
-from steadypose.prior.mocap.bvh import read_bvh
+from steadypose.prior.mocap.bvh import CMU_BVH, read_bvh
 from steadypose.prior.mocap.clip import TO_Z_UP, MotionError, documented, forward
-from steadypose.prior.mocap.cmu import CMU_BVH
 from steadypose.prior.mocap.plug_in_gait import MARKERS, calibrate, joint_centres
 from steadypose.prior.npz import open_npz
 

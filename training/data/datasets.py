@@ -13,9 +13,9 @@ from pathlib import Path, PurePosixPath
 from typing import Literal, NamedTuple
 
 from steadypose.prior.body.layouts import CANONICAL
-from steadypose.prior.mocap.bvh import Bvh
+from steadypose.prior.mocap.bvh import CMU_BVH, Bvh
 from steadypose.prior.mocap.clip import TO_Z_UP, Clip, MotionError
-from steadypose.prior.mocap.cmu import CMU_AMC, CMU_BVH, read_expmap
+from steadypose.training.data.cmu import CMU_AMC, read_expmap
 from steadypose.training.data.readers import (
     UNREADABLE,
     Dropped,

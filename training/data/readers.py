@@ -16,8 +16,8 @@ from steadypose.prior.body.layouts import CANONICAL, Skeleton, to_canonical
 from steadypose.prior.body.rigs import Rig, RigError, up_axis
 from steadypose.prior.mocap.bvh import Bvh, read_bvh
 from steadypose.prior.mocap.clip import TO_Z_UP, Clip, MotionError
-from steadypose.prior.mocap.cmu import CMU_AMC, Asf, read_amc, read_asf
 from steadypose.prior.mocap.files import SUFFIXES, UNDESCRIBED, Description, file_rig, read_motion
+from steadypose.training.data.cmu import CMU_AMC, Asf, read_amc, read_asf
 
 REST_POSE_SPEED = 30.0
 """m/s. No body does this: a first frame that is left faster is a rest pose that a converter has put in front."""

@@ -19,9 +19,9 @@ from tests.helpers.motion_files import AMC, ASF, BVH, amass
 from steadypose.prior import npz
 from steadypose.prior.mocap.bvh import read_bvh
 from steadypose.prior.mocap.clip import MotionError
-from steadypose.prior.mocap.cmu import read_amc, read_asf
 from steadypose.prior.mocap.files import read_amass
 from steadypose.prior.npz import check_arrays
+from steadypose.training.data.cmu import read_amc, read_asf
 
 WORDS = [b"", b"nan", b"1e999", b"-1", b"0", b"{", b"}", b"JOINT", b"CHANNELS 99999", b"\n", b"\xff\0", b"9" * 30]
 READERS: dict[str, tuple[str | bytes, Callable]] = {

@@ -7,7 +7,7 @@ import pytest
 from tests.training.data.test_motion_bvh import turn
 
 from steadypose.prior.mocap.clip import MotionError
-from steadypose.prior.mocap.cmu import read_amc, read_asf
+from steadypose.training.data.cmu import read_amc, read_asf
 
 ASF = """# comment
 :version 1.10

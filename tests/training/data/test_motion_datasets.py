@@ -13,8 +13,9 @@ from tests.training.data.test_motion_amc import AMC, ASF
 
 from steadypose.prior.body.layouts import CANONICAL
 from steadypose.prior.body.skeleton import JOINTS, J
+from steadypose.prior.mocap.bvh import CMU_BVH
 from steadypose.prior.mocap.clip import Clip, MotionError
-from steadypose.prior.mocap.cmu import CMU_AMC, CMU_BVH
+from steadypose.training.data.cmu import CMU_AMC
 from steadypose.training.data.datasets import DATA_SETS, REPEATS
 from steadypose.training.data.readers import Dropped, amc_motions, bvh_motion, members
 

@@ -10,9 +10,10 @@ import pytest
 from tests.training.data.test_motion_bvh import turn
 
 from steadypose.prior.body.skeleton import JOINTS, REST_OFFSETS, J
+from steadypose.prior.mocap.bvh import CMU_BVH
 from steadypose.prior.mocap.clip import MotionError
-from steadypose.prior.mocap.cmu import CMU_BVH, read_expmap
 from steadypose.prior.mocap.files import read_amass
+from steadypose.training.data.cmu import read_expmap
 
 # Enough of CMU's tree to reach every joint that the rig wants: name, parent, offset in metres.
 TREE = [

@@ -1,6 +1,5 @@
-"""CMU's motion capture: Acclaim skeletons (.asf) and their motion (.amc), as the Graphics Lab distributes them; rigs
-where topology alone (`prior.body.rigs`) does not tell the skeleton: its own, and its commonest conversion, which has
-lost bones; and clips of the latter as exponential maps.
+"""CMU's motion capture: Acclaim skeletons (.asf) and their motion (.amc), as the Graphics Lab distributes them, with
+their rig; and clips of its commonest conversion as exponential maps.
 
 Training needs complete bodies, so the tables place the joints that a file lacks within a bone that is there, at the
 height the rest skeleton has them. Figures in comments are centimetres above the hips, where the rest skeleton has
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.prior.body.rigs import UNITS, Rig, collar, skeleton
+from steadypose.prior.mocap.bvh import CMU_BVH
 from steadypose.prior.mocap.clip import MotionError, documented, forward
 from steadypose.prior.npz import open_npz
 
@@ -50,36 +50,6 @@ CMU_AMC = Rig(
     ),
     metres=1.0,
     up="y",
-)
-
-# The same bones, joints named by their near ends (B. Hahne's conversion, cgspeed.com, and what derives from it).
-# That converter loses the length of each bone with several children: the thorax (12 cm, as long as the upper back
-# in the ASF) and the wrist's part of the forearm (9 cm, half of the radius there).
-CMU_BVH = Rig(
-    skeleton(
-        "cmu_bvh",
-        {
-            "pelvis": "Hips",
-            "spine1": "Spine",
-            "spine2": {"Spine": 0.32, "Spine1": 0.68},
-            "spine3": "Spine1",
-            "neck": "Neck1",
-            "head": {"Head": 0.8, "Head_end": 0.2},
-        },
-        {
-            "hip": "LeftUpLeg",
-            "knee": "LeftLeg",
-            "ankle": "LeftFoot",
-            "foot": "LeftToeBase",
-            "collar": collar("Spine1", "Neck1", "LeftArm"),
-            "shoulder": "LeftArm",
-            "elbow": "LeftForeArm",
-            "wrist": "LeftFingerBase",
-        },
-        lambda joint: joint.replace("Left", "Right"),
-    ),
-    metres=UNITS["CMU"],
-    lost_bones={"Neck": 1.0, "LeftShoulder": 1.0, "RightShoulder": 1.0, "LeftFingerBase": 0.5, "RightFingerBase": 0.5},
 )
 
 INCH = 0.0254
