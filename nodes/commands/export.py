@@ -54,6 +54,11 @@ def export(
         raise LaunchError(f"--names {names}: expected OUT to end in {' or '.join(NAMED)}, got {out.suffix}")
     if not source.exists():
         raise LaunchError(f"{source} does not exist: expected a recording with pose/world, or an .npz of 'clean'")
+    if source.is_file() and source.suffix not in (".npz", ".mcap"):
+        raise LaunchError(
+            f"{source}: expected a recording with pose/world, or an .npz of 'clean', got {source.suffix or 'a file'}; "
+            f"clean it first: steadypose clean {source} {source.with_suffix('.npz').name}"
+        )
     if out.suffix in (".glb", ".vrma"):
         require_extra("export")
     # scipy, after it is known that there is something to do

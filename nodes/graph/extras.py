@@ -52,7 +52,7 @@ def require_extra(name: str) -> None:
         # `doctor` names extras where not even numpy is installed
         from steadypose.nodes.graph.settings import LaunchError
 
-        raise LaunchError(f"{EXTRAS[name].purpose}: {how_to_install(missing, name)}")
+        raise LaunchError(how_to_install(missing, name))
 
 
 def extra_of(module: str) -> str | None:

@@ -4,6 +4,7 @@ the streams of the project's own simulator.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -174,7 +175,7 @@ class Poses(dict[str, NDArray[Any]]):
         Raises:
             ModuleNotFoundError: xarray is not installed.
         """
-        import xarray  # pyright: ignore[reportMissingImports]
+        xarray = _installed("xarray")
 
         lead = [*(["time"] if self["stamp_ns"].ndim else []), *(["body"] if "body_id" in self else [])]
         tails: dict[str, list[str]] = {"positions": ["joint", "axis"], "world_positions": ["joint", "axis"]}
@@ -195,7 +196,7 @@ class Poses(dict[str, NDArray[Any]]):
         Raises:
             ModuleNotFoundError: pandas is not installed.
         """
-        import pandas  # pyright: ignore[reportMissingImports]
+        pandas = _installed("pandas")
 
         tables = []
         for id, body in self.bodies.items():
@@ -217,6 +218,22 @@ class Poses(dict[str, NDArray[Any]]):
     def _by_name(self, name: str) -> ByName:
         axis = -2 if name in ("positions", "world_positions", "rotations") else -1
         return ByName.of(self[name], _NAMES[name], axis)
+
+
+def _installed(name: str) -> Any:
+    """A library that no extra brings, for who has it already uses it.
+
+    Raises:
+        ModuleNotFoundError: it is not installed; says what to type.
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise ModuleNotFoundError(
+            f"to_{name} needs {name}, which is not installed: pip install {name}", name=name
+        ) from error
 
 
 BUNDLED = "walk_turn"

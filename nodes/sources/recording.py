@@ -162,7 +162,13 @@ class CsvSource:
             cells = list(rows)
         except csv.Error as error:
             raise CsvError(f"{path}: cannot be read as CSV: {error}") from error
+        if not columns:
+            raise CsvError(
+                f"{path}: has no rows: expected a header, stamp, JOINT_x, JOINT_y, JOINT_z, ..., and a row a frame"
+            )
         self._skeleton = _skeleton(path, columns, header.get("skeleton"))
+        if not cells:
+            raise CsvError(f"{path}: has a header, but no rows: expected one for each frame, and for each body in it")
         try:
             self._sensor_pose = Pose.from_up(header.get("up", "z"))
         except ValueError as error:

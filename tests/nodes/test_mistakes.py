@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -163,6 +164,12 @@ WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
 ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
     "no such file": (["clean", "nowhere.npz", "out.npz"], {}, "nowhere.npz does not exist: expected"),
     "no such folder": (["clean", "in.csv", "nowhere/out.npz"], {"in.csv": ""}, "to exist; make it first"),
+    "an empty CSV": (["clean", "in.csv", "out.npz"], {"in.csv": "\n"}, "in.csv: has no rows: expected a header"),
+    "a CSV with nothing but a header": (
+        ["clean", "in.csv", "out.npz"],
+        {"in.csv": "stamp,left_hip_x,left_hip_y,left_hip_z\n"},
+        "has a header, but no rows: expected one for each frame",
+    ),
     "a CSV without a header": (
         ["clean", "in.csv", "out.npz"],
         {"in.csv": "0.0, 1.0, 2.0, 3.0\n"},
@@ -183,6 +190,11 @@ ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
         ["clean", "in.csv", "out.npz", "--set", "delya=2"],
         {"in.csv": ""},
         "--set delya: no such setting, did you mean 'delay'?",
+    ),
+    "what has not been cleaned, exported": (
+        ["export", "in.csv", "out.bvh"],
+        {"in.csv": ""},
+        "clean it first: steadypose clean in.csv in.npz",
     ),
     "a command that there is not": (["claen"], {}, "did you mean 'clean'?"),
 }
@@ -234,6 +246,35 @@ def test_without_torch_a_fit_says_what_to_install(joints: np.ndarray, monkeypatc
     monkeypatch.setattr("steadypose.nodes.graph.extras.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"torch, .* extra 'train'"):
         steadypose.fit(joints, fps=30)
+
+
+@pytest.mark.parametrize("library", ["pandas", "xarray"])
+def test_without_a_library_of_tables_its_form_says_what_to_install(library: str, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    poses = steadypose.Poses({}, (), {})
+    with pytest.raises(ModuleNotFoundError, match=f"not installed: pip install {library}"):
+        getattr(poses, f"to_{library}")()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "extra"),
+    [
+        (["export", "in.npz", "out.glb"], "export"),
+        (["retarget", "in.csv", "out.csv", "--urdf", "robot.urdf"], "retarget"),
+        (["fit", "in.csv", "out.npz"], "train"),
+        (["clean", "in.mp4", "out.npz"], "webcam"),
+    ],
+)
+def test_a_missing_extra_is_said_once(arguments: list[str], extra: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    """The command is named by the command line, and not once more by what it misses."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("steadypose.nodes.graph.extras.find_spec", lambda name: None)
+    for name in ("in.csv", "in.mp4", "in.npz", "robot.urdf"):
+        Path(name).touch()
+    assert main(arguments) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"steadypose {arguments[0]}: needs ")
+    assert f"the extra {extra!r}" in told
 
 
 @pytest.mark.slow
