@@ -39,7 +39,9 @@ LIBRARIES = [
     "torch",
     "zmq",
 ]
-ELSEWHERE = (".venv", ".git", ".uv", ".hypothesis", "build", "data", "runs", "out", "__pycache__", ".*_cache")
+ELSEWHERE = shutil.ignore_patterns(".venv", ".git", ".uv", ".hypothesis", "__pycache__", ".*_cache")
+MADE = ("build", "data", "runs", "out")
+"""Folders at the top of a checkout that hold no code; further down, one of these names does."""
 
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -173,6 +175,15 @@ def _imports(path: Path) -> set[str]:
     return names
 
 
+def copy_checkout(source: Path, target: Path) -> None:
+    """All that tests of a checkout need, and nothing that they make."""
+
+    def left_out(folder: str, names: list[str]) -> set[str]:
+        return {*ELSEWHERE(folder, names), *(MADE if Path(folder) == source else ())}
+
+    shutil.copytree(source, target, symlinks=True, ignore=left_out)
+
+
 def passes(tests: Sequence[str], root: Path, limit_s: float | None = None) -> bool:
     """Whether the tests pass on the copy of the checkout at ``root``; those that do not end in time do not.
 
@@ -219,7 +230,7 @@ def main() -> int:
     drawn.sort(key=lambda mutant: mutant.file)
     with tempfile.TemporaryDirectory() as temporary:
         root = Path(temporary) / "checkout"
-        shutil.copytree(ROOT, root, symlinks=True, ignore=shutil.ignore_patterns(*ELSEWHERE))
+        copy_checkout(ROOT, root)
         seconds: dict[tuple[str, ...], float] = {(): 0.0}
 
         def survives(mutant: Mutant, tests: Sequence[str], limit_s: float) -> bool:

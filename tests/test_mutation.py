@@ -36,6 +36,17 @@ def test_every_place_that_a_test_can_hold_is_changed_once(tmp_path: Path) -> Non
         assert mutant.source.decode() != CODE
 
 
+def test_a_copy_has_all_code_and_nothing_that_was_made(tmp_path: Path) -> None:
+    for name in ("data/a.npz", "training/data/b.py", "training/__pycache__/b.pyc", ".venv/c.py", "tests/test_d.py"):
+        (file := tmp_path / "from" / name).parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    mutation.copy_checkout(tmp_path / "from", to := tmp_path / "to")
+    assert {str(path.relative_to(to)) for path in to.rglob("*.*") if path.is_file()} == {
+        "training/data/b.py",
+        "tests/test_d.py",
+    }
+
+
 @pytest.mark.slow
 def test_tests_that_are_not_there_kill_nothing(tmp_path: Path) -> None:
     (tmp_path / "test_it.py").write_text("def test_it():\n    assert 1 + 1 == 2\n")

@@ -6,7 +6,7 @@ with other recordings of somebody else, or nothing was learned.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,9 @@ from steadypose.benchmarks.studies.kinect_methods import KNOWN, RIDGE, TCN, UNKN
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
 from steadypose.training.data.ui_prmd import KinectPair
+from steadypose.training.loop import TrainingOptions
 from steadypose.training.recipes import sensor_bias
+from steadypose.training.recipes.sensor_bias import SensorTake, leave_one_person_out
 
 PEOPLE = ("s01", "s02", "s03")
 FRAMES = 20
@@ -118,6 +120,41 @@ def test_no_left_out_person_reaches_what_is_learned(bench: Bench, left_out: str)
     assert [key for key in plain if plain[key] != others[key]] == []
     taught = learned(bench, left_out, next(who for who in PEOPLE if who != left_out))
     assert [name for name in (RIDGE, TCN, KNOWN) if plain[name, 4] == taught[name, 4]] == []
+
+
+def test_a_sensors_correction_is_judged_by_whom_it_was_not_learned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # what is missing is known where the sensor has one joint 8 cm off: a correction of half of it leaves half
+    seen, off = to_canonical(KINECT22, pair("s01", 0, "").kinect)[0], np.zeros((22, 3))
+    off[J["left_wrist"]] = [0.0, 0.0, 0.08]
+    takes = [SensorTake(who, seen, np.array([3.0, 0.0, 1.0]), seen + off) for who in (*PEOPLE[::-1], *PEOPLE)]
+    missing = sensor_bias._take(takes[0])[1]
+    learned_of: list[list[str]] = []
+
+    def train(takes: Sequence[SensorTake], options: TrainingOptions) -> Path:
+        learned_of.append(sorted(take.person for take in takes))
+        return options.path("correction")
+
+    files: list[str] = []
+
+    class Half:
+        @staticmethod
+        def load(path: str, rows: int) -> Callable[[np.ndarray], np.ndarray]:
+            files.append(path)
+            return lambda x: 0.5 * missing[-rows:]
+
+    monkeypatch.setattr(sensor_bias, "LiveCorrection", Half)
+    monkeypatch.setattr(sensor_bias, "train_sensor", train)
+    share = 0.08 / np.isfinite(seen[0, :, 0]).sum()
+    found = list(leave_one_person_out(takes, TrainingOptions(tmp_path, tmp_path, "mine")))
+    assert tuple(held.person for held in found) == PEOPLE
+    assert learned_of == [[who for who in PEOPLE for _ in range(2) if who != held.person] for held in found]
+    assert len(set(files)) == len(PEOPLE), "each has weights of its own"
+    for held in found:
+        assert held.observed_m == pytest.approx(float(np.nanmean(np.linalg.norm(missing, axis=-1))), rel=1e-6)
+        assert share < held.observed_m < 2 * share, "the fit spreads it over the others, which are moved against it"
+        assert held.corrected_m == pytest.approx(0.5 * held.observed_m, rel=1e-6)
 
 
 def test_offsets_are_learned_on_the_others(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

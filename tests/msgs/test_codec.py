@@ -31,7 +31,7 @@ TOPIC_NAMES = st.sampled_from(list(TOPICS))
 
 
 @given(ANY)
-@settings(max_examples=150)
+@settings(max_examples=60)
 def test_round_trip(sent: tuple[str, Message]):
     topic, message = sent
     assert decode(topic, encode(message)) == message
@@ -67,14 +67,14 @@ def test_arrays_that_are_not_contiguous_are_encoded_by_value():
 
 
 @given(TOPIC_NAMES, st.binary(max_size=3000))
-@settings(max_examples=250)
+@settings(max_examples=120)
 def test_random_bytes_are_refused(topic: str, payload: bytes):
     _decode_or_refuse(topic, payload)
     _decode_or_refuse(topic, b"\0\1\0\0" + payload)
 
 
 @given(st.data(), TOPIC_NAMES)
-@settings(max_examples=250)
+@settings(max_examples=120)
 def test_mutated_messages_are_refused_or_read(data: st.DataObject, topic: str):
     payload = bytearray(PAYLOADS[topic])
     for _ in range(data.draw(st.integers(1, 8))):

@@ -144,6 +144,7 @@ def test_clean_gets_over_it(kind: str, weights: dict[str, str]) -> None:
         assert (prior.counters + trajectory.counters).total() > 0
 
 
+@pytest.mark.slow
 def test_no_node_goes_down(weights: dict[str, str], make_launch: Callable[..., Launch]) -> None:
     """All of it in a row over real sockets, with garbage in between."""
     launch = make_launch(weights, nodes='["pose_input", "prior", "trajectory"]')

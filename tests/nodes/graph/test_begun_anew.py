@@ -4,6 +4,7 @@ little off those of one that was not killed, and no worse."""
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from conftest import walk
 from numpy.typing import NDArray
 from tests.helpers.synthetic_poses import walker
@@ -25,6 +26,7 @@ def positions(messages: list[PoseClean] | list[PoseWorld]) -> NDArray[np.float32
     return np.array([m.bodies[0].positions for m in messages if begin < m.stamp_ns + 1000 <= end + 2000])
 
 
+@pytest.mark.slow
 def test_who_begins_anew_is_a_little_off_and_no_worse() -> None:
     frames = walk(FRAMES)
 

@@ -12,6 +12,7 @@ import pytest
 from conftest import VirtualClock, another_python, raw, running, until, walking
 from tests.helpers.synthetic_poses import walker
 
+from steadypose.msgs.codec import MAX_BODIES
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import PoseRaw
@@ -110,7 +111,7 @@ class Topic(LiveSource):
 def test_more_bodies_than_a_message_holds_are_refused_and_the_next_frame_comes(
     make_launch: Callable[..., Launch], clock: VirtualClock
 ) -> None:
-    crowd = from_pose_array(pose_array(22 * 4000), CANONICAL, "z")
+    crowd = from_pose_array(pose_array(22 * (MAX_BODIES + 1)), CANONICAL, "z")
     frames = Topic(raw(1, walking(1)), crowd, raw(2, walking(2)))
     source = PoseInputNode(make_launch(transport__lossless="false"), clock, frames)
     with running(source):

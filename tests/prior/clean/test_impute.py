@@ -71,8 +71,8 @@ def test_other_bodies_do_not_change_what_is_imputed() -> None:
 
 def test_switched_off_hidden_joints_follow_the_refinement_model() -> None:
     refined = {"impute": {"enabled": False}, "refine": {"enabled": True}}
-    off, _ = answers(hidden_arm(), **refined, score={"enabled": False})
-    scored, _ = answers(hidden_arm(), **refined)
+    off, _ = answers(hidden_arm(65), **refined, score={"enabled": False})
+    scored, _ = answers(hidden_arm(65), **refined)
     assert all((a.positions == b.positions).all() for a, b in zip(off, scored, strict=True))
     assert all((b.state[ARM] == JointState.IMPUTED).all() for b in off[50:])
 

@@ -45,7 +45,7 @@ def test_a_still_joint_keeps_its_bias_and_a_moving_one_loses_it() -> None:
 @pytest.mark.parametrize("fps", [15.0, 60.0])
 def test_noise_is_a_matter_of_seconds_not_of_frames(fps: float) -> None:
     def spread(rate: float) -> tuple[float, float]:
-        drawn = draw_errors(*evenly(4.0, rate, 0.3, batch=300), np.random.default_rng(0), MODEL)
+        drawn = draw_errors(*evenly(4.0, rate, 0.3, batch=100), np.random.default_rng(0), MODEL)
         return float(np.median(np.abs(drawn.quick))), float(np.median(np.abs(drawn.steady)))
 
     assert spread(fps) == pytest.approx(spread(30.0), rel=0.15)
