@@ -15,6 +15,8 @@ def of(x: int | None, y=True):
         raise ValueError(f"{x + 1}")
     x += 1
     print(x, [y, os], y)
+    if y:
+        return None
     return pair(y, x)[:, 0] + 3
 '''
 CHANGES = [

@@ -215,14 +215,14 @@ def test_a_subscriber_that_never_reads_neither_blocks_nor_fills_its_publisher(en
         assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
 
         def publish() -> None:
-            for stamp in range(1000):
+            for stamp in range(500):
                 publisher.publish(POSE_RAW, dataclasses.replace(BIG, stamp_ns=stamp))
 
         publishing = threading.Thread(target=publish, daemon=True)
         publishing.start()
         publishing.join(60)
         assert not publishing.is_alive(), "publish waits"
-        # 5 messages there, 5 here, and what the kernel holds on the way: not the 160 MB that were published
+        # 5 messages there, 5 here, and what the kernel holds on the way: not the 80 MB that were published
         held = 0
         while subscriber.receive(NEVER_S):
             held += 1
@@ -239,16 +239,16 @@ def test_who_is_reliable_is_waited_for_and_nobody_else(endpoint: str):
         assert publisher.wait_for_subscribers(["self-appointed", "deaf"], timeout_s=SOON_S)
         assert publisher.wait_for_subscribers(["slow"], timeout_s=SOON_S)
         received, waits = [], 0
-        for stamp in range(500):
+        for stamp in range(300):
             message = dataclasses.replace(BIG, stamp_ns=stamp)
             while not publisher.publish(POSE_RAW, message, timeout_s=0):
                 waits += 1
                 got = slow.receive(SOON_S)
                 assert got
                 received.append(got[1].stamp_ns)
-        received += stamps_until(slow, 499)
+        received += stamps_until(slow, 299)
         assert waits > 0
-        assert received == list(range(500))
+        assert received == list(range(300))
         assert not slow.dropped
 
 
