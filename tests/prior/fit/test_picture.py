@@ -75,6 +75,15 @@ def test_toes_say_which_side_is_the_far_one(yaw: float) -> None:
     assert min(off(start, truth) for start in starts) < 0.25
 
 
+@pytest.mark.parametrize("yaw", [-np.pi / 2, np.pi / 2])
+def test_who_is_wider_than_bones_allow_is_turned_to_the_camera_or_away_from_it(yaw: float) -> None:
+    told = pixels(person(yaw))
+    wide = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("hip", "shoulder")]
+    told[:, wide, 0] += 0.4 * (told[:, wide, 0] - told[:, wide, 0].mean(axis=1, keepdims=True))
+    for start in starts_of_key_points(told, camera(), REST_OFFSETS, -HEIGHT):
+        assert np.cos(heading(start.rotations[:, 0].double().numpy()) - yaw).min() > np.cos(0.2)
+
+
 @pytest.mark.parametrize("size", [0.7, 1.0, 1.1])
 def test_a_known_floor_says_how_large_somebody_is(size: float) -> None:
     truth = person(0.2, size)
