@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,9 +20,20 @@ from steadypose.benchmarks.baselines.filters import FILTERS
 from steadypose.benchmarks.bench import Bench, Tuned
 from steadypose.benchmarks.studies import kinect_methods, kinect_vicon
 from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip
-from steadypose.benchmarks.studies.kinect_methods import KNOWN, RIDGE, TCN, UNKNOWN, Kinect, Method, Stated, run_filter
+from steadypose.benchmarks.studies.kinect_methods import (
+    KNOWN,
+    RIDGE,
+    TCN,
+    UNKNOWN,
+    Kinect,
+    Method,
+    Stated,
+    run_filter,
+    run_ours,
+)
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.training.data.ui_prmd import KinectPair
 from steadypose.training.loop import TrainingOptions
 from steadypose.training.recipes import sensor_bias
@@ -120,6 +132,24 @@ def test_no_left_out_person_reaches_what_is_learned(bench: Bench, left_out: str)
     assert [key for key in plain if plain[key] != others[key]] == []
     taught = learned(bench, left_out, next(who for who in PEOPLE if who != left_out))
     assert [name for name in (RIDGE, TCN, KNOWN) if plain[name, 4] == taught[name, 4]] == []
+
+
+def test_each_clip_gets_its_own_frames_of_the_scored_joints(monkeypatch: pytest.MonkeyPatch) -> None:
+    some = [clip("s01", 0, ""), clip("s02", 0, "")]
+    some[1] = some[1]._replace(kinect=some[1].kinect[:12])
+    rng, frames = np.random.default_rng(0), (FRAMES, 2)
+    made = SimpleNamespace(
+        positions=rng.normal(size=(*frames, 22, 3)), sigma=rng.uniform(size=(*frames, 22)),
+        anomaly=rng.uniform(size=frames), flagged=rng.uniform(size=frames) > 0.5,
+    )  # fmt: skip
+    monkeypatch.setattr(kinect_methods.product, "run", lambda *_: made)
+    positions, stated = run_ours(some, PriorSettings(), 4)
+    scored = [J[name] for name in SCORED]
+    for number, (own, told, count) in enumerate(zip(positions, stated, (FRAMES, 12), strict=True)):
+        np.testing.assert_array_equal(own, made.positions[:count, number, scored])
+        np.testing.assert_array_equal(told.sigma, made.sigma[:count, number, scored])
+        np.testing.assert_array_equal(told.anomaly, made.anomaly[:count, number])
+        np.testing.assert_array_equal(told.flagged, made.flagged[:count, number])
 
 
 def test_a_sensors_correction_is_judged_by_whom_it_was_not_learned_of(
