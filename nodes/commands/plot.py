@@ -31,6 +31,7 @@ def plot(
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None,
     body: int | None = None,
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    over: Annotated[Path | None, tyro.conf.arg(metavar="VIDEO")] = None,
 ) -> None:
     """Draw what happened in a recording.
 
@@ -41,6 +42,8 @@ def plot(
         body: id of the body to draw; the one seen the longest if left out.
         video: moving picture to write instead, .gif or .mp4 (the latter by OpenCV, which the extra 'oak' brings): raw
             beside clean beside world, as far as the recording has them.
+        over: the video that was cleaned, as in 'steadypose clean walk.mp4 walk': with --video, raw (which an .npz
+            lacks) and clean are drawn over its images. A camera of the field of view that 'clean' takes is assumed.
 
     Raises:
         RecordingError: the recording cannot be read.
@@ -50,11 +53,16 @@ def plot(
 
     matplotlib.use("Agg")
     _refuse_folder(recording)
+    if over is not None and video is None:
+        raise PlotError("over: expected a video to write as well: --video FILE.mp4")
     if video is not None:
-        from steadypose.nodes.commands.plot_video import VIDEOS, write_video
+        from steadypose.nodes.commands.plot_video import VIDEOS, write_overlay, write_video
 
         check_picture(video, VIDEOS)
-        frames = write_video(history_of_path(recording), video, body)
+        if over is not None:
+            frames = write_overlay(recording, over, video, body)
+        else:
+            frames = write_video(history_of_path(recording), video, body)
         print(f"wrote {video}: {frames} frames")
         return
     output = output or Path(f"{recording.resolve().stem}.png")

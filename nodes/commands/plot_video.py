@@ -53,12 +53,25 @@ SHADES = (1.0, 0.8, 0.6, 0.45, 0.3, 0.15)
 """of each colour on white, which a GIF has: few, and the same in all frames, or colours flicker"""
 
 
+def write_overlay(recording: Path, video: Path, path: Path, body: int | None = None) -> int:
+    """Write what was cleaned of a video over its images, as the ending says; returns the number of frames.
+
+    Raises:
+        PlotError: OpenCV is not installed, or as `plot_overlay.overlaid`.
+    """
+    try:
+        from steadypose.nodes.commands.plot_overlay import overlaid
+    except ModuleNotFoundError as error:
+        raise PlotError(f"over: {how_to_install([error.name or ''], 'oak')}") from error
+    frames, fps = overlaid(recording, video, body)
+    return _write_gif(frames, path, fps, shades=False) if path.suffix == ".gif" else _write_mp4(frames, path, fps)
+
+
 def write_video(history: History, path: Path, body: int | None = None) -> int:
     """Write the video of one body, as the ending says, at about `FPS`; returns the number of frames.
 
     Raises:
-        PlotError: there is nothing to draw, or no such body.
-        ModuleNotFoundError: OpenCV is not installed, for an .mp4.
+        PlotError: there is nothing to draw, no such body, or OpenCV is not installed, for an .mp4.
     """
     chosen = body_of(history, body)
     lead = next(t for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW) if (t := history.track(topic, chosen)) is not None)
@@ -219,17 +232,22 @@ def _palette() -> list[int]:
     return np.round(255 * np.array([np.ones(3), *shades])).astype(int).ravel().tolist()
 
 
-def _write_gif(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> int:
+def _write_gif(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float, *, shades: bool = True) -> int:
+    """Args:
+    shades: whether the colours are those of `SHADES`; if not, each image has its own.
+    """
     from PIL import Image
 
-    pictures = [Image.fromarray(frame) for frame in frames]
-    if not pictures:
+    images = [Image.fromarray(frame) for frame in frames]
+    if not images:
         return 0
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(_palette())
-    first, *rest = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    if shades:
+        palette = Image.new("P", (1, 1))
+        palette.putpalette(_palette())
+        images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    first, *rest = images
     first.save(path, save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, optimize=True)
-    return len(pictures)
+    return len(images)
 
 
 def _write_mp4(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> int:

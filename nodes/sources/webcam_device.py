@@ -221,6 +221,21 @@ def connect(
         capture.release()
 
 
+def stamped_images(video: cv2.VideoCapture) -> Iterator[tuple[int, NDArray[Any] | None]]:
+    """The images (H, W, 3), BGR, of an open video, each with its nanoseconds; None where one cannot be decoded."""
+    period_ns = round(1e9 / (video.get(cv2.CAP_PROP_FPS) or 30.0))
+    stamp_ns = -1
+    while video.grab():
+        reported_ns = round(video.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+        # some containers state the frame rate alone
+        if reported_ns > stamp_ns:
+            stamp_ns = reported_ns
+        else:
+            stamp_ns += period_ns if stamp_ns >= 0 else 1
+        good, image = video.retrieve()
+        yield stamp_ns, image if good else None
+
+
 class VideoSource:
     """The skeletons that MediaPipe sees in a video, a recorded source: no image is left out, however long it takes.
 
@@ -242,7 +257,6 @@ class VideoSource:
         if not video.isOpened():
             raise LaunchError(f"[input.webcam] video: expected a video that OpenCV can read, got {settings.video!r}")
         self._images = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-        self._period_ns = round(1e9 / (video.get(cv2.CAP_PROP_FPS) or 30.0))
         video.release()
 
     def __len__(self) -> int:
@@ -251,24 +265,16 @@ class VideoSource:
     def __iter__(self) -> Iterator[tuple[str, Message]]:
         video = cv2.VideoCapture(self._settings.video)
         name = Path(self._settings.video).stem
-        stamp_ns = -1
         try:
             with (
                 self._make_landmarker(self._settings) as landmarker,
                 closing(PoseFinder(name, landmarker, self._settings, self._calibration, self._picture)) as finder,
             ):
-                while video.grab():
-                    reported_ns = round(video.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-                    # some containers state the frame rate alone
-                    if reported_ns > stamp_ns:
-                        stamp_ns = reported_ns
-                    else:
-                        stamp_ns += self._period_ns if stamp_ns >= 0 else 1
-                    good, image = video.retrieve()
-                    if good and (frame := finder.find(image, stamp_ns)) is not None:
-                        yield POSE_RAW, frame
-                    elif not good:
+                for stamp_ns, image in stamped_images(video):
+                    if image is None:
                         self.refused["image that cannot be decoded"] += 1
+                    elif (frame := finder.find(image, stamp_ns)) is not None:
+                        yield POSE_RAW, frame
                 self.refused.update(finder.counts)
         finally:
             video.release()

@@ -1,0 +1,145 @@
+"""``steadypose plot --video --over``: the skeletons of a video, raw beside clean, drawn over its images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.recording import RecordingReader
+from steadypose.msgs.topics import POSE_CLEAN
+from steadypose.msgs.types import JointState, PoseClean
+from steadypose.nodes.commands.plot_history import PlotError
+from steadypose.nodes.sinks.drawing import ALL_BONES, FAINT, ON_DARK, SIDES, bones
+from steadypose.nodes.sources.adapters import pinhole
+from steadypose.nodes.sources.npz import is_output, read_arrays
+from steadypose.nodes.sources.source import WebcamSettings
+from steadypose.nodes.sources.webcam_device import stamped_images
+from steadypose.prior.arrays import Floats
+
+FPS = 15
+"""Frames in a second of what is written, at most."""
+WIDTH = 480
+"""Width of one of its images in pixels, at most."""
+APART_NS = 34_000_000
+"""Time in nanoseconds between an image and the pose that is drawn over it, at most: a step of the prior's grid."""
+NEAREST = 0.1
+"""Depth in metres from which on a joint is drawn: nearer, it is far beside the image."""
+
+
+class Body(NamedTuple):
+    """One body at one moment, in the camera's optical frame."""
+
+    raw: Floats | None
+    """(22, 3) metres, what went in; None where it was not kept"""
+    clean: Floats
+    """(22, 3) metres"""
+    observed: NDArray[np.bool_]
+    """(22,)"""
+
+
+def overlaid(recording: Path, video: Path, body: int | None) -> tuple[Iterator[NDArray[np.uint8]], float]:
+    """The images (H, W, 3), RGB, of a video that was cleaned, with its skeletons; and how many make a second.
+
+    The camera is the one that `steadypose clean VIDEO` took it for, of which the field of view is guessed.
+
+    Raises:
+        PlotError: the video cannot be read, or is not the one of which the recording is.
+    """
+    moments = _of_npz(recording, body) if recording.suffix == ".npz" else _of_recording(recording, body)
+    capture = cv2.VideoCapture(str(video))
+    size = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+    rate = capture.get(cv2.CAP_PROP_FPS) or 30.0
+    if not capture.isOpened():
+        raise PlotError(f"over: expected a video that OpenCV can read, got {video}")
+    step = max(round(rate / FPS), 1)
+    return _frames(capture, moments, pinhole(size, WebcamSettings().field_of_view), step, video), rate / step
+
+
+def _of_recording(path: Path, body: int | None) -> dict[int, list[Body]]:
+    moments = {}
+    with RecordingReader(path) as reader:
+        for _, stamp_ns, message in reader.messages([POSE_CLEAN]):
+            if isinstance(message, PoseClean):
+                moments[stamp_ns] = [
+                    Body(found.raw_positions, found.positions, _observed(found.state))
+                    for found in message.bodies
+                    if body in (None, found.id)
+                ]
+    return moments
+
+
+def _of_npz(path: Path, body: int | None) -> dict[int, list[Body]]:
+    arrays = read_arrays(path)
+    if not is_output(arrays):
+        raise PlotError(f"{path}: expected what 'steadypose clean' made of the video, got an input")
+    frames, several = len(arrays["stamp_ns"]), "body_id" in arrays
+    clean, state = (
+        arrays[name].reshape(frames, -1, *arrays[name].shape[1 + several :]) for name in ("positions", "state")
+    )
+    chosen = [n for n, id in enumerate(arrays["body_id"] if several else [0]) if body in (None, id)]
+    return {
+        int(stamp_ns): [Body(None, clean[row, n], _observed(state[row, n])) for n in chosen]
+        for row, stamp_ns in enumerate(arrays["stamp_ns"])
+    }
+
+
+def _observed(state: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    return np.isin(state, (JointState.SEEN, JointState.REFINED))
+
+
+def _frames(
+    capture: cv2.VideoCapture, moments: dict[int, list[Body]], intrinsics: Floats, step: int, video: Path
+) -> Iterator[NDArray[np.uint8]]:
+    stamps = np.array(sorted(moments), dtype=np.int64)
+    raws = [body.raw for found in moments.values() for body in found if body.raw is not None]
+    ever = np.any([np.isfinite(raw).all(axis=1) for raw in raws], axis=0) if raws else np.zeros(22, bool)
+    drawn = False
+    for number, (stamp_ns, image) in enumerate(stamped_images(capture)):
+        if number % step or image is None:
+            continue
+        near = int(stamps[np.abs(stamps - stamp_ns).argmin()]) if len(stamps) else -APART_NS
+        bodies = moments[near] if abs(near - stamp_ns) < APART_NS else []
+        drawn |= bool(bodies)
+        scale = min(1.0, WIDTH / image.shape[1])
+        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        lens = intrinsics * [[scale], [scale], [1.0]]
+        panels = [_with_bones(small, [(body.clean, body.observed) for body in bodies], ALL_BONES, lens, "clean")]
+        if ever.any():
+            given = [(body.raw, np.ones(22, bool)) for body in bodies if body.raw is not None]
+            panels.insert(0, _with_bones(small, given, bones(ever), lens, "raw"))
+        yield np.ascontiguousarray(np.hstack(panels)[..., ::-1])
+    if not drawn:
+        raise PlotError(f"{video}: expected the video of which the recording is; none of its images has a pose's stamp")
+
+
+def _with_bones(
+    image: NDArray[np.uint8],
+    bodies: list[tuple[Floats, NDArray[np.bool_]]],
+    shown: NDArray[np.intp],
+    lens: Floats,
+    title: str,
+) -> NDArray[np.uint8]:
+    """An image with the bones of bodies, each of joints and which are observed, and with a title."""
+    image = image.copy()
+    for joints, observed in bodies:
+        depth = joints[:, 2:]
+        pixels = (joints @ lens.T)[:, :2] / np.where(depth > NEAREST, depth, np.nan)
+        seen = [bone for bone in shown if np.isfinite(pixels[bone]).all()]
+        guessed = image.copy()
+        _draw(guessed, pixels, [bone for bone in seen if not observed[bone].all()])
+        image = cv2.addWeighted(guessed, FAINT, image, 1.0 - FAINT, 0.0)
+        _draw(image, pixels, [bone for bone in seen if observed[bone].all()])
+    cv2.putText(image, title, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (255, 255, 255), 2, cv2.LINE_AA)
+    return image
+
+
+def _draw(image: NDArray[np.uint8], pixels: Floats, drawn: list[NDArray[np.intp]]) -> None:
+    for parent, child in drawn:
+        (x, y), (to_x, to_y) = np.round(pixels[[parent, child]]).astype(int).tolist()
+        red, green, blue = bytes.fromhex(ON_DARK[SIDES[child]][1:])
+        cv2.line(image, (x, y), (to_x, to_y), (blue, green, red), 3, cv2.LINE_AA)
