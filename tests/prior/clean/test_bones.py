@@ -118,6 +118,7 @@ def test_in_a_crowd_everybodys_bones_are_renewed_as_often_as_those_of_one_of_eig
 
 def test_who_comes_after_somebody_else_has_generic_bones() -> None:
     stage, both = PersonEstimator(PersonSettings(), 2), np.array([True, True])
+    before = stage.current
     for frame in waving(60, 0.85):
         before = stage.update(Smoothed(0.0, np.tile(frame, (2, 1, 1)), np.full((2, 22), 0.02)), np.full(2, BIAS), both)
     stage.forget(np.array([True, False]))

@@ -144,8 +144,8 @@ def recording(joints: np.ndarray, points: np.ndarray | None = None, height: floa
 
 
 def test_depth_is_observed_too_and_half_of_the_frames_cleaned_are_a_start() -> None:
-    joints = person(0.2) + 0.01 * np.arange(FRAMES)[:, None, None]
-    points = np.repeat(joints, 4, axis=1) - [0.0, 0.05, 0.0]
+    joints = person(0.2) + 0.01 * np.arange(FRAMES, dtype=np.float64)[:, None, None]
+    points = np.repeat(joints, 4, axis=1) - np.array([0.0, 0.05, 0.0])
 
     def track(known: list[int]) -> picture.Track:
         cleaned = np.full_like(joints, np.nan)
@@ -190,7 +190,7 @@ def test_a_camera_whose_height_nobody_states_is_guessed_and_its_floor_may_move(m
 def test_what_is_written_is_in_the_cameras_frame() -> None:
     told = recording(joints := person(0.7))
     told.pixels[3, 4] = np.nan
-    moving = joints + np.arange(FRAMES)[:, None, None] * [0.02, 0.0, 0.01]
+    moving = joints + np.arange(FRAMES, dtype=np.float64)[:, None, None] * np.array([0.02, 0.0, 0.01])
     rotations = np.tile(np.eye(3), (FRAMES, 22, 1, 1))
     rotations[:, 0] = yaw_matrix(np.full(FRAMES, 0.7))
     load = np.random.default_rng(0).uniform(size=(FRAMES, 8))
