@@ -32,6 +32,7 @@ SAME_LENGTH = 0.01
 """Deviation of a bone's length that is left; a fraction."""
 
 _LIMBS = [J[f"{side}_{part}"] for part in ("elbow", "wrist", "knee", "ankle", "foot") for side in ("left", "right")]
+_PARENTS = [PARENTS[joint] for joint in _LIMBS]
 _JOINTS, _WIDTH, _SCALE, _BATCH, _FRAMES = len(MIRROR), 256, 5.0, 32, 60
 
 
@@ -43,7 +44,7 @@ class MotionModel(nn.Module):
         self.gru = nn.GRU(6 * _JOINTS, _WIDTH, batch_first=True)
         self.decode = nn.Linear(_WIDTH, 3 * _JOINTS)
 
-    def forward(self, poses: Tensor, moved: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, poses: Tensor, moved: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         turn = _headings(poses)
         about = poses - poses[:, :, J["pelvis"], None]
         x = _SCALE * torch.cat([about @ turn, 10 * moved @ turn], dim=-1).flatten(2)
@@ -76,58 +77,72 @@ def train(
     return net.eval()
 
 
+class Bones:
+    """Lengths of the limbs of C bodies, as far as they are known."""
+
+    def __init__(self, clips: int) -> None:
+        self._moments = np.zeros((3, clips, len(_LIMBS)))  # frames, sum and sum of squares of lengths
+        self._known = np.zeros((clips, len(_LIMBS)), dtype=bool)
+
+    def take(self, poses: Floats) -> None:
+        """Measure poses (C, 22, 3), metres; a missing joint's bone is not measured."""
+        length = np.linalg.norm(poses[:, _LIMBS] - poses[:, _PARENTS], axis=-1)
+        self._moments += np.nan_to_num(np.stack([length / length, length, length**2]))
+        frames, mean = self._moments[0], self._mean
+        spread = np.sqrt(np.maximum(self._moments[2] / np.maximum(frames, 1.0) - mean**2, 0.0))
+        self._known |= (frames > LEAST_FRAMES) & (spread < MOST_SPREAD)
+
+    @property
+    def _mean(self) -> Floats:
+        return self._moments[1] / np.maximum(self._moments[0], 1.0)
+
+    def put_right(self, poses: Floats) -> Floats:
+        """Poses (C, 22, 3) whose limbs have their mean lengths where these are known."""
+        poses = poses.copy()
+        for bone, (joint, parent) in enumerate(zip(_LIMBS, _PARENTS, strict=True)):
+            offset, mean = poses[:, joint] - poses[:, parent], self._mean[:, bone]
+            ratio = np.linalg.norm(offset, axis=-1) / np.where(self._known[:, bone], mean, np.nan)
+            scaled = poses[:, parent] + offset / ratio[:, None]
+            poses[:, joint] = np.where((np.abs(ratio - 1.0) > SAME_LENGTH)[:, None], scaled, poses[:, joint])
+        return poses
+
+
 @torch.inference_mode()
-def filtered(net: MotionModel, seen: Floats, stamps_s: Floats, alpha: float, theta: float, kept: float) -> Floats:
+def filtered(
+    net: nn.Module, seen: Floats, stamps_s: Floats, delay: int, alpha: float, theta: float, kept: float
+) -> Floats:
     """Poses (T, C, 22, 3), metres; NaN before a joint is first measured.
 
     Args:
-        net: the motion model; its frames are those of 30 Hz.
+        net: a `MotionModel`, whose frames are those of 30 Hz.
         seen: (T, C, 22, 3) metres, NaN where missing.
         stamps_s: (T,) seconds.
+        delay: frames; the filter has none, and answers of them.
         alpha: how soon speed takes trust from a measurement, s²/m².
         theta: trust from which on a measurement is taken as it is.
         kept: weight of a frame against the output before it.
     """
     output, pose, covariance = seen.copy(), seen[0].copy(), np.ones(seen.shape[1:3])
-    moved, was_missing = np.zeros_like(pose), np.zeros(covariance.shape, dtype=bool)
-    lengths, state = [_lengths(pose)], None
+    moved, returns = np.zeros_like(pose), np.zeros(covariance.shape, dtype=bool)
+    bones, state = Bones(seen.shape[1]), None
+    bones.take(pose)
     for t in range(1, len(seen)):
         step = stamps_s[t] - stamps_s[t - 1]
-        found, state = net(*(torch.from_numpy(np.nan_to_num(x)).float()[:, None] for x in (pose, moved)), state)
-        predicted = np.where(np.isnan(pose), np.nan, pose + step * FPS * (found[:, 0].numpy() - np.nan_to_num(pose)))
-        gone = np.isnan(seen[t, ..., 0])
+        next_, state = net(*(torch.from_numpy(np.nan_to_num(x)).float()[:, None] for x in (pose, moved)), state)
+        predicted = pose + step * FPS * (next_[:, 0].numpy() - np.nan_to_num(pose))
+        gone, new = np.isnan(seen[t, ..., 0]), np.isnan(pose[..., 0])
         speed = np.linalg.norm(np.where(gone[..., None], predicted, seen[t]) - output[t - 1], axis=-1) / step
-        new = np.isnan(pose[..., 0])
         taken = ~gone & (new | (1.0 / (1.0 + alpha * speed**2) >= theta))
         ahead = covariance + 1.0 - (1.0 - alpha) * np.exp(-alpha * speed)
-        noise = np.where(was_missing, 0.0, alpha * speed**2)
+        noise = np.where(returns, 0.0, alpha * speed**2)
         gain = np.where(gone, 0.0, ahead / (ahead + noise))
         estimated = predicted + gain[..., None] * (np.nan_to_num(seen[t]) - predicted)
         estimated = np.where(taken[..., None], seen[t], estimated)
         covariance = np.where(taken | new, covariance, (1.0 - gain) * ahead)
-        was_missing = gone
-        lengths.append(_lengths(estimated))
+        returns = gone | (returns & taken)
         pose, moved = estimated, np.nan_to_num(estimated - pose)
-        output[t] = _with_lengths(estimated, np.array(lengths))
-        before = np.where(np.isnan(output[t - 1]), output[t], output[t - 1])
-        output[t] = kept * output[t] + (1.0 - kept) * before
+        bones.take(pose)
+        now = bones.put_right(estimated)
+        before = np.where(np.isnan(output[t - 1]), now, output[t - 1])
+        output[t] = kept * now + (1.0 - kept) * before
     return output
-
-
-def _lengths(poses: Floats) -> Floats:
-    """(C, 10) metres."""
-    return np.linalg.norm(poses[:, _LIMBS] - poses[:, [PARENTS[j] for j in _LIMBS]], axis=-1)
-
-
-def _with_lengths(poses: Floats, lengths: Floats) -> Floats:
-    """Poses (C, 22, 3) whose limbs are as long as the mean of lengths (T, C, 10) where these are known."""
-    if len(lengths) <= LEAST_FRAMES:
-        return poses
-    poses, mean = poses.copy(), lengths.mean(axis=0)
-    for bone, joint in enumerate(_LIMBS):
-        offset = poses[:, joint] - poses[:, PARENTS[joint]]
-        now = np.linalg.norm(offset, axis=-1)
-        wrong = (lengths[:, :, bone].std(axis=0) < MOST_SPREAD) & (np.abs(now / mean[:, bone] - 1.0) > SAME_LENGTH)
-        scaled = poses[:, PARENTS[joint]] + offset * (mean[:, bone] / now)[:, None]
-        poses[:, joint] = np.where(wrong[:, None], scaled, poses[:, joint])
-    return poses

@@ -1,7 +1,8 @@
 """Noisy joints: HuMoR's protocol (90 frames, 4 cm), swept over levels, and noise of the kinds that sensors make.
 
 HuMoR adds independent noise to every joint (Rempe et al. 2021, section 5.2). Independent noise flatters low-pass
-filters: the other conditions have correlated noise, spikes, and exchanged limbs.
+filters: the other conditions have correlated noise, spikes, and exchanged limbs. FLK, a Kalman filter of learned motion
+(Martini et al. 2024), is a baseline here alone: it was made for such noise, and has no delay.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from functools import partial
 import numpy as np
 
 from steadypose.benchmarks import figures
-from steadypose.benchmarks.baselines.filters import FILTERS
+from steadypose.benchmarks.baselines import flk
+from steadypose.benchmarks.baselines.filters import FILTERS, Baseline
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated, gaussian, spiked, swapped
 from steadypose.benchmarks.provenance import VARIANTS
@@ -66,7 +68,10 @@ def run(bench: Bench) -> Result:
     """Every method in every condition."""
     clips = bench.clips()
     kept = ("4 cm", "lasting 2 cm, spikes, swaps") if bench.quick else tuple(CONDITIONS)
-    data = run_conditions(bench, clips, {name: CONDITIONS[name] for name in kept}, FILTERS)
+    track = partial(bench.progress.track, description="FLK")
+    net = flk.train(bench.training_clips(), 50 if bench.quick else 3000, 0, track)
+    filters = (*FILTERS, Baseline("FLK", partial(flk.filtered, net), (0,), flk.SPACE, whole_body=True))
+    data = run_conditions(bench, clips, {name: CONDITIONS[name] for name in kept}, filters)
     records = data["records"]
     note = f"{clips.positions.shape[1]} clips of {len(clips.positions)} frames, 22 joints. {HOW}"
     tables = [
