@@ -135,7 +135,7 @@ LOOK_NS = 500_000_000
 """between two decisions"""
 CALM_NS = 2_000_000_000
 """without a dropped frame, before more bodies are tried"""
-SPARE = 0.8
+SPARE = 0.65
 """of the time that work may take with more bodies"""
 
 
