@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -118,12 +118,12 @@ def _frames(
 
 
 def _with_bones(
-    image: NDArray[np.uint8],
+    image: NDArray[Any],
     bodies: list[tuple[Floats, NDArray[np.bool_]]],
     shown: NDArray[np.intp],
     lens: Floats,
     title: str,
-) -> NDArray[np.uint8]:
+) -> NDArray[Any]:
     """An image with the bones of bodies, each of joints and which are observed, and with a title."""
     image = image.copy()
     for joints, observed in bodies:
@@ -138,7 +138,7 @@ def _with_bones(
     return image
 
 
-def _draw(image: NDArray[np.uint8], pixels: Floats, drawn: list[NDArray[np.intp]]) -> None:
+def _draw(image: NDArray[Any], pixels: Floats, drawn: list[NDArray[np.intp]]) -> None:
     for parent, child in drawn:
         (x, y), (to_x, to_y) = np.round(pixels[[parent, child]]).astype(int).tolist()
         red, green, blue = bytes.fromhex(ON_DARK[SIDES[child]][1:])

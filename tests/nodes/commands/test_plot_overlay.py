@@ -104,9 +104,9 @@ def test_what_was_not_observed_is_faint(tmp_path: Path, cleaned: list[PoseClean]
 
 def test_arrays_have_clean_alone(tmp_path: Path, cleaned: list[PoseClean], video: Path) -> None:
     bodies = [message.bodies[0] for message in cleaned]
-    arrays = {name: np.array([getattr(body, name) for body in bodies]) for name in ("positions", "state")}
+    positions, state = (np.array([getattr(body, name) for body in bodies]) for name in ("positions", "state"))
     stamps = np.array([message.stamp_ns for message in cleaned])
-    np.savez(tmp_path / "clean.npz", stamp_ns=stamps, world_positions=arrays["positions"], **arrays)
+    np.savez(tmp_path / "clean.npz", stamp_ns=stamps, world_positions=positions, positions=positions, state=state)
     plot(tmp_path / "clean.npz", video=tmp_path / "out.gif", over=video)
     assert (tmp_path / "out.gif").read_bytes().startswith(b"GIF8")
     plot(tmp_path / "clean.npz", video=tmp_path / "out.mp4", over=video)

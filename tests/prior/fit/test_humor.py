@@ -100,8 +100,9 @@ def test_a_step_is_that_of_plain_kinematics() -> None:
     state = some_states(3)
     change = 0.05 * torch.randn(3, CHANGE, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     after = moved_by(state, change, bones(3))
-    both = (torch.stack(pair, dim=1) for pair in ((state.root, after.root), (state.rotations, after.rotations)))
-    assert_same(states_of(*both, bones(3))[:, 0], after)
+    root = torch.stack((state.root, after.root), dim=1)
+    rotations = torch.stack((state.rotations, after.rotations), dim=1)
+    assert_same(states_of(root, rotations, bones(3))[:, 0], after)
     for body in range(3):
         turns = Rotation.from_rotvec(change[body, 3:].numpy().reshape(22, 3)).as_matrix()
         rotations = turns @ state.rotations[body].numpy()
