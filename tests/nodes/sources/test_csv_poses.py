@@ -101,7 +101,7 @@ def test_rows_that_are_no_frames_are_counted_and_left_out(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("lines", "expected"),
     [
-        ([], "expected a header with a column 'stamp'"),
+        ([], "has no rows: expected a header, stamp, JOINT_x"),
         (["time,nose_x,nose_y,nose_z"], "expected a header with a column 'stamp', in seconds; got time, nose_x"),
         (["stamp"], "JOINT_z for each joint; got none"),
         (["stamp,nose_x,nose_y"], "missing: nose_z"),
@@ -110,7 +110,7 @@ def test_rows_that_are_no_frames_are_counted_and_left_out(tmp_path: Path) -> Non
         (["# skeleton: smpl", "stamp,nose_x,nose_y,nose_z"], "skeleton: expected one of smpl22, .* got 'smpl'"),
         (["# skeleton: smpl22", "stamp,nose_x,nose_y,nose_z"], "smpl22 is closest, but has no nose"),
         (["# up: x", "stamp,nose_x,nose_y,nose_z", "0,1,2,3"], "up: expected one of"),
-        (["stamp,nose_x,nose_y,nose_z"], "at least one row"),
+        (["stamp,nose_x,nose_y,nose_z"], "has a header, but no rows"),
         (["stamp,nose_x,nose_y,nose_z", "a,b,c,d"], "at least one row"),
         (["stamp,nose_x,nose_y,nose_z", "0,1,2," + "3" * 200_000], "cannot be read as CSV: field larger"),
     ],
