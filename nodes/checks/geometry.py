@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.checks.problem import Problem, error, tracks, warning
@@ -76,16 +75,18 @@ def check_jumps(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     skeleton = SKELETONS.get(messages[-1].skeleton)
     if skeleton is None:
         return
-    last: dict[int, tuple[int, NDArray[np.floating]]] = {}
+    whole = [
+        (raw.stamp_ns, body) for raw in messages for body in raw.bodies if len(body.positions) == len(skeleton.joints)
+    ]
+    if len(whole) < ENOUGH:
+        return
+    middles = medians(np.array([body.positions for _, body in whole]), axis=1)
+    last: dict[int, tuple[int, Floats]] = {}
     speeds = []
-    for raw in messages:
-        for body in raw.bodies:
-            if len(body.positions) != len(skeleton.joints):
-                continue
-            middle = medians(body.positions)
-            if body.id in last and raw.stamp_ns > (stamp_ns := last[body.id][0]):
-                speeds.append(np.linalg.norm(middle - last[body.id][1]) / (raw.stamp_ns - stamp_ns) * 1e9)
-            last[body.id] = raw.stamp_ns, middle
+    for (stamp_ns, body), middle in zip(whole, middles, strict=True):
+        if body.id in last and stamp_ns > (before_ns := last[body.id][0]):
+            speeds.append(np.linalg.norm(middle - last[body.id][1]) / (stamp_ns - before_ns) * 1e9)
+        last[body.id] = stamp_ns, middle
     if len(speeds) < ENOUGH:
         return
     joints = tracks(messages, len(skeleton.joints))

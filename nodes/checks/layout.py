@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.checks.problem import Problem, bodies, error, warning
+from steadypose.nodes.checks.problem import Problem, bodies, error, some_bodies, warning
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
 from steadypose.prior.body.likeness import likenesses
 from steadypose.prior.settings import nearest
@@ -40,8 +40,9 @@ def check_layout(messages: Sequence[PoseRaw], max_bodies: int, *, identified: bo
     if counts and (common := counts.most_common(1)[0][0]) != len(skeleton.joints):
         yield _wrong_count(messages, skeleton, common)
         return
-    yield from _confidence(messages)
-    yield from _seen(messages)
+    few = some_bodies(messages)
+    yield from _confidence(few)
+    yield from _seen(few)
     yield from _ids(messages, max_bodies, identified)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,8 @@ def from_values(values: Mapping[str, str]) -> dict[str, str]:
 LENGTH_NS = 1_500_000_000
 LONGEST = 90
 """messages"""
+JUDGED = 4
+"""bodies of a message whose joints are looked at"""
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,11 @@ def bodies(messages: Sequence[PoseRaw]) -> Iterator[RawBody]:
     """All bodies of all messages."""
     for raw in messages:
         yield from raw.bodies
+
+
+def some_bodies(messages: Sequence[PoseRaw]) -> list[PoseRaw]:
+    """The messages with at most `JUDGED` bodies each: to look at the joints of a whole crowd would hold up frames."""
+    return [replace(raw, bodies=raw.bodies[:JUDGED]) for raw in messages]
 
 
 def tracks(messages: Sequence[PoseRaw], joints: int) -> NDArray[np.float64]:

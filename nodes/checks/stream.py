@@ -13,7 +13,7 @@ import numpy as np
 from steadypose.msgs.types import Level, PoseClean, PoseRaw
 from steadypose.nodes.checks.geometry import check_geometry, check_jumps, check_speed
 from steadypose.nodes.checks.layout import check_layout
-from steadypose.nodes.checks.problem import Problem, Window, error, warning
+from steadypose.nodes.checks.problem import Problem, Window, error, some_bodies, warning
 from steadypose.nodes.checks.stamps import check_stamps
 
 ENOUGH = 20
@@ -79,6 +79,8 @@ class Answers:
 
 SILENT_NS = 2_000_000_000
 """without a message, after which a stream has stopped"""
+AT_ONCE = 4
+"""streams examined by one call, each in its turn: a server's frames wait meanwhile"""
 NOBODY = 60
 """messages without ever a body"""
 
@@ -96,6 +98,9 @@ class StreamCheck:
         self._window = Window()
         self._heard_ns = 0
         self._ended = False
+        self._found: list[Problem] = []
+        self.examined_ns = -1
+        """when its messages were last examined; -1: never"""
 
     def see(self, raw: PoseRaw, at_ns: int) -> None:
         """A message came, at this wall time."""
@@ -107,29 +112,32 @@ class StreamCheck:
         """A message came, and was dropped unread for want of time."""
         self._heard_ns = at_ns
 
-    def problems(self, now_ns: int, *, live: bool) -> list[Problem]:
+    def problems(self, now_ns: int, *, live: bool, anew: bool = True) -> list[Problem]:
         """What is wrong with the stream now.
 
         Args:
             now_ns: wall time.
             live: whether it should be of now and go on: not a replay.
+            anew: examine its messages; else what they were found to have when last examined.
         """
-        with warnings.catch_warnings():  # of joints that are NaN throughout numpy warns; they are looked for
-            warnings.simplefilter("ignore", RuntimeWarning)
-            with np.errstate(all="ignore"):
-                return list(self._problems(now_ns, live))
-
-    def _problems(self, now_ns: int, live: bool) -> Iterator[Problem]:
         last = self._window.last
         if last is None or self._ended:
-            return
+            return []
         if live and (silent_ns := now_ns - max(last.at_ns, self._heard_ns)) > SILENT_NS:
-            yield error(
-                "stopped",
+            text = (
                 f"no message for {silent_ns / 1e9:.0f} s, after {self._window.received}: the tracker has stopped, "
-                "hangs, or its connection is cut; start it again: this goes on when it does",
+                "hangs, or its connection is cut; start it again: this goes on when it does"
             )
-            return
+            return [error("stopped", text)]
+        if anew:
+            self.examined_ns = now_ns
+            with warnings.catch_warnings():  # of joints that are NaN throughout numpy warns; they are looked for
+                warnings.simplefilter("ignore", RuntimeWarning)
+                with np.errstate(all="ignore"):
+                    self._found = list(self._problems(now_ns, live))
+        return self._found
+
+    def _problems(self, now_ns: int, live: bool) -> Iterator[Problem]:
         arrivals = self._window.arrivals(now_ns)
         messages = [arrival.raw for arrival in arrivals]
         if not messages:
@@ -145,13 +153,14 @@ class StreamCheck:
             )
         if not _usable(names):  # else joints are not what they are called
             return
-        shape = list(check_geometry(messages))
+        few = some_bodies(messages)
+        shape = list(check_geometry(few))
         yield from shape
         if _usable(stamps):
-            jumps = list(check_jumps(messages))
+            jumps = list(check_jumps(few))
             yield from jumps
             if _usable(shape) and not jumps:
-                yield from check_speed(messages)
+                yield from check_speed(few)
 
 
 def _usable(problems: list[Problem]) -> bool:
@@ -192,9 +201,10 @@ class StreamChecks:
 
     def problems(self, now_ns: int, *, live: bool) -> list[Problem]:
         """As of `StreamCheck.problems`; of several streams each with its source's name."""
+        turn = sorted(self._checks, key=lambda source: self._checks[source].examined_ns)[:AT_ONCE]
         found = [
             replace(problem, cause=f"{source}.{problem.cause}", text=f"{source}: {problem.text}") if source else problem
             for source, check in self._checks.items()
-            for problem in check.problems(now_ns, live=live)
+            for problem in check.problems(now_ns, live=live, anew=source in turn)
         ]
         return sorted(found, key=lambda problem: -problem.level)

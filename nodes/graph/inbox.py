@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import zmq
 
@@ -13,14 +14,16 @@ from steadypose.nodes.graph.clock import Clock
 
 READ_AHEAD = 64
 """messages a node takes off a socket before it works on one"""
-DEADLINE_NS = 100_000_000
-"""that a frame may be older than the newest of its stream; then it is that one's turn. Such gaps are bridged"""
+DEADLINE_NS = 50_000_000
+"""that a frame may wait for a node, and be older than the newest of its stream; then it is that one's turn. Two nodes
+have such a queue, so this bounds how old a published pose is under load. Such gaps are bridged"""
 
 
 class Inbox:
     """Messages received and not yet processed.
 
-    Who can drop frames works on the newest first: once the oldest that waits is late, all but the newest go.
+    Who can drop frames works on the newest first: once the oldest has waited too long, all but the newest go. Frames
+    that came late, as those of a camera that stopped for a moment, are not late for that: they have not waited here.
 
     With several subscribers, as for the clients of a server, each has a queue of its own, and they take turns: one that
     floods the node loses only its own messages.
@@ -29,10 +32,11 @@ class Inbox:
         subscribers: where it comes from.
         limit: frames to keep of each, beyond which the oldest goes; None loses nothing and leaves the rest to the
             sender.
+        clock: of the node.
     """
 
-    def __init__(self, subscribers: Sequence[Subscriber], limit: int | None) -> None:
-        self._queues = deque(_Queue(subscriber, limit) for subscriber in subscribers)
+    def __init__(self, subscribers: Sequence[Subscriber], limit: int | None, clock: Clock) -> None:
+        self._queues = deque(_Queue(subscriber, limit, clock) for subscriber in subscribers)
         self._poller = zmq.Poller()
         if len(subscribers) > 1:
             for subscriber in subscribers:
@@ -73,54 +77,74 @@ class Inbox:
             queue = self._queues[0]
             self._queues.rotate(-1)
             if queue.waiting:
-                return queue.waiting.popleft()
+                received = queue.waiting.popleft()
+                return received.topic, received.message
         return None
+
+
+class _Received(NamedTuple):
+    topic: str
+    message: Message
+    since_ns: int
+    """it came after this, by the clock that never steps"""
 
 
 class _Queue:
     """What came from one subscriber."""
 
-    def __init__(self, subscriber: Subscriber, limit: int | None) -> None:
+    def __init__(self, subscriber: Subscriber, limit: int | None, clock: Clock) -> None:
         self.overrun = 0
         self.sources: set[str] = set()
-        self.waiting: deque[tuple[str, Message]] = deque()
+        self.waiting: deque[_Received] = deque()
         self._subscriber = subscriber
         self._limit = limit
+        self._clock = clock
+        self._empty_ns = clock.monotonic_ns()
+        """when the socket was last seen without a message"""
 
     def fill(self, timeout_s: float) -> None:
+        since_ns = self._empty_ns
         for _ in range(READ_AHEAD):
             if self._limit is None and len(self.waiting) >= READ_AHEAD:
                 break
-            received = self._subscriber.receive(0 if self.waiting else timeout_s, taken=False)
+            received = self._subscriber.receive(0, taken=False)
             if received is None:
-                break
-            self.waiting.append(received)
+                if not self.waiting and timeout_s > 0:
+                    received = self._subscriber.receive(timeout_s, taken=False)
+                self._empty_ns = self._clock.monotonic_ns()
+                if received is None:
+                    break
+                since_ns = self._empty_ns
+            self.waiting.append(_Received(*received, since_ns))
             if self._limit is not None:
-                self._drop_late(*received)
+                self._drop_late(self.waiting[-1])
                 if len(self.waiting) > self._limit:
-                    self._drop(next((frame for frame in self.waiting if _is_frame(frame[1])), None))
+                    self._drop(next((frame for frame in self.waiting if _is_frame(frame.message)), None))
 
-    def _drop_late(self, topic: str, newest: Message) -> None:
+    def _drop_late(self, newest: _Received) -> None:
         """Drop the frames before the newest of a stream, if the oldest of them is late."""
-        if not _is_frame(newest):
+        if not _is_frame(newest.message):
             return
         before = [
             frame
             for frame in self.waiting
-            if frame[0] == topic
-            and frame[1] is not newest
-            and _is_frame(frame[1])
-            and _source(frame[1]) == _source(newest)
+            if frame.topic == newest.topic
+            and frame is not newest
+            and _is_frame(frame.message)
+            and _source(frame.message) == _source(newest.message)
         ]
-        if before and newest.stamp_ns - before[0][1].stamp_ns > DEADLINE_NS:
+        if not before:
+            return
+        waited_ns = self._clock.monotonic_ns() - before[0].since_ns
+        if min(waited_ns, newest.message.stamp_ns - before[0].message.stamp_ns) > DEADLINE_NS:
             for frame in before:
                 self._drop(frame)
 
-    def _drop(self, frame: tuple[str, Message] | None) -> None:
+    def _drop(self, frame: _Received | None) -> None:
         if frame is not None:
             self.waiting = deque(other for other in self.waiting if other is not frame)
             self.overrun += 1
-            self.sources.add(_source(frame[1]))
+            self.sources.add(_source(frame.message))
 
 
 def _is_frame(message: Message) -> bool:

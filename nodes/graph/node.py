@@ -82,7 +82,7 @@ class Node(ABC):
         self._blocked_ns = 0
         self._disconnected: Counter[str] = Counter()
         self._deaf: frozenset[str] = frozenset()
-        self.inbox = Inbox([], None)
+        self.inbox = Inbox([], None, self.clock)
         self._subscribers: list[Subscriber] = []
         self._refused_before: Counter[str] = Counter()
         self._supervisor = supervisor_id()
@@ -193,7 +193,7 @@ class Node(ABC):
                     )
                     for addresses in self._addresses()
                 ]
-                self.inbox = Inbox(self._subscribers, self.queue_limit)
+                self.inbox = Inbox(self._subscribers, self.queue_limit, self.clock)
             self.health.state = "running"
             self.report()
             notify(READY)

@@ -10,7 +10,7 @@ from conftest import VirtualClock, raw, walk, walking
 
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Message, PoseRaw
-from steadypose.nodes.checks.stream import StreamChecks
+from steadypose.nodes.checks.stream import AT_ONCE, StreamChecks
 from steadypose.nodes.graph.inbox import CALM_NS, DEADLINE_NS, LOOK_NS, BodyLimit, Inbox
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.pipeline import CATCH_UP, PriorPipeline
@@ -42,7 +42,7 @@ def camera(clock: VirtualClock, seconds: float, source: str = "test") -> Line:
 
 @pytest.mark.parametrize(("work_ms", "latest_ms"), [(20, 34), (60, 134), (100, 200)])
 def test_the_newest_is_worked_on_however_slow_the_work(clock: VirtualClock, work_ms: int, latest_ms: int) -> None:
-    inbox, late = Inbox([camera(clock, 10.0)], limit=8), []  # type: ignore[list-item]
+    inbox, late = Inbox([camera(clock, 10.0)], limit=8, clock=clock), []  # type: ignore[list-item]
     end_ns = clock.time_ns + 10 * 10**9
     while clock.time_ns < end_ns:
         received = inbox.next(0)
@@ -55,9 +55,19 @@ def test_the_newest_is_worked_on_however_slow_the_work(clock: VirtualClock, work
     assert len(late) + inbox.overrun >= 290, "each is worked on or counted"
 
 
+def test_frames_that_come_late_together_are_all_worked_on(clock: VirtualClock) -> None:
+    """A camera that stood still for a sixth of a second: its frames have waited for it, not for the node."""
+    late = [(clock.time_ns + 10**8, raw(k, stamp_ns=clock.time_ns + k * FRAME_NS)) for k in range(5)]
+    inbox, worked = Inbox([Line(clock, late)], limit=8, clock=clock), 0  # type: ignore[list-item]
+    for _ in range(200):
+        worked += inbox.next(0) is not None
+        clock.time_ns += 8_000_000
+    assert (worked, inbox.overrun) == (5, 0)
+
+
 def test_kiosks_share_what_time_there_is(clock: VirtualClock) -> None:
     names = [f"kiosk {k}" for k in range(20)]
-    inbox = Inbox([camera(clock, 20.0, name) for name in names], limit=8)  # type: ignore[misc]
+    inbox = Inbox([camera(clock, 20.0, name) for name in names], limit=8, clock=clock)  # type: ignore[misc]
     worked, end_ns = dict.fromkeys(names, 0), clock.time_ns + 19 * 10**9
     while clock.time_ns < end_ns:
         _, message = inbox.next(0)  # type: ignore[misc]
@@ -156,8 +166,21 @@ def test_a_tracker_whose_messages_are_dropped_here_has_not_stopped(clock: Virtua
     assert {problem.cause for problem in checks.problems(clock.time_ns, live=True)} == {"desk.stopped"}
 
 
+def test_streams_are_examined_in_turn_and_none_is_left_out(clock: VirtualClock) -> None:
+    checks, upside_down = StreamChecks(8, identified=False, streams=10), np.array([1.0, -1.0, -1.0], np.float32)
+    for k in range(45):
+        clock.time_ns += FRAME_NS
+        for n in range(10):
+            message = dataclasses.replace(raw(0, walking(k)), source=f"kiosk {n}", stamp_ns=clock.time_ns)
+            body = message.bodies[0]
+            message.bodies = [dataclasses.replace(body, positions=body.positions * upside_down)]
+            checks.see(message, clock.time_ns)
+    found = [len(checks.problems(clock.time_ns + k, live=True)) for k in range(3)]
+    assert found == [AT_ONCE, 2 * AT_ONCE, 10], "what was found stays until a stream is examined again"
+
+
 def test_the_inbox_says_whose_frames_it_dropped(clock: VirtualClock) -> None:
-    inbox = Inbox([camera(clock, 1.0)], limit=8)  # type: ignore[list-item]
+    inbox = Inbox([camera(clock, 1.0)], limit=8, clock=clock)  # type: ignore[list-item]
     clock.time_ns += LOOK_NS
     received = inbox.next(0)
     assert received

@@ -14,7 +14,7 @@ from steadypose.msgs.publisher import SEND_HIGH_WATER
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Level, Message, PoseClean, PoseRaw
-from steadypose.nodes.graph.clock import Timeline
+from steadypose.nodes.graph.clock import SystemClock, Timeline
 from steadypose.nodes.graph.inbox import READ_AHEAD, Inbox
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
@@ -82,7 +82,7 @@ def frames(count: int) -> list[tuple[str, Message]]:
 
 
 def test_a_late_node_keeps_the_newest_frames_and_counts_the_others() -> None:
-    inbox = Inbox([Script(frames(20))], limit=3)  # type: ignore[arg-type]
+    inbox = Inbox([Script(frames(20))], limit=3, clock=SystemClock())  # type: ignore[arg-type]
     assert [m.stamp_ns for _, m in iter(lambda: inbox.next(0), None)] == [raw(i).stamp_ns for i in (17, 18, 19)]
     assert inbox.overrun == 17
 
@@ -92,7 +92,7 @@ def test_a_late_node_keeps_the_end_of_the_stream_and_the_news() -> None:
     end.end_of_stream = True
     news = Diagnostics(0, "pose_input", Level.OK, "")
     script = [*frames(5), (POSE_RAW, end), (DIAGNOSTICS, news), *frames(5)]
-    inbox = Inbox([Script(script)], limit=2)  # type: ignore[arg-type]
+    inbox = Inbox([Script(script)], limit=2, clock=SystemClock())  # type: ignore[arg-type]
     assert [m for _, m in iter(lambda: inbox.next(0), None)] == [end, news]
     assert inbox.overrun == 10
 
@@ -108,7 +108,7 @@ def test_publishers_take_turns_and_who_floods_loses_its_own(tmp_path: Path) -> N
             publishers[1].publish(POSE_RAW, raw(1))
         for _ in range(3):
             publishers[0].publish(POSE_RAW, raw(0))
-        inbox, got = Inbox(subscribers, limit=3), []
+        inbox, got = Inbox(subscribers, limit=3, clock=SystemClock()), []
         until(lambda: all(subscriber.socket.poll(0) for subscriber in subscribers))
 
         def all_accounted_for() -> bool:  # the flood may arrive in parts, and more than three of it be kept
@@ -126,12 +126,12 @@ def test_a_source_faster_than_reading_does_not_keep_a_node_from_working() -> Non
         def receive(self, timeout_s: float, *, taken: bool = True) -> tuple[str, Message]:
             return POSE_RAW, raw(0)
 
-    assert Inbox([Endless([])], limit=3).next(0) is not None  # type: ignore[arg-type]
+    assert Inbox([Endless([])], limit=3, clock=SystemClock()).next(0) is not None  # type: ignore[arg-type]
 
 
 def test_a_lossless_node_leaves_the_rest_to_the_sender() -> None:
     script = Script(frames(500))
-    inbox = Inbox([script], limit=None)  # type: ignore[arg-type]
+    inbox = Inbox([script], limit=None, clock=SystemClock())  # type: ignore[arg-type]
     assert inbox.next(0) is not None
     assert len(script.messages) == 500 - READ_AHEAD
     assert len(list(iter(lambda: inbox.next(0), None))) == 499
