@@ -30,6 +30,7 @@ from steadypose.benchmarks.scores import score
 from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 from steadypose.benchmarks.studies.corrupted import Condition
 from steadypose.benchmarks.studies.world import chain, measure
+from steadypose.benchmarks.systems.workload import numpy_ms
 from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.bones import PersonSettings
 from steadypose.prior.clean.fuse import FuseSettings
@@ -212,5 +213,6 @@ def _table(
         "below it ratios to what ships: above 1 the part helps. In brackets the 95 % interval over people. ms: one "
         f"body and one frame, the mean of the least of {ROUNDS} rounds; below what ships, the difference to it"
         + (", without the prior." if feet else ".")
+        + f" 30 steps of a Kalman filter of 44 states in numpy take {numpy_ms():.2f} ms here."
     )
     return Table(name, f"{title}, delay {DELAY}", ["", *conditions, *feet, "ms a frame"], rows, note)
