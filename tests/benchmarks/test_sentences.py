@@ -15,8 +15,8 @@ OF_BANK = "of: whole-body bank"
 SENTENCES: list[tuple[str, str, list[Cell]]] = [
     (
         "README.md",
-        r"steadypose has (\S+) \(\S+, the 95 % interval over people\) in 2 cm with four frames of\s"
-        r"delay, (\S+) \(\S+\) without; in 2 cm that last half a second (\S+) ",
+        r"(?s)error is (\S+) \(95 % interval over people: \S+\) in\sindependent noise .*? (\S+) \(\S+\) without "
+        r"delay\. In time-correlated noise of 2 cm .*? it is (\S+) ",
         [
             ("fidelity", "fidelity-sources-4", "2 cm: steadypose", OF_BANK),
             ("fidelity", "fidelity-sources-0", "2 cm: steadypose", OF_BANK),
