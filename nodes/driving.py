@@ -156,9 +156,7 @@ class OfflineRun:
         Raises:
             LaunchError: no frame could be read.
         """
-        collector = NpzCollector()
-        for _, message in self:
-            collector.add(message)
+        collector = NpzCollector(self)
         if not self._stamps_ns:
             raise LaunchError(f"expected frames, but none of {len(self._source)} could be read")
         return collector.arrays(self.stamps_ns)

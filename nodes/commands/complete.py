@@ -2,47 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated
 
-import numpy as np
 import tyro
-from numpy.typing import NDArray
 from rich.progress import Progress
 
-from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.types import JOINTS, JointState, Message, PoseRaw
-from steadypose.nodes.commands.output import (
-    File,
-    In,
-    Out,
-    check_poses_file,
-    console,
-    plural,
-    write_output,
-)
+from steadypose.nodes.commands.output import File, In, Out, check_poses_file, console, plural, write_output
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
-from steadypose.nodes.sinks.arrays import NpzCollector
-from steadypose.nodes.sinks.drawing import ALL_BONES, STATE_COLOURS
-from steadypose.nodes.sources.recording import NO_RIG, open_recording, with_end
-from steadypose.nodes.sources.source import RecordedSource
+from steadypose.nodes.offline import complete_source, load_completer
+from steadypose.nodes.sinks.plot.figure import PICTURES, draw_completion, save
+from steadypose.nodes.sources.recording import NO_RIG, open_recording
 from steadypose.prior.body.layouts import add_layouts
-from steadypose.prior.complete.body import Fill, Uncertainty
-from steadypose.prior.complete.parts import PartsCompleter
-from steadypose.prior.complete.stream import Completion, complete_raws, moved, root_steps
-from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.timing.rate import FPS
-from steadypose.prior.world.pipeline import TrajectoryPipeline
-from steadypose.prior.world.settings import TrajectorySettings
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-FIGURES = 16
-_GIVEN, _COMPLETED = STATE_COLOURS[JointState.SEEN], STATE_COLOURS[JointState.IMPUTED]
 
 
 def complete(
@@ -87,7 +60,7 @@ def complete(
     if skeletons is not None:
         add_layouts(read_toml(skeletons).get("skeletons", {}))
     check_poses_file(source, out, *([picture] if picture else []), replace=force)
-    if picture is not None and picture.suffix not in (".png", ".svg", ".pdf"):
+    if picture is not None and picture.suffix not in PICTURES:
         raise LaunchError(f"--picture: expected a name ending in .png, .svg or .pdf, got {picture}")
     one_thread()
     fill, uncertainty = load_completer(weights)
@@ -121,104 +94,6 @@ def complete(
     for cause, count in completed.refused.items():
         terminal.print(f"  refused or dropped, {cause}: {count}")
     if picture is not None:
-        draw(completion, source.name, picture)
+        save(draw_completion(completion, source.name), picture)
         terminal.print(f"wrote {picture}")
     return 0
-
-
-class CompletedSource(NamedTuple):
-    """What came of a source."""
-
-    raws: list[PoseRaw]
-    """``pose/raw`` as it was, with its end"""
-    answers: list[tuple[str, Message]]
-    """``pose/clean`` and ``pose/world`` with their topics, in order"""
-    completion: Completion
-    refused: dict[str, int]
-    """what was refused or dropped, by cause"""
-
-    def messages(self) -> list[tuple[str, Message]]:
-        """All messages, by their stamps."""
-        every = [*((POSE_RAW, message) for message in self.raws), *self.answers]
-        return sorted(every, key=lambda pair: pair[1].stamp_ns)
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of ``clean``, with a row for each frame of the grid on which there is a body."""
-        collector = NpzCollector()
-        for _, message in self.answers:
-            collector.add(message)
-        return collector.arrays(np.array([message.stamp_ns for message in self.completion.clean[:-1]], np.int64))
-
-
-def load_completer(weights: str) -> tuple[PartsCompleter, Uncertainty]:
-    """The completer of a weight set, and the standard deviations of its output."""
-    completer = LiveCompleter.load(weights)
-    return PartsCompleter(completer), Uncertainty(completer.config.never_sigma, completer.config.half_frames)
-
-
-def complete_source(
-    frames: RecordedSource,
-    name: str,
-    fill: Fill,
-    uncertainty: Uncertainty,
-    began: Callable[[int], None] = lambda frames: None,
-    advanced: Callable[[int], None] = lambda frame: None,
-) -> CompletedSource:
-    """Complete what a source has; ``name`` is what errors call it, the rest as of `complete_raws`.
-
-    Raises:
-        LaunchError: it has no frame.
-        CompletionError: as `complete_raws`.
-    """
-    raws = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
-    if not raws:
-        raise LaunchError(f"{name}: expected frames, but none of {len(frames)} could be read")
-    completion = complete_raws(name, raws[:-1], fill, uncertainty, began, advanced)
-    settings = TrajectorySettings()
-    world, steps = TrajectoryPipeline(settings), root_steps(completion, settings.weights)
-    answers: list[tuple[str, Message]] = []
-    for message in completion.clean:
-        answers.append((POSE_CLEAN, message))
-        answers += [(POSE_WORLD, answer) for answer in world.process(moved(message, steps, completion.anchor_ns))]
-    refused = {cause: n for cause, n in (frames.refused + world.counters).items() if n}
-    return CompletedSource(raws, answers, completion, refused)
-
-
-def draw(completion: Completion, title: str, path: Path) -> None:
-    """Write the picture of the longest stretch that was completed: joints given when, stick figures, the trajectory."""
-    import matplotlib
-
-    from steadypose.nodes.commands.plot_panels import draw_bones, side_by_side
-
-    matplotlib.use("Agg")
-    from matplotlib.colors import ListedColormap
-    from matplotlib.figure import Figure
-
-    stretch, completed = max(completion.done, key=lambda pair: len(pair[0].given))
-    joints, known = completed.positions, completed.known
-    there = np.flatnonzero(np.isfinite(joints).all(axis=(1, 2)))
-    figure = Figure(figsize=(15, 9), layout="constrained")
-    figure.suptitle(f"{title} · body {stretch.body} · given in green, completed in orange", fontsize=13, weight="bold")
-    grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.2], width_ratios=[2.2, 1])
-    sticks = figure.add_subplot(grid[0, :])
-    chosen = there[np.linspace(0, len(there) - 1, min(FIGURES, len(there))).round().astype(int)]
-    for row, flat in zip(chosen, *side_by_side(sticks, chosen / FPS, joints[chosen]), strict=True):
-        colours = [_GIVEN if known[row, list(ends)].all() else _COMPLETED for ends in ALL_BONES]
-        draw_bones(sticks, flat, ALL_BONES, colours, width=2.0)
-    which = figure.add_subplot(grid[1, 0])
-    shown = np.where(np.isfinite(joints[..., 0]), np.where(known, 1, 2), 0)
-    which.imshow(
-        shown.T, aspect="auto", interpolation="nearest", vmin=0, vmax=2,
-        cmap=ListedColormap(["white", _GIVEN, _COMPLETED]), extent=(0.0, len(shown) / FPS, 21.5, -0.5),
-    )  # fmt: skip
-    which.set_yticks(range(len(JOINTS)), JOINTS, fontsize=7)
-    which.set(title="which joints were given when", xlabel="seconds")
-    _draw_trajectory(figure.add_subplot(grid[1, 1]), joints[:, 0], known[:, 0])
-    figure.savefig(path, dpi=110)
-
-
-def _draw_trajectory(axis: Axes, root: NDArray[np.float64], given: NDArray[np.bool_]) -> None:
-    for mask, colour in ((given, _GIVEN), (~given, _COMPLETED)):
-        axis.plot(root[mask, 0], root[mask, 1], ".", color=colour, markersize=3)
-    axis.set(title="the pelvis from above, m", aspect="equal")
-    axis.grid(alpha=0.25)

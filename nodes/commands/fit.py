@@ -5,37 +5,29 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from rich.progress import Progress
 
-from steadypose.msgs.types import JOINTS, Message, PoseRaw
-from steadypose.nodes.commands.output import (
-    In,
-    Out,
-    check_poses_file,
-    console,
-    write_output,
-)
-from steadypose.nodes.driving import clean_joints, stream
+from steadypose.msgs.types import JOINTS
+from steadypose.nodes.commands.output import In, Out, check_poses_file, console, write_output
+from steadypose.nodes.driving import clean_joints
 from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.settings import LaunchError
-from steadypose.nodes.sinks.arrays import NpzCollector
+from steadypose.nodes.offline import fit_source, load_transitions, with_bones
+from steadypose.nodes.sinks.plot.figure import draw_misfit, save
 from steadypose.nodes.sources.key_points import has_key_points, read_key_points
 from steadypose.nodes.sources.npz import NpzError, read_arrays
 from steadypose.nodes.sources.recording import open_recording
-from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.arrays import Floats
-from steadypose.prior.camera.key_points import in_sight
 
 if TYPE_CHECKING:
-    from steadypose.prior.fit.bodies import Fit, Seen
-    from steadypose.prior.fit.humor_network import HumorNet
+    from steadypose.prior.fit.bodies import Fit
     from steadypose.prior.fit.windows import FittedTrack
 
 
@@ -178,107 +170,4 @@ def _explain(out: Path, fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any
             arrays |= {f"{number}/offsets": track.offsets, f"{number}/ground": track.ground}
             arrays |= {f"{number}/energies": track.energies}
     np.savez(out.with_name(f"{out.name}.misfit.npz"), **arrays)
-    _picture(out.with_name(f"{out.name}.fit.png"), fits, unit)
-
-
-def _picture(path: Path, fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit: str) -> None:
-    from matplotlib.figure import Figure
-
-    shown = fits[:6]
-    figure = Figure(figsize=(9, 1.2 + 2.6 * len(shown)), layout="constrained")
-    for axis, (body, stamps, misfit, _) in zip(figure.subplots(len(shown), 1, squeeze=False)[:, 0], shown, strict=True):
-        seconds = (stamps[[0, -1]] - fits[0][1][0]) * 1e-9
-        image = axis.imshow(
-            misfit.T, aspect="auto", interpolation="nearest", extent=(*seconds, len(JOINTS) - 0.5, -0.5), cmap="magma"
-        )
-        axis.set_yticks(range(len(JOINTS)), JOINTS, fontsize=5)
-        axis.set(title=f"body {body}: how far joints lie from where they were seen, {unit}", xlabel="seconds")
-        figure.colorbar(image, ax=axis)
-    figure.savefig(path, dpi=110)
-
-
-class Fitted(NamedTuple):
-    """What came of a source."""
-
-    messages: list[tuple[str, Message]]
-    """of all topics, with poses replaced by the fitted ones"""
-    stamps_ns: NDArray[np.int64]
-    """(T,) of its frames"""
-    fits: list[Fit]
-    """of each body, for as long as it was seen"""
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of ``clean``, a row for each frame; of one body that was fitted, with its bones and the ground."""
-        collector = NpzCollector()
-        for _, message in self.messages:
-            collector.add(message)
-        arrays = collector.arrays(self.stamps_ns)
-        tracks = {fit.seen.id: fit.track for fit in self.fits if fit.track is not None}
-        return with_bones(arrays, next(iter(tracks.values()))) if len(tracks) == 1 else arrays
-
-
-def load_transitions(weights: str) -> HumorNet:
-    """The model of transitions of a weight set."""
-    from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
-    from steadypose.prior.fit.tensors import load_network
-
-    return load_network(HumorNet, HumorConfig.from_dict, weights, "humor")
-
-
-def fit_source(
-    frames: RecordedSource,
-    name: str,
-    points: ArrayLike | None,
-    *,
-    model: HumorNet,
-    delay: int,
-    folder: Path | None = None,
-    began: Callable[[Sequence[Seen]], None] = lambda bodies: None,
-    advanced: Callable[[], None] = lambda: None,
-) -> Fitted:
-    """Fit 3D joints, initialised by the nodes' own pipelines.
-
-    Args:
-        frames: the source.
-        name: what errors call it.
-        points: (T, N, 3) metres of the body's surface, in the sensor's frame, NaN where there are fewer.
-        delay: of the initialisation, frames at 30 Hz.
-        model, folder, began, advanced: as of `prior.fit.bodies.fit_stream`.
-
-    Raises:
-        LaunchError: nobody is seen for long enough.
-        NpzError: points of the wrong form.
-    """
-    from steadypose.nodes.graph.prior_node import make_prior
-    from steadypose.nodes.graph.trajectory_node import make_trajectory
-    from steadypose.prior.fit.bodies import fit_stream, rewritten
-    from steadypose.prior.fit.windows import MIN_FRAMES
-
-    surface = None if points is None else _surface(name, np.asarray(points), len(frames))
-    messages = list(stream(frames, make_prior({"delay": delay}), make_trajectory({})))
-    fits = fit_stream(messages, surface, model, folder, began, advanced)
-    if not fits:
-        raise LaunchError(
-            f"{name}: expected somebody who is seen for {MIN_FRAMES} frames or more, found nobody; is the skeleton "
-            "right, are the units metres? `steadypose info` says what it holds"
-        )
-    stamps = np.array([m.stamp_ns for _, m in messages if isinstance(m, PoseRaw) and not m.end_of_stream], np.int64)
-    return Fitted(rewritten(messages, fits), stamps, fits)
-
-
-def with_bones(arrays: dict[str, NDArray[Any]], track: FittedTrack) -> dict[str, NDArray[Any]]:
-    """With bones and ground, where there is one person; of several, .misfit.npz has them for each."""
-    from steadypose.prior.fit.bodies import ground_plane
-
-    bones = np.linalg.norm(track.offsets.mean(axis=0), axis=-1)
-    return arrays | {"bone_lengths": bones, "ground_plane": ground_plane(track.ground.mean(axis=0))}
-
-
-def _surface(name: str, points: NDArray[Any], frames: int) -> Floats:
-    """(T, N, 3) metres, points that a camera can see."""
-    if points.dtype.kind not in "fiu" or points.ndim != 3 or len(points) != frames or points.shape[-1] != 3:
-        raise NpzError(
-            f"{name}: points: expected ({frames}, N, 3) metres, NaN for what is missing, got {points.dtype} "
-            f"{points.shape}"
-        )
-    return in_sight(points.astype(np.float64))
+    save(draw_misfit(fits, unit), out.with_name(f"{out.name}.fit.png"))

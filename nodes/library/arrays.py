@@ -20,6 +20,8 @@ from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.library.poses import Poses
+from steadypose.nodes.sinks.plot.figure import draw, save
+from steadypose.nodes.sinks.plot.history import history_of_arrays, history_of_path
 from steadypose.nodes.sources.npz import ArraySource, NpzError, as_input
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.source import RecordedSource
@@ -221,7 +223,7 @@ def complete(
     Raises:
         ValueError: as `clean`; or there is no body.
     """
-    from steadypose.nodes.commands.complete import complete_source, load_completer
+    from steadypose.nodes.offline import complete_source, load_completer
 
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
     completed = complete_source(source, "positions", *load_completer(weights))
@@ -256,7 +258,7 @@ def fit(
         ValueError: as `clean`; nobody is seen for long enough; or torch is not installed (the extra 'train').
     """
     require_extra("train")
-    from steadypose.nodes.commands.fit import fit_source, load_transitions
+    from steadypose.nodes.offline import fit_source, load_transitions
 
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
     fitted = fit_source(source, "positions", points, model=load_transitions(weights), delay=delay)
@@ -280,9 +282,6 @@ def plot(poses: Positions, output: str | Path | None = None, *, body: int | None
         ValueError: there is nothing to draw, or nowhere to write to.
         ModuleNotFoundError: matplotlib is not installed: it comes with the extra 'view'.
     """
-    from steadypose.nodes.commands.plot import draw, save
-    from steadypose.nodes.commands.plot_history import history_of_arrays, history_of_path
-
     if not isinstance(poses, Mapping | str | os.PathLike):
         raise NpzError(
             f"expected what steadypose.clean, complete or fit gave, or the path of a recording, got "

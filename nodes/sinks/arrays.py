@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,9 +45,11 @@ _NEAREST = ("state", "anomaly_flag")
 class NpzCollector:
     """Gathers the output of both pipelines on their 30 Hz grid, and gives them at the stamps of the input."""
 
-    def __init__(self) -> None:
+    def __init__(self, messages: Iterable[tuple[str, Message]] = ()) -> None:
         self._rows: dict[int, list[NDArray[np.void]]] = {}
         self._newest: dict[int, NDArray[np.void]] = {}
+        for _, message in messages:
+            self.add(message)
 
     def add(self, message: Message) -> None:
         """Take the next message of the stream; of each moment ``pose/clean`` comes before ``pose/world``."""

@@ -148,11 +148,7 @@ def answers(stamp_ns: int, position: float, turn: Rotation, body: int = 0) -> tu
 
 
 def collect(*stamped: tuple[PoseClean, PoseWorld]) -> NpzCollector:
-    collector = NpzCollector()
-    for pair in stamped:
-        for message in pair:
-            collector.add(message)
-    return collector
+    return NpzCollector(("", message) for pair in stamped for message in pair)
 
 
 @settings(max_examples=30)

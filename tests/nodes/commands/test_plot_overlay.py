@@ -14,7 +14,7 @@ from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_CLEAN
 from steadypose.msgs.types import JointState, PoseClean
 from steadypose.nodes.commands.plot import plot
-from steadypose.nodes.commands.plot_history import PlotError
+from steadypose.nodes.sinks.plot.history import PlotError
 from steadypose.nodes.sources.source import WebcamSettings
 from steadypose.prior.body.skeleton import J
 

@@ -11,8 +11,8 @@ from tests.nodes.conftest import record, walk
 from steadypose.msgs.types import JointState, PoseRaw
 from steadypose.nodes.cli import main
 from steadypose.nodes.commands.complete import complete
-from steadypose.nodes.commands.plot_history import history_of_path
-from steadypose.nodes.commands.plot_video import View, write_video
+from steadypose.nodes.sinks.plot.history import history_of_path
+from steadypose.nodes.sinks.plot.video import View, write_video
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.skeleton import J
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.types import CONTACTS, JOINTS, JointState, Tracking
-from steadypose.nodes.commands.plot_history import History, Track, TrackError, nan_mean
 from steadypose.nodes.sinks.drawing import (
     ALARM_COLOUR,
     ALL_BONES,
@@ -24,6 +23,7 @@ from steadypose.nodes.sinks.drawing import (
     bones,
     facing,
 )
+from steadypose.nodes.sinks.plot.history import History, Track, TrackError, nan_mean
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN
 from steadypose.msgs.types import JointState, PoseClean
-from steadypose.nodes.commands.plot_history import PlotError
 from steadypose.nodes.sinks.drawing import ALL_BONES, FAINT, ON_DARK, SIDES, bones
+from steadypose.nodes.sinks.plot.history import PlotError
 from steadypose.nodes.sources.adapters import pinhole
 from steadypose.nodes.sources.npz import is_output, read_arrays
 from steadypose.nodes.sources.source import WebcamSettings

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JointState
-from steadypose.nodes.commands.plot_history import History, PlotError, Track, body_of
-from steadypose.nodes.commands.plot_panels import draw_bones
 from steadypose.nodes.graph.extras import how_to_install
 from steadypose.nodes.sinks.drawing import (
     ALL_BONES,
@@ -29,6 +27,8 @@ from steadypose.nodes.sinks.drawing import (
     bones,
     facing,
 )
+from steadypose.nodes.sinks.plot.history import History, PlotError, Track, body_of
+from steadypose.nodes.sinks.plot.panels import draw_bones
 from steadypose.prior.arrays import Floats
 
 if TYPE_CHECKING:
@@ -57,10 +57,10 @@ def write_overlay(recording: Path, video: Path, path: Path, body: int | None = N
     """Write what was cleaned of a video over its images, as the ending says; returns the number of frames.
 
     Raises:
-        PlotError: OpenCV is not installed, or as `plot_overlay.overlaid`.
+        PlotError: OpenCV is not installed, or as `overlay.overlaid`.
     """
     try:
-        from steadypose.nodes.commands.plot_overlay import overlaid
+        from steadypose.nodes.sinks.plot.overlay import overlaid
     except ModuleNotFoundError as error:
         raise PlotError(f"over: {how_to_install([error.name or ''], 'oak')}") from error
     frames, fps = overlaid(recording, video, body)

@@ -1,0 +1,172 @@
+"""A whole source at once, completed or fitted: what the offline commands and the library share, as `driving`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
+from steadypose.msgs.types import Message, PoseRaw
+from steadypose.nodes.driving import stream
+from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.sinks.arrays import NpzCollector
+from steadypose.nodes.sources.npz import NpzError
+from steadypose.nodes.sources.recording import with_end
+from steadypose.nodes.sources.source import RecordedSource
+from steadypose.prior.arrays import Floats
+from steadypose.prior.camera.key_points import in_sight
+from steadypose.prior.complete.body import Fill, Uncertainty
+from steadypose.prior.complete.parts import PartsCompleter
+from steadypose.prior.complete.stream import Completion, complete_raws, moved, root_steps
+from steadypose.prior.models.completer import LiveCompleter
+from steadypose.prior.world.pipeline import TrajectoryPipeline
+from steadypose.prior.world.settings import TrajectorySettings
+
+if TYPE_CHECKING:
+    from steadypose.prior.fit.bodies import Fit, Seen
+    from steadypose.prior.fit.humor_network import HumorNet
+    from steadypose.prior.fit.windows import FittedTrack
+
+
+class CompletedSource(NamedTuple):
+    """What came of a source."""
+
+    raws: list[PoseRaw]
+    """``pose/raw`` as it was, with its end"""
+    answers: list[tuple[str, Message]]
+    """``pose/clean`` and ``pose/world`` with their topics, in order"""
+    completion: Completion
+    refused: dict[str, int]
+    """what was refused or dropped, by cause"""
+
+    def messages(self) -> list[tuple[str, Message]]:
+        """All messages, by their stamps."""
+        every = [*((POSE_RAW, message) for message in self.raws), *self.answers]
+        return sorted(every, key=lambda pair: pair[1].stamp_ns)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of ``clean``, with a row for each frame of the grid on which there is a body."""
+        stamps_ns = np.array([message.stamp_ns for message in self.completion.clean[:-1]], np.int64)
+        return NpzCollector(self.answers).arrays(stamps_ns)
+
+
+def load_completer(weights: str) -> tuple[PartsCompleter, Uncertainty]:
+    """The completer of a weight set, and the standard deviations of its output."""
+    completer = LiveCompleter.load(weights)
+    return PartsCompleter(completer), Uncertainty(completer.config.never_sigma, completer.config.half_frames)
+
+
+def complete_source(
+    frames: RecordedSource,
+    name: str,
+    fill: Fill,
+    uncertainty: Uncertainty,
+    began: Callable[[int], None] = lambda frames: None,
+    advanced: Callable[[int], None] = lambda frame: None,
+) -> CompletedSource:
+    """Complete what a source has; ``name`` is what errors call it, the rest as of `complete_raws`.
+
+    Raises:
+        LaunchError: it has no frame.
+        CompletionError: as `complete_raws`.
+    """
+    raws = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
+    if not raws:
+        raise LaunchError(f"{name}: expected frames, but none of {len(frames)} could be read")
+    completion = complete_raws(name, raws[:-1], fill, uncertainty, began, advanced)
+    settings = TrajectorySettings()
+    world, steps = TrajectoryPipeline(settings), root_steps(completion, settings.weights)
+    answers: list[tuple[str, Message]] = []
+    for message in completion.clean:
+        answers.append((POSE_CLEAN, message))
+        answers += [(POSE_WORLD, answer) for answer in world.process(moved(message, steps, completion.anchor_ns))]
+    refused = {cause: n for cause, n in (frames.refused + world.counters).items() if n}
+    return CompletedSource(raws, answers, completion, refused)
+
+
+class Fitted(NamedTuple):
+    """What came of a source."""
+
+    messages: list[tuple[str, Message]]
+    """of all topics, with poses replaced by the fitted ones"""
+    stamps_ns: NDArray[np.int64]
+    """(T,) of its frames"""
+    fits: list[Fit]
+    """of each body, for as long as it was seen"""
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of ``clean``, a row for each frame; of one body that was fitted, with its bones and the ground."""
+        arrays = NpzCollector(self.messages).arrays(self.stamps_ns)
+        tracks = {fit.seen.id: fit.track for fit in self.fits if fit.track is not None}
+        return with_bones(arrays, next(iter(tracks.values()))) if len(tracks) == 1 else arrays
+
+
+def load_transitions(weights: str) -> HumorNet:
+    """The model of transitions of a weight set."""
+    from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
+    from steadypose.prior.fit.tensors import load_network
+
+    return load_network(HumorNet, HumorConfig.from_dict, weights, "humor")
+
+
+def fit_source(
+    frames: RecordedSource,
+    name: str,
+    points: ArrayLike | None,
+    *,
+    model: HumorNet,
+    delay: int,
+    folder: Path | None = None,
+    began: Callable[[Sequence[Seen]], None] = lambda bodies: None,
+    advanced: Callable[[], None] = lambda: None,
+) -> Fitted:
+    """Fit 3D joints, initialised by the nodes' own pipelines.
+
+    Args:
+        frames: the source.
+        name: what errors call it.
+        points: (T, N, 3) metres of the body's surface, in the sensor's frame, NaN where there are fewer.
+        delay: of the initialisation, frames at 30 Hz.
+        model, folder, began, advanced: as of `prior.fit.bodies.fit_stream`.
+
+    Raises:
+        LaunchError: nobody is seen for long enough.
+        NpzError: points of the wrong form.
+    """
+    from steadypose.nodes.graph.prior_node import make_prior
+    from steadypose.nodes.graph.trajectory_node import make_trajectory
+    from steadypose.prior.fit.bodies import fit_stream, rewritten
+    from steadypose.prior.fit.windows import MIN_FRAMES
+
+    surface = None if points is None else _surface(name, np.asarray(points), len(frames))
+    messages = list(stream(frames, make_prior({"delay": delay}), make_trajectory({})))
+    fits = fit_stream(messages, surface, model, folder, began, advanced)
+    if not fits:
+        raise LaunchError(
+            f"{name}: expected somebody who is seen for {MIN_FRAMES} frames or more, found nobody; is the skeleton "
+            "right, are the units metres? `steadypose info` says what it holds"
+        )
+    stamps = np.array([m.stamp_ns for _, m in messages if isinstance(m, PoseRaw) and not m.end_of_stream], np.int64)
+    return Fitted(rewritten(messages, fits), stamps, fits)
+
+
+def with_bones(arrays: dict[str, NDArray[Any]], track: FittedTrack) -> dict[str, NDArray[Any]]:
+    """With bones and ground, where there is one person; of several, .misfit.npz has them for each."""
+    from steadypose.prior.fit.bodies import ground_plane
+
+    bones = np.linalg.norm(track.offsets.mean(axis=0), axis=-1)
+    return arrays | {"bone_lengths": bones, "ground_plane": ground_plane(track.ground.mean(axis=0))}
+
+
+def _surface(name: str, points: NDArray[Any], frames: int) -> Floats:
+    """(T, N, 3) metres, points that a camera can see."""
+    if points.dtype.kind not in "fiu" or points.ndim != 3 or len(points) != frames or points.shape[-1] != 3:
+        raise NpzError(
+            f"{name}: points: expected ({frames}, N, 3) metres, NaN for what is missing, got {points.dtype} "
+            f"{points.shape}"
+        )
+    return in_sight(points.astype(np.float64))

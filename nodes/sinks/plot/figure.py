@@ -1,0 +1,145 @@
+"""The pictures: of a recording, of what was completed, and of how far a fit lies from what was observed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from steadypose.msgs.topics import POSE_CLEAN
+from steadypose.msgs.types import JOINTS, JointState
+from steadypose.nodes.sinks.drawing import ALL_BONES, STATE_COLOURS
+from steadypose.nodes.sinks.plot.history import History, PlotError, body_of, errors_of
+from steadypose.nodes.sinks.plot.panels import (
+    draw_bones,
+    draw_by_joint,
+    draw_path,
+    draw_stick_figures,
+    draw_summary,
+    panels_over_time,
+    side_by_side,
+)
+from steadypose.prior.arrays import Floats
+from steadypose.prior.timing.rate import FPS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from steadypose.prior.complete.stream import Completion
+
+
+STRIP = 2.8
+TITLE = 0.45
+"""inches: the strip of figures, and the title of a panel"""
+PICTURES = (".png", ".svg", ".pdf")
+
+
+def check_picture(output: Path, endings: tuple[str, ...] = PICTURES) -> None:
+    """Raises:
+    PlotError: this is no name for a picture, or its folder is not there.
+    """
+    if output.suffix not in endings:
+        raise PlotError(f"output: expected a name ending in {', '.join(endings[:-1])} or {endings[-1]}, got {output}")
+    if not output.resolve().parent.is_dir():
+        raise PlotError(f"output: {output.resolve().parent} is no directory; make it first")
+
+
+def save(figure: Figure, output: Path) -> None:
+    """Write a picture; raises as `check_picture`."""
+    check_picture(output)
+    figure.savefig(output, dpi=110)
+
+
+def draw(history: History, body: int | None = None) -> Figure:
+    """Draw one body, and the way over the floor of all.
+
+    Raises:
+        PlotError: as `body_of`.
+    """
+    from matplotlib.figure import Figure
+
+    chosen, bodies = body_of(history, body), history.bodies
+    errors = errors_of(history, chosen)
+    panels = panels_over_time(history, chosen, errors)
+    heights = [panel.height + TITLE for panel in panels]
+    body_height = max(sum(heights), 9.0)
+    figure = Figure(figsize=(16, STRIP + body_height), layout="constrained")
+    figure.suptitle(f"{history.name} · {history.origin} · body {chosen} of {len(bodies)}", fontsize=14, weight="bold")
+    rows = figure.add_gridspec(2, 1, height_ratios=[STRIP, body_height])
+    draw_stick_figures(figure.add_subplot(rows[0]), history, chosen)
+    columns = rows[1].subgridspec(1, 2, width_ratios=[2.2, 1])
+    over_time = columns[0].subgridspec(len(panels), 1, height_ratios=heights)
+    first: Axes | None = None
+    for row, panel in enumerate(panels):
+        ax = figure.add_subplot(over_time[row], sharex=first)
+        first = first or ax
+        panel.draw(ax)
+        ax.set_title(panel.title, loc="left", fontsize=10, weight="bold")
+        ax.margins(x=0)
+        ax.grid(alpha=0.25)
+        ax.tick_params(labelbottom=row == len(panels) - 1)
+        if row == len(panels) - 1:
+            ax.set_xlabel("seconds of capture")
+    beside = columns[1].subgridspec(3, 1, height_ratios=[2, 2, 1.2])
+    draw_path(figure.add_subplot(beside[0]), history, chosen)
+    draw_by_joint(figure.add_subplot(beside[1]), history.track(POSE_CLEAN, chosen), errors)
+    draw_summary(figure.add_subplot(beside[2]), history, chosen, errors)
+    return figure
+
+
+FIGURES = 16
+_GIVEN, _COMPLETED = STATE_COLOURS[JointState.SEEN], STATE_COLOURS[JointState.IMPUTED]
+
+
+def draw_completion(completion: Completion, title: str) -> Figure:
+    """Draw the longest stretch that was completed: joints given when, stick figures, the trajectory."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+
+    stretch, completed = max(completion.done, key=lambda pair: len(pair[0].given))
+    joints, known = completed.positions, completed.known
+    there = np.flatnonzero(np.isfinite(joints).all(axis=(1, 2)))
+    figure = Figure(figsize=(15, 9), layout="constrained")
+    figure.suptitle(f"{title} · body {stretch.body} · given in green, completed in orange", fontsize=13, weight="bold")
+    grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.2], width_ratios=[2.2, 1])
+    sticks = figure.add_subplot(grid[0, :])
+    chosen = there[np.linspace(0, len(there) - 1, min(FIGURES, len(there))).round().astype(int)]
+    for row, flat in zip(chosen, *side_by_side(sticks, chosen / FPS, joints[chosen]), strict=True):
+        colours = [_GIVEN if known[row, list(ends)].all() else _COMPLETED for ends in ALL_BONES]
+        draw_bones(sticks, flat, ALL_BONES, colours, width=2.0)
+    which = figure.add_subplot(grid[1, 0])
+    shown = np.where(np.isfinite(joints[..., 0]), np.where(known, 1, 2), 0)
+    which.imshow(
+        shown.T, aspect="auto", interpolation="nearest", vmin=0, vmax=2,
+        cmap=ListedColormap(["white", _GIVEN, _COMPLETED]), extent=(0.0, len(shown) / FPS, 21.5, -0.5),
+    )  # fmt: skip
+    which.set_yticks(range(len(JOINTS)), JOINTS, fontsize=7)
+    which.set(title="which joints were given when", xlabel="seconds")
+    above = figure.add_subplot(grid[1, 1])
+    for mask, colour in ((known[:, 0], _GIVEN), (~known[:, 0], _COMPLETED)):
+        above.plot(joints[mask, 0, 0], joints[mask, 0, 1], ".", color=colour, markersize=3)
+    above.set(title="the pelvis from above, m", aspect="equal")
+    above.grid(alpha=0.25)
+    return figure
+
+
+def draw_misfit(fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit: str) -> Figure:
+    """Draw how far joints lie from where they were seen, in this unit: of each body its id, stamps (T,) and misfit
+    (T, 22)."""
+    from matplotlib.figure import Figure
+
+    shown = fits[:6]
+    figure = Figure(figsize=(9, 1.2 + 2.6 * len(shown)), layout="constrained")
+    for axis, (body, stamps, misfit, _) in zip(figure.subplots(len(shown), 1, squeeze=False)[:, 0], shown, strict=True):
+        seconds = (stamps[[0, -1]] - fits[0][1][0]) * 1e-9
+        image = axis.imshow(
+            misfit.T, aspect="auto", interpolation="nearest", extent=(*seconds, len(JOINTS) - 0.5, -0.5), cmap="magma"
+        )
+        axis.set_yticks(range(len(JOINTS)), JOINTS, fontsize=5)
+        axis.set(title=f"body {body}: how far joints lie from where they were seen, {unit}", xlabel="seconds")
+        figure.colorbar(image, ax=axis)
+    return figure
