@@ -19,6 +19,8 @@ from importlib.metadata import version
 from io import StringIO
 from typing import Any
 
+from steadypose.nodes.extras import extra_of, how_to_install
+
 EVALUATE = "steadypose.benchmarks.evaluate"
 COMMANDS = {
     "run": ("run", "start a launch file's nodes, watch them, show how they do"),
@@ -86,8 +88,6 @@ def _main(arguments: list[str]) -> int:
                 f"steadypose {name}: the studies are not installed: expected a checkout of the project", file=sys.stderr
             )
             return USAGE_ERROR
-        from steadypose.nodes.graph.extras import extra_of, how_to_install  # numpy and more, which help does without
-
         missing = (error.name or "").partition(".")[0]
         if (extra := extra_of(missing)) is None:
             raise

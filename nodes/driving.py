@@ -16,7 +16,7 @@ from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.checks.stamps import check_length
 from steadypose.nodes.checks.stream import StreamCheck
 from steadypose.nodes.graph.clock import FRAME_NS
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.npz import ArraySource
 from steadypose.nodes.sources.recording import with_end

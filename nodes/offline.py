@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.driving import stream
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.npz import NpzError
 from steadypose.nodes.sources.recording import with_end

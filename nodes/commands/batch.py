@@ -29,9 +29,9 @@ from rich.progress import Progress
 from steadypose.nodes.cli import is_for_user
 from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.driving import NOBODY
-from steadypose.nodes.graph.extras import require_extra
+from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.process import own_command, own_environment
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.npz import SUFFIXES
 
 MANIFEST = "manifest.jsonl"

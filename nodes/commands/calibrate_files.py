@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.recording import VIDEOS
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.arrays import Floats

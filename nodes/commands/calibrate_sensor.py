@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.commands.output import check_output, plural
-from steadypose.nodes.graph.extras import require_extra
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.extras import require_extra
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.npz import read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats

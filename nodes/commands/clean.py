@@ -21,7 +21,7 @@ from steadypose.nodes.commands.output import (
 from steadypose.nodes.driving import NOBODY
 from steadypose.nodes.graph.launch import apply_override, check_settings, full_key, pipeline_sections, read_toml
 from steadypose.nodes.graph.loops import compile_missing
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.prior.body.layouts import add_layouts
 
 

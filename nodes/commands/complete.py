@@ -9,9 +9,9 @@ from rich.progress import Progress
 
 from steadypose.nodes.commands.output import File, In, Out, check_poses_file, console, plural, write_output
 from steadypose.nodes.graph.launch import read_toml
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.offline import complete_source, load_completer
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.plot.figure import PICTURES, draw_completion, save
 from steadypose.nodes.sources.recording import NO_RIG, open_recording
 from steadypose.prior.body.layouts import add_layouts

@@ -26,7 +26,7 @@ from steadypose.nodes.commands.doctor_checks import (
     check_streams,
     check_webcam,
 )
-from steadypose.nodes.graph.extras import EXTRAS, install_command
+from steadypose.nodes.extras import EXTRAS, install_command
 
 if TYPE_CHECKING:  # the doctor starts where not even numpy is installed
     from steadypose.msgs.types import PoseRaw

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from steadypose import PACKAGE
 from steadypose.msgs.security import TransportError, make_private
-from steadypose.nodes.graph.extras import install_command
+from steadypose.nodes.extras import install_command
 
 if TYPE_CHECKING:
     from steadypose.msgs.types import PoseRaw
@@ -148,7 +148,7 @@ LONGEST_IPC_PATH = 107  # bytes of a unix socket's path that the system takes
 
 def check_messages() -> Iterator[Finding]:
     """The directory of the ipc sockets, and a message there and back."""
-    from steadypose.nodes.graph.settings import TransportSettings
+    from steadypose.nodes.graph.topology import TransportSettings
 
     directory = TransportSettings().ipc_directory
     longest = len(os.fsencode(directory / "trajectory"))

@@ -11,8 +11,8 @@ import tyro
 from steadypose.msgs.types import PoseRaw, PoseWorld
 from steadypose.nodes.commands.output import ARRAY_FILES, File, In, Out, check_file, console, unfinished
 from steadypose.nodes.driving import stream
-from steadypose.nodes.graph.extras import require_extra
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.extras import require_extra
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.skeleton import AVATAR_NAMES
 

@@ -17,9 +17,9 @@ from rich.progress import Progress
 from steadypose.msgs.types import JOINTS
 from steadypose.nodes.commands.output import In, Out, check_poses_file, console, write_output
 from steadypose.nodes.driving import clean_joints
-from steadypose.nodes.graph.extras import require_extra
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.extras import require_extra
 from steadypose.nodes.offline import fit_source, load_transitions, with_bones
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.plot.figure import draw_misfit, save
 from steadypose.nodes.sources.key_points import has_key_points, read_key_points
 from steadypose.nodes.sources.npz import NpzError, read_arrays

@@ -28,8 +28,7 @@ from steadypose.msgs.types import JOINTS, Diagnostics, JointState, Message, Pose
 from steadypose.nodes.commands.output import plural, printable
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import TransportSettings
-from steadypose.nodes.graph.topology import publishers
+from steadypose.nodes.graph.topology import TransportSettings, publishers
 from steadypose.prior.settings import nearest
 
 PATIENCE_S = 3.0

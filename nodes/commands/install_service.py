@@ -19,7 +19,7 @@ from rich.console import Console
 
 from steadypose.nodes.graph.launch import Launch, find
 from steadypose.nodes.graph.loops import compile_missing
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.recorder import RecorderSettings
 
 MARK = "# made by `steadypose install-service`; `steadypose install-service --uninstall` removes it"

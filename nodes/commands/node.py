@@ -10,8 +10,8 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.loops import COMPILED, compile_missing
 from steadypose.nodes.graph.node import supervisor_id
 from steadypose.nodes.graph.process import startup, stop_on_signals
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.topology import NODES, load
+from steadypose.nodes.settings import LaunchError
 from steadypose.prior.settings import logger as names_logger
 from steadypose.prior.settings import nearest
 

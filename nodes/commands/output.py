@@ -22,7 +22,7 @@ from rich.console import Console
 from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.recording_writer import recorded_parts
 from steadypose.msgs.types import Message, PoseRaw
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.arrays import NpzCollector, write_csv
 from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.recording import open_recording

@@ -21,8 +21,8 @@ from steadypose.msgs.types import Diagnostics
 from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.commands.output import printable
 from steadypose.nodes.commands.run_table import line, table
+from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock
-from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.launch import Launch, check_settings, in_launch_file
 from steadypose.nodes.graph.loops import COMPILED, compile_missing
 from steadypose.nodes.graph.node import RUN, WATCHER

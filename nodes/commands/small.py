@@ -10,7 +10,7 @@ import tyro
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
 from steadypose.msgs.security import create_keys
 from steadypose.nodes.graph.launch import bundled
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.prior.sim.streams import ManifestError, read_manifest, record
 
 

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.training.data.datasets import WeightSet
 from steadypose.training.distributed import join, set_threads, writes
 from steadypose.training.loop import TrainingOptions

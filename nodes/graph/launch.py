@@ -17,8 +17,17 @@ from typing import Any, TypeVar
 
 from steadypose import PACKAGE
 from steadypose.msgs.topics import DIAGNOSTICS
-from steadypose.nodes.graph.settings import LaunchError, ServerSettings, TransportSettings, load_plugin, resolve_paths
-from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, NodeDeclaration, add_node, load
+from steadypose.nodes.graph.topology import (
+    NODES,
+    POSE_NODES,
+    Delivery,
+    NodeDeclaration,
+    ServerSettings,
+    TransportSettings,
+    add_node,
+    load,
+)
+from steadypose.nodes.settings import LaunchError, load_plugin, resolve_paths
 from steadypose.prior.body.layouts import add_layouts
 from steadypose.prior.settings import build_settings, current_key, current_keys, nearest
 

@@ -14,8 +14,8 @@ from steadypose.nodes.graph.clock import FRAME_NS, Clock
 from steadypose.nodes.graph.inbox import BodyLimit
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
+from steadypose.nodes.settings import LaunchError
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
 from steadypose.prior.clean.settings import PriorSettings

@@ -17,9 +17,9 @@ from steadypose.msgs.security import local_directory, make_private
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.types import Diagnostics, Level
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.supervisor import Supervisor
 from steadypose.nodes.graph.topology import NODES, Delivery
+from steadypose.nodes.settings import LaunchError
 
 HEALTH_FILE = "health.json"
 

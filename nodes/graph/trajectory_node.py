@@ -10,8 +10,8 @@ from steadypose.msgs.types import Message, PoseClean
 from steadypose.nodes.graph.clock import FRAME_NS, Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.threads import one_thread
+from steadypose.nodes.settings import LaunchError
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 

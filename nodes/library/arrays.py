@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from steadypose.nodes.driving import NOBODY, OfflineRun, Settings
-from steadypose.nodes.graph.extras import require_extra
+from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.loops import compile_missing
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.library.poses import Poses
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.plot.figure import draw, save
 from steadypose.nodes.sinks.plot.history import history_of_arrays, history_of_path
 from steadypose.nodes.sources.npz import ArraySource, NpzError, as_input

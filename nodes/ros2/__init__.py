@@ -9,8 +9,8 @@ import sys
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from steadypose.nodes.graph.extras import install_command
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.extras import install_command
+from steadypose.nodes.settings import LaunchError
 
 if TYPE_CHECKING:
     from steadypose.nodes.ros2.definitions import Connection

@@ -15,8 +15,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.ros2.definitions import DEPTH, Publish
+from steadypose.nodes.settings import LaunchError
 
 
 class RclpyConnection:

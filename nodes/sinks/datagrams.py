@@ -17,7 +17,7 @@ from steadypose.msgs.types import Message, PoseWorld, Tracking, WorldBody
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import check_host_and_port
+from steadypose.nodes.settings import check_host_and_port
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import global_rotations, rotation_matrices
 from steadypose.prior.body.skeleton import PARENTS, VRM

@@ -21,7 +21,7 @@ from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import LaunchError, path_setting
+from steadypose.nodes.settings import LaunchError, path_setting
 from steadypose.prior.settings import nearest
 
 logger = logging.getLogger(__name__)

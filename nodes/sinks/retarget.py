@@ -23,8 +23,8 @@ import numpy as np
 from steadypose.msgs.types import CONTACTS, PoseWorld, WorldBody
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError, path_setting
 from steadypose.nodes.graph.threads import one_thread
+from steadypose.nodes.settings import LaunchError, path_setting
 from steadypose.nodes.sinks.datagrams import DatagramNode, DatagramSettings, Followed
 from steadypose.nodes.sinks.robot import Robot, load_robot
 from steadypose.prior.arrays import Floats

@@ -20,7 +20,7 @@ from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.checks.problem import Problem, warning
 from steadypose.nodes.graph.clock import POLL_S, Clock
-from steadypose.nodes.graph.settings import LaunchError, check_addresses
+from steadypose.nodes.settings import LaunchError, check_addresses
 from steadypose.nodes.sources.source import (
     MODEL,
     LiveSource,

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from steadypose.msgs.recording import RecordingError, RecordingReader
 from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Diagnostics, Message, Pose, PoseRaw, RawBody
-from steadypose.nodes.graph.extras import require_extra
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.extras import require_extra
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.npz import MotionSource, NpzSource, holds_motion
 from steadypose.nodes.sources.source import CalibrationSettings, RecordedSource, WebcamSettings
 from steadypose.prior.body.layouts import SKELETONS, Skeleton

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from steadypose.msgs.security import Keys
+from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.clock import Clock, SystemClock
-from steadypose.nodes.graph.extras import require_extra
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError, load_plugin, path_setting
+from steadypose.nodes.settings import LaunchError, load_plugin, path_setting
 from steadypose.nodes.sources.camera import MergeSettings, MergeSource, open_oak, open_webcam
 from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source, TfSettings, TfSource
 from steadypose.nodes.sources.source import (
@@ -35,7 +35,7 @@ class SourceDeclaration:
     opens: Callable[[Any, SourceContext], RecordedSource | LiveSource]
     """makes the source from its settings; a camera is opened only when its frames are requested"""
     extra: str
-    """of `graph.extras.EXTRAS`, that it needs; empty: none"""
+    """of `nodes.extras.EXTRAS`, that it needs; empty: none"""
 
 
 def _declare(

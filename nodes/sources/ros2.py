@@ -17,9 +17,9 @@ from rosbags.serde import SerdeError
 from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.graph.clock import POLL_S, Clock
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.ros2 import check_ros, connect
 from steadypose.nodes.ros2.definitions import Connection, deserialise, stamp_ns
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_azure_kinect, from_pose_array
 from steadypose.nodes.sources.source import LiveSource, SourceContext
 from steadypose.prior.arrays import Floats

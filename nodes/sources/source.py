@@ -17,7 +17,7 @@ from steadypose.msgs.security import Keys
 from steadypose.msgs.types import Message, Pose, PoseRaw
 from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.graph.clock import Clock
-from steadypose.nodes.graph.settings import LaunchError, path_setting
+from steadypose.nodes.settings import LaunchError, path_setting
 from steadypose.prior.settings import check_range
 
 logger = logging.getLogger(__name__)

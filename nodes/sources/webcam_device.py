@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.graph.clock import Clock
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_mediapipe, pinhole
 from steadypose.nodes.sources.picture import PictureWriter
 from steadypose.nodes.sources.source import MODEL, CalibrationSettings, CameraError, WebcamSettings, count_failure

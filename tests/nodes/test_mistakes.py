@@ -243,7 +243,7 @@ def test_what_is_right_is_not_warned_of(joints: np.ndarray) -> None:
 
 
 def test_without_torch_a_fit_says_what_to_install(joints: np.ndarray, monkeypatch) -> None:
-    monkeypatch.setattr("steadypose.nodes.graph.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("steadypose.nodes.extras.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"torch, .* extra 'train'"):
         steadypose.fit(joints, fps=30)
 
@@ -268,7 +268,7 @@ def test_without_a_library_of_tables_its_form_says_what_to_install(library: str,
 def test_a_missing_extra_is_said_once(arguments: list[str], extra: str, tmp_path: Path, monkeypatch, capsys) -> None:
     """The command is named by the command line, and not once more by what it misses."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("steadypose.nodes.graph.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("steadypose.nodes.extras.find_spec", lambda name: None)
     for name in ("in.csv", "in.mp4", "in.npz", "robot.urdf"):
         Path(name).touch()
     assert main(arguments) == 2

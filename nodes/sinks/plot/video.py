@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JointState
-from steadypose.nodes.graph.extras import how_to_install
+from steadypose.nodes.extras import how_to_install
 from steadypose.nodes.sinks.drawing import (
     ALL_BONES,
     CONTACT_COLOUR,

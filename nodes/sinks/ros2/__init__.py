@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from steadypose.nodes.graph.settings import LaunchError, check_host_and_port
+from steadypose.nodes.settings import LaunchError, check_host_and_port
 
 HOST = "127.0.0.1"
 """this machine only, as poses are personal data: from another machine, use ssh -L 8765:localhost:8765 robot"""

@@ -16,9 +16,9 @@ from steadypose.nodes.checks.problem import Problem, warning
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.ros2 import check_ros, connect
 from steadypose.nodes.ros2.definitions import Connection, Publish, ros_types
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.ros2 import HOST, FoxgloveSettings, Ros2BridgeSettings
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from steadypose.msgs.types import Message
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import check_host_and_port
+from steadypose.nodes.settings import check_host_and_port
 from steadypose.nodes.sinks.serving import LOCAL_NAMES
 from steadypose.prior.clean.settings import PriorSettings
 

@@ -33,7 +33,7 @@ from steadypose.msgs.types import (
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.graph.settings import LaunchError, check_host_and_port
+from steadypose.nodes.settings import LaunchError, check_host_and_port
 from steadypose.nodes.sinks.serving import LOCAL_NAMES
 from steadypose.prior.body.skeleton import PARENTS
 

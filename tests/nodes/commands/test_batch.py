@@ -20,7 +20,7 @@ from steadypose.nodes.commands import batch
 from steadypose.nodes.commands.batch import Job, _Worker, find_recordings, is_folder_of_recordings, on_cores, plan, work
 from steadypose.nodes.commands.clean import clean
 from steadypose.nodes.commands.output import clean_recording
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 
 pytestmark = pytest.mark.slow
 

@@ -15,7 +15,7 @@ from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.cli import main
 from steadypose.nodes.commands.calibrate_files import draw_floor
 from steadypose.nodes.graph.launch import Launch, bundled
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.recording import RecordingSource
 from steadypose.nodes.sources.registry import InputSettings

@@ -16,7 +16,7 @@ from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean, PoseWorld, Tracking, WorldBody
 from steadypose.nodes.commands.clean import clean
 from steadypose.nodes.graph.clock import FRAME_NS
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.npz import NpzError
 

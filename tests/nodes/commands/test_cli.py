@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from steadypose.nodes.cli import COMMANDS, USAGE_ERROR, main
-from steadypose.nodes.graph.extras import install_command
+from steadypose.nodes.extras import install_command
 from steadypose.nodes.graph.launch import bundled
 from steadypose.prior.models.weights import WEIGHTS
 

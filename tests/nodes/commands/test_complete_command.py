@@ -12,7 +12,7 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JointState, PoseClean
 from steadypose.nodes.commands.complete import complete
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.complete.stream import CompletionError
 from steadypose.prior.fit import optimise

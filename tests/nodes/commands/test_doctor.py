@@ -11,12 +11,12 @@ from types import SimpleNamespace as Made
 
 import pytest
 
+from steadypose.nodes import extras
 from steadypose.nodes.commands import doctor as command
 from steadypose.nodes.commands import doctor_checks as checks
 from steadypose.nodes.commands.doctor import doctor
 from steadypose.nodes.commands.doctor_checks import INSTALL, Finding, Verdict
-from steadypose.nodes.graph import extras
-from steadypose.nodes.graph.extras import install_command
+from steadypose.nodes.extras import install_command
 
 
 def verdicts(check) -> dict[str, Verdict]:

@@ -181,7 +181,7 @@ def test_what_cannot_be_done_is_said(
 
 
 def test_without_torch_it_says_what_to_install(seen: Path, tmp_path: Path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr("steadypose.nodes.graph.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("steadypose.nodes.extras.find_spec", lambda name: None)
     assert main(["fit", str(seen), str(tmp_path / "out.npz")]) == 2
     assert "add train" in capsys.readouterr().err
 

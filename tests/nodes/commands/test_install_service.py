@@ -12,7 +12,7 @@ import pytest
 from steadypose.nodes.commands import install_service as command
 from steadypose.nodes.commands.install_service import Service, install_service, quoted
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 
 
 def service(**changed: object) -> Service:

@@ -14,7 +14,7 @@ from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw
 from steadypose.nodes.commands.plot import plot
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.plot.history import PlotError, errors_of, read_history
 from steadypose.nodes.sinks.plot.panels import busiest_joints
 from steadypose.prior.body.skeleton import J

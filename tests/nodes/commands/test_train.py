@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from steadypose.nodes.commands import train as command
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.training import weights as training_weights
 from steadypose.training.loop import TrainingOptions
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from steadypose.nodes.graph.launch import Launch, bundled, find, full_key, pipeline_sections
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.recorder import RecorderSettings
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.clean.bones import PersonSettings

@@ -14,8 +14,8 @@ from steadypose.msgs.topics import POSE_WORLD
 from steadypose.nodes.graph import topology
 from steadypose.nodes.graph.clock import SystemClock
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.topology import NODES, NodeDeclaration
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.registry import InputSettings, check_input, open_input
 from steadypose.nodes.sources.source import SourceContext
 

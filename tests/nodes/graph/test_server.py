@@ -17,8 +17,8 @@ from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import PoseRaw, PoseWorld
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
+from steadypose.nodes.settings import LaunchError
 
 FRAMES = 25
 

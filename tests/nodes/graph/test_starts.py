@@ -24,7 +24,7 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import SUPERVISOR, WATCHER, Node
 from steadypose.nodes.graph.process import own_command, own_environment, stop_on_signals
 from steadypose.nodes.graph.run_state import HEALTH_FILE, RunLock
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.recorder import free_directory
 from steadypose.nodes.sources.pose_input import PoseInputNode
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from steadypose.msgs.topics import DIAGNOSTICS, TOPICS
-from steadypose.nodes.graph.extras import EXTRAS
+from steadypose.nodes.extras import EXTRAS
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, load, publishers
 

@@ -14,7 +14,7 @@ from conftest import VirtualClock, walk
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.recorder import NO_ROOM, RecorderNode
 from steadypose.nodes.sources.recording import end_of
 

@@ -18,7 +18,7 @@ from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import PoseWorld
 from steadypose.nodes.cli import main
 from steadypose.nodes.graph.launch import Launch, bundled
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.prior.sim.streams import make, read_manifest
 
 pytest.importorskip("mink", reason="the extra 'retarget' is not installed")

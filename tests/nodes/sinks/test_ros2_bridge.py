@@ -28,8 +28,8 @@ from steadypose.nodes import ros2 as connecting
 from steadypose.nodes.commands.doctor import required
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.ros2.definitions import Connection, deserialise, stamp_ns
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, Ros2BridgeSettings, RosOutput, check_ros2
 from steadypose.nodes.sinks.ros2.messages import BodyTopics
 from steadypose.nodes.sinks.ros2.rep155 import JOINTS, LINKS, frames

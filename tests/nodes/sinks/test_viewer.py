@@ -25,9 +25,10 @@ from tests.helpers.synthetic_poses import CAMERA, messages, walker
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Diagnostics, JointState, Level, Pose, PoseClean, PoseRaw, RawBody, Tracking
-from steadypose.nodes.graph import extras
+from steadypose.nodes import extras
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError, TransportSettings
+from steadypose.nodes.graph.topology import TransportSettings
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.viewer import node as viewer_node
 from steadypose.nodes.sinks.viewer import server as drawings
 from steadypose.nodes.sinks.viewer import server as viewer_server

@@ -14,7 +14,7 @@ from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import PoseWorld
 from steadypose.nodes.graph.launch import Launch, bundled
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.prior.body.skeleton import PARENTS, J
 from steadypose.prior.sim.streams import make, read_manifest
 

@@ -21,7 +21,7 @@ from steadypose.msgs.topics import POSE_EVENTS, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import EventKind, JointState
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.web.node import WebNode, WebSettings, hello, kept_token, to_json
 from steadypose.nodes.sinks.web.server import FILES, MAX_CLIENTS, STATIC, WebServer
 

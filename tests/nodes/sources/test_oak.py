@@ -23,8 +23,8 @@ from steadypose.nodes.commands.run import _check
 from steadypose.nodes.graph.clock import Clock, SystemClock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources import oak_device
 from steadypose.nodes.sources.camera import PAUSES_S, CameraSource, open_oak
 from steadypose.nodes.sources.oak_device import FRAME_ID, QUEUE, TIMEOUT_S, Host

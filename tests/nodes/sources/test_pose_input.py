@@ -16,7 +16,7 @@ from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Message, PoseRaw, PoseWorld
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.npz import NpzError, NpzSource
 from steadypose.nodes.sources.pose_input import LEAP_NS, PoseInputNode
 from steadypose.nodes.sources.recording import RecordingSource, open_recording

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from steadypose.nodes.graph.extras import EXTRAS
+from steadypose.nodes.extras import EXTRAS
 from steadypose.nodes.sources.registry import SOURCES, InputSettings
 from steadypose.nodes.sources.source import LiveSource
 

@@ -17,7 +17,7 @@ from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_pose_array
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.source import LiveSource

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.ros2.definitions import Connection, Publish, serialise
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.ros2.messages import tf_message, transform
 from steadypose.nodes.sources import ros2 as module
 from steadypose.nodes.sources.registry import InputSettings, open_input

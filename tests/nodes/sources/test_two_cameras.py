@@ -16,8 +16,8 @@ from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Pose, PoseRaw, PoseWorld, RawBody
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
-from steadypose.nodes.graph.settings import LaunchError
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.camera import MergeSettings, MergeSource
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.registry import InputSettings

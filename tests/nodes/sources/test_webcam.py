@@ -15,10 +15,10 @@ import pytest
 from conftest import VirtualClock
 
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.graph import extras
+from steadypose.nodes import extras
 from steadypose.nodes.graph.clock import Clock, SystemClock
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.settings import LaunchError
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources import camera, webcam_device
 from steadypose.nodes.sources.camera import PAUSES_S, CameraSource
 from steadypose.nodes.sources.picture import PictureReader

@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from steadypose import PACKAGE
+from steadypose.nodes.settings import LaunchError
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,6 @@ def require_extra(name: str) -> None:
     """
     missing = [module for module in EXTRAS[name].modules if find_spec(module) is None]
     if missing:
-        # `doctor` names extras where not even numpy is installed
-        from steadypose.nodes.graph.settings import LaunchError
-
         raise LaunchError(how_to_install(missing, name))
 
 

@@ -1,0 +1,73 @@
+"""What the settings of all rooms share: their error, paths, addresses and plugins."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import field, fields, is_dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+_PATH = "path"
+
+
+class LaunchError(ValueError):
+    """A launch file, or a setting given on the command line, cannot be used. The text says what to do."""
+
+
+def path_setting(metadata: Mapping[str, Any] = MappingProxyType({})) -> Any:
+    """A field of a settings dataclass that is a path: a relative one in a launch file starts at that file."""
+    return field(default="", metadata={_PATH: True, **metadata})
+
+
+def resolve_paths(settings: type, table: dict[str, Any], folder: Path) -> None:
+    """Make the paths in a launch file's table absolute, in place.
+
+    Args:
+        settings: the dataclass of the table; nested ones are those of its sections.
+        table: as TOML gives it.
+        folder: where relative paths start.
+    """
+    for setting in fields(settings):
+        value = table.get(setting.name)
+        if setting.metadata.get(_PATH) and isinstance(value, str) and value:
+            table[setting.name] = str(folder / Path(value).expanduser())
+        elif isinstance(section := setting.default_factory, type) and is_dataclass(section) and isinstance(value, dict):
+            resolve_paths(section, value, folder)
+
+
+def check_addresses(setting: str, addresses: list[str]) -> None:
+    """Raises:
+    LaunchError: one of ``addresses`` is no text; the setting is named in it.
+    """
+    for address in addresses:
+        if not isinstance(address, str):
+            raise LaunchError(f"{setting}: expected addresses such as tcp://192.168.1.21:7111, got {address!r}")
+
+
+def check_host_and_port(section: str, host: str, port: int, *, least: int = 1) -> None:
+    """Raises:
+    LaunchError: there is no host, or no such port; 0, where it is allowed, is any that is free.
+    """
+    if not host:
+        raise LaunchError(f"[{section}] host: expected an address, such as 127.0.0.1, got none")
+    if not least <= port <= 65535:
+        raise LaunchError(f"[{section}] port: expected {least}{'' if least else ' (any)'} to 65535, got {port}")
+
+
+def load_plugin(setting: str, reference: Any) -> Any:
+    """What a launch file names as ``module:name`` of an installed package.
+
+    Raises:
+        LaunchError: it is no such name, or cannot be imported.
+    """
+    module, separator, name = reference.partition(":") if isinstance(reference, str) else ("", "", "")
+    if not (module and separator and name):
+        raise LaunchError(f"{setting}: expected module:name, got {reference!r}")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise LaunchError(
+            f"{setting}: {reference} cannot be imported: {error}; install its package beside steadypose"
+        ) from error
