@@ -162,13 +162,13 @@ def open_webcam(settings: WebcamSettings, context: SourceContext) -> CameraSourc
     def connect_webcam() -> AbstractContextManager[Connection]:
         from steadypose.nodes.sources.webcam_device import connect  # brings OpenCV
 
-        return connect(settings, context.calibration, context.clock, picture=context.picture)  # pyright: ignore[reportArgumentType]
+        return connect(settings, context.calibration, context.clock, image_file=context.image_file)  # pyright: ignore[reportArgumentType]
 
     if not settings.video:
         return CameraSource(context.clock, connect_webcam)
     from steadypose.nodes.sources.webcam_device import VideoSource
 
-    return VideoSource(settings, context.calibration, picture=context.picture)  # pyright: ignore[reportArgumentType]
+    return VideoSource(settings, context.calibration, image_file=context.image_file)  # pyright: ignore[reportArgumentType]
 
 
 LATE_S = 1.0

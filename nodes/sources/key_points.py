@@ -1,4 +1,4 @@
-"""Key points of a picture as ``.npz``, with the camera that took it: what ``steadypose fit`` lifts to a motion.
+"""Key points of an image as ``.npz``, with the camera that took it: what ``steadypose fit`` lifts to a motion.
 
 In: ``keypoints`` (T, J, 2) pixels, NaN where not found; ``skeleton``, a name; ``stamp_ns`` (T,) or ``fps``; ``focal``,
 pixels, one number or two; ``centre`` (2,) pixels; and where known ``confidence`` (T, J) in 0..1, ``up``, the axis of
@@ -37,7 +37,7 @@ _NUMBERS = {"keypoints", "confidence", "focal", "centre", "camera_height", "poin
 
 
 def has_key_points(path: Path) -> bool:
-    """Whether an ``.npz`` holds key points of a picture, not positions."""
+    """Whether an ``.npz`` holds key points of an image, not positions."""
     if path.suffix != ".npz" or not path.is_file():
         return False
     try:

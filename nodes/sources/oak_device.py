@@ -2,7 +2,7 @@
 
 On the camera run colour, a pose network, stereo depth aligned to colour, and the IMU. What it sends is one object for
 the rest of the program (`Host`), made of nodes that run on this machine; tests feed the same nodes from a pipeline that
-has no camera. `steadypose calibrate` wants one picture with its depth, lens and level (`Still`).
+has no camera. `steadypose calibrate` wants one image with its depth, lens and level (`Still`).
 """
 
 # without `from __future__ import annotations`: depthai reads those of `process` to know what an input takes
@@ -245,7 +245,7 @@ def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
 def aligned_depth(
     pipeline: dai.Pipeline, colour: dai.node.Camera, platform: str
 ) -> tuple[dai.Node.Output, dai.Node.Output]:
-    """Pictures of the colour camera, without distortion, and stereo depth in the same view."""
+    """Images of the colour camera, without distortion, and stereo depth in the same view."""
     stereo = pipeline.create(dai.node.StereoDepth).build(
         autoCreateCameras=True, presetMode=dai.node.StereoDepth.PresetMode.DEFAULT, size=DEPTH_SIZE, fps=DEPTH_FPS
     )
@@ -281,7 +281,7 @@ SETTLE_PAIRS = 30
 PAIR_TIMEOUT_S = 20.0
 """for each pair"""
 READING_TIMEOUT_S = 1.0
-"""for the accelerometer, which may speak after the picture"""
+"""for the accelerometer, which may speak after the image"""
 
 
 @dataclass(frozen=True)
@@ -325,7 +325,7 @@ def capture(
     readings: tuple[dai.Node.Output, NDArray[np.float64]] | None,
     settle: int = SETTLE_PAIRS,
 ) -> Still:
-    """Start a pipeline that has these outputs, and capture the picture that comes after ``settle`` others.
+    """Start a pipeline that has these outputs, and capture the image that comes after ``settle`` others.
 
     Raises:
         CameraError: none comes.
@@ -338,18 +338,18 @@ def capture(
     try:
         for _ in range(settle):
             pairs.pairs.get(timeout=PAIR_TIMEOUT_S)
-        picture, distances = pairs.pairs.get(timeout=PAIR_TIMEOUT_S)
+        image, distances = pairs.pairs.get(timeout=PAIR_TIMEOUT_S)
     except queue.Empty:
-        raise CameraError(f"the camera gave no picture with depth within {PAIR_TIMEOUT_S:g} s") from None
+        raise CameraError(f"the camera gave no image with depth within {PAIR_TIMEOUT_S:g} s") from None
     late = time.monotonic() + READING_TIMEOUT_S
     while readings and not level.measured and time.monotonic() < late:
         time.sleep(0.01)
     intrinsics = np.array(distances.getTransformation().getIntrinsicMatrix())
-    return Still(picture.getCvFrame(), distances.getFrame().copy(), intrinsics, level.up if level.measured else None)
+    return Still(image.getCvFrame(), distances.getFrame().copy(), intrinsics, level.up if level.measured else None)
 
 
 def capture_with_camera(settings: OakSettings) -> Still:
-    """A picture of the camera that the settings name.
+    """An image of the camera that the settings name.
 
     Raises:
         RuntimeError: the camera cannot be opened, or gives none.

@@ -13,7 +13,7 @@ from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.graph.clock import POLL_S, Clock, Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.sources.picture import NAME as PICTURE
+from steadypose.nodes.sources.image import NAME as IMAGE
 from steadypose.nodes.sources.recording import end_of
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import LiveSource, RecordedSource
@@ -58,7 +58,7 @@ class PoseInputNode(Node):
             self.clock,
             transport.curve_keys(),
             clear_text=transport.clear_text,
-            picture=transport.ipc_directory / PICTURE if settings.image else None,
+            image_file=transport.ipc_directory / IMAGE if settings.image else None,
         )
         self._rate = settings.rate
         self._loop = settings.loop

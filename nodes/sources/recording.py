@@ -66,13 +66,13 @@ class RecordingSource:
             self.refused.update({f"{UNDECODABLE} {topic}": n for topic, n in recording.refused.items()})
 
 
-def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, picture: Path | None = None) -> RecordedSource:
+def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, image_file: Path | None = None) -> RecordedSource:
     """The recording at ``path``: a rosbag2 directory, ``.mcap``, ``.npz`` or ``.csv``, a file of motion, or a video.
 
     Args:
         path: of the recording.
         rig: what a file of motion does not say (`prior.mocap.files.Description`).
-        picture: file that the newest image of a video is kept in, for the viewer.
+        image_file: file that the newest image of a video is kept in, for the viewer.
 
     Raises:
         LaunchError: there is nothing at the path, or it is a video and MediaPipe is not installed.
@@ -87,7 +87,7 @@ def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, picture: P
     if not path.exists():
         raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, {_FILES}, or a video")
     if path.suffix.lower() in VIDEOS:
-        return _open_video(path, picture)
+        return _open_video(path, image_file)
     if holds_motion(path):
         return MotionSource(path, rig)
     if path.is_file() and path.suffix not in (".npz", ".csv", ".mcap"):
@@ -96,11 +96,11 @@ def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, picture: P
     return formats.get(path.suffix, RecordingSource)(path)
 
 
-def _open_video(path: Path, picture: Path | None) -> RecordedSource:
+def _open_video(path: Path, image_file: Path | None) -> RecordedSource:
     require_extra("webcam")
     from steadypose.nodes.sources.webcam_device import VideoSource  # OpenCV
 
-    return VideoSource(WebcamSettings(video=str(path)), CalibrationSettings(), picture=picture)
+    return VideoSource(WebcamSettings(video=str(path)), CalibrationSettings(), image_file=image_file)
 
 
 def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:

@@ -48,7 +48,7 @@ def _declare(
 def _open_recording(path: str, context: SourceContext) -> RecordedSource:
     from steadypose.nodes.sources.recording import open_recording  # 3 MB, which nodes that play none do without
 
-    return open_recording(path, picture=context.picture)
+    return open_recording(path, image_file=context.image_file)
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def open_input(
     keys: Keys | None = None,
     *,
     clear_text: bool = False,
-    picture: Path | None = None,
+    image_file: Path | None = None,
 ) -> RecordedSource | LiveSource:
     """The source that ``[input]`` names.
 
@@ -108,7 +108,7 @@ def open_input(
         clock: of the node.
         keys: for cameras on other machines.
         clear_text: whether to listen to these without keys.
-        picture: file for the newest image, if ``[input] image`` asks for it.
+        image_file: file for the newest image, if ``[input] image`` asks for it.
 
     Raises:
         LaunchError, RecordingError, NpzError, CsvError: a setting, or the recording, cannot be used.
@@ -119,7 +119,7 @@ def open_input(
         declared, own = SOURCES[settings.source], getattr(settings, settings.source)
     if declared.extra:
         require_extra(declared.extra)
-    source = declared.opens(own, SourceContext(clock, settings.calibration, keys, clear_text, picture))
+    source = declared.opens(own, SourceContext(clock, settings.calibration, keys, clear_text, image_file))
     if not settings.tf.fixed_frame:
         return source
     if not isinstance(source, LiveSource):

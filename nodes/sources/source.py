@@ -28,7 +28,7 @@ class CalibrationSettings:
     """``[input.calibration]``: the camera's lens and place, as ``steadypose calibrate`` writes them."""
 
     size: list[int] = field(default_factory=list)
-    """pixels, width and height of the pictures that the lens was calibrated with"""
+    """pixels, width and height of the images that the lens was calibrated with"""
     focal: list[float] = field(default_factory=list)
     """fx, fy in pixels"""
     centre: list[float] = field(default_factory=list)
@@ -157,7 +157,7 @@ class SourceContext:
     """for publishers on other machines"""
     clear_text: bool = False
     """whether to listen to other machines without keys"""
-    picture: Path | None = None
+    image_file: Path | None = None
     """file that the newest image is kept in, for the viewer"""
 
 

@@ -1,4 +1,4 @@
-"""Pictures of a webcam or a video, undistorted, and the skeletons that MediaPipe finds in them, by OpenCV."""
+"""Images of a webcam or a video, undistorted, and the skeletons that MediaPipe finds in them, by OpenCV."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_mediapipe, pinhole
-from steadypose.nodes.sources.picture import PictureWriter
+from steadypose.nodes.sources.image import ImageWriter
 from steadypose.nodes.sources.source import MODEL, CalibrationSettings, CameraError, WebcamSettings, count_failure
 
 Landmarker = Callable[[NDArray[Any], int], Any]
@@ -75,12 +75,12 @@ class PoseFinder:
         landmarker: Landmarker,
         settings: WebcamSettings,
         calibration: CalibrationSettings,
-        picture: Path | None = None,
+        image_file: Path | None = None,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._name, self._landmarker = name, landmarker
         self._settings, self._calibration = settings, calibration
-        self._picture = PictureWriter(picture) if picture else None
+        self._newest = ImageWriter(image_file) if image_file else None
         self._lens: Lens | None = None
         self._started_ns: int | None = None
         self._last_ms = -1
@@ -95,8 +95,8 @@ class PoseFinder:
             self._lens = Lens(size, self._settings.field_of_view, self._calibration)
         try:
             straight = self._lens.undistort(image)
-            if self._picture:
-                self._picture.put(straight, stamp_ns, self._lens.intrinsics)
+            if self._newest:
+                self._newest.put(straight, stamp_ns, self._lens.intrinsics)
             result = self._landmarker(cv2.cvtColor(straight, cv2.COLOR_BGR2RGB), self._last_ms)
             return from_mediapipe(result, stamp_ns, size, self._lens.intrinsics, self._name)
         except (cv2.error, ValueError) as error:  # an image of another kind, a result that is none
@@ -104,8 +104,8 @@ class PoseFinder:
             return None
 
     def close(self) -> None:
-        if self._picture:
-            self._picture.close()
+        if self._newest:
+            self._newest.close()
 
 
 class Webcam:
@@ -200,7 +200,7 @@ def connect(
     calibration: CalibrationSettings,
     clock: Clock,
     make_landmarker: Callable[[WebcamSettings], AbstractContextManager[Landmarker]] = mediapipe_landmarker,
-    picture: Path | None = None,
+    image_file: Path | None = None,
 ) -> Iterator[Webcam]:
     """Open the camera and the landmarker.
 
@@ -215,7 +215,7 @@ def connect(
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest image, not the oldest that waits
         with make_landmarker(settings) as landmarker:
             name = f"webcam-{settings.camera}"
-            with closing(PoseFinder(name, landmarker, settings, calibration, picture)) as finder:
+            with closing(PoseFinder(name, landmarker, settings, calibration, image_file)) as finder:
                 yield Webcam(capture, finder, name, clock)
     finally:
         capture.release()
@@ -248,11 +248,11 @@ class VideoSource:
         settings: WebcamSettings,
         calibration: CalibrationSettings,
         make_landmarker: Callable[[WebcamSettings], AbstractContextManager[Landmarker]] = mediapipe_landmarker,
-        picture: Path | None = None,
+        image_file: Path | None = None,
     ) -> None:
         self.refused: Counter[str] = Counter()
         self._settings, self._calibration, self._make_landmarker = settings, calibration, make_landmarker
-        self._picture = picture
+        self._image_file = image_file
         video = cv2.VideoCapture(settings.video)
         if not video.isOpened():
             raise LaunchError(f"[input.webcam] video: expected a video that OpenCV can read, got {settings.video!r}")
@@ -268,7 +268,7 @@ class VideoSource:
         try:
             with (
                 self._make_landmarker(self._settings) as landmarker,
-                closing(PoseFinder(name, landmarker, self._settings, self._calibration, self._picture)) as finder,
+                closing(PoseFinder(name, landmarker, self._settings, self._calibration, self._image_file)) as finder,
             ):
                 for stamp_ns, image in stamped_images(video):
                     if image is None:

@@ -140,7 +140,7 @@ def script(
 ) -> list[tuple[str, dai.Buffer]]:
     """The messages of a recording of ``moments``, a thirtieth of a second apart, the first of them now.
 
-    Depth images are captured ``depth_late`` after the pictures they belong to.
+    Depth images are captured ``depth_late`` after the images they belong to.
     """
     start = dai.Clock.now()  # pyright: ignore[reportCallIssue] (static)
     messages: list[tuple[str, dai.Buffer]] = [("imu", readings(up))] if up is not None else []

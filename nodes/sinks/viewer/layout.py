@@ -81,14 +81,14 @@ def name_series(recording: rr.RecordingStream) -> None:
     recording.log("world/axes", axes, static=True)
 
 
-def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool, pictured: bool = False) -> rrb.Blueprint:
+def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool, images: bool = False) -> rrb.Blueprint:
     """How scenes and plots lie in the window.
 
     Args:
         eye: where the scenes are looked at from; None until somebody was seen.
         calibrated: whether the floor's place is known, and drawn under raw and clean.
         scored: whether the prior scores its windows, and there is an anomaly to plot.
-        pictured: whether there are images of the camera, to draw the clean poses over.
+        images: whether there are images of the camera, to draw the clean poses over.
     """
     import rerun.blueprint as rrb
 
@@ -117,13 +117,13 @@ def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool, pictured: bool
             time_ranges=last_half_minute,
         )
 
-    over_picture = rrb.Spatial2DView(
+    over_image = rrb.Spatial2DView(
         origin="/camera/image", contents=["/camera/**", "/clean/**"], name="camera: clean over its image"
     )
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
-                *([over_picture] if pictured else []),
+                *([over_image] if images else []),
                 scene("raw", "raw: as the sensor gives it", distance=2.0, height=0.3, floor=calibrated),
                 scene("clean", "clean: faint is inferred", distance=2.0, height=0.3, floor=calibrated),
                 scene("world", "world: path and contacts", distance=2.3, height=0.8, floor=True),

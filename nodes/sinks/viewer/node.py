@@ -48,12 +48,12 @@ class ViewerNode(Node):
         # not for those who only read a launch file
         from steadypose.nodes.sinks.viewer.scene import PoseView
         from steadypose.nodes.sinks.viewer.server import ViewerServer
-        from steadypose.nodes.sources.picture import NAME, PictureReader
+        from steadypose.nodes.sources.image import NAME, ImageReader
         from steadypose.nodes.sources.registry import InputSettings
 
         settings = self.launch.settings(ViewerSettings)
         asked = self.launch.settings(InputSettings).image
-        self._pictures = PictureReader(self.launch.transport.ipc_directory / NAME) if asked else None
+        self._images = ImageReader(self.launch.transport.ipc_directory / NAME) if asked else None
         with ViewerServer(settings.port, settings.host) as self._server:
             recording = connect(self._server)
             self._view = PoseView(recording, flagged_from(self.launch))
@@ -68,8 +68,8 @@ class ViewerNode(Node):
     def work(self) -> None:
         while not self.stopping:
             self.take_next(POLL_S)
-            if self._pictures and (picture := self._pictures.next()):
-                self._view.keep(picture)
+            if self._images and (image := self._images.next()):
+                self._view.keep(image)
             self.report_if_due()
             self._server.check()
 

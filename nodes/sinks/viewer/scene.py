@@ -43,7 +43,7 @@ from steadypose.prior.body.skeleton import HIPS, SHOULDERS, J
 if TYPE_CHECKING:
     import rerun as rr
 
-    from steadypose.nodes.sources.picture import Picture
+    from steadypose.nodes.sources.image import CameraImage
 
 PATH_SECONDS = 10.0
 """of a body's path over the floor that are drawn"""
@@ -57,7 +57,7 @@ BELOW_TRUNK = 0.25
 BACK_JUMP_NS = 1_000_000_000
 """a stamp so far behind the last one is a stream that starts again"""
 
-MOST_PICTURES = 30
+MOST_IMAGES = 30
 """that wait for the poses of their moment: two seconds"""
 
 OBSERVED = (JointState.SEEN, JointState.REFINED)
@@ -86,8 +86,8 @@ class PoseView:
         self._eye: Eye | None = None
         self._calibrated = True
         self._scored = False
-        self._pictures: deque[Picture] = deque(maxlen=MOST_PICTURES)
-        self._pictured = False
+        self._images: deque[CameraImage] = deque(maxlen=MOST_IMAGES)
+        self._has_images = False
         self._focus: dict[str, NDArray[np.float64]] = {}
         self._drawn: dict[str, set[str]] = {}
         self._paths: dict[str, deque[tuple[int, NDArray[np.float64]]]] = {}
@@ -111,28 +111,28 @@ class PoseView:
             drawn = dict(self._draw_raw(message))
         elif isinstance(message, PoseClean):
             drawn = dict(self._draw_clean(message))
-            self._draw_picture(message)
+            self._draw_image(message)
         else:
             drawn = dict(self._draw_world(message, truth=topic == POSE_TRUTH))
         self._clear_absent(f"{topic}/{message.source}", set(drawn))
         if topic != POSE_TRUTH:
             self._follow(topic, list(drawn.values()), calibrated=getattr(message, "calibrated", True))
 
-    def keep(self, picture: Picture) -> None:
+    def keep(self, image: CameraImage) -> None:
         """Draw an image of the camera once the clean poses of its moment have come."""
-        self._pictures.append(picture)
+        self._images.append(image)
 
-    def _draw_picture(self, message: PoseClean) -> None:
+    def _draw_image(self, message: PoseClean) -> None:
         """The newest image that is not ahead of the poses, where its camera stands: the poses lie over it."""
         import rerun as rr
 
-        newest: Picture | None = None
-        while self._pictures and self._pictures[0].stamp_ns <= message.stamp_ns:
-            newest = self._pictures.popleft()
+        newest: CameraImage | None = None
+        while self._images and self._images[0].stamp_ns <= message.stamp_ns:
+            newest = self._images.popleft()
         if newest is None:
             return
-        if not self._pictured:
-            self._pictured = True
+        if not self._has_images:
+            self._has_images = True
             self._send_layout()
         pose = message.sensor_pose
         self._log("camera", rr.Transform3D(translation=pose.position, quaternion=rr.Quaternion(xyzw=pose.orientation)))
@@ -269,7 +269,7 @@ class PoseView:
 
     def _send_layout(self) -> None:
         self._recording.send_blueprint(
-            blueprint(self._eye, calibrated=self._calibrated, scored=self._scored, pictured=self._pictured)
+            blueprint(self._eye, calibrated=self._calibrated, scored=self._scored, images=self._has_images)
         )
 
     def _set_time(self, topic: str, stamp_ns: int) -> None:

@@ -36,7 +36,7 @@ from steadypose.nodes.sinks.viewer.layout import FAINT_RGB, SIDE_RGB
 from steadypose.nodes.sinks.viewer.node import ViewerNode, ViewerSettings
 from steadypose.nodes.sinks.viewer.scene import PATH_SECONDS, PoseView
 from steadypose.nodes.sinks.viewer.server import LOOPBACK, Drawings, ViewerError, ViewerServer
-from steadypose.nodes.sources.picture import Picture
+from steadypose.nodes.sources.image import CameraImage
 
 rr = pytest.importorskip("rerun", reason="the optional extra `view` is not installed")
 
@@ -379,7 +379,7 @@ def test_an_image_is_drawn_with_the_clean_poses_of_its_moment_and_not_before(log
     view = PoseView(log)  # type: ignore[arg-type]
     cleaned = [message for topic, message in messages(1.0) if topic == POSE_CLEAN]
     layouts = log.blueprints
-    view.keep(Picture(cleaned[1].stamp_ns, (480, 360), np.eye(3), b"a jpeg"))
+    view.keep(CameraImage(cleaned[1].stamp_ns, (480, 360), np.eye(3), b"a jpeg"))
     view.log(POSE_CLEAN, cleaned[0])
     assert not log.times("camera/image")
     view.log(POSE_CLEAN, cleaned[1])

@@ -1,4 +1,4 @@
-"""A picture of an OAK for its calibration, from a depthai pipeline without a camera."""
+"""An image of an OAK for its calibration, from a depthai pipeline without a camera."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from steadypose.prior.camera.calibration import CalibrationError
 UP = np.array([0.0, -np.cos(0.2), np.sin(0.2)])
 
 
-def picture(brightness: int) -> dai.ImgFrame:
+def image(brightness: int) -> dai.ImgFrame:
     frame = dai.ImgFrame()
     frame.setCvFrame(
         np.full((CAMERA.height, CAMERA.width, 3), (brightness, 0, 10), np.uint8), dai.ImgFrame.Type.BGR888i
@@ -29,7 +29,7 @@ def picture(brightness: int) -> dai.ImgFrame:
     return frame
 
 
-def test_the_picture_after_those_in_which_the_camera_settles() -> None:
+def test_the_image_after_those_in_which_the_camera_settles() -> None:
     scene = moment(0)
     with dai.Pipeline(createImplicitDevice=False) as pipeline:
         player = pipeline.create(Player)
@@ -38,7 +38,7 @@ def test_the_picture_after_those_in_which_the_camera_settles() -> None:
         player.script = [("imu", readings(UP.tolist()))]
         start = dai.Clock.now()  # pyright: ignore[reportCallIssue] (static)
         for index in range(2):
-            for name, message in (("colour", picture(100 + index)), ("depth", depth_frame(scene))):
+            for name, message in (("colour", image(100 + index)), ("depth", depth_frame(scene))):
                 message.setTimestamp(start + index * oak_device.SYNC_THRESHOLD * 2)
                 player.script.append((name, message))
         still = capture(pipeline, colour, player.outputs["depth"], (player.outputs["imu"], np.eye(3)), settle=1)
@@ -53,7 +53,7 @@ def test_a_camera_that_gives_nothing_says_so(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(oak_device, "PAIR_TIMEOUT_S", 0.01)
     with dai.Pipeline(createImplicitDevice=False) as pipeline:
         player = pipeline.create(Player)
-        with pytest.raises(CameraError, match="no picture with depth"):
+        with pytest.raises(CameraError, match="no image with depth"):
             capture(pipeline, player.outputs["depth"], player.outputs["depth"], None)
 
 

@@ -1,4 +1,4 @@
-"""A webcam: real video through OpenCV, with a landmarker in MediaPipe's place that sees a person in every picture."""
+"""A webcam: real video through OpenCV, with a landmarker in MediaPipe's place that sees a person in every image."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources import camera, webcam_device
 from steadypose.nodes.sources.camera import PAUSES_S, CameraSource
-from steadypose.nodes.sources.picture import PictureReader
+from steadypose.nodes.sources.image import ImageReader
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import CalibrationSettings, SourceContext, WebcamSettings
@@ -56,17 +56,17 @@ def model(tmp_path: Path) -> str:
 
 
 class Seen:
-    """Sees one body two metres ahead, and notes the pictures."""
+    """Sees one body two metres ahead, and notes the images."""
 
     def __init__(self) -> None:
-        self.pictures: list[tuple[np.ndarray, int]] = []
+        self.images: list[tuple[np.ndarray, int]] = []
 
     @contextmanager
     def landmarker(self, settings: WebcamSettings) -> Iterator[webcam_device.Landmarker]:
         yield self.look
 
     def look(self, image: np.ndarray, milliseconds: int) -> Made:
-        self.pictures.append((image[0, 0], milliseconds))
+        self.images.append((image[0, 0], milliseconds))
         body = np.random.default_rng(0).normal(0, 0.3, (33, 3))
         height, width = image.shape[:2]
         focal = width / 2 / np.tan(WebcamSettings.field_of_view / 2)
@@ -81,7 +81,7 @@ def open_webcam(settings: WebcamSettings, clock: Clock, seen: Seen) -> CameraSou
     return CameraSource(clock, lambda: connect(settings, NOT_CALIBRATED, clock))
 
 
-def test_each_picture_gives_the_bodies_in_it(video: Path, model: str) -> None:
+def test_each_image_gives_the_bodies_in_it(video: Path, model: str) -> None:
     seen = Seen()
     source = open_webcam(WebcamSettings(camera=3, model=model), SystemClock(), seen)
     frames: list[PoseRaw] = []
@@ -97,19 +97,19 @@ def test_each_picture_gives_the_bodies_in_it(video: Path, model: str) -> None:
     for frame in frames:
         assert (frame.skeleton, frame.source, len(frame.bodies)) == ("blazepose33", "webcam-3", 1)
         np.testing.assert_allclose(frame.bodies[0].positions.mean(axis=0), [0.1, 0.2, 2.5], atol=0.2)
-    colours, milliseconds = zip(*seen.pictures, strict=True)
+    colours, milliseconds = zip(*seen.images, strict=True)
     assert [int(colour[2]) > int(colour[0]) for colour in colours[2:]] == [True] * 3, "RGB, not OpenCV's BGR"
     assert list(milliseconds) == sorted(set(milliseconds)), "MediaPipe wants them to rise"
 
 
-def test_a_picture_that_fails_is_counted_and_the_next_one_comes(video: Path, model: str) -> None:
+def test_an_image_that_fails_is_counted_and_the_next_one_comes(video: Path, model: str) -> None:
     class Stumbles(Seen):
         def look(self, image: np.ndarray, milliseconds: int) -> Made:
             found = super().look(image, milliseconds)
-            if len(self.pictures) == 2:
+            if len(self.images) == 2:
                 found.pose_world_landmarks[0].pop()
-            elif len(self.pictures) == 4:
-                cv2.cvtColor(image[:0], cv2.COLOR_BGR2RGB)  # nothing, where a picture is expected
+            elif len(self.images) == 4:
+                cv2.cvtColor(image[:0], cv2.COLOR_BGR2RGB)  # nothing, where an image is expected
             return found
 
     source = open_webcam(WebcamSettings(camera=3, model=model), SystemClock(), Stumbles())
@@ -120,7 +120,7 @@ def test_a_picture_that_fails_is_counted_and_the_next_one_comes(video: Path, mod
     assert not source.refused
 
 
-def test_a_video_gives_every_picture_at_its_own_time(video: Path, model: str) -> None:
+def test_a_video_gives_every_image_at_its_own_time(video: Path, model: str) -> None:
     seen = Seen()
     source = VideoSource(WebcamSettings(video=str(video), model=model), NOT_CALIBRATED, seen.landmarker)
     assert len(source) == FRAMES
@@ -129,8 +129,8 @@ def test_a_video_gives_every_picture_at_its_own_time(video: Path, model: str) ->
         steps = np.diff([frame.stamp_ns for frame in frames])
         np.testing.assert_allclose(steps, 1e9 / 30, rtol=0.02)
         assert {frame.source for frame in frames} == {"video"}
-    colours = [int(colour[2]) for colour, _ in seen.pictures[:FRAMES]]
-    assert colours == sorted(set(colours)), "each picture, and each once"
+    colours = [int(colour[2]) for colour, _ in seen.images[:FRAMES]]
+    assert colours == sorted(set(colours)), "each image, and each once"
     assert not source.refused
 
 
@@ -139,7 +139,7 @@ def test_a_video_is_a_recording_to_clean(video: Path) -> None:
     assert isinstance(source, VideoSource)
     frames = [message for _, message in source if isinstance(message, PoseRaw)]
     assert len(frames) == FRAMES
-    assert not any(frame.bodies for frame in frames), "MediaPipe sees nobody in an empty picture"
+    assert not any(frame.bodies for frame in frames), "MediaPipe sees nobody in an empty image"
 
 
 def test_a_video_that_cannot_be_read_says_so(model: str, tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def test_a_video_that_cannot_be_read_says_so(model: str, tmp_path: Path) -> None
         camera.open_webcam(settings.webcam, SourceContext(SystemClock(), NOT_CALIBRATED))
 
 
-def test_a_lens_that_is_calibrated_is_used_for_pictures_of_any_size() -> None:
+def test_a_lens_that_is_calibrated_is_used_for_images_of_any_size() -> None:
     told = CalibrationSettings([640, 480], [500.0, 510.0], [330.0, 235.0], [-0.3, 0.1, 0.0, 0.0, 0.0])
     guessed, lens, half = (
         Lens(size, 1.05, calibration)
@@ -164,9 +164,9 @@ def test_a_lens_that_is_calibrated_is_used_for_pictures_of_any_size() -> None:
         straight = points @ one.intrinsics.T
         straight = straight[:, :2] / straight[:, 2:]
         for (x, y), expected in zip((bent + 0.5) * scale - 0.5, straight, strict=True):
-            picture = np.zeros((size[1], size[0], 3), np.float32)
-            cv2.circle(picture, (round(x), round(y)), 3, (1.0, 1.0, 1.0), -1)
-            shown = np.argwhere(one.undistort(picture)[..., 0] > 0.5)[:, ::-1].mean(axis=0)
+            image = np.zeros((size[1], size[0], 3), np.float32)
+            cv2.circle(image, (round(x), round(y)), 3, (1.0, 1.0, 1.0), -1)
+            shown = np.argwhere(one.undistort(image)[..., 0] > 0.5)[:, ::-1].mean(axis=0)
             np.testing.assert_allclose(shown, expected, atol=1.0)
     image = np.zeros((480, 640, 3), np.uint8)
     assert guessed.undistort(image) is image
@@ -214,7 +214,7 @@ def test_the_launch_file_needs_no_download() -> None:
     assert launch.settings(InputSettings).webcam == WebcamSettings()
 
 
-def test_mediapipes_own_model_looks_at_each_picture_of_a_film(video: Path) -> None:
+def test_mediapipes_own_model_looks_at_each_image_of_a_video(video: Path) -> None:
     pytest.importorskip("mediapipe.python.solutions", reason="no MediaPipe with a model of its own")
     frames = [frame for _, frame in VideoSource(WebcamSettings(video=str(video)), NOT_CALIBRATED)]
     assert len(frames) == FRAMES
@@ -233,21 +233,21 @@ def test_mediapipe_itself_refuses_a_file_that_is_no_model(model: str) -> None:
 def test_the_newest_image_is_kept_for_the_viewer_and_none_is_left_behind(
     video: Path, model: str, tmp_path: Path
 ) -> None:
-    file = tmp_path / "picture"
-    reader = PictureReader(file)
+    file = tmp_path / "image"
+    reader = ImageReader(file)
     settings = WebcamSettings(video=str(video), model=model)
     shown = []
     for _ in VideoSource(settings, NOT_CALIBRATED, Seen().landmarker, file):
         shown.append(reader.next())
         assert reader.next() is None, "once"
         assert file.stat().st_mode & 0o077 == 0, "of this user alone"
-    assert not list(tmp_path.glob("picture*"))
-    pictures = [picture for picture in shown if picture]
-    assert 1 < len(pictures) < FRAMES, "half of the frames of 30 Hz"
-    image = cv2.imdecode(np.frombuffer(pictures[-1].jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert not list(tmp_path.glob("image*"))
+    images = [image for image in shown if image]
+    assert 1 < len(images) < FRAMES, "half of the frames of 30 Hz"
+    image = cv2.imdecode(np.frombuffer(images[-1].jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None
     height, width = image.shape[:2]
-    assert pictures[-1].size == (width, height)
+    assert images[-1].size == (width, height)
     focal = width / 2 / np.tan(WebcamSettings.field_of_view / 2)
-    np.testing.assert_allclose(pictures[-1].intrinsics[[0, 1], [0, 1]], focal, rtol=0.01)
-    assert [picture.stamp_ns for picture in pictures] == sorted({picture.stamp_ns for picture in pictures})
+    np.testing.assert_allclose(images[-1].intrinsics[[0, 1], [0, 1]], focal, rtol=0.01)
+    assert [image.stamp_ns for image in images] == sorted({image.stamp_ns for image in images})

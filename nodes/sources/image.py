@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
 
-NAME = "picture"
+NAME = "image"
 """of the file, in the directory of the sockets"""
 PERIOD_NS = 66_000_000
 """Time between images in nanoseconds: half the frames of a camera are enough to see what it sees."""
@@ -24,7 +24,7 @@ WIDTH = 480
 _HEAD = struct.Struct("<q2I4d")
 
 
-class Picture(NamedTuple):
+class CameraImage(NamedTuple):
     """An image, and how points in its camera's optical frame come into it."""
 
     stamp_ns: int
@@ -35,7 +35,7 @@ class Picture(NamedTuple):
     jpeg: bytes
 
 
-class PictureWriter:
+class ImageWriter:
     """Keeps the newest image in a file."""
 
     def __init__(self, path: Path) -> None:
@@ -65,14 +65,14 @@ class PictureWriter:
         self._path.unlink(missing_ok=True)
 
 
-class PictureReader:
-    """Reads what a `PictureWriter` of the same machine and user keeps."""
+class ImageReader:
+    """Reads what an `ImageWriter` of the same machine and user keeps."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._changed_ns = 0
 
-    def next(self) -> Picture | None:
+    def next(self) -> CameraImage | None:
         """The newest image, once."""
         try:
             changed_ns = self._path.stat().st_mtime_ns
@@ -84,4 +84,4 @@ class PictureReader:
         self._changed_ns = changed_ns
         stamp_ns, width, height, fx, fy, cx, cy = _HEAD.unpack_from(data)
         intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        return Picture(stamp_ns, (width, height), intrinsics, data[_HEAD.size :])
+        return CameraImage(stamp_ns, (width, height), intrinsics, data[_HEAD.size :])
