@@ -48,7 +48,7 @@ def info(
       steadypose info pose/world
 
     Args:
-        target: a topic, such as pose/clean, or a recording, .npz or .csv.
+        target: a topic, such as pose/clean, or a recording, or a file of poses.
         launch: the launch file, or the name of one of the project's own, whose addresses to look at.
         endpoints: the address to look at. May be given again.
 
@@ -57,7 +57,7 @@ def info(
     """
     if target not in TOPICS:
         path = recording_at(target)
-        for line in describe_file(path) if path.suffix in (".npz", ".csv") else _describe_recording(path):
+        for line in _describe_recording(path) if path.is_dir() or path.suffix == ".mcap" else describe_file(path):
             print(printable(line))
         return 0
     print(f"{target}: {wire_type(TOPICS[target])}")
@@ -154,21 +154,22 @@ def describe_file(path: Path) -> Iterator[str]:
     """Lines that say what it holds, and what is probably wrong with it.
 
     Raises:
-        NpzError, CsvError: it holds no poses.
+        LaunchError, NpzError, CsvError, MotionError: it holds no poses.
     """
+    size = f"{path.stat().st_size / 1e6:.2f} MB"
     if path.suffix == ".npz":
         arrays = read_arrays(path)
         output = is_output(arrays)
-        yield f"{path}: {'an output of clean, complete or fit' if output else 'joints'}, {_size(path)}"
+        yield f"{path}: {'an output of clean, complete or fit' if output else 'joints'}, {size}"
         for name, array in arrays.items():
             yield f"    {name} {array.shape} {array.dtype}"
         if output:
             state = arrays["state"]
             shares = ", ".join(f"{kind.name.lower()} {(state == kind).mean():.1%}" for kind in JointState)
             yield f"joints: {shares}; poses flagged as anomalies: {arrays['anomaly_flag'].mean():.1%}"
-    else:
-        yield f"{path}: joints, {_size(path)}"
     source = open_recording(path)
+    if path.suffix != ".npz":
+        yield f"{path}: joints, {size}"
     diagnosis = Diagnosis(PriorSettings())
     stamps, seen, skeletons, ids = [], [], set(), set()
     for _, message in source:
@@ -187,7 +188,3 @@ def describe_file(path: Path) -> Iterator[str]:
     for cause, count in source.refused.items():
         yield f"refused, {cause}: {count}"
     yield from diagnosis.look()
-
-
-def _size(path: Path) -> str:
-    return f"{path.stat().st_size / 1e6:.2f} MB"

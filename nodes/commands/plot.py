@@ -25,8 +25,8 @@ def plot(
     """Draw what happened in a recording.
 
     Args:
-        recording: rosbag2 directory, or one .mcap, with any of pose/raw, pose/clean, pose/world, pose/truth; or an .npz
-            or .csv, as `clean` reads and writes them.
+        recording: rosbag2 directory, or one .mcap, with any of pose/raw, pose/clean, pose/world, pose/truth; or a file
+            of poses, as `clean` reads and writes them.
         output: picture to write: .png, .svg or .pdf; named after the recording, in this folder, if left out.
         body: id of the body to draw; the one seen the longest if left out.
         video: moving picture to write instead, .gif or .mp4 (the latter by OpenCV, which the extra 'oak' brings): raw

@@ -176,6 +176,13 @@ ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
         "rename another program's columns to stamp, JOINT_x",
     ),
     "a picture": (["clean", "in.png", "out.npz"], {"in.png": "x"}, "or a video, got '.png'"),
+    "a text to draw": (
+        ["plot", "in.txt"],
+        {"in.txt": "x"},
+        "in.txt: expected a rosbag2 directory, an .mcap",
+    ),
+    "a text to look into": (["info", "in.txt"], {"in.txt": "x"}, "in.txt: expected a rosbag2 directory, an .mcap"),
+    "an empty CSV to look into": (["info", "in.csv"], {"in.csv": ""}, "in.csv: has no rows: expected a header"),
     "a folder that cannot be written to": (
         ["clean", "in.csv", "/proc/out.npz"],
         {"in.csv": "stamp,left_hip_x,left_hip_y,left_hip_z\n0,0,0,0\n"},
@@ -224,8 +231,9 @@ def test_the_command_answers_with_what_to_do(mistake: str, tmp_path: Path, monke
     for name, text in files.items():
         Path(name).write_text(text)
     assert main(arguments) == 2
-    told = capsys.readouterr().err
+    out, told = capsys.readouterr()
     assert answer in told
+    assert not out
     assert "Traceback" not in told
 
 

@@ -105,16 +105,16 @@ def history_of_arrays(arrays: Arrays, name: str = "arrays") -> History:
 
 
 def history_of_path(path: Path) -> History:
-    """A recording, an ``.npz`` or a ``.csv``.
+    """A recording, or a file of poses.
 
     Raises:
-        RecordingError, NpzError, CsvError: it cannot be read.
+        RecordingError, or as `open_recording`: it cannot be read.
     """
     if path.suffix == ".npz" and path.exists():
         return history_of_arrays(read_arrays(path), path.name)
-    if path.suffix in (".npz", ".csv"):
-        return _of_source(path.name, open_recording(path))
-    return read_history(path)
+    return (
+        read_history(path) if path.is_dir() or path.suffix == ".mcap" else _of_source(path.name, open_recording(path))
+    )
 
 
 def _of_source(name: str, messages: Iterable[tuple[str, Message]]) -> History:

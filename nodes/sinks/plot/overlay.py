@@ -50,14 +50,25 @@ def overlaid(recording: Path, video: Path, body: int | None) -> tuple[Iterator[N
     Raises:
         PlotError: the video cannot be read, or is not the one of which the recording is.
     """
+    whose = f"expected what 'steadypose clean {video} OUT' makes"
     moments = _of_npz(recording, body) if recording.suffix == ".npz" else _of_recording(recording, body)
     capture = cv2.VideoCapture(str(video))
     size = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
     rate = capture.get(cv2.CAP_PROP_FPS) or 30.0
     if not capture.isOpened():
         raise PlotError(f"over: expected a video that OpenCV can read, got {video}")
+    lens = pinhole(size, WebcamSettings().field_of_view)
+    pixels = [_pixels(body.clean, lens) for bodies in moments.values() for body in bodies]
+    if not any(((at > 0.0) & (at < size)).all(axis=-1).any() for at in pixels):
+        raise PlotError(f"{recording}: {whose}: poses as its camera sees them; none of these lies within its images")
+    length_ns = capture.get(cv2.CAP_PROP_FRAME_COUNT) / rate * 1e9
+    if 0 < length_ns < min(moments) - APART_NS:
+        raise PlotError(
+            f"{recording}: {whose}: stamps that count from its start; the video ends after {length_ns / 1e9:.1f} s, "
+            f"these begin at {min(moments) / 1e9:.1f} s"
+        )
     step = max(round(rate / FPS), 1)
-    return _frames(capture, moments, pinhole(size, WebcamSettings().field_of_view), step, video), rate / step
+    return _frames(capture, moments, lens, step), rate / step
 
 
 def _of_recording(path: Path, body: int | None) -> dict[int, list[Body]]:
@@ -93,18 +104,16 @@ def _observed(state: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _frames(
-    capture: cv2.VideoCapture, moments: dict[int, list[Body]], intrinsics: Floats, step: int, video: Path
+    capture: cv2.VideoCapture, moments: dict[int, list[Body]], intrinsics: Floats, step: int
 ) -> Iterator[NDArray[np.uint8]]:
     stamps = np.array(sorted(moments), dtype=np.int64)
     raws = [body.raw for found in moments.values() for body in found if body.raw is not None]
     ever = np.any([np.isfinite(raw).all(axis=1) for raw in raws], axis=0) if raws else np.zeros(22, bool)
-    drawn = False
     for number, (stamp_ns, image) in enumerate(stamped_images(capture)):
         if number % step or image is None:
             continue
-        near = int(stamps[np.abs(stamps - stamp_ns).argmin()]) if len(stamps) else -APART_NS
+        near = int(stamps[np.abs(stamps - stamp_ns).argmin()])
         bodies = moments[near] if abs(near - stamp_ns) < APART_NS else []
-        drawn |= bool(bodies)
         scale = min(1.0, WIDTH / image.shape[1])
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         lens = intrinsics * [[scale], [scale], [1.0]]
@@ -113,8 +122,12 @@ def _frames(
             given = [(body.raw, np.ones(22, bool)) for body in bodies if body.raw is not None]
             panels.insert(0, _with_bones(small, given, bones(ever), lens, "raw"))
         yield np.ascontiguousarray(np.hstack(panels)[..., ::-1])
-    if not drawn:
-        raise PlotError(f"{video}: expected the video of which the recording is; none of its images has a pose's stamp")
+
+
+def _pixels(joints: Floats, lens: Floats) -> Floats:
+    """(J, 2) where a camera sees joints (J, 3); NaN where they are not before it."""
+    depth = joints[:, 2:]
+    return (joints @ lens.T)[:, :2] / np.where(depth > NEAREST, depth, np.nan)
 
 
 def _with_bones(
@@ -127,8 +140,7 @@ def _with_bones(
     """An image with the bones of bodies, each of joints and which are observed, and with a title."""
     image = image.copy()
     for joints, observed in bodies:
-        depth = joints[:, 2:]
-        pixels = (joints @ lens.T)[:, :2] / np.where(depth > NEAREST, depth, np.nan)
+        pixels = _pixels(joints, lens)
         seen = [bone for bone in shown if np.isfinite(pixels[bone]).all()]
         guessed = image.copy()
         _draw(guessed, pixels, [bone for bone in seen if not observed[bone].all()])

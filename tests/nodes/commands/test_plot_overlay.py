@@ -117,8 +117,13 @@ def test_arrays_have_clean_alone(tmp_path: Path, cleaned: list[PoseClean], video
 
 def test_another_video_is_refused(tmp_path: Path, cleaned: list[PoseClean], video: Path) -> None:
     later = [dataclasses.replace(message, stamp_ns=message.stamp_ns + 10**10) for message in cleaned]
-    with pytest.raises(PlotError, match="none of its images has a pose's stamp"):
+    with pytest.raises(PlotError, match=r"clean .*video\.avi OUT' makes: .* ends after 0\.7 s, these begin at 10\.0 s"):
         plot(record(tmp_path / "bag", later), video=tmp_path / "out.mp4", over=video)
+    for message in cleaned:
+        message.bodies[0].positions[:] = message.bodies[0].positions[:, [2, 0, 1]] * [1.0, 1.0, -1.0]
+    with pytest.raises(PlotError, match="none of these lies within its images"):
+        plot(record(tmp_path / "world", cleaned), video=tmp_path / "out.mp4", over=video)
+    assert not (tmp_path / "out.mp4").exists()
     with pytest.raises(PlotError, match="over: expected a video that OpenCV can read"):
         plot(tmp_path / "bag", video=tmp_path / "out.mp4", over=tmp_path / "nowhere.mp4")
     with pytest.raises(PlotError, match="as well: --video"):
