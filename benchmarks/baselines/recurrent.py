@@ -21,7 +21,9 @@ from steadypose.prior.body.skeleton import MIRROR, J
 
 _WIDTH = 256
 _SCALE = 5.0  # a metre in the network's unit
-_BATCH, _FRAMES = 32, 60
+STEPS = 6000
+"""Number of optimiser steps. With the batch, in clips, and a clip's frames: as many as the product's mixture had."""
+_BATCH, _FRAMES = 32, 90
 _JOINTS = len(MIRROR)
 
 

@@ -103,6 +103,33 @@ def test_fewer_bodies_come_before_fewer_frames(clock: VirtualClock) -> None:
     assert limit.bodies == 1, "one is always worked on"
 
 
+def note_for(clock: VirtualClock, limit: BodyLimit, seconds: float, *, busy: float, in_time: float) -> None:
+    """A server's messages, 300 a second, one body in each look."""
+    dropped, spent_ns = float(limit._dropped_before), round(busy * 1e9 / 300)
+    for _ in range(round(seconds * 300)):
+        clock.time_ns += 10**9 // 300
+        dropped += 1 / in_time - 1
+        limit.note(8, spent_ns, int(dropped))
+
+
+@pytest.mark.parametrize(("busy", "in_time", "fewer"), [(0.9, 0.7, True), (0.9, 0.98, False), (0.3, 0.7, False)])
+def test_bodies_are_left_out_only_where_they_are_what_takes_the_time(
+    clock: VirtualClock, busy: float, in_time: float, fewer: bool
+) -> None:
+    limit = BodyLimit(8, clock)
+    note_for(clock, limit, 1.2, busy=busy, in_time=in_time)
+    assert (limit.bodies < 8) == fewer
+
+
+def test_one_more_body_is_tried_though_messages_without_any_take_half_the_time(clock: VirtualClock) -> None:
+    limit = BodyLimit(8, clock)
+    limit.bodies = 1
+    for _ in range(1200):  # four seconds, of which the messages take half and a body a sixtieth
+        clock.time_ns += 10**9 // 300
+        limit.note(limit.bodies, round((0.5 + limit.bodies / 60) * 1e9 / 300), 0)
+    assert limit.bodies >= 5
+
+
 def test_the_nearest_bodies_stay() -> None:
     prior = PriorPipeline(PriorSettings.from_dict(SIMPLE))
     bodies = [walking(0, body) for body in range(4)]

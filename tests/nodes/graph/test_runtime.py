@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,7 +16,7 @@ from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Level, Message, PoseClean, PoseRaw
 from steadypose.nodes.graph.clock import SystemClock, Timeline
-from steadypose.nodes.graph.inbox import READ_AHEAD, Inbox
+from steadypose.nodes.graph.inbox import LONGEST, READ_AHEAD, Inbox
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 
@@ -70,6 +71,8 @@ class Listener:
 class Script:
     """In a subscriber's place: gives what it was given."""
 
+    socket = 0
+
     def __init__(self, messages: list[tuple[str, Message]]) -> None:
         self.messages = messages
 
@@ -93,8 +96,28 @@ def test_a_late_node_keeps_the_end_of_the_stream_and_the_news() -> None:
     news = Diagnostics(0, "pose_input", Level.OK, "")
     script = [*frames(5), (POSE_RAW, end), (DIAGNOSTICS, news), *frames(5)]
     inbox = Inbox([Script(script)], limit=2, clock=SystemClock())  # type: ignore[arg-type]
-    assert [m for _, m in iter(lambda: inbox.next(0), None)] == [end, news]
-    assert inbox.overrun == 10
+    got = [m for _, m in iter(lambda: inbox.next(0), None)]
+    assert got[:2] == [end, news]
+    assert [m.stamp_ns for m in got[2:]] == [raw(i).stamp_ns for i in (3, 4)]  # type: ignore[union-attr]
+    assert inbox.overrun == 8
+
+
+def of_sources(count: int) -> list[tuple[str, Message]]:
+    return [(POSE_RAW, dataclasses.replace(raw(0), source=f"kiosk {k}")) for k in range(count)]
+
+
+def test_the_streams_of_one_publisher_do_not_displace_each_other() -> None:
+    inbox = Inbox([Script(of_sources(20))], limit=1, clock=SystemClock())  # type: ignore[arg-type]
+    assert len(list(iter(lambda: inbox.next(0), None))) == 20
+    assert inbox.overrun == 0
+
+
+def test_a_publisher_of_ever_new_streams_fills_no_memory() -> None:
+    script = Script(of_sources(2 * LONGEST))
+    inbox = Inbox([script], limit=1, clock=SystemClock())  # type: ignore[arg-type]
+    while script.messages:  # reading is faster than the work
+        inbox._queues[0].fill(0)
+    assert len(inbox) == LONGEST == inbox.overrun
 
 
 def test_publishers_take_turns_and_who_floods_loses_its_own(tmp_path: Path) -> None:
