@@ -1,4 +1,4 @@
-"""Time for nodes: the wall clock, and which moment of capture is played when."""
+"""Time for nodes: the clock, and the timeline that maps capture stamps to wall time."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 FRAME_NS = 1_000_000_000 / FPS
-"""of the grid the models run on"""
+"""Frame period of the models' 30 Hz grid, nanoseconds."""
 POLL_S = 0.1
-"""the longest that a node waits for anything before it checks whether to stop"""
+"""Longest time a node waits for anything before it checks whether to stop, seconds."""
 
 
 class Clock(Protocol):
-    """Time for nodes; tests pass one of their own that does not wait."""
+    """Time for nodes. Tests pass a virtual clock that does not wait."""
 
     def now_ns(self) -> int:
-        """Wall time, nanoseconds since 1970, for stamps; it steps when the system's clock is set."""
+        """Wall time for stamps, nanoseconds since 1970. It steps when the system clock is set."""
         ...
 
     def monotonic_ns(self) -> int:
-        """For durations, nanoseconds since some moment; never steps."""
+        """Monotonic time for durations, nanoseconds since an arbitrary start. It never steps."""
         ...
 
     def sleep(self, duration_ns: int) -> None: ...
@@ -36,7 +36,7 @@ class Clock(Protocol):
 class SystemClock:
     """The system's clocks.
 
-    A machine without a battery begins at some time, and is set when it hears of the time; so the wall clock steps.
+    The wall clock can step: a machine without a battery-backed clock boots with a wrong time and sets it later.
     """
 
     def now_ns(self) -> int:
@@ -51,28 +51,28 @@ class SystemClock:
 
 @dataclass(frozen=True)
 class Timeline:
-    """When, on the wall clock, a moment of capture is played: a live source's stamps are its wall times."""
+    """Maps capture stamps to the wall time at which they are played. A live source's stamps are wall times."""
 
     stamp_ns: int
     wall_ns: int
     rate: float
-    """times real time, above 0"""
+    """playback speed relative to real time, above 0"""
 
     def wall(self, stamp_ns: int) -> int:
-        """Nanoseconds of wall time at which ``stamp_ns`` is due."""
+        """Wall time at which ``stamp_ns`` is due, nanoseconds."""
         return self.wall_ns + round((stamp_ns - self.stamp_ns) / self.rate)
 
     def stamp_at(self, wall_ns: int) -> int:
-        """The moment of capture that is played at a wall time."""
+        """Capture stamp that is played at a wall time, nanoseconds."""
         return self.stamp_ns + round((wall_ns - self.wall_ns) * self.rate)
 
     @property
     def is_now(self) -> bool:
-        """Whether stamps are of the wall clock: a live source's, not a replay's."""
+        """Whether stamps are wall times: true for a live source, false for a replay."""
         return self.rate == 1.0 and self.stamp_ns == self.wall_ns
 
     def values(self) -> dict[str, str]:
-        """As the input node's diagnostics carry it."""
+        """The entries of the input node's diagnostics."""
         return {
             "timeline.stamp_ns": str(self.stamp_ns),
             "timeline.wall_ns": str(self.wall_ns),
@@ -81,7 +81,7 @@ class Timeline:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> Self | None:
-        """From diagnostics, or None if they carry none that can be."""
+        """The timeline in the values of diagnostics; None if there is none or it is invalid."""
         try:
             stamp_ns, wall_ns = int(values["timeline.stamp_ns"]), int(values["timeline.wall_ns"])
             rate = float(values["timeline.rate"])

@@ -13,11 +13,11 @@ from steadypose.nodes.graph.node import Node
 from steadypose.prior.events.detector import NOWHERE, EventDetector, EventSettings
 
 REPEAT_NS = 1_000_000_000
-"""of the stream, after which what holds is published again"""
+"""Interval in stream time at which ongoing events are published again, nanoseconds."""
 
 
 class EventStream:
-    """The events of one stream as the messages of ``pose/events``, and where its sensor stands.
+    """Turns one stream of ``pose/world`` into ``pose/events``, given the sensor's position.
 
     Args:
         settings: the thresholds.
@@ -29,7 +29,7 @@ class EventStream:
         self.sensor: NDArray[np.float64] = NOWHERE
 
     def process(self, world: PoseWorld) -> PoseEvents | None:
-        """What is to be published of a message of ``pose/world``; None if nothing is."""
+        """The events to publish for one ``pose/world``; None if there is nothing to publish."""
         events = self._detector.update(world, self.sensor)
         sent_ns = self._sent_ns
         since_ns = REPEAT_NS if sent_ns is None else abs(world.stamp_ns - sent_ns)
@@ -41,7 +41,7 @@ class EventStream:
 
 
 class EventsNode(Node):
-    """Runs an `EventStream` over each source of what the trajectory node gives."""
+    """Runs an `EventStream` for each source of the trajectory node's output."""
 
     name = "events"
 
@@ -63,6 +63,6 @@ class EventsNode(Node):
     def _stream(self, source: str) -> EventStream:
         stream = self._streams.pop(source, None) or EventStream(self._settings)
         self._streams[source] = stream
-        if len(self._streams) > max(len(self.launch.server.clients), 1):  # one came back under another name
+        if len(self._streams) > max(len(self.launch.server.clients), 1):  # a client reconnected under another name
             del self._streams[next(iter(self._streams))]
         return stream

@@ -1,4 +1,4 @@
-"""What a node measures of itself, and says in `diagnostics`: rates, latency, queue, what was dropped or refused."""
+"""A node's self-measurements for `diagnostics`: rates, latency, queue length, dropped and refused messages."""
 
 from __future__ import annotations
 
@@ -16,28 +16,29 @@ from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.topology import NODES
 
 REPORT_NS = 1_000_000_000
-"""between two reports"""
+"""Interval between reports, nanoseconds."""
 STALL_NS = 2_000_000_000
-"""input without output for so long is no progress"""
+"""Time of input without output after which a node counts as stalled, nanoseconds."""
 SAMPLES = 1000
-"""latencies and compute times kept for the percentiles: half a minute at 30 Hz"""
+"""Number of latencies and compute times kept for the percentiles; half a minute at 30 Hz."""
 
 
 class Health:
     """The measurements of one node.
 
     Args:
-        clock: of the node.
+        clock: the node's clock.
 
     Attributes:
-        state: in a word or two: ``starting``, ``running``, ``waiting for prior``, ``stopped``;
-            reported as ``stalled`` where frames come in and none go out.
-        unread: who of those that are waited for does not read; then that is the state of one that is ``running``.
-        counts: messages refused and dropped by the node itself, by cause.
-        published: messages published, by topic; where a node goes on for another one, by both.
-        received: messages worked on, by topic.
-        ended: topics of which the end of the stream was seen.
-        stamp_ns: capture of the newest frame, nanoseconds.
+        state: one or a few words: ``starting``, ``running``, ``waiting for prior``, ``stopped``. It is reported as
+            ``stalled`` if frames come in and none go out.
+        unread: text that names the reliable subscribers that do not read, or empty. It replaces the state
+            ``running``.
+        counts: messages that the node itself refused or dropped, by cause.
+        published: messages published, by topic. A restarted node that resumes includes its predecessor's.
+        received: messages processed, by topic.
+        ended: topics whose end of stream was seen.
+        stamp_ns: capture stamp of the newest frame, nanoseconds.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -51,7 +52,7 @@ class Health:
         self._clock = clock
         self._queue = 0
         self._received_ns = 0
-        self._unanswered_ns: int | None = None  # since when input has come and nothing has gone out
+        self._unanswered_ns: int | None = None  # time of the first input since the last output
         self._latency_ns: deque[int] = deque(maxlen=SAMPLES)
         self._compute_ns: deque[int] = deque(maxlen=SAMPLES)
         self._first_and_last_ns: dict[str, tuple[int, int]] = {}
@@ -62,23 +63,23 @@ class Health:
 
     @property
     def due(self) -> bool:
-        """Whether it is time for the next report."""
+        """Whether the next report is due."""
         return self._clock.monotonic_ns() - self._reported_at >= REPORT_NS
 
     def go_on_from(self, published: Mapping[str, int]) -> None:
-        """Count on from what the node before this one had published."""
+        """Continue counting from what this node's predecessor had published."""
         self.published.update(published)
         self._published_before.update(published)
 
     def note_received(self, topic: str) -> None:
-        """A frame was taken to be worked on."""
+        """Record that processing of a frame starts."""
         self.received[topic] += 1
         self._received_ns = self._clock.monotonic_ns()
         if self._unanswered_ns is None:
             self._unanswered_ns = self._received_ns
 
     def stall(self, node: str) -> list[Problem]:
-        """The problem of a node that takes frames and gives none."""
+        """The problem of a node that receives frames and publishes none."""
         now = self._clock.monotonic_ns()
         if NODES[node].stream is None or self._unanswered_ns is None or now - self._received_ns > STALL_NS:
             return []
@@ -93,12 +94,12 @@ class Health:
         ]
 
     def note_published(self, topic: str, at_ns: int, latency_ns: int | None) -> None:
-        """A message was published.
+        """Record a published message.
 
         Args:
             topic: its topic.
-            at_ns: when, on the monotonic clock.
-            latency_ns: from capture, less the delay that is meant; None where it is not known.
+            at_ns: monotonic time of publication, nanoseconds.
+            latency_ns: time since capture minus the intended delay, nanoseconds; None if unknown.
         """
         self.published[topic] += 1
         if topic != DIAGNOSTICS:
@@ -108,23 +109,23 @@ class Health:
             self._latency_ns.append(latency_ns)
 
     def note_computed(self, spent_ns: int) -> None:
-        """A frame took so long, without the time its publication waited for subscribers."""
+        """Record a frame's compute time, without the time that its publication waited for subscribers."""
         self._compute_ns.append(spent_ns)
 
     def note_queue(self, length: int) -> None:
-        """So many messages wait."""
+        """Record the current queue length; the report has the maximum."""
         self._queue = max(self._queue, length)
 
     def report(
         self, node: str, received: Counter[str], status: Mapping[str, str], problems: Sequence[Problem] = ()
     ) -> Diagnostics:
-        """The `diagnostics` of now.
+        """The current `diagnostics`.
 
         Args:
-            node: its name.
-            received: what was dropped and refused on the way to the node, by cause.
-            status: what the node itself has to say.
-            problems: that it found with its stream, the worst of which is the level and the message.
+            node: the node's name.
+            received: messages dropped or refused before the node processed them, by cause.
+            status: further entries of the node itself.
+            problems: problems of the node's stream. The worst one sets the level and the message.
         """
         self._reported_at = self._clock.monotonic_ns()
         self._measure_rates()
@@ -159,7 +160,7 @@ class Health:
     def _measure_rates(self) -> None:
         now = self._clock.monotonic_ns()
         elapsed = now - self._rated_at
-        # a report out of turn, as at the end of a stream, sees too little time for a rate
+        # an extra report, as at the end of a stream, covers too short a time to measure a rate
         if elapsed < REPORT_NS // 2 and self._rates:
             return
         new = self.published - self._published_before
@@ -175,7 +176,7 @@ def _percentiles(name: str, samples: deque[int]) -> dict[str, str]:
 
 
 def resident_bytes() -> int:
-    """Memory this process holds now; where the system does not say, the most it ever held."""
+    """Resident memory of this process, bytes. On systems without ``/proc`` it is the peak so far."""
     try:
         with open("/proc/self/statm", encoding="ascii") as file:
             return int(file.read().split()[1]) * resource.getpagesize()

@@ -1,4 +1,4 @@
-"""What a node does that falls behind: a queue that drops the oldest frames, and a limit to the number of bodies."""
+"""Overload handling of a node: a queue that drops the oldest frames, and a limit on the number of bodies."""
 
 from __future__ import annotations
 
@@ -13,30 +13,33 @@ from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.graph.clock import Clock
 
 READ_AHEAD = 64
-"""messages a node takes off a socket before it works on one"""
+"""Largest number of messages that a node takes off a socket before it processes one."""
 LONGEST = 512
-"""messages of one publisher that wait, at most, whatever number of streams it has"""
+"""Largest number of waiting messages of one publisher, over all its streams."""
 LOOK_S = 0.5
-"""after which a subscriber is asked though nothing has come: it mends its connections meanwhile"""
+"""Interval at which an idle subscriber is polled, seconds. Polling also repairs its connections."""
 DEADLINE_NS = 50_000_000
-"""that a frame may wait for a node, and be older than the newest of its stream; then it is that one's turn. Two nodes
-have such a queue, so this bounds how old a published pose is under load. Such gaps are bridged"""
+"""Longest time a frame waits in a node's queue while newer frames of its stream arrive, nanoseconds.
+
+After that, only the newest frame is kept. Two nodes have such a queue, so the deadline bounds the age of a published
+pose under load. The pipeline bridges the gaps."""
 
 
 class Inbox:
     """Messages received and not yet processed.
 
-    Who can drop frames works on the newest first: once the oldest has waited too long, all but the newest go. Frames
-    that came late, as those of a camera that stopped for a moment, are not late for that: they have not waited here.
+    With a limit, the queue drops frames when the node falls behind. Once a stream's oldest frame has waited longer than
+    the deadline, all but the newest are dropped. Only time spent in this queue counts: a frame that arrives late, for
+    example after a camera stalled, is not dropped for that.
 
-    With several subscribers, as for the clients of a server, each has a queue of its own, and they take turns: one that
-    floods the node loses only its own messages.
+    Each subscriber (for example one per client of a server) has its own queue, and the queues take turns. A publisher
+    that floods the node loses only its own messages.
 
     Args:
-        subscribers: where it comes from.
-        limit: frames to keep of each stream, beyond which its oldest goes; None loses nothing and leaves the rest to
-            the sender.
-        clock: of the node.
+        subscribers: sources of the messages.
+        limit: largest number of waiting frames per stream; beyond it the oldest is dropped. With None nothing is
+            dropped, and the publisher has to wait (back-pressure).
+        clock: the node's clock.
     """
 
     def __init__(self, subscribers: Sequence[Subscriber], limit: int | None, clock: Clock) -> None:
@@ -48,7 +51,7 @@ class Inbox:
                 self._poller.register(subscriber.socket, zmq.POLLIN)
 
     def dropped_of(self, message: Message) -> bool:
-        """Whether frames of a message's stream were dropped since this was last asked of it."""
+        """Whether frames of the message's stream were dropped since the last call for that stream."""
         source = _source(message)
         dropped = [queue.sources for queue in self._queues if source in queue.sources]
         for sources in dropped:
@@ -57,19 +60,19 @@ class Inbox:
 
     @property
     def sources(self) -> frozenset[str]:
-        """Of which frames were dropped and none has been worked on since."""
+        """Sources whose frames were dropped and of which no frame was processed since."""
         return frozenset(source for queue in self._queues for source in queue.sources)
 
     @property
     def overrun(self) -> int:
-        """Frames dropped because this node was late."""
+        """Number of frames dropped because this node was late."""
         return sum(queue.overrun for queue in self._queues)
 
     def __len__(self) -> int:
         return sum(len(queue.waiting) for queue in self._queues)
 
     def next(self, timeout_s: float) -> tuple[str, Message] | None:
-        """The oldest message of the queue whose turn it is, or None if none comes in time."""
+        """The oldest message of the next queue in turn, or None if none arrives within ``timeout_s``."""
         if len(self._queues) == 1:
             self._queues[0].fill(timeout_s)
         else:
@@ -85,7 +88,7 @@ class Inbox:
         return None
 
     def _fill(self, timeout_s: float) -> None:
-        """Take what has come: to ask every subscriber would cost more than a message does."""
+        """Read the sockets that are ready. Polling every subscriber would cost more than processing a message."""
         ready = dict(self._poller.poll(round(timeout_s * 1000)))
         now_ns = self._clock.monotonic_ns()
         for queue in self._queues:
@@ -99,11 +102,11 @@ class _Received(NamedTuple):
     topic: str
     message: Message
     since_ns: int
-    """it came after this, by the clock that never steps"""
+    """lower bound of its arrival time, monotonic clock, nanoseconds"""
 
 
 class _Queue:
-    """What came from one subscriber."""
+    """The waiting messages of one subscriber."""
 
     def __init__(self, subscriber: Subscriber, limit: int | None, clock: Clock) -> None:
         self.overrun = 0
@@ -114,7 +117,7 @@ class _Queue:
         self._limit = limit
         self._clock = clock
         self.empty_ns = self.filled_ns = clock.monotonic_ns()
-        """when the socket was last seen without a message, and when the subscriber was last asked"""
+        """monotonic times at which the socket was last found empty, and the subscriber last read, nanoseconds"""
 
     def fill(self, timeout_s: float) -> None:
         since_ns, self.filled_ns = self.empty_ns, self._clock.monotonic_ns()
@@ -134,8 +137,7 @@ class _Queue:
                 self._make_room(self.waiting[-1], self._limit)
 
     def _make_room(self, newest: _Received, limit: int) -> None:
-        """Drop the frames before the newest of a stream, if the oldest of them is late; else that one, if more than
-        the limit wait."""
+        """Drop all of the stream's older frames if the oldest is late, or only the oldest if the queue is full."""
         before = [
             frame
             for frame in self.waiting
@@ -168,30 +170,30 @@ def _source(message: Message) -> str:
 
 
 LOOK_NS = 500_000_000
-"""between two decisions"""
+"""Interval between decisions, nanoseconds."""
 CALM_NS = 2_000_000_000
-"""without a dropped frame, before more bodies are tried"""
+"""Time without dropped frames before the limit is raised, nanoseconds."""
 SPARE = 0.65
-"""of the time that work may take with more bodies"""
+"""Largest predicted load (compute time per elapsed time) with more bodies, ratio."""
 MARGIN = 0.05
-"""Share of the time below `SPARE` from which on one more body is tried: messages take time, too, whoever is in them."""
+"""Margin of the load below `SPARE` at which one more body is tried, ratio. A message has a cost besides its bodies."""
 FEW = 0.05
-"""Share of the frames that may be dropped without bodies being left out: of one stream none in half a second."""
+"""Tolerated share of dropped frames, ratio. For one stream this means none in half a second."""
 BUSY = 0.5
-"""Share of the time that bodies take from which on fewer of them help: else it is other work that made frames late."""
+"""Load above which fewer bodies help, ratio. Below it, other processes made the frames late."""
 
 
 class BodyLimit:
-    """Lowers the number of bodies while frames are dropped for being late, and raises it again where there is time.
+    """Limits the number of bodies: lowers it while frames are dropped, raises it again when there is spare time.
 
     Args:
-        most: bodies, however much time there is.
-        clock: of the node.
+        most: upper bound of the limit.
+        clock: the node's clock.
     """
 
     def __init__(self, most: int, clock: Clock) -> None:
         self.bodies = self._most = most
-        """that there is time for"""
+        """current limit"""
         self._clock = clock
         self._looked_ns = self._late_ns = clock.monotonic_ns()
         self._worked = self._dropped_before = 0
@@ -200,12 +202,12 @@ class BodyLimit:
         self._settling = False
 
     def note(self, present: int, spent_ns: int, dropped: int) -> None:
-        """A frame was worked on.
+        """Record a processed frame.
 
         Args:
-            present: bodies in it that were worked on.
-            spent_ns: how long it took.
-            dropped: frames dropped so far for being late.
+            present: number of bodies processed in it.
+            spent_ns: compute time, nanoseconds.
+            dropped: number of frames dropped so far for being late.
         """
         self._worked += 1
         self._spent_ns += spent_ns
@@ -219,9 +221,9 @@ class BodyLimit:
         if late and not self._settling:
             in_time = max(in_time, 0.5)
             self.bodies = max(1, min(self._present - 1, int(self._present * in_time)))
-        elif now - self._late_ns > CALM_NS:  # what is worked on shows what more would take, at most
+        elif now - self._late_ns > CALM_NS:  # scaling the present load gives an upper bound of the load of more bodies
             more = max(int(self._present * SPARE / max(busy, 0.01)), self._present + (busy < SPARE - MARGIN))
             self.bodies = min(max(self.bodies, more), self._most)
         self._late_ns = now if late else self._late_ns
-        self._settling = late and not self._settling  # what waits is of before
+        self._settling = late and not self._settling  # frames still in the queue date from before the change
         self._looked_ns, self._worked, self._spent_ns = now, 0, 0

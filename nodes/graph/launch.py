@@ -1,10 +1,10 @@
-"""Launch files: what to start, from where, and how the nodes reach each other.
+"""Launch files: which nodes to start, with which settings, and how they reach each other.
 
-A launch file is TOML, one section a subject, and read strictly: a key that does not exist is an error that names
-the nearest one that does. Every section may be left out; the defaults play nothing but run. The sections of nodes are
-declared in `nodes.graph.topology`; ``[prior]`` and ``[trajectory]`` are passed on as they are to the stages they
-configure (`prior.clean.settings.PriorSettings`, `prior.world.settings.TrajectorySettings`), which check them just as
-strictly. On the command line ``--set delay=2`` is ``prior.delay``, where no other setting ends so.
+A launch file is TOML with one section per subject, and is read strictly: an unknown key is an error that names the
+nearest known one. Every section is optional; with the defaults the nodes run but play no input. `nodes.graph.topology`
+declares the sections of nodes. ``[prior]`` and ``[trajectory]`` are passed unchanged to the pipelines
+(`prior.clean.settings.PriorSettings`, `prior.world.settings.TrajectorySettings`), which check them just as strictly.
+On the command line, ``--set delay=2`` means ``prior.delay``, because no other setting's name ends in ``delay``.
 """
 
 from __future__ import annotations
@@ -49,17 +49,17 @@ class _EveryLaunch:
     transport: TransportSettings = field(default_factory=TransportSettings)
     server: ServerSettings = field(default_factory=ServerSettings)
     skeletons: dict[str, Any] = field(default_factory=dict)
-    """joint layouts of the user's own (`prior.body.layouts`)"""
+    """custom joint layouts (`prior.body.layouts`)"""
     plugins: dict[str, Any] = field(default_factory=dict)
-    """nodes of other packages: to each name the ``module:name`` of its `NodeDeclaration`"""
+    """nodes of other packages: node name to the ``module:name`` of its `NodeDeclaration`"""
 
 
 @dataclass(frozen=True)
 class Launch(_EveryLaunch):
-    """A launch file as read, with the overrides of the command line applied."""
+    """A parsed launch file with the command line's overrides applied."""
 
     sections: Mapping[str, Any] = field(default_factory=dict)
-    """the sections of nodes that the file has; see `settings` and `table`"""
+    """the nodes' sections that the file contains; read them with `settings` and `table`"""
 
     def __post_init__(self) -> None:
         if not self.nodes:
@@ -79,11 +79,12 @@ class Launch(_EveryLaunch):
         """Read a launch file.
 
         Args:
-            path: a file, or the name of one of the project's own (``replay``, ``oak``).
-            overrides: ``section.key=value`` each, over what the file says; the value is TOML, or else plain text.
+            path: a file, or the name of a bundled launch file (``replay``, ``oak``).
+            overrides: ``section.key=value`` each, which replace the file's values. A value is TOML, or plain text if it
+                is not valid TOML.
 
         Raises:
-            LaunchError: no such file, not TOML, an unknown key, or a value of the wrong type.
+            LaunchError: the file does not exist, is not TOML, has an unknown key, or a value of the wrong type.
         """
         file = find(path)
         table = read_toml(file)
@@ -103,24 +104,24 @@ class Launch(_EveryLaunch):
             raise LaunchError(str(error)) from error
 
     def settings(self, kind: type[Settings]) -> Settings:
-        """The settings of the node that declares this dataclass: its section of the file, or the defaults."""
+        """The settings of the node that declares this dataclass: its section in the file, or the defaults."""
         section = next(n.section for n in NODES.values() if n.settings == f"{kind.__module__}:{kind.__qualname__}")
         found = self.sections.get(section) or kind()
         assert isinstance(found, kind)
         return found
 
     def table(self, section: str) -> Mapping[str, Any]:
-        """A section of a node that reads it itself."""
+        """The raw table of a section that its node parses itself; empty if the file has none."""
         return self.sections.get(section, {})
 
     def addresses(self, node: str) -> list[str]:
-        """Where ``node`` publishes: one address, or those of all clients."""
+        """The addresses at which ``node`` publishes: one, or those of all clients."""
         if node == "pose_input" and self.server.clients:
             return self.server.clients
         return [self.transport.endpoint(node)]
 
     def reliable_subscribers(self, node: str) -> frozenset[str]:
-        """The nodes of this launch that must not miss a pose of ``node``, so that it waits for them."""
+        """The nodes of this launch that must not miss a pose of ``node``, and for which ``node`` therefore waits."""
         if not self.transport.lossless:
             return frozenset()
         return frozenset(
@@ -142,20 +143,22 @@ def _add_plugins(table: Any) -> None:
 
 
 def _sections() -> dict[str, str]:
-    """The sections of all nodes, and the settings dataclass of each as ``module:name``."""
+    """Section name to its settings dataclass as ``module:name``, for all nodes."""
     return {declared.section: declared.settings for declared in NODES.values() if declared.section}
 
 
 def _layout(table: Mapping[str, Any]) -> type:
-    """The dataclass of a launch file; the settings of a section are imported only where the file has it."""
+    """The dataclass of a launch file. It imports a section's settings only if the file contains the section."""
     kinds = {name: load(kind) if kind and name in table else dict for name, kind in _sections().items()}
     sections = [(name, kind, field(default_factory=kind)) for name, kind in kinds.items()]
     return make_dataclass("LaunchFile", sections, bases=(_EveryLaunch,), frozen=True)
 
 
 def read_toml(file: Path) -> dict[str, Any]:
-    """Raises:
-    LaunchError: it cannot be read, or is not TOML.
+    """Read a TOML file.
+
+    Raises:
+        LaunchError: the file cannot be read, or is not TOML.
     """
     try:
         return tomllib.loads(file.read_text(encoding="utf-8"))
@@ -168,10 +171,10 @@ def read_toml(file: Path) -> dict[str, Any]:
 
 
 def bundled(*parts: str) -> Path:
-    """A path inside the package: launch files, and a recorded stream (in a checkout, all of them) lie there.
+    """A path inside the package, which contains launch files and one recorded stream (in a checkout, all of them).
 
     Raises:
-        LaunchError: it is not there: the installation is damaged.
+        LaunchError: the path does not exist, so the installation is damaged.
     """
     path = PACKAGE.joinpath(*parts)
     if not path.exists():
@@ -180,7 +183,7 @@ def bundled(*parts: str) -> Path:
 
 
 def find(launch: str | Path) -> Path:
-    """The launch file of that path, or of that name among the project's own."""
+    """The launch file at a path, or the bundled launch file of that name."""
     path = Path(launch).expanduser()
     if path.is_file():
         return path.resolve()
@@ -195,10 +198,10 @@ def find(launch: str | Path) -> Path:
 
 
 def apply_override(table: dict[str, Any], override: str) -> None:
-    """Set one ``section.key=value`` in a table of settings, making the sections on the way.
+    """Set one ``section.key=value`` in a table of settings, and create missing sections.
 
     Raises:
-        LaunchError: it has no ``=``, or goes through something that is not a section.
+        LaunchError: the override has no ``=``, or a part of its path is a value, not a section.
     """
     path, separator, text = override.partition("=")
     if not separator or not path.strip():
@@ -222,18 +225,18 @@ PIPELINES = {
     "prior": "steadypose.prior.clean.settings:PriorSettings",
     "trajectory": "steadypose.prior.world.pipeline:TrajectorySettings",
 }
-"""the sections that the nodes read themselves, and the dataclass of each"""
+"""Settings dataclasses (``module:name``) of the sections that nodes parse themselves, by section."""
 
 
 def full_key(override: str, sections: Mapping[str, type]) -> str:
-    """``section.key=value``, of one that may lack the beginning of its name.
+    """Complete an abbreviated override: ``delay=2`` becomes ``prior.delay=2``.
 
     Args:
-        override: as it was given.
-        sections: of the launch file, and the dataclass of each.
+        override: ``key=value``; the key may lack its first parts.
+        sections: settings dataclass of each section.
 
     Raises:
-        LaunchError: it is no setting, or the end of several.
+        LaunchError: no setting has this name or ending, or several have.
     """
     path, separator, value = override.partition("=")
     name = current_key(path.strip())
@@ -249,14 +252,16 @@ def full_key(override: str, sections: Mapping[str, type]) -> str:
         more = f" and {len(found) - 6} more" if len(found) > 6 else ""
         raise LaunchError(f"--set {name}: expected one setting, got the end of {', '.join(found[:6])}{more}")
     if any(key.startswith(f"{name}.") or name.startswith(f"{key}.") for key in known):
-        return f"{name}={value}"  # a table, or a part of one
+        return f"{name}={value}"  # a whole table, or a key inside a free-form table
     near = nearest(name, [*known, *(key.partition(".")[2] for key in known)])
     raise LaunchError(f"--set {name}: no such setting{near}; sections are {', '.join(sections)}")
 
 
 def check_settings(settings: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raises:
-    LaunchError: a setting of a pipeline that does not exist, or a value that cannot be; nothing is loaded for that.
+    """Check the settings of both pipelines without loading weights.
+
+    Raises:
+        LaunchError: a setting does not exist, or its value is invalid.
     """
     for section, kind in PIPELINES.items():
         try:
@@ -266,12 +271,12 @@ def check_settings(settings: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def pipeline_sections() -> dict[str, type]:
-    """The sections of the two pipelines, which `clean` runs."""
+    """Settings dataclasses of the two pipelines that `clean` runs, by section."""
     return {section: load(kind) for section, kind in PIPELINES.items()}
 
 
 def in_launch_file(overrides: Sequence[str]) -> list[str]:
-    """As `full_key`, of any section of a launch file; one that names its section is left to the launch file's reader.
+    """Apply `full_key` over all sections of a launch file. Overrides that begin with a section are left unchanged.
 
     Raises:
         LaunchError: as `full_key`.
@@ -279,7 +284,7 @@ def in_launch_file(overrides: Sequence[str]) -> list[str]:
     declared = {node.section: node.settings for node in NODES.values() if node.section}
     first = {*declared, *(setting.name for setting in fields(Launch))}
     if all(override.partition("=")[0].partition(".")[0].strip() in first for override in overrides):
-        return list(overrides)  # without the libraries of every node
+        return list(overrides)  # avoids importing the libraries of every node
     sections = pipeline_sections() | {section: load(kind) for section, kind in declared.items() if kind}
     sections |= {"transport": TransportSettings, "server": ServerSettings}
     return [
@@ -289,7 +294,7 @@ def in_launch_file(overrides: Sequence[str]) -> list[str]:
 
 
 def _keys(kind: type) -> Iterator[str]:
-    """The settings of a dataclass, those of nested ones with a dot."""
+    """The field names of a dataclass; nested fields are joined by dots."""
     for setting in fields(kind):
         inner = setting.default_factory if setting.default_factory is not MISSING else type(setting.default)
         if isinstance(inner, type) and is_dataclass(inner):

@@ -1,7 +1,8 @@
-"""Compiles the loops of prior and trajectory before anything waits for them, once, and says how far it is.
+"""Compiles the numba loops of prior and trajectory once, before any node needs them, and reports progress.
 
-Two processes do it at once, one from the beginning of a frame's way through the prior and one from its end; what one
-has compiled, the other finds on disk. ``python -I -m steadypose.nodes.graph.loops`` does no more than that.
+Two processes share the work: one compiles from the first stage of the prior onwards, the other from the last stage
+backwards. They share the compiled loops through the cache on disk.
+``python -I -m steadypose.nodes.graph.loops`` does only this.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from steadypose.nodes.graph.process import own_command, own_environment
 from steadypose.prior import loop_cache
 
 COMPILED = {"prior", "trajectory"}
-"""the nodes that need them"""
+"""Names of the nodes that need compiled loops."""
 WAIT_S = 600.0
-"""for another process that compiles; it may have been stopped"""
+"""Longest time to wait for another process that compiles, seconds. That process may be suspended."""
 SAY_S = 5.0
-"""between two lines that say how far it is"""
+"""Interval between progress lines, seconds."""
 _GARBAGE = 20_000
-"""objects between two looks for garbage: with Python's 700, they take a seventh of the time"""
+"""Garbage collector's threshold while compiling, objects. With Python's 700, collection takes a seventh of the time."""
 
 
 def compile_from_the_beginning() -> None:
-    """Clean a few frames with the settings that ship."""
+    """Clean a few frames with the default settings."""
     from steadypose.prior.clean.pipeline import load_loops
     from steadypose.prior.clean.settings import PriorSettings
 
@@ -40,10 +41,10 @@ def compile_from_the_beginning() -> None:
 
 
 def compile_from_the_end() -> None:
-    """Run each network, the smoother's features, the pose solver and orientations by themselves, and import the
-    trajectory, whose loops are compiled by that.
+    """Run each network, the smoother's features, the pose solver and orientations separately.
 
-    In an order in which the other process, whose first great loop is the bank of smoothers, finds each done.
+    Importing the trajectory compiles its loops. The order lets the other process, which starts with the large bank of
+    smoothers, find each loop compiled when it needs it.
     """
     import numpy as np
 
@@ -77,7 +78,7 @@ def compile_from_the_end() -> None:
 
 
 def compile_part() -> None:
-    """Do one of the two, in a process of its own, and write the name of each loop that is ready into a pipe."""
+    """Entry point of a compiling process: does one of the two parts, and writes each finished loop's name to a pipe."""
     part, pipe = sys.argv[1:]
     gc.set_threshold(_GARBAGE)
     with open(int(pipe), "w", encoding="utf-8", buffering=1) as said:
@@ -86,12 +87,13 @@ def compile_part() -> None:
 
 
 def compile_missing(say: Callable[[str], None]) -> None:
-    """Compile all loops that the nodes take and that are not on disk; returns when they are, at once if nothing is due.
+    """Compile all loops that the nodes need and that are not on disk. Returns at once if none is missing.
 
-    Where they cannot be kept, or not be compiled, it says so: then the nodes do it themselves, or say why not.
+    If they cannot be stored or compiled, it reports that and returns; each node then compiles them itself, or fails
+    with the reason.
 
     Args:
-        say: takes a line about how far it is.
+        say: receives progress lines.
     """
     if loop_cache.is_complete():
         return

@@ -1,18 +1,19 @@
-"""Base of all nodes: a process that takes messages, publishes messages, and reports its state once a second.
+"""Base class of all nodes: a process that receives and publishes messages, and reports its state once a second.
 
-**When a node falls behind.** A recording can wait: with ``lossless`` a full node holds up the one before it, back to
-the source, so that every frame arrives and a replay repeats. A camera cannot: otherwise a node keeps the newest
-frames, drops the oldest and counts them. What a node's `Delivery` says comes before either.
+**Overload.** A recording can wait. With ``lossless``, a node with a full queue applies back-pressure up to the source:
+every frame arrives, and a replay is repeatable. A camera cannot wait. Without ``lossless``, a node keeps the newest
+frames, drops the oldest and counts them. A node's declared `Delivery` takes precedence over both.
 
-**Order of start.** With ``lossless``, a node opens its publisher, waits until its reliable subscribers are there, and
-only then subscribes itself. So a stream starts when the whole way to its end is open, whatever the order in which the
-processes came up, and its first frame is not lost; and it halts while a node on the way is started again, which is then
-given again what the one before it had not answered (`relay`).
+**Order of start.** With ``lossless``, a node opens its publisher, waits until its reliable subscribers are connected,
+and only then subscribes. A stream therefore starts once the whole chain is connected, in whatever order the processes
+started, and its first frame is not lost. The stream pauses while a node restarts. The restarted node receives again the
+messages that its predecessor had not acknowledged (`relay`).
 
-**Latency.** Stamps are of capture, and in a replay long past. The input node says in its diagnostics which stamp
-it plays at which time (`Timeline`); with that, every node knows how late it is. Stamps are never touched.
+**Latency.** Stamps are capture times; in a replay they lie in the past. The input node publishes in its diagnostics
+which stamp it plays at which wall time (`Timeline`), and every node computes its latency from that. No node changes
+stamps.
 
-**Bad input.** What cannot be used is counted by its cause and reported; it stops nothing.
+**Bad input.** Unusable input is counted by cause and reported. It never stops a node.
 """
 
 from __future__ import annotations
@@ -44,30 +45,30 @@ from steadypose.nodes.graph.topology import NODES, Delivery
 logger = logging.getLogger(__name__)
 
 WAITING = "waiting for"
-"""begins the state of a node that waits for its listeners"""
+"""Prefix of the state of a node that waits for its subscribers."""
 SUPERVISOR = "STEADYPOSE_SUPERVISOR"
-"""environment: the process that started this node; without it, the node stops"""
+"""Environment variable with the supervisor's process id. The node stops when that process is gone."""
 WATCHER = "run"
-"""the name under which that process subscribes"""
+"""Name under which the supervisor subscribes."""
 LAST_WORD_S = 5.0
-"""for how long a node that is done waits until that process listens: a short stream can be over before"""
+"""Longest time a finished node waits for the supervisor to subscribe, seconds. A short stream can end before that."""
 RUN = "STEADYPOSE_RUN"
-"""environment, and a value of diagnostics: which run the node is of"""
+"""Name of the environment variable, and of the entry in diagnostics, that identify the node's run."""
 
 
 def supervisor_id() -> int:
-    """The process that started this node, and starts it again; 0 if there is none."""
+    """Process id of the supervisor that starts and restarts this node; 0 if there is none."""
     return int(os.environ.get(SUPERVISOR, 0))
 
 
 class Node(ABC):
-    """A node of the graph. A subclass says what it does with a message; all else is here.
+    """A node of the graph. Subclasses implement `handle`.
 
-    Made in one thread, it may run in another; `stop` may be called from anywhere.
+    A node may be created in one thread and run in another; `stop` may be called from any thread.
     """
 
     name: ClassVar[str]
-    """by which `topology.NODES` declares it"""
+    """the node's name in `topology.NODES`"""
 
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         if extra := NODES[self.name].extra:
@@ -91,7 +92,7 @@ class Node(ABC):
 
     @property
     def timeline(self) -> Timeline | None:
-        """Which moment of capture is played when; None until that is known."""
+        """Mapping of capture stamps to wall time; None until it is known."""
         return self._timeline
 
     @timeline.setter
@@ -100,9 +101,10 @@ class Node(ABC):
         self._set_ns = self.clock.now_ns() - self.clock.monotonic_ns()
 
     def _late_ns(self, timeline: Timeline, stamp_ns: int) -> int:
-        """How late it is for a stamp; where the wall clock was set since the timeline was known, by the nearer of both.
+        """Time since a stamp was due, nanoseconds.
 
-        Which of the two a stamp is of cannot be known: what was captured before it was set still comes after.
+        If the wall clock was set since the timeline became known, it is unknown whether the stamp was taken before or
+        after: frames captured before the step still arrive after it. The smaller of the two latencies is returned.
         """
         now_ns = self.clock.now_ns()
         set_by_ns = now_ns - self.clock.monotonic_ns() - self._set_ns
@@ -111,10 +113,10 @@ class Node(ABC):
 
     @abstractmethod
     def handle(self, topic: str, message: Message) -> None:
-        """Work on one message. What it raises is counted and logged, and the next message comes."""
+        """Process one message. An exception is counted and logged, and the node goes on with the next message."""
 
     def status(self) -> dict[str, str]:
-        """What this node has to say in `diagnostics` beyond what every node says."""
+        """This node's own entries in `diagnostics`, besides those of every node."""
         return {}
 
     def problems(self) -> list[Problem]:
@@ -122,12 +124,12 @@ class Node(ABC):
         return []
 
     def mark(self, message: Message) -> tuple[int, int]:
-        """What the node after this one needs to know of a message that was published and taken."""
+        """What a restarted node needs to know of the last published and acknowledged message: stamp, end of stream."""
         return message.stamp_ns, int(not isinstance(message, Diagnostics) and message.end_of_stream)
 
     @property
     def queue_limit(self) -> int | None:
-        """Frames kept when this node falls behind; None: it loses nothing."""
+        """Largest number of frames kept when this node falls behind; None if it must not lose any."""
         transport = self.launch.transport
         delivery = NODES[self.name].delivery
         reliable = transport.lossless if delivery is Delivery.AS_LAUNCHED else delivery is Delivery.RELIABLE
@@ -135,24 +137,24 @@ class Node(ABC):
 
     @property
     def behind(self) -> bool:
-        """Whether frames wait that will be dropped if this node does not catch up."""
+        """Whether frames are waiting that may be dropped if this node does not catch up."""
         return self.queue_limit is not None and len(self.inbox) > 0
 
     def stop(self) -> None:
-        """Ask the node to end; `run` returns within `POLL_S` and what the message at hand takes."""
+        """Ask the node to stop. `run` returns within `POLL_S` plus the processing time of the current message."""
         self._stopping = True
 
     @property
     def stopping(self) -> bool:
-        """Whether the node was asked to end."""
+        """Whether the node was asked to stop."""
         return self._stopping
 
     def run(self) -> None:
-        """Work until stopped.
+        """Run the node until it is stopped.
 
         Raises:
             TransportError: an address cannot be bound.
-            LaunchError: the keys that are asked for cannot be used.
+            LaunchError: the configured keys cannot be used.
         """
         transport = self.launch.transport
         keys = transport.curve_keys()
@@ -204,7 +206,7 @@ class Node(ABC):
             self.report()
 
     def _addresses(self) -> Iterator[list[str]]:
-        """Addresses of the publishers to subscribe to; one subscriber for each client, so that none starves another."""
+        """Publishers' addresses, one list per subscriber. Each client has its own, so that none starves another."""
         nodes, clients = NODES[self.name].subscribes, self.launch.server.clients
         if "pose_input" in nodes:
             yield from ([address] for address in clients)
@@ -213,13 +215,13 @@ class Node(ABC):
             yield others
 
     def work(self) -> None:
-        """Take messages until stopped."""
+        """Process messages until stopped."""
         while not self._stopping:
             self.take_next(POLL_S)
             self.report_if_due()
 
     def take_next(self, timeout_s: float) -> bool:
-        """Work on the next message; False if none came in ``timeout_s``."""
+        """Process the next message; returns False if none arrives within ``timeout_s``."""
         received = self.inbox.next(timeout_s)
         if received is None:
             self.settle()
@@ -227,7 +229,7 @@ class Node(ABC):
         self.health.note_queue(len(self.inbox))
         topic, message = received
         if isinstance(message, Diagnostics):
-            # of several clients each has its own
+            # several clients have different timelines
             if message.node == "pose_input" and not self.launch.server.clients:
                 self.timeline = Timeline.from_values(message.values)
         else:
@@ -242,15 +244,15 @@ class Node(ABC):
             self.health.note_computed(self.clock.monotonic_ns() - started - self._blocked_ns)
             if self._relay:
                 self._relay.handled()
-                # what was handled before this process began counts, too, and once
+                # includes the messages that this node's predecessor handled, each once
                 self.health.received[topic] = self._subscribers[0].arrived(topic)
             if message.end_of_stream:
                 self.note_end(topic)
-        self.settle()  # at once: what is not taken comes twice if this process dies now
+        self.settle()  # immediately: a message not acknowledged before a crash is delivered again
         return True
 
     def settle(self, timeout_s: float = 0.0) -> bool:
-        """Tell publishers which of their messages are answered; whether all that was published was taken."""
+        """Acknowledge answered messages to their publishers. Returns whether all own messages were acknowledged."""
         if self._relay is None:
             return True
         answered = self._relay.settle(self._publisher, timeout_s)
@@ -259,17 +261,19 @@ class Node(ABC):
         return self._relay.settled
 
     def refuse(self, topic: str, error: Exception) -> None:
-        """Count a message that could not be worked on, and log the first of its kind."""
+        """Count a message that could not be processed, and log the first of its kind."""
         cause = f"refused.{type(error).__name__}"
         if cause not in self.health.counts:
             logger.error("%s: a message of %s failed; more are only counted", self.name, topic, exc_info=error)
         self.health.counts[cause] += 1
 
     def publish(self, topic: str, message: Message, *, delay_ns: int = 0) -> bool:
-        """Publish a message; if the launch is lossless, as soon as all reliable subscribers have room.
+        """Publish a message. In a lossless launch, wait until all reliable subscribers have room.
 
         Args:
-            delay_ns: how much of its age is meant; latency is what goes beyond.
+            topic: its topic.
+            message: the message.
+            delay_ns: the pipeline's intended delay, nanoseconds of stream time; latency is measured beyond it.
 
         Returns:
             False if the node was stopped while it waited.
@@ -291,7 +295,7 @@ class Node(ABC):
         self._blocked_ns += now - asked_ns
         of_frame = not isinstance(message, Diagnostics) and not message.end_of_stream
         latency_ns = None
-        if of_frame and self.timeline:  # the delay is of the stream's time, which may run faster
+        if of_frame and self.timeline:  # the delay is in stream time, which may run faster than real time
             latency_ns = self._late_ns(self.timeline, message.stamp_ns) - round(delay_ns / self.timeline.rate)
         self.health.note_published(topic, now, latency_ns)
         if self._relay:
@@ -303,12 +307,12 @@ class Node(ABC):
         return True
 
     def note_end(self, topic: str) -> None:
-        """Report at once that a stream has ended, not only with the next second's diagnostics."""
+        """Report the end of a stream at once, not only with the next second's diagnostics."""
         self.health.ended.add(topic)
         self.report()
 
     def report_if_due(self) -> None:
-        """Publish `diagnostics` if the last are a second old."""
+        """Publish `diagnostics` if the last report is a second old."""
         if self.health.due:
             self.report()
 
@@ -320,15 +324,15 @@ class Node(ABC):
         notify(ALIVE)
         self._publisher.check()
         if self._relay and self._subscribers:
-            self._subscribers[0].take(0)  # who waits in `publish` is not deaf
+            self._subscribers[0].take(0)  # a sign of life: a node that waits in `publish` must not count as deaf
         self._disconnected, self._deaf = self._publisher.refused, self._publisher.silent(DEAF_S)
         unread = self._publisher.silent(STALL_NS / 1e9)
         self.health.unread = f"{WAITING} {', '.join(sorted(unread))} to read" if unread else ""
-        # a subscriber without room for this second's diagnostics can have those of the next
+        # a subscriber whose queue is full misses this report and gets the next one
         self._publisher.publish(DIAGNOSTICS, self.diagnostics(), timeout_s=0)
 
     def diagnostics(self) -> Diagnostics:
-        """How this node is doing."""
+        """The node's current diagnostics."""
         received = Counter({f"refused.{cause}": n for cause, n in self._disconnected.items()})
         received["dropped.late"] = self.inbox.overrun
         for subscriber in self._subscribers:
@@ -348,7 +352,7 @@ class Node(ABC):
             )
 
     def _wire_problems(self) -> Iterator[Problem]:
-        """Problems with received bytes that are no messages, since the last call."""
+        """Problems with refused frames since the last call."""
         refused = sum((subscriber.refused for subscriber in self._subscribers), Counter[str]())
         new, self._refused_before = refused - self._refused_before, refused
         if second := new.pop(SECOND, 0):
@@ -365,7 +369,7 @@ class Node(ABC):
             )
 
     def _await_subscribers(self) -> None:
-        """Wait until all reliable subscribers are there, or the node is stopped."""
+        """Wait until all reliable subscribers are connected, or the node is stopped."""
         if self._required <= self._publisher.subscribers:
             return
         missing = ", ".join(sorted(self._required - self._publisher.subscribers))

@@ -21,24 +21,25 @@ from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
 from steadypose.prior.clean.settings import PriorSettings
 
 GATED = ("joints_refused", "limbs_exchanged", "joints_stuck")
-"""counts of what the gate found in the sensor's joints: its daily work, and no fault of a message"""
+"""Counters of the gate's outlier rejection. They are normal operation, not refused messages."""
 
 OWN_SOURCE_NS, FOREIGN_SOURCE_NS = 10_000_000_000, 2_000_000_000
-"""until the first message of a source that this launch starts itself, and of one that should be there"""
+"""Longest time until a source's first message, nanoseconds: of a source that this launch starts, and of one that should
+be running already."""
 
 
 def make_prior(settings: Mapping[str, Any]) -> PriorPipeline:
-    """The prior of one stream, as ``[prior]`` of a launch file wants it.
+    """Create the prior of one stream from ``[prior]`` of a launch file.
 
     Raises:
-        LaunchError: an unknown setting, a value that cannot be, or weights that are not there.
+        LaunchError: a setting is unknown, its value is invalid, or weights are missing.
     """
     with _launch_errors():
         return PriorPipeline(PriorSettings.from_dict(settings))
 
 
 def make_batch(settings: Mapping[str, Any], clients: int) -> StreamBatch:
-    """The prior of several clients; raises as `make_prior`."""
+    """Create the prior of several clients; raises as `make_prior`."""
     with _launch_errors():
         return StreamBatch(PriorSettings.from_dict(settings), clients)
 
@@ -52,7 +53,7 @@ def _launch_errors() -> Iterator[None]:
 
 
 class PriorNode(Node):
-    """Runs `PriorPipeline` over what the input node gives."""
+    """Runs `PriorPipeline` on the input node's stream."""
 
     name = "prior"
 
@@ -61,7 +62,7 @@ class PriorNode(Node):
         one_thread()
         settings, clients = launch.table("prior"), len(launch.server.clients)
         with _launch_errors():
-            load_loops(PriorSettings.from_dict(settings))  # first: what it takes and leaves serves the pipeline
+            load_loops(PriorSettings.from_dict(settings))  # first, so that the pipeline reuses the memory it frees
         self._pipeline = make_batch(settings, clients) if clients else make_prior(settings)
         self._bodies = 0
         self._anomalies = 0
@@ -113,7 +114,7 @@ class PriorNode(Node):
 
     @property
     def _patience_ns(self) -> int:
-        """How long a source may take until its first message: one of this launch has to start first."""
+        """Longest time until a source's first message, nanoseconds. A source of this launch has to start first."""
         return OWN_SOURCE_NS if "pose_input" in self.launch.nodes else FOREIGN_SOURCE_NS
 
     def _no_source(self, now_ns: int) -> Problem:

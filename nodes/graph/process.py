@@ -1,4 +1,4 @@
-"""Processes of our own: how one is started safely, what its start gives back, its signals, and its notes to systemd."""
+"""Our own processes: safe start, release of start-up memory, signals, and systemd notifications."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 
 _SCRIPT = (
-    # as python -P, which 3.10 does not have
+    # equivalent of python -P, which 3.10 lacks
     "import sys; sys.path[:] = [p for p in sys.path if p]; "
     "from importlib import import_module; module, _, name = sys.argv.pop(1).partition(':'); "
     "sys.exit(getattr(import_module(module), name)())"
@@ -21,17 +21,17 @@ _SCRIPT = (
 
 
 def own_command(function: str, *arguments: str) -> list[str]:
-    """The command line of a process that calls a function, and exits with what it returns.
+    """The command line of a process that calls a function and exits with its return value.
 
     Args:
         function: as ``module:name``.
-        arguments: what it finds in `sys.argv`.
+        arguments: the process's `sys.argv[1:]`.
     """
     return [sys.executable, "-c", _SCRIPT, function, *arguments]
 
 
 def own_environment() -> dict[str, str]:
-    """This process' environment for such a process: without the working folder, which an empty part of a path means."""
+    """The environment for such a process. It drops empty parts of PYTHONPATH, which mean the working directory."""
     found = dict(os.environ)
     if parts := found.get("PYTHONPATH"):
         found["PYTHONPATH"] = os.pathsep.join(part for part in parts.split(os.pathsep) if part)
@@ -42,20 +42,22 @@ _DONTNEED = 4
 """``MADV_DONTNEED`` of madvise(2)"""
 
 _COMPILED = "STEADYPOSE_COMPILED"
-"""in the environment of a process that has started anew after compiling"""
+"""Name of the environment variable that marks a process restarted after compiling."""
 
 _STARTS_WITH = 400_000
-"""objects, more than any start makes that compiles nothing"""
+"""Garbage collector's threshold during start-up, objects. A start that compiles nothing creates fewer."""
 
 
 @contextmanager
 def startup() -> Iterator[None]:
-    """Start within this: imports and loading make two hundred thousand objects that stay, and leave memory free.
+    """Context for a process's start-up: no garbage collection during it, and memory returned after it.
 
-    The garbage collector looks for none among them: not now, for a tenth of the time, nor ever, for 50 ms each time.
-    Only who compiles loops makes more than that. `loops.compile_missing` compiles those of the settings that ship;
-    other settings may need more, and a damaged one is compiled again. Compiling leaves up to 400 MB, so the process
-    then starts anew, once, with the loops that are now on disk.
+    Imports and loading create 200,000 permanent objects. Collecting during start-up would take a tenth of its time, and
+    scanning the permanent objects later 50 ms per collection, so they are frozen.
+
+    Only a process that compiles loops creates more. `loops.compile_missing` compiles those of the default settings;
+    other settings may need further loops, and a damaged one is compiled again. Compiling leaves up to 400 MB allocated,
+    so the process then re-executes itself once and loads the loops from disk.
     """
     thresholds = gc.get_threshold()
     gc.set_threshold(_STARTS_WITH)
@@ -74,8 +76,11 @@ def startup() -> Iterator[None]:
 
 
 def stop_on_signals(stop: Callable[[int, FrameType | None], object]) -> None:
-    """Call this at what asks a process to stop: SIGTERM, Ctrl-C, also where a shell that starts it in the background
-    ignores that, and the end of its terminal, unless nohup(1) had that ignored."""
+    """Call ``stop`` on SIGTERM, SIGINT and SIGHUP.
+
+    SIGINT is handled even if a shell started the process in the background and made it ignore SIGINT. SIGHUP stays
+    ignored if nohup(1) ignores it.
+    """
     for request in (signal.SIGTERM, signal.SIGINT):
         signal.signal(request, stop)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
@@ -83,9 +88,9 @@ def stop_on_signals(stop: Callable[[int, FrameType | None], object]) -> None:
 
 
 def _give_back() -> None:
-    """Give back to the system what malloc has free, and the code of LLVM: who has loaded the loops compiles none.
+    """Return malloc's free memory and LLVM's code pages to the system; a process with loaded loops compiles none.
 
-    If one is compiled after all, its pages come back from the file.
+    If it compiles one after all, the pages are read from the file again.
     """
     libc = ctypes.CDLL(None)
     if hasattr(libc, "malloc_trim"):
@@ -103,7 +108,7 @@ STOPPING = "STOPPING=1"
 
 
 def notify(state: str) -> None:
-    """Send a line of the protocol of sd_notify(3) to who started this process, if it listens."""
+    """Send a state of sd_notify(3) to the service manager, if there is one."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return

@@ -1,12 +1,12 @@
-"""What a lossless node has answered, so that the one after it is given what it had not.
+"""Acknowledgements of a lossless node, so that after a crash its successor continues without loss.
 
-An input has been answered once all that was published until it was worked on is taken by all reliable subscribers; only
-then is it taken here. So whatever dies on the way, each message is still kept by somebody before it. A node that begins
-anew is given `CONTEXT` answered inputs as well, lest bodies begin anew with it; what it makes of them, its subscribers
-have, and it is not published again.
+An input is answered once all reliable subscribers have acknowledged everything that was published up to the end of its
+processing. Only then does this node acknowledge the input to its own publisher. So whichever process dies, a process
+upstream still keeps each unanswered message. A restarted node also receives the last `CONTEXT` answered inputs, so that
+bodies are not initialised anew. Their outputs are not published again, because the subscribers have them.
 
-How far a node has come stands in a few bytes in the directory of the sockets, written with each message that all
-reliable subscribers have taken. They hold for nodes of the same supervisor only; a new run begins at the beginning.
+A node's progress is a few bytes in the directory of the sockets, written whenever a message is acknowledged by all
+reliable subscribers. It is valid only for nodes of the same supervisor; a new run starts from the beginning.
 """
 
 from __future__ import annotations
@@ -25,33 +25,36 @@ _FORM = struct.Struct("<qqqqqq")
 
 
 class Progress(NamedTuple):
-    """What was published and taken."""
+    """What was published and acknowledged."""
 
     publisher: int = 0
     """the publisher's number"""
     sequence: tuple[int, int] = (0, 0)
-    """of the next message of the node's first topic, and of its second"""
+    """sequence number of the next message of the node's first topic, and of its second"""
     mark: tuple[int, int] = (0, 0)
-    """what the node itself notes of the last message: `Node.mark`"""
+    """the node's own note on the last message, `Node.mark`"""
 
 
 CONTEXT = 384
-"""messages, 13 seconds of a stream of 30 Hz: longer than any window and delay, and than bones are measured for. These
-are then measured at another time, so that poses are not those without a restart: observed joints differ by
-0.4 mm (median; at most 99), hidden ones by 11 mm (at most 123); with 128 messages, by 2.1 (528) and 13 (289)."""
+"""Number of answered inputs that a restarted node receives again: 13 seconds at 30 Hz.
+
+This is longer than any window, any delay, and the time for which bone lengths are measured. Bones are then measured
+over other frames, so poses differ from those without a restart: observed joints by 0.4 mm (median; at most 99 mm),
+hidden ones by 11 mm (at most 123 mm). With 128 messages it is 2.1 mm (528 mm) and 13 mm (289 mm)."""
 BACK_NS = 1_000_000_000
-"""a stamp so far before the last is of a stream that begins anew"""
+"""Backward step of stamps beyond which the stream counts as started anew, nanoseconds."""
 
 
 class Relay:
-    """Inputs, and what was published because of them.
+    """Tracks the inputs of a node and the outputs that they caused.
 
     Args:
-        file: keeps the progress for the next node.
-        topics: that the node publishes, two at most.
-        supervisor: process id of the node's supervisor, without whom nobody begins where this one ends; or 0.
-        lag: messages before those that were not taken at which the next one begins. Of a source: a node that dies with
-            it has to be given its context.
+        file: stores the progress for the node's successor.
+        topics: topics that the node publishes, at most two.
+        supervisor: process id of the supervisor that would restart this node; 0 if there is none, and then no progress
+            is stored.
+        lag: number of acknowledged messages that the successor publishes again. A source needs this: if a subscriber
+            dies together with it, the source must supply that subscriber's context.
     """
 
     def __init__(self, file: Path, topics: tuple[str, ...], supervisor: int, lag: int = 0) -> None:
@@ -61,28 +64,28 @@ class Relay:
         self.begun = self._read() if topics and supervisor else None
         self._answered = self.begun if self.begun and any(self.begun.sequence) else None
         self.context = CONTEXT if topics and supervisor else 0
-        """answered inputs to be given again to one that begins anew"""
+        """number of answered inputs that a restarted node receives again"""
         self._recent: deque[Progress] = deque(maxlen=lag + 1)
         self._untaken: deque[tuple[str, int, tuple[int, int]]] = deque()
         self._published = self._taken = 0
-        self._inputs: deque[int] = deque()  # of each, how much was published until it was worked on
+        self._inputs: deque[int] = deque()  # for each input, messages published up to the end of its processing
         self._newest_ns = 0
 
     @property
     def resume(self) -> Resume | None:
-        """Where the publisher of the node before ended."""
+        """State from which the publisher resumes the predecessor's stream; None if there is no predecessor."""
         if self.begun is None:
             return None
         return Resume(self.begun.publisher, dict(zip(self._topics, self.begun.sequence, strict=False)))
 
     def begin(self, publisher: Publisher) -> None:
-        """Note who publishes: what is not taken of it is to be distinguished from what another one publishes."""
+        """Record the publisher, to distinguish its unacknowledged messages from those of another publisher."""
         if self._topics:
             self._recent.append(self.begun or Progress(publisher.id))
             self._keep(self._recent[0])
 
     def knows(self, topic: str, message: Message) -> bool:
-        """Whether the subscribers have this from the node before this one."""
+        """Whether the subscribers already have this message from the node's predecessor."""
         if self._answered is None or topic not in self._topics:
             return False
         if not isinstance(message, PoseRaw | PoseClean | PoseWorld):
@@ -90,24 +93,24 @@ class Relay:
         newest_ns, ended = self._answered.mark
         again = message.stamp_ns < self._newest_ns - BACK_NS
         self._newest_ns = message.stamp_ns
-        # the grid of one that begins anew may lie elsewhere between two frames
+        # the 30 Hz grid of a restarted node may be shifted by up to half a frame
         known = bool(ended) if message.end_of_stream else message.stamp_ns <= newest_ns + FRAME_NS / 2
         if not known or again:
             self._answered = None
         return self._answered is not None
 
     def published(self, publisher: Publisher, topic: str, mark: tuple[int, int]) -> None:
-        """Note what was just published."""
+        """Record a message that was just published."""
         if topic in self._topics:
             self._untaken.append((topic, publisher.sequence(topic) - 1, mark))
             self._published += 1
 
     def handled(self) -> None:
-        """Note that an input was worked on."""
+        """Record that an input was processed."""
         self._inputs.append(self._published)
 
     def settle(self, publisher: Publisher, timeout_s: float = 0.0) -> int:
-        """Note what was taken, waiting so long for the oldest; returns how many inputs are answered by that."""
+        """Read acknowledgements, waiting up to ``timeout_s`` for the oldest. Returns the number of answered inputs."""
         newest: tuple[int, int] | None = None
         while self._untaken and publisher.is_taken(*self._untaken[0][:2], timeout_s=timeout_s):
             *_, newest = self._untaken.popleft()
@@ -126,11 +129,11 @@ class Relay:
 
     @property
     def settled(self) -> bool:
-        """Whether all that was published is taken."""
+        """Whether all published messages were acknowledged."""
         return not self._untaken
 
     def forget(self) -> None:
-        """Keep no progress any more: the stream is finished."""
+        """Delete the progress, because the stream is finished."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
@@ -138,7 +141,7 @@ class Relay:
             self._path.unlink(missing_ok=True)
 
     def _read(self) -> Progress | None:
-        """Where the node before this one was; None if there was none, or it was another supervisor's."""
+        """The predecessor's progress; None if there is none, or it belongs to another supervisor."""
         try:
             supervisor, publisher, *numbers = _FORM.unpack(self._path.read_bytes())
         except (OSError, struct.error):

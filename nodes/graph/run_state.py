@@ -1,4 +1,4 @@
-"""What ``steadypose run`` keeps of its nodes: locks of their addresses, an account of each frame, ``health.json``."""
+"""State that ``steadypose run`` keeps: locks of the nodes' addresses, message counts, ``health.json``."""
 
 from __future__ import annotations
 
@@ -25,15 +25,17 @@ HEALTH_FILE = "health.json"
 
 
 class RunLock:
-    """The addresses of a run's nodes, and where there is no other run, ``health.json``. A context manager.
+    """Locks the addresses of a run's nodes, and ``health.json`` if no other run holds it. A context manager.
 
     Attributes:
-        has_health: whether ``health.json`` is this run's to write; the other run there has other nodes.
+        has_health: whether this run writes ``health.json``; otherwise another run with other nodes does.
     """
 
     def __init__(self, launch: Launch) -> None:
-        """Raises:
-        LaunchError: another run has one of the addresses.
+        """Take the locks.
+
+        Raises:
+            LaunchError: another run uses one of the addresses.
         """
         directory = launch.transport.make_ipc_directory()
         self.has_health = True
@@ -42,7 +44,7 @@ class RunLock:
                 endpoint = launch.transport.endpoint(name)
                 if endpoint.startswith("ipc://"):
                     holder = _take(stack, endpoint.removeprefix("ipc://") + ".lock")
-                else:  # whatever the directory of this launch's sockets
+                else:  # a fixed directory, because launches with different socket directories share tcp ports
                     make_private(local_directory())
                     holder = _take(stack, f"{local_directory()}/{endpoint.replace('/', '')}.lock")
                 if holder is not None:
@@ -61,7 +63,7 @@ class RunLock:
 
 
 def _take(stack: ExitStack, path: str) -> str | None:
-    """Take a lock; returns None, or what is known of who has it."""
+    """Take a lock. Returns None on success, or a text that names the process that holds it (empty if unknown)."""
     try:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
     except OSError as error:
@@ -73,25 +75,25 @@ def _take(stack: ExitStack, path: str) -> str | None:
         pid = os.read(file, 16).decode("ascii", "replace").strip()
         return f" (process {pid})" if pid else ""
     os.ftruncate(file, 0)
-    with suppress(OSError):  # a full disk: the lock holds all the same
+    with suppress(OSError):  # on a full disk the lock holds all the same
         os.write(file, str(os.getpid()).encode())
     return None
 
 
 LOSSES = ("dropped.", "refused.")
-"""begin the counts of what did not go through a node"""
+"""Prefixes of the counts of messages that a node did not process."""
 
 
 class Ledger:
-    """The counts of a run's nodes. A node that is started again counts from 0; here its counts go on.
+    """Accumulates the counts of a run's nodes over restarts, because a restarted node counts from 0.
 
     Args:
-        launch: of the run.
+        launch: the run's launch file.
     """
 
     def __init__(self, launch: Launch) -> None:
         self._launch = launch
-        # a lossless node counts on itself from what the one before it had published
+        # a lossless node itself continues its predecessor's counts of received and published messages
         self._restarted = LOSSES if launch.transport.lossless else (*LOSSES, "in.", "count.")
         self._before: dict[str, Counter[str]] = {}
         self._latest: dict[str, Diagnostics] = {}
@@ -99,14 +101,14 @@ class Ledger:
         self._ended: dict[str, set[str]] = {}
 
     def note(self, diagnostics: Diagnostics, restarts: int) -> Diagnostics:
-        """Take a report of a node that was restarted so often; the report with the counts of all its processes."""
+        """Add a node's report, given its number of restarts. Returns the report with sums over all its processes."""
         node = diagnostics.node
         before = self._before.setdefault(node, Counter())
         if restarts != self._restarts[node] and node in self._latest:
             before.update(self._counts(self._latest[node]))
         self._restarts[node], self._latest[node] = restarts, diagnostics
         total = {key: str(n) for key, n in (before + self._counts(diagnostics)).items()}
-        if self._launch.transport.lossless:  # one that is killed after the end is not given it again
+        if self._launch.transport.lossless:  # a node killed after the end of a stream does not receive the end again
             ended = self._ended.setdefault(node, set())
             ended.update(diagnostics.values.get("ended", "").split())
             total["ended"] = " ".join(sorted(ended))
@@ -116,9 +118,9 @@ class Ledger:
         return Counter({k: int(n) for k, n in diagnostics.values.items() if k.startswith(self._restarted)})
 
     def away(self, node: str, reports: dict[str, Diagnostics]) -> dict[str, str]:
-        """What was published for a node while it was not there, by topic, from the last reports of all.
+        """Number of messages per topic that a node missed while it was down, from the last reports of all nodes.
 
-        A node that was killed had up to a second to say what it had taken, so this is of that accuracy.
+        The last report of a killed node is up to a second old, which limits the accuracy.
         """
         declared = NODES[node]
         if self._launch.transport.lossless or declared.delivery is Delivery.BEST_EFFORT or node not in reports:
@@ -138,7 +140,7 @@ class Ledger:
 
 
 def losses(diagnostics: Diagnostics, *kinds: str) -> str:
-    """What a node says that it dropped or refused, as a text; empty if nothing."""
+    """The nonzero counts of a node whose names begin with ``kinds``, as a text; empty if there are none."""
     values = diagnostics.values.items()
     return ", ".join(f"{key} {n}" for key, n in values if key.startswith(kinds) and n != "0")
 
@@ -149,16 +151,16 @@ def write_health(
     supervisor: Supervisor,
     diagnostics: Mapping[str, Diagnostics],
 ) -> None:
-    """Write ``health.json`` anew: the state of a run, for monitoring a machine without a screen.
+    """Write ``health.json``, the state of a run, for monitoring a machine without a screen.
 
-    It lies in the directory of the sockets and is rewritten atomically once a second. Check its age first: a file older
-    than a few seconds is no longer written. A full disk, like any other OSError, is ignored.
+    The file is in the directory of the sockets and is replaced atomically once a second. Readers check its age first: a
+    file older than a few seconds is no longer written. A full disk, like any other OSError, is ignored.
 
     Args:
-        directory: of the sockets.
-        required: nodes that ``ok`` demands to be running.
-        supervisor: of the run.
-        diagnostics: the latest of each node, by its name.
+        directory: directory of the sockets.
+        required: nodes that must be running for ``ok``.
+        supervisor: the run's supervisor.
+        diagnostics: latest diagnostics by node name.
     """
     nodes = {name: _node(name, supervisor, diagnostics.get(name)) for name in supervisor.children}
     health = {

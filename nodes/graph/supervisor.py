@@ -1,4 +1,4 @@
-"""Nodes as processes: started, watched, started again when they crash or fall silent, stopped in order."""
+"""Runs nodes as processes: starts and monitors them, restarts them when they crash or hang, stops them in order."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from steadypose.nodes.graph.process import own_command, own_environment
 from steadypose.nodes.graph.topology import NODES
 
 BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""pauses before successive restarts; the last one repeats"""
+"""Pauses before successive restarts, seconds; the last one repeats."""
 STEADY_S = 10.0
-"""after running for so long, a node's next restart waits for the first pause again"""
+"""Uptime after which the pauses start from the first again, seconds."""
 TRIES = 6
-"""of a node that was not heard once: then it has failed"""
+"""Number of successive crashes after which a node that has never reported counts as failed."""
 STARTING_S = 600.0
-"""until a node must be heard; the first start on a small machine compiles for minutes"""
+"""Longest time until a node's first report, seconds. The first start on a small machine compiles for minutes."""
 STALE_S = 3.0
-"""silence of a node, which reports once a second, after which its last report no longer counts"""
+"""Time without a report after which a node's last report is outdated, seconds. Nodes report once a second."""
 HUNG_S = 10.0
-"""silence after which a node is killed and restarted"""
+"""Time without a report after which a node is killed and restarted, seconds."""
 STOP_S = 5.0
-"""between SIGTERM and SIGKILL"""
+"""Time between SIGTERM and SIGKILL, seconds."""
 USAGE_ERROR = 2
-"""exit status of a node that cannot do what its launch file says: if it never could, it never will"""
+"""Exit status of a node whose launch file cannot work. It is not restarted if it has never reported."""
 COMMAND = (*own_command("steadypose.nodes.cli:main"), "node")
 
 
@@ -38,7 +38,7 @@ class Child:
     Attributes:
         state: ``running``, ``stale`` (runs, but does not report), ``crashed`` (waiting for its restart), ``ended``, or
             ``failed``.
-        restarts: their number.
+        restarts: number of restarts.
     """
 
     def __init__(
@@ -61,30 +61,30 @@ class Child:
 
     @property
     def silent_s(self) -> float:
-        """Since when it was not heard; 0 for one that does not run, or that is only starting."""
+        """Time since the last report, seconds; 0 for a node that is not running or that is still starting."""
         if self.state not in ("running", "stale") or self._heard_ns is None:
             return 0.0
         return (self._clock.monotonic_ns() - self._heard_ns) / 1e9
 
     @property
     def reports(self) -> bool:
-        """Whether it runs, and was heard since it was started."""
+        """Whether the node runs and has reported since its last start."""
         return self.state == "running" and self._heard_ns is not None
 
     def heard(self) -> None:
-        """Note a report of the node."""
+        """Record a report of the node."""
         if self.state in ("running", "stale"):
             self._heard_ns = self._clock.monotonic_ns()
             self._was_heard = True
             self.state = "running"
 
     def excuse(self) -> None:
-        """Who listens was away: silence begins to count from now."""
+        """Restart the count of silence, because the supervisor itself was not listening."""
         if self._heard_ns is not None:
             self._heard_ns = self._clock.monotonic_ns()
 
     def poll(self) -> None:
-        """Check the process, and restart it when that is due."""
+        """Check the process, and restart it when a restart is due."""
         if self.state in ("running", "stale"):
             self._check()
         if self.state == "crashed" and self._clock.monotonic_ns() >= self._due_ns:
@@ -119,7 +119,7 @@ class Child:
             self._log(f"{self.name}: ended with {cause}; starting it again in {pause_s:g} s")
 
     def stop(self) -> None:
-        """End the process, with SIGTERM first; returns when it is gone."""
+        """Stop the process by SIGTERM, then SIGKILL; returns when it has exited."""
         if self.state in ("running", "stale"):
             self._process.terminate()
             try:
@@ -130,7 +130,7 @@ class Child:
                 self._process.wait()
         if self.state != "failed":
             self.state = "ended"
-        self._reader.join(STOP_S)  # what the node left behind may still hold its output open
+        self._reader.join(STOP_S)  # a child process that the node left behind may hold its output open
 
     def _start(self) -> None:
         self._process = subprocess.Popen(
@@ -158,7 +158,7 @@ class Child:
 
 
 def _environment(run: str) -> dict[str, str]:
-    """Of a node: that of this process, which is its supervisor, less what systemd says to this process alone."""
+    """The environment of a node: this process's, without the variables that systemd addresses to the supervisor."""
     kept = own_environment()
     for said in ("NOTIFY_SOCKET", "WATCHDOG_USEC"):
         kept.pop(said, None)
@@ -166,7 +166,7 @@ def _environment(run: str) -> dict[str, str]:
 
 
 class Supervisor:
-    """The nodes of a launch, each in a process. A context manager; leaving it stops them all."""
+    """Runs the nodes of a launch, each in its own process. A context manager; leaving it stops all nodes."""
 
     def __init__(
         self,
@@ -179,10 +179,11 @@ class Supervisor:
         """Start the nodes.
 
         Args:
-            nodes: their names.
-            arguments: of ``steadypose node NAME``, the same for all.
-            log: where a line from a node, or about it, goes; called from several threads.
-            run: what tells this run's nodes from others', in their diagnostics.
+            nodes: names of the nodes.
+            arguments: arguments of ``steadypose node NAME``, the same for all nodes.
+            clock: monotonic time for restarts and timeouts.
+            log: receives each line of a node's output and each message about a node; called from several threads.
+            run: identifier of this run in its nodes' diagnostics.
         """
         self._clock = clock
         self._polled_ns = clock.monotonic_ns()
@@ -192,21 +193,21 @@ class Supervisor:
         }
 
     def poll(self) -> None:
-        """Check all nodes; to be called several times a second, after their reports are read."""
+        """Check all nodes. Call it several times a second, after reading their reports."""
         before, self._polled_ns = self._polled_ns, self._clock.monotonic_ns()
         away = self._polled_ns - before > STALE_S * 1e9
         for child in self.children.values():
-            if away:  # suspended, or starved: nobody listened
+            if away:  # this process was suspended or starved, and read no reports
                 child.excuse()
             child.poll()
 
     @property
     def failed(self) -> list[str]:
-        """The nodes that will not run."""
+        """Names of the nodes that have failed and are not restarted."""
         return [name for name, child in self.children.items() if child.state == "failed"]
 
     def stop(self) -> None:
-        """Stop all nodes, the first of the stream first."""
+        """Stop all nodes in the order of the stream, the source first."""
         for name in sorted(self.children, key=list(NODES).index):
             self.children[name].stop()
 

@@ -1,4 +1,4 @@
-"""One thread for a process whose products are small."""
+"""Single-threaded BLAS for a process whose matrices are small."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import scipy
 from threadpoolctl import threadpool_limits
 
 _USED = ("scipy.linalg.cython_blas", "scipy.linalg.cython_lapack")
-"""what numba's linear algebra calls"""
+"""Modules of scipy that numba's linear algebra calls."""
 
 
 def one_thread() -> None:
-    """Keep the BLAS of numpy and scipy, and of torch where it is loaded, to the calling thread, from now on.
+    """Limit the BLAS of numpy and scipy, and of torch if it is loaded, to one thread.
 
-    Two threads that share the cores with other nodes wait for each other: eight bodies take a prior twice as long, and
-    three times as much of the processors.
+    Two threads that share the cores with other nodes wait for each other: the prior then takes twice the time for eight
+    bodies, and three times the processor time.
     """
     threadpool_limits(1)
 
 
 def _load(name: str) -> None:
-    """Load a module of scipy that compiled loops call, and nothing else: all of ``linalg`` takes 12 MB and 0.5 s."""
+    """Load one module of ``scipy.linalg`` alone, because importing the whole package takes 12 MB and 0.5 s."""
     spec = PathFinder.find_spec(name, [str(Path(path, "linalg")) for path in scipy.__path__])
     if spec is None or spec.loader is None:
         raise ImportError(f"this scipy ({scipy.__version__}) has no {name}", name=name)
@@ -34,4 +34,5 @@ def _load(name: str) -> None:
 
 for _name in _USED:
     if _name not in sys.modules:
-        _load(_name)  # as this is imported, before any loop: numba would load all of it, and `one_thread` comes after
+        # at import, because the loops are loaded before `one_thread` is called, and numba would import all of linalg
+        _load(_name)

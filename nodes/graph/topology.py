@@ -1,9 +1,9 @@
-"""The graph: every node, declared once, where it publishes, and who may subscribe.
+"""The graph: declares each node once, with the topics that it publishes and subscribes to.
 
-A new node is a class and one entry in `NODES`.
+To add a node, write its class and one entry in `NODES`.
 
-An entry names classes as ``module:name`` instead of importing them: to read a launch file, or to show the help of a
-command, takes none of the libraries that a node works with.
+An entry names classes as ``module:name`` instead of importing them, so that reading a launch file or showing a
+command's help imports none of the nodes' libraries.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from steadypose.prior.settings import nearest
 
 
 class Delivery(Enum):
-    """What becomes of messages for a node that falls behind."""
+    """What happens to messages when a node falls behind."""
 
     AS_LAUNCHED = auto()
-    """``[transport] lossless`` says: the publisher waits, or the subscriber drops its oldest frames"""
+    """``[transport] lossless`` decides: true makes the publisher wait, false makes the node drop its oldest frames"""
     RELIABLE = auto()
-    """nothing is dropped: the queue has no limit, and with ``lossless`` the publisher waits as well"""
+    """nothing is dropped: the queue is unbounded, and with ``lossless`` the publisher waits as well"""
     BEST_EFFORT = auto()
-    """the oldest frames are dropped; no publisher ever waits for this node"""
+    """the oldest frames are dropped; no publisher waits for this node"""
 
 
 @dataclass(frozen=True)
@@ -38,32 +38,32 @@ class NodeDeclaration:
     """One node of the graph."""
 
     node: str
-    """its class, a `Node`, as ``module:name``"""
+    """the node's class, a subclass of `Node`, as ``module:name``"""
     publishes: tuple[str, ...] = ()
-    """topics, the one of its stream first; ``diagnostics``, which every node publishes, is not among them"""
+    """published topics, the main stream first; without ``diagnostics``, which every node publishes"""
     subscribes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """to each publishing node, the topics taken from there"""
+    """publishing node to the topics subscribed to there"""
     section: str = ""
-    """of a launch file, with its settings; empty: it has none"""
+    """the launch file's section with the node's settings; empty if it has none"""
     settings: str = ""
-    """the dataclass of the section, as ``module:name``; empty: a table that the node itself reads, so that reading a
-    launch file takes none of its libraries"""
+    """the section's dataclass as ``module:name``; empty if the node parses the table itself, so that reading a launch
+    file imports none of its libraries"""
     delivery: Delivery = Delivery.AS_LAUNCHED
     optional: bool = False
-    """poses go on without it: a run whose optional node cannot run does"""
+    """whether a run continues when this node cannot run"""
     extra: str = ""
-    """of `extras.EXTRAS`, that it needs; empty: none"""
+    """the extra in `extras.EXTRAS` that the node needs; empty if none"""
     preflight: str = ""
-    """a function of the `Launch`, as ``module:name``, that raises what would keep the node from starting; or empty"""
+    """a function of the `Launch`, as ``module:name``, that raises if the node could not start; empty if none"""
 
     @property
     def stream(self) -> str | None:
-        """The topic of its stream; None for a node that publishes no poses."""
+        """The node's main topic; None if it publishes only diagnostics."""
         return self.publishes[0] if self.publishes else None
 
     @property
     def topics(self) -> frozenset[str]:
-        """All topics that it subscribes to."""
+        """All topics that the node subscribes to."""
         return frozenset(topic for topics in self.subscribes.values() for topic in topics)
 
 
@@ -168,50 +168,53 @@ _NODES: dict[str, NodeDeclaration] = {
     ),
 }
 NODES: Mapping[str, NodeDeclaration] = MappingProxyType(_NODES)
-"""by name, in the order in which they are stopped: with the stream, so that what is on its way arrives, and the
-recorder has it; then those of other packages"""
+"""Declarations by node name, in the order in which nodes are stopped.
+
+This is the order of the stream, so that messages in flight still arrive and are recorded. Nodes of other packages come
+last."""
 
 POSE_NODES = tuple(name for name, declared in NODES.items() if declared.publishes and not declared.optional)
-"""the publishers of poses, which run unless a launch file says otherwise"""
+"""Names of the nodes that publish poses. They run unless a launch file names others."""
 
 
 def add_node(name: str, declared: NodeDeclaration) -> None:
-    """Make a node of another package known, to all of this process."""
+    """Register a node of another package in this process."""
     _NODES[name] = declared
 
 
 def publishers(topic: str) -> list[str]:
-    """The nodes to listen to for a topic: for ``diagnostics`` those that publish poses."""
+    """Names of the nodes that publish a topic; for ``diagnostics``, those that publish poses."""
     if topic == DIAGNOSTICS:
         return list(POSE_NODES)
     return [name for name, declared in NODES.items() if topic in declared.publishes]
 
 
 def load(reference: str) -> Any:
-    """What a declaration names as ``module:name``."""
+    """Import the object that a declaration names as ``module:name``."""
     module, _, name = reference.partition(":")
     return getattr(importlib.import_module(module), name)
 
 
 @dataclass(frozen=True)
 class TransportSettings:
-    """``[transport]``: how messages travel."""
+    """``[transport]``: how messages travel between nodes."""
 
     directory: str = path_setting()
-    """of the ipc sockets; empty: ``steadypose`` in the user's runtime directory"""
+    """directory of the ipc sockets; empty: ``steadypose`` in the user's runtime directory"""
     endpoints: dict[str, str] = field(default_factory=dict)
-    """node to address (``tcp://192.168.1.5:7101``); a node not named here has an ipc socket in ``directory``"""
+    """node to address (``tcp://192.168.1.5:7101``); any other node has an ipc socket in ``directory``"""
     keys: str = path_setting()
-    """directory of CurveZMQ keys, needed where an address is not local"""
+    """directory of CurveZMQ keys; required if an address is not local"""
     lossless: bool = True
-    """a recording can wait, a camera cannot: true lets a node hold up its source while it is slow, or not there yet;
-    false drops its oldest frames"""
+    """true, for a recording: a slow or missing node makes its source wait; false, for a camera: a slow node drops its
+    oldest frames"""
     queue: int = 8
-    """not lossless: frames a node keeps at most when it falls behind; once the oldest is late, all but the newest go"""
+    """without ``lossless``: largest number of frames in a node's queue; once the oldest is late, only the newest is
+    kept"""
     lifespan_s: float = 1.0
-    """not lossless: age of a message, from its sending on, from which a node drops it instead of taking it for new"""
+    """without ``lossless``: age since sending at which a node drops a message, seconds"""
     clear_text: bool = False
-    """whether to publish and subscribe to other machines without keys: others on the network can read and forge
+    """whether to publish and subscribe to other machines without keys; others on the network can then read and forge
     poses"""
 
     def __post_init__(self) -> None:
@@ -229,16 +232,16 @@ class TransportSettings:
             raise LaunchError(f"[transport] queue: expected 1 frame or more, got {self.queue}")
 
     def endpoint(self, node: str) -> str:
-        """The address ``node`` publishes at."""
+        """The address at which ``node`` publishes."""
         if node in self.endpoints:
             return self.endpoints[node]
         return f"ipc://{self.ipc_directory / node}"
 
     def curve_keys(self) -> Keys | None:
-        """The CurveZMQ keys asked for, or None.
+        """The configured CurveZMQ keys; None if none are configured.
 
         Raises:
-            LaunchError: they are not there, or not safe.
+            LaunchError: the keys are missing, or have unsafe permissions.
         """
         try:
             return load_keys(self.keys) if self.keys else None
@@ -247,14 +250,14 @@ class TransportSettings:
 
     @property
     def ipc_directory(self) -> Path:
-        """Where the ipc sockets are."""
+        """The directory of the ipc sockets."""
         return Path(self.directory) if self.directory else local_directory()
 
     def make_ipc_directory(self) -> Path:
-        """Make the directory of the sockets, accessible to this user only.
+        """Create the directory of the sockets, accessible to this user only.
 
         Raises:
-            TransportError: it is there, and others may write to it.
+            TransportError: it exists, and others may write to it.
         """
         make_private(self.ipc_directory)
         return self.ipc_directory
@@ -262,10 +265,10 @@ class TransportSettings:
 
 @dataclass(frozen=True)
 class ServerSettings:
-    """``[server]``: one prior for several clients, whose input nodes run on machines of their own."""
+    """``[server]``: one prior for several clients, whose input nodes run on other machines."""
 
     clients: list[str] = field(default_factory=list)
-    """addresses of their input nodes (``tcp://192.168.1.21:7101``), subscribed to in place of an own one"""
+    """addresses of the clients' input nodes (``tcp://192.168.1.21:7101``), which replace a local input node"""
 
     def __post_init__(self) -> None:
         check_addresses("[server] clients", self.clients)

@@ -17,10 +17,10 @@ from steadypose.prior.world.settings import TrajectorySettings
 
 
 def make_trajectory(settings: Mapping[str, Any]) -> TrajectoryPipeline:
-    """The trajectory as ``[trajectory]`` of a launch file wants it.
+    """Create the trajectory pipeline from ``[trajectory]`` of a launch file.
 
     Raises:
-        LaunchError: an unknown setting, a value that cannot be, or weights that are not there.
+        LaunchError: a setting is unknown, its value is invalid, or weights are missing.
     """
     try:
         return TrajectoryPipeline(TrajectorySettings.from_dict(settings))
@@ -29,7 +29,7 @@ def make_trajectory(settings: Mapping[str, Any]) -> TrajectoryPipeline:
 
 
 class TrajectoryNode(Node):
-    """Runs `TrajectoryPipeline` over what the prior node gives."""
+    """Runs `TrajectoryPipeline` on the prior node's stream."""
 
     name = "trajectory"
 
@@ -50,13 +50,13 @@ class TrajectoryNode(Node):
             self.publish(POSE_WORLD, world, delay_ns=round(message.delay_frames * FRAME_NS))
 
     def _pipeline_of(self, source: str) -> TrajectoryPipeline:
-        """The trajectory of a stream; each client has one of its own, by its source."""
+        """The pipeline of a stream. Each client has its own, identified by the message's source."""
         clients = len(self.launch.server.clients)
         if not clients:
             return self._pipeline
         pipeline = self._of_clients.pop(source, None) or make_trajectory(self.launch.table("trajectory"))
         self._of_clients[source] = pipeline
-        if len(self._of_clients) > clients:  # one came back under another name
+        if len(self._of_clients) > clients:  # a client reconnected under another name
             del self._of_clients[next(iter(self._of_clients))]
         return pipeline
 
