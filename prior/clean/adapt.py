@@ -1,4 +1,4 @@
-"""Messages to canonical joints and back: layouts, the sensor's frame, and what no message may bring in."""
+"""Converts messages to canonical joints and back: joint layouts, the sensor's frame, and validation of the input."""
 
 from __future__ import annotations
 
@@ -18,14 +18,13 @@ from steadypose.prior.clean.frame import CleanFrame
 from steadypose.prior.compiled import median
 
 MAX_DISTANCE = 30.0
-"""Metres from the sensor beyond which a joint is no observation."""
+"""Largest distance of a joint from the sensor, metres; joints farther away count as missing."""
 MAX_PLACE = 10_000.0
-"""Metres from the world's origin beyond which no sensor stands: joints lose their millimetres."""
+"""Largest coordinate of a sensor's position, metres; beyond it, float32 joints would lose millimetres."""
 MAX_SIZE, MIN_BONES = 2.5, 4
-"""Least number of observed bones by which a body is refused, and ratio of their median to the mean person's from which
-on it is: nobody is so large."""
+"""Largest median ratio of a body's bone lengths to the mean person's; least number of observed bones to judge it."""
 UNIT_TOLERANCE = 0.01
-"""Largest distance from 1 of the norm of a sensor pose's quaternion."""
+"""Largest deviation from 1 of the norm of a sensor's quaternion."""
 
 _REST_LENGTHS = np.linalg.norm(REST_OFFSETS[1:], axis=1)
 
@@ -43,7 +42,7 @@ class BodyJoints(NamedTuple):
 
 
 def stacked(bodies: Collection[BodyJoints]) -> BodyJoints:
-    """N bodies as one: (N, 22, 3) and (N, 22)."""
+    """Stack N bodies into arrays (N, 22, 3) and (N, 22)."""
     return BodyJoints(
         np.array([body.positions for body in bodies]).reshape(-1, 22, 3),
         np.array([body.confidence for body in bodies]).reshape(-1, 22),
@@ -51,7 +50,7 @@ def stacked(bodies: Collection[BodyJoints]) -> BodyJoints:
 
 
 def layout_of(raw: PoseRaw, counters: Counter[str]) -> Skeleton | None:
-    """The layout of a message's joints, or None, counted, if the message cannot be used."""
+    """Return the layout of a message's joints. If the message cannot be used, count the cause and return None."""
     layout = SKELETONS.get(raw.skeleton)
     if layout is None:
         counters["unknown_skeleton"] += 1
@@ -67,15 +66,14 @@ def layout_of(raw: PoseRaw, counters: Counter[str]) -> Skeleton | None:
 def canonical_bodies(
     raw: PoseRaw, layout: Skeleton, sensor: SensorFrame, counters: Counter[str], *, numbered: bool
 ) -> dict[int, BodyJoints]:
-    """A message's bodies as canonical joints in the world.
+    """Convert a message's bodies to canonical joints in the world.
 
     Args:
         raw: the message.
-        layout: of its joints.
-        sensor: where the sensor stands.
-        counters: what was refused, by cause.
-        numbered: whether bodies are called by their place in the message, for a source that does not know whose body
-            is whose, or by their id.
+        layout: the layout of its joints.
+        sensor: the sensor's frame.
+        counters: counts what is refused, by cause.
+        numbered: whether the result is keyed by index in the message (for a source without stable ids) instead of id.
     """
     bodies: dict[int, BodyJoints] = {}
     for index, body in enumerate(raw.bodies):
@@ -95,7 +93,7 @@ def canonical_bodies(
 
 
 def _canonical(body: RawBody, layout: Skeleton, counters: Counter[str]) -> tuple[Floats, Floats]:
-    """A body's canonical joints in the sensor's frame; what is not finite or too far away is missing."""
+    """Return a body's canonical joints in the sensor's frame, without joints that are not finite or too far away."""
     joints = body.positions.astype(np.float64)
     finite = finite_joints(joints)
     far = finite & (np.abs(np.where(finite[:, None], joints, 0.0)).max(axis=1) > MAX_DISTANCE)
@@ -107,16 +105,16 @@ def _canonical(body: RawBody, layout: Skeleton, counters: Counter[str]) -> tuple
 
 
 def _is_too_large(positions: Floats) -> bool:
-    """Whether joints (22, 3) are nobody's: one such frame would be learned from for seconds."""
+    """Whether joints (22, 3) are too large for a person. One such frame would spoil running estimates for seconds."""
     lengths = np.linalg.norm(positions[1:] - positions[PARENT[1:]], axis=1)
     observed = np.isfinite(lengths)
     return bool(observed.sum() >= MIN_BONES and median(lengths[observed] / _REST_LENGTHS[observed]) > MAX_SIZE)
 
 
 def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int]) -> dict[int, CleanBody]:
-    """The bodies of a moment, by slot, as that sensor sees them; ``ids`` from slots to what they are called.
+    """Return the bodies of a frame by slot, in the sensor's frame. ``ids`` maps slots to body ids.
 
-    One that breaks what `msgs.topics` promises is not among them.
+    Bodies that break the guarantees of `msgs.topics` are left out.
     """
     estimate, score = frame.estimate, frame.score
     bodies: dict[int, CleanBody] = {}
@@ -144,7 +142,7 @@ def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int])
 
 
 def clean_message(raw: PoseRaw, stamp_ns: int, delay_frames: int, bodies: list[CleanBody]) -> PoseClean:
-    """The output for a source of which ``raw`` came last; ``stamp_ns`` is its time, on the source's clock."""
+    """Build a source's output message. ``raw`` is its newest message, ``stamp_ns`` the output's time on its clock."""
     return PoseClean(
         stamp_ns=stamp_ns,
         frame_id=raw.frame_id,
@@ -157,7 +155,7 @@ def clean_message(raw: PoseRaw, stamp_ns: int, delay_frames: int, bodies: list[C
 
 
 def end_of_stream(raw: PoseRaw, delay_frames: int) -> PoseClean:
-    """The last output for a source that has ended with ``raw``."""
+    """Build the last output message of a source whose last message is ``raw``."""
     ended = clean_message(raw, raw.stamp_ns, delay_frames, [])
     ended.end_of_stream = True
     return ended

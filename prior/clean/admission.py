@@ -1,6 +1,6 @@
-"""Outlier rejection of a message's stamp and of its sensor's pose, before its bodies are looked at.
+"""Outlier rejection of message stamps and sensor poses, before the bodies are processed.
 
-One wrong stamp must not end the stream, and one publisher must not be two; one wrong pose must not displace all bodies.
+A single wrong stamp must not end the stream or split it in two. A single wrong pose must not displace all bodies.
 """
 
 from __future__ import annotations
@@ -13,45 +13,46 @@ import numpy as np
 from steadypose.msgs.types import Pose, PoseRaw
 
 LASTING = 3
-"""Messages in a row, of stamps that follow each other, after which a jump of stamps is accepted: a pause, or a clock
-that was set."""
+"""Number of consecutive messages with increasing stamps after which a jump of stamps is accepted. The source paused, or
+its clock was set."""
 SLOWEST_NS = 10_000_000_000
-"""Nanoseconds at most between two stamps of a stream; one that is slower is taken for a pause at every message."""
+"""Longest time between two stamps of a stream, nanoseconds; a slower stream pauses before every message."""
 STEP_M, SPEED = 0.5, 10.0
-"""Metres and m/s: a sensor may have moved by STEP_M + SPEED * elapsed since its last accepted pose; a running robot
-does 4 m/s."""
+"""Largest motion of a sensor since its last accepted pose: STEP_M + SPEED * elapsed, metres and m/s. A running robot
+reaches 4 m/s."""
 TURN, TURN_RATE = 0.5, 10.0
-"""Radians and rad/s: the same of its orientation; a person's head turns at up to 6 rad/s."""
+"""Largest rotation of a sensor since then: TURN + TURN_RATE * elapsed, radians and rad/s. A person's head turns at up
+to 6 rad/s."""
 LASTING_S = 0.2
-"""Seconds after which a suspect pose is accepted: the sensor was moved, or calibrated."""
+"""Time after which a suspect pose is accepted, seconds. The sensor was moved or calibrated."""
 
 
 class StampGate:
-    """Holds messages back whose stamps jump, until it is seen whether the jump lasts.
+    """Holds back messages whose stamps jump until it is clear whether the jump lasts.
 
-    A stream that goes on where it was had one wrong stamp (0, seconds ahead, the year 2037), which is dropped and
-    counted. One that goes on from the new stamp was paused, or its clock was set: then nothing is lost, and the two
-    messages held back come with the third.
+    If the stream continues from the old stamp, the jump was a wrong stamp (0, seconds ahead, the year 2037). The
+    message is dropped and counted. If it continues from the new stamp, the source paused or its clock was set. Then
+    nothing is lost: the two messages held back are released with the third.
 
     Args:
-        timeout_ns: between two stamps of a stream, unless it is slower throughout.
-        back_ns: by which a stamp may be out of order.
-        counters: gets ``stamp_outlier``.
+        timeout_ns: longest time between two stamps of a stream, unless the whole stream is slower.
+        back_ns: by how much a stamp may be out of order.
+        counters: counts ``stamp_outlier``.
     """
 
     def __init__(self, timeout_ns: float, back_ns: int, counters: Counter[str]) -> None:
         self._timeout_ns, self._back_ns, self._counters = timeout_ns, back_ns, counters
         self._last_ns: int | None = None
-        self._step_ns = 0  # between the last two that were admitted
+        self._step_ns = 0  # between the last two admitted stamps
         self._held: list[tuple[PoseRaw, int]] = []
 
     def admit(self, raw: PoseRaw, at_ns: int = 0, *, gap: bool = False) -> list[tuple[PoseRaw, int]]:
-        """The messages that go on with this one, oldest first: none while a jump is looked at.
+        """Return the messages to process now, oldest first; none while a jump is being judged.
 
         Args:
             raw: the newest message.
-            at_ns: when it came; given back with it.
-            gap: whether messages before it were dropped here, so that its stamp may be later than usual.
+            at_ns: its time of arrival, returned with it.
+            gap: whether this node dropped messages before it, so that its stamp may be later than usual.
         """
         if raw.end_of_stream:
             return [*self.release(), (raw, at_ns)]
@@ -66,7 +67,7 @@ class StampGate:
         return self.release() if len(self._held) >= LASTING else []
 
     def release(self) -> list[tuple[PoseRaw, int]]:
-        """The messages that are held, oldest first, as those of a stream that begins with them."""
+        """Return the messages held back, oldest first, as the beginning of a new stream."""
         held, self._held = self._held, []
         if held:
             self._last_ns = None
@@ -87,7 +88,7 @@ class StampGate:
 
 
 class Verdict(Enum):
-    """Outcome for one pose."""
+    """Result of judging one pose."""
 
     ACCEPTED = auto()
     SUSPECT = auto()
@@ -97,7 +98,7 @@ class Verdict(Enum):
 
 
 class SensorPoseGate:
-    """Rejects poses that jump, until the jump has lasted for `LASTING_S`. A still or moving sensor passes unchanged."""
+    """Rejects sensor poses that jump, until the jump has lasted for `LASTING_S`. A still or moving sensor passes."""
 
     def __init__(self) -> None:
         self._accepted: tuple[int, Pose] | None = None
@@ -108,7 +109,7 @@ class SensorPoseGate:
         self._accepted = self._suspect_since_ns = None
 
     def judge(self, pose: Pose, stamp_ns: int) -> Verdict:
-        """Judge the sensor's pose in the frame of ``stamp_ns``, which is later than the last."""
+        """Judge the sensor's pose at ``stamp_ns``, which must be later than the last."""
         if self._accepted is None or _is_near(*self._accepted, stamp_ns, pose):
             self._accepted, self._suspect_since_ns = (stamp_ns, pose), None
             return Verdict.ACCEPTED
@@ -121,7 +122,7 @@ class SensorPoseGate:
 
 
 def _is_near(before_ns: int, before: Pose, after_ns: int, after: Pose) -> bool:
-    """Whether a sensor may have moved from one pose to the other."""
+    """Whether a sensor can have moved from one pose to the other in this time."""
     elapsed_s = (after_ns - before_ns) * 1e-9
     turned = 2.0 * np.arccos(min(abs(float(before.orientation @ after.orientation)), 1.0))
     moved = float(np.linalg.norm(after.position - before.position))

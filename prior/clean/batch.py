@@ -1,12 +1,11 @@
-"""Many streams through one prior, in batches: a frame of all of them goes through each stage together.
+"""Runs the prior over many streams in batches: each stage processes a frame of all streams together.
 
-Bodies of several cameras share the stages' slots as bodies of one camera do; what differs is the clock. Each stream has
-its own, and its frames are stamped by it. So each is resampled to one grid that all share, and a grid time is processed
-when every stream has reached it or `PATIENCE_NS` is over; a stream that is later misses that frame, and holds up no
-other.
+Bodies of several cameras share the stages' slots like bodies of one camera. Only the clocks differ: each stream is
+stamped by its own. All streams are therefore resampled to one shared grid. A grid time is processed when every stream
+has reached it, or after `PATIENCE_NS`. A stream that is later misses that frame and delays no other stream.
 
-The offset from a stream's clock to the server's is the minimum of arrival less capture stamp: clock difference plus the
-least latency of the network. The minimum decays slowly (`DRIFT`), so that it follows clocks that drift.
+The offset from a stream's clock to the server's is the minimum of arrival time minus capture stamp: the clock
+difference plus the least network latency. The minimum decays slowly (`DRIFT`), so that it follows clocks that drift.
 """
 
 from __future__ import annotations
@@ -35,29 +34,29 @@ from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.resample import PERIOD_NS, Resampler
 
 PATIENCE_NS = 2 * PERIOD_NS
-"""Time that a frame waits for the other streams, nanoseconds: a period, as their phases differ, and another for the
-network."""
+"""Longest time that a frame waits for the other streams, nanoseconds: one period for their different phases, and one
+for the network."""
 DRIFT = 200e-6
-"""Largest relative drift between two clocks: twice that of two poor quartz oscillators."""
+"""Largest relative drift between two clocks, twice that of two poor quartz oscillators."""
 LATE_IN_A_ROW = 15
-"""Number of late frames in a row (half a second) after which a stream starts anew: its clock was set, or its latency
+"""Number of late frames in a row after which a stream starts anew (half a second). Its clock was set or its latency
 grew."""
 
 
 @dataclass
 class _Stream:
-    """State of one stream; times are on the server's clock.
+    """State of one stream. Times are on the server's clock.
 
     Attributes:
-        resampler: to the shared grid; its slots are the batch's.
+        resampler: resamples to the shared grid; its slots are those of the batch.
         identify: assigns ids to its bodies; None if the source does.
-        offset_ns: from its clock to the server's.
+        offset_ns: offset from its clock to the server's.
         last: its newest message.
         sensor_pose: outlier rejection of its sensor's pose.
-        time_ns: capture of the newest message.
-        heard_ns: arrival of the newest message.
-        first_ns, newest_ns: the first and the newest grid time with joints of this stream; negative before the first.
-        late: how many of its frames in a row came too late.
+        time_ns: capture time of the newest message.
+        heard_ns: arrival time of the newest message.
+        first_ns, newest_ns: first and newest grid time with joints of this stream; negative before the first.
+        late: number of its frames in a row that came too late.
     """
 
     resampler: Resampler
@@ -73,11 +72,11 @@ class _Stream:
 
 
 class StreamBatch(BodyPipeline[tuple[str, int]]):
-    """The prior for many streams, distinguished by their messages' ``source``.
+    """The prior for many streams, which are distinguished by their messages' ``source``.
 
     Args:
-        settings: of the prior; ``max_bodies`` is the limit of all streams together.
-        max_streams: further ones are refused.
+        settings: settings of the prior; ``max_bodies`` limits all streams together.
+        max_streams: largest number of streams; further ones are refused.
     """
 
     def __init__(self, settings: PriorSettings, max_streams: int) -> None:
@@ -90,17 +89,17 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
 
     @property
     def streams(self) -> int:
-        """How many there are now."""
+        """Number of open streams."""
         return len(self._streams)
 
     def process_at(self, raw: PoseRaw, now_ns: int, *, hurry: bool = False, gap: bool = False) -> list[PoseClean]:
-        """Take a message of any stream, and give the frames of all streams that are then complete, oldest first.
+        """Process a message of any stream and return the frames of all streams that are now complete, oldest first.
 
         Args:
             raw: the message.
-            now_ns: its arrival, on the server's clock.
-            hurry: the node falls behind: skip grid times that are late.
-            gap: as of `PriorPipeline.process`.
+            now_ns: its arrival time, on the server's clock.
+            hurry: whether the node falls behind and should skip grid times that are late.
+            gap: as in `PriorPipeline.process`.
         """
         stamps = self._stamps.pop(raw.source, None) or StampGate(self._timeout_ns, BACKWARDS_NS, self.counters)
         self._stamps[raw.source] = stamps
@@ -113,14 +112,14 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         return cleaned if admitted else self._advance(now_ns, hurry)
 
     def heard(self, source: str, now_ns: int) -> None:
-        """Note that a stream goes on, though its message was dropped by the node."""
+        """Note that a stream continues, although the node dropped its message."""
         if stream := self._streams.get(source):
             stream.heard_ns = now_ns
 
     def _process(self, raw: PoseRaw, now_ns: int, *, hurry: bool, gap: bool) -> list[PoseClean]:
         cleaned: list[PoseClean] = []
         if not gap and self._done_ns is not None and now_ns - self._done_ns > self._timeout_ns + 2 * PATIENCE_NS:
-            cleaned += self.flush()  # all were silent, and start anew
+            cleaned += self.flush()  # all streams were silent and start anew
         for name, stream in list(self._streams.items()):
             if not gap and now_ns - stream.heard_ns > self._timeout_ns and name != raw.source:
                 self.counters["stream_silent"] += 1
@@ -128,7 +127,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         stream = self._streams.get(raw.source)
         if raw.end_of_stream:
             if stream:
-                # of the last message only the sensor's pose is used, and this one's was not looked at
+                # only the sensor's pose of the last message is used, and the pose of this one was not checked
                 stream.last = dataclasses.replace(raw, sensor_pose=stream.last.sensor_pose)
                 stream.heard_ns = now_ns
         else:
@@ -137,11 +136,11 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
                 self._take(raw, layout, now_ns, gap=gap)
         cleaned += self._advance(now_ns, hurry)
         if self._streams and all(stream.last.end_of_stream for stream in self._streams.values()):
-            cleaned += self.flush()  # nobody is left for whose sake there will be another frame
+            cleaned += self.flush()  # all streams have ended, so no further frame will arrive
         return cleaned
 
     def flush(self) -> list[PoseClean]:
-        """The frames that the delay still holds, oldest first; all streams are then forgotten."""
+        """Return the frames that the delay still holds, oldest first, and forget all streams."""
         cleaned = [part for frame in self._core.flush() for part in self._split(frame)]
         for name, stream in list(self._streams.items()):
             if stream.last.end_of_stream:
@@ -153,7 +152,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         return cleaned
 
     def _is_pose_accepted(self, raw: PoseRaw) -> bool:
-        """Whether the message's sensor pose is accepted; a stream whose sensor was moved starts anew."""
+        """Whether the message's sensor pose is accepted. A stream whose sensor was moved starts anew."""
         stream = self._streams.get(raw.source)
         if stream is None or raw.stamp_ns <= stream.last.stamp_ns:
             return True
@@ -193,17 +192,17 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         stream.heard_ns = now_ns
         time_ns = raw.stamp_ns + round(stream.offset_ns)
         if time_ns <= stream.time_ns:
-            # out of order; or the first messages came late, and the clock turns out to be another
+            # out of order, or the clock's offset was overestimated because the first messages came late
             self.counters["stamp_out_of_order"] += 1
             stream.late += 1
             return
         stream.last, stream.time_ns = raw, time_ns
-        # levelled, but observed from where the sensor stands: the streams have no world in common
+        # levelled, with the sensor at the origin, because the streams share no world frame
         sensor = SensorFrame.of(raw.sensor_pose).levelled()
         joints = self._arranged(raw, layout, sensor, stream.identify, lambda body_id: (raw.source, body_id))
         for tick_ns, *ready in stream.resampler.update(time_ns, *joints):
             if self._done_ns is not None and tick_ns <= self._done_ns:
-                # the first frames of a stream, which nobody expected yet, are not late
+                # the first frames of a new stream do not count as late
                 self.counters["late_for_batch"] += stream.first_ns >= 0
                 stream.late += 1
                 continue
@@ -213,7 +212,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             self._waiting.setdefault(tick_ns, []).append(BodyJoints(*ready))
 
     def _advance(self, now_ns: int, hurry: bool) -> list[PoseClean]:
-        """Process the grid times that wait for no further stream."""
+        """Process the grid times that need not wait for any stream."""
         cleaned: list[PoseClean] = []
         if hurry:
             self._catch_up(now_ns)
@@ -231,7 +230,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         return cleaned
 
     def _catch_up(self, now_ns: int) -> None:
-        """Skip grid times that are so late that to work on them would make all others later."""
+        """Skip grid times that are so late that processing them would delay all later ones."""
         if self._done_ns is None:
             return
         late = (now_ns - PATIENCE_NS - self._done_ns) // PERIOD_NS - CATCH_UP
@@ -252,12 +251,12 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         return merged
 
     def _split(self, frame: CleanFrame) -> list[PoseClean]:
-        """A frame of all streams, as one message for each stream that was present."""
+        """Split a frame of all streams into one message for each stream that was present."""
         stamp_ns = self._origin_ns + round(frame.estimate.stamp_s * 1e9)
         cleaned = []
         published: set[int] = set()
         for name, stream in list(self._streams.items()):
-            # stamps were seconds on the way, and may be a nanosecond off the grid
+            # stamps were converted to seconds and back, and may be a nanosecond off the grid
             if not 0 <= stream.first_ns <= stamp_ns + 1000:
                 continue
             if stream.last.end_of_stream and stream.newest_ns < stamp_ns - 1000:

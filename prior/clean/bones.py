@@ -1,14 +1,14 @@
-"""Estimates from bone lengths: this person's bones, and the sensor's bias.
+"""Estimates from bone lengths: the person's bones, and the sensor's bias.
 
-Bones are measured for the first ten seconds, with human proportions as a prior.
+Bones are measured in the first ten seconds, with human proportions as the prior.
 
-The sensor's bias no filter averages out, but it varies the lengths of bones. The observed length of a rigid segment
-varies by the noise that the smoother leaves, whose variance it states, and by the bias: the rest of the variance,
-halved because a bone has two ends, is the bias's variance. Where the mean length differs from the person's bone, or one
-segment varies by more than the others, the sensor's definition of a joint differs from the skeleton's, and that
-segment's length is uncertain. The estimates weigh measured bones against human proportions (`prior.body.bone_lengths`),
-and say how firmly bones hold hidden joints. Moving observed joints onto the bones by them was tried: it gains 0.2 % of
-a Kinect's error, and costs 0.6 mm on a perfect input.
+No filter averages out the sensor's bias, but it changes the lengths of bones. The observed length of a rigid segment
+varies with the noise after smoothing, whose variance the smoother gives, and with the bias. The rest of the length's
+variance, halved because a bone has two ends, is the bias's variance. If the mean length differs from the person's bone,
+or one segment varies by more than the others, the sensor's definition of a joint differs from the skeleton's. The
+length of that segment is then uncertain. The estimates weigh measured bones against human proportions
+(`prior.body.bone_lengths`) and determine how tightly bones constrain hidden joints. Constraining observed joints to the
+bones as well gained 0.2 % of a Kinect's error and cost 0.6 mm on a noise-free input, so they are left alone.
 """
 
 from __future__ import annotations
@@ -29,36 +29,36 @@ from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
 
 MEMORY = round(3.0 * FPS)
-"""Frames of the running moments: long against an error's correlation time of half a second, short against a change of
-sensor."""
+"""Length of the running moments, frames. It is long compared with an error's correlation time of half a second, and
+short compared with a change of sensor."""
 
 PRIOR_FRAMES = round(0.5 * FPS)
-"""Frames for which the expected bias counts, as a prior."""
+"""Weight of the expected bias as the prior, frames."""
 
 JITTER_RATIO = 4.0
-"""Upper bound of the expected bias, as a multiple of the jitter, so that none is expected of a perfect sensor. Of
-a Kinect v2, bones give a bias of 5.5 mm where third differences give a jitter of 0.7 mm (medians of UI-PRMD, s01
-to s06); the gate's estimate of the jitter is larger, as it includes part of the body's motion."""
+"""Upper bound of the expected bias, as a multiple of the jitter, so that a noise-free sensor has none. For a Kinect v2,
+bones give a bias of 5.5 mm and third differences a jitter of 0.7 mm (medians of UI-PRMD, s01 to s06). The gate's
+estimate of the jitter is larger, because it includes part of the body's motion."""
 
 MIN_FRAMES = 3
-"""A length's mean and variance are used only after more frames than this."""
+"""Number of frames after which a length's mean and variance are used."""
 
 UNKNOWN_VARIANCE = 1e-4
-"""m², length variance of a segment seen for no more frames: (1 cm)²."""
+"""Length variance of a segment observed for at most `MIN_FRAMES` frames, m²: (1 cm)²."""
 
 CORRELATION_FRAMES = 5.0
-"""Correlation time of the noise that the smoother leaves, in frames."""
+"""Correlation time of the noise after smoothing, frames."""
 
 MAX_SIGMA = 0.05
-"""Metres along an axis: joints of a larger standard deviation do not count for lengths."""
+"""Largest standard deviation along an axis of a joint that counts for lengths, metres."""
 
 _BONE = np.array([k for k, (end, start) in enumerate(RIGID) if start == PARENT[end]])
 
-_MIN_JOINTS = 8  # with a standard deviation below MAX_SIGMA, for a frame to be sampled
-_GROWTH = 1.5  # the estimate is renewed when the number of samples has grown by this factor
-_SLOTS_PER_RENEWAL = 8  # of so many slots, one is renewed in a frame
-_APPROACH = 0.1  # share of the way to a renewed estimate, per frame: a jump of the bones would shake the whole limb
-_MIN_SAMPLES = 4  # for the bones to count as measured
+_MIN_JOINTS = 8  # least number of joints with a standard deviation below MAX_SIGMA in a sampled frame
+_GROWTH = 1.5  # growth of the number of samples after which the estimate is renewed, factor
+_SLOTS_PER_RENEWAL = 8  # number of slots for each renewal allowed in one frame
+_APPROACH = 0.1  # share of the way to a renewed estimate per frame; a jump of the bones would shake the whole limb
+_MIN_SAMPLES = 4  # least number of samples for the bones to count as measured
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class PersonSettings:
     """Settings of the bones stage.
 
     Attributes:
-        enabled: whether to measure at all; off, every body has a generic adult's bones.
+        enabled: whether to measure bones; if off, every body has a generic adult's bones.
         samples: frames sampled before the estimate is frozen.
         every: frames between two samples, so that their errors are less correlated.
     """
@@ -77,13 +77,13 @@ class PersonSettings:
 
 
 class PersonEstimator:
-    """The bones of every body: `estimate_bones` over frames sampled from its first ten seconds.
+    """Estimates the bones of every body by `estimate_bones`, from frames sampled in its first ten seconds.
 
-    The estimate is renewed whenever the number of samples has grown by half, so that it costs little and settles, and
-    is approached smoothly.
+    The estimate is renewed whenever the number of samples has grown by half, so that it costs little and settles. The
+    bones in use approach it smoothly.
 
     Attributes:
-        current: the bones as of the last frame.
+        current: the bones in use since the last frame.
     """
 
     def __init__(self, settings: PersonSettings, slots: int) -> None:
@@ -109,16 +109,16 @@ class PersonEstimator:
         )
 
     def update(self, smoothed: Smoothed | None, bias_sigma: Floats, present: Bools) -> Person:
-        """Sample the newest estimate of the bodies ``present`` (S,), where it is due, and renew the bones.
+        """Sample the newest estimate of the bodies for which a sample is due, and renew the bones.
 
         Args:
-            smoothed: joints and their standard deviations; None while there is none.
-            bias_sigma: (S,) metres along an axis, the sensor's bias as estimated so far.
-            present: (S,) who is there.
+            smoothed: joints and their standard deviations; None if there is no estimate yet.
+            bias_sigma: (S,) metres along an axis, the sensor's bias estimated so far.
+            present: (S,) which slots hold a body.
         """
         if not self._settings.enabled or smoothed is None:
             return self.current
-        # smoothed positions: noise lengthens bones
+        # smoothed positions, because noise lengthens bones
         known = smoothed.sigma < MAX_SIGMA
         positions = np.where(known[..., None], smoothed.positions, np.nan)
         enough = known.sum(axis=1) >= _MIN_JOINTS
@@ -130,7 +130,7 @@ class PersonEstimator:
             self._wait[slot] = self._settings.every - 1
         full = self._count == self._settings.samples
         renew = (self._count >= _GROWTH * self._used) | (full & (self._count > self._used))
-        # people who came together are due in the same frame: after the first estimate, only a few at a time
+        # people who entered together are due in the same frame; after the first estimate, renew only a few per frame
         stale = np.flatnonzero(renew & (self._count > 0) & present & enough)
         first, later = stale[self._used[stale] == 0], stale[self._used[stale] > 0]
         offsets, variance = self.current.offsets.copy(), self.current.length_variance.copy()
@@ -152,11 +152,11 @@ class PersonEstimator:
 
 
 class SensorBias(NamedTuple):
-    """The sensor's bias, and what it does to lengths.
+    """The sensor's bias, and its effect on lengths.
 
     Attributes:
         bias_sigma: (S,) metres along an axis, estimated from each body.
-        length_variance: (S, R) m², of each segment of `RIGID`: of its observed length about the person's bone.
+        length_variance: (S, R) m², variance of each `RIGID` segment's observed length about the person's bone.
     """
 
     bias_sigma: Floats
@@ -167,8 +167,8 @@ class BiasEstimator:
     """Keeps, for each body, running moments of the lengths of the segments of `RIGID`.
 
     Args:
-        bias_sigma: metres along an axis, the expected bias, at most.
-        slots: bodies.
+        bias_sigma: metres along an axis, upper bound of the expected bias.
+        slots: number of bodies.
 
     Attributes:
         bias_sigma: (S,) metres along an axis, the latest estimate.
@@ -185,12 +185,12 @@ class BiasEstimator:
         self.bias_sigma = np.where(slot, self._expected, self.bias_sigma)
 
     def update(self, smoothed: Smoothed | None, offsets: Floats, jitter: Floats) -> SensorBias:
-        """Take a smoothed frame in, if there is one.
+        """Update the estimate with a smoothed frame, if there is one.
 
         Args:
             smoothed: (S, 22) joints and their standard deviations.
             offsets: (S, 22, 3) metres, the bones in use.
-            jitter: (S,) metres along an axis.
+            jitter: (S,) metres along an axis, the sensor's jitter.
         """
         expected = np.minimum(self._expected, JITTER_RATIO * jitter)
         bias, length = expected.copy(), np.full((len(offsets), len(RIGID)), UNKNOWN_VARIANCE)
@@ -202,7 +202,7 @@ class BiasEstimator:
 
 @njit(cache=True)
 def _estimate(positions, sigma, offsets, expected, moments, bias, length_variance):
-    """As `BiasEstimator.update`; writes ``bias`` (S,) and ``length_variance`` (S, R)."""
+    """Write ``bias`` (S,) and ``length_variance`` (S, R), as described in `BiasEstimator.update`."""
     rest, unexplained = np.zeros((22, 3)), np.empty(len(_BONE))
     for s in range(len(positions)):
         for joint in range(1, 22):

@@ -1,4 +1,4 @@
-"""The stages of the prior in order, for one time step of all bodies together, one slot a body."""
+"""Runs the stages of the prior in order: one time step of all bodies together, each body in its own slot."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
 
 IDLE_S = 3.0
-"""Seconds without a body after which only stamps are kept, in a twentieth of the time: every stage is then as it was
-before the first body."""
+"""Time without a body after which only the stamps advance, seconds. This takes a twentieth of the time, and by then
+every stage is in its initial state."""
 
 UNPUBLISHED_S = 0.5
-"""Seconds that a body may be observed without a publishable estimate, before its state, which then contains NaN, is
+"""Longest time that a body may be observed without a publishable estimate, seconds. Its state then contains NaN and is
 reset."""
 
 
 class _Newest(NamedTuple):
-    """Results of the newest frame, for it and for those still to be published.
+    """Results of the newest frame, used for it and for the frames that are still to be published.
 
     Attributes:
         gated: the frame.
         present: (S,) which slots hold a body.
-        person: their bones.
-        bias: of the sensor, as estimated by then.
-        left_out: (S,) metres along an axis, what the smoother's deviations leave out of the sensor's error.
+        person: the bodies' bones.
+        bias: the sensor's bias, estimated up to this frame.
+        left_out: (S,) metres along an axis, the part of the sensor's error that the smoother's deviations omit.
         rotations: (K, S, 22, 3, 3) local, of the last frames.
         score: of the newest frame.
-        imputed: the last frames, completed; None without that stage.
+        imputed: the last frames, completed; None if the impute stage is off.
     """
 
     gated: Gated
@@ -60,16 +60,16 @@ class _Newest(NamedTuple):
 
 
 class CleanCore:
-    """From observations to clean frames, ``settings.delay`` later. Each stage keeps its own state, by slot.
+    """Turns observations into clean frames, ``settings.delay`` frames later. Each stage keeps its own state, by slot.
 
-    Nothing here reads a clock or draws a random number: the same input gives the same output, bit for bit.
+    It reads no clock and draws no random number: the same input gives the same output, bit for bit.
 
     Args:
         settings: of the prior.
-        counters: gets numbers of joints and frames refused or skipped, by cause.
+        counters: counts refused joints and skipped frames, by cause.
 
     Attributes:
-        fuse: the last stage.
+        fuse: the stage before orient; public because training records its candidates.
     """
 
     def __init__(self, settings: PriorSettings, counters: Counter[str]) -> None:
@@ -103,11 +103,11 @@ class CleanCore:
 
     @property
     def sensor_noise(self) -> SensorNoise | None:
-        """The latest estimate of the sensor's error, the median over the bodies present; None before the first."""
+        """The latest estimate of the sensor's error: the median over the bodies present. None before the first body."""
         return self._noise and SensorNoise(*(float(np.median(sigma)) for sigma in self._noise))
 
     def step(self, observation: Observation) -> CleanFrame | None:
-        """Take in a frame of the grid; returns the output for the one ``delay`` before, or None while there is none."""
+        """Process a frame of the grid; return the output for the frame ``delay`` earlier, or None if there is none."""
         self._nobody = 0 if observation.present.any() else self._nobody + 1
         if self._last and self._nobody > IDLE_S * FPS:
             stamp_s = self._smooth.skip(observation.stamp_s)
@@ -116,7 +116,7 @@ class CleanCore:
         return self._last
 
     def _through_stages(self, observation: Observation) -> CleanFrame | None:
-        # of the frame before: all that is fed back
+        # the previous frame's estimates: the only feedback between frames
         person, bias_sigma, present = self._person.current, self._bias.bias_sigma, observation.present
         gated = self._gate.update(observation)
         if self._correct:
@@ -133,7 +133,7 @@ class CleanCore:
         person = self._person.update(smoothed, bias.bias_sigma, present)
         score = Score.unscored(len(present))
         if self._score:
-            # bones do not show all of a sensor's bias: at least the expected one is assumed, lest it be a fault
+            # Bones show only part of the bias. Assume at least the expected bias, so that it is not flagged as a fault.
             sigma = np.hypot(gated.jitter, np.maximum(bias.bias_sigma, self._bias_sigma))
             score = self._score.update(windows, gated.frozen, sigma)
         imputed = impute(windows, gated.jitter, self._delay + 1) if self._imputes else None
@@ -144,7 +144,7 @@ class CleanCore:
         return None if smoothed is None else self._fused(smoothed, newest, self._delay)
 
     def flush(self) -> list[CleanFrame]:
-        """The output for the frames that the delay still holds, oldest first."""
+        """Return the output for the frames that the delay still holds, oldest first."""
         newest, self._newest = self._newest, None
         self._nobody, self._last = 0, None
         if newest is None:
@@ -178,7 +178,7 @@ class CleanCore:
             self.forget(invalid)
 
     def _fused(self, smoothed: Smoothed, newest: _Newest, back: int) -> CleanFrame:
-        """The output for the frame ``back`` before the newest."""
+        """Return the output for the frame ``back`` frames before the newest."""
         at, imputed = -1 - back, newest.imputed
         estimate = self.fuse.fuse(
             smoothed,

@@ -1,6 +1,6 @@
-"""The values that the stages of the pipeline pass to each other, frozen.
+"""Frozen values that the stages of the pipeline pass to each other.
 
-S slots hold one body each; coordinates are world-aligned (z up), in metres and seconds.
+Each of the S slots holds one body. Coordinates are world-aligned (z up), in metres and seconds.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ class SensorNoise:
     """A sensor's error, as standard deviations along an axis.
 
     Attributes:
-        jitter_sigma: metres, independent from frame to frame, of a joint of full confidence.
-        bias_sigma: metres, the bias: constant or slowly varying, so that no filter averages it out.
+        jitter_sigma: metres, the error of a fully confident joint that is independent from frame to frame.
+        bias_sigma: metres, the constant or slowly varying error, which no filter averages out.
     """
 
     jitter_sigma: float
@@ -38,8 +38,8 @@ class Observation:
         stamp_s: seconds since the stream began.
         positions: (S, 22, 3) canonical joints; NaN where unobserved.
         confidence: (S, 22) in 0..1.
-        present: (S,) which slots hold a body, seen in this frame or within the timeout.
-        sensor_position: (3,) of the sensor.
+        present: (S,) which slots hold a body that was observed in this frame or within the timeout.
+        sensor_position: (3,) metres, position of the sensor.
     """
 
     stamp_s: float
@@ -55,8 +55,8 @@ class Gated:
 
     Attributes:
         observation: the input.
-        positions: (S, 22, 3) metres; NaN where unobserved or refused.
-        jitter: (S,) metres along an axis, estimated for each body.
+        positions: (S, 22, 3) metres; NaN where unobserved or rejected.
+        jitter: (S,) metres along an axis, noise that is independent from frame to frame, estimated for each body.
         frozen: (S, 22) joints for which the tracker repeats its last output.
     """
 
@@ -68,12 +68,12 @@ class Gated:
 
 @dataclass(frozen=True)
 class BodyWindows:
-    """The windows of the bodies present, observed and reconstructed by HG-VAE.
+    """The windows of the bodies present: as observed, and as HG-VAE reconstructs them.
 
     Attributes:
         slots: (B,) of the bodies.
         tracks: the observed windows, each in its body's frame.
-        size: (B,) of the bodies, as `body_size` gives it.
+        size: (B,) size of each body (`body_size`).
         reconstruction: (B, 66, T) mean and standard deviation.
     """
 
@@ -89,9 +89,9 @@ class Person:
 
     Attributes:
         offsets: (S, 22, 3) metres, each joint in its parent's frame.
-        length_variance: (S, 22) metres^2, of each bone's length that further measurements will reduce; 0 for the
-            generic adult's.
-        measured: (S,) whether these are the person's own bones, or still a generic adult's.
+        length_variance: (S, 22) metres^2, the part of each bone length's variance that further measurements will
+            reduce; 0 for a generic adult.
+        measured: (S,) True for the person's own bones, False for a generic adult's.
     """
 
     offsets: Floats
@@ -110,8 +110,8 @@ class Score:
 
     Attributes:
         anomaly: (S,) of the last half second; NaN if not scored.
-        flag: (S,) whether the anomaly is above its threshold, with hysteresis.
-        joint_anomaly: (S, 22) on the same scale; NaN where not seen.
+        flag: (S,) whether the anomaly exceeds its threshold, with hysteresis.
+        joint_anomaly: (S, 22) on the same scale; NaN where unobserved.
     """
 
     anomaly: Floats
@@ -120,12 +120,12 @@ class Score:
 
     @classmethod
     def unscored(cls, slots: int) -> Score:
-        """NaN and no flag, in every slot."""
+        """A score of NaN and a cleared flag in every slot."""
         return cls(np.full(slots, np.nan), np.zeros(slots, dtype=bool), np.full((slots, 22), np.nan))
 
 
 class Imputed(NamedTuple):
-    """The last K frames of every body as completed by HG-VAE, the newest last.
+    """The last K frames of every body, completed by HG-VAE, oldest first.
 
     Attributes:
         positions: (K, S, 22, 3) metres; NaN for a body without hidden joints.
@@ -143,7 +143,7 @@ class Estimate:
     Attributes:
         stamp_s: seconds since the stream began.
         positions: (S, 22, 3) metres; NaN for a body without an estimate.
-        rotations: (S, 22, 3, 3) local, for these positions.
+        rotations: (S, 22, 3, 3) local rotations that match these positions.
         offsets: (S, 22, 3) metres, the person's bones.
         sigma: (S, 22) metres, standard deviation along an axis.
         state: (S, 22) `JointState`.
@@ -163,9 +163,9 @@ class CleanFrame:
 
     Attributes:
         estimate: of the joints.
-        score: as of the newest frame, ``delay`` later.
-        observed: (S, 22, 3) metres, the input of that time step; NaN where unobserved.
-        confidence: (S, 22) of the input.
+        score: the anomaly of the newest frame, which is ``delay`` frames later.
+        observed: (S, 22, 3) metres, the input of the time step; NaN where unobserved.
+        confidence: (S, 22) confidence of the input.
     """
 
     estimate: Estimate

@@ -1,4 +1,4 @@
-"""The fuse stage: smoothed joints, the prior's estimate of the hidden ones, this person's bones, and the deviations."""
+"""The fuse stage: combines smoothed joints, the prior's estimates of hidden joints, and the person's bone lengths."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from steadypose.prior.timing.kalman import Smoothed
 
 @dataclass(frozen=True)
 class FuseSettings:
-    """Settings of the fuse stage. Lengths are standard deviations along one axis.
+    """Settings of the fuse stage. Standard deviations are along one axis.
 
     Attributes:
-        enabled: whether to fuse; off, the body stands as the refinement model decoded it, where its pelvis was seen.
-        prior_sigma: metres, of a joint placed by the refinement model, when its body is well seen.
-        prior_drift: m/s, how fast that grows for a joint that is not seen.
-        fade: seconds after which a joint that is neither seen nor completed within `MAX_SIGMA` is unknown.
+        enabled: whether to fuse; if off, the body has the decoded rotations, translated to fit the observed joints.
+        prior_sigma: metres, standard deviation of a joint placed by the decoded rotations in a well observed body.
+        prior_drift: m/s, growth of this deviation for an unobserved joint.
+        fade: seconds after which a joint that is neither observed nor completed within `MAX_SIGMA` is unknown.
         weights: weight set of the occlusion network, or a path to a ``.safetensors`` file.
     """
 
@@ -41,26 +41,27 @@ class FuseSettings:
 
 
 MAX_SIGMA = 0.25
-"""Metres along an axis: a completed joint is known while its standard deviation is at most this, however long it was
-not seen."""
+"""Largest standard deviation along an axis at which a completed joint counts as known, metres. How long it has been
+hidden does not matter."""
 
 DERIVED_SIGMA = 0.025
-"""Metres along an axis: deviation of a joint that the sensor does not have and that follows from those around it, as a
-spine from hips and shoulders (validation: 0.019 to 0.028 of a spine, 0.016 to 0.023 of collars)."""
+"""Standard deviation along an axis of a joint that the sensor lacks and that its neighbours determine, metres. For
+example, hips and shoulders determine the spine (validation: 0.019 to 0.028 for spine joints, 0.016 to 0.023 for
+collars)."""
 
 _NEAR = 1 / (1 + BONES_BETWEEN) ** 2
-"""(22, 22) weight of one joint's error in the correction of another, by the bones between them"""
+"""(22, 22) weight of one joint's error in the correction of another, from the number of bones between them."""
 
 _MIN_VARIANCE = 1e-10
-"""m^2: a hundredth of a millimetre"""
+"""Least variance of a position, m²: a hundredth of a millimetre squared."""
 
 
 class Precision(NamedTuple):
     """Inverse variances of each joint's position along an axis, 1/m^2, (S, 22).
 
     Attributes:
-        seen: the smoother.
-        prior: the prior.
+        seen: precision of the smoother.
+        prior: precision of the prior.
     """
 
     seen: Floats
@@ -70,13 +71,13 @@ class Precision(NamedTuple):
 class Fuse:
     """Fuses observed joints with the prior's estimates of the hidden ones.
 
-    An observed joint keeps its smoothed and denoised position. A hidden one is the weighted mean of the smoother's, the
-    completed and the held position (`OccludedJoints`); without a completion, or between joints that are seen where the
-    sensor does not have it, it follows from the observed ones by the decoded rotations. Bone lengths are constrained as
-    far as they are known.
+    An observed joint keeps its smoothed and denoised position. A hidden joint gets the weighted mean of several
+    candidates (`OccludedJoints`). A joint without a completion, and a joint that the sensor lacks between observed
+    ones, follows from the observed joints by the decoded rotations. Bone lengths are constrained as far as they are
+    known.
 
     Attributes:
-        occluded: estimates the hidden joints; None if nothing is to be fused.
+        occluded: estimates the hidden joints; None if fusion is off.
     """
 
     def __init__(self, settings: FuseSettings, slots: int) -> None:
@@ -100,18 +101,18 @@ class Fuse:
         present: Bools,
         track: Track,
     ) -> Estimate:
-        """The estimate of one frame; frames are to be given in order.
+        """Return the estimate of one frame. Call it with frames in order.
 
         Args:
             smoothed: the joints, smoothed and denoised.
-            person: whose bones.
-            slow_error: of the sensor, as estimated so far.
-            rotations: (S, 22, 3, 3) local, of the body as far as it is not seen.
-            imputed: (S, 22, 3) and (S, 22), that frame as HG-VAE completes it; None without it.
-            unseen_s: (S, 22) seconds for which each joint had not been seen by then.
-            seen_later: (S, 22) whether each was seen in one of the frames since.
+            person: the bodies' bones.
+            slow_error: the sensor's bias, estimated so far.
+            rotations: (S, 22, 3, 3) local, for joints that are not observed.
+            imputed: (S, 22, 3) and (S, 22), the frame completed by HG-VAE; None if the impute stage is off.
+            unseen_s: (S, 22) seconds since each joint was last observed, at this frame.
+            seen_later: (S, 22) whether each joint was observed in a later frame within the delay.
             present: (S,) which slots hold a body.
-            track: the observations before and since.
+            track: the observations before and after this frame.
         """
         s = self._settings
         slots, count = np.flatnonzero(present), len(present)
@@ -123,7 +124,7 @@ class Fuse:
         body, fitted = place_joints(decoded, offsets), decoded
         well = _align(body, seen, precision)
         if self.occluded:
-            # Hidden joints follow from the observed ones by the prior's rotations.
+            # hidden joints follow from the observed ones by the prior's rotations
             placed = solve_pose(well, offsets, decoded)[1]
             body = np.where(np.isfinite(well[:, :1, :1]), placed, body)
             completed_sigma = None
@@ -139,11 +140,12 @@ class Fuse:
                 body[row, joint] = occluded.positions
                 precision.seen[row, joint], precision.prior[row, joint] = 0.0, 1.0 / np.square(occluded.sigma)
                 known[row, joint] |= occluded.sigma <= MAX_SIGMA
-            # of a frame that was lost whole, the smoother knows more
+            # if no joint of a frame was observed, the smoother is more accurate than the prior
             here = (unseen <= unseen.min(axis=1, keepdims=True)) & np.isfinite(deviation)
             variance = _merge(body, seen, here, precision)
             length_variance = slow_error.length_variance[slots] + _of_rigid(person.length_variance[slots])
-            # nor between two observations that are near: put on its bones for a frame or two, a joint would flicker
+            # Joints between two observations close in time do not move either. Constraining a joint to its bones for a
+            # frame or two would make it flicker.
             stays = here | (seen_later[slots] & (unseen < BRIEF_S))
             body = fit_lengths(body, offsets, np.where(stays, _MIN_VARIANCE, variance), length_variance)
             fitted = solve_pose(body, offsets, decoded)[0]
@@ -161,7 +163,8 @@ class Fuse:
 
 
 def _of_rigid(length_variance: Floats) -> Floats:
-    """(B, R) of `RIGID`, of what is of bones (B, 22): what is rigid across two bones varies by both."""
+    """(B, R) variance of each `RIGID` segment, from that of bones (B, 22). A segment across two bones varies with
+    both."""
     end, start = RIGID.T
     across = np.where(PARENT[end] == start, 0.0, length_variance[:, start])
     return length_variance[:, end] + across
@@ -179,13 +182,14 @@ def _states(unseen_s: Floats, known: Bools) -> NDArray[np.uint8]:
 
 
 # ---------------------------------------------------------------------------------------------------------------
-# Compiled: of S bodies, `seen` (S, 22, 3) is where the smoother has the joints, NaN of those it knows nothing of,
-# `unseen_s` (S, 22) for how many seconds they were not seen, `body` (S, 22, 3) where the prior has them.
+# Compiled loops over S bodies. `seen` (S, 22, 3) are the smoother's positions, NaN where it has none. `unseen_s` (S,
+# 22) are the seconds since each joint was last observed. `body` (S, 22, 3) are the prior's positions.
 
 
 @njit(cache=True)
 def _unseen_of_subtree(unseen_s):
-    """(S, 22) for how long neither a joint nor any below it was seen: a joint between two seen is held by them."""
+    """(S, 22) seconds since a joint or any joint below it was observed: observed neighbours determine the joint
+    between."""
     least = unseen_s.copy()
     for row in range(len(least)):
         for joint in range(least.shape[1] - 1, 0, -1):
@@ -196,13 +200,14 @@ def _unseen_of_subtree(unseen_s):
 
 @njit(cache=True)
 def _inverse(variance):
-    """Of what is 0, that of `_MIN_VARIANCE`: settings may say that a sensor or the prior is never wrong."""
+    """Invert a variance of at least `_MIN_VARIANCE`. Settings may give the sensor or the prior a deviation of 0."""
     return 1.0 / max(variance, _MIN_VARIANCE)
 
 
 @njit(cache=True)
 def _weigh(deviation, held_s, bias_sigma, prior_sigma, prior_drift, fade):
-    """Inverse variances of the smoother, of ``deviation`` (S, 22), and of the prior: the parts of `Precision`."""
+    """Return the parts of `Precision`: inverse variances of the smoother, from ``deviation`` (S, 22), and of the
+    prior."""
     seen, prior = np.empty_like(deviation), np.empty_like(deviation)
     for row in range(len(deviation)):
         for joint in range(deviation.shape[1]):
@@ -214,10 +219,10 @@ def _weigh(deviation, held_s, bias_sigma, prior_sigma, prior_drift, fade):
 
 @njit(cache=True)
 def _align(body, seen, precision):
-    """Translate each body, in place, to the weighted least squares fit to all observed joints, not to the pelvis alone.
+    """Translate each body, in place, to the weighted least squares fit to all observed joints, not only to the pelvis.
 
     Returns:
-        (S, 22, 3) the joints of which the smoother is more precise than the prior; NaN of the others.
+        (S, 22, 3) the joints for which the smoother is more precise than the prior; NaN for the others.
     """
     well = np.full_like(seen, np.nan)
     for row in range(len(body)):
@@ -239,7 +244,8 @@ def _align(body, seen, precision):
 
 @njit(cache=True)
 def _between(unseen_s):
-    """(S, 22) which joints lie between some that the sensor has: on at least two sides of each, one was seen."""
+    """(S, 22) which joints lie between joints that the sensor has: a joint was observed on at least two sides of
+    each."""
     between = np.zeros(unseen_s.shape, dtype=np.bool_)
     below = np.empty(unseen_s.shape[1], dtype=np.int64)
     for row in range(len(unseen_s)):
@@ -261,10 +267,10 @@ def _between(unseen_s):
 
 @njit(cache=True)
 def _completable(unseen_s, completed):
-    """(S, 22) which joints are hidden and completed.
+    """(S, 22) which joints are hidden and get a completion.
 
-    Joints that the sensor does not have are left out where they lie between two that it has, which give their place
-    better. So are frames that were lost whole, of which the smoother knows more.
+    Two groups are excluded. The neighbours of a joint that the sensor lacks determine it better, if it lies between
+    joints that the sensor has. In frames without any observation, the smoother is more accurate.
     """
     hidden, between = np.zeros(unseen_s.shape, dtype=np.bool_), _between(unseen_s)
     for row in range(len(unseen_s)):
@@ -278,8 +284,7 @@ def _completable(unseen_s, completed):
 
 @njit(cache=True)
 def _complete(body, completed, seen, unseen_s, hidden, precision):
-    """Set ``hidden`` joints (S, 22) to HG-VAE's completion, corrected by its mean error at the observed joints near
-    them."""
+    """Set ``hidden`` joints (S, 22) to HG-VAE's completion, corrected by its mean error at nearby observed joints."""
     joints = body.shape[1]
     for row in range(len(body)):
         for joint in range(joints):
@@ -299,8 +304,10 @@ def _complete(body, completed, seen, unseen_s, hidden, precision):
 
 @njit(cache=True)
 def _merge(body, seen, here, precision):
-    """Set joints ``here`` (S, 22) to the smoother's position, others to the mean of smoother and body; returns the
-    variance (S, 22) of that mean."""
+    """Merge the smoother's positions into the body, in place, and return the variance (S, 22) of the weighted mean.
+
+    Joints ``here`` (S, 22) get the smoother's position, the others the weighted mean of smoother and body.
+    """
     variance = 1.0 / (precision.seen + precision.prior)
     for row in range(len(body)):
         for joint in range(body.shape[1]):
@@ -313,8 +320,11 @@ def _merge(body, seen, here, precision):
 
 @njit(cache=True)
 def _stated(unseen_s, deviation, precision, derived):
-    """(S, 22) standard deviations. Of a hidden joint, smoother and prior know the same past, so that their errors are
-    dependent: the smaller deviation of the two is stated. That of joints ``derived`` (S, 22) is `DERIVED_SIGMA`."""
+    """(S, 22) standard deviations of the output.
+
+    For a hidden joint, the errors of smoother and prior are dependent, as both use the same past. The smaller deviation
+    of the two is used. Joints ``derived`` (S, 22) have `DERIVED_SIGMA`.
+    """
     sigma = np.empty_like(unseen_s)
     for row in range(len(sigma)):
         for joint in range(sigma.shape[1]):

@@ -1,4 +1,4 @@
-"""The gate stage: rejects jumps, impossible bone lengths, exchanged limbs and frozen joints."""
+"""The gate stage: rejects jumps, impossible bone lengths and frozen joints, and swaps exchanged limbs back."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ class GateSettings:
     """Thresholds of the gate.
 
     Attributes:
-        enabled: off, all observed joints pass.
-        jump: metres that a joint may be from its prediction, in addition to three standard deviations of it.
-        patience: seconds after which a joint that is refused (or a limb that is exchanged) throughout is accepted.
-        min_confidence: joints below it are unobserved.
+        enabled: whether to reject outliers; if off, all observed joints pass.
+        jump: metres that a joint may be from its prediction, in addition to three standard deviations of the
+            prediction.
+        patience: seconds after which a joint that is rejected (or a limb that is exchanged) in every frame is accepted.
+        min_confidence: joints of lower confidence count as unobserved.
     """
 
     enabled: bool = True
@@ -36,26 +37,27 @@ class GateSettings:
     min_confidence: float = 0.1
 
 
-# limbs that detectors exchange: whole arms and whole legs, on both sides
+# limbs whose sides detectors exchange: whole arms and whole legs
 _EXCHANGED = tuple(np.concatenate(limbs(chain)) for chain in (("elbow", "wrist"), ("knee", "ankle", "foot")))
-# Shoulders or hips, which detectors exchange with them, or not.
+# shoulders and hips, which detectors may or may not exchange with the limb
 _BASES = tuple(np.concatenate(limbs((joint,))) for joint in ("shoulder", "hip"))
-_SWAP_APART = 0.15  # metres between prediction and observation, mean of a limb's joints, for an exchange to be tested
-_SWAP_BETTER = 0.4  # an exchange must reduce that distance to this share
-_JUMP_FACTOR = 7.0  # times the jitter: one observation in a thousand is further from its prediction
-_JITTER_FRAMES = 15  # of the running mean of the jitter
-_UNIT_DISTANCE = 2.6  # median distance to this filter's prediction, of white noise of 1 along each axis
-_MEAN_FRAMES, _MEAN_FACTOR = 9, 3.0  # of a joint's running mean distance to its prediction; and multiple of it
-_HIDDEN_SPEED = 4.0  # m/s that a joint at rest may reach while it is hidden
-_BODY_JUMP = 0.5  # if a larger share of the joints jumps at once, the body did (a new track, a gap), not the joints
+_SWAP_APART = 0.15  # least mean distance of a limb's joints to their predictions to test for an exchange, metres
+_SWAP_BETTER = 0.4  # share to which an exchange must reduce that distance
+_JUMP_FACTOR = 7.0  # threshold in multiples of the jitter; one observation in a thousand exceeds it
+_JITTER_FRAMES = 15  # length of the running mean of the jitter, frames
+_UNIT_DISTANCE = 2.6  # median distance to the filter's prediction in white noise with sigma 1 along each axis
+_MEAN_FRAMES, _MEAN_FACTOR = 9, 3.0  # length of a joint's running mean distance, frames; threshold as multiple of it
+_HIDDEN_SPEED = 4.0  # speed that a joint at rest may reach while it is hidden, m/s
+_BODY_JUMP = 0.5  # share of joints that jump at once above which the whole body jumped (a new track, a gap)
 
 
 class Gate:
-    """Outlier rejection: a refused joint becomes unobserved, exchanged limbs are put back.
+    """Outlier rejection. A rejected joint becomes unobserved; the sides of exchanged limbs are swapped back.
 
-    Predictions are those of a constant-velocity Kalman filter, updated with what passes. A joint far from its own that
-    kept the lengths of its bones moved, where lengths show it. No jump is refused for longer than ``patience``: then
-    the prediction is wrong, not the sensor. Bone lengths are tested by `BoneOutliers`.
+    A constant-velocity Kalman filter, updated with the accepted joints, predicts each joint. A joint far from its
+    prediction is still accepted if its bones kept their lengths and the sensor's bone lengths are constant enough to
+    tell (`BoneOutliers`). No jump is rejected for longer than ``patience``: by then the prediction is wrong, not the
+    sensor.
     """
 
     def __init__(self, settings: GateSettings, slots: int, counters: Counter[str]) -> None:
@@ -86,7 +88,7 @@ class Gate:
         self._swapped[slot] = 0
 
     def update(self, observation: Observation) -> Gated:
-        """The newest frame, without refused joints."""
+        """Return the newest frame without rejected joints."""
         s = self._settings
         self._observed.push(observation.positions)
         positions = observation.positions.copy()
@@ -108,14 +110,14 @@ class Gate:
         return Gated(observation, positions, self._jitter.copy(), frozen)
 
     def _reject(self, positions: Floats, expected: Smoothed, distance: Floats) -> None:
-        """Put exchanged limbs back, and set refused joints to NaN, in place."""
+        """Swap exchanged limbs back and set rejected joints to NaN, in place."""
         s = self._settings
         known = np.isfinite(expected.positions[..., 0])
         if (distance > _SWAP_APART).any() or self._swapped.any():
             self._exchange(positions, expected.positions, known)
             distance = _apart(positions, expected.positions)
         seen = np.isfinite(positions[..., 0])
-        # a limb in violent motion is far from its prediction all the time, a joint that jumps only once
+        # a fast limb is far from its prediction in every frame, a joint that jumps only once
         least = np.maximum(np.maximum(s.jump, _JUMP_FACTOR * self._jitter)[:, None], _MEAN_FACTOR * self._mean_distance)
         self._mean_distance += np.where(seen & known, distance - self._mean_distance, 0.0) / _MEAN_FRAMES
         # a joint may have changed its velocity while it was hidden
@@ -129,7 +131,7 @@ class Gate:
         self._restart(overruled)
         self._refused[overruled] = 0
         refused = jumped & ~overruled
-        # of the bone between a joint that jumped and one that did not, the one that did not is right
+        # bones are tested without joints that jumped, so that their neighbours are not rejected too
         refused |= self._bones.update(np.where(refused[..., None], np.nan, positions))
         if refused.any():
             self._counters["joints_refused"] += int(refused.sum())
@@ -138,8 +140,7 @@ class Gate:
     def _measure_jitter(self, distance: Floats) -> None:
         """Update the jitter from the median of a body's distances (S, 22) between joints and predictions.
 
-        The median, so that a limb in violent motion, or a joint that jumps, does not count. Noise that is correlated
-        over frames does not show here; it belongs to the bias.
+        The median ignores fast limbs and joints that jump. Time-correlated noise does not show here; it counts as bias.
         """
         jitter = _median_by_row(distance) / _UNIT_DISTANCE
         for slot in np.flatnonzero(np.isfinite(jitter)):
@@ -151,7 +152,7 @@ class Gate:
             self._filter.forget(joints)
 
     def _exchange(self, positions: Floats, expected: Floats, known: Bools) -> None:
-        """Put exchanged limbs back: those of which both sides are nearer to the other's prediction."""
+        """Swap back limbs whose two sides are each nearer to the other side's prediction."""
         for k, pair in enumerate(_EXCHANGED):
             keep, swap = _kept_and_exchanged(positions, expected, pair)
             with np.errstate(invalid="ignore"):  # a limb with a joint unseen compares as False
@@ -173,7 +174,8 @@ class Gate:
 
 
 def _kept_and_exchanged(positions: Floats, expected: Floats, pair: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """(S,) metres, mean distances of the joints ``pair`` of both sides to their predictions: as they are, exchanged."""
+    """(S,) metres, mean distances of the joints ``pair`` of both sides to their predictions, as observed and
+    exchanged."""
     return (
         _apart(positions[:, pair], expected[:, pair]).mean(axis=1),
         _apart(positions[:, MIRROR[pair]], expected[:, pair]).mean(axis=1),
@@ -201,7 +203,7 @@ def _apart(a, b):
 
 @njit(cache=True)
 def _median_by_row(distance):
-    """(S,) median of the finite values of each row; NaN where there is none."""
+    """(S,) median of each row's finite values; NaN if it has none."""
     middle, known = np.full(len(distance), np.nan), np.empty(distance.shape[1])
     for row in range(len(distance)):
         count = 0

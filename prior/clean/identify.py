@@ -1,9 +1,9 @@
-"""Stable ids: multi-person tracking by position and bone lengths.
+"""The identify stage: multi-person tracking by position and bone lengths, which gives people stable ids.
 
-For sources that number the bodies of each frame anew (detectors), or give a person who was hidden a new number.
-Multi-target tracking by a sequence of best assignments; scores are log-likelihood ratios of "the same person" against
+It serves sources that number the bodies of each frame anew (detectors), or that give a person a new number after an
+occlusion. Each frame solves one assignment problem. The scores are log-likelihood ratios of "the same person" against
 "somebody else", as in multiple-hypothesis tracking (Blackman, "Multiple Hypothesis Tracking For Multiple Target
-Tracking", IEEE AES Magazine 19(1), 2004, section II.C), and pairs with a score below 0 are not made.
+Tracking", IEEE AES Magazine 19(1), 2004, section II.C). Pairs with a score below 0 are not matched.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class IdentifySettings:
     """Settings of the identify stage.
 
     Attributes:
-        enabled: whether ids are assigned here and the source's ignored; off, the source's are passed on.
+        enabled: whether to assign ids here and ignore the source's; if off, the source's ids are passed on.
         birth: seconds for which an unknown body must be observed before it gets an id.
-        death: seconds without an observation after which a person is forgotten, and gets a new id on return.
+        death: seconds without an observation after which a person is forgotten. On return, the person gets a new id.
     """
 
     enabled: bool = False
@@ -34,7 +34,7 @@ class IdentifySettings:
     death: float = 5.0
 
     def __post_init__(self) -> None:
-        # a track that is dropped before it may be matched by position alone could never be continued
+        # a shorter `death` would drop tracks that can still be matched by position
         for name, least in (("birth", 0.0), ("death", RECENT_S)):
             if not least <= getattr(self, name) < 60.0:
                 raise ValueError(
@@ -43,35 +43,36 @@ class IdentifySettings:
 
 
 RECENT_S = 0.25
-"""Time since a body was observed up to which it is matched by position from frame to frame, seconds; after longer, it
-must be recognised."""
+"""Longest time without an observation after which a body is still matched by position alone, seconds. Later, it must be
+recognised."""
 ACCELERATION = 1.0
-"""m²/s³, density of the white acceleration noise of a visible body."""
+"""Spectral density of a visible body's white acceleration noise, m²/s³."""
 SPEED, SPEED_MEMORY_S = 0.6, 1.0
-"""m/s and seconds: standard deviation and correlation time of the velocity of a body out of sight, an
-Ornstein-Uhlenbeck process: a person who stops behind a pillar must not be expected in the next room."""
+"""Standard deviation and correlation time of the velocity of a body out of sight, m/s and seconds. The velocity is an
+Ornstein-Uhlenbeck process, so a person who stops behind a pillar is not predicted into the next room."""
 PLACE_SIGMA, HEIGHT_SIGMA = 0.1, 0.3
-"""Standard deviation of a body's position in one frame along an axis, and upper bound of that of its height while it is
-not observed, metres."""
+"""Standard deviation along an axis of a body's position in one frame, and upper bound of the standard deviation of its
+height while it is unobserved, metres."""
 NEWCOMERS = 0.01
-"""Density of new people per m³, relative to one person who reappears (a tenth in a room of 20 m²)."""
+"""Density of new people relative to one person who reappears, 1/m³ (a tenth of a person in a room of 20 m²)."""
 LENGTH_SIGMA, LENGTH_MEMORY_S = 0.05, 1.0
 """Standard deviation (metres) and correlation time (seconds) of the error of an observed bone length."""
 LENGTH_SPREAD = 0.1
 """Standard deviation of a bone's length between people, relative to its length."""
 LENGTH_DOUBT = 3.0
-"""Lower bound (negative) of one bone's log-likelihood ratio: an outlier is never less likely than this."""
+"""Largest amount by which one bone can lower the log-likelihood ratio, so that an outlier does not decide."""
 CERTAIN_SCORE = 3.0
-"""Margin of the best score over all others (20 to 1) at which a body is recognised without waiting for `birth`."""
+"""Margin of the best score over all others at which a body is recognised without waiting for `birth` (odds of 20 to
+1)."""
 APART = 0.25
-"""Metres: two bodies nearer than this to each other are one, detected twice."""
+"""Distance below which two bodies are one person detected twice, metres."""
 MIN_CONFIDENCE = 0.3
 """Least confidence of a bone's joints for its length to count."""
 MIN_JOINTS = 6
 """Least number of visible joints of a detection."""
 
 _FREE, _TENTATIVE = 0, -1
-"""In place of an id: ids are 1 and up."""
+"""Values in place of an id; ids start at 1."""
 
 _BONES: tuple[tuple[tuple[str, str], ...], ...] = (
     (("left_hip", "left_knee"), ("right_hip", "right_knee")),
@@ -86,15 +87,16 @@ _BONES: tuple[tuple[tuple[str, str], ...], ...] = (
 class Identify:
     """Assigns an id to each body of a frame.
 
-    A row holds a track: a person, or a tentative track that has no id yet. A constant-velocity Kalman filter predicts
-    each track's position; bodies are first matched to tracks observed within `RECENT_S`, by position. What remains
-    starts tentative tracks, which after ``birth`` seconds, or as soon as the score is decisive, are recognised as a
-    person out of sight or become a new one: bone lengths from several frames are better than from one.
+    Each row holds a track: a person, or a tentative track without an id. A constant-velocity Kalman filter predicts
+        each
+    track's position. Bodies are first matched by position to tracks observed within `RECENT_S`. Each unmatched body
+    starts a tentative track. After ``birth`` seconds, or as soon as the score is decisive, a tentative track is either
+    recognised as a person out of sight or becomes a new person. The wait lets bone lengths average over several frames.
 
     Args:
-        settings: of this stage.
-        rows: tracks kept at once: visible, out of sight, and tentative.
-        counters: gets ``too_many_bodies``.
+        settings: settings of this stage.
+        rows: largest number of tracks: visible, out of sight and tentative ones together.
+        counters: counts ``too_many_bodies``.
     """
 
     def __init__(self, settings: IdentifySettings, rows: int, counters: Counter[str]) -> None:
@@ -103,7 +105,7 @@ class Identify:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all tracks; no id is used a second time."""
+        """Forget all tracks. Their ids are not used again."""
         rows = self._rows
         self._origin_ns = self._last_ns = -1
         self._filter = ConstantVelocityFilter(ACCELERATION, PLACE_SIGMA)
@@ -116,10 +118,10 @@ class Identify:
         self._lengths_s = np.zeros((rows, len(_BONES)))
 
     def update(self, stamp_ns: int, bodies: Floats, confidence: Floats) -> list[int | None]:
-        """The id of each body of a frame; None for one that has none yet.
+        """Return the id of each body of a frame; None for a body without an id yet.
 
         Args:
-            stamp_ns: capture, later than the last; earlier, or much later, it starts a new stream.
+            stamp_ns: time of capture. An earlier stamp than the last, or a much later one, starts a new stream.
             bodies: (N, 22, 3) metres, world-aligned; NaN where unobserved.
             confidence: (N, 22).
         """
@@ -149,7 +151,7 @@ class Identify:
         """Match bodies to tracks observed within `RECENT_S`.
 
         Returns:
-            (N,) row of each body or -1, (N, 3) its position in metres, and (rows, N) score of all pairs by position.
+            (N,) row of each body or -1, (N, 3) its position in metres, and (rows, N) score by position of all pairs.
         """
         row_of, places = np.full(len(bodies), -1), np.full((len(bodies), 3), np.nan)
         score = np.full((self._rows, len(bodies)), -np.inf)
@@ -181,7 +183,7 @@ class Identify:
     def _update_tracks(
         self, rows: NDArray[np.intp], bodies: Floats, places: Floats, lengths: Floats, now: float, step: float
     ) -> None:
-        """Update tracks by their bodies, at these positions, with bones of these lengths (N, B)."""
+        """Update tracks with the positions and bone lengths (N, B) of their bodies."""
         measured = np.full((self._rows, 3), np.nan)
         measured[rows] = places
         estimate = self._filter.update(measured, now)
@@ -216,7 +218,7 @@ class Identify:
                 self._next_id += 1
 
     def _length_score(self, rows: NDArray[np.intp], people: NDArray[np.intp]) -> Floats:
-        """(rows, people) log-likelihood ratio of the bone lengths, being the same person against being another."""
+        """(rows, people) log-likelihood ratio of the bone lengths: the same person against another."""
         variance = [LENGTH_SIGMA**2 / np.maximum(self._lengths_s[who] / LENGTH_MEMORY_S, 1.0) for who in (rows, people)]
         both = (self._lengths_s[rows, None] > 0) & (self._lengths_s[people] > 0)
         apart = self._lengths[rows, None] - self._lengths[people]
@@ -226,7 +228,7 @@ class Identify:
         return np.where(both, np.maximum(ratio, -LENGTH_DOUBT), 0.0).sum(axis=-1)
 
     def _recognise(self, row: int, person: int) -> None:
-        """Give the track in a row the id and bones of a person out of sight."""
+        """Give the track of a row the id and bones of a person out of sight."""
         self._id[row] = self._id[person]
         total = np.maximum(self._lengths_s[row] + self._lengths_s[person], _MIN_STEP_S)
         self._lengths[row] += self._lengths_s[person] / total * (self._lengths[person] - self._lengths[row])
@@ -244,13 +246,13 @@ class Identify:
 _MIN_STEP_S = 1e-3
 
 _ENDS = np.array([[[J[end] for end in bone] for bone in (sides[0], sides[-1])] for sides in _BONES])
-"""(B, 2, 2) the joints at both ends of each bone, on either side of the body."""
+"""(B, 2, 2) the joints at the two ends of each bone, on both sides of the body."""
 _GENERIC_LENGTHS = np.array([0.415, 0.41, 0.275, 0.25, 0.36, 0.50])
-"""(B,) metres, those of the generic adult."""
+"""(B,) metres, bone lengths of the generic adult."""
 
 
 def _bone_lengths(bodies: Floats, confidence: Floats) -> Floats:
-    """(N, B) metres of bodies (N, 22, 3), the mean of both sides; NaN where neither was well observed."""
+    """(N, B) metres, bone lengths of bodies (N, 22, 3), mean of both sides; NaN where neither side is well observed."""
     ends = np.where((confidence >= MIN_CONFIDENCE)[..., None], bodies, np.nan)[:, _ENDS]
     lengths = np.linalg.norm(ends[..., 0, :] - ends[..., 1, :], axis=-1)
     observed = np.isfinite(lengths) & (lengths < 2 * _GENERIC_LENGTHS[:, None])
@@ -259,18 +261,18 @@ def _bone_lengths(bodies: Floats, confidence: Floats) -> Floats:
 
 
 def _middle(body: Floats) -> Floats:
-    """(3,) metres, median of the joints of a body's trunk, or of all joints (22, 3) where the trunk is not observed."""
+    """(3,) metres, median of the trunk's joints, or of all joints (22, 3) if the trunk is not observed."""
     trunk = medians(body[list(TRUNK_LANDMARKS)])
     return trunk if np.isfinite(trunk).all() else medians(body)
 
 
 def _unobserved(last: Floats, coasting: Floats, sigma: Floats, unobserved_s: Floats) -> tuple[Floats, Floats]:
-    """Prediction of bodies out of sight: an Ornstein-Uhlenbeck velocity in place of a constant one.
+    """Predict bodies out of sight, with an Ornstein-Uhlenbeck velocity instead of a constant one.
 
     Args:
-        last: (R, 3) metres, last position observed.
-        coasting: (R, 3) metres, predicted at constant velocity, with ``sigma`` (R,) along an axis.
-        unobserved_s: (R,) seconds since.
+        last: (R, 3) metres, last observed position.
+        coasting: (R, 3) metres, prediction at constant velocity, with ``sigma`` (R,) along an axis.
+        unobserved_s: (R,) seconds since the last observation.
 
     Returns:
         (R, 3) metres, and the standard deviation along an axis (R,).
@@ -282,7 +284,8 @@ def _unobserved(last: Floats, coasting: Floats, sigma: Floats, unobserved_s: Flo
 
 
 def _place_score(away: Floats, sigma: Floats) -> Floats:
-    """Log-likelihood ratio of bodies (..., 3) metres from a person's predicted position being that person."""
+    """Log-likelihood ratio that a body is a person, from its displacement (..., 3) metres from that person's
+    prediction."""
     horizontal, vertical = sigma**2 + PLACE_SIGMA**2, np.minimum(sigma, HEIGHT_SIGMA) ** 2 + PLACE_SIGMA**2
     distance_squared = (away[..., :2] ** 2).sum(axis=-1) / horizontal + away[..., 2] ** 2 / vertical
     score = -0.5 * (distance_squared + np.log((2 * np.pi) ** 3 * horizontal**2 * vertical)) - np.log(NEWCOMERS)
@@ -290,8 +293,9 @@ def _place_score(away: Floats, sigma: Floats) -> Floats:
 
 
 def _best(score: Floats) -> list[tuple[int, int]]:
-    """Pairs (row, column) of the assignment with the greatest sum of scores (R, C), none below 0."""
-    from scipy.optimize import linear_sum_assignment  # 12 MB, for those alone whose source gives no ids
+    """Return the pairs (row, column) of the assignment with the greatest sum of scores (R, C), without negative
+    ones."""
+    from scipy.optimize import linear_sum_assignment  # imported here, as it takes 12 MB that most sources do not need
 
     pairs = zip(*linear_sum_assignment(np.maximum(score, 0.0), maximize=True), strict=True)
     return [(int(r), int(c)) for r, c in pairs if score[r, c] > 0]

@@ -1,8 +1,8 @@
-"""The impute stage: hidden joints, as the completion network and HG-VAE complete the window in one pass.
+"""The impute stage: the completion network and HG-VAE estimate hidden joints in one pass.
 
-The paper instead ascends log p(z | x) in the missing entries. That drifts from the truth with every step (`steadypose
-evaluate hgvae`): the posterior is narrowest for windows that are easy to encode, not for correct ones. Nor does ascent
-in the latents gain (benchmarks/NOTEBOOK.md).
+The paper instead maximises log p(z | x) over the missing entries by gradient ascent. Its error grows with every step
+(`steadypose evaluate hgvae`), because the posterior is narrowest for windows that are easy to encode, not for correct
+ones. Ascent in the latents does not gain either (benchmarks/NOTEBOOK.md).
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from steadypose.prior.compiled import njit
 from steadypose.prior.models.hgvae.features import Tracks, from_tracks
 
 CARRY_FRAMES = 20.0
-"""Frames over which the model's residual at the edge of a gap, added inside it, decays (1/e)."""
+"""Decay length (1/e) inside a gap of the model's residual at the edge of the gap, frames."""
 
 EDGE_FRAMES = 3
 EDGE_NOISE = 0.005
-"""The residual at the edge of a gap is the mean over this many frames where the jitter is larger than this (metres), so
-that one frame's noise is not carried into the gap; otherwise that of the last frame."""
+"""Number of frames over which the residual at the edge of a gap is averaged, and jitter above which it is, metres. The
+mean keeps one frame's noise out of the gap. With less jitter, the residual of the last frame is used."""
 
 SIGMA_SCALE = 1.2
-"""Ratio of error to HG-VAE's stated deviation, for limbs hidden for 0.3 to 2 s in validation motion."""
+"""Error-to-sigma ratio of HG-VAE for limbs hidden for 0.3 to 2 s in validation motion."""
 
 
 @dataclass(frozen=True)
@@ -34,19 +34,19 @@ class ImputeSettings:
     """Settings of the impute stage.
 
     Attributes:
-        enabled: whether to impute at all; off, hidden joints keep their last local rotations.
+        enabled: whether to impute; if off, hidden joints keep their last local rotations.
     """
 
     enabled: bool = True
 
 
 def impute(windows: BodyWindows | None, jitter: Floats, frames: int) -> Imputed | None:
-    """Complete the last ``frames`` of every body with joints hidden in them.
+    """Complete the last ``frames`` frames of every body that has hidden joints in them.
 
     Args:
-        windows: the newest; None if no body is present.
-        jitter: (S,) metres along an axis, of each body.
-        frames: those that are still to be published.
+        windows: the newest windows; None if no body is present.
+        jitter: (S,) metres along an axis, estimated from each body.
+        frames: number of frames that are still to be published.
     """
     if windows is None:
         return None
@@ -64,7 +64,7 @@ def impute(windows: BodyWindows | None, jitter: Floats, frames: int) -> Imputed 
 
 
 def completed_tracks(tracks: Tracks, mean: Floats, noise: Floats | float = 0.0) -> Floats:
-    """(..., 66, T) metres: observed entries, and the reconstruction elsewhere, continuous at the edges of gaps.
+    """Fill gaps with the reconstruction, continuous at their edges; returns (..., 66, T) metres.
 
     Args:
         tracks: observed windows (..., 66, T).
@@ -80,9 +80,9 @@ def completed_tracks(tracks: Tracks, mean: Floats, noise: Floats | float = 0.0) 
 
 @njit(cache=True)
 def _carried(off, observed, fade, edge):
-    """(N, T) the model's residuals where observed, extrapolated from either side into the gaps, where they decay.
+    """(N, T) the model's residuals where observed; in the gaps, extrapolated from both sides with exponential decay.
 
-    ``edge`` (N,): frames beside a gap over which the residual is averaged.
+    ``edge`` (N,) is the number of frames beside a gap over which the residual is averaged.
     """
     nodes, frames = off.shape
     carried = np.zeros((nodes, frames))
@@ -106,7 +106,7 @@ def _carried(off, observed, fade, edge):
 
 @njit(cache=True)
 def _beside_gap(off, observed, last, following, edge):
-    """The model's residual just before and just after a gap, from ``last`` to ``following``; 0 beyond the window."""
+    """The model's residuals just before and after the gap between ``last`` and ``following``; 0 outside the window."""
     earlier = later = 0.0
     count = 0
     for t in range(last, max(last - edge, -1), -1):

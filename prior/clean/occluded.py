@@ -1,9 +1,9 @@
-"""Occluded joints: each a weighted mean of four candidates.
+"""Occluded joints: each is estimated as a weighted mean of four candidates (`prior.models.occlusion.candidates`).
 
-One of them bridges a gap that has ended within the delay: the joint's own observations on either side place it. The
-estimate is that of a bank of constant-velocity Kalman filters, each with the position at the time in question as a
-further state (fixed-point smoothing), weighted by their likelihoods. Nothing else of the body enters: over 0.2 s that
-is nearer than an estimate from the body.
+One candidate bridges a gap that ends within the delay, from the joint's own observations on both sides. A bank of
+constant-velocity Kalman filters estimates it. Each filter has the position at the time in question as a further state
+(fixed-point smoothing), and the estimates are weighted by the filters' likelihoods. Other joints are not used: over
+0.2 s, this is more accurate than an estimate from the body.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from steadypose.prior.timing.rate import FPS
 Weigher = Callable[[Occluded], Weighed]
 
 FORGETTING_S = 2.0, 10.0
-"""Seconds after which what was last seen of a joint begins to count less, and after which its deviation is at least the
-completion's: of joints hidden for 4 to 10 s the network, trained on 3 s, states a deviation 1.3 to 1.6 times too small,
-and with this one 0.9 to 1.1 (validation)."""
+"""Times hidden at which the completion's deviation begins to be added to a joint's, and from which all of it is,
+seconds. The network is trained on 3 s. For joints hidden for 4 to 10 s its error-to-sigma ratio is 1.3 to 1.6, and with
+this correction 0.9 to 1.1 (validation)."""
 
 _LEGS, _UNSEEN_LEG = limbs(("knee", "ankle", "foot")), 1.2
-"""By how much the completion states too small a deviation of legs of which no joint was ever seen (validation)."""
+"""Error-to-sigma ratio of the completion for legs of which no joint was ever observed (validation)."""
 
 DENSITIES = np.array([0.05, 0.3, 1.8, 10.0, 60.0])
-"""Process densities of the filters that bridge a gap, m²/s³."""
+"""Spectral densities of the acceleration noise of the filters that bridge a gap, m²/s³."""
 
 BEFORE = 14
-"""Number of frames before the gap that are used, at most."""
+"""Largest number of frames before the gap that are used."""
 
 MIN_NOISE = 1e-3
 """Least standard deviation of the measurements along an axis, metres."""
@@ -49,7 +49,7 @@ class Placed(NamedTuple):
     """N occluded joints.
 
     Attributes:
-        joints: (N, 2) row of the body, and the joint.
+        joints: (N, 2) row of the body, and index of the joint.
         positions: (N, 3) metres.
         sigma: (N,) metres, standard deviation along an axis.
     """
@@ -60,12 +60,12 @@ class Placed(NamedTuple):
 
 
 class Track(NamedTuple):
-    """The last frames of S bodies, for joints seen again within the delay.
+    """The last frames of S bodies, for joints that are observed again within the delay.
 
     Attributes:
-        positions: (T, S, 22, 3) metres, as observed; NaN where they were not.
-        at: index of the frame to be answered.
-        noise: (S,) metres along an axis, of the observations.
+        positions: (T, S, 22, 3) metres, observations; NaN where unobserved.
+        at: index of the frame to be estimated.
+        noise: (S,) metres along an axis, standard deviation of the observations.
     """
 
     positions: Floats
@@ -74,10 +74,10 @@ class Track(NamedTuple):
 
 
 class OccludedJoints:
-    """Estimates every body's occluded joints. Frames are to be given in order.
+    """Estimates every body's occluded joints. Frames must come in order.
 
     Attributes:
-        weigher: of the candidates; training replaces it by one that records them.
+        weigher: weighs the candidates; training replaces it with one that records them.
     """
 
     def __init__(self, weights: str, slots: int) -> None:
@@ -99,21 +99,22 @@ class OccludedJoints:
         completed_sigma: Floats | None,
         track: Track,
     ) -> Placed | None:
-        """Where B bodies' occluded joints are; None where nothing is completed.
+        """Estimate the occluded joints of B bodies; None if there is no completion.
 
-        A joint is occluded if another of its body was seen since: a frame that was lost whole occludes none. One that
-        was never seen is where the completion has placed it on average of late, carried along with the body, halfway to
-        where a standing adult has it.
+        A joint is occluded if another joint of its body was observed more recently. A frame without any observation
+        therefore occludes no joint. A joint that was never observed is placed halfway between two positions: the
+        running mean of its completions, moved along with the body, and its position in a standing adult.
 
         Args:
-            slots: (B,) of the bodies.
-            seen: (B, 22, 3) metres, of the smoother; NaN of joints never seen.
-            sigma: (B, 22) metres along an axis, of the smoother; inf of joints never seen.
-            unseen_s: (B, 22) seconds since each was last seen.
-            seen_later: (B, 22) whether each is seen again within the delay.
-            completed: (B, 22, 3) metres, by the completion network.
-            completed_sigma: (B, 22) metres along an axis, inf of joints that are not completed; None without it.
-            track: of all slots, as observed.
+            slots: (B,) slots of the bodies.
+            seen: (B, 22, 3) metres, from the smoother; NaN for joints never observed.
+            sigma: (B, 22) metres along an axis, from the smoother; inf for joints never observed.
+            unseen_s: (B, 22) seconds since each joint was last observed.
+            seen_later: (B, 22) whether each joint is observed again within the delay.
+            completed: (B, 22, 3) metres, from the completion network.
+            completed_sigma: (B, 22) metres along an axis, inf for joints that are not completed; None if imputation is
+                off.
+            track: the observations of all slots.
         """
         held = np.empty_like(seen)
         _observe(self._past, slots, seen, sigma, unseen_s, held)
@@ -149,7 +150,7 @@ class OccludedJoints:
         unseen_s: Floats,
         seen_later: Bools,
     ) -> Weighed:
-        # contiguous, as one loop is compiled for each memory layout
+        # contiguous, because numba compiles a loop for each memory layout
         body, joint = (np.ascontiguousarray(index) for index in np.nonzero(occluded))
         if not len(body):
             return Weighed(np.empty((0, 3)), np.empty(0))
@@ -161,7 +162,7 @@ class OccludedJoints:
 
 
 def _of_legs(never: Bools) -> Floats:
-    """(B, 22) `_UNSEEN_LEG` at the joints of legs that were never seen, by ``never`` (B, 22) of each joint; else 1."""
+    """(B, 22) `_UNSEEN_LEG` for joints of legs whose joints were all ``never`` (B, 22) observed, 1 for the others."""
     factors = np.ones(never.shape)
     for leg in _LEGS:
         factors[:, leg] = np.where(never[:, leg].all(axis=1), _UNSEEN_LEG, 1.0)[:, None]
@@ -210,13 +211,13 @@ def _describe(past, slots, body, joint, candidates, sigmas, sigma, unseen_s, see
 
 @njit(cache=True)
 def bridge(track, at, noise, place):
-    """Write where a joint was, given its observations before and after; returns its deviation along an axis, metres.
+    """Estimate a joint's position from its observations before and after; returns its deviation along an axis, metres.
 
     Args:
-        track: (T, 3) metres, NaN where it was not observed.
-        at: frame in question.
+        track: (T, 3) metres, observations; NaN where unobserved.
+        at: index of the frame to be estimated.
         noise: standard deviation of the observations along an axis, metres.
-        place: (3,) metres, written; NaN where the track has no observation before ``at``.
+        place: (3,) metres, written; NaN if the track has no observation before ``at``.
     """
     last = at
     while last >= 0 and math.isnan(track[last, 0]):
@@ -249,7 +250,7 @@ def bridge(track, at, noise, place):
 
 @njit(cache=True)
 def _fixed_point(track, first, at, density, square, place):
-    """One filter: the log-likelihood of the track from frame ``first`` on, and the variance of ``place`` (3,)."""
+    """Run one filter and write ``place`` (3,); returns the log-likelihood from frame ``first`` on, and the variance."""
     dt, likelihood, begun = 1.0 / FPS, 0.0, False
     mean, gain = np.zeros((3, 3)), np.zeros(3)  # position, velocity, position in question
     p = np.zeros((3, 3))

@@ -1,10 +1,10 @@
-"""Outliers among a body's joints that need no prediction: by the lengths of its bones, and by exact repetition.
+"""Outlier detection without a prediction of motion: by bone lengths, and by exact repetition.
 
-The error of a measured length depends on the sensor, the bone and the person: a network that estimates depth from one
-image varies bones all the time, a marker system hardly. So each bone is compared with its own running mean and
-standard deviation. A wrist that collapses onto the elbow is detected at any speed of the body; a test for jumps alone
-takes it for motion. And a joint that is thrown about with all its bones as long as ever has moved, not jumped, if the
-sensor is one whose bones are constant.
+The error of a measured bone length depends on the sensor, the bone and the person. A network that estimates depth from
+one image changes lengths in every frame; a marker system hardly does. Each bone is therefore compared with its own
+running mean and standard deviation. This detects a wrist that collapses onto the elbow at any speed, where a test for
+jumps would take it for motion. Conversely, if the sensor's bone lengths are constant, a joint far from its prediction
+whose bones kept their lengths has moved and not jumped.
 """
 
 from __future__ import annotations
@@ -19,43 +19,46 @@ from steadypose.prior.body.skeleton import CHILDREN, PARENT, limbs
 from steadypose.prior.compiled import median, njit
 
 MIN_SHARE, MIN_DIFFERENCE, DEVIATIONS = 0.5, 0.1, 6.0
-"""An impossible length differs from the mean by more than this share of it, these metres and these standard
-deviations (chosen on validation, benchmarks/NOTEBOOK.md)."""
+"""Thresholds of an impossible length: its difference from the mean exceeds this share of the mean, this many metres and
+this many standard deviations (chosen on validation, benchmarks/NOTEBOOK.md)."""
 
 MIN_DEVIATION = 0.01
-"""Metres, least standard deviation of a length."""
+"""Least standard deviation of a length, metres."""
 
 MEMORY, FIRST = 45, 15
-"""Frames of the running mean and deviation; and observations before which nothing is judged."""
+"""Length of the running mean and deviation, and number of observations before a bone is judged, frames."""
 
 WINSORISED = 2.0
-"""Standard deviations at which differences are clipped before they update mean and deviation: an outlier changes them
-little, but a new length that lasts is accepted within two seconds."""
+"""Bound at which differences are clipped before they update mean and deviation, standard deviations. A single outlier
+then has little effect, but a lasting new length is accepted within two seconds."""
 
 INTACT_DEVIATIONS, INTACT = 2.0, 0.01
-"""A bone is as long as ever within these standard deviations, or metres."""
+"""Largest change of length of an intact bone, standard deviations or metres."""
 
 TELLING = 0.03
-"""Share of a joint's distance to its prediction: a bone that varies by more does not distinguish a jump from motion."""
+"""Largest standard deviation of a bone that can distinguish a jump from motion, as a share of the joint's distance to
+its prediction."""
 
 MAX_OUTLIERS = 0.5
-"""Share of the limbs' bones observed beyond which it is another body, which is measured anew."""
+"""Share of impossible bones among the limbs' observed bones above which this is another body, whose bones are measured
+anew."""
 
 RECENT = 15
-"""Frames in which a joint that repeats itself must do so mostly."""
+"""Number of recent frames in most of which a frozen joint must repeat itself."""
 
 SAME = 1e-6
-"""Metres: a joint that has moved less from one frame to the next repeats itself."""
+"""Largest motion between two frames of a joint that repeats itself, metres."""
 
 MIN_NOISE = 0.001
-"""Metres along an axis, from frame to frame: of a sensor with less, a joint that repeats itself may be at rest."""
+"""Least noise along an axis, from frame to frame, for frozen joints to be detected, metres. With a quieter sensor, a
+joint that repeats itself may be at rest."""
 
 MAX_ALIKE = 0.1
-"""Share of the coordinates of joints that did move that may repeat themselves: with more, the sensor rounds, and what
-rests repeats itself."""
+"""Largest share of repeated coordinates among joints that moved. Above it the sensor rounds its output, and any joint
+at rest repeats itself."""
 
 _MIN_NEW = 5
-"""Frames, at least, that are no repetition of the whole body."""
+"""Least number of frames that do not repeat the whole body."""
 
 _LIMB_JOINTS = np.sort(np.concatenate(limbs(("shoulder", "elbow", "wrist"), ("knee", "ankle", "foot"))))
 _IN_LIMB = np.isin(np.arange(len(PARENT)), _LIMB_JOINTS)
@@ -63,7 +66,7 @@ _CHILD = np.array([children[0] if len(children) == 1 else -1 for children in CHI
 
 
 class BoneOutliers:
-    """Finds the outliers among the limbs' joints of ``slots`` bodies, and joints that moved with their limb."""
+    """Detects outliers among the limbs' joints of ``slots`` bodies, and joints that moved with their limb."""
 
     def __init__(self, slots: int) -> None:
         self._mean = np.zeros((slots, 22))
@@ -76,10 +79,10 @@ class BoneOutliers:
             values[slot] = 0.0
 
     def update(self, positions: Floats) -> Bools:
-        """Judge a frame's bones, and update their means and deviations.
+        """Judge a frame's bones and update their means and deviations.
 
-        An impossible bone makes outliers of its outer joint and of all joints beyond; of the outer joint alone if the
-        next bone is impossible too.
+        The outer joint of an impossible bone and all joints beyond it are outliers. If the next bone is impossible too,
+        only the outer joint is.
 
         Args:
             positions: (S, 22, 3) metres, NaN where unobserved.
@@ -92,14 +95,15 @@ class BoneOutliers:
         return bad
 
     def intact(self, positions: Floats, distance: Floats) -> Bools:
-        """Joints that move with their limb: all their bones are as long as ever, of a sensor whose bones show jumps.
+        """Detect joints that moved with their limb: their bones kept their lengths, and those are constant enough to
+        tell.
 
         Args:
             positions: (S, 22, 3) metres, NaN where unobserved.
-            distance: (S, 22) metres, of the joints to their predictions.
+            distance: (S, 22) metres from the joints to their predictions.
 
         Returns:
-            (S, 22) which joints moved, rather than jumped.
+            (S, 22) which joints moved and did not jump.
         """
         moved = np.zeros(positions.shape[:2], dtype=np.bool_)
         _hold(positions, distance, self._mean, self._variance, self._observed, moved)
@@ -161,7 +165,7 @@ def _judge(positions, mean, variance, observed, bad):
 
 @njit(cache=True)
 def _attribute(bad):
-    """Turn ``bad`` (22,) from joints at the outer end of an impossible bone into outliers, in place."""
+    """Convert ``bad`` (22,), the joints at the outer ends of impossible bones, into outliers, in place."""
     of_bone = bad.copy()
     for joint in _LIMB_JOINTS:  # from the trunk outwards
         if not of_bone[joint]:
@@ -177,12 +181,13 @@ def _attribute(bad):
 
 @njit(cache=True)
 def frozen_joints(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(B, 22) joints that a tracker has lost and for which it repeats its last output.
+    """(B, 22) joints that the tracker lost and for which it repeats its last output.
 
-    These repeat in most of the frames in which the body as a whole does not, while other joints jitter.
+    A frozen joint repeats itself in most of the frames in which the body as a whole does not, while other joints
+    jitter.
 
     Args:
-        positions: (B, T, 22, 3) metres as the sensor gave them, NaN where it did not; the last frames count.
+        positions: (B, T, 22, 3) metres, the sensor's output, NaN where it has none; the last frames count.
     """
     count, frames, joints, _ = positions.shape
     found = np.zeros((count, joints), dtype=np.bool_)
@@ -213,7 +218,7 @@ def frozen_joints(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 @njit(cache=True)
 def _noise(positions):
-    """(22,) metres along an axis, from frame to frame, of positions (T, 22, 3): from their second differences."""
+    """(22,) metres along an axis, noise from frame to frame of positions (T, 22, 3), from their second differences."""
     frames, joints, _ = positions.shape
     noise = np.empty(joints)
     for joint in range(joints):

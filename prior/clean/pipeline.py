@@ -34,19 +34,20 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.prior.timing.resample import Frame, Resampler
 
 BACKWARDS_NS = 1_000_000_000
-"""Distance before the last stamp from which on a new stream starts, nanoseconds; one nearer is a frame out of order."""
+"""Least step back in time that starts a new stream, nanoseconds; a smaller one is a frame out of order."""
 CATCH_UP = 3
-"""Largest number of grid frames that one message completes where messages before it were dropped: all of them would
-take as long as the messages themselves."""
+"""Largest number of grid frames that one message completes after messages were dropped. Processing all of them would
+take as long as the dropped messages."""
 
 
 class BodyPipeline(ABC, Generic[Key]):
-    """What the prior over one stream and over many share: the stages, and the slots in which bodies go through them.
+    """Base of the prior over one stream and over many: the stages, and the slots that hold the bodies.
 
     Attributes:
-        counters: messages, bodies and joints refused or dropped so far, by cause.
-        delay_frames: frames at 30 Hz between a frame and its answer.
-        most_bodies: that are worked on, if a node has no time for all; the nearest to the sensor.
+        counters: numbers of messages, bodies and joints refused or dropped so far, by cause.
+        delay_frames: frames at 30 Hz between a frame and its output.
+        most_bodies: largest number of bodies that are processed, set by a node that lacks time; the nearest ones are
+            kept.
     """
 
     def __init__(self, settings: PriorSettings) -> None:
@@ -57,36 +58,36 @@ class BodyPipeline(ABC, Generic[Key]):
         self._timeout_ns = round(settings.timeout * 1e9)
         self._core = CleanCore(settings, self.counters)
         self._slots: Slots[Key] = Slots(settings.max_bodies, settings.timeout, self.counters)
-        self._origin_ns = 0  # stamps within are seconds since: a float of seconds since 1970 would round them
+        self._origin_ns = 0  # stages count seconds from here, because float seconds since 1970 would be rounded
 
     @property
     def bodies(self) -> int:
-        """That are worked on."""
+        """Number of bodies that are processed."""
         return self._slots.taken
 
     @property
     def offered(self) -> int:
-        """Bodies that are worked on, and those that would be if there were time."""
+        """Number of bodies that are processed or left out for lack of time."""
         return self._slots.taken + self._slots.left_out
 
     @property
     def sensor_noise(self) -> SensorNoise | None:
-        """The latest estimate of the sensor's error, the median over bodies; None before the first body."""
+        """The latest estimate of the sensor's error: the median over bodies. None before the first body."""
         return self._core.sensor_noise
 
     @abstractmethod
     def _resamplers(self) -> Iterable[Resampler]:
-        """Of all streams that are open."""
+        """The resamplers of all open streams."""
 
     def _new_identify(self) -> Identify | None:
-        """A tracker of ids, if the source gives none."""
+        """A tracker that assigns ids, if the settings ask for one."""
         settings = self._settings.identify
         return Identify(settings, 2 * self._settings.max_bodies, self.counters) if settings.enabled else None
 
     def _arranged(
         self, raw: PoseRaw, layout: Skeleton, sensor: SensorFrame, identify: Identify | None, key: Callable[[int], Key]
     ) -> BodyJoints:
-        """A message's bodies, by slot, as that sensor observes them; ``key`` of an id."""
+        """Return a message's bodies by slot, in the world. ``key`` converts a body id to the key of a slot."""
         bodies = canonical_bodies(raw, layout, sensor, self.counters, numbered=identify is not None)
         ids = identify.update(raw.stamp_ns, *stacked(bodies.values())) if identify else bodies
         keys = [None if body_id is None else key(body_id) for body_id in ids]
@@ -96,7 +97,7 @@ class BodyPipeline(ABC, Generic[Key]):
         return self._slots.arrange(keyed)
 
     def _advance_to(self, stamp_ns: int, joints: BodyJoints, sensor_position: Floats) -> CleanFrame | None:
-        """One step of the 30 Hz grid."""
+        """Process one step of the 30 Hz grid."""
         timed_out = self._slots.advance(stamp_ns, joints.positions)
         if timed_out.any():
             self._drop(timed_out)
@@ -119,7 +120,7 @@ class BodyPipeline(ABC, Generic[Key]):
 
 
 class PriorPipeline(BodyPipeline[int]):
-    """The prior over one stream. The same messages give the same answers, bit for bit."""
+    """The prior over one stream. The same messages give the same output, bit for bit."""
 
     def __init__(self, settings: PriorSettings) -> None:
         super().__init__(settings)
@@ -130,14 +131,14 @@ class PriorPipeline(BodyPipeline[int]):
         self._last: PoseRaw | None = None
 
     def process(self, raw: PoseRaw, *, gap: bool = False) -> list[PoseClean]:
-        """Take a ``pose/raw`` message and give the ``pose/clean`` messages it completes, oldest first.
+        """Process a ``pose/raw`` message and return the ``pose/clean`` messages that it completes, oldest first.
 
-        A message that cannot be used is counted in `counters` and otherwise ignored; one whose stamp jumps waits until
-        the next ones show whether that lasts.
+        A message that cannot be used is counted in `counters` and otherwise ignored. A message whose stamp jumps waits
+        until the next messages show whether the jump lasts.
 
         Args:
             raw: the message.
-            gap: messages before this one were dropped by the node, so that a gap in the stamps is no new stream.
+            gap: whether the node dropped messages before this one, so that a gap in the stamps starts no new stream.
         """
         return [clean for admitted, _ in self._stamps.admit(raw, gap=gap) for clean in self._process(admitted, gap=gap)]
 
@@ -179,7 +180,7 @@ class PriorPipeline(BodyPipeline[int]):
         return flushed + self._stepped(ticks, raw)
 
     def flush(self) -> list[PoseClean]:
-        """The frames that the delay still holds, oldest first; the stream is then forgotten."""
+        """Return the frames that the delay still holds, oldest first, and forget the stream."""
         held = [clean for raw, _ in self._stamps.release() for clean in self._process(raw, gap=False)]
         return held + self._flush()
 
@@ -196,7 +197,8 @@ class PriorPipeline(BodyPipeline[int]):
         return cleaned
 
     def _stepped(self, ticks: list[Frame], raw: PoseRaw) -> list[PoseClean]:
-        """The messages that frames of the 30 Hz grid complete, oldest first; ``raw`` is the newest message."""
+        """Process frames of the 30 Hz grid and return the messages that they complete. ``raw`` is the newest
+        message."""
         origin = SensorFrame.of(raw.sensor_pose).origin
         frames = (self._advance_to(stamp_ns, BodyJoints(*joints), origin) for stamp_ns, *joints in ticks)
         return [self._message(frame, raw) for frame in frames if frame is not None]
@@ -205,7 +207,7 @@ class PriorPipeline(BodyPipeline[int]):
         return (self._resampler,)
 
     def _message(self, frame: CleanFrame, raw: PoseRaw) -> PoseClean:
-        """The answer, in the frame of the message that completed it."""
+        """Build the output message, in the frame of the input message that completed it."""
         ids = {slot: key for slot, key in enumerate(self._slots.keys) if key is not None}
         bodies = clean_bodies(frame, SensorFrame.of(raw.sensor_pose), ids)
         self._core.note_published(frame, bodies)
@@ -215,8 +217,8 @@ class PriorPipeline(BodyPipeline[int]):
 
 @cache
 def load_loops(settings: PriorSettings) -> None:
-    """Have the compiled loops of every stage in use loaded, or compiled: they are at their first call, and no frame
-    should wait."""
+    """Load or compile the loops of every stage in use, so that no frame waits for them. Numba does so at a first
+    call."""
     pipeline = PriorPipeline(settings)
     pose = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     for frame in range(settings.delay + 5):
@@ -226,6 +228,6 @@ def load_loops(settings: PriorSettings) -> None:
         if frame > 2:
             positions[J["right_wrist"]] = np.nan
         bodies = [RawBody(0, positions, np.ones(22, dtype=np.float32))]
-        if frame > 3:  # arrays of two bodies lie otherwise in memory, which is another loop
+        if frame > 3:  # arrays of two bodies have another memory layout, for which numba compiles another loop
             bodies.append(RawBody(1, positions + np.float32(1.0), np.ones(22, dtype=np.float32)))
         pipeline.process(PoseRaw(round(frame * 1e9 / FPS), "", "", CANONICAL.name, pose, False, bodies))

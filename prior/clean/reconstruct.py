@@ -1,10 +1,10 @@
-"""The stages reconstruct and denoise: HG-VAE's reconstruction of each body's window, and observed joints fused with it.
+"""The stages reconstruct and denoise: HG-VAE reconstructs each body's window; observed joints are fused with the
+result.
 
-HG-VAE is trained to denoise windows, and knows how poses go on, of which the smoothers of the whole body know the
-linear part. Behind these it reduces the error in 4 cm of noise, after four frames, by 1 % on dancers and 8 % on people
-who exercise (validation, estimated beside earlier weights); in 1 cm it has next to no weight. The errors of
-both estimates are correlated, as most of their noise is the same, so the weights are not those of independent
-estimates.
+HG-VAE is trained to denoise windows and models nonlinear motion; the whole-body smoothers model only the linear part.
+After these smoothers, in noise of 4 cm with a delay of four frames, it reduces the error by 1 % on dancers and by 8 %
+on people who exercise (validation, measured with earlier weights). In noise of 1 cm it has almost no weight. Both
+estimates share most of their noise, so the fusion weights account for correlated errors.
 """
 
 from __future__ import annotations
@@ -25,32 +25,30 @@ from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
 
 MIN_CONFIDENCE = 0.1
-"""Lower bound of the confidence of a joint that passed the gate."""
+"""Least confidence assigned to a joint that passed the gate."""
 
 MODEL_SIGMA = 0.005
-"""Metres along an axis: lower bound of HG-VAE's own error, apart from the sensor's noise."""
+"""Least standard deviation along an axis of HG-VAE's own error, excluding the sensor's noise, metres."""
 
 NOISE_LEFT = 0.75
-"""Variance that the sensor's noise causes in HG-VAE's reconstruction, relative to that in the smoother's estimate."""
+"""Variance that sensor noise causes in HG-VAE's reconstruction, relative to the variance in the smoother's estimate."""
 
 MEMORY = 15
-"""Frames of the running mean of the squared distance between the two estimates, from which HG-VAE's own error
-follows."""
+"""Length of the running mean of the squared distance between the two estimates, frames. It gives HG-VAE's own error."""
 
 SUDDEN = 3.0
-"""A squared distance of the current frame above this multiple of the running mean replaces it (divided by the
-multiple)."""
+"""Factor over the running mean above which the current squared distance, divided by this factor, replaces it."""
 
 LATE_S, LATE_NEWEST_S = 0.01, 0.03
-"""Seconds by which HG-VAE lags behind a moving joint: of a frame `SETTLED` frames before the newest or older, and of
-the newest. At 3 m/s that is 3 or 9 cm; of a motion that has just begun, the running mean does not show it yet."""
+"""Lag of HG-VAE behind a moving joint, seconds: at least `SETTLED` frames before the newest frame, and in the newest.
+At 3 m/s this is 3 or 9 cm. When a motion begins, the running mean does not include it yet."""
 
 SETTLED = 4
-"""Frames before the newest from which on a frame of the window has settled."""
+"""Distance from the newest frame at which a frame of the window has settled, frames."""
 
 RENEWAL = 0.5
-"""Weight of the newest window in the running mean of a frame's reconstructions: successive windows disagree, which
-would be jitter."""
+"""Weight of the newest window in the running mean of a frame's reconstructions. Successive windows disagree, and
+without the mean this would be jitter."""
 
 _BESIDE_PELVIS = np.array([*HIPS, J["spine1"]])
 
@@ -67,19 +65,19 @@ class ReconstructSettings:
 
 
 class Reconstruct:
-    """Runs HG-VAE once over the last frames of the bodies present."""
+    """Runs HG-VAE once per frame over the last frames of the bodies present."""
 
     def __init__(self, settings: ReconstructSettings, slots: int) -> None:
         self._model = LiveHGVAE.load(settings.weights, slots)
         self.frames = self._model.frames
 
     def update(self, history: History, present: Bools, person: Person, bias_sigma: Floats) -> BodyWindows | None:
-        """Reconstruct the windows of the bodies present; None if there is none.
+        """Reconstruct the windows of the bodies present; None if no body is present.
 
         Args:
-            history: of the observations.
+            history: the observations.
             present: (S,) which slots hold a body.
-            person: their bones.
+            person: the bodies' bones.
             bias_sigma: (S,) metres along an axis, the sensor's bias, estimated from each body.
         """
         slots = np.flatnonzero(present)
@@ -97,7 +95,7 @@ class DenoiseSettings:
     """Settings of the denoise stage.
 
     Attributes:
-        enabled: off, observed joints stay as smoothed.
+        enabled: whether to denoise; if off, observed joints stay as smoothed.
     """
 
     enabled: bool = True
@@ -107,12 +105,12 @@ class Denoise:
     """Moves the smoother's estimate of observed joints towards HG-VAE's reconstruction.
 
     Args:
-        delay_frames: between the newest frame and the one that is published.
+        delay_frames: frames between the newest frame and the published one.
         slots: maximum number of bodies.
     """
 
     def __init__(self, delay_frames: int, slots: int) -> None:
-        self._apart = np.zeros((slots, 22))  # m², mean square of the distance between the two along an axis
+        self._apart = np.zeros((slots, 22))  # m², mean square of the distance between the two estimates along an axis
         self._frames = np.zeros((slots, 22))
         self._reconstructed = np.full((delay_frames + 1, slots, 22, 3), np.nan)
         self._before = np.full((slots, 22, 3), np.nan)
@@ -126,19 +124,20 @@ class Denoise:
     def update(
         self, windows: BodyWindows | None, smoothed: Smoothed | None, history: History, jitter: Floats
     ) -> Smoothed | None:
-        """Take in HG-VAE's reconstruction of the newest windows; the smoother's newest estimate, if any, denoised.
+        """Add HG-VAE's reconstruction of the newest windows, and denoise the smoother's newest estimate if there is
+        one.
 
         Args:
-            windows: None if no body is present.
-            smoothed: (S, 22) joints and their standard deviations, of the frame ``delay_frames`` before the newest.
-            history: of the observations.
-            jitter: (S,) metres along an axis, as of the newest frame.
+            windows: the newest windows; None if no body is present.
+            smoothed: (S, 22) joints and their standard deviations, ``delay_frames`` before the newest frame.
+            history: the observations.
+            jitter: (S,) metres along an axis, estimated up to the newest frame.
         """
         self._take(windows, history)
         return None if smoothed is None else self._denoised(smoothed, history, jitter, len(self._reconstructed) - 1)
 
     def flush(self, held: list[Smoothed], history: History, jitter: Floats) -> list[Smoothed]:
-        """The last estimates that the smoother held, oldest first, denoised."""
+        """Denoise the last estimates that the smoother held, oldest first."""
         return [self._denoised(smoothed, history, jitter, len(held) - 1 - k) for k, smoothed in enumerate(held)]
 
     def _take(self, windows: BodyWindows | None, history: History) -> None:
@@ -150,25 +149,26 @@ class Denoise:
         _place_pelvis(latest, history.positions[:, slots].swapaxes(0, 1))
         latest = latest.swapaxes(0, 1)
         before = self._reconstructed[:, slots]
-        # a window that ends without any observation is worse for earlier frames than the last one that had some
+        # a window that ends in an unobserved frame is worse for earlier frames than the last window that does not
         seen = np.asarray(np.isfinite(history.positions[-1, slots, :, 0]).any(axis=1))
         renewed = np.where(seen[:, None, None], before + RENEWAL * (latest - before), before)
         self._reconstructed[:, slots] = np.where(np.isnan(before), latest, renewed)
 
     def _denoised(self, smoothed: Smoothed, history: History, jitter: Floats, back: int) -> Smoothed:
-        """The smoother's estimate of the frame ``back`` before the newest, denoised.
+        """Denoise the smoother's estimate of the frame ``back`` frames before the newest.
 
-        The weights are those of least variance for two estimates of which the second has the share `NOISE_LEFT` of the
-        first one's noise, and an error of its own. That error is estimated for each joint from the running mean of the
-        squared distance between the two, less what noise explains (innovation-based adaptation, as in adaptive Kalman
-        filters: Mehra 1970), so that motion unlike HG-VAE's training data loses its weight; and from the joint's speed,
-        by HG-VAE's lag. Only jitter counts as noise: bias, HG-VAE reproduces.
+        The weights minimise the variance of the fused estimate. HG-VAE's estimate has the share `NOISE_LEFT` of the
+        smoother's noise variance, and an error of its own with two parts. The first part is the running mean of the
+        squared distance between the two estimates, less the part that noise explains (innovation-based adaptation, as
+        in adaptive Kalman filters: Mehra 1970). It lowers HG-VAE's weight in motion unlike its training data. The
+        second part is HG-VAE's lag times the joint's speed. Only jitter counts as noise, because HG-VAE reproduces
+        bias.
         """
         reconstructed = self._reconstructed[-1 - back]
         seen = np.isfinite(history.positions[-1 - back][..., 0])
-        # also in a frame without any observation: else the estimate would jump to the smoother's
+        # also in a frame without any observation: otherwise the estimate would jump to the smoother's
         seen |= ~seen.any(axis=1, keepdims=True)
-        # and between two observations that are near
+        # and between two observations that are close in time
         seen |= history.seen_since(back) & (history.unseen_s[-1 - back] < BRIEF_S)
         late = np.interp(back, (0, SETTLED), (LATE_NEWEST_S, LATE_S)) * FPS
         positions, sigma = smoothed.positions.copy(), smoothed.sigma.copy()
@@ -179,11 +179,12 @@ class Denoise:
 
 @njit(cache=True)
 def _denoise(positions, sigma, seen, reconstructed, jitter, late, apart, frames, before):
-    """As `Denoise._denoised`: moves the joints (S, 22, 3) that are ``seen`` (S, 22), and their deviations, in place.
+    """Denoise the joints (S, 22, 3) that are ``seen`` (S, 22), and their deviations, in place (see
+    `Denoise._denoised`).
 
     Args:
-        late: frames by which HG-VAE lags.
-        apart, frames: (S, 22) of the running mean of the squared distance between the two estimates, updated.
+        late: HG-VAE's lag, frames.
+        apart, frames: (S, 22) state of the running mean of the squared distance between the two estimates, updated.
         before: (S, 22, 3) metres, the smoother's estimate one frame earlier.
     """
     moved = np.empty(3)
@@ -210,13 +211,14 @@ def _denoise(positions, sigma, seen, reconstructed, jitter, late, apart, frames,
 
 @njit(cache=True)
 def _place_pelvis(reconstructed, seen):
-    """Replace the reconstructed pelvis, in place, by hips and spine less their mean observed offset from it.
+    """Replace the reconstructed pelvis, in place, with the mean of hips and spine less their mean observed offsets.
 
-    The tracks of other joints are relative to the trunk's path, the pelvis's is relative to that path's mean, so no
-    other joint informs HG-VAE of the pelvis's noise, and it removes less of it than of any other joint's.
+    The tracks of other joints are relative to the trunk's path, but the pelvis's track is relative to that path's mean.
+    No other joint therefore informs HG-VAE of the pelvis's noise, and it removes less of it than of other joints'
+    noise.
 
     Args:
-        reconstructed: (B, K, 22, 3) metres, of the newest frames.
+        reconstructed: (B, K, 22, 3) metres, the newest frames.
         seen: (B, T, 22, 3) metres, observed; NaN where not.
     """
     joints = len(_BESIDE_PELVIS)

@@ -1,12 +1,12 @@
-"""The stages refine and orient: local rotations, solved from joint positions.
+"""The stages refine and orient: inverse kinematics, from joint positions to local rotations.
 
-Refine solves those of the newest frames and, if enabled, has HM-VAE refine them (equations 10 to 13).
+Refine solves the rotations of the newest frames. If enabled, HM-VAE refines them (equations 10 to 13).
 
-Orient solves those that are published. Two hips 18 cm apart, each with a bias, show the root's heading badly, and a
-straight limb does not show its twist. So rotations are solved for where the joints are to be expected by the whole body
-(`prior.models.posture`), each by its deviation; the root is averaged of its own joints and the whole body's posture,
-filters keep the twist through straight limbs, and the usual direction of short bones (`prior.body.rotation_filters`).
-Positions stay as they are.
+Orient solves the published rotations. Two hips 18 cm apart, each with a bias, hardly determine the root's heading, and
+a straight limb does not show its twist. Orient therefore solves for the joint positions that the whole body predicts
+(`prior.models.posture`), weighted by their deviations. It averages the root's rotation from its own joints and from the
+whole body's posture. Filters hold the twist of straight limbs and the usual direction of short bones
+(`prior.body.rotation_filters`). Positions do not change.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class RefineSettings:
     """Settings of the refine stage.
 
     Attributes:
-        enabled: whether to refine; off, the default, the solved rotations pass unchanged and no model is loaded. With
-            `impute` and `fuse` on, observed joints stay as smoothed and hidden ones as completed, so that refinement
-            changes nothing by 0.1 mm (validation people, benchmarks/NOTEBOOK.md).
+        enabled: whether to refine. If off (the default), the solved rotations pass unchanged and no model is loaded.
+            With `impute` and `fuse` on, observed joints stay as smoothed and hidden joints as completed. Refinement
+            then changes no result by 0.1 mm (validation people, benchmarks/NOTEBOOK.md).
         weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
     """
 
@@ -47,10 +47,10 @@ class RefineSettings:
 class Refine:
     """Local rotations of the last frames: solved from the observed joints and, if enabled, refined by HM-VAE.
 
-    A window N_1 … N_T is encoded to the posterior's mean and decoded, and the fuse stage takes its frame
-    ``T - 1 - delay`` (counted from 0). With the default delay T / 2 that is index T / 2 - 1, the paper's M_{T/2} of
-    equation 12. Smaller delays take later frames of the same windows, down to the newest; with larger ones a frame is
-    kept as it was decoded at the centre. At the start of a stream, windows are padded with the first frame.
+    A window N_1 … N_T is encoded to the posterior's mean and decoded. The fuse stage takes its frame ``T - 1 - delay``
+    (counted from 0). With the default delay T / 2 this is index T / 2 - 1, the paper's M_{T/2} of equation 12. Smaller
+    delays take later frames of the same window, down to the newest. Larger delays keep a frame as decoded at the
+    centre. At the start of a stream, windows are padded with the first frame.
     """
 
     def __init__(self, settings: RefineSettings, delay_frames: int, slots: int) -> None:
@@ -66,15 +66,16 @@ class Refine:
         self._decoded[:, slot] = np.eye(3)
 
     def update(self, gated: Gated, person: Person) -> Floats:
-        """(K, S, 22, 3, 3) local rotations of the last frames on these bones; unobserved joints keep their last."""
+        """(K, S, 22, 3, 3) local rotations of the last frames with these bones; unobserved joints keep their last
+        one."""
         slots = np.flatnonzero(gated.observation.present)
         self._solve(gated.positions, person.offsets, slots)
-        kept = self._window // 2 + 1  # from the centre on; earlier frames stay as decoded at the centre
+        kept = self._window // 2 + 1  # from the centre on; earlier frames stay as decoded when they were the centre
         self._decoded[:-1] = self._decoded[1:]
         frames = self._solved.all[:, slots]
         _repeat_first(frames)
         if self._reconstruct and len(slots):
-            # the heading of the centre frame is removed, as in training; it is in the root's rotation alone
+            # remove the heading of the centre frame, as in training; only the root's rotation contains it
             back = yaw_matrix(heading(frames[self._window // 2 - 1, :, 0]))
             x = np.empty((len(slots), self._window, 22, 6), dtype=np.float32)
             _facing_forward(frames, back, x)
@@ -96,7 +97,7 @@ class OrientSettings:
     """Settings of the orient stage.
 
     Attributes:
-        enabled: off, rotations are those solved for the joints as published, frame by frame.
+        enabled: whether to orient; if off, rotations are solved frame by frame from the published joints.
         weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
     """
 
@@ -116,7 +117,7 @@ class Orient:
         self._twist[slot], self._turns[slot] = unknown_twist(1), unknown_turns(1)
 
     def update(self, estimate: Estimate) -> Estimate:
-        """The estimate with rotations by the whole body. Frames must come in order."""
+        """Return the estimate with rotations solved from the whole body. Call it with frames in order."""
         slots = np.flatnonzero(np.isfinite(estimate.positions).all(axis=(1, 2)))
         if not len(slots):
             return estimate
@@ -137,7 +138,7 @@ class Orient:
 
 @njit(cache=True)
 def _repeat_first(frames):
-    """Fill the frames (T, B, 22, 3, 3) before a young body's first with that one."""
+    """Fill the frames (T, B, 22, 3, 3) before a new body's first frame with that frame."""
     for row in range(frames.shape[1]):
         first = 0
         while first < len(frames) - 1 and math.isnan(frames[first, row, 0, 0, 0]):
@@ -151,9 +152,9 @@ def _repeat_first(frames):
 
 @njit(cache=True)
 def _facing_forward(frames, back, x):
-    """Writes ``x`` (B, T, 22, 6), the first two columns of the rotations (T, B, 22, 3, 3), as `to_6d` of the network.
+    """Write the first two columns of rotations (T, B, 22, 3, 3) to ``x`` (B, T, 22, 6), like the network's `to_6d`.
 
-    The root's are turned by the inverse of ``back`` (B, 3, 3).
+    The root's rotations are turned by the inverse of ``back`` (B, 3, 3).
     """
     for row in range(len(x)):
         for t in range(len(frames)):
@@ -169,7 +170,8 @@ def _facing_forward(frames, back, x):
 
 @njit(cache=True)
 def rotations_of(x, back):
-    """(T, B, 22, 3, 3) rotations of ``x`` (B, T, 22, 6), as `from_6d` of the network, the root's turned by ``back``."""
+    """(T, B, 22, 3, 3) rotations of ``x`` (B, T, 22, 6), like the network's `from_6d`, with the root turned by
+    ``back``."""
     rotations = np.empty((x.shape[1], len(x), 22, 3, 3))
     root = np.empty((3, 3))
     for row in range(len(x)):
@@ -189,7 +191,7 @@ def rotations_of(x, back):
 
 @njit(cache=True)
 def _orthonormal(x, r):
-    """Writes the rotation ``r`` (3, 3) whose first two columns are nearest to ``x`` (6,), by Gram and Schmidt."""
+    """Write the rotation ``r`` (3, 3) that Gram-Schmidt orthonormalisation of the two columns ``x`` (6,) gives."""
     along = length = rest = 0.0
     for i in range(3):
         length += x[i] * x[i]

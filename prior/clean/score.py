@@ -1,13 +1,13 @@
-"""The score stage: whether the observations of a body can be trusted, and which joints cannot.
+"""The score stage: anomaly detection for each body and joint.
 
-The fault network gives each joint's log odds of being at fault; a window's score is the highest of its joints'. Both
-are expressed as an anomaly: -log10 of the rate at which clean windows of people unseen in training, of the same pace,
-score at least as high. An anomaly of 2 occurs in one of a hundred clean windows.
+The fault network gives each joint's log odds of being faulty. A window's score is the highest score of its joints. Both
+are converted to an anomaly: -log10 of the rate at which clean windows of the same pace, of people unseen in training,
+score at least as high. One clean window in a hundred has an anomaly of 2 or more.
 
-Sensors and people unlike those of validation score higher throughout, without being at fault throughout. So each body's
-anomaly is divided by a scale estimated from its own last ten seconds (`OwnScale`).
+Sensors and people unlike those of the validation set score higher throughout without being faulty. Each body's anomaly
+is therefore divided by a scale estimated from its own last ten seconds (`OwnScale`).
 
-The paper scores by log p(z | x) alone (`steadypose evaluate hgvae` has both).
+The paper scores by log p(z | x) alone; `steadypose evaluate hgvae` compares the two.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from steadypose.prior.models.hgvae.faults import SENSOR_SIGMAS, Calibration, Liv
 from steadypose.prior.timing.rate import FPS
 
 MEAN_ANOMALY = 0.54
-"""Mean anomaly at which the scale is 1. Of a body that follows validation's distribution it would be 1 / ln 10 = 0.43;
-chosen on validation (benchmarks/NOTEBOOK.md)."""
+"""Mean anomaly at which the scale is 1 (chosen on validation, benchmarks/NOTEBOOK.md). For a body that follows the
+validation set's distribution, the mean is 1 / ln 10 = 0.43."""
 
 MAX_COUNTED = 2.0
-"""At which a frame's anomaly is clipped in the mean, so that a fault of a second hardly changes it."""
+"""Bound at which a frame's anomaly is clipped in the mean, so that a fault of one second hardly changes the scale."""
 
 MAX_SCALE = 2.0
-"""The largest scale: a body that would need more, such as one with a wrong skeleton, is to be flagged."""
+"""Largest scale; a body that would need more, such as one with a wrong skeleton, should be flagged."""
 
 OWN_FRAMES, FIRST_FRAMES = 300, 30
-"""Frames of the running mean; and for how many `MEAN_ANOMALY` counts when a body is new."""
+"""Length of the running mean, and weight of `MEAN_ANOMALY` in it for a new body, frames."""
 
 RELEASED = 0.8
-"""Fraction of the flag's threshold below which the anomaly has to stay for the flag to be cleared."""
+"""Fraction of the flag's threshold below which the anomaly must stay for the flag to be cleared."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class ScoreSettings:
     """Settings of the score stage.
 
     Attributes:
-        enabled: whether to score at all; off, the anomaly is NaN and the flag down.
-        false_alarms: the share of frames of clean motion that may be flagged; 0.01 would be one every three seconds.
-        hold: seconds that the anomaly must stay under `RELEASED` of the flag's height before the flag goes down.
+        enabled: whether to score; if off, the anomaly is NaN and the flag is not set.
+        false_alarms: share of frames of clean motion that may be flagged; 0.01 is one frame every three seconds.
+        hold: seconds for which the anomaly must stay below `RELEASED` times the threshold before the flag is cleared.
     """
 
     enabled: bool = True
@@ -55,10 +55,9 @@ class ScoreSettings:
 
 
 class OwnScale:
-    """The scale of each body's anomaly: how many times as high as validation's it is on average, 1 to `MAX_SCALE`.
+    """The scale of each body's anomaly: its mean relative to the validation set's, between 1 and `MAX_SCALE`.
 
-    If the calibration holds, an anomaly is distributed exponentially, so that a mean k times as large stands for
-    quantiles k times as large.
+    A calibrated anomaly is distributed exponentially. If its mean is k times as large, so are its quantiles.
     """
 
     def __init__(self, slots: int) -> None:
@@ -70,7 +69,7 @@ class OwnScale:
         self._mean[slot], self._frames[slot] = MEAN_ANOMALY, FIRST_FRAMES
 
     def update(self, slots: NDArray[np.intp], anomaly: Floats) -> Floats:
-        """(B,) scales of the bodies ``slots`` (B,) as of the frame before; then ``anomaly`` (B,) enters the means."""
+        """Return the scales (B,) of the bodies ``slots`` (B,) up to the last frame, then add ``anomaly`` (B,)."""
         scale = np.clip(self._mean[slots] / MEAN_ANOMALY, 1.0, MAX_SCALE)
         self._frames[slots] = np.minimum(self._frames[slots] + 1, OWN_FRAMES)
         self._mean[slots] += (np.fmin(anomaly, MAX_COUNTED) - self._mean[slots]) / self._frames[slots]
@@ -78,7 +77,7 @@ class OwnScale:
 
 
 class Scorer:
-    """Scores the newest window of each body, and raises the flag with hysteresis."""
+    """Scores the newest window of each body, and sets the flag with hysteresis."""
 
     def __init__(self, settings: ScoreSettings, weights: str, slots: int) -> None:
         if not 0 < settings.false_alarms < 1:
@@ -98,9 +97,9 @@ class Scorer:
         self._flag = self._flag & ~slot
 
     def update(self, windows: BodyWindows | None, frozen: Bools, sensor_sigma: Floats) -> Score:
-        """The score of the newest frame, in which the joints ``frozen`` (S, 22) repeat themselves.
+        """Score the newest frame, in which the joints ``frozen`` (S, 22) repeat themselves.
 
-        ``sensor_sigma`` (S,) metres along an axis is the estimated error of each body's observations.
+        ``sensor_sigma`` (S,) is the estimated error of each body's observations, metres along an axis.
         """
         anomaly, joint_anomaly = np.full(len(frozen), np.nan), np.full(frozen.shape, np.nan)
         if windows is not None:
@@ -115,7 +114,7 @@ class Scorer:
         return Score(anomaly, self._flag, joint_anomaly)
 
     def _score(self, windows: BodyWindows, frozen: Bools, sensor_sigma: Floats) -> tuple[Floats, Floats]:
-        """The anomaly of each window (B,), on the scale of validation's people, and of its joints (B, 22)."""
+        """Return the anomaly of each window (B,) and of its joints (B, 22), before the body's own scale."""
         tracks, found = windows.tracks, windows.reconstruction
         sensor_sigma = np.clip(sensor_sigma, SENSOR_SIGMAS[0], SENSOR_SIGMAS[-1])  # the range it was trained on
         odds = self._network(tracks.x, found.mean, found.sigma, tracks.observed, sensor_sigma)

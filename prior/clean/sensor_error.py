@@ -1,11 +1,13 @@
-"""Systematic errors of sensors: the correct stage, which subtracts a known sensor's from the observed joints, and the
-estimate, from bones, of how much more an unknown one errs along one direction: its line of sight.
+"""Systematic sensor errors: correction of a known sensor's bias, and estimation of an unknown sensor's depth error.
 
-No filter averages out what lasts, so the smoother's deviations leave part of it out: of simulated monocular estimators,
-whose errors lie in depth, they are 1.7 to 2.1 times too small. But errors in depth vary the lengths of bones that point
-to the camera, and hardly those of bones that lie across, whatever the person does. Half the variance of bones' lengths
-is fitted, by least squares, as a quadratic form of their direction. By how much its largest eigenvalue exceeds the
-second says how much is left out; where the camera is, need not be known.
+The correct stage subtracts a known sensor's bias from the observed joints.
+
+`DepthError` estimates, from bones, how much larger an unknown sensor's error is along its line of sight. No filter
+averages out lasting errors, so the smoother's deviations omit part of them: for simulated monocular estimators, whose
+errors lie in depth, the deviations are 1.7 to 2.1 times too small. Errors in depth vary the lengths of bones that point
+to the camera, but hardly those of bones across the line of sight. Half the variance of bone lengths is therefore
+fitted, by least squares, as a quadratic form of the bone's direction. The difference between its largest and second
+eigenvalue gives the missing variance. The position of the camera need not be known.
 """
 
 from __future__ import annotations
@@ -28,21 +30,21 @@ FADE = 0.9
 """Decay per frame of the last correction while none can be computed, because the trunk is hidden."""
 
 MEMORY = round(10.0 * FPS)
-"""Number of frames of the running means of bones' lengths."""
+"""Length of the running means of bone lengths, frames."""
 
 PRIOR, RIDGE = 8.0, 0.05
-"""Number of frames, and share of all frames, that count as isotropic: bodies that stand show few directions."""
+"""Weight of the isotropic prior: frames, and share of all frames. A standing body's bones have few directions."""
 
 MAX_SIGMA, MAX_RESIDUAL = 0.05, 0.05
-"""Largest standard deviation of a joint that counts for lengths, and bound of their residuals, metres."""
+"""Largest standard deviation of a joint that counts for lengths, and bound of the lengths' residuals, metres."""
 
 LEFT_OUT = 3.0
-"""Variance along an axis that is left out, relative to the difference of the eigenvalues: what lasts longer than the
-mean of the lengths does not vary them, nor do errors that both ends share."""
+"""Ratio of the missing variance along an axis to the difference of the eigenvalues. It exceeds 1 because lengths do not
+show errors that last longer than their running mean, or that both ends share."""
 
 _PARENTS = np.array(PARENTS[1:])
 _ENTRIES = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
-"""Of the symmetric matrix, in the vector of its six different entries."""
+"""Index of each entry of a symmetric 3 × 3 matrix in the vector of its six distinct entries."""
 _ISOTROPIC = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 _TWICE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
 
@@ -52,8 +54,8 @@ class CorrectSettings:
     """Settings of the correct stage.
 
     Attributes:
-        sensor: ``kinect_v2``, or empty for a sensor whose error is not known. A property of the sensor, not of its
-            joint layout: another camera with the same joints has other errors.
+        sensor: ``kinect_v2``, or empty for a sensor whose error is not known. The error belongs to the sensor, not to
+            its joint layout: another camera with the same joints has other errors.
     """
 
     sensor: str = ""
@@ -93,16 +95,16 @@ class Correct:
 
 
 class DepthError:
-    """Keeps, for each body, mean lengths of bones, and the moments of the fit.
+    """Estimates the depth error of each body, from mean bone lengths and the moments of the fit.
 
     Args:
-        slots: bodies.
+        slots: number of bodies.
     """
 
     def __init__(self, slots: int) -> None:
         self._frames, self._length = np.zeros((2, slots, len(_PARENTS)))
         self._normal, self._right = np.zeros((slots, 6, 6)), np.zeros((slots, 6))
-        self._total = np.zeros((2, slots))  # of bones, and of halves of their squared residuals
+        self._total = np.zeros((2, slots))  # number of bones, and sum of half their squared residuals
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
@@ -111,11 +113,11 @@ class DepthError:
         self._total[:, slot] = 0.0
 
     def update(self, smoothed: Smoothed | None, white: Floats) -> Floats:
-        """Take in joints (S, 22) and their deviations; the deviation (S,) along an axis, metres, that these leave out.
+        """Add a smoothed frame and return the standard deviation (S,) that its deviations omit, metres along an axis.
 
         Args:
-            smoothed: of a frame; None while there is none.
-            white: (S,) share of the noise that is white, of which they leave out nothing.
+            smoothed: joints and their deviations; None if there is no estimate yet.
+            white: (S,) share of the noise that is white, which the deviations include in full.
         """
         if smoothed is None:
             return np.zeros(len(white))
@@ -132,7 +134,7 @@ class DepthError:
 
 @njit(cache=True)
 def _take_in(positions, sigma, frames, length, normal, right, total):
-    """Take joints (S, 22, 3) and their deviations (S, 22) into the moments of `DepthError`."""
+    """Add joints (S, 22, 3) and their deviations (S, 22) to the moments of `DepthError`, in place."""
     keep, entries = 1.0 - 1.0 / MEMORY, np.empty(6)
     for slot in range(len(positions)):
         for i in range(6):

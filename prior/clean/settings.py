@@ -21,15 +21,15 @@ from steadypose.prior.settings import build_settings, check_range, current_keys
 logger = logging.getLogger(__name__)
 
 MAX_DELAY = 16
-"""Frames, the longest delay that the mixture of smoothers was trained for."""
+"""Longest delay that the mixture of smoothers is trained for, frames."""
 
 UNUSED = ("steps", "rate")
-"""Keys of ``[prior.impute]`` of version 0.2, ignored with a warning: ascent in the latents gained nothing."""
+"""Keys of ``[prior.impute]`` in version 0.2, ignored with a warning. Gradient ascent in the latents gained nothing."""
 
 
 @dataclass(frozen=True)
 class SmoothSettings:
-    """Settings of the smooth stage: there are no noise parameters to tune.
+    """Settings of the smooth stage. There are no noise parameters to tune.
 
     Attributes:
         weights: weight set (``default``), or a path to a ``.safetensors`` file.
@@ -43,14 +43,14 @@ class PriorSettings:
     """Settings of the prior: ``[prior]`` of a launch file.
 
     Attributes:
-        delay: look-ahead, frames at 30 Hz between a frame and its answer, 0 to 16 (the default, 4, is half of HM-VAE's
-            window: the paper's centre-frame refinement).
-        max_bodies: bodies tracked at once.
-        timeout: seconds without an observation after which a body is dropped, and without a frame after which the
-            stream starts anew.
-        bias_sigma: metres along an axis, expected standard deviation of the sensor's bias: the prior of its
-            estimate from the stream, and the least that a fault has to exceed. Depth cameras have 2 cm or more.
-        identify: whether ids are the source's (the default) or assigned by the prior.
+        delay: look-ahead in frames at 30 Hz, from a frame to its output, 0 to 16. The default of 4 is half of HM-VAE's
+            window, which gives the paper's centre-frame refinement.
+        max_bodies: largest number of bodies tracked at once.
+        timeout: seconds without an observation after which a body is dropped, and seconds without a frame after which
+            the stream starts anew.
+        bias_sigma: metres along an axis, expected standard deviation of the sensor's bias. It is the prior of the bias
+            that is estimated from the stream, and a fault must exceed it. Depth cameras have 2 cm or more.
+        identify: settings of the identify stage, which assigns body ids instead of the source (off by default).
         gate, correct, smooth, reconstruct, denoise, person, score, impute, refine, fuse, orient: settings of the
             stages.
     """
@@ -74,7 +74,7 @@ class PriorSettings:
 
     def __post_init__(self) -> None:
         check_range("[prior] delay", self.delay, 0, MAX_DELAY)
-        check_range("[prior] max_bodies", self.max_bodies, 1, 256)  # as many as the bench puts side by side
+        check_range("[prior] max_bodies", self.max_bodies, 1, 256)  # benchmarks run 256 bodies together
         check_range("[prior] timeout", self.timeout, 0.05, 60.0)
         check_range("[prior.person] samples", self.person.samples, 1, 1e6)
         check_range("[prior.person] every", self.person.every, 1, 1e6)
@@ -86,10 +86,10 @@ class PriorSettings:
 
     @classmethod
     def from_dict(cls, settings: Mapping[str, Any]) -> PriorSettings:
-        """From the section of a launch file.
+        """Build the settings from the section of a launch file.
 
         Raises:
-            ValueError: a key that does not exist (the message names the nearest that does) or a wrong type.
+            ValueError: for an unknown key (the message names the most similar one) or a wrong type.
         """
         settings = current_keys("prior", settings)
         impute = settings.get("impute")

@@ -1,4 +1,4 @@
-"""Assignment of bodies to slots: a new body takes a free slot, one not observed for a while leaves it."""
+"""Assigns bodies to slots. A new body takes a free slot; a body that is not observed for a while leaves it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.clean.adapt import BodyJoints
 
 MIN_JOINTS = 6
-"""Least number of visible canonical joints of a new body."""
+"""Least number of observed canonical joints of a new body."""
 
 
 Key = TypeVar("Key", bound=Hashable)
@@ -23,14 +23,14 @@ class Slots(Generic[Key]):
     """The bodies tracked at once.
 
     Args:
-        count: of slots.
+        count: number of slots.
         timeout_s: seconds without an observation after which a body is dropped.
-        counters: gets ``body_too_little_seen``, ``too_many_bodies`` and ``body_for_load``.
+        counters: counts ``body_too_little_seen``, ``too_many_bodies`` and ``body_for_load``.
 
     Attributes:
-        keys: (S,) key of each slot's body; None of a free slot.
+        keys: (S,) key of each slot's body; None for a free slot.
         present: (S,) which slots hold a body that has been observed at a grid time.
-        left_out: bodies of the newest message for which there is no time.
+        left_out: number of bodies in the newest message that are not processed for lack of time.
     """
 
     def __init__(self, count: int, timeout_s: float, counters: Counter[str]) -> None:
@@ -43,12 +43,12 @@ class Slots(Generic[Key]):
         self._last_observed_ns = np.zeros(count, dtype=np.int64)  # 0: not on the grid yet
 
     def crowded_out(self, most: int, bodies: Iterable[tuple[Key | None, BodyJoints]], sensor: Floats) -> Bools:
-        """The slots (S,) of bodies beyond the ``most`` that there is time for: those that were observed farthest away.
+        """Return the slots (S,) of the farthest bodies, those beyond the ``most`` for which there is time.
 
         Args:
-            most: bodies, from now on.
-            bodies: of the newest message, as of `arrange`.
-            sensor: (3,) metres, where it stands.
+            most: largest number of bodies from now on.
+            bodies: the bodies of the newest message, as in `arrange`.
+            sensor: (3,) metres, position of the sensor.
         """
         self._most = most
         out = np.zeros(len(self.keys), dtype=bool)
@@ -62,16 +62,15 @@ class Slots(Generic[Key]):
 
     @property
     def taken(self) -> int:
-        """How many slots hold a body."""
+        """Number of slots that hold a body."""
         return sum(key is not None for key in self.keys)
 
     def excuse(self, stamp_ns: int) -> None:
-        """Messages were skipped until now: no body counts as unobserved in that time."""
+        """Note that messages until ``stamp_ns`` were skipped, so that no body counts as unobserved in that time."""
         self._last_observed_ns[self._last_observed_ns > 0] = stamp_ns
 
     def arrange(self, bodies: Iterable[tuple[Key | None, BodyJoints]]) -> BodyJoints:
-        """Sort bodies into slots by key (None: a body without one, which is left out): joints and confidence by
-        slot."""
+        """Sort bodies into slots by key and return joints and confidence by slot. Bodies without a key are left out."""
         positions, confidence = np.full((len(self.keys), 22, 3), np.nan), np.zeros((len(self.keys), 22))
         self.left_out = 0
         for key, joints in bodies:
@@ -83,7 +82,7 @@ class Slots(Generic[Key]):
         return BodyJoints(positions, confidence)
 
     def advance(self, stamp_ns: int, positions: Floats) -> Bools:
-        """Advance to a grid time, with its joints (S, 22, 3); returns the slots (S,) whose bodies have timed out."""
+        """Advance to a grid time with its joints (S, 22, 3); return the slots (S,) whose bodies have timed out."""
         taken = np.array([key is not None for key in self.keys])
         observed = np.asarray(finite_joints(positions).any(axis=1))
         self.present = self.present & taken | observed
@@ -98,7 +97,7 @@ class Slots(Generic[Key]):
             self.keys[k] = None
 
     def _slot(self, key: Key, joints_observed: int) -> int | None:
-        """The slot of a body; a free one if it is new and enough of it is visible."""
+        """Return the slot of a body. A new body takes a free slot if enough of its joints are observed."""
         if key in self.keys:
             return self.keys.index(key)
         if joints_observed < MIN_JOINTS:
@@ -119,6 +118,6 @@ class Slots(Generic[Key]):
 
 
 def _distance(positions: Floats, sensor: Floats) -> float:
-    """Metres from a sensor to the mean of the joints (22, 3) that it observes."""
+    """Return the metres from a sensor to the mean of the observed joints (22, 3)."""
     observed = positions[finite_joints(positions)]
     return float(np.linalg.norm(observed.mean(axis=0) - sensor)) if len(observed) else np.inf
