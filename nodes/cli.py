@@ -23,31 +23,31 @@ from steadypose.nodes.extras import extra_of, how_to_install
 
 EVALUATE = "steadypose.benchmarks.evaluate"
 COMMANDS = {
-    "run": ("run", "start a launch file's nodes, watch them, show how they do"),
-    "node": ("node", "one node, for another machine or a supervisor such as systemd"),
-    "clean": ("clean", "clean a recording or .npz offline, with the nodes' own code"),
-    "retarget": ("export", "a recording's person as a robot's motion, by its URDF"),
-    "fit": ("fit", "fit a motion to a whole recording: slower than clean"),
-    "complete": ("complete", "key frames to motion, a part of a body to all of it, offline"),
-    "export": ("export", "cleaned motion as BVH, GLB, VRMA, CSV or TRC"),
+    "run": ("run", "start the nodes of a launch file, watch and restart them"),
+    "node": ("node", "run a single node, for another machine or a supervisor"),
+    "clean": ("clean", "clean a recording, .npz or .csv offline, as `run` does live"),
+    "retarget": ("export", "convert a person's motion to a robot's, by its URDF"),
+    "fit": ("fit", "fit a motion to a whole recording; slower than `clean`"),
+    "complete": ("complete", "fill in gaps between key frames and missing joints, offline"),
+    "export": ("export", "write cleaned motion as BVH, GLB, VRMA, CSV or TRC"),
     "echo": ("inspect", "print the messages of a topic or recording"),
     "hz": ("inspect", "measure the rate of a topic or recording"),
-    "info": ("info", "what is in a recording, or on a topic"),
-    "repair": ("small", "what can be read of a damaged recording, as a whole one"),
-    "plot": ("plot", "what happened in a recording, as pictures"),
-    "prepare": ("prepare", "motion capture into training data"),
+    "info": ("info", "describe a recording, a file of poses or a topic"),
+    "repair": ("small", "write the readable part of a damaged recording to a new one"),
+    "plot": ("plot", "plot a recording as an image or a video"),
+    "prepare": ("prepare", "convert motion capture to training data"),
     "train": ("train", "train a model of the prior"),
-    "evaluate": (EVALUATE, "measure beside tuned baselines, by studies (in a checkout)"),
-    "simulate": ("small", "streams as a depth camera would see them, with their truth"),
-    "calibrate": ("calibrate", "a camera's lens, its place in the world, its own error"),
-    "doctor": ("doctor", "what is missing on this machine, and how to get it"),
+    "evaluate": (EVALUATE, "measure accuracy and speed beside tuned baselines"),
+    "simulate": ("small", "simulate recordings of a depth camera, with ground truth"),
+    "calibrate": ("calibrate", "calibrate a camera's lens and pose, or a sensor's own error"),
+    "doctor": ("doctor", "check this machine: what is missing, and how to get it"),
     "install-service": ("install_service", "run a launch file at every boot, under systemd"),
-    "keys": ("small", "make CurveZMQ keys, for messages that leave this machine"),
+    "keys": ("small", "make CurveZMQ keys, for messages between machines"),
 }
-"""of each command: the module of the function of that name, in `nodes.commands` unless named whole; and what it does"""
+"""Module of each command's function, in `nodes.commands` unless it is a full name; and what the command does."""
 
 USAGE_ERROR = 2
-"""exit status: what was asked for cannot be done, and will not be the next time either"""
+"""Exit status of a request that cannot succeed, and should not be retried."""
 INTERRUPTED = 130
 
 
@@ -158,7 +158,7 @@ def usage() -> str:
             "steadypose: clean, world-space human pose from any noisy 3D skeleton source\n",
             "commands:",
             *lines,
-            "\n`steadypose COMMAND --help` says more; `steadypose run` plays a bundled stream.",
+            "\nOptions: `steadypose COMMAND --help`. `steadypose run` plays a bundled stream.",
         )
     )
 

@@ -54,10 +54,10 @@ _INCH_MM = 25.4
 
 @dataclass(frozen=True)
 class PrintBoard:
-    """Make the board to print: a PDF or PNG at its true size.
+    """Write the calibration board: a PDF or PNG to print at its true size.
 
-    Print it at 100 % ("actual size", not "fit to page"), glue it to something flat and stiff, and measure a square: all
-    other steps want its side in metres as --square. A3 lets a camera stand farther away than A4.
+    Print it at 100 % ("actual size", not "fit to page"), glue it to something flat and stiff, and measure a square. All
+    other steps take its side in metres as --square. With A3 the camera can stand farther away than with A4.
 
     Try:
       steadypose calibrate board board.pdf
@@ -101,20 +101,20 @@ class PrintBoard:
 
 @dataclass(frozen=True)
 class CalibrateLens:
-    """The lens, from 15 to 25 pictures of the board.
+    """Calibrate the lens from 15 to 25 images of the board.
 
-    Hold the board in front of the camera, or the camera before the board: near and far, tilted to all sides, in the
-    middle and in every corner of the picture; still each time, and the same resolution as in use. An OAK camera knows
-    its lens and needs this only for the pictures of 'pose'.
+    Take images of the board near and far, tilted to all sides, in the middle and in every corner of the image. Keep the
+    board still each time, and use the resolution that you run with. An OAK camera stores its lens parameters: use the
+    step 'oak' instead.
 
     Try:
       steadypose calibrate lens kitchen.toml pictures/ --square 0.0561
       steadypose calibrate lens kitchen.toml video.mp4 --square 0.0561
 
     Args:
-        launch: the launch file of this camera, your own copy of one; what is found goes into its [input.calibration].
-        pictures: picture files, folders of them, or videos, of which two pictures a second are taken.
-        square: metres, the side of a square as measured on the print.
+        launch: your launch file of this camera; the result is written to its [input.calibration].
+        pictures: image files, folders of them, or videos, of which two images per second are used.
+        square: side of a square in metres, measured on the print.
         columns: squares along the lower edge.
         rows: squares along the left edge.
     """
@@ -152,23 +152,23 @@ class CalibrateLens:
 
 @dataclass(frozen=True)
 class CalibratePose:
-    """Where the camera stands, from pictures of the board on the floor.
+    """Estimate the camera's pose from images of the board on the floor.
 
-    Lay the board flat on the floor where the camera sees it well, 1 to 2.5 m away, and take a few pictures; neither may
-    move. The world begins at the lower left corner of the pattern (the corner that the print names), x along its lower
-    edge, y along its left edge, z up. Several cameras that see the board lying in one place share one world. Look at
-    the picture that is written: the grid must lie on the floor.
+    Lay the board flat on the floor, 1 to 2.5 m from the camera, and take a few images; neither may move. The world's
+    origin is the lower left corner of the pattern (labelled on the print): x along its lower edge, y along its left
+    edge, z up. Cameras that see the board in the same place share one world. Check the image that is written: the grid
+    must lie on the floor.
 
     Try:
       steadypose calibrate pose kitchen.toml floor.jpg --square 0.0561
 
     Args:
-        launch: the launch file of this camera, with the lens; the pose goes into its [input.calibration].
-        pictures: picture files, folders of them, or videos.
-        square: metres, the side of a square as measured on the print.
+        launch: your launch file of this camera, with the lens; the pose is written to its [input.calibration].
+        pictures: image files, folders of them, or videos.
+        square: side of a square in metres, measured on the print.
         columns: squares along the lower edge.
         rows: squares along the left edge.
-        picture: where to write what the camera sees with the floor's grid; beside the launch file if left out.
+        picture: image to write, with the floor's grid drawn over it. Default: beside the launch file.
     """
 
     launch: LaunchFile
@@ -206,22 +206,21 @@ class CalibratePose:
 
 @dataclass(frozen=True)
 class CalibrateFloor:
-    """Where the camera stands above the floor, from a depth image and from where up is; without a board.
+    """Estimate the camera's height and tilt from a depth image and the direction of gravity, without a board.
 
-    This gives height and tilt. It cannot give where on the floor the camera stands or which way it looks: the world
-    begins under the camera, and the camera looks along +y. Several cameras need the board.
+    Position and heading on the floor cannot be estimated: the world's origin is below the camera, which looks along
+    +y. For several cameras, use the board.
 
     Try:
       steadypose calibrate floor kitchen.toml depth.png
       steadypose calibrate floor kitchen.toml depth.png --up 0.02 -0.94 -0.34
 
     Args:
-        launch: the launch file of this camera, with the lens; the pose goes into its [input.calibration].
-        depth: 16 bit .png in millimetres, or .npy (H, W) in millimetres; 0 where nothing is seen. At the resolution of
-            the lens.
-        up: where up is in the camera's frame (x right, y down, z forward), as its IMU feels it at rest, to 10 degrees;
-            a level camera if left out.
-        picture: where to write the depth image with the floor's grid; beside the launch file if left out.
+        launch: your launch file of this camera, with the lens; the pose is written to its [input.calibration].
+        depth: depth image in millimetres, 16 bit .png or .npy (H, W), 0 where unknown, at the resolution of the lens.
+        up: upward direction in the camera's frame (x right, y down, z forward), within 10 degrees, as its IMU measures
+            it at rest. Default: a level camera.
+        picture: image to write, with the floor's grid drawn over it. Default: beside the launch file.
     """
 
     launch: LaunchFile
@@ -243,14 +242,14 @@ class CalibrateFloor:
 
 @dataclass(frozen=True)
 class CalibrateOak:
-    """A picture and a depth image of an OAK camera for the other steps, and its lens, which it knows.
+    """Write the lens parameters of an OAK camera, and take an image and a depth image for the other steps.
 
     Try:
       steadypose calibrate oak kitchen.toml floor
       steadypose calibrate pose kitchen.toml floor.png --square 0.0561
 
     Args:
-        launch: the launch file of this camera; the lens goes into its [input.calibration].
+        launch: your launch file of this camera; the lens is written to its [input.calibration].
         out: name of the files to write, without ending: NAME.png and NAME.depth.png.
     """
 
@@ -292,12 +291,11 @@ def calibrate(
         tyro.conf.arg(name=""),
     ],
 ) -> None:
-    """Tell a camera its lens and its place, so that bodies stand on the floor of one world.
+    """Calibrate a camera's lens and pose, so that bodies stand on the floor of one world frame.
 
-    In order: 'board' makes the board to print, 'lens' takes pictures of it, 'pose' takes pictures of it on the floor.
-    A camera with depth can do with 'floor' in place of 'pose'. What is found goes into the launch file, which keeps its
-    comments; from then on poses are sent as calibrated. 'sensor' learns what a sensor itself gets wrong.
-    docs/calibrate.md shows it step by step.
+    The steps in order: 'board' writes a board to print, 'lens' uses images of it, and 'pose' uses images of it on the
+    floor. With a depth camera, 'floor' can replace 'pose'. Each step writes its result to the launch file, whose
+    comments are kept. Separately, 'sensor' trains a correction of a sensor's own error. See docs/calibrate.md.
     """
     step.run()
 

@@ -35,27 +35,27 @@ SHORTEST_S = 10.0
 
 @dataclass(frozen=True)
 class CalibrateSensor:
-    """A sensor's own error, from recordings of it beside a reference: markers, or several cameras.
+    """Train a correction of a sensor's bias from recordings beside a reference: markers, or several cameras.
 
-    What a depth camera or a network gets wrong depends on the pose and on the direction of view, and does not average
-    out. This learns it, and prints how far off people are of whom it has learned nothing, before and after. Ten people
-    of a few minutes each are good, three are the least that makes sense.
+    The bias of a depth camera or a network depends on pose and direction of view, and does not average out. The
+    command prints the error before and after correction by cross-validation over people. Ten people with a few
+    minutes each are good; three are the minimum.
 
-    Sensor and reference have stamps of one clock, or start in the same frame. They need neither the same frame of
-    reference nor the same rate, and joints of either may be missing. The sensor stands still in a recording, which
-    shows one person; who it is says the array 'person' of an .npz, or the folder that it lies in, or the file's name.
+    Sensor and reference need stamps of one clock, or the same first frame. Their frames of reference and rates may
+    differ, and joints may be missing. The sensor must stand still, and a recording must show one person, who is named
+    by the array 'person' of an .npz, else by the folder, else by the file name.
 
     Try:
       steadypose calibrate sensor oak/ vicon/ --name my_oak --install
       steadypose run oak --set prior.correct.sensor=my_oak
 
     Args:
-        recording: of the sensor, as 'steadypose clean' reads it; or a folder of these.
-        reference: of the same time; or a folder with files of the same names.
-        name: of the sensor, for correct.sensor.
-        out: folder for the weights, correction-NAME.safetensors, and for their card.
-        iterations: optimiser steps; fewer make a weaker correction sooner.
-        install: put the weights where nodes find them by the name; else correct.sensor takes their path.
+        recording: recording of the sensor, in a format of 'steadypose clean'; or a folder of them.
+        reference: recording of the reference at the same time; or a folder with files of the same names.
+        name: name of the sensor, for correct.sensor.
+        out: folder for the weights, correction-NAME.safetensors, and their card.
+        iterations: optimiser steps; fewer give a weaker correction sooner.
+        install: install the weights under this name; otherwise, set correct.sensor to their path.
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]

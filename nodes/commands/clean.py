@@ -36,32 +36,30 @@ def clean(
     ray: bool = False,
     force: bool = False,
 ) -> int:
-    """Clean recorded poses: what `run` does live, offline, with the same numbers.
+    """Clean recorded poses offline, with the same result as `run` live.
 
-    A folder of recordings is cleaned into another, as many at once as there are cores, or on a Ray cluster.
-    OUT/manifest.jsonl says what became of each; started again, the command does what is not done yet. A recording
-    that cannot be cleaned does not stop the others. The exit status is 1 if one could not be cleaned, shows nobody, or
-    is damaged so that a part of it could not be read.
+    Given a folder, it cleans each recording in it into another folder, in parallel on all cores or on a Ray cluster.
+    OUT/manifest.jsonl lists the result of each recording. If you run the command again, it does only what is left. A
+    recording that cannot be cleaned does not stop the others. The exit status is 1 if a recording cannot be cleaned,
+    shows nobody, or is damaged.
 
     Args:
-        source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
-            motion, as .bvh of any rig, .trc, .c3d, AMASS' .npz or .npy; or a folder with any number of these, at any
-            depth.
-        out: the recording to make, or .npz or .csv with one row for each row of the input; or the folder for them.
-        delay: frames at 30 Hz to wait for, 0 to 16; more is smoother. 4 unless given.
-        settings: any setting of [prior] or [trajectory], such as gate.enabled=false or trajectory.contacts=false; the
-            end of its name will do, where there is one such setting only. May be given again. Weights of your own
-            ('steadypose train') are settings too: smooth.weights, reconstruct.weights, trajectory.weights=NAME, or the
-            path of a .safetensors file.
-        skeletons: TOML with [skeletons.NAME] of joint layouts of your own; a launch file with them will do.
-        rig: TOML that says of files of motion what they do not: metres (the size of their unit), up, fps, skeleton (of
-            arrays), and [canonical], which of their joints left_elbow and the others of smpl22 are.
-        jobs: of a folder, how many recordings at once, each in a process of its own that takes about 1 GB of
-            memory; as many as there are cores unless given.
-        ray: clean a folder on the Ray cluster that this machine belongs to, or that RAY_ADDRESS names, or else on
-            one started here; its machines must see IN and OUT under the same paths. Needs the extra 'ray'.
-        force: replace what is at OUT, if it is a recording, an .npz or a .csv. In a folder, what an earlier call made
-            is replaced without being asked for, and all else is kept in any case.
+        source: a recording; a .csv; an .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
+            motion capture (.bvh, .trc, .c3d, AMASS .npz, .npy); a video; or a folder of these, with subfolders.
+        out: the result: a recording, or an .npz or .csv with one row per input row; or a folder.
+        delay: frames at 30 Hz that the output lags behind, 0 to 16; more is more accurate. Default 4.
+        settings: override a setting of [prior] or [trajectory], such as gate.enabled=false or
+            trajectory.contacts=false. A unique end of its name is enough. Repeatable. To use weights that you trained,
+            set smooth.weights, reconstruct.weights or trajectory.weights to their name or .safetensors file.
+        skeletons: TOML file, or launch file, with joint layouts of your own as [skeletons.NAME].
+        rig: TOML file that describes motion capture which is not recognised: metres (length of its unit), up, fps,
+            skeleton (of arrays), and [canonical], its names of the joints of smpl22.
+        jobs: for a folder, how many recordings to clean at once. Each takes about 1 GB of memory. Default: the
+            number of cores.
+        ray: clean a folder on a Ray cluster: the one of this machine or of RAY_ADDRESS, or else a new local one. All
+            its machines must see IN and OUT under the same paths. Needs the extra 'ray'.
+        force: replace OUT if it is a recording, an .npz or a .csv. In a folder, results of earlier calls are always
+            replaced, and other files never.
     """
     table: dict[str, Any] = {"prior": {}, "trajectory": {}}
     if delay is not None:

@@ -34,11 +34,11 @@ if TYPE_CHECKING:  # the doctor starts where not even numpy is installed
 
 
 def doctor(live: bool = False, launch: str = "replay") -> int:
-    """Check this machine: what works, what is missing, and what to type about it.
+    """Check this machine: what works, what is missing, and which command mends it.
 
     Args:
-        live: listen for three seconds to a tracker that publishes, and to nodes that run, and say what is wrong there.
-        launch: the launch file whose addresses these are.
+        live: listen for three seconds to your tracker and to running nodes, and report problems.
+        launch: launch file, or name of a bundled one, whose addresses to listen at.
 
     Returns:
         0 if `steadypose run` can work here, otherwise 1; with `live`, 0 if nothing is wrong.

@@ -28,13 +28,13 @@ def export(
     names: Literal["smpl22", "vrm", "mixamo"] = "smpl22",
     force: bool = False,
 ) -> int:
-    """Write cleaned motion for other programs: .bvh, .glb, .vrma, .csv or .trc, by the name of OUT.
+    """Write cleaned motion for other programs. The ending of OUT chooses the format.
 
-    One body, in the world (its floor at 0), at the rate of the input's stamps, its bones of constant length, moved by
-    the rotations that 'clean' found; the rest pose is a T.
+    The file holds one body, in the world frame (floor at 0), at the input's frame rate. Bone lengths are constant, the
+    rotations are those of 'clean', and the rest pose is a T-pose.
       .bvh   animation programs: centimetres, y up, facing +z
       .glb   Blender, Unity, Unreal, browsers: animated bones with a skin; metres, y up (extra 'export')
-      .vrma  any VRM avatar: three-vrm, UniVRM, VRM Posing Desktop (extra 'export')
+      .vrma  VRM avatars: three-vrm, UniVRM, VRM Posing Desktop (extra 'export')
       .csv   spreadsheets, and steadypose itself: metres, z up, and quaternions xyzw
       .trc   OpenSim: markers at the joints; millimetres, y up
 
@@ -43,11 +43,11 @@ def export(
       steadypose export my_recording take.glb --body 2
 
     Args:
-        source: what 'steadypose clean' or 'run --record' has written: a recording with pose/world, or .npz.
-        out: the file to make.
-        names: of the joints in .bvh and .glb: those of the rig that the motion is for.
-        body: id of the body, of several; that which is there longest unless given.
-        force: replace what is at OUT.
+        source: output of 'steadypose clean' or 'run --record': a recording with pose/world, or an .npz.
+        out: the file to write: .bvh, .glb, .vrma, .csv or .trc.
+        names: names of the joints in .bvh and .glb: those of steadypose, VRM or Mixamo.
+        body: id of the body. Default: the one that is visible longest.
+        force: replace OUT if it exists.
     """
     check_file(source, out, FORMATS, replace=force)
     if names != "smpl22" and out.suffix not in NAMED:
@@ -92,24 +92,23 @@ def retarget(
     body: int | None = None,
     force: bool = False,
 ) -> int:
-    """Clean a recording, and write the motion of a robot that does what its person does.
+    """Clean a recording, and convert the person's motion to that of a robot.
 
-    Joints keep to the ranges and speeds of the URDF, feet that stand stay where they are. Of several people one is
-    followed at a time.
+    Joints respect the position and velocity limits of the URDF, and standing feet do not slide. If there are several
+    people, the robot follows one at a time.
 
     Try:
       steadypose retarget sim_data/walk_turn walk.csv --urdf launch/robots/humanoid29.urdf
 
     Args:
-        source: a recording, a .csv, or .npz, as for `steadypose clean`.
-        out: .csv with a row a frame: seconds, root (metres, xyzw), joints in radians; or .npz with stamp_ns (T,), root
-            (T, 7), joints (T, N), joint_names (N,) and stands (T, 2), whether the left and the right foot do.
-        urdf: the robot's.
-        links: the link that plays a part of the body, such as left_foot=l_sole, where its name does not tell. May be
-            given again.
-        sole: metres from the floor to the origins of the foot links, when they stand.
-        body: the id of the one to follow; the first who is there unless given.
-        force: replace what is at OUT.
+        source: a recording, .csv or .npz, as for `steadypose clean`.
+        out: .csv with one row per frame: seconds, root (metres, xyzw), joints in radians; or .npz with stamp_ns (T,),
+            root (T, 7), joints (T, N), joint_names (N,) and stands (T, 2), true while the left or right foot stands.
+        urdf: URDF file of the robot.
+        links: link of a body part, such as left_foot=l_sole, if its name is not recognised. Repeatable.
+        sole: height in metres of the foot links' origins above the floor while the robot stands.
+        body: id of the person to follow. Default: the first one visible.
+        force: replace OUT if it exists.
     """
     check_file(source, out, ARRAY_FILES, replace=force)
     if urdf is None:

@@ -41,16 +41,16 @@ def info(
     launch: LaunchFile = None,
     endpoints: Address = (),
 ) -> int:
-    """Tell what is in a recording, or who publishes a topic.
+    """Describe a recording or a file of poses, or list who publishes a topic.
 
     Try:
       steadypose info RECORDING
       steadypose info pose/world
 
     Args:
-        target: a topic, such as pose/clean, or a recording, or a file of poses.
-        launch: the launch file, or the name of one of the project's own, whose addresses to look at.
-        endpoints: the address to look at. May be given again.
+        target: a topic, such as pose/clean; a recording; or a file of poses.
+        launch: launch file, or name of a bundled one, whose addresses to listen at.
+        endpoints: address to listen at. Repeatable.
 
     Returns:
         0, or 1 if nobody publishes the topic.

@@ -109,7 +109,7 @@ def echo(
     launch: LaunchFile = None,
     endpoints: Address = (),
 ) -> None:
-    """Print messages, a line for each and one for each body.
+    """Print messages: one line per message and one per body.
 
     Try:
       steadypose echo pose/world
@@ -118,11 +118,11 @@ def echo(
 
     Args:
         target: a topic, such as pose/clean, or a recording.
-        count: stop after so many messages.
-        full: print every field instead, as YAML.
-        topics: of a recording, this topic alone. May be given again.
-        launch: the launch file, or the name of one of the project's own, whose addresses to look at.
-        endpoints: the address to look at. May be given again.
+        count: stop after this many messages.
+        full: print every field, as YAML.
+        topics: in a recording, only this topic. Repeatable.
+        launch: launch file, or name of a bundled one, whose addresses to listen at.
+        endpoints: address to listen at. Repeatable.
     """
     left = sys.maxsize if count is None else count
     for topic, message in messages_of(target, topics, launch, endpoints, newest=True):
@@ -234,7 +234,7 @@ def hz(
     launch: LaunchFile = None,
     endpoints: Address = (),
 ) -> None:
-    """Measure how often messages come: of a topic by the time they arrive, of a recording by their stamps.
+    """Measure the rate of messages: on a topic by arrival times, in a recording by stamps.
 
     Try:
       steadypose hz pose/world
@@ -242,11 +242,11 @@ def hz(
 
     Args:
         target: a topic, such as pose/clean, or a recording.
-        window: seconds to look back; a recording is measured as a whole.
-        count: stop after so many messages.
-        topics: of a recording, this topic alone. May be given again.
-        launch: the launch file, or the name of one of the project's own, whose addresses to look at.
-        endpoints: the address to look at. May be given again.
+        window: seconds over which to average; a recording is measured as a whole.
+        count: stop after this many messages.
+        topics: in a recording, only this topic. Repeatable.
+        launch: launch file, or name of a bundled one, whose addresses to listen at.
+        endpoints: address to listen at. Repeatable.
     """
     if target not in TOPICS:
         stamps: dict[str, list[float]] = {}

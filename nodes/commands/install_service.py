@@ -201,19 +201,19 @@ def install_service(
     dry_run: bool = False,
     uninstall: bool = False,
 ) -> int:
-    """Run a launch file at every boot, as a service of systemd with a user of its own.
+    """Run a launch file at every boot, as a systemd service with its own user.
 
-    Says what it does as it does it: the user, the unit, and its start. Folders are systemd's to make: recordings in
-    /var/lib/NAME, compiled loops in /var/cache/NAME, sockets and health.json in /run/NAME. The service sees no
-    homes, writes nowhere else, and uses no device but cameras.
+    The command prints each step. The service writes recordings to /var/lib/NAME, compiled code to /var/cache/NAME,
+    sockets and health.json to /run/NAME, and nothing elsewhere. It sees no home folders, and uses no devices but
+    cameras.
 
     Args:
-        launch: a launch file, or the name of one of the project's own. A file outside all homes, such as in /etc.
-        name: of the service, and of its folders.
-        user: an existing user to run it as; unless given, one is made with the service's name.
-        dry_run: print what would be done, and do nothing.
-        uninstall: stop and remove the service, its compiled loops, and its user if it was made for it. What is in
-            /var/lib/NAME is kept.
+        launch: a launch file, or the name of a bundled one. The file must lie outside home folders, such as in /etc.
+        name: name of the service and of its folders.
+        user: existing user to run it as. Default: a new user with the service's name.
+        dry_run: print every step and do nothing.
+        uninstall: stop and remove the service, its compiled code, and its user if it was created for it. Recordings in
+            /var/lib/NAME are kept.
     """
     console = Console(highlight=False, soft_wrap=True)
     if uninstall:

@@ -17,16 +17,16 @@ from steadypose.prior.settings import nearest
 
 
 def node(arguments: Sequence[str]) -> None:
-    """Run one node of a launch file until it is stopped, with SIGTERM or Ctrl-C."""
+    """Run one node of a launch file until SIGTERM or Ctrl-C."""
     parser = argparse.ArgumentParser(prog="steadypose node", description=node.__doc__, allow_abbrev=False)
     parser.add_argument("name", help=", ".join(NODES))
-    parser.add_argument("--launch", default="replay", help="a launch file, or the name of one of the project's own")
+    parser.add_argument("--launch", default="replay", help="a launch file, or the name of a bundled one")
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="SECTION.KEY=VALUE",
-        help="any setting of the launch file, over what it says; may be given again",
+        help="override a setting of the launch file; repeatable",
     )
     given = parser.parse_args(arguments)
     if supervisor_id():  # who started it has warned of former names already

@@ -33,14 +33,14 @@ def prepare(
     speeds: tuple[float, ...] = (1.0,),
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
 ) -> None:
-    """Turn motion capture into training data: 22 joints at 30 Hz, z up, on a floor, with contacts and splits.
+    """Convert motion capture to training data: 22 joints at 30 Hz, z up, on a floor, with contacts and splits.
 
-    Writes prepared.npz, and prepare-report.json, which lists every recording that was left out and why. Validation
-    and test hold out people, never frames; what is chosen is chosen on validation, and nothing on test. Models
-    trained on the set 'default' may go into products; 'research' is what only non-commercial models may use;
-    'measure' trains none.
+    Writes prepared.npz, and prepare-report.json, which lists every recording that was left out, with the reason.
+    Validation and test sets hold out whole people. Each data set has a licence class, in the last column: models
+    trained on 'default' may go into products, 'research' is for non-commercial models only, and 'measure' is
+    never trained on.
 
-    What is read, by the name of the archive (.tar.xz, .npz) or folder:
+    Data sets are recognised by the name of the archive (.tar.xz, .npz) or folder:
       cmu_amc, cmu_bvh, cmu_expmap   CMU Graphics Lab, free for all uses            default
       cmu_more                       the same, some fifteen more people             default
       cmu_dance                      the same: salsa; martial arts and dance test   default
@@ -52,21 +52,21 @@ def prepare(
       lafan1                         four actors, CC BY-NC-ND                       measure
       own, or any other name         your own; folders 'val', 'test' hold out       default
 
-    Your own are .bvh of any rig, .trc, .c3d (extra 'mocap'), AMASS' .npz, or arrays, .npy with --rig. Joints, units and
-    the axis that points up are recognised; a folder is a person.
+    Your own files may be .bvh of any rig, .trc, .c3d (extra 'mocap'), AMASS .npz, or .npy arrays with --rig. Joints,
+    units and the up axis are recognised. Use one folder per person.
 
     Try:
-      steadypose prepare mocap/                        all of it, a few minutes
+      steadypose prepare mocap/                        everything, a few minutes
       steadypose prepare mocap/cmu_amc.tar.xz --out /tmp/cmu
       steadypose prepare my-takes/ --rig studio.toml   files that are not recognised
-      steadypose prepare mocap/ --speeds 1 --speeds 2   fast motion to train on
+      steadypose prepare mocap/ --speeds 1 --speeds 2  add motion at twice the speed
 
     Args:
-        mocap: folder with these, or one of them.
+        mocap: a data set, or a folder of them.
         out: folder to write to.
-        speeds: training recordings of 50 frames a second and more are played once at each of these speeds.
-        rig: TOML that says of your own files what they do not: metres (the size of their unit), up, fps, skeleton (of
-            arrays), and [canonical], which of their joints left_elbow and the others of smpl22 are.
+        speeds: add training recordings of at least 50 frames per second at this speed. Repeatable.
+        rig: TOML file that describes files which are not recognised: metres (length of their unit), up, fps, skeleton
+            (of arrays), and [canonical], their names of the joints of smpl22.
     """
     console = Console()
     sources = find_sources(mocap)

@@ -51,21 +51,19 @@ def run(
     view: bool = False,
     settings: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="SECTION.KEY=VALUE")] = (),
 ) -> int:
-    """Start the nodes of a launch file, watch them and show how they do, until the stream ends or Ctrl-C.
+    """Start the nodes of a launch file, and show their state until the stream ends or Ctrl-C.
 
-    A node that crashes, or is not heard any more, is started again. On a terminal, the picture in the browser stays
-    when the stream has ended.
+    A node that crashes or hangs is restarted. On a terminal, the 3D view stays open after the stream has ended.
 
     Args:
-        launch: a launch file, or the name of one of the project's own, such as replay, oak, ros2 or server.
-        input: the recording, .npz or .csv to play in place of the launch file's; or a video, in which MediaPipe finds
-            people.
-        rate: times real time; 0 is as fast as it goes.
-        loop: play it again and again.
-        record: a recording to make of all topics.
-        view: serve the picture for a browser, and print its address.
-        settings: any setting of the launch file, over what it says; the end of its name will do, where there is one
-            such setting only: delay=2. May be given again.
+        launch: a launch file, or the name of a bundled one, such as replay, oak, ros2 or server.
+        input: a recording, .npz or .csv to play instead of the launch file's input; or a video, in which MediaPipe
+            detects people.
+        rate: speed of playback, 1 for real time; 0 is as fast as possible.
+        loop: repeat the input until Ctrl-C.
+        record: record all topics to this folder.
+        view: serve a 3D view for a browser, and print its address.
+        settings: override a setting of the launch file. A unique end of its name is enough: delay=2. Repeatable.
     """
     overrides = in_launch_file(settings)
     if input is not None and input.suffix.lower() in VIDEOS:

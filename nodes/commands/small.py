@@ -15,13 +15,13 @@ from steadypose.prior.sim.streams import ManifestError, read_manifest, record
 
 
 def keys(directory: Path) -> None:
-    """Make a pair of CurveZMQ keys: who has no key on the list hears nothing.
+    """Make a pair of CurveZMQ keys, so that only the subscribers that you list can receive messages.
 
-    Copy own.key of each machine that listens into clients/ here, and own.key of here to those machines as
-    server.key. Then name the directory as 'keys' under [transport] of the launch file.
+    Copy own.key of each subscribing machine into clients/ here, and own.key from here to those machines as
+    server.key. Then set `keys` to this folder, in [transport] of the launch file.
 
     Args:
-        directory: where the keys go; own.key_secret never leaves it.
+        directory: folder for the keys. Keep own.key_secret secret.
     """
     try:
         create_keys(directory)
@@ -36,14 +36,14 @@ def repair(
     source: Annotated[Path, tyro.conf.arg(name="in", metavar="IN")],
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
 ) -> int:
-    """Write what can be read of a recording into a new one, with its index and metadata, and say what is lost.
+    """Write the readable part of a recording to a new one, with index and metadata, and print what is lost.
 
-    For recordings whose writer was killed, which other programs may not read, and for damaged files: of these a chunk
-    is lost, half a second at most, for each place that is damaged. The exit status is 1 if anything is lost.
+    Use it for damaged files, and for recordings whose writer was killed, which other programs may not read. Each
+    damaged place costs half a second at most. The exit status is 1 if anything is lost.
 
     Args:
         source: a rosbag2 directory or an .mcap.
-        out: the directory to make.
+        out: the directory to write.
     """
     with RecordingReader(source) as recording, RecordingWriter(out) as writer:
         saved = 0
@@ -61,10 +61,10 @@ def simulate(
     stream: tuple[str, ...] = (),
     manifest: Path | None = None,
 ) -> None:
-    """Make streams as a depth camera would see them, with the truth on a topic of its own.
+    """Simulate recordings of a depth camera, with the ground truth on the topic pose/truth.
 
-    The same manifest gives the same bytes on the same machine. For scenes of your own copy sim_data/manifest.json,
-    change script, seed, camera or noise, and name it with --manifest.
+    The same manifest gives the same bytes on the same machine. For your own scenes, copy sim_data/manifest.json,
+    change script, seed, camera or noise, and pass it with --manifest.
 
     Try:
       steadypose simulate /tmp/streams                        all of sim_data
@@ -72,9 +72,9 @@ def simulate(
       steadypose run --input /tmp/streams/walk_turn --view
 
     Args:
-        out: folder to write to; each stream gets a folder in it, which must not be there yet.
-        stream: names of the streams to make; all of them if left out.
-        manifest: what to make; that of sim_data if left out.
+        out: folder to write to. Each stream gets a new folder in it.
+        stream: name of a stream to make. Repeatable. Default: all.
+        manifest: what to simulate. Default: that of sim_data.
     """
     path = manifest or bundled("sim_data", "manifest.json")
     known = read_manifest(path)

@@ -51,30 +51,30 @@ def train(
 ) -> None:
     """Train a model of the prior on prepared motion.
 
-    With torchrun, several processes or machines share each batch; the first of them writes:
+    Training takes about an hour on two cores. It shows progress and draws curves. If it is killed, the same command
+    resumes it. The folder runs/MODEL-SET gets the weights and a card that describes how they were made. To use them,
+    put their path into a launch file, or replace the bundled weights with --install.
+
+    To train on several processes or machines, use torchrun:
     `torchrun --nproc-per-node 2 -m steadypose.nodes.cli train hmvae`.
 
-    Takes about an hour on two cores, shows its progress, draws its curves as it goes, and resumes where it was if
-    it is killed and started again. The weights, with a card that says how they were made, lie in the run's folder,
-    runs/MODEL-SET; a launch file takes their path. Those that ship are replaced only when asked to, and kept.
-
     Args:
-        model: mixture (the smoother), body_modes (which joints it smooths together, in seconds), hmvae (refinement),
-            hmvae64 ('complete --optimise'), hgvae (anomaly score and imputation), hgvae-wide (the same in the paper's
+        model: mixture (the smoother), body_modes (which joints it smooths together; takes seconds), hmvae (refinement),
+            hmvae64 ('complete --optimise'), hgvae (anomaly score and imputation), hgvae-wide (the same, in the paper's
             size, for recordings), trajectory (root velocity), contacts, humor (transitions, for 'steadypose fit'),
-            occlusion (weights of a hidden joint), posture (how joints lie to each other), completer ('steadypose
-            complete'), or correction (a sensor's own error).
-        data: what 'steadypose prepare' wrote; for a correction, ui_prmd.npz, the Kinect beside Vicon; for
-            mixture, body_modes and occlusion, the folder of the recordings, which they take at several speeds.
-        weights: the set to train: 'default' takes only data free for products, 'research' all of it (there is none of
-            mixture, body_modes and occlusion); a correction is named after its sensor, kinect_v2.
-        runs: where checkpoints and curves go.
-        iterations: optimiser steps; the model's own number, if left out. Fewer make a weaker model sooner.
-        start: weights to go on from, a set or a .safetensors file: with motion of one's own and a third of the
-            iterations, say. Not for a correction.
-        seed: for weights and sampling.
-        threads: CPU threads; under torchrun, of all processes of a machine together.
-        install: put the weights where nodes find them by the set's name; what they replace goes to 'previous' there.
+            occlusion (weights of a hidden joint), posture (relative position of joints), completer ('steadypose
+            complete'), or correction (bias of a sensor).
+        data: output of 'steadypose prepare'. For a correction, ui_prmd.npz (Kinect beside Vicon). For mixture,
+            body_modes and occlusion, the folder of the recordings, which are played at several speeds.
+        weights: the weight set to train: 'default' uses only data licensed for products, 'research' all data (not for
+            mixture, body_modes and occlusion). For a correction, the sensor's name, kinect_v2.
+        runs: folder for checkpoints and curves.
+        iterations: optimiser steps. Default: as the model needs. Fewer give a weaker model sooner.
+        start: weights to start from, a set or a .safetensors file, for fine-tuning on your own motion; try a third of
+            the iterations. Not for a correction.
+        seed: random seed of weights and sampling.
+        threads: CPU threads; with torchrun, of all processes of a machine together.
+        install: replace the bundled weights of this set; the old ones move to the folder 'previous' beside them.
     """
     join()
     set_threads(threads)
