@@ -1,4 +1,4 @@
-"""The wire: messages, codec, transport and recordings. Importing it needs no torch."""
+"""Messages, codec, transport and recordings. Importing them does not import torch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Closing:
-    """A context manager that is closed at its end."""
+    """A context manager that calls `close` on exit."""
 
     @abstractmethod
     def close(self) -> None: ...

@@ -1,4 +1,4 @@
-"""Messages to bytes and back: CDR, as ROS 2 puts it on the wire, from the definitions in `msgs/msg`."""
+"""Encodes and decodes messages as CDR, ROS 2's wire format, by the definitions in `msgs/msg`."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from steadypose.msgs.types import Diagnostics, Level, Message, Pose, forms_of
 MAX_BODIES = 128
 MAX_EVENTS = 16 * MAX_BODIES
 MAX_VALUES = 1000
-"""of one node's diagnostics"""
+"""Largest number of entries in one node's diagnostics."""
 
 _HEADER = "iIs"
-#: what comes before the count that is limited: numbers as `struct` names them, s for a string
+# the fields before the limited count, by struct's format characters with s for a string; and the limit
 _BEFORE = {
     POSE_RAW: (_HEADER + "ss" + 7 * "d" + "?", MAX_BODIES),
     POSE_CLEAN: (_HEADER + "s" + 7 * "d" + "?" + "I", MAX_BODIES),
@@ -38,9 +38,12 @@ _BEFORE = {
 
 
 def check_size(topic: str, payload: bytes | memoryview) -> None:
-    """Raises:
-    ValueError: CDR of a message that holds more bodies, events or values than any is to hold. A million bytes of bodies
-        without joints would take seconds to decode, in which nobody else is heard.
+    """Check the number of bodies, events or values in an encoded message before it is decoded.
+
+    A megabyte of bodies without joints would take seconds to decode, and would block all other messages.
+
+    Raises:
+        ValueError: the number exceeds the limit.
     """
     before, most = _BEFORE[topic]
     order = "<" if len(payload) > 1 and payload[1] & 1 else ">"
@@ -57,7 +60,7 @@ def check_size(topic: str, payload: bytes | memoryview) -> None:
         at += -at % 4
         (count,) = struct.unpack_from(f"{order}I", data, at)
     except struct.error:
-        return  # too short, which decoding says better
+        return  # too short; decoding raises the more precise error
     if count > most:
         raise ValueError(f"expected at most {most} bodies, events or values, got {count}")
 
@@ -74,19 +77,19 @@ ROS_DEFINITIONS = {
     "byte level\nstring name\nstring message\nstring hardware_id\ndiagnostic_msgs/KeyValue[] values",
     "diagnostic_msgs/msg/DiagnosticArray": "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status",
 }
-"""Those of ROS 2's own that the messages are made of: to load all that rosbags has takes 50 ms of every start."""
+"""ROS 2's definitions that the messages use. Loading all of rosbags' definitions would take 50 ms at every start."""
 
 
 class DecodeError(ValueError):
-    """Bytes that are not the message they should be."""
+    """Bytes that are not a message of the expected type."""
 
 
 @cache
 def typestore() -> Typestore:
-    """The wire's types: ROS 2's own and those of `msgs/msg`, compiled.
+    """The compiled message types: ROS 2's and those of `msgs/msg`.
 
-    Made on the first call (50 ms), because it costs as much as all of this package's imports together. Whatever
-    opens a socket or a file calls it, so that no message has to wait for it.
+    They are compiled on the first call (50 ms), not at import, because that takes as long as all of this package's
+    imports together. Code that opens a socket or a file calls this function, so that no message waits for it.
     """
     store = get_typestore(Stores.EMPTY)
     definitions = {}
@@ -101,22 +104,23 @@ def typestore() -> Typestore:
 
 
 def wire_type(kind: type) -> str:
-    """The ROS 2 name of a message type, such as `steadypose_msgs/msg/PoseRaw`."""
+    """ROS 2 name of a message type, such as `steadypose_msgs/msg/PoseRaw`."""
     return "diagnostic_msgs/msg/DiagnosticArray" if kind is Diagnostics else f"steadypose_msgs/msg/{kind.__name__}"
 
 
 def encode(message: Message) -> bytes:
-    """The message as CDR, little-endian, with its four bytes of encapsulation."""
+    """Encode a message as little-endian CDR, with the four-byte encapsulation header."""
     kind = type(message)
     return bytes(typestore().serialize_cdr(_codec(kind).to_wire(message), wire_type(kind), little_endian=True))
 
 
 def decode(topic: str, payload: bytes | memoryview) -> Message:
-    """The message that travels on `topic`, from CDR of either byte order; its arrays are its own.
+    """Decode a message of `topic` from CDR of either byte order. Its arrays are copies.
+
+    Lengths are checked against the size of the payload before memory is allocated.
 
     Raises:
-        DecodeError: for an unknown topic and for any bytes that are not such a message. Lengths are checked
-            against the bytes that are there before anything is allocated.
+        DecodeError: the topic is unknown, or the bytes are not a message of its type.
     """
     if topic not in TOPICS:
         raise DecodeError(f"unknown topic {topic!r}: expected one of {', '.join(TOPICS)}")
@@ -134,7 +138,7 @@ class _Codec(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """One field of a definition: its value for a message, and the fields of the message that it is read into."""
+    """One field of a definition: how to write it from a message, and how to read the message's fields from it."""
 
     write: Callable[[Any], Any]
     read: Mapping[str, Callable[[Any], Any]]
@@ -142,7 +146,7 @@ class _Part(NamedTuple):
 
 @cache
 def _codec(kind: type) -> _Codec:
-    """How messages of a kind go over the wire, by their definition in `msgs/msg` and their fields' forms."""
+    """The codec of a message type, derived from its definition in `msgs/msg` and its fields' forms."""
     if kind is Diagnostics:
         return _Codec(_diagnostics_to_wire, _diagnostics_from_wire)
     store, name = typestore(), wire_type(kind)
@@ -168,7 +172,7 @@ def _part(kind: type, field: str, node: Any) -> _Part:
         array = form.array if isinstance(form, States) else form
         assert isinstance(array, Array)
         dtype, shape = array.dtype, tuple(n if isinstance(n, int) else -1 for n in array.shape)
-        # a copy: what was decoded is a read-only, perhaps unaligned view into the payload
+        # copied, because decoding yields a read-only and possibly unaligned view of the payload
         return _Part(
             lambda m: np.ascontiguousarray(getattr(m, field), dtype).reshape(-1),
             {field: lambda w: np.array(getattr(w, field)).reshape(shape)},

@@ -1,18 +1,19 @@
-"""What is in the frames of a connection, whose messages are taken, and what reliable subscribers have taken of them.
+"""Frame format, acknowledgements of reliable subscribers, and the rule of one publisher per source.
 
-From the publisher, one frame is one message:
+A frame from the publisher holds one message:
 
     topic, UTF-8 | 0 | version, uint8 | publisher, uint32 | sequence, uint32 | sent, uint64 | CDR
 
-with little-endian integers; `sent` is in nanoseconds of the publisher's monotonic clock.
+Integers are little-endian; `sent` is the publisher's monotonic clock in nanoseconds.
 
-To the publisher, beside the subscriptions of ZeroMQ itself: the name of a subscriber, as a subscription, and from one
-that must miss nothing, which messages it has taken. What is for that subscriber alone, because it had not taken it when
-it was started again, has that subscription and a zero byte before it.
+A subscriber sends the publisher its ZeroMQ subscriptions. A named subscriber also sends its name in the form of a
+subscription, and a reliable one acknowledges messages. Messages that are resent to one subscriber alone are prefixed by
+its name's subscription and a zero byte.
 
-A reliable subscriber says of each message when it has done with it: not that it has arrived, but that whatever followed
-from it is safe. What it has not taken is kept. Who comes under the name of one that has left, because its process was
-started again, is sent what that one had not taken, and before that as much as it asks for to be in the picture.
+A reliable subscriber acknowledges a message when it has finished with it: not on arrival, but once everything that
+followed from it is safe. The publisher keeps unacknowledged messages. A restarted subscriber connects under the same
+name. It receives the messages that its predecessor had not acknowledged, preceded by as many earlier messages as it
+requests as context.
 """
 
 from __future__ import annotations
@@ -26,35 +27,35 @@ from typing import NamedTuple
 
 VERSION = 2
 MAX_FRAME = 2**20
-"""bytes; 100 people with 100 joints each are 160 kB"""
+"""Largest size of a frame, bytes. 100 people with 100 joints each take 160 kB."""
 PREFIX = struct.Struct("<BIIQ")
 
-# No topic begins with this byte. It is also the last in order, and ZeroMQ subscribes in that order: whose name has
-# arrived gets its topics.
+# No topic begins with this byte. It sorts last, and ZeroMQ sends subscriptions in sorted order: when a subscriber's
+# name arrives, its topics are subscribed.
 _NAME = b"\xff"
 _TAKEN = b"\x02"
 _COUNT = struct.Struct("<III")
 
 
 class Listener(NamedTuple):
-    """A subscriber with a name, as it makes itself known."""
+    """A named subscriber, as it identifies itself to publishers."""
 
     name: str
     instance: int
-    """drawn at random at start, so that a restarted publisher is recognised as a new one, uint32"""
+    """random number drawn at start, which distinguishes a restarted process from its predecessor, uint32"""
     reliable: tuple[str, ...] = ()
-    """topics of which it must miss nothing"""
+    """topics of which it must not miss a message"""
     context: int = 0
-    """messages of each that it wants to see again, if the one of this name before it had taken them"""
+    """number of messages per topic to resend even though its predecessor had acknowledged them"""
 
     def subscription(self) -> bytes:
-        """What it subscribes to, to be known, and to be sent what is for it alone."""
+        """The subscription that identifies it, and that prefixes messages resent to it alone."""
         topics = " ".join(self.reliable).encode()
         return _NAME + b"\0".join([self.name.encode(), b"%08x" % self.instance, topics, b"%d" % self.context])
 
 
 def read_subscription(prefix: bytes) -> Listener | None:
-    """The listener that a subscription makes known; None if it is another subscription."""
+    """The listener that a subscription identifies; None for an ordinary subscription."""
     if not prefix.startswith(_NAME):
         return None
     try:
@@ -65,12 +66,12 @@ def read_subscription(prefix: bytes) -> Listener | None:
 
 
 class Taken(NamedTuple):
-    """How far a listener has come with a topic of a publisher."""
+    """A listener's acknowledgement of all messages of a publisher's topic before a sequence number."""
 
     instance: int
     publisher: int
     following: int
-    """sequence of the message that it expects next"""
+    """sequence number of the message that it expects next"""
     topic: str
 
     def frame(self) -> bytes:
@@ -78,7 +79,7 @@ class Taken(NamedTuple):
 
 
 def read_taken(frame: bytes, topics: Collection[str]) -> Taken | None:
-    """What a frame says of a listener's progress; None if it is something else."""
+    """The acknowledgement in a frame; None if the frame is something else."""
     if not frame.startswith(_TAKEN) or len(frame) < 1 + _COUNT.size:
         return None
     topic = frame[1 + _COUNT.size :].decode(errors="replace")
@@ -87,24 +88,26 @@ def read_taken(frame: bytes, topics: Collection[str]) -> Taken | None:
 
 
 WINDOW = 256
-"""messages of a topic that a reliable subscriber may be behind before it is waited for; with what is sent beside them,
-and with `MAX_CONTEXT`, below the messages that ZeroMQ holds for a subscriber, so that it never drops one"""
+"""Number of unacknowledged messages of a topic at which the publisher waits for a reliable subscriber.
+
+Together with `MAX_CONTEXT` and other messages it stays below ZeroMQ's queue for a subscriber, so ZeroMQ drops none."""
 MAX_CONTEXT = 512
-"""messages before those that somebody can ask for"""
+"""Largest number of acknowledged messages that a subscriber can request as context."""
 DEAF_S = 10.0
-"""without a sign of life for so long, a subscriber that has something to read is not waited for any more"""
+"""Time without a sign of life after which the publisher no longer waits for a subscriber that has unread messages,
+seconds."""
 WRAP = 2**32
-"""sequence numbers are unsigned integers of 32 bits"""
+"""Modulus of sequence numbers, which are uint32."""
 
 
 @dataclass(eq=False)
 class _Place:
-    """How far a subscriber is.
+    """Progress of a subscriber.
 
     Attributes:
-        following: of each topic, the sequence of the message that it takes next.
-        context: messages before that it wants to see if it begins anew.
-        sign_s: when it last gave a sign of life, or first had something to read.
+        following: by topic, the sequence number of the next message to be acknowledged.
+        context: number of acknowledged messages that it requests if it restarts.
+        sign_s: time of its last sign of life, or since which it has unread messages, monotonic seconds.
     """
 
     following: dict[str, int]
@@ -112,30 +115,30 @@ class _Place:
     sign_s: float
 
     def silent_s(self, sequence: Mapping[str, int]) -> float:
-        """Since when it does not read what it could, seconds."""
+        """Time for which it has had unread messages without a sign of life, seconds."""
         if all(sequence[topic] == following for topic, following in self.following.items()):
             return 0.0
         return time.monotonic() - self.sign_s
 
 
 class Deliveries:
-    """Keeps the messages of one publisher's reliable subscribers until they are taken.
+    """Keeps a publisher's messages until its reliable subscribers have acknowledged them.
 
     Args:
-        names: of the subscribers.
-        sequence: of the next message of each topic, for a publisher that goes on where another one ended.
+        names: names of the reliable subscribers.
+        sequence: sequence number of each topic's next message, for a publisher that resumes a predecessor's stream.
     """
 
     def __init__(self, names: Collection[str], sequence: Mapping[str, int]) -> None:
         self.sequence = Counter(sequence)
-        """of the next message of each topic"""
+        """sequence number of the next message, by topic"""
         self._names = frozenset(names)
         self._live: dict[Listener, _Place] = {}
-        self._last: dict[str, _Place] = {}  # of each name, the one who came last, live or gone
+        self._last: dict[str, _Place] = {}  # by name, the most recent subscriber, connected or not
         self._kept: deque[tuple[str, int, bytes]] = deque()
 
     def sent(self, topic: str, frame: bytes) -> None:
-        """Note the next message of a topic, as it was sent."""
+        """Record that the next message of a topic was sent as ``frame``."""
         for place in self._live.values():
             if not place.silent_s(self.sequence):
                 place.sign_s = time.monotonic()
@@ -145,10 +148,10 @@ class Deliveries:
         self.sequence[topic] = (self.sequence[topic] + 1) % WRAP
 
     def join(self, listener: Listener) -> list[bytes]:
-        """Note that a subscriber is there; the frames to be sent to it alone."""
+        """Record that a subscriber connected. Returns the frames to resend to it alone."""
         if listener.name not in self._names or not listener.reliable:
             return []
-        before = self._last.get(listener.name)  # what an heir need not have again, it knows itself
+        before = self._last.get(listener.name)  # a successor recognises what it need not receive again
         inherited = before.following if before else {}
         following = {topic: inherited.get(topic, self.sequence[topic]) for topic in listener.reliable}
         self._live[listener] = self._last[listener.name] = place = _Place(
@@ -161,7 +164,7 @@ class Deliveries:
         ]
 
     def leave(self, listener: Listener) -> None:
-        """Note that a subscriber is gone."""
+        """Record that a subscriber disconnected."""
         gone = self._live.pop(listener, None)
         if gone is None:
             return
@@ -173,23 +176,23 @@ class Deliveries:
             self._last[listener.name] = gone
 
     def leave_all(self) -> None:
-        """Note that all subscribers were disconnected."""
+        """Record that all subscribers were disconnected."""
         for listener in list(self._live):
             self.leave(listener)
 
     def take(self, taken: Taken) -> None:
-        """Note what a subscriber says that it has taken; what cannot be is ignored."""
+        """Record an acknowledgement. Impossible ones are ignored."""
         for listener, place in self._live.items():
             if listener.instance == taken.instance and taken.topic in place.following:
                 place.sign_s = time.monotonic()
                 further = (taken.following - place.following[taken.topic]) % WRAP
-                if further < WRAP // 2:  # of a publisher that resumes it may have more than was sent again
+                if further < WRAP // 2:  # after a publisher's restart it may be ahead of the resent messages
                     further = min(further, self._behind(place, taken.topic))
                     place.following[taken.topic] = (place.following[taken.topic] + further) % WRAP
         self._let_go()
 
     def waited_for(self, topic: str) -> frozenset[str]:
-        """The names of the subscribers that must take something before the next message of a topic is sent."""
+        """Names of the subscribers that must acknowledge messages before the topic's next message is sent."""
         return frozenset(
             listener.name
             for listener, place in self._live.items()
@@ -197,13 +200,13 @@ class Deliveries:
         )
 
     def silent(self, for_s: float) -> frozenset[str]:
-        """The names of the subscribers that are there and have not read for so long, though they could."""
+        """Names of the connected subscribers that have had unread messages for longer than ``for_s``."""
         return frozenset(
             listener.name for listener, place in self._live.items() if place.silent_s(self.sequence) > for_s
         )
 
     def is_taken(self, topic: str, sequence: int) -> bool:
-        """Whether all reliable subscribers of a topic have taken a message."""
+        """Whether all reliable subscribers of a topic have acknowledged a message."""
         return all(
             topic not in place.following or self._is_deaf(place) or not _ahead(sequence, place.following[topic])
             for place in (*self._last.values(), *self._live.values())
@@ -216,7 +219,7 @@ class Deliveries:
         return (self.sequence[topic] - place.following[topic]) % WRAP
 
     def _let_go(self) -> None:
-        """Forget what nobody will ask for; and where somebody stays away, the oldest."""
+        """Drop messages that no subscriber can still request, and the oldest ones if a subscriber stays away."""
         while self._kept:
             topic, sequence, _ = self._kept[0]
             wanted = any(
@@ -230,18 +233,18 @@ class Deliveries:
 
 
 def _ahead(sequence: int, following: int) -> bool:
-    """Whether a message comes no earlier than the one that is expected next."""
+    """Whether a sequence number equals or follows the expected one."""
     return (sequence - following) % WRAP < WRAP // 2
 
 
 AWAY_S = 1.0
-"""of silence after which another publisher may go on with a source"""
+"""Time of silence after which another publisher may take over a source, seconds."""
 MOST = 1024
-"""streams that are remembered"""
+"""Largest number of remembered streams."""
 
 
 class _Principal(NamedTuple):
-    """Who publishes a stream: its number, by which connection it came, when it was last heard, and who was before."""
+    """The publisher of a stream: its number, its connection, when it was last heard, and its predecessor's number."""
 
     publisher: int
     connection: object
@@ -250,22 +253,24 @@ class _Principal(NamedTuple):
 
 
 class Principals:
-    """Binds each source to the publisher that is first heard with it. To be shared by subscribers of one program.
+    """Binds each source to the first publisher heard with it. The subscribers of one program share an instance.
 
-    An address has one publisher at a time, so a new one there is the old one, started again; but a source that comes
-    from elsewhere as well has two publishers, and only the first is heard.
+    An address has one publisher at a time, so a new publisher at the same address is the restarted old one. If a source
+    also comes from another address, it has two publishers, and only the first is admitted.
     """
 
     def __init__(self) -> None:
         self._bound: OrderedDict[tuple[str, str], _Principal] = OrderedDict()
 
     def admits(self, topic: str, source: str, publisher: int, connection: object, *, ended: bool = False) -> bool:
-        """Whether a message is from whom its source belongs to.
+        """Whether a message comes from the publisher that its source is bound to.
 
         Args:
-            topic, source, publisher: of the message.
-            connection: of a subscriber to a single address; None of one to several.
-            ended: whether the stream ends with this message, and its source is free.
+            topic: the message's topic.
+            source: the message's source.
+            publisher: number of the message's publisher.
+            connection: identity of a subscriber to a single address; None for a subscriber to several.
+            ended: whether the stream ends with this message, which releases its source.
         """
         now_s, key = time.monotonic(), (topic, source)
         bound = self._bound.get(key)

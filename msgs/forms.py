@@ -1,4 +1,4 @@
-"""The forms of messages' fields: what a constructor makes of a value, or says against it."""
+"""Forms of message fields: each converts and checks the value that a constructor is given."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 Form = Callable[[Any], Any]
-"""takes a field's value, and returns it as it is kept; raises `UnfitError` if it cannot be"""
+"""Function from a given value to the stored value. It raises `UnfitError` if the value does not fit."""
 
 
 class UnfitError(ValueError):
-    """What a field was expected to hold, and what it was given."""
+    """A value that does not fit a field: what was expected, and what came."""
 
     def __init__(self, expected: str, got: object) -> None:
         super().__init__(f"expected {expected}, got {got}")
 
 
 class Array(NamedTuple):
-    """An array; a length J is that of the message's skeleton."""
+    """An array of a dtype and shape. A length "J" is the number of joints of the message's skeleton."""
 
     dtype: type[np.generic]
     shape: tuple[int | Literal["J"], ...]
@@ -43,7 +43,7 @@ class Array(NamedTuple):
 
 
 class States(NamedTuple):
-    """An array of the values of an enumeration."""
+    """An array of enumeration values, 0 to ``last``."""
 
     array: Array
     last: int
@@ -56,7 +56,7 @@ class States(NamedTuple):
 
 
 class ListOf(NamedTuple):
-    """A list of messages of one kind."""
+    """A list of messages of one type."""
 
     kind: type
 
@@ -67,7 +67,7 @@ class ListOf(NamedTuple):
 
 
 class Integer(NamedTuple):
-    """An integer of ``low`` or more and under ``end``, or the member of an enumeration that it stands for."""
+    """An integer with ``low`` <= value < ``end``, converted to an enumeration member if ``kind`` is one."""
 
     low: int
     end: int
@@ -84,7 +84,7 @@ class Integer(NamedTuple):
 
 
 def number(value: Any) -> float:
-    """A number, as a float."""
+    """A number, converted to float."""
     try:
         return float(value)
     except (TypeError, ValueError) as error:
@@ -99,7 +99,7 @@ def text(value: Any) -> str:
 
 
 def texts(value: Any) -> dict[str, str]:
-    """Strings by strings."""
+    """A dictionary from strings to strings."""
     if not all(isinstance(text, str) for pair in value.items() for text in pair):
         raise UnfitError("strings for keys and values", repr(value)[:80])
     return value

@@ -1,10 +1,10 @@
-"""One MCAP file, read chunk by chunk, so that what is damaged costs what is damaged and nothing else.
+"""Reads one MCAP file chunk by chunk, so that damage costs only the damaged chunks.
 
-The index at the end of a file is used if its checksum is right. Otherwise, as after the writer was killed, the file is
-scanned from its beginning; where bytes are no record, the scan goes on at the next that look like a chunk. A
-chunk whose checksum does not hold is left out and counted; all others are read. What a chunk, and all chunks of a file,
-may become when they are decompressed has a limit, and so has the number of records in a chunk, so that a small file
-can neither fill the memory nor keep the processor busy.
+The index at the end of the file is used if its checksum is valid. Otherwise, for example after the writer was killed,
+the file is scanned from its beginning; after invalid bytes the scan continues at the next bytes that look like a chunk.
+A chunk with a wrong checksum is skipped and counted. The decompressed size of each chunk and of all chunks together,
+and the number of records per chunk, are limited, so that a small malicious file can neither fill the memory nor keep
+the processor busy.
 """
 
 from __future__ import annotations
@@ -27,14 +27,15 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Header, MessageIndex, Schema
 
 MAX_CHUNK = 2**26
-"""bytes of one chunk, decompressed; a writer closes its chunks at some megabytes"""
+"""Largest decompressed size of a chunk, bytes. Writers close their chunks at some megabytes."""
 MAX_RATIO = 250
-"""a chunk's size decompressed by its size in the file, above `RATIO_FROM`; skeletons come to a hundred at most"""
+"""Largest compression ratio of a chunk larger than `RATIO_FROM`. Skeletons reach at most 100."""
 RATIO_FROM = 2**20
+"""Decompressed size of a chunk above which `MAX_RATIO` applies, bytes."""
 FILE_RATIO_FROM = 2**24
-"""bytes that the chunks of a file may come to, however small it is; above, `MAX_RATIO` times its size"""
+"""Decompressed size that any file's chunks may reach together, bytes. Beyond it, `MAX_RATIO` times the file size."""
 MIN_RECORD = 31
-"""bytes of a message without content: more records than fit into a chunk at this size are none that anybody wrote"""
+"""Size of a message record without content, bytes. It bounds the plausible number of records in a chunk."""
 
 BROKEN = (
     McapError,
@@ -48,14 +49,14 @@ BROKEN = (
     struct.error,
     zstandard.ZstdError,
 )
-"""what the libraries raise, somewhere, for bytes that are not MCAP"""
+"""Exceptions that the libraries raise for bytes that are not MCAP."""
 
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
-_CHUNK = struct.Struct("<QQQII")  # start, end, size decompressed, its checksum, length of the compression's name
+_CHUNK = struct.Struct("<QQQII")  # start, end, decompressed size, its checksum, length of the compression's name
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct("<BQQQI")
-#: the head of a chunk, whose lengths are under a terabyte and whose compression is known
+# the head of a chunk with lengths under a terabyte and a known compression
 _CHUNK_HEAD = re.compile(rb"\x06.{5}\0{3}.{16}.{5}\0{3}.{4}(?:\0{4}|\x04\0{3}zstd|\x03\0{3}lz4).{5}\0{3}", re.DOTALL)
 _CHUNK_HEAD_BYTES = 9 + _CHUNK.size + 4 + 8
 _WINDOW = 2**20
@@ -64,7 +65,7 @@ _Record = TypeVar("_Record", Schema, Channel, Header, MessageIndex)
 
 
 class Place(NamedTuple):
-    """Where in a file a chunk, or a message outside of chunks, lies, and the log times of what is in it."""
+    """Position in the file of a chunk, or of a message outside chunks, and the range of its log times."""
 
     opcode: int
     offset: int
@@ -74,7 +75,7 @@ class Place(NamedTuple):
 
 
 class Logged(NamedTuple):
-    """A message, not decoded."""
+    """An undecoded message."""
 
     log_ns: int
     channel: Channel
@@ -82,23 +83,23 @@ class Logged(NamedTuple):
 
 
 class McapFile:
-    """What is in an MCAP file, whole or damaged.
+    """The content of an MCAP file, intact or damaged.
 
     Args:
-        file: opened for reading; it stays open.
-        size: of it, bytes.
+        file: file opened for reading; it stays open.
+        size: its size, bytes.
 
     Attributes:
-        channels: by id.
-        schemas: by id.
-        counts: of messages, by channel; with an index as it says, so that damaged chunks are among them.
-        places: of chunks.
-        complete: whether the writer came to the end.
-        lost_bytes: that could not be read, as far as is known: all of them once all messages were read.
-        gaps: how many pieces these are.
+        channels: channels by id.
+        schemas: schemas by id.
+        counts: number of messages by channel. Counts from the index include messages in damaged chunks.
+        places: positions of the chunks.
+        complete: whether the writer finished the file.
+        lost_bytes: number of unreadable bytes known so far; complete once all messages were read.
+        gaps: number of unreadable pieces.
 
     Raises:
-        ValueError: nothing in it looks like MCAP.
+        ValueError: nothing in the file looks like MCAP.
     """
 
     def __init__(self, file: IO[bytes], size: int) -> None:
@@ -110,7 +111,7 @@ class McapFile:
         self.places: list[Place] = []
         self.complete = True
         self._lost: dict[int, int] = {}
-        self._left = 0  # bytes that may still be decompressed while the file is gone through
+        self._left = 0  # bytes that may still be decompressed in this pass over the file
         try:
             indexed = self._read_index()
         except BROKEN:
@@ -131,16 +132,16 @@ class McapFile:
 
     @property
     def start_ns(self) -> int:
-        """The first log time; 0 if there is none."""
+        """First log time, nanoseconds; 0 if there is none."""
         return min((place.start_ns for place in self.places), default=0)
 
     @property
     def end_ns(self) -> int:
-        """The last log time; 0 if there is none."""
+        """Last log time, nanoseconds; 0 if there is none."""
         return max((place.end_ns for place in self.places), default=0)
 
     def messages(self, topics: Container[str], start_ns: int | None = None) -> Iterator[Logged]:
-        """The messages on ``topics``, as the file calls them, from ``start_ns`` on, by log time, then as written."""
+        """The messages on ``topics`` (names as in the file) from ``start_ns`` on, by log time, then in file order."""
         self._left = self._budget
         wanted = {channel.id for channel in self.channels.values() if channel.topic in topics}
         waiting: list[tuple[int, int, int, Channel, bytes | memoryview]] = []
@@ -173,7 +174,7 @@ class McapFile:
         self._lost[offset] = length
 
     def _messages_at(self, place: Place) -> Iterator[tuple[int, int, bytes | memoryview]]:
-        """Channel, log time and data of each message in a chunk."""
+        """Channel id, log time and data of each message in a chunk."""
         opcode, body = self._record_at(place.offset)
         if opcode != place.opcode or _RECORD.size + len(body) != place.length:
             raise ValueError("not the record that the index says")
@@ -183,10 +184,10 @@ class McapFile:
                 yield channel, log_ns, data[_MESSAGE.size :]
 
     def _record_at(self, offset: int) -> tuple[int, bytes]:
-        """The opcode and the bytes of a record.
+        """The opcode and content of the record at ``offset``.
 
         Raises:
-            ValueError: it is longer than the file.
+            ValueError: the record extends beyond the end of the file.
         """
         self._file.seek(offset)
         opcode, length = _RECORD.unpack(self._file.read(_RECORD.size))
@@ -195,7 +196,7 @@ class McapFile:
         return opcode, self._file.read(length)
 
     def _inside(self, opcode: int, body: bytes) -> Iterator[tuple[int, memoryview]]:
-        """The records in a chunk; a record outside of chunks is itself."""
+        """The records in a chunk. A record that is not a chunk is returned as it is."""
         if opcode != Opcode.CHUNK:
             yield opcode, memoryview(body)
             return
@@ -214,7 +215,7 @@ class McapFile:
             at += length
 
     def _read_index(self) -> bool:
-        """Take the places of chunks from the end of the file; False if there is no index, or it does not hold."""
+        """Read the chunks' positions from the index; False if the index is missing or invalid."""
         tail = _FOOTER.size + len(_MAGIC)
         self._file.seek(max(self._size - tail, 0))
         end = self._file.read()
@@ -246,7 +247,7 @@ class McapFile:
         return True
 
     def _scan(self) -> None:
-        """Go through the file from its beginning for whatever can be read."""
+        """Find the readable chunks by scanning the file from its beginning."""
         self.complete = False
         self._left = self._budget
         found: list[tuple[Place, Counter[int]]] = []
@@ -258,7 +259,7 @@ class McapFile:
                 after = self._next_chunk(at + 1)
                 self._lose(at, after - at)
                 at = after
-        # messages outside of chunks have no checksum: beside chunks, they are damage that looks like one
+        # messages outside chunks have no checksum: in a file with chunks, they are damage that looks like a message
         chunked = any(place.opcode == Opcode.CHUNK for place, _ in found)
         for place, counts in found:
             if not chunked or place.opcode == Opcode.CHUNK:
@@ -266,10 +267,10 @@ class McapFile:
                 self.counts += counts
 
     def _take(self, at: int, places: list[tuple[Place, Counter[int]]]) -> int:
-        """Note what is in the record at ``at``; where the next one begins.
+        """Register the content of the record at ``at``. Returns the offset of the next record.
 
         Raises:
-            BROKEN: it is none, or damaged.
+            BROKEN: the bytes are not a record, or the record is damaged.
         """
         opcode, body = self._record_at(at)
         length = _RECORD.size + len(body)
@@ -287,7 +288,7 @@ class McapFile:
                     channels |= {(found := _parse(Channel, data)).id: found}
                 elif inner == Opcode.SCHEMA:
                     schemas |= {(schema := _parse(Schema, data)).id: schema}
-            # what a checksum covers goes before what none does
+            # definitions inside a chunk are covered by a checksum, so they replace those outside
             self.channels |= channels
             self.schemas |= schemas
             if stamps:
@@ -305,7 +306,7 @@ class McapFile:
         return at + length
 
     def _next_chunk(self, at: int) -> int:
-        """Where the next bytes lie that look like a chunk; the end of the file if there are none."""
+        """Offset of the next bytes that look like a chunk; the size of the file if there are none."""
         while at < self._size:
             self._file.seek(at)
             window = self._file.read(_WINDOW)
@@ -318,7 +319,7 @@ class McapFile:
 
 
 def _parse(kind: type[_Record], body: bytes | memoryview) -> _Record:
-    """A record, of which no byte is left over: a length that is damaged shows in that."""
+    """Parse a record. A leftover byte reveals a damaged length."""
     stream = ReadDataStream(BytesIO(body))
     record = kind.read(stream)
     if stream.count != len(body):
@@ -327,14 +328,14 @@ def _parse(kind: type[_Record], body: bytes | memoryview) -> _Record:
 
 
 def _decompressed(body: bytes, most: int) -> bytes | memoryview:
-    """What is in a chunk, if its checksum holds.
+    """The decompressed content of a chunk.
 
     Args:
-        body: of its record.
-        most: bytes that it may come to, if that is less than `MAX_CHUNK`.
+        body: content of the chunk's record.
+        most: largest decompressed size besides `MAX_CHUNK`, bytes.
 
     Raises:
-        BROKEN: it does not, or it would be larger than a chunk may be.
+        BROKEN: the checksum is wrong, or the content exceeds a limit.
     """
     _, _, size, checksum, name_length = _CHUNK.unpack_from(body)
     at = _CHUNK.size + name_length

@@ -1,4 +1,4 @@
-"""Publishing messages at an address."""
+"""The publisher: sends messages at an address."""
 
 from __future__ import annotations
 
@@ -35,40 +35,40 @@ if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
 SEND_HIGH_WATER = 1000
-"""messages held for each subscriber that does not keep up"""
+"""Largest number of messages queued for a subscriber that does not keep up (ZeroMQ's high-water mark)."""
 LINGER_MS = 1000
-"""how long `Publisher.close` waits for what is on its way"""
+"""Longest time that `Publisher.close` waits for messages in flight, milliseconds."""
 MAX_SUBSCRIPTIONS = 4096
-"""different ones, of all subscribers together; who goes beyond is disconnected"""
+"""Largest number of different subscriptions of all subscribers together. A connection that exceeds it is closed."""
 MAX_NEW_SUBSCRIPTIONS = 256
-"""of one connection in a second"""
+"""Number of new subscriptions in a second at which a connection is closed."""
 REBIND_S = 5.0
-"""how long to wait for an address of our own: ZeroMQ gives it back in a thread, soon after the socket was closed"""
+"""Longest time to wait for our own address, seconds. ZeroMQ releases it in a thread, soon after the socket closes."""
 
 _LOOK_S = 1.0
-"""between two looks at who is waited for"""
+"""Interval between checks whether a subscriber still has to be waited for, seconds."""
 _CUT = "subscriptions"
 _DOMAIN = "steadypose"
 
 
 class Resume(NamedTuple):
-    """Where a publisher ended that another one continues."""
+    """State of a stopped publisher, from which its successor continues."""
 
     id: int
-    """its number, uint32"""
+    """the publisher's number, uint32"""
     sequence: Mapping[str, int]
-    """of each topic, the sequence of the first message that not all reliable subscribers had taken"""
+    """by topic, the sequence number of the first message that not all reliable subscribers had acknowledged"""
 
 
 class Publisher(Closing):
     """Publishes messages at an address. A context manager.
 
-    `publish` waits only for subscribers that are named in `reliable` and request it; any other that does not read loses
-    what exceeds `SEND_HIGH_WATER`, and detects that by the sequence numbers.
+    `publish` waits only for subscribers that are named in `reliable` and request it. Any other subscriber that does not
+    read loses the messages beyond `SEND_HIGH_WATER`, and detects the loss by sequence numbers.
 
     Attributes:
-        endpoint: as bound: a port given as `*` is a number here.
-        refused: connections that were closed, by cause.
+        endpoint: the bound address; a port given as `*` is replaced by its number.
+        refused: number of connections closed by the publisher, by cause.
     """
 
     def __init__(
@@ -80,18 +80,19 @@ class Publisher(Closing):
         clear_text: bool = False,
         resume: Resume | None = None,
     ) -> None:
-        """Bind `endpoint`: `ipc://` and a path, or `tcp://` and an address of this machine and a port.
+        """Bind `endpoint`.
 
         Args:
-            keys: whose holders may subscribe; the list is reread while this runs. A tcp address of this machine without
-                keys is for programs of this user alone, which find `keys.loopback_keys`.
+            endpoint: `ipc://PATH`, or `tcp://HOST:PORT` with an address of this machine.
+            keys: keys whose holders may subscribe; the list of clients is reread while this runs. Without keys, a tcp
+                address of this machine is open to this user's programs only, by `security.loopback_keys`.
             reliable: names of the subscribers to wait for.
-            clear_text: whether a tcp address may do without keys, for whoever can reach it.
-            resume: the publisher of this address that was there before, whose messages are counted on: who has some of
-                them already takes no notice.
+            clear_text: whether a tcp address may do without keys, and is open to anyone who can reach it.
+            resume: state of this address's previous publisher, whose sequence numbers are continued. Subscribers ignore
+                messages that they already have.
 
         Raises:
-            TransportError: if the address is malformed, in use, or reachable from outside and `keys` is None.
+            TransportError: the address is malformed, in use, or reachable from outside while `keys` is None.
         """
         transport, host = parse(endpoint)
         if keys is None and not clear_text and not is_local(endpoint):
@@ -111,8 +112,8 @@ class Publisher(Closing):
         self._new_subscriptions: Counter[int] = Counter()
         self._new_since = time.monotonic()
         self.id = resume.id if resume else int.from_bytes(os.urandom(4), "little")
-        """of the topics that a publisher of this address may resume; drawn at random"""
-        self._new_id = int.from_bytes(os.urandom(4), "little")  # what is not resumed is not to be taken for repeated
+        """random number that identifies this publisher on the resumed topics (all topics, if nothing is resumed)"""
+        self._new_id = int.from_bytes(os.urandom(4), "little")  # so that topics not resumed do not look like repeats
         self._resumed = frozenset(resume.sequence) if resume else frozenset(TOPICS)
         self._context = zmq.Context()
         self._authenticator = _authenticate(self._context, self._clients) if self._clients else None
@@ -130,21 +131,20 @@ class Publisher(Closing):
         self.endpoint: str = self._socket.get_string(zmq.LAST_ENDPOINT)
 
     def _bind(self, endpoint: str) -> zmq.Socket[bytes]:
-        # XPUB, not PUB, because it receives the subscriptions
+        # XPUB, unlike PUB, receives the subscriptions
         socket = self._context.socket(zmq.XPUB)
         try:
             socket.setsockopt(zmq.SNDHWM, SEND_HIGH_WATER)
             socket.setsockopt(zmq.LINGER, LINGER_MS)
             socket.setsockopt(zmq.MAXMSGSIZE, 1024)
             socket.setsockopt(zmq.IPV6, "[" in endpoint)
-            # a subscriber whose machine vanished is noticed in 15 s
             for option, value in KEEPALIVE.items():
                 socket.setsockopt(option, value)
             if self._keys:
                 socket.curve_server = True
                 socket.curve_secretkey = self._keys.secret
                 socket.curve_publickey = self._keys.public
-                # without this, whoever comes while nobody checks keys is let in
+                # without this, a connection made while no thread checks keys would be accepted
                 socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN.encode())
                 socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
             socket.bind(endpoint)
@@ -154,17 +154,19 @@ class Publisher(Closing):
         return socket
 
     def publish(self, topic: str, message: Message, timeout_s: float = math.inf) -> bool:
-        """Send a message to all who subscribe to its topic.
+        """Send a message to all subscribers of its topic.
 
         Args:
-            timeout_s: how long to wait for a reliable subscriber that is behind.
+            topic: its topic.
+            message: the message.
+            timeout_s: longest time to wait for reliable subscribers that are behind, seconds.
 
         Returns:
-            whether it was sent; False if a reliable subscriber stayed behind, and then no subscriber got it.
+            True if it was sent. False if a reliable subscriber stayed behind; then no subscriber received it.
 
         Raises:
-            ValueError: if the message is not of the topic's type, encodes to more than `MAX_FRAME` bytes, or holds more
-                than `msgs.codec` allows.
+            ValueError: the message is not of the topic's type, encodes to more than `MAX_FRAME` bytes, or holds more
+                bodies, events or values than `msgs.codec` allows.
         """
         check_topic(topic, message)
         payload = encode(message)
@@ -184,34 +186,34 @@ class Publisher(Closing):
         return self.id if topic in self._resumed else self._new_id
 
     def sequence(self, topic: str) -> int:
-        """Of the next message of a topic."""
+        """Sequence number of the next message of a topic."""
         return self._deliveries.sequence[topic]
 
     def waited_for(self, topic: str) -> frozenset[str]:
-        """The names of the reliable subscribers for whom the next message of a topic waits."""
+        """Names of the reliable subscribers for which the topic's next message waits."""
         return self._deliveries.waited_for(topic)
 
     def silent(self, for_s: float) -> frozenset[str]:
-        """The names of reliable subscribers that have not read for so long, though there is something to read."""
+        """Names of the reliable subscribers that have had unread messages for longer than ``for_s`` seconds."""
         return self._deliveries.silent(for_s)
 
     def is_taken(self, topic: str, sequence: int, timeout_s: float = 0.0) -> bool:
-        """Whether all reliable subscribers of a topic have taken a message; waits until they have, or for so long."""
+        """Whether all reliable subscribers of a topic acknowledge a message within ``timeout_s`` seconds."""
         return self._wait(lambda: self._deliveries.is_taken(topic, sequence), timeout_s)
 
     @property
     def subscribers(self) -> frozenset[str]:
-        """The names of the subscribers that are connected and get what is published from now on."""
+        """Names of the connected subscribers. They receive every message published from now on."""
         self._note_subscribers()
         return frozenset(listener.name for listener in self._listeners)
 
     def wait_for_subscribers(self, names: Iterable[str], *, timeout_s: float) -> bool:
-        """Wait until the subscribers of these names are there; False if `timeout_s` passed before."""
+        """Wait until the named subscribers are connected; False if that takes longer than `timeout_s`."""
         wanted = frozenset(names)
         return self._wait(lambda: wanted <= {listener.name for listener in self._listeners}, timeout_s)
 
     def _wait(self, until: Callable[[], bool], timeout_s: float) -> bool:
-        """Take what subscribers say until a condition holds; False if it does not in time."""
+        """Process subscribers' frames until a condition holds; False if it does not within ``timeout_s``."""
         deadline = time.monotonic() + timeout_s
         while True:
             self._note_subscribers()
@@ -223,14 +225,15 @@ class Publisher(Closing):
             self._socket.poll(milliseconds(min(left, _LOOK_S)))
 
     def check(self) -> None:
-        """Enforce the list of keys; to be called about once a second.
+        """Enforce the list of keys. Call it about once a second.
 
-        If a key was removed since the last call, or a flood of subscriptions got past `_note_new`, all connections are
-        closed; permitted subscribers reconnect.
+        If a key was removed since the last call, or a flood of subscriptions was not stopped otherwise, all connections
+        are closed, and permitted subscribers reconnect.
 
         Raises:
-            RuntimeError: keys are no longer checked, and no new subscriber is accepted: make another publisher.
-            TransportError: the address was taken by another process meanwhile.
+            RuntimeError: the thread that checks keys has ended and no new subscriber is accepted; create another
+                publisher.
+            TransportError: another process took the address meanwhile.
         """
         self._note_subscribers()
         if self._authenticator and not self._authenticator.is_alive():
@@ -258,7 +261,7 @@ class Publisher(Closing):
             time.sleep(0.01)
 
     def _note_subscribers(self) -> None:
-        for _ in range(SEND_HIGH_WATER):  # whoever floods this is not to keep it from publishing
+        for _ in range(SEND_HIGH_WATER):  # bounded, so that a flood of frames cannot block publishing
             try:
                 received = self._socket.recv(zmq.NOBLOCK, copy=False)
             except zmq.Again:
@@ -286,26 +289,24 @@ class Publisher(Closing):
                 self._socket.send(prefix + b"\0" + frame)
 
     def _note_new(self, received: zmq.Frame) -> None:
-        """Count what a connection asks for, and close one that asks for too much."""
+        """Count a connection's subscriptions, and close a connection that has too many."""
         now = time.monotonic()
         if now - self._new_since > 1.0:
             self._new_subscriptions.clear()
             self._new_since = now
         try:
             connection = int(received.get(zmq.SRCFD))  # type: ignore[arg-type]
-        except (
-            zmq.ZMQError
-        ):  # who speaks the first version of the protocol cannot be distinguished from others; see `check`
+        except zmq.ZMQError:  # peers with version 1 of the protocol cannot be told apart; `check` limits them
             return
         self._new_subscriptions[connection] += 1
         too_many = len(self._subscriptions) > MAX_SUBSCRIPTIONS
         if too_many or self._new_subscriptions[connection] == MAX_NEW_SUBSCRIPTIONS:
             self.refused[_CUT] += 1
             with suppress(OSError), posix.socket(fileno=os.dup(connection)) as end:
-                end.shutdown(posix.SHUT_RDWR)  # ZeroMQ sees it leave, and forgets what it asked for
+                end.shutdown(posix.SHUT_RDWR)  # ZeroMQ sees it disconnect, and drops its subscriptions
 
     def close(self) -> None:
-        """Stop, once what was published is on its way, or after `LINGER_MS`."""
+        """Stop once all published messages are sent, or after `LINGER_MS`."""
         self._socket.close()
         self._end()
 
@@ -321,17 +322,18 @@ KEEPALIVE = {
     zmq.TCP_KEEPALIVE_INTVL: 5,
     zmq.TCP_KEEPALIVE_CNT: 2,
 }
-"""so that whose machine vanished is noticed in 15 s. Not by ZeroMQ's heartbeats: they abort the process of a subscriber
-that is behind (libzmq issue 3937)."""
+"""Socket options by which a vanished machine is detected within 15 s.
+
+ZeroMQ's own heartbeats would abort the process of a subscriber that is behind (libzmq issue 3937)."""
 
 
 def milliseconds(seconds: float) -> int:
-    """For ZeroMQ; -1 is for ever."""
+    """A timeout for ZeroMQ, milliseconds; -1 waits forever."""
     return -1 if math.isinf(seconds) else math.ceil(seconds * 1000)
 
 
 def _authenticate(context: zmq.Context[zmq.Socket[bytes]], clients: ClientList) -> ThreadAuthenticator:
-    from zmq.auth.thread import ThreadAuthenticator  # brings asyncio, which nobody else here needs
+    from zmq.auth.thread import ThreadAuthenticator  # imported late: it imports asyncio, which nothing else needs
 
     class KeyList:
         def callback(self, domain: str, key: bytes) -> bool:

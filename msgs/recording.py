@@ -1,6 +1,6 @@
-"""Recordings: rosbag2 directories with MCAP storage, which `ros2 bag`, Foxglove and rosbags read too.
+"""Recordings: rosbag2 directories with MCAP storage, which `ros2 bag`, Foxglove and rosbags also read.
 
-A topic has its ROS name in the file (`/pose/raw` for `pose/raw`); a message is filed under the stamp it is of.
+In the file, a topic has its ROS name (`/pose/raw` for `pose/raw`), and a message's log time is its stamp.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["Recorded", "RecordingError", "RecordingReader", "RecordingWriter"]
 
 
 class Recorded(NamedTuple):
-    """A message of a recording: its topic, and the stamp it is filed under, in nanoseconds."""
+    """A recorded message, its topic, and its stamp in the file in nanoseconds."""
 
     topic: str
     stamp_ns: int
@@ -35,21 +35,21 @@ class Recorded(NamedTuple):
 
 
 class RecordingReader(Closing):
-    """Reads a recording: one made here, complete or cut short, or one of `ros2 bag record` with the same types.
+    """Reads a recording made by steadypose, complete or truncated, or by `ros2 bag record` with the same types.
 
-    A context manager. Iterating gives every message of the project's topics, in the order of their stamps; other
-    topics are passed over.
+    A context manager. Iteration yields the messages of steadypose's topics in the order of their stamps, and skips
+    other topics.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Open a rosbag2 directory, with or without `metadata.yaml`, or one `.mcap`.
+        """Open a rosbag2 directory, with or without `metadata.yaml`, or a single `.mcap` file.
 
         Raises:
-            RecordingError: if there is no recording, no message in it, or it was made with other definitions.
+            RecordingError: there is no recording, it has no messages, or it was made with other message definitions.
         """
         self.path = Path(path)
         self.refused: Counter[str] = Counter()
-        """messages passed over because they could not be decoded, by topic"""
+        """number of messages skipped because they could not be decoded, by topic"""
         self._files = ExitStack()
         with ExitStack() as undo:
             undo.callback(self._files.close)
@@ -66,39 +66,38 @@ class RecordingReader(Closing):
         self.start_ns = min(part.start_ns for part in filled)
         self.end_ns = max(part.end_ns for part in filled)
         self.complete = all(part.complete for part in self._parts)
-        """False if the writer was killed or the file cut short: what could be read is here"""
+        """False if the writer was killed or a file is truncated; the readable messages are available"""
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes that could not be read, as far as is known: damage shows when the messages are read."""
+        """Number of unreadable bytes known so far. Damage is detected while messages are read."""
         return sum(part.lost_bytes for part in self._parts)
 
     @property
     def gaps(self) -> int:
-        """How many pieces the lost bytes are."""
+        """Number of unreadable pieces known so far."""
         return sum(part.gaps for part in self._parts)
 
     @property
     def duration_s(self) -> float:
-        """From the first stamp to the last."""
+        """Time from the first stamp to the last, seconds."""
         return (self.end_ns - self.start_ns) / 1e9
 
     def count(self, topic: str) -> int:
-        """How many messages there are on a topic."""
+        """Number of messages on a topic."""
         return self._counts[topic]
 
     def __iter__(self) -> Iterator[Recorded]:
         return self.messages()
 
     def messages(self, topics: Iterable[str] | None = None, *, start_ns: int | None = None) -> Iterator[Recorded]:
-        """The messages on `topics`, from `start_ns` on, in the order of their stamps, then of recording.
+        """The messages on `topics` from `start_ns` on, in the order of their stamps, then of recording.
 
-        Seeking reads no more of the file than what comes at and after `start_ns`. A chunk that is damaged is passed
-        over, and counted in `lost_bytes`.
+        Chunks that end before `start_ns` are not read. A damaged chunk is skipped, and counted in `lost_bytes`.
 
         Raises:
-            RecordingError: the file cannot be read any more.
-            ValueError: for a topic that does not exist.
+            RecordingError: the file can no longer be read.
+            ValueError: a topic does not exist.
         """
         wanted = set(TOPICS if topics is None else topics)
         if unknown := wanted - TOPICS.keys():
@@ -165,5 +164,5 @@ def _topic(channel: Channel) -> str:
 
 
 def _in_order(path: Path) -> list[tuple[int, str]]:
-    """Parts by their numbers: the tenth after the ninth."""
+    """Sort key that orders parts by number: the tenth after the ninth."""
     return [(int(text), "") if text.isdecimal() else (-1, text) for text in re.split(r"(\d+)", path.name)]

@@ -1,10 +1,10 @@
-"""Writing recordings: rosbag2 directories with MCAP storage, in one file or in parts.
+"""Writes recordings: rosbag2 directories with MCAP storage, in one file or in several parts.
 
-No clock and no chance goes into the `.mcap`: the same messages make the same bytes.
+The bytes of an `.mcap` depend only on its messages, not on the clock or on chance.
 
-A writer that is killed loses at most the last half second of what it was given, counted in stamps: MCAP's chunks
-are closed, and handed to the operating system, as often as that. The file then has no index and the directory no
-`metadata.yaml`; `RecordingReader` makes the index anew, and a writer that is asked to go on begins the next part.
+A killed writer loses at most the last half second, measured in stamps, because it closes MCAP chunks and hands them to
+the operating system at that interval. The file then has no index, and the directory no `metadata.yaml`.
+`RecordingReader` rebuilds the index; a writer with `go_on` starts the next part.
 """
 
 from __future__ import annotations
@@ -30,27 +30,28 @@ from steadypose.msgs.types import Message
 CHUNK_NS = 500_000_000
 CHUNK_BYTES = 2**18
 TAIL_NS = 10_000_000_000
-"""of the last part: what may be given again to a recorder that was killed before it could say that it has it"""
+"""Length of the last part's end that is searched for duplicates, nanoseconds. A killed recorder may receive again
+messages that it had written and not yet acknowledged."""
 METADATA = "metadata.yaml"
 
 
 class RecordingError(ValueError):
-    """A recording that cannot be made or read. The text says why."""
+    """A recording that cannot be written or read. The text says why."""
 
 
 @dataclass
 class PartInfo:
-    """What `metadata.yaml` says of one file."""
+    """The entries of one file in `metadata.yaml`."""
 
     path: Path
     counts: Counter[str] = field(default_factory=Counter)
-    """messages by topic"""
+    """number of messages by topic"""
     first_ns: int = 2**63 - 1
     last_ns: int = 0
 
     @classmethod
     def of(cls, path: Path) -> PartInfo:
-        """Of a file that is there; nothing, if it cannot be read."""
+        """Read the entries from an existing file; empty if it cannot be read."""
         with path.open("rb") as file, suppress(*BROKEN):
             mcap = McapFile(file, path.stat().st_size)
             counts = Counter({c.topic.removeprefix("/"): mcap.counts[c.id] for c in mcap.channels.values()})
@@ -70,17 +71,19 @@ class RecordingWriter(Closing):
         split_ns: int = 0,
         keep_bytes: int = 0,
     ) -> None:
-        """Make `directory`, and its parents where they are missing.
+        """Create `directory` and missing parents.
 
         Args:
-            go_on: if a recording is there already, write its next part; what the end of its last one holds is not
-                written again.
-            split_bytes: begin the next part when one has so many; 0: never.
-            split_ns: begin the next part when one spans so much, in stamps; 0: never.
-            keep_bytes: remove the oldest parts so that all together have no more; 0: never.
+            directory: the recording's directory.
+            go_on: whether to append a part if the recording exists. Messages at the end of its last part are not
+            written
+                again.
+            split_bytes: size at which the next part starts, bytes; 0: never.
+            split_ns: time span in stamps at which the next part starts, nanoseconds; 0: never.
+            keep_bytes: total size above which the oldest parts are removed, bytes; 0: never.
 
         Raises:
-            RecordingError: if it is there already, or cannot be made.
+            RecordingError: the directory exists already, or cannot be created.
         """
         self.directory = Path(directory)
         self._split_bytes, self._split_ns, self._keep_bytes = split_bytes, split_ns, keep_bytes
@@ -101,11 +104,11 @@ class RecordingWriter(Closing):
             raise RecordingError(f"cannot record to {directory}: {error.strerror}") from error
 
     def write(self, topic: str, message: Message, stamp_ns: int) -> None:
-        """Append a message, to be found at `stamp_ns` (0 or later); stamps need not rise.
+        """Append a message with the log time `stamp_ns` (0 or later). Stamps need not increase.
 
         Raises:
-            ValueError: if the message is not of the topic's type, or the stamp is negative.
-            OSError: the disk is full, or gone. What was written before is kept; the next call begins another part.
+            ValueError: the message is not of the topic's type, or the stamp is negative.
+            OSError: the disk is full, or gone. Earlier messages are kept; the next call starts another part.
         """
         check_topic(topic, message)
         if stamp_ns < 0:
@@ -119,20 +122,20 @@ class RecordingWriter(Closing):
 
     @property
     def pending(self) -> bool:
-        """Whether something that was written would be lost with this process."""
+        """Whether written messages would be lost if this process died."""
         return self._part.pending
 
     def flush(self) -> None:
-        """Hand what was written to the operating system."""
+        """Hand all written messages to the operating system."""
         if self.pending:
             self._part.flush()
 
     def sync(self) -> None:
-        """Have what was written reach the disk itself, so that it outlasts a power failure."""
+        """Write all flushed messages to the disk, so that they survive a power failure."""
         self._part.sync()
 
     def split(self) -> None:
-        """Complete this part, and begin the next."""
+        """Complete this part, and start the next."""
         self._finish()
         self._part = _Part(self.directory, self._part.number + 1)
 
@@ -144,12 +147,12 @@ class RecordingWriter(Closing):
         return 0 < self._split_bytes <= self._part.size or 0 < self._split_ns <= span_ns
 
     def close(self) -> None:
-        """Complete the recording: the index, and `metadata.yaml`."""
+        """Complete the recording: write the index and `metadata.yaml`."""
         if not self._part.closed:
             self._finish()
 
     def _finish(self) -> None:
-        """Complete this part, remove the oldest where there is a limit, and say so in the metadata."""
+        """Complete this part, remove the oldest parts beyond the limit, and write the metadata."""
         self._part.close()
         self._done.append(self._part.info)
         sizes = {info.path: info.path.stat().st_size for info in self._done}
@@ -160,7 +163,7 @@ class RecordingWriter(Closing):
         self._write_metadata()
 
     def _write_metadata(self) -> None:
-        from ruamel.yaml import YAML  # slow to import, and only those who record need it
+        from ruamel.yaml import YAML  # slow to import, and needed only for recording
 
         counts = sum((info.counts for info in self._done), Counter[str]())
         first_ns = min(info.first_ns for info in self._done)
@@ -210,7 +213,7 @@ class _Part:
         self.broken = False
         self.size = 0
         self._file = self.info.path.open("xb")
-        # compression would cost more time than it saves space: floats of a noisy sensor hardly shrink
+        # uncompressed, because a noisy sensor's floats hardly compress
         self._writer = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=CompressionType.NONE)
         self._writer.start(profile="ros2", library="steadypose")
         self._channels: dict[str, int] = {}
@@ -240,8 +243,8 @@ class _Part:
             self._written[topic] = stamp_ns
             self._pending += len(payload)
             self.size += len(payload)
-            # by topic, because the clocks of two topics may have nothing to do with each other; and in both directions,
-            # because a clock may be set back
+            # per topic, because two topics' clocks may be unrelated; in both directions, because a clock may be set
+            # back
             flushed = self._flushed.get(topic)
             if flushed is None or abs(stamp_ns - flushed) >= CHUNK_NS or self._pending >= CHUNK_BYTES:
                 self.flush()
@@ -255,7 +258,7 @@ class _Part:
             schema = self._writer.register_schema(name, "ros2msg", definition(name).encode())
             about = {"offered_qos_profiles": "", "topic_type_hash": typestore().hash_rihs01(name)}
             channel = self._writer.register_channel(f"/{topic}", "cdr", schema, about)
-            # beside the chunk that they are in as well: without one or the other, no message could be read
+            # written outside the chunk as well, so that a damaged chunk does not make all messages unreadable
             outside = RecordBuilder()
             Schema(id=schema, name=name, encoding="ros2msg", data=definition(name).encode()).write(outside)
             self._file.write(outside.end())
@@ -278,7 +281,7 @@ class _Part:
             os.fdatasync(self._file.fileno())
 
     def close(self) -> None:
-        """Write the index, unless writing failed: what is there is then found without one."""
+        """Write the index, unless writing failed before; the file is then readable without an index."""
         try:
             if not self.broken:
                 self._writer.finish()
@@ -288,14 +291,14 @@ class _Part:
                 raise
         finally:
             with suppress(OSError):
-                self._file.close()  # the second call closes what the first could not write to
+                self._file.close()  # if the first close failed to write, the second one closes the file
 
 
 def recorded_parts(directory: Path) -> dict[int, Path]:
-    """The files of a recording made here, by their numbers.
+    """The files of a recording made by steadypose, by their numbers.
 
     Raises:
-        RecordingError: there is something else in the directory.
+        RecordingError: the directory contains something else.
     """
     name = re.compile(rf"{re.escape(directory.name)}_(\d+)\.mcap")
     parts: dict[int, Path] = {}
@@ -308,7 +311,7 @@ def recorded_parts(directory: Path) -> dict[int, Path]:
 
 
 def _tail(part: Path) -> set[tuple[str, bytes]]:
-    """The last messages of a part, encoded, with their topics; none, if it cannot be read."""
+    """Topics and encoded bytes of a part's last messages; empty if it cannot be read."""
     tail: set[tuple[str, bytes]] = set()
     with part.open("rb") as file, suppress(*BROKEN):
         mcap = McapFile(file, part.stat().st_size)
@@ -319,7 +322,7 @@ def _tail(part: Path) -> set[tuple[str, bytes]]:
 
 
 def definition(name: str) -> str:
-    """The text of a message definition, as it stands in a recording."""
+    """The text of a message definition as stored in a recording."""
     return typestore().generate_msgdef(name, ros_version=2)[0]
 
 

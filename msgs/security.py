@@ -1,15 +1,15 @@
-"""Addresses that messages travel by, which of them may be used, and CurveZMQ keys: who may listen.
+"""Addresses and access control: which addresses may be used, and which CurveZMQ keys may subscribe.
 
-On this machine an ipc address is private to its user by its directory. A tcp address is not: there a pair of keys that
-only this user can read (`loopback_keys`) keeps other users out. Where messages leave the machine, a directory of keys
-says who may listen. It holds
+An ipc address on this machine is private to its user by the permissions of its directory. A local tcp address is not,
+so a pair of keys that only this user can read (`loopback_keys`) keeps other users out. If messages leave the machine, a
+directory of keys defines who may subscribe. It contains:
 
-- `own.key_secret`, readable by its owner alone, and `own.key`, the public half to hand out;
-- `clients/*.key`: public keys of those who may subscribe here. Who is taken off the list is not let in any more, and is
-  disconnected within a second or two, without a restart;
-- `server.key`: public key of the publishers to subscribe to; without it they are this machine's own;
-- `servers/HOST.key`: public keys of publishers that each have their own, by host as in their addresses; then those on
-  other hosts are not subscribed to.
+- `own.key_secret`, readable only by its owner, and `own.key`, the public key to hand out;
+- `clients/*.key`: public keys that may subscribe here. A client whose key is removed is disconnected within a second or
+  two, without a restart, and no longer accepted;
+- `server.key`: public key of the publishers to subscribe to. Without it, publishers are expected to use `own.key`;
+- `servers/HOST.key`: public keys of publishers with individual keys, by host as in their addresses. Publishers on other
+  hosts are then not subscribed to.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from pathlib import Path
 
 
 class TransportError(ValueError):
-    """An address that cannot, or must not, be used. The text says what to do."""
+    """An address that cannot or must not be used. The text says what to do."""
 
 
 def parse(endpoint: str) -> tuple[str, str]:
-    """Transport and path or host of an address.
+    """The transport, and the path or host, of an address.
 
     Raises:
-        TransportError: it is malformed.
+        TransportError: the address is malformed.
     """
     transport, _, address = endpoint.partition("://")
     host, _, port = address.rpartition(":")
@@ -46,7 +46,7 @@ def parse(endpoint: str) -> tuple[str, str]:
 
 
 def is_local(endpoint: str) -> bool:
-    """Whether only this machine is at the other end."""
+    """Whether an address can be reached from this machine only."""
     transport, host = parse(endpoint)
     return transport == "ipc" or _is_loopback(host)
 
@@ -59,9 +59,12 @@ def _is_loopback(host: str) -> bool:
 
 
 def refuse_used(path: Path) -> None:
-    """Raises:
-    TransportError: a publisher is at this path, or something that is no socket. ZeroMQ would take the path from the
-        one without either noticing, and delete the other.
+    """Refuse a socket path that is in use.
+
+    ZeroMQ would silently take the path from another publisher, and would delete a file that is not a socket.
+
+    Raises:
+        TransportError: a publisher uses this path, or the path is not a socket.
     """
     try:
         kind = path.lstat().st_mode
@@ -78,8 +81,10 @@ def refuse_used(path: Path) -> None:
 
 
 def check_private(directory: Path) -> None:
-    """Raises:
-    TransportError: others own the directory, or may write to it, and so could publish in this user's name.
+    """Check that no other user could publish in this user's name.
+
+    Raises:
+        TransportError: another user owns the directory, or others may write to it.
     """
     try:
         status = directory.lstat()
@@ -96,17 +101,17 @@ def check_private(directory: Path) -> None:
             f"{directory} belongs to user {status.st_uid}: expected a directory of one's own for sockets; "
             "set XDG_RUNTIME_DIR, or [transport] directory"
         )
-    sticky = status.st_uid == 0 and status.st_mode & stat.S_ISVTX  # /tmp, for an address that somebody chose there
+    sticky = status.st_uid == 0 and status.st_mode & stat.S_ISVTX  # /tmp, for an address chosen explicitly
     others = stat.S_IWOTH if status.st_gid == os.getgid() else stat.S_IWOTH | stat.S_IWGRP
     if status.st_mode & others and not sticky:
         raise TransportError(f"{directory} can be written to by others: run `chmod 700 {directory}`, or choose another")
 
 
 def make_private(directory: Path) -> None:
-    """Make a directory for sockets, accessible to this user only, unless it exists.
+    """Create a directory for sockets, accessible to this user only, unless it exists.
 
     Raises:
-        TransportError: it exists with other owners or permissions, or cannot be made.
+        TransportError: it exists with other owners or permissions, or cannot be created.
     """
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -116,10 +121,10 @@ def make_private(directory: Path) -> None:
 
 
 def local_directory() -> Path:
-    """Where ipc sockets live unless a launch file says otherwise: private to the user, gone after a reboot.
+    """The default directory of ipc sockets. It is private to the user, and removed at a reboot.
 
     Raises:
-        TransportError: it is there, and others may write to it.
+        TransportError: it exists, and others may write to it.
     """
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     directory = Path(runtime) / "steadypose" if runtime else Path(tempfile.gettempdir()) / f"steadypose-{os.getuid()}"
@@ -128,7 +133,7 @@ def local_directory() -> Path:
 
 
 def local_address(node: str) -> str:
-    """Where ``node`` (``pose_input``, ``prior``, ``trajectory``) publishes unless a launch file says otherwise.
+    """The default address at which ``node`` (``pose_input``, ``prior``, ``trajectory``) publishes.
 
     Raises:
         TransportError: others may write to the directory.
@@ -137,7 +142,7 @@ def local_address(node: str) -> str:
 
 
 MADE_S = 2.0
-"""that another process may take to make the keys of this user"""
+"""Longest time to wait for another process that creates this user's keys, seconds."""
 _OWN = "own"
 
 
@@ -148,19 +153,19 @@ class Keys:
     public: bytes
     secret: bytes = field(repr=False)
     server: bytes
-    """public key that a subscriber expects of its publishers"""
+    """public key that a subscriber expects from its publishers"""
     clients: frozenset[bytes]
-    """public keys that a publisher serves; always with `public`, for the subscribers of the same machine"""
+    """public keys that a publisher accepts; always includes `public`, for subscribers on the same machine"""
     servers: Mapping[str, bytes] = field(default_factory=dict)
-    """public keys of publishers that have their own, by host"""
+    """public keys of publishers with individual keys, by host"""
     directory: Path | None = None
-    """where they were read from"""
+    """directory that the keys were read from"""
 
     def server_at(self, endpoint: str) -> bytes:
         """The public key of the publisher at an address.
 
         Raises:
-            ValueError: there is none for it.
+            ValueError: there is no key for its host.
         """
         _, host = parse(endpoint)
         if host in self.servers:
@@ -171,18 +176,18 @@ class Keys:
 
 
 class ClientList:
-    """Who may subscribe, as the directory of keys says now."""
+    """The public keys that may subscribe, reread from the directory of keys at each call."""
 
     def __init__(self, keys: Keys) -> None:
         self._keys = keys
         self._served = self._read()
 
     def allows(self, key: bytes) -> bool:
-        """Whether the holder of this public key is let in."""
+        """Whether the holder of this public key may subscribe."""
         return key in self._read()
 
     def revoked(self) -> bool:
-        """Whether keys were taken off the list since the last call."""
+        """Whether keys were removed from the list since the last call."""
         before, self._served = self._served, self._read()
         return not before <= self._served
 
@@ -191,16 +196,16 @@ class ClientList:
             return self._keys.clients
         listed = {self._keys.public}
         for file in (self._keys.directory / "clients").glob("*.key"):
-            with suppress(ValueError, OSError):  # one that is not yet whole is none
+            with suppress(ValueError, OSError):  # a file that is still being written is ignored
                 listed.add(_public(file))
         return frozenset(listed)
 
 
 def _listed(directory: Path) -> dict[str, bytes]:
-    """Public keys in a folder, by the names of their files.
+    """Public keys in a folder, by file name without suffix.
 
     Raises:
-        ValueError: one is no key.
+        ValueError: a file is not a key.
     """
     return {file.stem: _public(file) for file in sorted(directory.glob("*.key"))}
 
@@ -210,8 +215,8 @@ def _public(file: Path) -> bytes:
 
 
 def _certificate(file: Path) -> tuple[bytes, bytes | None]:
-    """Public and, where the file has it, secret key."""
-    from zmq.auth import load_certificate  # here, because reading an address takes no ZeroMQ
+    """The public key in a file, and the secret key if the file has one."""
+    from zmq.auth import load_certificate  # imported late, because parsing an address needs no ZeroMQ
 
     public, secret = load_certificate(file)
     for key in (public, secret or public):
@@ -221,16 +226,16 @@ def _certificate(file: Path) -> tuple[bytes, bytes | None]:
 
 
 def create_keys(directory: str | Path) -> Keys:
-    """Make a pair of keys in `directory`, and the empty list `clients` beside it.
+    """Create a pair of keys in `directory`, and an empty folder `clients`.
 
     Raises:
-        ValueError: if there is a pair already; it is not replaced, for others may rely on it.
+        ValueError: a pair exists already. It is not replaced, because others may rely on it.
     """
     directory = Path(directory)
     (directory / "clients").mkdir(parents=True, exist_ok=True)
     secret = directory / f"{_OWN}.key_secret"
     try:
-        # made first with its mode, for pyzmq would make it readable by all
+        # created here with its mode, because pyzmq would create it readable by all
         os.close(os.open(secret, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     except FileExistsError as error:
         raise ValueError(f"{secret} exists already: expected a directory without keys, or use these") from error
@@ -244,7 +249,7 @@ def load_keys(directory: str | Path) -> Keys:
     """Read a directory of keys.
 
     Raises:
-        ValueError: if a file is missing or holds no key, or if the secret can be read by others.
+        ValueError: a file is missing or contains no key, or others can read the secret key or write to the directory.
     """
     directory = Path(directory)
     secret_file = directory / f"{_OWN}.key_secret"
@@ -265,8 +270,10 @@ def load_keys(directory: str | Path) -> Keys:
 
 
 def _check_folder(folder: Path) -> None:
-    """Raises:
-    ValueError: others may write to it, and so say who may listen, and whose poses are accepted.
+    """Check that no other user can change which keys are accepted.
+
+    Raises:
+        ValueError: another user owns the folder, or others may write to it.
     """
     status = folder.stat()
     others = stat.S_IWOTH if status.st_gid == os.getgid() else stat.S_IWOTH | stat.S_IWGRP
@@ -279,15 +286,15 @@ def _check_folder(folder: Path) -> None:
 
 
 def loopback_keys() -> Keys:
-    """This user's keys for tcp addresses of this machine, made at first; they last as long as the runtime directory.
+    """This user's keys for local tcp addresses, created on first use. They last as long as the runtime directory.
 
     Raises:
-        TransportError: they cannot be made, or others can read them.
+        TransportError: the keys cannot be created, or others can read them.
     """
     directory = local_directory()
     make_private(directory)
     folder = directory / "loopback"
-    with suppress(ValueError):  # they are there
+    with suppress(ValueError):  # raised if they exist
         return create_keys(folder)
     deadline = time.monotonic() + MADE_S
     while True:

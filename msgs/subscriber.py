@@ -1,4 +1,4 @@
-"""Receiving messages from publishers."""
+"""The subscriber: receives messages from publishers."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.types import Diagnostics, Message
 
 HIGH_WATER = 1000
-"""messages a subscriber holds unread, unless it says otherwise"""
+"""Default number of unread messages that a subscriber's queue holds."""
 MAX_RECEIVED = 2**26
-"""bytes of a frame that is received at all; with one beyond, ZeroMQ ends the connection"""
+"""Largest size of a frame that ZeroMQ receives, bytes. It closes the connection on a larger one."""
 DRIFT = 1e-4
-"""of two machines' clocks against each other: more than any crystal has"""
+"""Upper bound of the relative drift of two machines' clocks, ratio. Any crystal oscillator is better."""
 REVIVE_S = 0.5
-"""without another attempt, a connection that was lost is given up by ZeroMQ, and made anew here"""
+"""Time without a reconnection attempt by ZeroMQ after which a lost connection is re-established here, seconds."""
 
 SECOND = "second publisher"
-"""the cause of what is refused because its source is another publisher's"""
+"""Cause in `Subscriber.refused` of messages whose source is bound to another publisher."""
 
 _PUBLISHERS = 256
-_EVENT = struct.Struct("=HI")  # of ZeroMQ's monitor; zmq.utils.monitor, which reads it too, brings asyncio
+_EVENT = struct.Struct("=HI")  # an event of ZeroMQ's monitor; zmq.utils.monitor could read it, but imports asyncio
 _HANDSHAKES = (
     zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
@@ -44,9 +44,9 @@ _RETRIES = zmq.EVENT_CONNECT_DELAYED | zmq.EVENT_CONNECT_RETRIED | zmq.EVENT_CON
 class Subscriber(Closing):
     """Receives messages from publishers. A context manager.
 
-    What cannot be used is counted, never raised: `dropped` counts by topic the messages that were published and
-    did not arrive (or, with `conflate`, were overtaken), `late` those that came after their lifespan, `refused` by
-    cause the frames that were not messages.
+    Unusable input is counted and raises nothing. `dropped` counts, by topic, published messages that did not arrive (or
+    were replaced by newer ones, with `conflate`). `late` counts messages that arrived after their lifespan. `refused`
+    counts, by cause, frames that were not valid messages.
     """
 
     def __init__(
@@ -64,22 +64,25 @@ class Subscriber(Closing):
         name: str = "",
         principals: Principals | None = None,
     ) -> None:
-        """Connect to `endpoints`, now or as soon as a publisher is there, and subscribe to `topics`.
+        """Connect to `endpoints`, now or as soon as a publisher binds them, and subscribe to `topics`.
 
         Args:
-            conflate: keep the newest message alone: for a picture or a control loop that wants the state, not the
-                history. For one topic and without a name, because ZeroMQ then keeps one message of each publisher,
-                and one subscription to it; open a subscriber for each topic.
-            reliable: miss no pose of a publisher that names this subscriber: it waits, as long as this one is behind,
-                and sends what one of this name before had not taken again.
-            context: messages before those to be sent again, too.
-            lifespan_s: what was sent longer ago is dropped, but for news of nodes and the end of a stream: a program
-                that was stopped for a minute is not to take that minute's poses for new ones.
-            high_water: messages held unread, beyond which the newest are lost; 0 holds all there is memory for.
-            keys: for publishers that have them; a tcp address of this machine without any is one of this user's own.
-            clear_text: whether to listen at a tcp address without keys.
-            principals: who publishes what, where several subscribers are to agree on it.
-            name: what `Publisher.subscribers` calls this subscriber; without one it is not among them.
+            endpoints: one address or several.
+            topics: one topic or several.
+            conflate: whether to keep only the newest message, for a display or a control loop that needs the state
+                rather than the history. It requires a single topic and no name, because ZeroMQ then keeps one message
+                and one subscription per publisher; open a subscriber for each topic.
+            reliable: whether to miss no pose of a publisher that names this subscriber. The publisher waits while this
+                subscriber is behind, and resends the messages that its predecessor of this name had not acknowledged.
+            context: number of earlier messages to be resent as well.
+            lifespan_s: age since sending at which a message is dropped, seconds, so that a program that was suspended
+                does not take old poses for new ones. Diagnostics and the end of a stream are never dropped for age.
+            high_water: largest number of unread messages, beyond which the newest are lost; 0: unlimited.
+            keys: keys for publishers that require them. A local tcp address without keys uses those of this user
+                (`security.loopback_keys`).
+            clear_text: whether to subscribe at a tcp address without keys.
+            principals: binding of sources to publishers, to be shared by several subscribers.
+            name: this subscriber's name in `Publisher.subscribers`; without one it is not listed there.
 
         Raises:
             TransportError: if an address is malformed, or another machine's and `keys` is None, or if others could
@@ -109,7 +112,7 @@ class Subscriber(Closing):
         self._lifespan_ns = lifespan_s * 1e9
         self._local = all(map(is_local, self._endpoints))
         self._expected: OrderedDict[tuple[int, str], int] = OrderedDict()
-        self._offsets: OrderedDict[int, tuple[int, int]] = OrderedDict()  # of each publisher's clock, and when found
+        self._offsets: OrderedDict[int, tuple[int, int]] = OrderedDict()  # by publisher: clock offset, and when found
         news = [topic for topic in topics if TOPICS[topic] is Diagnostics]
         waited_for = tuple(topic for topic in topics if topic not in news) if reliable else ()
         self._listener = Listener(name, int.from_bytes(os.urandom(4), "little"), waited_for, context)
@@ -119,9 +122,9 @@ class Subscriber(Closing):
         self._lost: dict[str, float] = {}
         self._looked = 0.0
         self._context = zmq.Context()
-        # XSUB, unlike SUB, can say how far it is
+        # XSUB, unlike SUB, can send acknowledgements
         self.socket = self._context.socket(zmq.XSUB if reliable else zmq.SUB)
-        """for a `zmq.Poller`; read it with `receive` alone"""
+        """socket to register in a `zmq.Poller`; read it only by `receive`"""
         self.socket.setsockopt(zmq.CONFLATE, conflate)
         self.socket.setsockopt(zmq.RCVHWM, high_water)
         self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_RECEIVED)
@@ -156,14 +159,15 @@ class Subscriber(Closing):
             self.socket.curve_secretkey = keys.secret
             self.socket.curve_serverkey = keys.server_at(endpoint)
         else:
-            self.socket.curve_server = False  # what was set for the address before does not hold for this one
+            self.socket.curve_server = False  # resets the keys of the address before
         self.socket.connect(endpoint)
 
     def receive(self, timeout_s: float, *, taken: bool = True) -> tuple[str, Message] | None:
-        """The next message and its topic, or None if none came in `timeout_s`.
+        """The next topic and message, or None if none arrives within `timeout_s`.
 
         Args:
-            taken: whether the message counts as taken; if not, `take` says so later. Of a reliable subscriber only.
+            timeout_s: longest time to wait, seconds.
+            taken: whether a reliable subscriber acknowledges the message at once. If False, call `take` later.
         """
         received = self._receive(timeout_s)
         if taken and self._untaken:
@@ -171,12 +175,11 @@ class Subscriber(Closing):
         return received
 
     def arrived(self, topic: str) -> int:
-        """How many messages of a topic had been published when the newest arrived, those that were lost included."""
+        """Number of messages of a topic published up to the newest received one, including lost ones."""
         return sum(following for (_, of), following in self._expected.items() if of == topic)
 
     def take(self, number: int) -> None:
-        """Tell publishers that this reliable subscriber has done with the oldest `number` of messages, or if it is 0,
-        that it is still there."""
+        """Acknowledge the oldest `number` messages to their publishers. With 0, only send a sign of life."""
         news = {(taken.publisher, taken.topic): taken for taken in (self._untaken.popleft() for _ in range(number))}
         self._taken.update(news)
         while len(self._taken) > _PUBLISHERS:
@@ -185,7 +188,7 @@ class Subscriber(Closing):
             self._tell(taken)
 
     def _tell(self, taken: Taken) -> None:
-        with suppress(zmq.Again):  # who does not listen gets it again
+        with suppress(zmq.Again):  # a publisher that does not listen gets it again later
             self.socket.send(taken.frame(), zmq.NOBLOCK)
 
     def _receive(self, timeout_s: float) -> tuple[str, Message] | None:
@@ -219,7 +222,7 @@ class Subscriber(Closing):
         if version != VERSION:
             return self._refuse("version")
         if not self._count(publisher, topic, sequence):
-            if taken := self._taken.get((publisher, topic)):  # a publisher goes on where it last heard from here
+            if taken := self._taken.get((publisher, topic)):  # the publisher resumed from an older acknowledgement
                 return self._tell(taken)
             return self._refuse("repeated")
         late = self._age_ns(publisher, sent_ns) > self._lifespan_ns
@@ -241,7 +244,7 @@ class Subscriber(Closing):
         return topic, message
 
     def _pass_over(self, refused: Taken) -> None:
-        """Count a message that nobody will take as taken, with the one before it."""
+        """Acknowledge a refused message together with the one before it, because nothing else will acknowledge it."""
         if refused.topic not in self._listener.reliable:
             return
         for index in reversed(range(len(self._untaken))):
@@ -253,7 +256,7 @@ class Subscriber(Closing):
         self._tell(refused)
 
     def _count(self, publisher: int, topic: str, sequence: int) -> bool:
-        """Count what is missing before `sequence`; False if it is no later than what came before."""
+        """Count the messages missing before `sequence`; False if it is not newer than the last one."""
         missed = (sequence - self._expected.get((publisher, topic), sequence)) % 2**32
         if missed >= 2**31:
             return False
@@ -269,10 +272,10 @@ class Subscriber(Closing):
         return True
 
     def _age_ns(self, publisher: int, sent_ns: int) -> int:
-        """How long ago a message was sent, nanoseconds.
+        """Time since a message was sent, nanoseconds.
 
-        The clocks of one machine's processes are one. Another machine's stands to it by what the fastest message
-        showed, which took next to no time.
+        Processes on one machine share a monotonic clock. The offset to another machine's clock is estimated from the
+        fastest message so far, whose travel time is assumed to be zero.
         """
         now = time.monotonic_ns()
         apart = now - sent_ns
@@ -290,7 +293,7 @@ class Subscriber(Closing):
         self.refused[cause] += 1
 
     def _note_connections(self, now: float) -> None:
-        """Count refused connections, and reconnect where ZeroMQ has given up, as it does after too large a frame."""
+        """Count refused connections, and reconnect if ZeroMQ has given up, as it does after too large a frame."""
         self._looked = now
         while self._monitor.poll(0):
             description, at = self._monitor.recv_multipart()

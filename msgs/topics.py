@@ -1,9 +1,9 @@
-"""The topics, what travels on each, and what every `pose/clean` and `pose/world` promises.
+"""The topics, their message types, and the guarantees of `pose/clean` and `pose/world`.
 
-Where a joint's state is not UNKNOWN, its position, its deviation and its rotation are numbers. Rotations have norm 1,
-known or not. The root of a body in the world, its velocity and covariance are numbers, and the covariance is symmetric
-and positive semi-definite. The nodes publish no body that breaks this. Stamps of a source increase, until its stream
-ends or begins anew.
+If a joint's state is not UNKNOWN, its position, standard deviation and rotation are finite. Rotations have norm 1 in
+every state. In the world, a body's root pose, velocity and covariance are finite, and the covariance is symmetric and
+positive semi-definite. The nodes publish no body that violates this. A source's stamps increase until its stream ends
+or restarts.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ POSE_CLEAN = "pose/clean"
 POSE_WORLD = "pose/world"
 POSE_EVENTS = "pose/events"
 POSE_TRUTH = "pose/truth"
-"""the ground truth of a simulated stream"""
+"""Topic of a simulated stream's ground truth."""
 DIAGNOSTICS = "diagnostics"
 
 TOPICS: Mapping[str, type[Message]] = MappingProxyType(
@@ -45,7 +45,7 @@ TOPICS: Mapping[str, type[Message]] = MappingProxyType(
 
 
 def check_topic(topic: str, message: Message) -> None:
-    """Raise `ValueError` unless `message` is of the type that travels on `topic`."""
+    """Raise `ValueError` unless `message` has the type of `topic`."""
     if topic not in TOPICS:
         raise ValueError(f"topic: expected one of {', '.join(TOPICS)}, got {topic!r}")
     if type(message) is not TOPICS[topic]:
@@ -53,11 +53,11 @@ def check_topic(topic: str, message: Message) -> None:
 
 
 NORM_TOLERANCE = 1e-3
-"""how far from 1 the norm of a quaternion may be"""
+"""Largest deviation of a quaternion's norm from 1."""
 
 
 def broken(body: CleanBody | WorldBody) -> str | None:
-    """Which promise a body breaks; None if it keeps them all."""
+    """The guarantee that a body violates, as a text; None if it violates none."""
     known = body.state != JointState.UNKNOWN
     if not np.isfinite(body.positions[known]).all():
         return "a position is not finite though its state is known"
@@ -83,7 +83,7 @@ def broken(body: CleanBody | WorldBody) -> str | None:
 
 
 def are_unit(quaternions: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which of quaternions (..., 4) are of norm 1."""
+    """Which of the quaternions (..., 4) have norm 1, shape (...)."""
     with np.errstate(over="ignore"):
         norms = np.sqrt((quaternions.astype(np.float64) ** 2).sum(axis=-1))
     return np.abs(norms - 1.0) < NORM_TOLERANCE

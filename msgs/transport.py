@@ -1,10 +1,10 @@
 """Messages between processes: ZeroMQ PUB/SUB over ipc on one machine and tcp across machines.
 
-A publisher binds, subscribers connect, in any order; either may go and come back. What is in a frame stands in
-`msgs/delivery.py`. The publisher draws its number when it starts and counts its messages per topic, so that a
-subscriber knows what it missed. Sockets are not thread-safe: use each in the thread that made it.
+A publisher binds and subscribers connect, in any order; either may stop and return. `msgs/delivery.py` describes the
+frames. A publisher draws a random number when it starts and counts its messages per topic, so that a subscriber knows
+how many it missed. Sockets are not thread-safe: use each in the thread that created it.
 
-Queues are bounded everywhere, and a publisher waits only for the subscribers that it names. Any other may be slow,
+All queues are bounded, and a publisher waits only for the subscribers that it names. Any other subscriber may be slow,
 stopped or hostile: it loses messages, and delays no other.
 """
 

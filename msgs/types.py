@@ -1,12 +1,12 @@
 """The messages as Python dataclasses.
 
-Units are SI; stamps are nanoseconds of capture; quaternions are xyzw; the world is right-handed with z up and
-the floor at z = 0. A constructor takes anything numpy reads as an array, gives it the dtype written here, and
-raises `ValueError` naming the field, what was expected and what came. It checks form, not plausibility: a NaN or
-a body 10 km away is a valid message, and the receiver's business.
+Units are SI; stamps are capture times in nanoseconds; quaternions are xyzw; the world is right-handed with z up and the
+floor at z = 0. A constructor accepts anything that numpy converts to an array, converts it to the dtype declared here,
+and raises a `ValueError` that names the field, what was expected and what came. It checks form, not plausibility: a NaN
+or a body 10 km away makes a valid message, and the receiver has to handle it.
 
-Messages compare by value, NaN equal to NaN. The annotation of a field says what it holds, for the constructors and for
-the codec alike, which takes the rest from the definitions in `msgs/msg`.
+Messages compare by value, with NaN equal to NaN. A field's annotation defines its form for the constructor and the
+codec. The codec takes the wire format from the definitions in `msgs/msg`.
 """
 
 # without `from __future__ import annotations`: the constructors read the annotations
@@ -35,30 +35,30 @@ JOINTS = (
 CONTACTS = (
     "left_knee", "right_knee", "left_ankle", "right_ankle", "left_foot", "right_foot", "left_wrist", "right_wrist",
 )  # fmt: skip
-"""The joints of `WorldBody.contacts`, in its order (an ankle stands for the heel, a foot for the toe)."""
+"""The joints of `WorldBody.contacts`, in order. An ankle stands for the heel, a foot for the toe."""
 
 
 class JointState(IntEnum):
     """Where a joint's position comes from."""
 
     UNKNOWN = 0
-    """no estimate: do not use"""
+    """no estimate; do not use"""
     SEEN = 1
-    """the sensor's own, passed on"""
+    """observed, and passed on unchanged"""
     REFINED = 2
-    """seen, then corrected by the prior"""
+    """observed, and corrected by the prior"""
     IMPUTED = 3
-    """not seen: inferred from the rest of the body and its motion"""
+    """not observed; inferred from the rest of the body and its motion"""
 
 
 class Tracking(IntEnum):
-    """Whether a body's place in the world rests on observation."""
+    """Whether a body's root in the world is observed or predicted."""
 
     OK = 0
     COASTING = 1
-    """the root is not observed for now: predicted, its covariance growing"""
+    """the root is not observed at present; it is predicted, and its covariance grows"""
     LOST = 2
-    """predicted for too long to be of use"""
+    """the root has been predicted for too long to be useful"""
 
 
 class EventKind(IntEnum):
@@ -69,11 +69,11 @@ class EventKind(IntEnum):
     NEAR = 2
     """within reach of the sensor"""
     STANDS = 3
-    """upright on the feet, walking included"""
+    """upright on the feet, also while walking"""
     SITS = 4
     LIES = 5
     FELL = 6
-    """came to lie fast, and has not got up since"""
+    """came to lie quickly, and has not got up since"""
     HAND_RAISED = 7
     WAVES = 8
     POINTS = 9
@@ -81,7 +81,7 @@ class EventKind(IntEnum):
 
 
 class Phase(IntEnum):
-    """Where an event is in its course."""
+    """Whether an event begins, continues or ends."""
 
     BEGINS = 0
     HOLDS = 1
@@ -89,7 +89,7 @@ class Phase(IntEnum):
 
 
 class Hand(IntEnum):
-    """Whose event it is; `NONE` for those of the whole body."""
+    """The hand that an event refers to; `NONE` for events of the whole body."""
 
     NONE = 0
     LEFT = 1
@@ -105,7 +105,7 @@ class Level(IntEnum):
     STALE = 3
 
 
-# for a type checker any array will do, because the constructors convert
+# type checkers accept any array, because the constructors convert
 _Array = NDArray[Any]
 _J, _C = len(JOINTS), len(CONTACTS)
 Id = Annotated[int, Integer(-(2**31), 2**31)]
@@ -128,12 +128,12 @@ def _same(a: Any, b: Any) -> bool:
 
 @cache
 def forms_of(kind: type) -> dict[str, Form]:
-    """The forms of a message's fields, by their names; those without one are taken as they come."""
+    """The forms of a message's fields, by name. Fields without a form are stored unchanged."""
     return {f.name: f.type.__metadata__[0] for f in fields(kind) if hasattr(f.type, "__metadata__")}  # pyright: ignore
 
 
 class _Record:
-    """Equality by value (the dataclass' own cannot compare arrays) and the checks of the constructors."""
+    """Equality by value, because a dataclass's own cannot compare arrays; and the checks of the constructors."""
 
     __slots__ = ()
     __hash__ = None  # type: ignore[assignment]
@@ -153,27 +153,27 @@ class _Record:
 
 @dataclass(slots=True, eq=False)
 class Pose(_Record):
-    """A frame's pose in the z-up world: world = orientation · point + position."""
+    """The pose of a frame in the z-up world: world = orientation · point + position."""
 
     position: Vector
     """(3,) metres, world"""
     orientation: Quaternion
-    """(4,) xyzw, from the frame to the world"""
+    """(4,) xyzw, rotates from the frame to the world"""
 
     @classmethod
     def identity(cls) -> "Self":
-        """The pose of a frame that is the world itself."""
+        """The identity: the frame is the world."""
         return cls(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
     @classmethod
     def from_up(cls, up: str) -> "Self":
-        """The pose, at the origin, of a frame whose axis `up` points up.
+        """The pose of a frame at the origin whose axis `up` points up.
 
-        `z` is the identity. `y` (graphics) and `-y` (a level camera: x right, y down, z forward) turn about x
-        by the quarter that brings that axis to the world's z; a level camera then looks along the world's +y.
+        `z` is the identity. `y` (graphics) and `-y` (a level camera: x right, y down, z forward) rotate by 90 degrees
+        about x, so that the axis becomes the world's z. A level camera then looks along the world's +y.
 
         Raises:
-            ValueError: for any other axis.
+            ValueError: `up` is another axis.
         """
         quarter = math.sqrt(0.5)
         turns = {"z": (0.0, 1.0), "y": (quarter, quarter), "-y": (-quarter, quarter)}
@@ -185,7 +185,7 @@ class Pose(_Record):
 
 @dataclass(slots=True, eq=False)
 class RawBody(_Record):
-    """One body as the sensor gives it, in the joints of the message's skeleton."""
+    """One body as given by the sensor, in the joints of the message's skeleton."""
 
     id: Id
     """the sensor's track id, int32"""
@@ -203,74 +203,74 @@ class RawBody(_Record):
 
 @dataclass(slots=True, eq=False)
 class PoseRaw(_Record):
-    """`pose/raw`: what a skeleton source saw at one moment."""
+    """`pose/raw`: the bodies that a skeleton source observed at one time."""
 
     stamp_ns: Stamp
-    """capture, nanoseconds, 0 or later"""
+    """capture time, nanoseconds, 0 or later"""
     frame_id: Text
     """the frame of the positions"""
     source: Text
     """the camera or recording, by name"""
     skeleton: Text
-    """the joints' names and order: `smpl22`, `coco17`, `kinect22`, …"""
+    """name of the joint layout: `smpl22`, `coco17`, `kinect22`, …"""
     sensor_pose: Pose
-    """of `frame_id` in the world; only the orientation means anything unless `calibrated`"""
+    """pose of `frame_id` in the world; only its orientation is valid unless `calibrated`"""
     calibrated: bool
     """whether `sensor_pose.position`, and so the floor at z = 0, can be trusted"""
     bodies: Annotated[list[RawBody], ListOf(RawBody)]
     end_of_stream: bool = False
-    """the source ends here: sent once, without bodies"""
+    """whether the stream ends here; sent once, without bodies"""
 
 
 @dataclass(slots=True, eq=False)
 class CleanBody(_Record):
-    """One body after the prior, in the canonical joints `JOINTS`."""
+    """One body as estimated by the prior, in the canonical joints `JOINTS`."""
 
     id: Id
     """the sensor's track id, int32"""
     positions: Positions
     """(22, 3) metres, header frame"""
     rotations: Rotations
-    """(22, 4) xyzw, each from the joint's to its parent's frame; the pelvis' to the header frame. At rest, all
-    identity, the body stands in a T with +x forward, +y left, +z up"""
+    """(22, 4) xyzw, each from the joint's frame to its parent's, the pelvis' to the header frame. If all are the
+    identity, the body stands in a T pose with +x forward, +y left, +z up"""
     state: States
     """(22,) `JointState`"""
     sigma: PerJoint
     """(22,) metres, standard deviation of a position along an axis"""
     anomaly: Number
-    """how unlike human motion the last half second is: -log10 of the rate at which clean motion scores as high; NaN if
-    it was not scored"""
+    """anomaly score of the last half second: -log10 of the rate at which clean motion scores as high; NaN if not
+    scored"""
     anomaly_flag: bool
-    """the estimate cannot be trusted"""
+    """whether the estimate cannot be trusted"""
     joint_anomaly: PerJoint
-    """(22,) the same scale, joint by joint: which ones caused it; NaN where not seen"""
+    """(22,) anomaly score of each joint, on the same scale; NaN where not observed"""
     bone_lengths: PerJoint
     """(22,) metres, joint to parent; 0 for the pelvis"""
     raw_positions: Positions
-    """(22, 3) metres, header frame: the joints that went in; NaN where missing"""
+    """(22, 3) metres, header frame: the input joints; NaN where missing"""
     raw_confidence: PerJoint
     """(22,) 0 to 1"""
 
 
 @dataclass(slots=True, eq=False)
 class PoseClean(_Record):
-    """`pose/clean`: the bodies at one moment, refined and complete, in the sensor's frame."""
+    """`pose/clean`: the bodies at one time, refined and completed, in the sensor's frame."""
 
     stamp_ns: Stamp
-    """the moment the poses are of, on the clock of capture; nanoseconds"""
+    """capture time of the poses, nanoseconds"""
     frame_id: Text
-    """the frame of the positions, as it came"""
+    """the frame of the positions, as in `pose/raw`"""
     source: Text
     """the camera or recording, by name"""
     sensor_pose: Pose
-    """of `frame_id` in the world, as it came"""
+    """pose of `frame_id` in the world, as in `pose/raw`"""
     calibrated: bool
     """whether `sensor_pose.position` can be trusted"""
     delay_frames: Annotated[int, Integer(0, 2**32)]
-    """how many later frames, at 30 Hz, the prior waited for"""
+    """the prior's delay: number of later frames, at 30 Hz, that it waited for"""
     bodies: Annotated[list[CleanBody], ListOf(CleanBody)]
     end_of_stream: bool = False
-    """the source ends here: sent once, without bodies"""
+    """whether the stream ends here; sent once, without bodies"""
 
 
 @dataclass(slots=True, eq=False)
@@ -282,85 +282,84 @@ class WorldBody(_Record):
     root_position: Vector
     """(3,) metres, world: the pelvis"""
     root_orientation: Quaternion
-    """(4,) xyzw, from the body (+x forward, +y left, +z up) to the world"""
+    """(4,) xyzw, rotates from the body (+x forward, +y left, +z up) to the world"""
     root_velocity: Vector
     """(3,) m/s, world"""
     covariance: Annotated[_Array, Array(np.float64, (6, 6))]
-    """(6, 6) of root position and velocity: m², m²/s, m²/s²"""
+    """(6, 6) covariance of root position and velocity: m², m²/s, m²/s²"""
     positions: Positions
     """(22, 3) metres, world"""
     rotations: Rotations
-    """(22, 4) xyzw, each from the joint's to its parent's frame; the pelvis' to the world"""
+    """(22, 4) xyzw, each from the joint's frame to its parent's, the pelvis' to the world"""
     state: States
     """(22,) `JointState`"""
     sigma: PerJoint
     """(22,) metres, standard deviation of a position along an axis"""
     contacts: Annotated[_Array, Array(np.float32, (_C,))]
-    """(8,) probability that each of `CONTACTS` bears load on something: rests on it, or rolls over it"""
+    """(8,) probability that each joint of `CONTACTS` bears load on a surface, at rest or rolling over it"""
     tracking: Annotated[Tracking, Integer(0, len(Tracking), Tracking)]
 
 
 @dataclass(slots=True, eq=False)
 class PoseWorld(_Record):
-    """`pose/world`: the bodies at one moment, in the world. `pose/truth` has the same form."""
+    """`pose/world`: the bodies at one time, in the world. `pose/truth` has the same form."""
 
     stamp_ns: Stamp
-    """the moment the poses are of, on the clock of capture; nanoseconds"""
+    """capture time of the poses, nanoseconds"""
     frame_id: Text
     """the world's name"""
     source: Text
     """the camera or recording, by name"""
     ground_plane: Annotated[_Array, Array(np.float64, (4,))]
-    """(4,) a, b, c, d with ax + by + cz + d = 0, the unit normal (a, b, c) up, d in metres"""
+    """(4,) a, b, c, d with ax + by + cz + d = 0; the unit normal (a, b, c) points up, d in metres"""
     bodies: Annotated[list[WorldBody], ListOf(WorldBody)]
     end_of_stream: bool = False
-    """the source ends here: sent once, without bodies"""
+    """whether the stream ends here; sent once, without bodies"""
 
 
 @dataclass(slots=True, eq=False)
 class Event(_Record):
-    """Something that one body does."""
+    """An event of one body."""
 
     body: Id
     """`WorldBody.id`, int32"""
     kind: Annotated[EventKind, Integer(0, len(EventKind), EventKind)]
     phase: Annotated[Phase, Integer(0, len(Phase), Phase)]
     hand: Annotated[Hand, Integer(0, len(Hand), Hand)]
-    """of HAND_RAISED, WAVES and POINTS"""
+    """hand of HAND_RAISED, WAVES and POINTS"""
     confidence: Number
-    """0 to 1: the probability of its condition, given the standard deviations of the joints it was computed from"""
+    """0 to 1: probability of the event's condition, given the standard deviations of its joints"""
     direction: Vector
-    """(3,) of POINTS: unit vector, world, from the head through the wrist; zeros otherwise"""
+    """(3,) direction of POINTS: unit vector, world, from the head through the wrist; zeros for other events"""
     since_ns: Stamp
-    """capture, nanoseconds: when it began"""
+    """capture time at which the event began, nanoseconds"""
 
 
 @dataclass(slots=True, eq=False)
 class PoseEvents(_Record):
-    """`pose/events`: all that begins, holds or ends at one moment. Sent when something begins or ends, and once a
-    second."""
+    """`pose/events`: all events that begin, hold or end at one time. Sent once a second and when one begins or ends."""
 
     stamp_ns: Stamp
-    """of the `pose/world` it was computed from, nanoseconds"""
+    """stamp of the `pose/world` that the events were computed from, nanoseconds"""
     frame_id: Text
     """the world's name"""
     source: Text
     """the camera or recording, by name"""
     events: Annotated[list[Event], ListOf(Event)]
     end_of_stream: bool = False
-    """the source ends here: sent once, without events"""
+    """whether the stream ends here; sent once, without events"""
 
 
 @dataclass(slots=True, eq=False)
 class Diagnostics(_Record):
-    """`diagnostics`: how one node is doing; on the wire a diagnostic_msgs/DiagnosticArray of one status."""
+    """`diagnostics`: the state of one node; on the wire a diagnostic_msgs/DiagnosticArray with one status."""
 
     stamp_ns: Stamp
-    """nanoseconds, on the clock of the frames it speaks of"""
+    """capture time of the node's newest frame, nanoseconds"""
     node: Text
     level: Annotated[Level, Integer(0, len(Level), Level)]
     message: Text
-    """one line for a person"""
+    """one human-readable line"""
     values: Annotated[dict[str, str], forms.texts] = field(default_factory=dict)
     """rates, latencies, counts of dropped and refused messages, by name"""
 
