@@ -163,8 +163,7 @@ class Fuse:
 
 
 def _of_rigid(length_variance: Floats) -> Floats:
-    """(B, R) variance of each `RIGID` segment, from that of bones (B, 22). A segment across two bones varies with
-    both."""
+    """(B, R) variance of each `RIGID` segment, from that of bones (B, 22); two bones add their variances."""
     end, start = RIGID.T
     across = np.where(PARENT[end] == start, 0.0, length_variance[:, start])
     return length_variance[:, end] + across
@@ -188,8 +187,7 @@ def _states(unseen_s: Floats, known: Bools) -> NDArray[np.uint8]:
 
 @njit(cache=True)
 def _unseen_of_subtree(unseen_s):
-    """(S, 22) seconds since a joint or any joint below it was observed: observed neighbours determine the joint
-    between."""
+    """(S, 22) seconds since a joint or any below it was observed: its observed neighbours determine a joint."""
     least = unseen_s.copy()
     for row in range(len(least)):
         for joint in range(least.shape[1] - 1, 0, -1):
@@ -206,8 +204,7 @@ def _inverse(variance):
 
 @njit(cache=True)
 def _weigh(deviation, held_s, bias_sigma, prior_sigma, prior_drift, fade):
-    """Return the parts of `Precision`: inverse variances of the smoother, from ``deviation`` (S, 22), and of the
-    prior."""
+    """Return the parts of `Precision`: of the smoother, from ``deviation`` (S, 22), and of the prior."""
     seen, prior = np.empty_like(deviation), np.empty_like(deviation)
     for row in range(len(deviation)):
         for joint in range(deviation.shape[1]):
@@ -244,8 +241,7 @@ def _align(body, seen, precision):
 
 @njit(cache=True)
 def _between(unseen_s):
-    """(S, 22) which joints lie between joints that the sensor has: a joint was observed on at least two sides of
-    each."""
+    """(S, 22) which joints have joints that the sensor has on at least two sides."""
     between = np.zeros(unseen_s.shape, dtype=np.bool_)
     below = np.empty(unseen_s.shape[1], dtype=np.int64)
     for row in range(len(unseen_s)):

@@ -174,8 +174,7 @@ class Gate:
 
 
 def _kept_and_exchanged(positions: Floats, expected: Floats, pair: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """(S,) metres, mean distances of the joints ``pair`` of both sides to their predictions, as observed and
-    exchanged."""
+    """(S,) metres, mean distance of the joints ``pair`` to their predictions: as observed, and with sides exchanged."""
     return (
         _apart(positions[:, pair], expected[:, pair]).mean(axis=1),
         _apart(positions[:, MIRROR[pair]], expected[:, pair]).mean(axis=1),

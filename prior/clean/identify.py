@@ -43,8 +43,8 @@ class IdentifySettings:
 
 
 RECENT_S = 0.25
-"""Longest time without an observation after which a body is still matched by position alone, seconds. Later, it must be
-recognised."""
+"""Longest time without an observation after which a body is matched by position alone, seconds. Later, bone lengths
+must match as well."""
 ACCELERATION = 1.0
 """Spectral density of a visible body's white acceleration noise, m²/s³."""
 SPEED, SPEED_MEMORY_S = 0.6, 1.0
@@ -284,8 +284,7 @@ def _unobserved(last: Floats, coasting: Floats, sigma: Floats, unobserved_s: Flo
 
 
 def _place_score(away: Floats, sigma: Floats) -> Floats:
-    """Log-likelihood ratio that a body is a person, from its displacement (..., 3) metres from that person's
-    prediction."""
+    """Log-likelihood ratio that bodies, displaced by (..., 3) metres from a person's prediction, are that person."""
     horizontal, vertical = sigma**2 + PLACE_SIGMA**2, np.minimum(sigma, HEIGHT_SIGMA) ** 2 + PLACE_SIGMA**2
     distance_squared = (away[..., :2] ** 2).sum(axis=-1) / horizontal + away[..., 2] ** 2 / vertical
     score = -0.5 * (distance_squared + np.log((2 * np.pi) ** 3 * horizontal**2 * vertical)) - np.log(NEWCOMERS)
@@ -293,8 +292,7 @@ def _place_score(away: Floats, sigma: Floats) -> Floats:
 
 
 def _best(score: Floats) -> list[tuple[int, int]]:
-    """Return the pairs (row, column) of the assignment with the greatest sum of scores (R, C), without negative
-    ones."""
+    """Return the pairs (row, column) of the assignment with the greatest sum of positive scores (R, C)."""
     from scipy.optimize import linear_sum_assignment  # imported here, as it takes 12 MB that most sources do not need
 
     pairs = zip(*linear_sum_assignment(np.maximum(score, 0.0), maximize=True), strict=True)

@@ -36,12 +36,10 @@ INTACT_DEVIATIONS, INTACT = 2.0, 0.01
 """Largest change of length of an intact bone, standard deviations or metres."""
 
 TELLING = 0.03
-"""Largest standard deviation of a bone that can distinguish a jump from motion, as a share of the joint's distance to
-its prediction."""
+"""Largest standard deviation of a bone that can tell a jump from motion, as a share of the joint's prediction error."""
 
 MAX_OUTLIERS = 0.5
-"""Share of impossible bones among the limbs' observed bones above which this is another body, whose bones are measured
-anew."""
+"""Share of impossible bones among the limbs' observed bones above which it is another body, measured anew."""
 
 RECENT = 15
 """Number of recent frames in most of which a frozen joint must repeat itself."""

@@ -197,8 +197,7 @@ class PriorPipeline(BodyPipeline[int]):
         return cleaned
 
     def _stepped(self, ticks: list[Frame], raw: PoseRaw) -> list[PoseClean]:
-        """Process frames of the 30 Hz grid and return the messages that they complete. ``raw`` is the newest
-        message."""
+        """Process frames of the 30 Hz grid and return the messages that they complete; ``raw`` is the newest input."""
         origin = SensorFrame.of(raw.sensor_pose).origin
         frames = (self._advance_to(stamp_ns, BodyJoints(*joints), origin) for stamp_ns, *joints in ticks)
         return [self._message(frame, raw) for frame in frames if frame is not None]
@@ -217,8 +216,7 @@ class PriorPipeline(BodyPipeline[int]):
 
 @cache
 def load_loops(settings: PriorSettings) -> None:
-    """Load or compile the loops of every stage in use, so that no frame waits for them. Numba does so at a first
-    call."""
+    """Load or compile the loops of every stage in use. Numba does so at a first call, and no frame should wait."""
     pipeline = PriorPipeline(settings)
     pose = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     for frame in range(settings.delay + 5):

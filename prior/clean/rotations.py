@@ -66,8 +66,7 @@ class Refine:
         self._decoded[:, slot] = np.eye(3)
 
     def update(self, gated: Gated, person: Person) -> Floats:
-        """(K, S, 22, 3, 3) local rotations of the last frames with these bones; unobserved joints keep their last
-        one."""
+        """(K, S, 22, 3, 3) local rotations of the last frames; unobserved joints keep their last rotation."""
         slots = np.flatnonzero(gated.observation.present)
         self._solve(gated.positions, person.offsets, slots)
         kept = self._window // 2 + 1  # from the centre on; earlier frames stay as decoded when they were the centre

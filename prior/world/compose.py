@@ -1,8 +1,8 @@
-"""A body of `pose/world`, composed of what the stages estimate of it.
+"""Composes a body of `pose/world` from the stages' estimates.
 
-Where the root is observed, joints stay where `pose/clean` has them, but for the feet, which stand as far as they rest,
-and what of the legs hangs on them by bones. Where it is not, the body goes with its root. A body with both feet at rest
-is published standing, its root at the velocity of one that sways.
+While the root is observed, joints keep their positions from `pose/clean`. The exceptions are resting feet, which stand
+still, and the leg joints that bones connect to them. While the root is unobserved, the whole body moves with its root.
+A body with both feet at rest is published as standing, with the root velocity of a swaying body.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from steadypose.prior.world.core import BodyEstimate
 from steadypose.prior.world.observe import FEET
 
 LENGTH_SIGMA = 0.025
-"""Standard deviation of the length of a leg's bone, measured through a sensor's bias or a generic adult's, metres."""
+"""Standard deviation of a leg bone's length, whether measured by a biased sensor or of a generic adult, metres."""
 
 _SWEEPS = 4
 _LEGS = np.array(limbs(("hip", "knee", "ankle", "foot")))
@@ -30,15 +30,15 @@ _MIN_NORM = 1e-6
 
 
 def fit_legs(positions: Floats, sigma: Floats, bone_lengths: NDArray[np.floating]) -> Floats:
-    """Hips, knees, ankles and toes, moved towards the lengths of the bones between them; (22, 3) metres.
+    """Move hips, knees, ankles and toes towards the lengths of the bones between them; returns (22, 3) metres.
 
-    Each by as much as it is uncertain, and all by as much as the lengths are known: constraints with compliance (XPBD,
-    Macklin et al. 2016), whose converged result is the most likely one.
+    The joints are weighted by their variances, and the lengths by theirs (compliant constraints, XPBD, Macklin et al.
+    2016). The converged result is the maximum likelihood estimate.
 
     Args:
-        positions: (22, 3) metres; NaN where not known.
-        sigma: (22,) metres.
-        bone_lengths: (22,) metres, each to its parent; what is not above 0 is not known.
+        positions: (22, 3) metres; NaN where unknown.
+        sigma: (22,) metres, standard deviations.
+        bone_lengths: (22,) metres from each joint to its parent; unknown if not above 0.
     """
     fitted = np.array(positions, dtype=np.float64, order="C")
     _fit(fitted, sigma**2, np.asarray(bone_lengths, dtype=np.float64))
@@ -46,10 +46,10 @@ def fit_legs(positions: Floats, sigma: Floats, bone_lengths: NDArray[np.floating
 
 
 def turn_legs(rotations: NDArray[np.floating], positions: Floats, moved: Floats) -> Floats:
-    """Local rotations (22, 4) xyzw of a body whose legs have moved: each bone turned by the shortest way.
+    """Return local rotations (22, 4) xyzw after legs have moved, with the smallest rotation of each bone.
 
     Args:
-        rotations: (22, 4) as they fitted ``positions``; of a leg without a rotation, or a position, they stay.
+        rotations: (22, 4) that match ``positions``. A leg with a missing rotation or position keeps its rotations.
         positions, moved: (22, 3) metres, before and after, in the frame of the root's rotation.
     """
     turned = np.array(rotations, dtype=np.float64, order="C")
@@ -78,7 +78,7 @@ def _fit(positions, variance, lengths):
 
 @njit(cache=True)
 def _product(a, b):
-    """Of quaternions xyzw."""
+    """Product of quaternions xyzw."""
     return np.array([
         a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1],
         a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0],
@@ -94,7 +94,7 @@ def _inverse(q):
 
 @njit(cache=True)
 def _shortest(a, b):
-    """The quaternion that turns the direction of ``a`` (3,) to that of ``b`` by the shortest way."""
+    """The quaternion of the smallest rotation from the direction of ``a`` (3,) to that of ``b``."""
     q = np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0], 0.0])
     q[3] = (a * b).sum() + np.sqrt((a * a).sum() * (b * b).sum())
     norm = np.sqrt((q * q).sum())
@@ -126,22 +126,22 @@ def _turn(rotations, before, after):
 
 
 SWAY, MOVES = 0.015, 0.1
-"""Standard deviations along an axis of the velocity of a root that sways over both feet, as in half of the training
-motion with both at rest, and of one that bends or shifts, m/s."""
+"""Standard deviations along an axis of the root's velocity over two resting feet, m/s: of a swaying body, and of a body
+that bends or shifts. In the training motion, half of the bodies with both feet at rest only sway."""
 
 SWAYS = 0.5
-"""Share of bodies with both feet at rest that only sway."""
+"""Prior probability that a body with both feet at rest only sways."""
 
 VELOCITY_ERROR = 0.3
-"""Ratio of the error to the filter's standard deviation of an observed velocity, of a body that stands (validation)."""
+"""Error-to-sigma ratio of the filter's velocity for a standing body with an observed root (validation)."""
 
 VELOCITY_STATED = 0.6
-"""Ratio of the published to the filter's standard deviation of an observed velocity: what validation finds in motion,
-from noise of 0 to 4 cm (benchmarks/NOTEBOOK.md)."""
+"""Ratio of the published to the filter's standard deviation of the velocity while the pelvis is observed. It is the
+error-to-sigma ratio in motion on validation, for noise of 0 to 4 cm (benchmarks/NOTEBOOK.md)."""
 
 
 def compose(estimate: BodyEstimate, lost_sigma: float) -> WorldBody:
-    """The body as published; LOST where the root's horizontal standard deviation exceeds ``lost_sigma`` metres."""
+    """Compose the published body; LOST if the root's horizontal standard deviation exceeds ``lost_sigma`` metres."""
     observed, root, rest = estimate.observed, estimate.root, estimate.stance.rest
     spread = root.position_sigma
     sigma = np.sqrt(observed.sigma**2 + (0.0 if observed.root_observed else float(np.mean(spread**2))))
@@ -154,7 +154,7 @@ def compose(estimate: BodyEstimate, lost_sigma: float) -> WorldBody:
     rotations = observed.body.rotations.astype(np.float64)
     rotations[0] = observed.orientation
     rotations = turn_legs(rotations, observed.positions, positions)
-    rotations[~are_unit(rotations)] = [0.0, 0.0, 0.0, 1.0]  # a message of somebody who knows positions alone
+    rotations[~are_unit(rotations)] = [0.0, 0.0, 0.0, 1.0]  # the publisher may send positions without rotations
     known = np.isfinite(positions).all(axis=1) & np.isfinite(sigma)
     tracking = Tracking.OK if observed.root_observed else Tracking.COASTING
     both_rest = float(rest.reshape(2, 2).max(axis=0).min()) if observed.root_observed else 0.0
@@ -178,15 +178,15 @@ def compose(estimate: BodyEstimate, lost_sigma: float) -> WorldBody:
 def standing_velocity(
     velocity: Floats, covariance: Floats, both_rest: float, *, stated: float
 ) -> tuple[Floats, Floats]:
-    """The velocity (3,) m/s of a root that may only sway, and the covariance (6, 6) of [position, velocity] then.
+    """Return velocity (3,) m/s and covariance (6, 6) of [position, velocity] of a root that may only sway.
 
-    Mean and covariance under a mixture of two: it sways, or moves, and then as estimated.
+    They are mean and covariance of a mixture of two cases: the root sways, or it moves as estimated.
 
     Args:
-        velocity: (3,) m/s, as the filter estimates it.
-        covariance: (6, 6) of [position, velocity]: m², m²/s, m²/s², as the filter states it.
-        both_rest: the probability that both feet rest.
-        stated: of the standard deviation of ``velocity`` that the filter states, what is to be published.
+        velocity: (3,) m/s, the filter's estimate.
+        covariance: (6, 6) of [position, velocity], the filter's: m², m²/s, m²/s².
+        both_rest: probability that both feet rest.
+        stated: ratio of the published standard deviation of ``velocity`` to the filter's.
     """
     variance = float(np.trace(covariance[3:, 3:])) / 3.0
     error = VELOCITY_ERROR**2 * variance

@@ -1,4 +1,4 @@
-"""The stages of `pose/world` in order, for all bodies of one message."""
+"""Runs the stages of `pose/world` in order, for all bodies of one message."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ _NO_STANCE = Stance(np.zeros(4), np.zeros(4))
 
 @dataclass(frozen=True)
 class BodyEstimate:
-    """What the stages estimate of one body of a message.
+    """The stages' estimates for one body of a message.
 
     Attributes:
         observed: the input.
-        velocity: of the root, as predicted; None if that is switched off.
-        contacts: as predicted.
-        stance: feet that may hold the root.
-        root: root and feet, by the filter.
-        feet: as they are to be published.
+        velocity: predicted root velocity; None if the network is off.
+        contacts: predicted contacts.
+        stance: feet that may anchor the root.
+        root: the filter's estimate of root and feet.
+        feet: feet for publication.
     """
 
     observed: BodyObservation
@@ -50,7 +50,7 @@ class BodyEstimate:
 
 @dataclass
 class BodyStages:
-    """The stages' state of one body, made afresh for each: nothing of another can be left in it."""
+    """State of all stages for one body. Each body gets a new one, so that no state of another body can remain."""
 
     observed: BodyObservation
     motion: MotionMemory
@@ -60,15 +60,15 @@ class BodyStages:
 
 
 class Scene:
-    """What is known of one source: its floor and its bodies, which share it.
+    """State of one source: its bodies, and the floor that they share.
 
     Args:
         calibrated: whether the floor is known to be at z = 0.
 
     Attributes:
-        stamp_ns: of its newest message; negative before the first.
-        floor: that all its bodies stand on.
-        bodies: by id.
+        stamp_ns: stamp of the newest message; negative before the first.
+        floor: the floor on which all bodies stand.
+        bodies: the stages' state of each body, by id.
     """
 
     def __init__(self, calibrated: bool) -> None:
@@ -77,7 +77,7 @@ class Scene:
         self.bodies: dict[int, BodyStages] = {}
 
     def advance(self, stamp_ns: int, timeout_ns: int) -> None:
-        """Advance to a message; bodies that none of the last ``timeout_ns`` mentioned are dropped."""
+        """Advance to a message, and drop bodies that no message has contained for ``timeout_ns``."""
         self.stamp_ns = stamp_ns
         self.bodies = {i: b for i, b in self.bodies.items() if stamp_ns - b.observed.stamp_ns <= timeout_ns}
 
@@ -88,13 +88,13 @@ class Scene:
 
 
 class WorldCore:
-    """From observations to estimates; keeps no state but the networks.
+    """Turns observations into estimates. It holds the networks and no other state.
 
-    A message's observation of a body goes through the stages in the order of `step`; each stage's state is in the
-    body's `BodyStages`, so that to forget a body is to drop that one object.
+    `step` passes each body's observation through the stages in order. The state of all stages is in the body's
+    `BodyStages`, so dropping that object forgets the body.
 
     Raises:
-        FileNotFoundError: a weight set that does not exist; says which do.
+        FileNotFoundError: a weight set does not exist; the message lists those that do.
     """
 
     def __init__(self, settings: TrajectorySettings) -> None:
@@ -104,7 +104,7 @@ class WorldCore:
         self._noise = BodyNoise(settings.acceleration, network_memory_s=self._velocity.memory_s)
 
     def step(self, scene: Scene, observations: Sequence[BodyObservation]) -> list[BodyEstimate]:
-        """Estimates of a message's bodies, in its order; without those that had no root so far."""
+        """Estimate a message's bodies, in its order, without bodies that have had no root so far."""
         observed = [o for o in observations if o.root_known or o.body.id in scene.bodies]
         bodies = [self._stages(scene, o) for o in observed]
         velocities: Sequence[RootVelocity | None] = [None] * len(bodies)
@@ -121,7 +121,7 @@ class WorldCore:
         return estimates
 
     def _stages(self, scene: Scene, observed: BodyObservation) -> BodyStages:
-        """Those of a body, new ones for one that is new."""
+        """Return the stages' state of a body, created if the body is new."""
         body = scene.bodies.get(observed.body.id)
         if body is None:
             motion, contacts = self._velocity.memory(), self._contacts.memory()

@@ -1,11 +1,11 @@
-"""Feet as published: those at rest are on the floor and still, and none is under the floor.
+"""Feet for publication: resting feet stand still on the floor, and no foot is below the floor.
 
-A sensor's error of one foot's height lasts, so that no filter of that foot alone can estimate it; that a foot stands on
-the floor, at the height at which this person's feet stand, is another measurement of the same height. It is taken at
-publication, not by the filter: a bias taken anew each frame would be trusted ever more.
+A sensor's error in a foot's height lasts, so no filter of that foot alone can estimate it. The floor gives a second
+measurement: a standing foot is at this person's standing height above it. That measurement is applied at publication
+and not in the filter. Its error is a bias, and a filter that used it in every frame would trust it more and more.
 
-While a foot stands, the filter learns better and better where, so that its estimate creeps. What is published of it
-stays: half a standard deviation more adds a tenth to an estimate's error.
+While a foot stands, the filter's estimate of its position becomes more accurate and therefore creeps. The published
+position stays: half a standard deviation of distance adds only a tenth to an estimate's error.
 """
 
 from __future__ import annotations
@@ -23,43 +23,41 @@ from steadypose.prior.world.floor import UPRIGHT_M, Floor
 from steadypose.prior.world.observe import SOLE, BodyObservation
 
 SOLE_SIGMA: Floats = np.array([0.013, 0.006])
-"""Standard deviation (2,) of the height of heels and of toes that stand, between the people of the training motion,
-metres."""
+"""Standard deviations (2,) of the standing heights of heels and toes, between people of the training motion, metres."""
 
 UNEVEN = 0.006
-"""Standard deviation of the height of one person's foot from stand to stand, there, metres."""
+"""Standard deviation of one person's standing height from stance to stance, in the training motion, metres."""
 
 MEMORY_S = 1.5
-"""Time for which an error of the height of a standing foot lasts, seconds: frames closer together measure the same
-again."""
+"""Correlation time of the error of a standing foot's height, seconds. Frames closer together repeat a measurement."""
 
 FLOOR_EASE_S = 0.05
-"""Time constant by which feet come to be where the floor has them, seconds: what they are off by lasts longer."""
+"""Time constant with which feet are moved to the floor, seconds. Their offset lasts longer than this."""
 
 AIR_M = 0.1
-"""Height above the floor among which feet that do not stand, or stand on something else, are taken to be, metres."""
+"""Range of heights above the floor assumed for feet that do not stand or stand on something else, metres."""
 
 OUTLIER = 0.05
-"""Probability that the floor is not where it is estimated to be."""
+"""Probability that the floor's estimate is wrong."""
 
 LYING_M = 0.25
-"""Height of the pelvis above the floor up to which the floor does not measure a body's feet, metres: it lies."""
+"""Height of the pelvis above the floor below which a body lies, and the floor gives no height of its feet, metres."""
 
 DEADBAND = 0.5
-"""Distance from its estimate at which a foot may be published, standard deviations."""
+"""Largest distance of a published foot from its estimate, standard deviations."""
 
 EASE_S = 0.1
-"""Time constant by which a foot that has lifted comes to be where it is estimated, seconds."""
+"""Time constant with which a lifted foot returns to its estimate, seconds."""
 
 _UP = np.array([0.0, 0.0, 1.0])
 
 
 class FeetState(NamedTuple):
-    """Where feet are published.
+    """Published feet.
 
     Attributes:
-        positions: (4, 3) metres, world, of `FEET`; NaN where not placed.
-        sigma: (4,) metres, standard deviation along an axis.
+        positions: (4, 3) metres, world, positions of `FEET`; NaN where unknown.
+        sigma: (4,) metres, standard deviations along an axis.
     """
 
     positions: Floats
@@ -67,17 +65,17 @@ class FeetState(NamedTuple):
 
 
 class Feet:
-    """Puts one body's feet on the floor, and keeps those still that rest."""
+    """Puts one body's feet on the floor, and keeps resting feet still."""
 
     def __init__(self) -> None:
         self._soles, self._still = Soles(), StillFeet()
 
     def update(self, observed: BodyObservation, root: RootState, rest: Floats, floor: Floor) -> FeetState:
-        """The feet of the newest frame, of which (4,) ``rest`` are the probabilities of rest."""
+        """Return the feet of the newest frame, given their probabilities (4,) of ``rest``."""
         feet, spread = root.feet.copy(), root.feet_sigma.copy()
         under = np.array([floor.under(sole) for sole in feet - self._soles.heights[:, None] * _UP])
         sigma = observed.feet_sigma
-        # What the filter takes to fade with time is, of a sensor, in part an offset of a foot that stays.
+        # the filter models the sensor's error as fading, but part of it is a lasting offset of the foot
         variance = spread[:, 2] ** 2 + np.where(np.isfinite(sigma), sigma, 0.0) ** 2
         raised = root.position[2] - np.nan_to_num(under)
         upright = np.clip((raised - LYING_M) / (UPRIGHT_M - LYING_M), 0.0, 1.0)
@@ -87,23 +85,23 @@ class Feet:
         if observed.root_observed:
             self._soles.learn(observed.feet[:, 2] - under, sigma, stands, max(observed.dt, FRAME_S))
         positions = self._still.update(feet, np.sqrt(np.mean(spread**2, axis=1)), rest, observed.dt)
-        spread[:, 2] = np.minimum(spread[:, 2], np.sqrt(settled))  # else bones would draw at a foot that is held
+        spread[:, 2] = np.minimum(spread[:, 2], np.sqrt(settled))  # else fit_legs would move a held foot
         return FeetState(positions, np.sqrt(np.mean(spread**2, axis=1)))
 
 
 class StillFeet:
-    """Keeps feet still while they rest: a deadband with memory, as the backlash of gears."""
+    """Keeps feet still while they rest, with a deadband that has memory, like the backlash of gears."""
 
     def __init__(self) -> None:
         self._offset, self._before = np.zeros((4, 3)), np.full((4, 3), np.nan)
 
     def update(self, estimates: Floats, sigma: Floats, rest: Floats, dt: float) -> Floats:
-        """Where each foot is published, (4, 3) metres; NaN where there is no estimate.
+        """Return the published position of each foot, (4, 3) metres; NaN where there is no estimate.
 
         Args:
-            estimates: (4, 3) metres, world; NaN where there is none.
+            estimates: (4, 3) metres, world; NaN where there is no estimate.
             sigma: (4,) metres, their standard deviations.
-            rest: (4,) the probability that each rests.
+            rest: (4,) probabilities that the feet rest.
             dt: seconds since the last call.
         """
         moved = np.nan_to_num(estimates - self._before)
@@ -116,7 +114,7 @@ class StillFeet:
 
 
 class Soles:
-    """Learns how high this person's heels and toes stand above the floor, and estimates feet's heights by that."""
+    """Learns the standing heights of one person's heels and toes, and estimates the heights of feet from them."""
 
     def __init__(self) -> None:
         self._heights, self._variances = SOLE[::2].copy(), SOLE_SIGMA**2
@@ -124,26 +122,26 @@ class Soles:
 
     @property
     def heights(self) -> Floats:
-        """(4,) metres, of `SOLE`'s points."""
+        """(4,) metres, standing heights, in the order of `SOLE`."""
         return np.repeat(self._heights, 2)
 
     def settle(
         self, heights: Floats, variances: Floats, floor: Floats, floor_sigma: float, rest: Floats, known: Floats,
         dt: float,
     ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
-        """Heights of feet, as the filter and the floor have them.
+        """Fuse the filter's heights of feet with the floor's.
 
         Args:
-            heights: (4,) metres, world.
-            variances: (4,) m², of these.
-            floor: (4,) metres, world, under each; NaN where none is known.
-            floor_sigma: metres, its standard deviation.
-            rest: (4,) the probability that each rests.
-            known: (4,) the probability that the floor, if any, measures a foot of such a body.
+            heights: (4,) metres, world, from the filter.
+            variances: (4,) m², their variances.
+            floor: (4,) metres, world, height of the floor under each foot; NaN where unknown.
+            floor_sigma: metres, standard deviation of the floor's height.
+            rest: (4,) probabilities that the feet rest.
+            known: (4,) probabilities that the floor, if known, gives the height of such a body's feet.
             dt: seconds since the last call.
 
         Returns:
-            (4,) heights and (4,) variances of them; (4,) the probability that each stands on this floor.
+            (4,) heights, (4,) their variances, and (4,) probabilities that the feet stand on this floor.
         """
         own = np.repeat(self._variances, 2) + UNEVEN**2 + floor_sigma**2
         settled, left, stands = _settle(heights, variances, floor + self.heights, own, rest, known * (1.0 - OUTLIER))
@@ -154,24 +152,25 @@ class Soles:
         return heights + moved, left, stands
 
     def learn(self, above: Floats, sigma: Floats, stands: Floats, dt: float) -> None:
-        """Take at what height above the floor the sensor has the feet, after ``dt`` seconds.
+        """Update the standing heights from the observed heights of feet.
 
         Args:
-            above: (4,) metres; NaN where either is not known.
-            sigma: (4,) metres, the standard deviation of the sensor's errors.
-            stands: (4,) the probability that each stands.
-            dt: seconds, above 0.
+            above: (4,) metres above the floor; NaN where foot or floor is unknown.
+            sigma: (4,) metres, standard deviations of the sensor's errors.
+            stands: (4,) probabilities that the feet stand.
+            dt: seconds since the last frame, above 0.
         """
         _learn(self._heights, self._variances, above, sigma, stands, max(MEMORY_S / dt, 1.0))
 
 
 @njit("(f8[:], f8[:], f8[:], f8[:], f8[:], f8[:])", cache=True)
 def _settle(heights, variances, stand, stand_variances, rest, known):
-    """Means and variances of heights, and the probability that each foot stands; see `Soles.settle`.
+    """Return means and variances of heights, and the probability that each foot stands (see `Soles.settle`).
 
-    A mixture of three: a foot stands, and its height is ``stand``; it does not, and is anywhere above that, so that
-    only if it is seen below is it as if it stood; the floor is not as known. The second has the most likely height,
-    not the mean: that of a foot hidden, and so seen with a large deviation, would be far above where it is seen.
+    The model is a mixture of three cases. In the first, the foot stands at height ``stand``. In the second, it is
+    anywhere above; if observed below, it is treated as standing. In the third, the floor's estimate is wrong. The
+    second case uses the most likely height and not the mean. The mean of a hidden foot, whose deviation is large, would
+    lie far too high.
     """
     means, left, probability = heights.copy(), variances.copy(), np.zeros(len(heights))
     for k in range(len(heights)):
@@ -193,7 +192,7 @@ def _settle(heights, variances, stand, stand_variances, rest, known):
 
 @njit("(f8[:], f8[:], f8[:], f8[:], f8[:], f8)", cache=True)
 def _learn(heights, variances, above, sigma, stands, repeats):
-    """Move (2,) heights and variances on, in place; see `Soles.learn`."""
+    """Update heights (2,) and variances (2,), in place (see `Soles.learn`)."""
     for k in range(len(above)):
         if stands[k] > 0.0 and math.isfinite(above[k] + sigma[k]):
             noise = (sigma[k] ** 2 + UNEVEN**2) * repeats / stands[k]

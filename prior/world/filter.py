@@ -1,4 +1,4 @@
-"""A body's root and feet: which observations and predictions its Kalman filter takes, and how far it trusts them."""
+"""Selects and weighs the observations and predictions that update a body's Kalman filter of root and feet."""
 
 from __future__ import annotations
 
@@ -19,32 +19,31 @@ from steadypose.prior.world.observe import FEET, SOLE, BodyObservation
 Sigma = TypeVar("Sigma", float, NDArray[np.float64])
 
 EASE_S = 0.1
-"""Time constant by which a body whose root is observed again comes to be where it is observed, seconds."""
+"""Time constant with which a body returns to its observations when its root is observed again, seconds."""
 
 FIRST_SIGMA = 1.0
-"""Standard deviation of a first root that rests on no observation, metres."""
+"""Standard deviation of a body's first root if no observation supports it, metres."""
 
 JITTER_SHARE = 0.3
-"""Share of the standard deviation of a joint or velocity that is new in each frame; the rest is slow bias."""
+"""Share of a joint's or velocity's standard deviation that is independent in each frame; the rest is slow bias."""
 
 INFERRED_LEGS_SPEED = 0.5
-"""Standard deviation added to the predicted velocity's as the legs that it is read from are themselves inferred,
-m/s."""
+"""Standard deviation added to the predicted velocity's if the legs are not observed but inferred, m/s."""
 
 OFF_MEMORY_S = 0.5
 """Time constant of the predicted velocity's mean error against an observed root, seconds. While the root is observed,
-that is added to its standard deviation: there is motion that the network does not know."""
+this error is added to the standard deviation, because some motion is unknown to the network."""
 
 JUMP_SIGMAS, JUMP_M, JUMP_FRAMES = 5.0, 0.3, 6
-"""Distance from which on an observed root is gated out, standard deviations and metres; and for how many frames in a
-row. One that was unobserved before is not. Either way the filter then starts anew."""
+"""Distance above which an observed root is rejected, standard deviations and metres, and the number of frames in a row
+after which it is accepted. A root that was unobserved before is accepted at once. The filter then starts anew."""
 
 AT_ODDS_SIGMAS, AT_ODDS_MEMORY_S = 2.0, 0.2
-"""Mean distance of the observed root from which on the body is carried along by what it stands on, standard deviations,
-and its time constant, seconds: motion as feet and network have it is then not the motion in the world."""
+"""Mean distance of the observed root above which the body is carried by what it stands on, standard deviations, and
+time constant of that mean, seconds. Feet and network then do not measure the motion in the world."""
 
 AT_ONE_SPEED = 0.3
-"""Difference between predicted and estimated velocity up to which the prediction is used again, m/s."""
+"""Difference between predicted and estimated velocity below which the prediction is used again, m/s."""
 
 _LEGS = [joint for leg in limbs(("knee", "ankle", "foot")) for joint in leg]
 _UP = np.array([0.0, 0.0, 1.0])
@@ -55,12 +54,13 @@ class RootState:
     """A body's estimated root and feet, in the world.
 
     Attributes:
-        position: (3,) metres, of the root.
-        velocity: (3,) m/s, of the root.
+        position: (3,) metres, position of the root.
+        velocity: (3,) m/s, velocity of the root.
         covariance: (6, 6) of [position, velocity]: m², m²/s, m²/s².
-        feet: (4, 3) metres, of `FEET`; NaN where not placed.
+        feet: (4, 3) metres, positions of `FEET`; NaN where unknown.
         feet_sigma: (4, 3) metres, standard deviations along each axis.
-        shift: (3,) metres by which the body's other joints go with an unobserved root; fades once it is observed.
+        shift: (3,) metres by which an unobserved root moves the body's other joints; it decays once the root is
+            observed.
     """
 
     position: Floats
@@ -77,11 +77,11 @@ class RootState:
 
 
 class RootFilter:
-    """Fuses what is observed and predicted of one body's root and feet.
+    """Fuses observations and predictions of one body's root and feet.
 
     Args:
         first: the body's first observation with a root.
-        noise: of root and feet.
+        noise: process noise of root and feet.
     """
 
     def __init__(self, first: BodyObservation, noise: BodyNoise) -> None:
@@ -92,19 +92,19 @@ class RootFilter:
 
     @property
     def feet_off(self) -> Floats:
-        """(4,) standard deviations, of the sensor's error of each foot along its worst axis, as of the last frame."""
+        """(4,) distance from each foot to its last observation along the worst axis, in standard deviations."""
         return self._kalman.feet_off
 
     def update(
         self, observed: BodyObservation, velocity: RootVelocity | None, stance: Stance, floor: Floor
     ) -> RootState:
-        """Predict to the newest observation, and take in what is known of it.
+        """Predict to the newest observation, and update with it.
 
         Args:
             observed: the newest observation.
-            velocity: the predicted root velocity; None if it is not to be used.
-            stance: feet that may hold the root.
-            floor: measures the height of feet that stand under an unobserved root.
+            velocity: the predicted root velocity; None if it is not used.
+            stance: feet that may anchor the root.
+            floor: gives the height of standing feet while the root is unobserved.
         """
         if observed.after_gap:
             for foot in range(len(FEET)):
@@ -129,7 +129,7 @@ class RootFilter:
         return BodyFilter(self._noise, observed.positions[0], *_split(sigma), velocity, len(FEET))
 
     def _observe_velocity(self, observed: BodyObservation, velocity: RootVelocity) -> None:
-        """Take the predicted velocity, unless it cannot be reconciled with an observed root, horizontally."""
+        """Update with the predicted velocity, unless an observed root contradicts it horizontally."""
         kalman, share = self._kalman, 1.0 - math.exp(-observed.dt / AT_ODDS_MEMORY_S)
         if not observed.root_observed:
             self._odds[:], self._carried = 0.0, False
@@ -148,14 +148,14 @@ class RootFilter:
         kalman.observe_velocity(velocity.velocity, *_split(sigma))
 
     def _mean_error(self, observed: BodyObservation, velocity: Floats) -> float:
-        """m/s, the length of the predicted velocity's mean error, of late, against the observed root's."""
+        """Return the length of the predicted velocity's running mean error against the observed root, m/s."""
         if self._before.root_observed and observed.dt > 0.0:
             moved = (observed.positions[0] - self._before.positions[0]) / observed.dt
             self._off += (1.0 - math.exp(-observed.dt / OFF_MEMORY_S)) * (moved - velocity - self._off)
         return float(np.linalg.norm(self._off))
 
     def _observe_root(self, observed: BodyObservation) -> bool:
-        """Take an observed root; whether it is gated in, so that other joints are where they are observed as well."""
+        """Update with an observed root; returns whether it, and so the observed world positions, are accepted."""
         if not observed.root_observed:
             return False
         off = np.abs(observed.positions[0] - self._kalman.position)
@@ -170,7 +170,7 @@ class RootFilter:
         return not self._jumps
 
     def _observe_feet(self, observed: BodyObservation, *, in_world: bool) -> None:
-        """Take the feet, in the world or against the root."""
+        """Update with the observed feet, in the world or relative to the root."""
         if not observed.root_known:
             return
         places, sigma = observed.feet - (0.0 if in_world else observed.positions[0]), observed.feet_sigma
@@ -182,7 +182,7 @@ class RootFilter:
                 self._kalman.lose(foot)
 
     def _observe_floor(self, stance: Stance, floor: Floor) -> None:
-        """Take the height of feet that stand from the floor under them."""
+        """Update the heights of standing feet with the floor under them."""
         for foot in np.flatnonzero((stance.rest > STANDING) & self._kalman.placed).tolist():
             under = floor.under(self._kalman.feet[foot] - SOLE[foot] * _UP)
             if math.isfinite(under):
@@ -190,5 +190,5 @@ class RootFilter:
 
 
 def _split(sigma: Sigma) -> tuple[Sigma, Sigma]:
-    """The standard deviations of the jitter and of the slow bias that make up ``sigma``."""
+    """Split ``sigma`` into the standard deviations of jitter and slow bias."""
     return JITTER_SHARE * sigma, math.sqrt(1.0 - JITTER_SHARE**2) * sigma

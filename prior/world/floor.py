@@ -1,7 +1,7 @@
-"""What feet stand on, in a gravity-aligned frame: the floor, and the steps and platforms above it.
+"""The ground in a gravity-aligned frame: the floor, and the steps and platforms above it.
 
-HuMoR's ground is one plane. That of a hall is; a robot's has steps. Ground here is horizontal, at several heights: the
-floor, which reaches everywhere, and levels, each as far as feet have stood on it.
+HuMoR's ground is a single plane, but a robot may meet steps. The ground here is horizontal, at several heights. The
+floor extends everywhere; each level above it extends as far as feet have stood on it.
 """
 
 from __future__ import annotations
@@ -16,42 +16,40 @@ from steadypose.prior.models.root_velocity import FRAME_S
 from steadypose.prior.world.observe import BodyObservation
 
 SOLE_SIGMA = 0.02
-"""Standard deviation of a standing foot's height above the floor, between sources and people and from stand to stand,
-metres."""
+"""Standard deviation of a standing foot's height above the floor, over sources, people and stances, metres."""
 
 STANDING = 0.5
-"""Probability of rest from which on a foot measures the floor."""
+"""Probability of rest above which a foot measures the floor."""
 
 UPRIGHT_M = 0.45
-"""Height of the pelvis above the sole from which on a body's feet measure the floor, metres: not those of one that
-lies."""
+"""Height of the pelvis above the sole above which feet measure the floor, metres. It excludes bodies that lie."""
 
 CALIBRATED_SIGMA = 0.01
 """Standard deviation of a calibrated floor's height, metres."""
 
 GUESS_SIGMA = 0.15
-"""Standard deviation of the floor's height by the lowest foot of a first frame, standing or not, metres."""
+"""Standard deviation of a floor height guessed from the lowest foot of the first frame, metres."""
 
 CREEP = 0.001
-"""Density of the random walk of an estimate that is sure, metres over √s."""
+"""Density of the random walk of the floor's height, metres over √s."""
 
 MEMORY_S = 0.5
-"""Time for which the error of one standing foot lasts, seconds: frames closer together measure the same again."""
+"""Correlation time of the error of one standing foot, seconds. Frames closer together repeat a measurement."""
 
 GATE = 3.0
-"""Height above the floor from which on a foot stands on something else, standard deviations."""
+"""Height above the floor above which a foot stands on something else, standard deviations."""
 
 PATIENCE_S = 5.0
-"""Time of feet standing on something else, and none on the floor, after which that is the floor, seconds."""
+"""Time after which ground that feet stand on becomes the floor if no foot stands on the old one, seconds."""
 
 STEP_M = 0.10
-"""Height above the floor, or another level, from which on something is a level of its own, metres."""
+"""Least height of a new level above the floor or another level, metres."""
 
 STOOD_S = 0.3
-"""Time that feet stand on a level before it is one, seconds: no jump hangs in the air for so long."""
+"""Time for which feet must stand on a level before it counts, seconds. A jump is shorter."""
 
 REACH_M = 0.4
-"""Distance beyond where feet have stood that a level is taken to reach, metres."""
+"""Extent of a level beyond the positions where feet have stood, metres."""
 
 FORGOTTEN_S = 60.0
 """Time of standing elsewhere after which a level is forgotten, seconds."""
@@ -59,14 +57,14 @@ FORGOTTEN_S = 60.0
 
 @dataclass
 class Level:
-    """Something to stand on.
+    """A horizontal surface above the floor.
 
     Attributes:
         height: metres, world.
-        variance: of that, m².
-        low, high: (2,) metres, world: between them feet have stood.
-        stood_s: seconds that feet have stood on it.
-        idle_s: seconds that feet have stood elsewhere since.
+        variance: m², variance of the height.
+        low, high: (2,) metres, world, corners of the area where feet have stood.
+        stood_s: seconds for which feet have stood on it.
+        idle_s: seconds for which feet have stood elsewhere since.
     """
 
     height: float
@@ -77,12 +75,12 @@ class Level:
     idle_s: float = 0.0
 
     def reaches(self, place: Floats) -> bool:
-        """Whether it is one, and under or near a place (2,)."""
+        """Whether feet have stood on it long enough and it lies under or near a place (2,)."""
         inside = (place > self.low - REACH_M).all() and (place < self.high + REACH_M).all()
         return self.stood_s > STOOD_S and bool(inside)
 
     def observe(self, height: float, sigma: float, place: Floats, dt: float) -> None:
-        """Update by the height in metres that one foot standing at ``place`` measures; see `Floor.observe`."""
+        """Update with the height measured by one foot that stands at ``place`` (see `Floor.observe`)."""
         self.variance += CREEP**2 * dt
         gain = self.variance / (self.variance + sigma**2 * max(MEMORY_S / dt, 1.0))
         self.height += gain * (height - self.height)
@@ -92,11 +90,11 @@ class Level:
 
 
 class Floor:
-    """A running estimate of the floor's height, which slows down as it grows sure, and of levels above it.
+    """A recursive estimate of the floor's height, and of levels above it.
 
-    Feet cannot stand under the floor, so a foot that does is trusted; one well above it stands on a step, or was
-    taken to stand when it did not. An uncalibrated floor that no foot touches for `PATIENCE_S` seconds of standing is
-    given up for the one that the feet stand on.
+    Feet cannot stand below the floor, so a foot below it corrects the floor at once. A foot well above it stands on a
+    step, or does not stand at all. If feet stand elsewhere for `PATIENCE_S` seconds, an uncalibrated floor is replaced
+    by the ground on which they stand.
 
     Args:
         calibrated: whether the floor is known to be at z = 0.
@@ -111,31 +109,31 @@ class Floor:
 
     @property
     def known(self) -> bool:
-        """Whether there is any estimate."""
+        """Whether the floor has an estimate."""
         return math.isfinite(self._variance)
 
     @property
     def height(self) -> float:
-        """Metres, world, of the floor; 0 while unknown."""
+        """Height of the floor, metres, world; 0 while unknown."""
         return self._height
 
     @property
     def sigma(self) -> float:
-        """Metres, the standard deviation of `height`; infinite while unknown."""
+        """Standard deviation of `height`, metres; infinite while unknown."""
         return math.sqrt(self._variance)
 
     @property
     def levels(self) -> list[float]:
-        """Metres, world, of the levels above the floor that feet have stood on for long enough."""
+        """Heights of the levels on which feet have stood for long enough, metres, world."""
         return [level.height for level in self._levels if level.stood_s > STOOD_S]
 
     @property
     def plane(self) -> Floats:
-        """(4,) a, b, c, d of the floor, with ax + by + cz + d = 0 and the unit normal (a, b, c) up."""
+        """(4,) coefficients a, b, c, d of the ground plane ax + by + cz + d = 0, with the unit normal (a, b, c) up."""
         return np.array([0.0, 0.0, 1.0, -self._height])
 
     def under(self, sole: Floats) -> float:
-        """Metres, world: the height of what a sole at (3,) metres may stand on; NaN if nothing known is near."""
+        """Height of the ground near a sole at (3,) metres, metres, world; NaN if no known ground is near."""
         if not self.known:
             return math.nan
         heights = [self._height, *(level.height for level in self._levels if level.reaches(sole[:2]))]
@@ -143,7 +141,7 @@ class Floor:
         return near if sole[2] - near < STEP_M else math.nan
 
     def update(self, observed: BodyObservation, rest: Floats) -> None:
-        """Update by one body's observed feet; (4,) ``rest`` are their probabilities of rest."""
+        """Update with one body's observed feet and their probabilities (4,) of ``rest``."""
         if not self.known and observed.feet_observed.any():
             self.guess(float(np.nanmin(observed.soles[:, 2])))
         if not observed.root_observed:
@@ -154,17 +152,17 @@ class Floor:
             self.observe(soles[k], math.hypot(sigma[k], SOLE_SIGMA), max(observed.dt, FRAME_S))
 
     def guess(self, lowest: float) -> None:
-        """Start from where the floor would be, in metres, if the lowest foot in sight stood on it."""
+        """Start at the height of the lowest observed foot, metres, as if it stood on the floor."""
         if not self.known:
             self._height, self._variance = lowest, GUESS_SIGMA**2
 
     def observe(self, sole: Floats, sigma: float, dt: float) -> None:
-        """Update by the ground's height that one standing foot measures, with its standard deviation.
+        """Update with the height of the ground under one standing foot.
 
         Args:
-            sole: (3,) metres, world: the joint, less its height above the sole.
-            sigma: metres, of the height.
-            dt: seconds for which this foot has stood since it was last taken.
+            sole: (3,) metres, world, the point of the sole under the joint.
+            sigma: metres, standard deviation of the height.
+            dt: seconds for which this foot has stood since the last update.
         """
         height = float(sole[2])
         if not self.known:

@@ -1,17 +1,19 @@
-"""The Kalman filter behind a body's place in the world: root position and velocity, and where its feet are.
+"""The Kalman filter of a body's trajectory: position and velocity of the root, and positions of the feet.
 
-Neither the sensor's observations nor the network's predictions err independently from frame to frame, so all biases are
-in the state: a root seen for long is not taken to be known ever better, and one that coasts strays as errors that last
-make it. So are the places of the feet, as in contact-aided filters of legged robots (Bloesch et al., "State Estimation
-for Legged Robots", RSS 2012). A foot that rests stays where it is; what it seems to move is the sensor's error, which
-the filter so learns, and forgets when the foot lifts: a planted foot is an anchor that is eased in and out. Against a
-hidden root the same foot measures how far the root has moved: the zero-velocity update and the anchor that keeps
-errors from adding up are one measurement, and the covariance knows that an anchor is no better placed than it was
-seen.
+The errors of the sensor's observations and of the network's predictions are correlated in time. All biases are
+therefore part of the state. The filter does not become overconfident about a root that is observed for long, and the
+uncertainty of a coasting root grows as lasting errors make it grow.
 
-Observations have been smoothed, so their errors are smooth as well: each is the second-order Gauss-Markov process of a
-critically damped spring, (1 + wt) exp(-wt) of it left after t. The axes are independent: the noise is the same in both
-horizontal directions, so no correlation between axes arises, and the filter turns with the world.
+The positions of the feet are part of the state as well, as in contact-aided filters of legged robots (Bloesch et al.,
+"State Estimation for Legged Robots", RSS 2012). A resting foot stays in place. If it seems to move, that is the
+sensor's error; the filter learns this error and forgets it when the foot lifts, so an anchor is eased in and out. While
+the root is hidden, the distance to the same foot measures how far the root has moved. One measurement thus serves as
+zero-velocity update and as anchor against accumulating errors, and the covariance includes the uncertainty of the
+anchor's position.
+
+Observations are smoothed, so their errors are smooth too. Each error is the second-order Gauss-Markov process of a
+critically damped spring: after time t, (1 + wt) exp(-wt) of it is left. The axes are independent. The noise is equal in
+both horizontal directions, so the axes stay uncorrelated and the filter is equivariant under rotations about z.
 """
 
 from __future__ import annotations
@@ -27,26 +29,26 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
 
 _POSITION, _VELOCITY, _SENSOR, _SENSOR_RATE, _NETWORK, _FEET = 0, 1, 2, 3, 4, 5
-"""Of the state. Errors are in units of their present standard deviations, their rates in those times their w."""
+"""Indices into the state. Errors are in units of their current standard deviations, their rates in those times w."""
 _FOOT, _FOOT_ERROR, _FOOT_RATE, _OF_FOOT = 0, 1, 2, 3
-"""Of a foot's part of the state: its place, the sensor's error of it, the rate of that."""
+"""Indices into a foot's part of the state: its position, the sensor's error of it, that error's rate; and its size."""
 
 
 @dataclass(frozen=True)
 class BodyNoise:
-    """How root and feet move, and for how long measurements of them err.
+    """Process noise of root and feet, and correlation times of measurement errors.
 
     Attributes:
-        acceleration: density of the white-noise acceleration of a root at rest, m/s² over √Hz.
-        acceleration_at_speed: what each m/s of its speed adds to that, 1/√s.
-        rest, load, swing: densities of the random walk of a foot that rests, of one that rolls under load, and of one
-            in the air, metres over √s.
-        slip_at_speed: s/m, by how much more each m/s of the root's speed lets feet at rest and under load walk: they
-            roll, slide, and are taken to stand when they do not.
-        sensor_rate: 1/s, w of the sensor's errors of what is at rest.
-        sensor_memory_m: metres of travel by which a moving root's is forgotten as well, as a camera's error is.
-        network_memory_s: (3,) or a number, the time constant of the network's error, a Gauss-Markov process.
-        first_speed: m/s, the standard deviation of a root's first velocity.
+        acceleration: m/s² over √Hz, density of the white-noise acceleration of a root at rest.
+        acceleration_at_speed: 1/√s, increase of that density for each m/s of the root's speed.
+        rest, load, swing: metres over √s, densities of the random walk of a foot that rests, of a foot that rolls under
+            load, and of a foot in the air.
+        slip_at_speed: s/m, relative increase of the random walk of feet at rest and under load for each m/s of the
+            root's speed. Such feet roll and slide, or are wrongly taken to stand.
+        sensor_rate: 1/s, w of the sensor's errors of a point at rest.
+        sensor_memory_m: metres of travel with which a moving root's error decays in addition, as a camera's error does.
+        network_memory_s: (3,) or a number, seconds, time constant of the network's error, a Gauss-Markov process.
+        first_speed: m/s, standard deviation of a root's first velocity.
     """
 
     acceleration: float = 3.0
@@ -61,11 +63,11 @@ class BodyNoise:
     first_speed: float = 1.0
 
     def density(self, speed: float) -> float:
-        """Power spectral density of the white-noise acceleration of a root at ``speed`` m/s: m²/s³."""
+        """Power spectral density of the white-noise acceleration of a root at ``speed`` m/s, in m²/s³."""
         return (self.acceleration + self.acceleration_at_speed * speed) ** 2
 
     def walk(self, load: Floats, rest: Floats, speed: float) -> Floats:
-        """(feet,) m²/s of the feet's random walks, by the probabilities (feet,) that each bears load, and rests."""
+        """(feet,) m²/s of the feet's random walks, from the probabilities (feet,) of ``load`` and ``rest``."""
         slip = math.log(1.0 + self.slip_at_speed * speed)
         rolls = np.maximum(load - rest, 0.0)
         walk = rest * (math.log(self.rest) + slip) + rolls * (math.log(self.load) + slip)
@@ -74,15 +76,15 @@ class BodyNoise:
 
 
 class BodyFilter:
-    """Root position and velocity, the places of ``feet`` points of the feet, and biases.
+    """Kalman filter of root position and velocity, positions of ``feet`` points of the feet, and biases.
 
     Args:
-        noise: of all but the measurements.
-        position: (3,) metres, where the root is first seen.
-        jitter: metres, the standard deviation of the sensor's error from frame to frame.
-        bias: metres, the standard deviation of its slow bias.
-        velocity: (3,) m/s, what the root is taken to do there.
-        feet: how many points of the feet there are.
+        noise: process noise and correlation times.
+        position: (3,) metres, first observed position of the root.
+        jitter: metres, standard deviation of the sensor's error from frame to frame.
+        bias: metres, standard deviation of the sensor's slow bias.
+        velocity: (3,) m/s, initial velocity of the root.
+        feet: number of points of the feet.
     """
 
     def __init__(
@@ -128,7 +130,7 @@ class BodyFilter:
 
     @property
     def placed(self) -> NDArray[np.bool_]:
-        """(feet,) which feet have a place."""
+        """(feet,) which feet have a position."""
         return self._placed.copy()
 
     @property
@@ -144,43 +146,43 @@ class BodyFilter:
 
     @property
     def feet_off(self) -> Floats:
-        """(feet,) by how many standard deviations the sensor has each foot elsewhere, along the worst axis."""
+        """(feet,) distance from each foot to its observation along the worst axis, in standard deviations."""
         return np.abs(self._x[_FEET + _FOOT_ERROR :: _OF_FOOT]).max(axis=1)
 
     def predict(self, dt: float, load: Floats, rest: Floats) -> None:
-        """Move on by ``dt`` seconds, above 0; (feet,) probabilities that each foot bears load, and that it rests."""
+        """Predict over ``dt`` seconds, above 0, given the feet's probabilities (feet,) of ``load`` and ``rest``."""
         noise = self._noise
-        speed = math.hypot(*self._x[_VELOCITY, :2])  # not the height, which the floor has a say in
+        speed = math.hypot(*self._x[_VELOCITY, :2])  # horizontal speed only, because the floor affects the vertical one
         rates = np.full(1 + len(load), noise.sensor_rate)
         rates[0] += speed / noise.sensor_memory_m
         kept = np.exp(-dt / np.broadcast_to(np.asarray(noise.network_memory_s, dtype=np.float64), (3,)))
         _predict(self._x, self._p, dt, noise.density(speed), rates * dt, kept, noise.walk(load, rest, speed) * dt)
 
     def observe_position(self, position: Floats, jitter: float, bias: float) -> None:
-        """Take a root position (3,) in metres as the sensor sees it.
+        """Update with an observed root position.
 
         Args:
-            position: with both errors of the sensor.
-            jitter: metres, the standard deviation of its error from frame to frame.
-            bias: metres, that of its slow bias.
+            position: (3,) metres, with both errors of the sensor.
+            jitter: metres, standard deviation of the error from frame to frame.
+            bias: metres, standard deviation of the slow bias.
         """
         self._correct({_POSITION: 1.0, _SENSOR: bias}, position, jitter)
 
     def observe_velocity(self, velocity: Floats, jitter: ArrayLike, bias: ArrayLike) -> None:
-        """Take a root velocity (3,) in m/s as the network predicts it.
+        """Update with the network's root velocity.
 
         Args:
-            velocity: with both errors of the network.
-            jitter: (3,) or a number, m/s, the standard deviation of its error from frame to frame.
-            bias: (3,) or a number, m/s, that of its slow bias.
+            velocity: (3,) m/s, with both errors of the network.
+            jitter: (3,) or a number, m/s, standard deviation of the error from frame to frame.
+            bias: (3,) or a number, m/s, standard deviation of the slow bias.
         """
         self._correct({_VELOCITY: 1.0, _NETWORK: bias}, velocity, jitter)
 
     def observe_foot(self, foot: int, place: Floats, jitter: float, bias: float, *, from_root: bool) -> None:
-        """Take the place (3,) metres of a foot, in the world or from the root, with both errors of the sensor.
+        """Update with the observed position (3,) metres of a foot, in the world or relative to the root.
 
-        Against the root these are other errors than in the world: what was learned of the ones does not hold for the
-        others.
+        The position has both errors of the sensor. Errors relative to the root differ from those in the world, so a
+        change between the two forgets the learned error.
         """
         if not self._placed[foot]:
             self._place(foot, place + self._x[_POSITION] if from_root else place, jitter, bias, from_root)
@@ -192,15 +194,15 @@ class BodyFilter:
         self._correct({**entries, _POSITION: -1.0} if from_root else entries, place, jitter)
 
     def observe_foot_height(self, foot: int, height: float, sigma: float) -> None:
-        """Take the height in metres, world, of a foot, with its standard deviation."""
+        """Update with the height of a foot and its standard deviation, metres, world."""
         self._correct({_index(foot, _FOOT): 1.0}, np.array([0, 0, height]), np.array([np.inf, np.inf, sigma]))
 
     def lose(self, foot: int) -> None:
-        """Forget where a foot is."""
+        """Forget the position of a foot."""
         self._placed[foot] = False
 
     def _place(self, foot: int, place: Floats, jitter: float, bias: float, from_root: bool) -> None:
-        """Put a foot where it is first seen."""
+        """Initialise a foot at its first observation."""
         at, error, p = _index(foot, _FOOT), _index(foot, _FOOT_ERROR), self._p
         self._forget_error(foot)
         self._x[at] = place
@@ -219,7 +221,7 @@ class BodyFilter:
             self._p[:, part, part] = 1.0
 
     def _correct(self, entries: Mapping[int, ArrayLike], measured: Floats, sigma: ArrayLike) -> None:
-        """The Kalman update with one scalar measurement an axis: measured = sum of entries · x + noise."""
+        """Kalman update with one scalar measurement per axis: measured = sum of entries · x + noise."""
         rows = np.array(list(entries), dtype=np.int64)
         values, deviation = np.empty((len(rows), 3)), np.empty(3)
         for k, value in enumerate(entries.values()):
@@ -232,12 +234,12 @@ def _index(foot: int, part: int) -> int:
     return _FEET + _OF_FOOT * foot + part
 
 
-# Compiled: a body needs some ten of these a frame, and numpy takes 30 µs for each.
+# Compiled, because a body needs about ten of these calls per frame and numpy takes 30 µs for each.
 
 
 @njit(cache=True)
 def _spring(x, p, a, at, angle):
-    """Move one error, at ``at`` and its rate after it, on by ``angle`` = w dt, along axis ``a``, in place."""
+    """Predict the error at index ``at``, and its rate at the next, over ``angle`` = w dt along axis ``a``, in place."""
     left = math.exp(-angle)
     f00, f01, f10, f11 = left * (1 + angle), left * angle, -left * angle, left * (1 - angle)
     first, second = x[at, a], x[at + 1, a]
@@ -256,10 +258,10 @@ def _spring(x, p, a, at, angle):
 
 @njit("(f8[:,::1], f8[:,:,::1], f8, f8, f8[::1], f8[::1], f8[::1])", cache=True)
 def _predict(x, p, dt, density, angles, kept, walk):
-    """Move state (size, 3) and covariances (3, size, size) on in place.
+    """Predict state (size, 3) and covariances (3, size, size), in place.
 
-    ``angles`` (1 + feet,) are w dt of the errors of root and feet, ``kept`` (3,) is left of the network's, ``walk``
-    (feet,) m² is added to the feet's variances.
+    ``angles`` (1 + feet,) are w dt of the errors of root and feet. ``kept`` (3,) is the share of the network's error
+    that is left. ``walk`` (feet,) m² is added to the feet's variances.
     """
     for a in range(3):
         x[_POSITION, a] += dt * x[_VELOCITY, a]
@@ -286,7 +288,7 @@ def _predict(x, p, dt, density, angles, kept, walk):
 
 @njit("(f8[:,::1], f8[:,:,::1], i8[::1], f8[:,::1], f8[::1], f8[::1])", cache=True)
 def _correct(x, p, rows, values, measured, sigma):
-    """Correct state and covariances in place by one measurement (3,) along each axis: measured = values · x[rows]."""
+    """Correct state and covariances, in place, with one measurement (3,) per axis: measured = values · x[rows]."""
     size = len(x)
     cross = np.empty(size)
     for a in range(3):

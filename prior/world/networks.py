@@ -1,5 +1,7 @@
-"""What recurrent networks predict of bodies in the world: root velocity from a body's own motion (the task of HM-VAE,
-section 3.3), and contacts: what bears load, what rests, and which feet may hold a root.
+"""Recurrent networks' predictions for bodies in the world: root velocity and contacts.
+
+Root velocity is predicted from the body's own motion (the task of HM-VAE, section 3.3). Contacts are predicted as load
+and rest; they decide which feet may anchor the root.
 """
 
 from __future__ import annotations
@@ -18,25 +20,24 @@ from steadypose.prior.world.floor import Floor
 from steadypose.prior.world.observe import FEET, BodyObservation
 
 CAMERA_ERROR, CAMERA_MEMORY_S = 2.0, 0.3
-"""Ratio of the velocity's error on poses from a camera to validation's on motion capture, and the least time constant
-of it, seconds: on simulated streams half of an error was still there after 0.5 s."""
+"""Ratio of the velocity's error on a camera's poses to its error on motion capture (validation), and the error's least
+time constant, seconds. On simulated streams, half of an error remained after 0.5 s."""
 
 SCALE_FACTOR_ERROR = 0.35
-"""Standard deviation of the predicted speed's scale factor, which the network does not state."""
+"""Standard deviation of the predicted speed's scale factor, which the network's own standard deviation omits."""
 
 MOVED_SIGMAS = 3.0
-"""Distance between a standing foot and where it is observed from which on it has evidently moved, standard
-deviations: it stands anew."""
+"""Distance between a standing foot and its observation above which the foot has moved, standard deviations."""
 
 _FOOT_CONTACTS = [CONTACT_JOINTS.index(joint) for joint in FEET]
 
 
 class RootVelocity(NamedTuple):
-    """A body's root velocity as predicted, in the world.
+    """The predicted root velocity of a body, in the world.
 
     Attributes:
         velocity: (3,) m/s.
-        sigma: (3,) m/s, standard deviation, as validation measured it.
+        sigma: (3,) m/s, standard deviation, calibrated on validation.
     """
 
     velocity: Floats
@@ -44,7 +45,7 @@ class RootVelocity(NamedTuple):
 
 
 class MotionMemory:
-    """What is kept of a body from frame to frame: its joints, and the network's state (hidden,)."""
+    """State of the velocity network for one body: its last joints, and the hidden state (hidden,)."""
 
     def __init__(self, hidden: int) -> None:
         self._hidden = hidden
@@ -52,9 +53,10 @@ class MotionMemory:
         self.state = np.zeros(hidden, dtype=np.float32)
 
     def update(self, observed: BodyObservation) -> tuple[Floats, Floats, float]:
-        """Joints (22, 3) metres from the root, world axes, those of the frame before, and seconds between them.
+        """Return this frame's and the last frame's joints (22, 3), metres from the root, world axes, and the seconds
+        between.
 
-        Motion begins anew after a gap. A joint without a position stays where it last was from the root.
+        After a gap, motion starts anew. A joint without a position keeps its last position relative to the root.
         """
         before = self.local
         last = REST_POSITIONS @ yaw_matrix(observed.yaw).T if before is None else before
@@ -83,11 +85,11 @@ class VelocityNetwork:
         self.memory_s = np.maximum(np.array(config.correlation_s)[horizontal_first] / 2.0, CAMERA_MEMORY_S)
 
     def memory(self) -> MotionMemory:
-        """That of a new body."""
+        """Return the state of a new body."""
         return MotionMemory(self._net.config.hidden)
 
     def update(self, memories: Sequence[MotionMemory], observed: Sequence[BodyObservation]) -> list[RootVelocity]:
-        """Of each body, by its memory, which takes in its observation."""
+        """Predict the velocity of each body, and update the bodies' ``memories``."""
         if not observed:
             return []
         parts = zip(*(memory.update(each) for memory, each in zip(memories, observed, strict=True)), strict=True)
@@ -98,18 +100,18 @@ class VelocityNetwork:
         for memory, after in zip(memories, states, strict=True):
             memory.state = after
         variance = np.exp(2.0 * log_sigma)
-        variance[:, :2] = variance[:, :2].mean(axis=1, keepdims=True)  # the filter's noise must not know the heading
+        variance[:, :2] = variance[:, :2].mean(axis=1, keepdims=True)  # the filter assumes isotropic horizontal noise
         speed = np.linalg.norm(velocity[:, :2], axis=1, keepdims=True)
         sigma = np.hypot(np.sqrt(variance) * self._scale, SCALE_FACTOR_ERROR * speed)
         return [RootVelocity(yaw_matrix(o.yaw) @ v, s) for o, v, s in zip(observed, velocity, sigma, strict=True)]
 
 
 class Stance(NamedTuple):
-    """Feet that may hold the root.
+    """Feet that may anchor the root.
 
     Attributes:
-        load: (4,) probabilities that `FEET` bear load; 0 of those that may not hold it.
-        rest: (4,) that they stand still, likewise.
+        load: (4,) probabilities that `FEET` bear load; 0 for feet that may not anchor the root.
+        rest: (4,) probabilities that they rest; 0 likewise.
     """
 
     load: Floats
@@ -117,17 +119,17 @@ class Stance(NamedTuple):
 
 
 def stance(contacts: Contacts, observed: BodyObservation, feet_off: Floats) -> Stance:
-    """Which feet may hold a root.
+    """Select the feet that may anchor the root.
 
-    Not those of a body without a root; nor those that nobody observed, if nobody observed the root; nor those that
-    were last ``feet_off`` (4,) standard deviations off, if that is too far.
+    A foot may not if the body has no root, if neither the foot nor the root was observed, or if its last observation
+    was too far from its estimate: ``feet_off`` (4,), in standard deviations.
     """
     holds = (observed.feet_observed | observed.root_observed) & (feet_off < MOVED_SIGMAS) & observed.root_known
     return Stance(*(holds * p[_FOOT_CONTACTS].astype(np.float64) for p in (contacts.load, contacts.rest)))
 
 
 class ContactMemory:
-    """What is kept of a body from frame to frame: its last observation, and the network's state (hidden,)."""
+    """State of the contact network for one body: its last observation, and the hidden state (hidden,)."""
 
     def __init__(self, hidden: int) -> None:
         self.observed: BodyObservation | None = None
@@ -145,13 +147,13 @@ class ContactNetwork:
         self._net = LiveContacts.load(weights)
 
     def memory(self) -> ContactMemory:
-        """That of a new body."""
+        """Return the state of a new body."""
         return ContactMemory(self._net.hidden)
 
     def update(
         self, memories: Sequence[ContactMemory], observed: Sequence[BodyObservation], floor: Floor
     ) -> list[Contacts]:
-        """Of each body: load (8,), rest (8,) and the state (hidden,) that its memory then keeps."""
+        """Predict each body's load (8,), rest (8,) and new hidden state (hidden,), and update the ``memories``."""
         if not observed:
             return []
         before, states, dt = [], [], []
@@ -174,8 +176,10 @@ class ContactNetwork:
 
 
 def _under(observed: BodyObservation, floor: Floor, known: bool) -> Floats:
-    """(8,) metres, the height of what is under each contact joint: under a foot, or else under the lowest; NaN where
-    not ``known``."""
+    """(8,) metres, height of the ground under each contact joint; NaN if not ``known``.
+
+    For joints other than the feet, and for feet over unknown ground, it is the ground under the lowest foot.
+    """
     under = np.full(len(CONTACT_JOINTS), np.nan)
     if known:
         soles = observed.soles

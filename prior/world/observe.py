@@ -1,4 +1,4 @@
-"""Bodies of a `pose/clean` message as observations in the world's frame."""
+"""Converts the bodies of a `pose/clean` message to observations in the world's frame."""
 
 from __future__ import annotations
 
@@ -15,26 +15,25 @@ from steadypose.prior.body.kinematics import quaternion_product, rotation_matrix
 from steadypose.prior.body.skeleton import HIPS, J
 
 FEET: tuple[int, ...] = tuple(J[f"{side}_{part}"] for part in ("ankle", "foot") for side in ("left", "right"))
-"""Joints that may stand: heels and toes (left, right)."""
+"""Joints that can stand on the floor: left and right heel, left and right toes."""
 
 SOLE: Floats = np.array([0.07, 0.07, 0.022, 0.022])
-"""Height (4,) of `FEET` above the floor while they stand, metres: the median over labelled contacts of the training
-motion, the mean over its five sources."""
+"""Heights (4,) of `FEET` above the floor while they stand, metres. Medians over labelled contacts in each of the five
+sources of training motion, averaged over the sources."""
 
 MIN_SIGMA = 0.001
-"""Least standard deviation of a joint, whatever the message states, metres."""
+"""Least standard deviation of a joint, which replaces smaller ones in the message, metres."""
 
 UNOBSERVED_ROOT_SIGMA = 0.05
-"""Standard deviation added to that of an unobserved root where other joints are observed, metres: the prior inferred it
-from them."""
+"""Standard deviation added to that of a root which the prior inferred from other observed joints, metres."""
 
 REACH_M = 2.0
-"""Distance from its own root beyond which a joint is refused, metres."""
+"""Largest distance of a joint from its root; joints beyond it are rejected, metres."""
 
 LONGEST_GAP_S = 0.3
-"""Time without a message over which motion is interpolated and feet may go on standing, seconds."""
+"""Longest gap between messages over which motion is interpolated and feet may keep standing, seconds."""
 
-_MIN_NORM = 1e-6  # of a quaternion that is a rotation
+_MIN_NORM = 1e-6  # least norm of a quaternion that is a rotation
 _PELVIS = [J["pelvis"], *HIPS]
 _FEET, _SOLE_OFFSETS = list(FEET), SOLE[:, None] * [0.0, 0.0, 1.0]
 
@@ -44,15 +43,16 @@ class BodyObservation:
     """A body of one message, in the world.
 
     Attributes:
-        body: as it came.
-        stamp_ns: of the message.
-        dt: seconds since the last message with this body; 0 in its first.
-        positions: (22, 3) metres; NaN where not known.
-        orientation: (4,) xyzw of the root; where the message has no rotation, the last one.
-        observed: (22,) whether the joint was observed, not inferred.
-        sigma: (22,) metres, at least `MIN_SIGMA`; infinite where the message states none.
-        root_sigma: metres, standard deviation of the root's position; infinite if it rests on no observation.
-        pelvis_observed: whether pelvis or a hip was observed; else the prior inferred the root from other joints.
+        body: the body in the message, unchanged.
+        stamp_ns: stamp of the message.
+        dt: seconds since the last message with this body; 0 in the first.
+        positions: (22, 3) metres; NaN where unknown.
+        orientation: (4,) xyzw, orientation of the root; the last valid one if the message has none.
+        observed: (22,) whether each joint was observed and not inferred.
+        sigma: (22,) metres, standard deviations, at least `MIN_SIGMA`; infinite where the message has none.
+        root_sigma: metres, standard deviation of the root's position; infinite if no observation supports it.
+        pelvis_observed: whether the pelvis or a hip was observed; if not, the prior inferred the root from other
+            joints.
     """
 
     body: CleanBody
@@ -72,38 +72,38 @@ class BodyObservation:
 
     @property
     def root_observed(self) -> bool:
-        """Whether the root's position rests on observations."""
+        """Whether observations support the root's position."""
         return math.isfinite(self.root_sigma)
 
     @property
     def after_gap(self) -> bool:
-        """Whether it is the body's first, or the first after a gap of more than `LONGEST_GAP_S`."""
+        """Whether this is the body's first observation, or the first after a gap of more than `LONGEST_GAP_S`."""
         return not 0.0 < self.dt <= LONGEST_GAP_S
 
     @property
     def yaw(self) -> float:
-        """Heading in radians: `kinematics.heading` of the orientation, where R (0, 1, 0) is the body's left."""
+        """Heading in radians: `kinematics.heading` of the orientation R, where R (0, 1, 0) is the body's left."""
         x, y, z, w = self.orientation.tolist()
         return math.atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (x * x + z * z))
 
     @property
     def feet(self) -> Floats:
-        """(4, 3) metres, of `FEET`."""
+        """(4, 3) metres, positions of `FEET`."""
         return self.positions[_FEET]
 
     @property
     def feet_sigma(self) -> Floats:
-        """(4,) metres, of `FEET`."""
+        """(4,) metres, standard deviations of `FEET`."""
         return self.sigma[_FEET]
 
     @property
     def feet_observed(self) -> NDArray[np.bool_]:
-        """(4,) of `FEET`."""
+        """(4,) whether each of `FEET` was observed."""
         return self.observed[_FEET]
 
     @property
     def soles(self) -> Floats:
-        """(4, 3) metres, the points of the soles under `FEET` of a body that stands."""
+        """(4, 3) metres, the points of the soles under `FEET` if the body stands."""
         return self.feet - _SOLE_OFFSETS
 
 
@@ -111,14 +111,14 @@ def observe(
     bodies: Sequence[CleanBody], stamp_ns: int, orientation: Floats, position: Floats,
     last: Mapping[int, BodyObservation],
 ) -> list[BodyObservation]:  # fmt: skip
-    """The bodies of a message in the world.
+    """Convert the bodies of a message to observations in the world.
 
     Args:
-        bodies: each id once.
-        stamp_ns: of the message.
-        orientation: (4,) a unit quaternion xyzw, the sensor's in the world.
-        position: (3,) metres, the sensor's.
-        last: observations of the same bodies in the message before, by id.
+        bodies: the bodies; each id occurs once.
+        stamp_ns: stamp of the message.
+        orientation: (4,) unit quaternion xyzw, orientation of the sensor in the world.
+        position: (3,) metres, position of the sensor in the world.
+        last: last observation of each body, by id.
     """
     if not bodies:
         return []
@@ -147,7 +147,7 @@ def observe(
 
 
 def _orientations(quaternions: Floats, sensor: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Quaternions (N, 4) of any length turned from the sensor's frame to the world, and which of them are rotations."""
+    """Turn quaternions (N, 4) of any norm from the sensor's frame to the world; also returns which are rotations."""
     with np.errstate(invalid="ignore"):
         valid = np.linalg.norm(quaternions, axis=1) >= _MIN_NORM
         valid &= np.isfinite(quaternions).all(axis=1)
@@ -157,7 +157,7 @@ def _orientations(quaternions: Floats, sensor: Floats) -> tuple[Floats, NDArray[
 
 
 def unit_quaternion(quaternion: NDArray[np.floating]) -> Floats | None:
-    """A quaternion (4,) of any length at length 1; None if it is no rotation."""
+    """Normalise a quaternion (4,); None if it is no rotation."""
     q = np.asarray(quaternion, dtype=np.float64)
     if not np.isfinite(q).all() or (length := np.linalg.norm(q)) < _MIN_NORM:
         return None

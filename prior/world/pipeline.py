@@ -1,8 +1,8 @@
-"""From clean poses in the sensor's frame to poses in the world: root velocity, contacts, floor and their fusion.
+"""Turns clean poses in the sensor's frame into poses in the world, with root velocity, contacts and floor.
 
-A body's place comes from three sources that fail at different times: the observed root, where there is one; the root
-velocity that the network predicts from the body's own motion (HM-VAE, section 3.3); and the feet at rest, which stay
-where they are. A Kalman filter weighs them, and its covariance grows while the root is unobserved.
+Three sources, which fail at different times, determine a body's position: the observed root, the root velocity that a
+network predicts from the body's own motion (HM-VAE, section 3.3), and resting feet, which stay in place. A Kalman
+filter fuses them. Its covariance grows while the root is unobserved.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from steadypose.prior.world.observe import observe, unit_quaternion
 from steadypose.prior.world.settings import TrajectorySettings
 
 WORLD = "world"
-"""Frame of everything published here."""
+"""Frame id of all published messages."""
 
 MAX_SOURCES = 64
-"""Number of sources whose floor and bodies are kept; beyond it the one not heard of for longest is forgotten."""
+"""Largest number of sources whose state is kept; beyond it, the least recently received source is forgotten."""
 
 
 class TrajectoryPipeline:
-    """Turns ``pose/clean`` into ``pose/world``, message by message; the same messages give the same output.
+    """Turns ``pose/clean`` into ``pose/world``, message by message. The same messages give the same output.
 
     Attributes:
-        counters: messages and bodies refused, and sources forgotten, by cause.
+        counters: numbers of messages and bodies refused, and of sources forgotten, by cause.
     """
 
     def __init__(self, settings: TrajectorySettings) -> None:
         self.counters: Counter[str] = Counter()
         self._core, self._lost_sigma = WorldCore(settings), settings.lost_sigma
         self._timeout_ns = round(settings.timeout_s * 1e9)
-        self._scenes: dict[str, Scene] = {}  # the one heard of last, last
+        self._scenes: dict[str, Scene] = {}  # least recently received first
 
     def process(self, clean: PoseClean) -> list[PoseWorld]:
-        """The world at the message's moment: one message, or none if it was refused (see `counters`)."""
+        """Return the ``pose/world`` message for a ``pose/clean`` message; none if it was refused (see `counters`)."""
         if clean.end_of_stream:
             return [_message(clean, self._scenes.pop(clean.source, None) or Scene(clean.calibrated), [])]
         orientation, position = unit_quaternion(clean.sensor_pose.orientation), clean.sensor_pose.position
@@ -57,11 +57,11 @@ class TrajectoryPipeline:
         return [_message(clean, scene, self._composed(scene, estimates))]
 
     def scene(self, source: str) -> Scene | None:
-        """What is known of a source; None of one not heard of, ended or forgotten."""
+        """The state of a source; None if it is unknown, ended or forgotten."""
         return self._scenes.get(source)
 
     def _named(self, bodies: Sequence[CleanBody]) -> list[CleanBody]:
-        """The first body of each id."""
+        """Return the first body with each id."""
         named: dict[int, CleanBody] = {}
         for body in bodies:
             if body.id in named:
@@ -70,7 +70,7 @@ class TrajectoryPipeline:
         return [*named.values()]
 
     def _composed(self, scene: Scene, estimates: Sequence[BodyEstimate]) -> list[WorldBody]:
-        """The bodies that keep their promises; whatever made another break them is in its state, which is dropped."""
+        """Compose the bodies. A body that breaks the guarantees of `msgs.topics` is left out and its state dropped."""
         bodies = []
         for estimate in estimates:
             body = compose(estimate, self._lost_sigma)
@@ -82,7 +82,7 @@ class TrajectoryPipeline:
         return bodies
 
     def _scene(self, clean: PoseClean) -> Scene | None:
-        """The scene of the message's source, without the bodies not heard of for long; None if it is out of order."""
+        """Return the source's scene without bodies that timed out; None if the message is out of order."""
         scene, stamp_ns = self._scenes.pop(clean.source, None), clean.stamp_ns
         if scene is not None and stamp_ns < scene.stamp_ns - self._timeout_ns:
             self.counters["stamp_jumped_back"] += 1

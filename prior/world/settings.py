@@ -12,16 +12,16 @@ from steadypose.prior.settings import build_settings
 
 @dataclass(frozen=True)
 class TrajectorySettings:
-    """What a launch file may set.
+    """Settings of the trajectory node.
 
     Attributes:
-        weights: the weight set of the root's velocity, or a path to a ``.safetensors`` file.
-        contact_weights: the same of the contacts.
-        network: whether the network's root velocity is used.
-        contacts: whether feet that rest stand, and hold the root.
-        acceleration: m/s² over √Hz, how quickly a root may change its velocity.
-        lost_sigma: metres, the horizontal standard deviation beyond which a body counts as LOST.
-        timeout_s: seconds after which a body that no message mentions is forgotten.
+        weights: weight set of the root velocity network, or a path to a ``.safetensors`` file.
+        contact_weights: weight set of the contact network, or a path to a ``.safetensors`` file.
+        network: whether to use the network's root velocity.
+        contacts: whether resting feet stay in place and anchor the root.
+        acceleration: m/s² over √Hz, density of the root's white-noise acceleration.
+        lost_sigma: metres, horizontal standard deviation of the root above which a body counts as LOST.
+        timeout_s: seconds without a message that contains it after which a body is forgotten.
     """
 
     weights: str = "default"
@@ -34,10 +34,10 @@ class TrajectorySettings:
 
     @classmethod
     def from_dict(cls, settings: Mapping[str, Any]) -> TrajectorySettings:
-        """From the table of a launch file.
+        """Build the settings from the section of a launch file.
 
         Raises:
-            ValueError: a key that does not exist, a value of the wrong type, or a number that is not above 0.
+            ValueError: for an unknown key, a value of the wrong type, or a number that is not above 0.
         """
         return build_settings(cls, settings, "trajectory")
 
