@@ -1,1 +1,1 @@
-"""The processes: each takes topics and gives topics; and the command line."""
+"""The nodes, which are processes that subscribe to topics and publish topics; and the command line."""

@@ -1,7 +1,7 @@
-"""The ``steadypose`` command: dispatch to subcommands, with one line of help for each.
+"""The ``steadypose`` command: dispatches to subcommands, with one line of help for each.
 
-A subcommand is a typed function with a docstring, in a module of its own that is imported when it is chosen, so that
-`steadypose --help`, or a subcommand that needs no torch, never waits for one that does.
+A subcommand is a typed function with a docstring. Its module is imported only when the subcommand is called, so that
+`steadypose --help` and subcommands without torch never wait for torch.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ COMMANDS = {
     "install-service": ("install_service", "run a launch file at every boot, under systemd"),
     "keys": ("small", "make CurveZMQ keys, for messages between machines"),
 }
-"""Module of each command's function, in `nodes.commands` unless it is a full name; and what the command does."""
+"""Module and one-line help of each command. Modules without a dot in their name are in `nodes.commands`."""
 
 USAGE_ERROR = 2
-"""Exit status of a request that cannot succeed, and should not be retried."""
+"""Exit status of a request that cannot succeed and should not be retried."""
 INTERRUPTED = 130
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line and return its exit status."""
     try:
         status = _main(sys.argv[1:] if arguments is None else arguments)
         sys.stdout.flush()
     except BrokenPipeError:
-        # the reader of a pipe, as in `steadypose echo … | head`, has seen enough; spare Python the flush at exit
+        # a reader such as `head` closed the pipe; redirect stdout so that Python's flush at exit does not fail
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     return status
@@ -76,7 +76,7 @@ def _main(arguments: list[str]) -> int:
         hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(COMMANDS)}"
         print(f"steadypose: no command {name!r}: {hint}", file=sys.stderr)
         return USAGE_ERROR
-    if name == "node":  # OpenBLAS makes threads, with 9 MB, as it is loaded; `one_thread` comes too late for that
+    if name == "node":  # OpenBLAS creates its threads (9 MB) when it is loaded, before `one_thread` could prevent it
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         status = _run(name, arguments[1:])
@@ -105,7 +105,7 @@ def _run(name: str, arguments: list[str]) -> object:
     place, _ = COMMANDS[name]
     module = importlib.import_module(place if "." in place else f"steadypose.nodes.commands.{place}")
     command = getattr(module, name.replace("-", "_"))
-    if name == "node":  # reads its arguments itself: tyro would take 0.1 s and 6 MB of every node
+    if name == "node":  # parses its arguments itself, because tyro would cost every node 0.1 s and 6 MB
         return command(arguments)
     import tyro
 
@@ -122,7 +122,7 @@ def _run(name: str, arguments: list[str]) -> object:
 
 
 def _join_lines(documented: Iterable[Any]) -> None:
-    """Give every argument of a docstring one line, for tyro keeps line breaks, which are those of 120 columns."""
+    """Join each argument's description into one line, because tyro keeps the source's line breaks."""
     for thing in documented:
         doc = getattr(thing, "__doc__", None) or ""
         if callable(thing) and "\n    Args:\n" in doc:
@@ -132,9 +132,9 @@ def _join_lines(documented: Iterable[Any]) -> None:
 
 @contextmanager
 def _wrapped() -> Iterator[None]:
-    """Break the paragraphs of a help between words, where the terminal ends."""
+    """Wrap the paragraphs of a help text at the terminal's width."""
     text = StringIO()
-    text.isatty = sys.stdout.isatty  # type: ignore[method-assign]  (tyro asks, for its colours)
+    text.isatty = sys.stdout.isatty  # type: ignore[method-assign]  (tyro decides by it whether to use colours)
     try:
         with redirect_stdout(text):
             yield
@@ -145,12 +145,12 @@ def _wrapped() -> Iterator[None]:
 
 
 def is_for_user(error: Exception) -> bool:
-    """Whether an error says what to do: the project's own, and those of files. Others are bugs."""
+    """Whether an error is meant for the user: steadypose's own errors and OSErrors. Any other is a bug."""
     return isinstance(error, OSError) or type(error).__module__.startswith("steadypose.")
 
 
 def usage() -> str:
-    """The help of the command itself."""
+    """The help of ``steadypose`` itself."""
     width = max(map(len, COMMANDS))
     lines = [f"  {name:<{width}}  {what}" for name, (_, what) in COMMANDS.items()]
     return "\n".join(

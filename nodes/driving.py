@@ -1,4 +1,4 @@
-"""Both pipelines over what is recorded, as fast as they go: what the offline commands and the library share."""
+"""Runs both pipelines on recorded input as fast as possible; shared by the offline commands and the library."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from steadypose.prior.world.pipeline import TrajectoryPipeline
 
 CHECKED, CHECKED_NS = 45, 1_500_000_000
-"""frames between two looks at whether the input can be right, and the time in which they count as having come"""
+"""Number of frames between checks of the input, and the time that they are assumed to take, nanoseconds."""
 
 NOBODY = "nobody_recognised: no body in any frame; is the skeleton right, are the units metres?"
-"""what is said of an input that came to nothing"""
+"""Problem text of an input without any recognised body."""
 
 Settings = Mapping[str, Mapping[str, Any]]
 
@@ -40,9 +40,9 @@ Settings = Mapping[str, Mapping[str, Any]]
 def stream(
     messages: Iterable[tuple[str, Message]], prior: PriorPipeline, trajectory: TrajectoryPipeline
 ) -> Iterator[tuple[str, Message]]:
-    """All that the nodes publish when the input node publishes ``messages``: these, and the answers to each.
+    """All messages that the nodes would publish for an input of ``messages``: the input, and the outputs after each.
 
-    Both pipelines are new, or have seen the end of their last stream.
+    Both pipelines must be new, or have processed the end of their last stream.
     """
     for topic, message in with_end(messages):
         yield topic, message
@@ -54,11 +54,11 @@ def stream(
 
 
 class Diagnosis:
-    """Problems of a stream that comes without a wall clock: its frames count as having come at 30 Hz.
+    """Checks an offline stream, whose frames are assumed to arrive at 30 Hz.
 
     Attributes:
-        problems: texts by cause, each as it was first found.
-        frames: that came.
+        problems: texts by cause, as first detected.
+        frames: number of frames so far.
     """
 
     def __init__(self, settings: PriorSettings) -> None:
@@ -70,18 +70,18 @@ class Diagnosis:
         self.frames = 0
 
     def see(self, raw: PoseRaw) -> None:
-        """Take the next frame, without looking at it yet."""
+        """Add the next frame without examining it yet."""
         self._check.see(raw, self.frames * CHECKED_NS // CHECKED)
         self._first_ns = raw.stamp_ns if self._first_ns is None else self._first_ns
         self._last_ns = raw.stamp_ns
         self.frames += 1
 
     def look(self) -> list[str]:
-        """Examine the last of them; returns what is newly wrong, a line each."""
+        """Examine the last frames. Returns the new problems, one line each."""
         return self._note(self._check.problems((self.frames - 1) * CHECKED_NS // CHECKED, live=False))
 
     def end(self) -> list[str]:
-        """The stream has ended, and another may begin; returns as `look`, and whether it was long enough."""
+        """End the stream; another may follow. Returns as `look`, including whether the stream was too short."""
         new = self.look()
         if self._first_ns is not None and not self.problems:
             new += self._note(check_length(self._first_ns, self._last_ns, self._delay_frames))
@@ -95,27 +95,27 @@ class Diagnosis:
 
     @property
     def texts(self) -> list[str]:
-        """What is wrong, a line each."""
+        """All problems so far, one line each."""
         return [f"{cause}: {text}" for cause, text in self.problems.items()]
 
 
 class OfflineRun:
-    """A recorded source through both pipelines; iterating gives all messages of `stream`, once.
+    """Runs both pipelines on a recorded source. It can be iterated once, and yields the messages of `stream`.
 
     Args:
         source: the recording.
         settings: ``[prior]`` and ``[trajectory]`` of a launch file.
 
     Attributes:
-        diagnosis: what is wrong with the input.
+        diagnosis: problems of the input.
         poses: number of bodies in the output so far.
 
     Raises:
-        LaunchError: a setting that is not known, or cannot be.
+        LaunchError: a setting is unknown, or its value is invalid.
     """
 
     def __init__(self, source: RecordedSource, settings: Settings) -> None:
-        # these compile loops: not before it is known that there is something to do
+        # imported late, because these imports compile loops
         from steadypose.nodes.graph.prior_node import make_prior
         from steadypose.nodes.graph.threads import one_thread
         from steadypose.nodes.graph.trajectory_node import make_trajectory
@@ -141,17 +141,17 @@ class OfflineRun:
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
-        """(T,) of the input."""
+        """(T,) stamps of the input, nanoseconds."""
         return np.array(self._stamps_ns, np.int64)
 
     @property
     def refused(self) -> Counter[str]:
-        """What was refused or dropped, by cause."""
+        """Number of refused or dropped frames, bodies and joints, by cause."""
         counted = self._source.refused + self._prior.counters + self._trajectory.counters
         return Counter({cause: n for cause, n in counted.items() if n})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Run all of it; the arrays of `NpzCollector`, a row for each frame of the input.
+        """Process the whole source. Returns the arrays of `NpzCollector`, one row per input frame.
 
         Raises:
             LaunchError: no frame could be read.
@@ -163,7 +163,10 @@ class OfflineRun:
 
 
 def clean_joints(joints: Floats, delay: int = 8) -> Floats:
-    """What `steadypose clean` makes of joints (T, 22, 3) metres, z up, at 30 Hz; NaN where it finds nobody."""
+    """Output positions (T, 22, 3) of `steadypose clean` for joints (T, 22, 3) metres, z up, at 30 Hz.
+
+    NaN where no body is recognised.
+    """
     stamps = np.round(np.arange(len(joints)) * FRAME_NS).astype(np.int64)
     source = ArraySource(Path("joints"), {"positions": joints, "stamp_ns": stamps, "skeleton": np.array("smpl22")})
     return OfflineRun(source, {"prior": {"delay": delay}, "trajectory": {}}).arrays()["positions"].astype(float)

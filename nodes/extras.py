@@ -1,4 +1,4 @@
-"""The optional extras: what each is for, and the modules that it brings."""
+"""The optional extras: the purpose of each, and the modules that it installs."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from steadypose.nodes.settings import LaunchError
 
 @dataclass(frozen=True)
 class Extra:
-    """One of ``[project.optional-dependencies]`` that a user of the nodes may want."""
+    """One entry of ``[project.optional-dependencies]``."""
 
     purpose: str
     """what needs it"""
     modules: tuple[str, ...]
-    """which it brings, by the names they are imported by"""
+    """import names of the modules that it installs"""
     size: str = ""
-    """what it downloads, where that is much"""
+    """size of its download, if it is large"""
 
 
 EXTRAS: Mapping[str, Extra] = {
@@ -41,12 +41,14 @@ EXTRAS: Mapping[str, Extra] = {
     "web": Extra("poses in the browser: steadypose run web", ("websockets",)),
     "webcam": Extra("a webcam as the source", ("mediapipe",)),
 }
-"""by the name in ``[project.optional-dependencies]``; a module that several bring stands at one of them"""
+"""Extras by their name in ``[project.optional-dependencies]``. A module that several install is listed at one."""
 
 
 def require_extra(name: str) -> None:
-    """Raises:
-    LaunchError: a module of the extra is not installed.
+    """Check that an extra is installed.
+
+    Raises:
+        LaunchError: a module of the extra is not installed.
     """
     missing = [module for module in EXTRAS[name].modules if find_spec(module) is None]
     if missing:
@@ -54,12 +56,12 @@ def require_extra(name: str) -> None:
 
 
 def extra_of(module: str) -> str | None:
-    """The extra that brings a module; None if none does."""
+    """The extra that installs a module; None if none does."""
     return next((name for name, extra in EXTRAS.items() if module in extra.modules), None)
 
 
 def how_to_install(missing: Sequence[str], extra: str) -> str:
-    """What to say of modules that an extra brings and that are not installed."""
+    """The error text for missing modules of an extra."""
     size = f" ({EXTRAS[extra].size})" if EXTRAS[extra].size else ""
     return (
         f"needs {', '.join(missing)}, which comes with the extra {extra!r}{size} and is not installed: "
@@ -68,9 +70,9 @@ def how_to_install(missing: Sequence[str], extra: str) -> str:
 
 
 def install_command(extra: str = "") -> str:
-    """What to type to install an extra, or steadypose itself anew, where this Python looks for packages.
+    """The command that installs an extra, or reinstalls steadypose, for this Python.
 
-    The name is not on the package index yet, so it is the checkout that is named.
+    It names the checkout, because steadypose is not on the package index yet.
     """
     if (PACKAGE.parents[1] / "pyproject.toml").exists():
         checkout = str(PACKAGE.parents[1])

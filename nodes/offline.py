@@ -1,4 +1,4 @@
-"""A whole source at once, completed or fitted: what the offline commands and the library share, as `driving`."""
+"""Completes or fits a whole source; shared, like `driving`, by the offline commands and the library."""
 
 from __future__ import annotations
 
@@ -33,29 +33,29 @@ if TYPE_CHECKING:
 
 
 class CompletedSource(NamedTuple):
-    """What came of a source."""
+    """The output of `complete_source`."""
 
     raws: list[PoseRaw]
-    """``pose/raw`` as it was, with its end"""
+    """the unchanged ``pose/raw``, with the end of the stream"""
     answers: list[tuple[str, Message]]
     """``pose/clean`` and ``pose/world`` with their topics, in order"""
     completion: Completion
     refused: dict[str, int]
-    """what was refused or dropped, by cause"""
+    """number of refused or dropped messages, by cause"""
 
     def messages(self) -> list[tuple[str, Message]]:
-        """All messages, by their stamps."""
+        """All messages, ordered by stamp."""
         every = [*((POSE_RAW, message) for message in self.raws), *self.answers]
         return sorted(every, key=lambda pair: pair[1].stamp_ns)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of ``clean``, with a row for each frame of the grid on which there is a body."""
+        """The arrays of ``clean``, one row for each frame of the grid that has a body."""
         stamps_ns = np.array([message.stamp_ns for message in self.completion.clean[:-1]], np.int64)
         return NpzCollector(self.answers).arrays(stamps_ns)
 
 
 def load_completer(weights: str) -> tuple[PartsCompleter, Uncertainty]:
-    """The completer of a weight set, and the standard deviations of its output."""
+    """Load the completer of a weight set, and its output's uncertainty."""
     completer = LiveCompleter.load(weights)
     return PartsCompleter(completer), Uncertainty(completer.config.never_sigma, completer.config.half_frames)
 
@@ -68,11 +68,11 @@ def complete_source(
     began: Callable[[int], None] = lambda frames: None,
     advanced: Callable[[int], None] = lambda frame: None,
 ) -> CompletedSource:
-    """Complete what a source has; ``name`` is what errors call it, the rest as of `complete_raws`.
+    """Complete a source. ``name`` is its name in errors; the other arguments are those of `complete_raws`.
 
     Raises:
-        LaunchError: it has no frame.
-        CompletionError: as `complete_raws`.
+        LaunchError: no frame could be read.
+        CompletionError: as in `complete_raws`.
     """
     raws = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
     if not raws:
@@ -89,24 +89,24 @@ def complete_source(
 
 
 class Fitted(NamedTuple):
-    """What came of a source."""
+    """The output of `fit_source`."""
 
     messages: list[tuple[str, Message]]
-    """of all topics, with poses replaced by the fitted ones"""
+    """messages of all topics, with the fitted poses"""
     stamps_ns: NDArray[np.int64]
-    """(T,) of its frames"""
+    """(T,) stamps of the source's frames, nanoseconds"""
     fits: list[Fit]
-    """of each body, for as long as it was seen"""
+    """the fit of each body over the time that it was observed"""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of ``clean``, a row for each frame; of one body that was fitted, with its bones and the ground."""
+        """The arrays of ``clean``, one row per frame. If exactly one body was fitted, also its bones and the ground."""
         arrays = NpzCollector(self.messages).arrays(self.stamps_ns)
         tracks = {fit.seen.id: fit.track for fit in self.fits if fit.track is not None}
         return with_bones(arrays, next(iter(tracks.values()))) if len(tracks) == 1 else arrays
 
 
 def load_transitions(weights: str) -> HumorNet:
-    """The model of transitions of a weight set."""
+    """Load HuMoR's transition model of a weight set."""
     from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
     from steadypose.prior.fit.tensors import load_network
 
@@ -124,18 +124,21 @@ def fit_source(
     began: Callable[[Sequence[Seen]], None] = lambda bodies: None,
     advanced: Callable[[], None] = lambda: None,
 ) -> Fitted:
-    """Fit 3D joints, initialised by the nodes' own pipelines.
+    """Fit a motion to 3D joints, initialised by the nodes' own pipelines.
 
     Args:
         frames: the source.
-        name: what errors call it.
-        points: (T, N, 3) metres of the body's surface, in the sensor's frame, NaN where there are fewer.
-        delay: of the initialisation, frames at 30 Hz.
-        model, folder, began, advanced: as of `prior.fit.bodies.fit_stream`.
+        name: its name in errors.
+        points: (T, N, 3) metres, points on the body's surface in the sensor's frame; padded with NaN.
+        model: as in `prior.fit.bodies.fit_stream`.
+        delay: delay of the initial estimate, frames at 30 Hz.
+        folder: as in `prior.fit.bodies.fit_stream`.
+        began: as in `prior.fit.bodies.fit_stream`.
+        advanced: as in `prior.fit.bodies.fit_stream`.
 
     Raises:
-        LaunchError: nobody is seen for long enough.
-        NpzError: points of the wrong form.
+        LaunchError: nobody is observed for long enough.
+        NpzError: the points have the wrong form.
     """
     from steadypose.nodes.graph.prior_node import make_prior
     from steadypose.nodes.graph.trajectory_node import make_trajectory
@@ -155,7 +158,7 @@ def fit_source(
 
 
 def with_bones(arrays: dict[str, NDArray[Any]], track: FittedTrack) -> dict[str, NDArray[Any]]:
-    """With bones and ground, where there is one person; of several, .misfit.npz has them for each."""
+    """The arrays with one person's bone lengths and ground plane. For several people, .misfit.npz has them."""
     from steadypose.prior.fit.bodies import ground_plane
 
     bones = np.linalg.norm(track.offsets.mean(axis=0), axis=-1)
@@ -163,7 +166,7 @@ def with_bones(arrays: dict[str, NDArray[Any]], track: FittedTrack) -> dict[str,
 
 
 def _surface(name: str, points: NDArray[Any], frames: int) -> Floats:
-    """(T, N, 3) metres, points that a camera can see."""
+    """(T, N, 3) metres, without points at an impossible distance from the camera."""
     if points.dtype.kind not in "fiu" or points.ndim != 3 or len(points) != frames or points.shape[-1] != 3:
         raise NpzError(
             f"{name}: points: expected ({frames}, N, 3) metres, NaN for what is missing, got {points.dtype} "

@@ -1,4 +1,4 @@
-"""What the settings of all rooms share: their error, paths, addresses and plugins."""
+"""Shared by the settings of all packages: their error, and checks of paths, addresses and plugins."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _PATH = "path"
 
 
 class LaunchError(ValueError):
-    """A launch file, or a setting given on the command line, cannot be used. The text says what to do."""
+    """A launch file or a command line's setting that cannot be used. The text says what to do."""
 
 
 def path_setting(metadata: Mapping[str, Any] = MappingProxyType({})) -> Any:
-    """A field of a settings dataclass that is a path: a relative one in a launch file starts at that file."""
+    """A field for a path. A relative path in a launch file is relative to that file."""
     return field(default="", metadata={_PATH: True, **metadata})
 
 
@@ -25,9 +25,9 @@ def resolve_paths(settings: type, table: dict[str, Any], folder: Path) -> None:
     """Make the paths in a launch file's table absolute, in place.
 
     Args:
-        settings: the dataclass of the table; nested ones are those of its sections.
-        table: as TOML gives it.
-        folder: where relative paths start.
+        settings: the table's dataclass; nested dataclasses are its sections.
+        table: the parsed TOML table.
+        folder: the folder that paths are relative to.
     """
     for setting in fields(settings):
         value = table.get(setting.name)
@@ -38,8 +38,10 @@ def resolve_paths(settings: type, table: dict[str, Any], folder: Path) -> None:
 
 
 def check_addresses(setting: str, addresses: list[str]) -> None:
-    """Raises:
-    LaunchError: one of ``addresses`` is no text; the setting is named in it.
+    """Check that all addresses are strings.
+
+    Raises:
+        LaunchError: an address is not a string. The text names the setting.
     """
     for address in addresses:
         if not isinstance(address, str):
@@ -47,8 +49,10 @@ def check_addresses(setting: str, addresses: list[str]) -> None:
 
 
 def check_host_and_port(section: str, host: str, port: int, *, least: int = 1) -> None:
-    """Raises:
-    LaunchError: there is no host, or no such port; 0, where it is allowed, is any that is free.
+    """Check a host and a port. With ``least`` 0, port 0 is allowed and means any free port.
+
+    Raises:
+        LaunchError: the host is empty, or the port is out of range.
     """
     if not host:
         raise LaunchError(f"[{section}] host: expected an address, such as 127.0.0.1, got none")
@@ -57,10 +61,10 @@ def check_host_and_port(section: str, host: str, port: int, *, least: int = 1) -
 
 
 def load_plugin(setting: str, reference: Any) -> Any:
-    """What a launch file names as ``module:name`` of an installed package.
+    """Import the object that a launch file names as ``module:name``.
 
     Raises:
-        LaunchError: it is no such name, or cannot be imported.
+        LaunchError: the reference is malformed, or cannot be imported.
     """
     module, separator, name = reference.partition(":") if isinstance(reference, str) else ("", "", "")
     if not (module and separator and name):

@@ -1,1 +1,1 @@
-"""What is wrong with a stream, in words: causes that a user can act on, while the stream runs."""
+"""Checks of a running stream. Each problem states a cause that the user can act on."""

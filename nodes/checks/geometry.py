@@ -1,4 +1,4 @@
-"""Joints: that they make a body, in metres, upright, not mirrored, and that it moves."""
+"""Checks of joint positions: a human body, in metres, upright, not mirrored, moving at plausible speed."""
 
 from __future__ import annotations
 
@@ -16,29 +16,31 @@ from steadypose.prior.body.likeness import Likeness, Stance, likeness, likenesse
 from steadypose.prior.body.skeleton import J
 
 ENOUGH = 15
-"""messages to judge by"""
+"""Smallest number of messages to judge by."""
 SIZES = (0.5, 1.4)
-"""of bodies, from a child of three to the tallest, times an adult's lengths"""
+"""Range of body sizes relative to an adult, from a child of three to the tallest adult."""
 UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281, "kilometres": 0.001}
 ADULT_M = 1.72
 UPRIGHT, ALONG = 0.5, 0.85
-"""cosines: of the angle to the vertical below which a body may be bending; to an axis above which it stands along it"""
+"""Cosines of the body's up direction: with the vertical, above which it counts as upright; with an axis of its frame,
+above which it stands along that axis."""
 MIRRORED = -0.2
-"""handedness: trackers of the field stay above 0.2"""
+"""Handedness below which a body counts as mirrored. Correct trackers stay above 0.2."""
 FASTEST = 8.0
-"""times its height that a body moves in a second: twice a sprinter"""
+"""Largest speed of a body, body heights per second; twice a sprinter's."""
 RUNNER_M_S, LIMB_M_S = 7.0, 8.0
-"""Speeds in m/s that no body keeps up for a second, nor any limb beside the trunk: of actors, dancers and sprinters of
-motion capture the greatest medians over 1.5 s are 3.7 and 4.8."""
+"""Largest sustained speeds of a body, and of a limb relative to the trunk, m/s. In motion capture of actors, dancers
+and sprinters, the largest medians over 1.5 s are 3.7 and 4.8 m/s."""
 SPEED_BASE_NS = 50_000_000
-"""Interval in nanoseconds over which such a speed is measured: a jitter of 2 cm is then 0.6 m/s."""
+"""Interval over which speed is measured, nanoseconds. A jitter of 2 cm then amounts to 0.6 m/s."""
 AT_ORIGIN_M = 1e-3
+"""Largest distance from the origin at which a pelvis counts as being there, metres."""
 FLOOR_M = (-0.4, 0.7)
-"""height of the lowest joint of a leg: a pit, or a stage, is more"""
+"""Range of the lowest leg joint's height above the floor, metres. A pit or a stage exceeds it."""
 
 
 def check_geometry(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
-    """Problems with where the joints of a window are."""
+    """Problems with the joint positions in a window of messages."""
     messages = [raw for raw in messages if raw.skeleton == messages[-1].skeleton]
     if len(messages) < ENOUGH or messages[-1].skeleton not in SKELETONS:
         return
@@ -71,7 +73,7 @@ def check_geometry(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
 
 
 def check_jumps(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
-    """Bodies of which the whole goes from place to place; of stamps that are nanoseconds."""
+    """The problem of whole bodies that jump. The stamps must be valid nanoseconds."""
     skeleton = SKELETONS.get(messages[-1].skeleton)
     if skeleton is None:
         return
@@ -101,7 +103,7 @@ def check_jumps(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
 
 
 def check_speed(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
-    """A body in metres that moves faster than people do: a wrong rate, or wrong stamps."""
+    """The problem of a body that moves faster than people do, caused by a wrong rate or wrong stamps. In metres."""
     skeleton = SKELETONS.get(messages[-1].skeleton)
     if skeleton is None:
         return
@@ -196,7 +198,7 @@ def _unit(like: Likeness) -> Problem:
 
 
 def _frame(pose: Pose, stand: Stance) -> Iterator[Problem]:
-    """Which axis points up, and whether one has the wrong sign."""
+    """Problems with the direction of up, and with mirrored or exchanged axes."""
     up = SensorFrame.of(pose).rotation @ stand.up
     mirrored = stand.handed < MIRRORED
     if up[2] >= UPRIGHT:
@@ -247,7 +249,7 @@ def _frame(pose: Pose, stand: Stance) -> Iterator[Problem]:
 
 
 def _place(raw: PoseRaw, skeleton: Skeleton, joints: Floats) -> Iterator[Problem]:
-    """Where bodies are: at the origin, on the floor."""
+    """Problems with bodies that stay at the origin, or whose feet are far from the floor."""
     canonical, _ = to_canonical(skeleton, joints)
     pelvis = canonical[:, J["pelvis"]]
     if np.isfinite(pelvis).any() and np.nanmax(np.abs(pelvis)) < AT_ORIGIN_M:

@@ -1,4 +1,4 @@
-"""Names, numbers of joints, confidences and ids; and what was probably meant by arrays of the wrong form."""
+"""Checks of layouts, joint counts, confidences and ids; and hints for arrays of the wrong shape."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from steadypose.prior.settings import nearest
 
 UNIT_TOLERANCE = 0.01
 ENOUGH = 5
-"""messages to judge by"""
+"""Smallest number of messages to judge by."""
 
 
 def check_layout(messages: Sequence[PoseRaw], max_bodies: int, *, identified: bool) -> Iterator[Problem]:
-    """Problems with what the messages of a window say that they are.
+    """Problems with the layout, sensor pose, confidences and ids in a window of messages.
 
     Args:
         messages: the window.
-        max_bodies: that the prior follows at once.
-        identified: whether the prior finds ids itself, whatever the source's are.
+        max_bodies: largest number of bodies that the prior tracks at once.
+        identified: whether the prior assigns ids itself and ignores the source's.
     """
     if len(messages) < ENOUGH:
         return
@@ -125,7 +125,7 @@ def _confidence(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
 
 
 def _seen(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
-    from steadypose.prior.clean.slots import MIN_JOINTS  # 95 MB of numba: not for nodes that only read arrays
+    from steadypose.prior.clean.slots import MIN_JOINTS  # imported late: loads 95 MB of numba
 
     seen = [int(np.isfinite(body.positions).all(axis=1).sum()) for body in bodies(messages)]
     if seen and 0 < (usual := int(np.median(seen))) < MIN_JOINTS:
@@ -165,7 +165,7 @@ def _ids(messages: Sequence[PoseRaw], max_bodies: int, identified: bool) -> Iter
 
 
 def count_hint(shape: Sequence[int]) -> str:
-    """For positions of a shape whose skeleton is not named."""
+    """A hint for positions without a skeleton's name."""
     if len(shape) not in (3, 4) or shape[-1] != 3:
         return ""
     names = _with_joints(shape[-2])
@@ -173,7 +173,7 @@ def count_hint(shape: Sequence[int]) -> str:
 
 
 def skeleton_hint(name: str, shape: Sequence[int]) -> str:
-    """For a name that is no skeleton's."""
+    """A hint for an unknown skeleton name."""
     plain = name.lower().replace("_", "").replace("-", "").replace(" ", "")
     return (
         nearest(plain, SKELETONS)
@@ -183,7 +183,7 @@ def skeleton_hint(name: str, shape: Sequence[int]) -> str:
 
 
 def axes_hint(shape: Sequence[int], skeleton: str) -> str:
-    """For positions whose shape is not that of the skeleton."""
+    """A hint for positions whose shape does not fit the skeleton."""
     joints = len(SKELETONS[skeleton].joints)
     if len(shape) == 2 and shape == (joints, 3):
         return "; of a single frame: positions[None], or steadypose.Filter for frame by frame"
@@ -207,7 +207,7 @@ def axes_hint(shape: Sequence[int], skeleton: str) -> str:
 
 
 def stamps_hint(stamps: NDArray[Any], frames: int) -> str:
-    """For stamps that are not whole nanoseconds, one a frame."""
+    """A hint for stamps that are not integer nanoseconds, one per frame."""
     if stamps.ndim != 1 or stamps.dtype.kind not in "fiu":
         return ""
     if len(stamps) != frames:
@@ -222,7 +222,7 @@ def stamps_hint(stamps: NDArray[Any], frames: int) -> str:
 
 
 def frames_hint(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """For arrays without any time."""
+    """A hint for arrays without stamps or frame rate."""
     return ": of a regular stream give fps, 30 for instance" if "positions" in arrays else ""
 
 

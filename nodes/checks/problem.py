@@ -1,5 +1,5 @@
-"""What all checks share: a problem, as `diagnostics`, the console and `steadypose doctor --live` report it, and the
-last second of a stream, which they examine.
+"""Shared by all checks: `Problem`, as reported by `diagnostics`, the console and `steadypose doctor --live`, and
+`Window`, the last messages of a stream.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from steadypose.msgs.types import Level, PoseRaw, RawBody
 
 PREFIX = "problem."
-"""of the keys in `diagnostics` whose values are problems"""
+"""Prefix of the keys in `diagnostics` whose values are problems."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem.
+    """A problem with a stream.
 
     Attributes:
         level: ERROR if no useful output is possible, WARN if the output is worse than it could be.
-        cause: in a word; docs/troubleshooting.md has one entry for each.
+        cause: one word; docs/troubleshooting.md has an entry for each.
         text: what was received, what was expected, and what to do.
     """
 
@@ -41,7 +41,7 @@ def warning(cause: str, text: str) -> Problem:
 
 
 def as_values(problems: Iterable[Problem]) -> dict[str, str]:
-    """As `diagnostics` carry them."""
+    """The entries of `diagnostics` for problems."""
     return {f"{PREFIX}{problem.cause}": problem.text for problem in problems}
 
 
@@ -51,30 +51,31 @@ def from_values(values: Mapping[str, str]) -> dict[str, str]:
 
 
 LENGTH_NS = 1_500_000_000
+"""Length of the window, nanoseconds."""
 LONGEST = 90
-"""messages"""
+"""Largest number of messages in the window."""
 JUDGED = 4
-"""bodies of a message whose joints are looked at"""
+"""Largest number of bodies per message whose joints are examined."""
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """A message, and when it came."""
+    """A message and its time of arrival."""
 
     at_ns: int
-    """wall time"""
+    """wall time, nanoseconds since 1970"""
     raw: PoseRaw
 
 
 class Window:
-    """The messages of the last second, with their times of arrival."""
+    """The messages of the last `LENGTH_NS`, with their times of arrival."""
 
     def __init__(self) -> None:
         self._arrivals: deque[Arrival] = deque(maxlen=LONGEST)
         self.received = 0
-        """messages, ever"""
+        """number of messages received so far"""
         self.inhabited = 0
-        """messages with a body in them, ever"""
+        """number of messages with at least one body so far"""
 
     def add(self, raw: PoseRaw, at_ns: int) -> None:
         self.received += 1
@@ -82,7 +83,7 @@ class Window:
         self._arrivals.append(Arrival(at_ns, raw))
 
     def arrivals(self, now_ns: int) -> list[Arrival]:
-        """Those of the window that ends now, oldest first."""
+        """The arrivals in the window that ends at ``now_ns``, oldest first."""
         return [arrival for arrival in self._arrivals if now_ns - arrival.at_ns <= LENGTH_NS]
 
     @property
@@ -97,12 +98,12 @@ def bodies(messages: Sequence[PoseRaw]) -> Iterator[RawBody]:
 
 
 def some_bodies(messages: Sequence[PoseRaw]) -> list[PoseRaw]:
-    """The messages with at most `JUDGED` bodies each: to look at the joints of a whole crowd would hold up frames."""
+    """The messages with at most `JUDGED` bodies each, because examining a whole crowd would delay frames."""
     return [replace(raw, bodies=raw.bodies[:JUDGED]) for raw in messages]
 
 
 def tracks(messages: Sequence[PoseRaw], joints: int) -> NDArray[np.float64]:
-    """(N, J, 3) the joints of all bodies that have as many as the layout; NaN where not finite."""
+    """(N, J, 3) joints of all bodies that have ``joints`` of them; NaN where not finite."""
     found = [body.positions for body in bodies(messages) if len(body.positions) == joints]
     stacked = np.array(found, np.float64).reshape(-1, joints, 3)
     return np.where(np.isfinite(stacked).all(axis=-1, keepdims=True), stacked, np.nan)

@@ -1,4 +1,4 @@
-"""Stamps: that they are nanoseconds of capture, rise, and are of now."""
+"""Checks of stamps: nanoseconds, of capture, increasing, and close to the present."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from steadypose.prior.timing.rate import FPS
 
 SECOND_NS = 1_000_000_000
 ENOUGH = 10
-"""messages to judge by"""
+"""Smallest number of messages to judge by."""
 RATES_HZ = (4.0, 300.0)
-"""usual frame rates of trackers"""
+"""Range of trackers' frame rates, Hz."""
 SLOW_HZ = 9.0
-"""below that, half of what moves is gone between two frames"""
+"""Frame rate below which half of the motion is lost between two frames, Hz."""
 UNITS = {"seconds": 1e9, "milliseconds": 1e6, "microseconds": 1e3, "ticks of 100 ns": 100.0}
 AHEAD_NS = 300_000_000
-"""that a stamp may be ahead of this machine's clock: two clocks that are set by hand, no more"""
+"""Largest tolerated lead of stamps over this machine's clock, nanoseconds. Two clocks set by hand stay below it."""
 STEP_NS = 500_000_000
-"""between stamps and clock, from one message to the next, that a source's clock was set"""
+"""Change of the offset between stamps and clock, from one message to the next, that shows that a clock was set,
+nanoseconds."""
 SECONDS_BELOW = 10**11
-"""a stamp that counts seconds since 1970, until the year 5138"""
+"""Upper bound of stamps that may be seconds since 1970, seconds; valid until the year 5138."""
 SETTLED = 8
-"""messages before and after such a step"""
+"""Smallest number of messages before and after such a step."""
 
 
 def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem]:
@@ -32,7 +33,7 @@ def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem
 
     Args:
         arrivals: the window.
-        live: whether stamps should be of now: not those of a replay.
+        live: whether stamps should be close to the present; False for a replay.
     """
     if len(arrivals) < ENOUGH:
         return
@@ -93,7 +94,7 @@ def _unit(stamps: np.ndarray) -> Problem | None:
         )
     step = float(np.median(rising[rising > 0])) if (rising > 0).any() else 0.0
     if not step and (rising < 0).any():
-        return None  # they fall
+        return None  # they decrease
     if not (stamps % SECOND_NS).any() and (step == 0 or step >= SECOND_NS):
         return error(
             "stamps_whole_seconds",
@@ -110,14 +111,14 @@ def _unit(stamps: np.ndarray) -> Problem | None:
         )
     if SECOND_NS / step > RATES_HZ[1]:
         for unit, factor in UNITS.items():
-            # whole seconds count up by one now and then; what is finer by every frame
+            # whole seconds increase by one only now and then; finer units increase with every frame
             if RATES_HZ[0] <= SECOND_NS / (step * factor) <= RATES_HZ[1] or (unit == "seconds" and step <= 1):
                 return _of_unit(unit, f"stamps are {step:g} ns apart, {SECOND_NS / step:.3g} frames a second", factor)
     return None
 
 
 def _stretched(rate: float) -> tuple[str, float] | None:
-    """The unit that was taken for seconds, of stamps so many times too far apart."""
+    """The unit that was mistaken for seconds, and the factor between them, from the apparent frame rate in Hz."""
     for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6)):
         if RATES_HZ[0] <= rate * factor <= RATES_HZ[1]:
             return unit, factor
@@ -133,7 +134,7 @@ def _of_unit(unit: str, found: str, factor: float) -> Problem:
 
 
 def _against_clock(arrivals: Sequence[Arrival], stamps: np.ndarray) -> Iterator[Problem]:
-    """Stamps against this machine's clock."""
+    """Problems with the offset between stamps and this machine's clock."""
     late = np.array([arrival.at_ns for arrival in arrivals]) - stamps
     if -late.max() > AHEAD_NS:
         yield warning(
@@ -141,7 +142,7 @@ def _against_clock(arrivals: Sequence[Arrival], stamps: np.ndarray) -> Iterator[
             f"stamps are {-late.max() / SECOND_NS:.1f} s ahead of this machine's clock: expected times of capture, "
             "which are past; synchronise the two clocks (NTP or PTP)",
         )
-    # what was held up on its way comes late and then catches up; a clock that was set stays where it is
+    # delayed messages arrive late and then catch up; after a clock was set, the offset stays
     step = int(np.argmax(np.abs(np.diff(late)))) + 1
     before, after = late[:step], late[step:]
     if min(len(before), len(after)) >= SETTLED and abs(moved := int(after.min() - before.min())) > STEP_NS:

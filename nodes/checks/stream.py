@@ -1,4 +1,4 @@
-"""All checks of one stream of ``pose/raw``, and of what the prior makes of it."""
+"""All checks of a stream of ``pose/raw``, and of the prior's output for it."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from steadypose.nodes.checks.problem import Problem, Window, error, some_bodies,
 from steadypose.nodes.checks.stamps import check_stamps
 
 ENOUGH = 20
-"""bodies between two checks, at least, for a judgement"""
+"""Smallest number of bodies between two checks to judge by."""
 MAX_SHARE = 0.7
-"""of the joints refused, or of the poses flagged"""
+"""Largest normal share of refused joints, or of flagged poses, ratio."""
 CHECKS = 3
-"""checks in a row with nearly all bodies flagged: a shorter fault is what the flag itself reports"""
+"""Number of successive checks with nearly all poses flagged that make a problem. The flag reports shorter faults."""
 
 
 class Answers:
     """Counts the pipeline's input and output between two checks.
 
     Args:
-        counters: of the pipeline.
+        counters: the pipeline's counters.
     """
 
     def __init__(self, counters: Counter[str]) -> None:
@@ -78,11 +78,11 @@ class Answers:
 
 
 SILENT_NS = 2_000_000_000
-"""without a message, after which a stream has stopped"""
+"""Time without a message after which a stream counts as stopped, nanoseconds."""
 AT_ONCE = 4
-"""streams examined by one call, each in its turn: a server's frames wait meanwhile"""
+"""Largest number of streams examined in one call, in turn, because a server's frames wait meanwhile."""
 NOBODY = 60
-"""messages without ever a body"""
+"""Number of messages without any body that make a problem."""
 
 
 class StreamCheck:
@@ -100,25 +100,25 @@ class StreamCheck:
         self._ended = False
         self._found: list[Problem] = []
         self.examined_ns = -1
-        """when its messages were last examined; -1: never"""
+        """wall time of the last examination, nanoseconds; -1: never"""
 
     def see(self, raw: PoseRaw, at_ns: int) -> None:
-        """A message came, at this wall time."""
+        """Record a message that arrived at wall time ``at_ns``."""
         self._ended = raw.end_of_stream
         if not raw.end_of_stream:
             self._window.add(raw, at_ns)
 
     def heard(self, at_ns: int) -> None:
-        """A message came, and was dropped unread for want of time."""
+        """Record that a message arrived and was dropped unread because the node was late."""
         self._heard_ns = at_ns
 
     def problems(self, now_ns: int, *, live: bool, anew: bool = True) -> list[Problem]:
-        """What is wrong with the stream now.
+        """The stream's current problems.
 
         Args:
-            now_ns: wall time.
-            live: whether it should be of now and go on: not a replay.
-            anew: examine its messages; else what they were found to have when last examined.
+            now_ns: wall time, nanoseconds.
+            live: whether the stream should continue in real time; False for a replay.
+            anew: whether to examine the messages; otherwise the last result is returned.
         """
         last = self._window.last
         if last is None or self._ended:
@@ -131,7 +131,7 @@ class StreamCheck:
             return [error("stopped", text)]
         if anew:
             self.examined_ns = now_ns
-            with warnings.catch_warnings():  # of joints that are NaN throughout numpy warns; they are looked for
+            with warnings.catch_warnings():  # numpy warns of joints that are always NaN, which the checks expect
                 warnings.simplefilter("ignore", RuntimeWarning)
                 with np.errstate(all="ignore"):
                     self._found = list(self._problems(now_ns, live))
@@ -151,7 +151,7 @@ class StreamCheck:
                 f"{self._window.received} messages and nobody in any: expected bodies; if somebody stands there, the "
                 "tracker does not find them, or the publisher leaves `bodies` empty",
             )
-        if not _usable(names):  # else joints are not what they are called
+        if not _usable(names):  # with a wrong layout, checks of joints mean nothing
             return
         few = some_bodies(messages)
         shape = list(check_geometry(few))
@@ -168,10 +168,11 @@ def _usable(problems: list[Problem]) -> bool:
 
 
 class StreamChecks:
-    """The checks of all streams that a prior takes: one, or one of each client, by its source.
+    """The checks of all streams of a prior: a single one, or one per client, identified by its source.
 
     Args:
-        max_bodies, identified: as of `StreamCheck`.
+        max_bodies: as in `StreamCheck`.
+        identified: as in `StreamCheck`.
         streams: number of sources.
     """
 
@@ -182,11 +183,11 @@ class StreamChecks:
 
     @property
     def seen(self) -> bool:
-        """Whether any message came, ever."""
+        """Whether any message has arrived so far."""
         return bool(self._checks)
 
     def see(self, raw: PoseRaw, at_ns: int) -> None:
-        """A message came, at this wall time."""
+        """Record a message that arrived at wall time ``at_ns``."""
         source = raw.source if self._streams > 1 else ""
         check = self._checks.pop(source, None) or self._new()
         self._checks[source] = check
@@ -195,12 +196,12 @@ class StreamChecks:
         check.see(raw, at_ns)
 
     def heard(self, source: str, at_ns: int) -> None:
-        """A message of a source came, and was dropped unread."""
+        """Record that a message of a source arrived and was dropped unread."""
         if check := self._checks.get(source if self._streams > 1 else ""):
             check.heard(at_ns)
 
     def problems(self, now_ns: int, *, live: bool) -> list[Problem]:
-        """As of `StreamCheck.problems`; of several streams each with its source's name."""
+        """The problems of all streams, worst first; with several streams each names its source."""
         turn = sorted(self._checks, key=lambda source: self._checks[source].examined_ns)[:AT_ONCE]
         found = [
             replace(problem, cause=f"{source}.{problem.cause}", text=f"{source}: {problem.text}") if source else problem
