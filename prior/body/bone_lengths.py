@@ -1,4 +1,4 @@
-"""A person's bones from their poses: robust medians of a recording or, live, with human proportions as a prior."""
+"""A person's bone lengths: robust medians over a recording or, live, estimates with human proportions as the prior."""
 
 from __future__ import annotations
 
@@ -23,21 +23,20 @@ from steadypose.prior.body.skeleton import (
 )
 
 STATURE_SPREAD = 0.1
-"""Standard deviation of the log of a person's size against the generic adult's."""
+"""Standard deviation of the logarithm of a person's size relative to the generic adult's."""
 
 LIMB_SPREAD, TRUNK_SPREAD = 0.05, 0.12
-"""Standard deviations of the log of a bone's length about the person's size: 2 to 7 % for the arms and legs of 22
-people measured by motion capture; more in trunk, head and feet, where sensors mean different places by one name."""
+"""Standard deviations of the logarithm of a bone's length relative to the person's size. Motion capture of 22 people
+gives 0.02 to 0.07 for arms and legs. Trunk, head and feet vary more, because sensors define them differently."""
 
 TRUNK_PLACE_SPREAD = 0.05
-"""Metres along each axis: deviation between sensors in the places of hips, neck and shoulders on the trunk."""
+"""Standard deviation between sensors, along an axis, of hips, neck and shoulders on the trunk, metres."""
 
 LENGTH_BIASES = 3.0
-"""Least error of a single sample of a bone, as a multiple of the sensor's bias; most of it is shared by
-successive samples."""
+"""Least error of a single sample of a bone, as a multiple of the sensor's bias. Successive samples share most of it."""
 
 LIKE_SAMPLES = 12
-"""Correlation time of the samples' errors, in samples (two seconds): so many count as one independent sample."""
+"""Correlation time of the samples' errors, samples (two seconds): that many count as one independent sample."""
 
 _COLLAR_TO_SHOULDER = SHOULDERS[0] - COLLARS[0]
 
@@ -47,7 +46,7 @@ class BoneEstimate(NamedTuple):
 
     Attributes:
         offsets: (22, 3) metres, each joint in its parent's frame.
-        length_variance: (22,) metres^2, of each bone's length, as far as more samples will take it away.
+        length_variance: (22,) metres^2, the part of each bone length's variance that more samples will remove.
     """
 
     offsets: Floats
@@ -55,19 +54,20 @@ class BoneEstimate(NamedTuple):
 
 
 def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float, samples: int) -> BoneEstimate:
-    """This person's bones, the same on both sides, from a few poses in a row.
+    """Estimate a person's bones, equal on both sides, from a few consecutive poses.
 
-    Lengths are the posterior mean of a log-normal model: a person's size varies about the generic adult's, each bone
-    about the person's size, and the median length over the samples of both sides about the bone, the less the more
-    samples there are. A body first seen from the side, with the far limbs guessed, so starts with human proportions.
-    A joint never seen is placed by scaling the rest pose between its neighbours seen. Bones that leave pelvis and
-    chest rigidly (hips, neck, collars) go the way of the median vector in the trunk's frame, weighed likewise.
+    Lengths are posterior means of a log-normal model with three levels. A person's size varies about the generic
+    adult's, each bone varies about the person's size, and the median length over the samples of both sides varies about
+    the bone, less with more samples. A body first observed from the side, with guessed far limbs, therefore starts with
+    human proportions. A joint that was never observed is placed by scaling the rest pose between its observed
+    neighbours. Bones fixed to pelvis and chest (hips, neck, collars) take the median vector in the trunk's frame, with
+    the same weights.
 
     Args:
-        positions: (T, 22, 3) metres, NaN where unobserved; samples of about 6 Hz.
+        positions: (T, 22, 3) metres, NaN where unobserved; samples at about 6 Hz.
         bias_sigma: metres along an axis, the sensor's bias.
-        noise_sigma: metres along an axis, the positions' other error.
-        samples: how many there will be in the end.
+        noise_sigma: metres along an axis, the remaining error of the positions.
+        samples: final number of samples.
     """
     counts = np.array([len(positions), max(samples, len(positions))])
     same = 1.0 + counts / LIKE_SAMPLES
@@ -85,7 +85,7 @@ def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float, sam
             median = _median(lengths)
             deviation = 1.4826 * _median(np.abs(lengths - median))
             log_ratio[k] = np.log(max(median, 0.1 * generic) / generic)
-            # what noise does not explain of the deviation is as slow as the bias
+            # the part of the deviation that noise does not explain varies as slowly as the bias
             slow = max(deviation**2 - noise**2, bias**2)
             sigma[:, k] = np.sqrt(slow / same + noise**2 / len(lengths) * counts[0] / counts) / generic
     spread = np.array([LIMB_SPREAD if paths[0][0] in LIMB_ENDS else TRUNK_SPREAD for paths in bones])
@@ -110,8 +110,10 @@ _ON_TRUNK = sorted({int(end) for _, joints in _TRUNKS for joint in joints for en
 
 
 def _bones(seen: NDArray[np.bool_]) -> list[list[int]]:
-    """What can be measured of the joints (22,) that are ever ``seen``: for each, the path of joints from it up to, not
-    with, its nearest ancestor seen."""
+    """Return the measurable bones, given the joints (22,) that were ever ``seen``.
+
+    Each bone is the path of joints from an observed joint up to, but without, its nearest observed ancestor.
+    """
     measurable = []
     for joint in range(1, len(PARENTS)):
         path = [joint]
@@ -123,7 +125,7 @@ def _bones(seen: NDArray[np.bool_]) -> list[list[int]]:
 
 
 def _both_sides(paths: list[list[int]]) -> list[list[list[int]]]:
-    """The same bones, left and right together."""
+    """Group the bones by left and right counterparts."""
     pairs: dict[tuple[int, ...], list[list[int]]] = {}
     for path in paths:
         pairs.setdefault(min(tuple(path), tuple(MIRROR[path].tolist())), []).append(path)
@@ -131,13 +133,13 @@ def _both_sides(paths: list[list[int]]) -> list[list[list[int]]]:
 
 
 def _median(values: Floats) -> Floats:
-    """Along the first axis, in a tenth of the time that numpy's takes for as few."""
+    """Median along the first axis; for few values ten times faster than numpy's."""
     ordered = np.sort(values, axis=0)
     return 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def _place_on_trunk(positions: Floats, seen: NDArray[np.bool_], offsets: Floats, weight: float) -> Floats:
-    """Offsets (22, 3) with hips, neck and collars moved by ``weight`` to where the samples (T, 22, 3) have them."""
+    """Return offsets (22, 3) with hips, neck and collars moved by ``weight`` towards the samples (T, 22, 3)."""
     placed = offsets.copy()
     world = global_rotations(solve_rotations(positions, offsets))
     for trunk, children in _TRUNKS:
@@ -158,12 +160,12 @@ def _place_on_trunk(positions: Floats, seen: NDArray[np.bool_], offsets: Floats,
 
 
 def estimate_offsets(positions: NDArray[np.floating]) -> Floats:
-    """This person's bones from a set of poses, robustly.
+    """Estimate a person's bones robustly from a set of poses.
 
-    Bone lengths are medians over the frames. The directions of the rest pose are kept, but for the bones that
-    leave the pelvis and the chest rigidly (hips, neck, collars), whose directions differ from sensor to sensor:
-    there the median vector in the trunk's frame is taken. A joint that is never seen is placed by scaling the
-    rest pose between its neighbours seen.
+    Bone lengths are medians over the frames. Bones keep their directions from the rest pose. The exceptions are bones
+    fixed to pelvis and chest (hips, neck, collars), whose directions differ between sensors. They take the median
+    vector in the trunk's frame. A joint that was never observed is placed by scaling the rest pose between its observed
+    neighbours.
 
     Args:
         positions: (T, 22, 3) metres, NaN where unobserved.

@@ -1,5 +1,6 @@
-"""A simulated person's measures: bones for the kinematics, capsules for what hides what, and where a sensor's joints
-lie: each is held in the frame of a canonical joint.
+"""Dimensions of a simulated person: bones, capsules that occlude, and the positions of a sensor's joints on the body.
+
+Each joint of a sensor is fixed in the frame of a canonical joint.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from steadypose.prior.body.layouts import get_skeleton
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, REST_OFFSETS, REST_POSITIONS, J
 
 REST_HEIGHT = 1.72
-"""Metres: the stature that `REST_OFFSETS` stands for."""
+"""Stature of a person with the bones `REST_OFFSETS`, metres."""
 
 TOE_HEIGHT = 0.015
-"""Metres from the floor to the ball of a foot that rests on it."""
+"""Height above the floor of the ball of a resting foot, metres."""
 
 CAPSULES: tuple[tuple[str, str, float], ...] = (
     ("pelvis", "spine3", 0.125),
@@ -39,7 +40,7 @@ CAPSULES: tuple[tuple[str, str, float], ...] = (
     ("left_elbow", "left_wrist", 0.04),
     ("right_elbow", "right_wrist", 0.04),
 )
-"""The body's flesh as capsules: from joint, to joint, radius in metres for a stature of 1.72 m."""
+"""Capsules of the body's volume: from joint, to joint, radius for a stature of 1.72 m, metres."""
 
 _ARM, _LEG = ("elbow", "wrist"), ("knee", "ankle", "foot")
 _STATURE = [
@@ -48,14 +49,14 @@ _STATURE = [
 
 
 def random_offsets(rng: np.random.Generator, height: float) -> Floats:
-    """Bones of a random adult, the same on both sides.
+    """Draw the bones of a random adult, equal on both sides.
 
-    Legs, arms and trunk vary by 3 % each and every bone by 1.5 % more (standard deviations, cut at two of them),
-    about the generic proportions.
+    Legs, arms and trunk vary about the generic proportions by 3 % each, and every bone by another 1.5 % (standard
+    deviations, clipped at two of them).
 
     Args:
-        rng: source of the proportions.
-        height: stature in metres.
+        rng: random generator for the proportions.
+        height: stature, metres.
 
     Returns:
         (22, 3) metres, each joint in its parent's frame in the rest pose.
@@ -69,12 +70,13 @@ def random_offsets(rng: np.random.Generator, height: float) -> Floats:
 
 
 def stature(offsets: Floats) -> float:
-    """Metres of height of a person with bones (22, 3)."""
+    """Return the stature of a person with bones (22, 3), metres."""
     return REST_HEIGHT * float(np.abs(offsets[_STATURE, 2]).sum() / np.abs(REST_OFFSETS[_STATURE, 2]).sum())
 
 
-# What the canonical skeleton lacks: the joint it rides on, and metres in the rest frame (x forward, y left, z up) of
-# a person of 1.72 m. The left side and the middle; the right is the mirror image.
+# Joints that the canonical skeleton lacks: the canonical joint to which each is fixed, and its position in the rest
+# frame (x forward, y left, z up), metres, for a stature of 1.72 m. Only left and middle are listed; right is the mirror
+# image.
 _RIDES: Mapping[str, Mapping[str, tuple[str, tuple[float, float, float]]]] = {
     "smpl22": {},
     "coco17": {
@@ -109,9 +111,9 @@ class Mount:
     """A sensor's J joints on the canonical body.
 
     Attributes:
-        joint: (J,) index of the canonical joint each rides on.
-        place: (J, 3) metres in that joint's frame, for a stature of 1.72 m.
-        mirror: (J,) each joint's counterpart on the other side.
+        joint: (J,) index of the canonical joint to which each joint is fixed.
+        place: (J, 3) metres, position in that joint's frame for a stature of 1.72 m.
+        mirror: (J,) index of each joint's counterpart on the other side.
     """
 
     joint: NDArray[np.intp]
@@ -119,17 +121,17 @@ class Mount:
     mirror: NDArray[np.intp]
 
     def positions(self, joints: Floats, orientations: Floats, scale: float) -> Floats:
-        """(..., J, 3) metres from canonical joints (..., 22, 3), their world orientations, and the stature / 1.72 m."""
+        """(..., J, 3) metres, from canonical joints (..., 22, 3), their world orientations, and stature / 1.72 m."""
         turned = np.einsum("...jab,jb->...ja", orientations[..., self.joint, :, :], scale * self.place)
         return joints[..., self.joint, :] + turned
 
 
 @cache
 def mount(skeleton: str) -> Mount:
-    """How a sensor's skeleton sits on the body.
+    """Return the positions of a sensor's joints on the body.
 
     Raises:
-        ValueError: a skeleton that the simulator cannot place.
+        ValueError: the simulator cannot place this skeleton.
     """
     if skeleton not in _RIDES:
         raise ValueError(f"cannot simulate skeleton '{skeleton}': expected one of {', '.join(_RIDES)}")
@@ -147,6 +149,6 @@ def mount(skeleton: str) -> Mount:
     joint = np.array([J[rides[name][0]] for name in names])
     place = np.array([rides[name][1] for name in names])
     rest = REST_POSITIONS[joint] + place
-    # In the rest pose a joint's counterpart is the one nearest to its mirror image.
+    # a joint's counterpart is the joint nearest to its mirror image in the rest pose
     apart = np.linalg.norm(rest[:, None] * [1.0, -1.0, 1.0] - rest[None], axis=-1)
     return Mount(joint, place, apart.argmin(axis=1))

@@ -1,7 +1,7 @@
-"""From joint positions to local rotations and back, on one person's bones, frame by frame.
+"""Inverse kinematics: joint positions to local rotations and back, with one person's bones, frame by frame.
 
-Swing comes from the directions of the bones, twist from the bend of elbows and knees. Rotations are local (child in
-parent's frame); the root's is its orientation in the frame of the positions.
+The directions of bones determine the swing, the bend of elbows and knees the twist. Rotations are local (child in the
+parent's frame). The root's rotation is its orientation in the frame of the positions.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from steadypose.prior.body.vectors import (
 )
 from steadypose.prior.compiled import njit
 
-# What shows the frame of pelvis and chest, best first: a left-right pair, and a place above, the middle of two joints.
+# Joints that determine the frames of pelvis and chest, best first: a left-right pair, and a point above, which is the
+# midpoint of two joints.
 _RIGID_PARTS = np.array([J["pelvis"], J["spine3"]])
 _PART_LEFT = np.array([[HIPS, SHOULDERS], [SHOULDERS, COLLARS]])
 _PART_UP = np.array(
@@ -38,7 +39,7 @@ _PART_UP = np.array(
         [(J["neck"],) * 2, (J["head"],) * 2, (J["head"],) * 2, (J["head"],) * 2],
     ]
 )
-# What is rigid on constant bones: every bone, and what pelvis and chest carry.
+# Rigid segments: every bone, and all pairs of joints fixed to the pelvis or to the chest.
 _PELVIS_GROUP = (*HIPS, J["spine1"], J["pelvis"])
 _CHEST_GROUP = (*COLLARS, J["neck"], J["spine3"])
 RIGID = np.array(
@@ -47,17 +48,17 @@ RIGID = np.array(
         | {(max(a, b), min(a, b)) for group in (_PELVIS_GROUP, _CHEST_GROUP) for a in group for b in group if a != b}
     )
 )
-"""(R, 2) the joints at the ends of each."""
+"""(R, 2) the joints at the two ends of each rigid segment."""
 HELD = 1e-6
-"""Mobility of an observed joint in `fit_lengths`, relative to 1 of an unobserved one."""
+"""Mobility of an observed joint in `fit_lengths`; an unobserved one has 1."""
 _SWEEPS = 20
 
-# Where the pelvis is upright below, when it is hidden itself: the middle of two joints, best first.
+# Points below which a hidden pelvis is placed upright, best first: each is the midpoint of two joints.
 _BELOW = np.array([HIPS, (J["spine3"],) * 2, (J["neck"],) * 2, SHOULDERS])
 
 
 def _aims() -> NDArray[np.intp]:
-    """(22, 4) joints to aim at, nearest first, as far as the chain below does not branch; -1 for none."""
+    """(22, 4) joints at which each bone aims, nearest first, down to the first branch of the chain; -1 for none."""
     aims = np.full((len(PARENTS), 4), -1)
     for joint in set(range(len(PARENTS))) - set(_RIGID_PARTS.tolist()):
         below = joint
@@ -71,13 +72,13 @@ def _aims() -> NDArray[np.intp]:
 
 _AIM = _aims()
 
-# The hinge axes in the rest pose, about which elbows and knees flex (right-hand rule, flexion positive).
+# Hinge axes of elbows and knees in the rest pose (right-hand rule, flexion positive).
 HINGE = np.zeros((len(PARENTS), 3))
 HINGE[list(HIPS)] = (0.0, 1.0, 0.0)
 HINGE[SHOULDERS[0]] = (0.0, 0.0, -1.0)
 HINGE[SHOULDERS[1]] = (0.0, 0.0, 1.0)
 _HINGED = np.array([hinge.any() for hinge in HINGE])
-# The sine of the bend below which the plane of a limb shows nothing of its twist, and above which it shows all.
+# Sines of the bend below which the plane of a limb does not determine its twist, and above which it does so fully.
 _BEND_NONE, _BEND_FULL = 0.1, 0.35
 
 
@@ -87,20 +88,20 @@ def solve_rotations(
     fallback: NDArray[np.floating] | None = None,
     root: NDArray[np.floating] | None = None,
 ) -> Floats:
-    """Local rotations from joint positions.
+    """Solve local rotations from joint positions.
 
-    The pelvis and the chest take the frame spanned by hips (shoulders) and spine (neck). Every other joint swings
-    its bone from where forward kinematics has put it towards the next joint seen below, so that an error is not
-    handed down the chain; a shoulder or hip also twists so that the limb bends in the plane seen, as far as it is
-    bent enough to show one. The twist of neck, head, wrists and feet cannot be seen in 22 positions: identity.
-    With the hips hidden, the pelvis is taken to be upright below the shoulders.
+    The pelvis takes the frame spanned by hips and spine, the chest that of shoulders and neck. Every other joint swings
+    its bone from its position in forward kinematics towards the next observed joint below, so that errors do not
+    accumulate along the chain. Shoulders and hips also twist, so that the limb bends in the observed plane, as far as
+    it is bent enough to show one. 22 positions do not show the twist of neck, head, wrists and feet; it is the
+    identity. If the hips are hidden, the pelvis is assumed to be upright below the shoulders.
 
     Args:
         positions: (..., 22, 3) metres, z up; NaN where unobserved.
         offsets: (22, 3) or (..., 22, 3) metres, the person's bones.
-        fallback: (..., 22, 3, 3) local rotations for what cannot be solved (the last frame's, say); identity
-            if left out.
-        root: (..., 3, 3) orientations of the pelvis, where they are known; solved if left out.
+        fallback: (..., 22, 3, 3) local rotations for joints that cannot be solved, such as the last frame's; identity
+            if omitted.
+        root: (..., 3, 3) orientations of the pelvis, if known; solved if omitted.
 
     Returns:
         (..., 22, 3, 3) local.
@@ -114,7 +115,7 @@ def solve_pose(
     fallback: NDArray[np.floating] | None = None,
     root: NDArray[np.floating] | None = None,
 ) -> tuple[Floats, Floats]:
-    """`solve_rotations`, and the positions (..., 22, 3) where those rotations put the joints on these bones."""
+    """Return the rotations of `solve_rotations`, and the positions (..., 22, 3) that they give with these bones."""
     shape = np.shape(positions)
     p, bones = _frames(positions, shape), _frames(offsets, shape)
     local, placed = _initial(fallback, p), np.empty_like(p)
@@ -130,18 +131,18 @@ def fit_lengths(
     mobility: NDArray[np.floating],
     length_variance: NDArray[np.floating] | float = 0.0,
 ) -> Floats:
-    """The joints nearest to the positions whose bones are as long as these.
+    """Return the joints nearest to the positions that have the lengths of these bones.
 
-    `solve_pose` follows the chain: where a bone seems too long or short, all of that goes to its end, and on to what
-    hangs from it. Here every bone and every rigid part of the trunk pulls at both its ends until the lengths are
-    right, by sweeps of Gauss-Newton over the distances (position-based dynamics, Müller et al. 2007). Lengths that
-    are uncertain give way as their variance says (compliant constraints, XPBD, Macklin et al. 2016).
+    `solve_pose` follows the chain, so the whole error of a bone's length moves the joint at its end and all joints
+    below. Here, every bone and every rigid segment of the trunk pulls at both its ends until the lengths match, by
+    Gauss-Newton sweeps over the distances (position-based dynamics, Müller et al. 2007). Uncertain lengths yield
+    according to their variance (compliant constraints, XPBD, Macklin et al. 2016).
 
     Args:
-        positions: (..., 22, 3) metres, all of them finite.
+        positions: (..., 22, 3) metres, all finite.
         offsets: (22, 3) or (..., 22, 3) metres, the person's bones.
-        mobility: (..., 22) how easily each joint yields: its variance, in any unit.
-        length_variance: (..., R) of the length of each of `RIGID`, in that unit.
+        mobility: (..., 22) variance of each joint, in any unit.
+        length_variance: (..., R) variance of the length of each `RIGID` segment, in the same unit.
 
     Returns:
         (..., 22, 3) metres.
@@ -155,7 +156,7 @@ def fit_lengths(
 
 
 def place_joints(rotations: NDArray[np.floating], offsets: NDArray[np.floating]) -> Floats:
-    """Forward kinematics without gradients: positions (..., 22, 3) metres, the root at the origin.
+    """Forward kinematics without gradients: positions (..., 22, 3) metres, with the root at the origin.
 
     Args:
         rotations: (..., 22, 3, 3) local.
@@ -168,14 +169,14 @@ def place_joints(rotations: NDArray[np.floating], offsets: NDArray[np.floating])
 
 
 def _initial(fallback: NDArray[np.floating] | None, positions: Floats) -> Floats:
-    """(B, 22, 3, 3) local rotations to start from."""
+    """(B, 22, 3, 3) initial local rotations."""
     local = np.empty((*positions.shape, 3))
     local[...] = np.eye(3) if fallback is None else np.reshape(fallback, local.shape)
     return local
 
 
 def _frames(values: NDArray[np.floating], shape: tuple[int, ...]) -> Floats:
-    """(B, 22, 3) float64 of values that broadcast to ``shape``; a copy, as compiled code takes no read-only arrays."""
+    """(B, 22, 3) float64 copy of values broadcast to ``shape``. Compiled code does not accept read-only arrays."""
     frames = np.empty(shape)
     frames[...] = values
     return frames.reshape(-1, *shape[-2:])
@@ -183,7 +184,7 @@ def _frames(values: NDArray[np.floating], shape: tuple[int, ...]) -> Floats:
 
 @njit(cache=True)
 def _write_rest(offsets, rest):
-    """Write where the joints (22, 3) of the rest pose are, on these bones."""
+    """Write the joints (22, 3) of the rest pose with these bones."""
     for i in range(3):
         rest[0, i] = 0.0
         for joint in range(1, len(PARENT)):
@@ -192,7 +193,7 @@ def _write_rest(offsets, rest):
 
 @njit(cache=True)
 def _pelvis(p, seen, rest):
-    """The pelvis: seen, between the hips, or upright below the highest part of the trunk seen."""
+    """The pelvis: observed, between the hips, or upright below the best observed point of the trunk."""
     if seen[0]:
         return point(p, 0)
     for k in range(len(_BELOW)):
@@ -204,7 +205,7 @@ def _pelvis(p, seen, rest):
 
 @njit(cache=True)
 def _write_trunk(which, p, seen, rest, here, above, out):
-    """Write the rotation of pelvis (0) or chest (1), local to its parent's, ``above``, if the frame shows it."""
+    """Write the rotation of pelvis (0) or chest (1), local to its parent's ``above``, if this frame determines it."""
     joint = _RIGID_PARTS[which]
     for k in range(len(_PART_LEFT[which])):
         left, right = _PART_LEFT[which, k]
@@ -225,7 +226,7 @@ def _write_trunk(which, p, seen, rest, here, above, out):
 
 @njit(cache=True)
 def _constrain(positions, offsets, mobility, length_variance):
-    """Of B frames: moves ``positions`` (B, 22, 3) until what is rigid has its lengths."""
+    """Move ``positions`` (B, 22, 3) of B frames, in place, until the rigid segments have their lengths."""
     rest = np.empty((len(PARENT), 3))
     length = np.empty(len(RIGID))
     force = np.empty(len(RIGID))
@@ -251,8 +252,10 @@ def _constrain(positions, offsets, mobility, length_variance):
 
 @njit(cache=True)
 def _twist(joint, p, seen, above, turn, bone):
-    """The angle about unit ``bone`` (parent's frame) by which ``turn`` is to be twisted so that the hinge below lies in
-    the plane of the bent limb."""
+    """Return the angle about unit ``bone`` (parent's frame) by which to twist ``turn``.
+
+    It makes the hinge axis normal to the plane of the limb, as far as the limb is bent.
+    """
     middle, end = _AIM[joint, 0], _AIM[joint, 1]
     if not (seen[middle] and seen[end]):
         return 0.0
@@ -266,8 +269,7 @@ def _twist(joint, p, seen, above, turn, bone):
 
 @njit(cache=True)
 def _solve(positions, observed, offsets, local, placed, root_known):
-    """Of B frames: writes ``placed`` (B, 22, 3), and into ``local`` (B, 22, 3, 3) what can be solved; the root's only
-    if it is not ``root_known``."""
+    """Write ``placed`` (B, 22, 3) and the solvable part of ``local`` (B, 22, 3, 3); the root unless ``root_known``."""
     joints = len(PARENT)
     rest = np.empty((joints, 3))
     world = np.empty((joints, 3, 3))
@@ -304,7 +306,7 @@ def _solve(positions, observed, offsets, local, placed, root_known):
 
 @njit(cache=True)
 def _place(local, offsets, placed):
-    """Of B frames: writes ``placed`` (B, 22, 3)."""
+    """Write ``placed`` (B, 22, 3) of B frames."""
     world = np.empty((len(PARENT), 3, 3))
     for frame in range(len(local)):
         for i in range(3):

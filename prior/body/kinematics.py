@@ -1,8 +1,8 @@
-"""Kinematics of the canonical skeleton: forward, headings and contacts; and rotations, of joints and of sensors.
+"""Kinematics of the canonical skeleton (forward kinematics, headings, contact labels), and rotations.
 
-Rotations are local (child in parent's frame), the root's is its orientation in the frame of the positions. The
-identity everywhere is a T-pose facing +x, left +y, up +z. From positions to rotations:
-`prior.body.inverse_kinematics`; a person's bones: `prior.body.bone_lengths`.
+Rotations are local (child in the parent's frame). The root's rotation is its orientation in the frame of the positions.
+With identity rotations, the body is in a T-pose facing +x, left +y, up +z. See `prior.body.inverse_kinematics` for
+rotations from positions, and `prior.body.bone_lengths` for a person's bones.
 """
 
 from __future__ import annotations
@@ -29,29 +29,30 @@ def _levels() -> list[slice]:
 
 
 LEVELS: list[slice] = _levels()
-"""Joints by depth: those of one level depend only on the level above and are handled together."""
+"""Joints by depth in the tree. Joints of one level depend only on the level above and are processed together."""
 
 CONTACT_JOINTS: tuple[int, ...] = tuple(
     J[f"{side}_{part}"] for part in ("knee", "ankle", "foot", "wrist") for side in ("left", "right")
 )
-"""The eight joints of the contact labels: HuMoR's nine without the hips, which are never in contact there."""
+"""The eight joints with contact labels: HuMoR's nine without the hips, which are never in contact in its data."""
 
 REST_SPEED, LOAD_SPEED = 0.15, 0.7
-"""m/s: a joint that rests on something is slower than the first (HuMoR's contact), one that bears load on it slower
-than the second, for a foot rolls from heel to toe. Against force plates, of walking feet under load the first finds
-69 %, the second 96 %, and what they find does bear load."""
+"""Largest speeds of a joint at rest (HuMoR's contact) and of a joint that bears load, m/s. The second is larger because
+a foot rolls from heel to toe. Compared with force plates, the first detects 69 % of walking feet under load, the second
+96 %, and the feet that they detect do bear load."""
 
 CONTACT_HEIGHT: Floats = np.array([0.04 if JOINTS[j].endswith("foot") else 0.08 for j in CONTACT_JOINTS])
-"""(8,) metres above the *lowest the joint can be*: see `label_contacts`."""
+"""(8,) largest height of a joint in contact above the *lowest height that the joint can have*, metres; see
+`label_contacts`."""
 
 REST_HEIGHT: Floats = np.array(
     [{"knee": 0.05, "ankle": 0.07, "foot": 0.015, "wrist": 0.02}[JOINTS[j].split("_")[1]] for j in CONTACT_JOINTS]
 )
-"""(8,) metres above the floor at which the joint's centre lies when the limb rests there: a heel's is the ankle's."""
+"""(8,) height of the joint's centre above the floor while the limb rests on it, metres; a heel's is the ankle's."""
 
 
 def forward_kinematics(rotations: Floats, offsets: Floats, root: Floats) -> tuple[Floats, Floats]:
-    """Joint positions from local rotations and bones; with gradients: `prior.fit.tensors`.
+    """Compute joint positions from local rotations and bones. `prior.fit.tensors` has a version with gradients.
 
     Args:
         rotations: (..., 22, 3, 3) local rotation matrices.
@@ -72,7 +73,7 @@ def forward_kinematics(rotations: Floats, offsets: Floats, root: Floats) -> tupl
 
 
 def global_rotations(local: Floats) -> Floats:
-    """Rotations (..., 22, 3, 3) in the root's frame of reference, of local rotations (..., 22, 3, 3)."""
+    """Convert local rotations (..., 22, 3, 3) to rotations (..., 22, 3, 3) in the root's frame of reference."""
     world = local.copy()
     for level in LEVELS[1:]:
         world[..., level, :, :] = world[..., list(PARENTS[level]), :, :] @ local[..., level, :, :]
@@ -80,10 +81,10 @@ def global_rotations(local: Floats) -> Floats:
 
 
 def heading(root_rotation: NDArray[np.floating]) -> Floats:
-    """Yaw (...) in radians of root rotations (..., 3, 3), z up: where the body's forward axis points.
+    """Return the yaw (...) in radians of root rotations (..., 3, 3), z up: the direction that the body faces.
 
-    From the body's left axis, which stays near the horizontal in every pose but lying on a side, where its
-    forward axis does not: a bow turns forward to the floor.
+    The yaw is computed from the body's left axis, which stays almost horizontal unless the body lies on its side. The
+    forward axis does not: in a bow it points to the floor.
     """
     left = root_rotation[..., :, 1]
     return np.arctan2(-left[..., 0], left[..., 1])
@@ -101,9 +102,9 @@ def yaw_matrix(angle: NDArray[np.floating] | float) -> Floats:
 
 
 def quaternions(rotations: NDArray[np.floating]) -> Floats:
-    """Unit quaternions (..., 4), xyzw, of rotations (..., 3, 3), by the largest of their components (Shepperd 1978).
+    """Convert rotations (..., 3, 3) to unit quaternions (..., 4), xyzw, from their largest component (Shepperd 1978).
 
-    scipy's ``Rotation`` gives the same, and takes longer for a body than all that comes after it.
+    scipy's ``Rotation`` gives the same result, but takes longer for a body than all later steps together.
     """
     shape = np.shape(rotations)[:-2]
     found = np.empty((*shape, 4))
@@ -132,7 +133,7 @@ def _write_quaternions(rotations, out):
 
 
 def quaternion_product(p: NDArray[np.floating], q: NDArray[np.floating]) -> Floats:
-    """Rotation by ``q`` and then by ``p``: quaternions (..., 4), xyzw."""
+    """Product of quaternions (..., 4), xyzw: the rotation by ``q``, then by ``p``."""
     (a, b, c, d), (x, y, z, w) = np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)
     found = [
         d * x + w * a + b * z - c * y,
@@ -144,12 +145,12 @@ def quaternion_product(p: NDArray[np.floating], q: NDArray[np.floating]) -> Floa
 
 
 def rotation_matrix(quaternion: NDArray[np.floating]) -> Floats:
-    """The rotation (3, 3) of a quaternion (4,), xyzw, of any length but 0."""
+    """Convert a quaternion (4,), xyzw, of any norm but 0 to a rotation (3, 3)."""
     return rotation_matrices(np.asarray(quaternion / np.linalg.norm(quaternion)))
 
 
 def rotation_matrices(q: Floats) -> Floats:
-    """Rotations (..., 3, 3) of unit quaternions (..., 4), xyzw."""
+    """Convert unit quaternions (..., 4), xyzw, to rotations (..., 3, 3)."""
     x, y, z, w = np.moveaxis(q, -1, 0)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
@@ -160,11 +161,11 @@ def rotation_matrices(q: Floats) -> Floats:
 
 
 class SensorFrame(NamedTuple):
-    """Where a sensor stands in the world.
+    """The pose of a sensor in the world.
 
     Attributes:
-        rotation: (3, 3) from its frame to the world's.
-        origin: (3,) metres.
+        rotation: (3, 3) from the sensor's frame to the world's.
+        origin: (3,) metres, position of the sensor.
     """
 
     rotation: Floats
@@ -172,19 +173,19 @@ class SensorFrame(NamedTuple):
 
     @classmethod
     def of(cls, pose: Pose) -> SensorFrame:
-        """From a message's pose."""
+        """Build the frame from a message's pose."""
         return cls(_rotation(pose.orientation.tobytes()), pose.position)
 
     def levelled(self) -> SensorFrame:
-        """Its own frame, z up."""
+        """The same orientation, with the sensor at the origin."""
         return SensorFrame(self.rotation, np.zeros(3))
 
     def to_world(self, positions: Floats) -> Floats:
-        """Of (..., 3) metres in the sensor's frame."""
+        """Transform positions (..., 3) metres from the sensor's frame to the world."""
         return positions @ self.rotation.T + self.origin
 
     def from_world(self, positions: Floats) -> Floats:
-        """Of (..., 3) metres in the world."""
+        """Transform positions (..., 3) metres from the world to the sensor's frame."""
         return (positions - self.origin) @ self.rotation
 
 
@@ -194,7 +195,7 @@ def _rotation(quaternion: bytes) -> Floats:
 
 
 def from_rotation_vectors(vectors: Floats) -> Floats:
-    """(..., 3, 3) rotations by vectors (..., 3), radians about their directions (Rodrigues)."""
+    """Convert rotation vectors (..., 3), radians, to rotations (..., 3, 3) (Rodrigues)."""
     rotations = np.empty((*vectors.shape, 3))
     _rodrigues(np.ascontiguousarray(vectors).reshape(-1, 3), rotations.reshape(-1, 3, 3))
     return rotations
@@ -220,7 +221,7 @@ def _rodrigues(vectors, rotations):
 
 
 def to_rotation_vectors(rotations: Floats) -> Floats:
-    """(..., 3) radians, of rotations (..., 3, 3) by less than a half turn."""
+    """Convert rotations (..., 3, 3) by less than a half turn to rotation vectors (..., 3), radians."""
     vectors = np.empty(rotations.shape[:-1])
     _rotation_vectors(np.ascontiguousarray(rotations).reshape(-1, 3, 3), vectors.reshape(-1, 3))
     return vectors
@@ -241,10 +242,10 @@ def _rotation_vectors(rotations, vectors):
 
 
 def rigid_alignment(source: NDArray[np.floating], target: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    """The rotation R (3, 3) and translation t (3,) with the least sum of |R source + t - target|².
+    """Return the rotation R (3, 3) and translation t (3,) that minimise the sum of |R source + t - target|².
 
     Args:
-        source: (..., 3) metres; points not finite in either are left out.
+        source: (..., 3) metres; points that are not finite in both arrays are ignored.
         target: the same shape.
 
     Raises:
@@ -255,24 +256,25 @@ def rigid_alignment(source: NDArray[np.floating], target: NDArray[np.floating]) 
     if len(a) < 3:
         raise ValueError(f"alignment: expected at least 3 points that both have, got {len(a)}")
     centre_a, centre_b = a.mean(axis=0), b.mean(axis=0)
-    from scipy.spatial.transform import Rotation  # 9 MB, which nodes do without
+    from scipy.spatial.transform import Rotation  # imported here: 9 MB that nodes do not need
 
     rotation = Rotation.align_vectors(b - centre_b, a - centre_a)[0].as_matrix()
     return rotation, centre_b - rotation @ centre_a
 
 
 def label_contacts(positions: NDArray[np.floating], fps: float, speed: float = REST_SPEED) -> NDArray[np.bool_]:
-    """Contacts from motion: slow and low, in SI units so that no frame rate changes them (HuMoR labels a frame).
+    """Label contacts from motion: joints that are slow and low.
 
-    Joint centres do not touch the floor: height is counted from where the centre lies when the limb rests.
+    Thresholds are in SI units, so labels do not depend on the frame rate (HuMoR's are per frame). Joint centres do not
+    touch the floor, so heights are measured from the centre's height while the limb rests.
 
     Args:
         positions: (T, 22, 3) metres, world, floor at z = 0.
-        fps: frames a second.
-        speed: m/s, of what is slow: `REST_SPEED` or `LOAD_SPEED`.
+        fps: frames per second.
+        speed: m/s, largest speed in contact: `REST_SPEED` or `LOAD_SPEED`.
 
     Returns:
-        (T, 8) for `CONTACT_JOINTS`.
+        (T, 8) labels of `CONTACT_JOINTS`.
     """
     p = np.asarray(positions, dtype=np.float64)[:, list(CONTACT_JOINTS)]
     if len(p) < 2:

@@ -1,7 +1,7 @@
-"""Sensors' joint layouts: the tables that map each sensor's joints to the canonical 22.
+"""Joint layouts of sensors: tables that map each sensor's joints to the canonical 22.
 
-A table says, of each canonical joint, which sensor joints it is the weighted mean of. A joint that a sensor lacks has
-no entry: it stays unobserved. Those that ship are in ``layouts.toml``, described as a user describes a layout:
+A table gives the sensor joints whose weighted mean is a canonical joint. A joint that the sensor lacks has no entry and
+stays unobserved. The bundled layouts are in ``layouts.toml``, in the same form as a user's own layouts:
 
     [skeletons.gym16]
     joints = ["head", "left_shoulder", "l_elbow", ...] # in the order of the messages
@@ -10,8 +10,8 @@ no entry: it stays unobserved. Those that ship are in ``layouts.toml``, describe
     left_elbow = "l_elbow"
     spine3 = ["left_shoulder", "right_shoulder"]       # the middle of several
 
-A canonical joint that has no entry is the joint of the same name, where there is one; pelvis, neck and head may also be
-the middle of hips, shoulders and ears.
+A canonical joint without an entry is the sensor joint of the same name, if there is one. Pelvis, neck and head may also
+be the midpoints of hips, shoulders and ears.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ else:
     import tomli as tomllib
 
 MIDDLES: Mapping[str, str] = {"pelvis": "hip", "neck": "shoulder", "head": "ear"}
-"""Canonical joints that may be the middle of a part of the left and of the right."""
+"""Canonical joints that may be midpoints, each with the part whose left and right it lies between."""
 
 NEEDED = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
-"""Canonical joints without which no body is placed."""
+"""Canonical joints that every layout must have."""
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A sensor's joints and how the canonical ones are made of them.
+    """A sensor's joints and their mapping to the canonical joints.
 
     Attributes:
         name: the name that messages and files use.
-        joints: the sensor's joint names in the sensor's order.
-        table: canonical joint -> sensor joint, or sensor joints with their weights (made to sum to 1).
+        joints: the sensor's joint names, in the sensor's order.
+        table: canonical joint -> sensor joint, or sensor joints with weights (normalised to sum to 1).
     """
 
     name: str
@@ -68,7 +68,7 @@ class Skeleton:
 
     @cached_property
     def to_canonical(self) -> NDArray[np.float64]:
-        """(22, J) weights: each row sums to 1, or to 0 where the sensor lacks the joint."""
+        """(22, J) weights; each row sums to 1, or to 0 if the sensor lacks the joint."""
         matrix = np.zeros((len(JOINTS), len(self.joints)))
         for joint, source in self.table.items():
             weights = {source: 1.0} if isinstance(source, str) else source
@@ -79,24 +79,24 @@ class Skeleton:
 
     @cached_property
     def observable(self) -> NDArray[np.bool_]:
-        """(22,) which canonical joints this sensor can see at all."""
+        """(22,) which canonical joints this sensor has."""
         return self.to_canonical.sum(axis=1) > 0
 
 
 CANONICAL = Skeleton("smpl22", JOINTS, {joint: joint for joint in JOINTS})
 _SKELETONS: dict[str, Skeleton] = {CANONICAL.name: CANONICAL}
 SKELETONS: Mapping[str, Skeleton] = MappingProxyType(_SKELETONS)
-"""Every skeleton that ``pose/raw`` may name: those that ship, and those of the user's own (`add_layouts`)."""
+"""All skeletons that ``pose/raw`` may name: the bundled ones and the user's own (`add_layouts`)."""
 
 
 def add_layouts(descriptions: Mapping[str, Any]) -> None:
-    """Make layouts known, by their names, to all of this process.
+    """Register layouts by name in this process.
 
     Args:
         descriptions: the table ``skeletons`` of a TOML file.
 
     Raises:
-        ValueError: one does not describe a skeleton, or has the name of another.
+        ValueError: a description is invalid, or its name is already taken.
     """
     for name, description in descriptions.items():
         skeleton = _described(name, description)
@@ -105,7 +105,7 @@ def add_layouts(descriptions: Mapping[str, Any]) -> None:
 
 
 def _described(name: str, description: object) -> Skeleton:
-    """The layout that a section of TOML describes."""
+    """Build the layout that a TOML section describes."""
     where = f"[skeletons.{name}]"
     if not isinstance(description, Mapping):
         raise ValueError(f"{where}: expected a section with joints, got {description!r}")
@@ -139,15 +139,15 @@ def _described(name: str, description: object) -> Skeleton:
 
 
 def _texts(value: object) -> list[str]:
-    """The list, if it is one of texts, or none."""
+    """Return the value if it is a list of strings, otherwise an empty list."""
     return list(value) if isinstance(value, list) and all(isinstance(text, str) for text in value) else []
 
 
 def get_skeleton(name: str) -> Skeleton:
-    """The skeleton of that name.
+    """Return the skeleton of this name.
 
     Raises:
-        KeyError: unknown name; the message lists the known ones.
+        KeyError: the name is unknown; the message lists the known ones.
     """
     try:
         return SKELETONS[name]
@@ -163,11 +163,11 @@ def to_canonical(
     Args:
         skeleton: the sensor's skeleton with J joints.
         positions: (..., J, 3) metres, any frame; NaN where missing.
-        confidence: (..., J) in 0..1; all ones if left out.
+        confidence: (..., J) in 0..1; all ones if omitted.
 
     Returns:
-        positions (..., 22, 3), NaN where unobserved, and confidence (..., 22), the least of the joints that
-        went in and 0 where unobserved.
+        Positions (..., 22, 3), NaN where unobserved, and confidence (..., 22), the least of the sensor joints used, 0
+        where unobserved.
     """
     weights = skeleton.to_canonical
     if confidence is None:

@@ -1,7 +1,7 @@
-"""How well joints fit a human body, and under which layout, unit, up axis and handedness they would fit better.
+"""Measures how well joints fit a human body, and with which layout, unit, up axis and handedness they fit better.
 
-For input from outside whose declared layout may be wrong. Nothing here changes a pose; it diagnoses what is wrong with
-one. Lengths are compared as logarithms, so that a wrong unit is a common offset.
+It diagnoses input whose declared layout may be wrong, and changes no pose. Lengths are compared as logarithms, so that
+a wrong unit is a common offset.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ _SPANS = (
     *((f"{side}_{a}", f"{side}_{b}") for side in ("left", "right") for a, b in (s.split("-") for s in _SIDE)),
 )
 SPANS: NDArray[np.intp] = np.array([[J[a], J[b]] for a, b in _SPANS])
-"""(S, 2) canonical joints whose distance hardly depends on the pose"""
+"""(S, 2) pairs of canonical joints whose distance hardly depends on the pose."""
 SPAN_NAMES: tuple[str, ...] = tuple(f"{a} to {b}" for a, b in _SPANS)
 MIN_SPANS = 5
-"""of which a body is known by its lengths"""
+"""Least number of observed spans for a judgement."""
 BODY_ERROR = 0.5
-"""RMS of the logarithms of lengths against a human's, up to which joints make a body; trackers of the field stay below
-0.35, joints read in the order of another layout are above 0.55"""
+"""Largest RMS of the logarithms of lengths relative to a human's at which joints form a body. Real trackers stay below
+0.35; joints read in the order of another layout exceed 0.55."""
 NO_LENGTH = 1e-4
-"""of an adult's: two joints in one place are so far apart, which keeps logarithms finite"""
+"""Least length relative to an adult's, which keeps logarithms finite if two joints coincide."""
 
 HUMAN: Floats = np.linalg.norm(REST_POSITIONS[SPANS[:, 0]] - REST_POSITIONS[SPANS[:, 1]], axis=1)
-"""(S,) metres, of an adult"""
+"""(S,) lengths of an adult's spans, metres."""
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """Joints, read in the order of a layout, against a human body.
+    """The fit of joints, read in the order of a layout, to a human body.
 
     Attributes:
-        skeleton: the layout they were read in.
-        scale: their lengths over an adult's: 1 in metres, 1000 in millimetres.
-        error: RMS over the spans of the logarithm of a length over the human one at that scale, and of its spread
-            over time. 0 is a statue of proportions of the canonical skeleton.
-        worst: the span that is farthest off.
-        ratio: that span's length over the human one at that scale.
+        skeleton: the layout in which they are read.
+        scale: ratio of their lengths to an adult's: 1 in metres, 1000 in millimetres.
+        error: RMS over the spans of the logarithm of the ratio of a length to the human length at that scale, and of
+            its spread over time. A statue with the proportions of the canonical skeleton has 0.
+        worst: the span that differs most.
+        ratio: ratio of that span's length to the human length at that scale.
     """
 
     skeleton: str
@@ -63,14 +63,14 @@ class Likeness:
 
 
 def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | None:
-    """How like a body joints are in the order of a layout.
+    """Measure how well joints fit a human body in the order of a layout.
 
     Args:
-        skeleton: the layout, of J joints.
+        skeleton: the layout, with J joints.
         positions: (T, J, 3) of one or several bodies, any unit and frame; NaN where missing.
 
     Returns:
-        None where too few joints were seen to say.
+        The fit; None if too few joints were observed.
     """
     joints, _ = to_canonical(skeleton, positions.astype(np.float64))
     lengths = np.linalg.norm(joints[:, SPANS[:, 0]] - joints[:, SPANS[:, 1]], axis=-1)
@@ -93,7 +93,7 @@ def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | 
 
 
 def likenesses(positions: NDArray[np.floating]) -> list[Likeness]:
-    """The layouts of this number of joints, best fit first."""
+    """Return the fits of all layouts with this number of joints, best first."""
     fitting = [s for s in SKELETONS.values() if len(s.joints) == positions.shape[1]]
     found = [like for skeleton in fitting if (like := likeness(skeleton, positions))]
     return sorted(found, key=lambda like: like.error)
@@ -104,9 +104,9 @@ class Stance:
     """Up axis and handedness of bodies in their frame.
 
     Attributes:
-        up: (3,) unit vector from their feet to their heads, in the frame of the joints.
-        handed: -1 to 1: whether toes, noses and knees point where left and right say is forward. A mirrored body
-            is near -1; NaN if no joint shows it.
+        up: (3,) unit vector from feet to heads, in the frame of the joints.
+        handed: -1 to 1, agreement of toes, noses and knees with the forward direction that left and right imply. It is
+            near -1 for a mirrored body, and NaN if no joint shows it.
     """
 
     up: Floats
@@ -117,11 +117,11 @@ def stance(skeleton: Skeleton, positions: NDArray[np.floating]) -> Stance | None
     """Estimate the up axis and handedness of a stream.
 
     Args:
-        skeleton: the layout, of J joints.
+        skeleton: the layout, with J joints.
         positions: (T, J, 3) any unit, NaN where missing.
 
     Returns:
-        None if they cannot be estimated, or change.
+        The estimate; None if it is impossible, or if the up axis changes.
     """
     positions = positions.astype(np.float64)
     joints, _ = to_canonical(skeleton, positions)
@@ -132,13 +132,13 @@ def stance(skeleton: Skeleton, positions: NDArray[np.floating]) -> Stance | None
     if not len(ups):
         return None
     up = ups.mean(axis=0)
-    if np.linalg.norm(up) < 0.9:  # not one direction: somebody falls, or the joints are no body
+    if np.linalg.norm(up) < 0.9:  # no common direction: somebody falls, or the joints form no body
         return None
     return Stance(up / np.linalg.norm(up), _handedness(skeleton, positions, joints))
 
 
 def _handedness(skeleton: Skeleton, positions: Floats, joints: Floats) -> float:
-    """The mean cosine between what points forwards on a body and what its left and right say is forwards."""
+    """Mean cosine between directions that point forward on a body and the forward direction of its left and right."""
     upwards = _unit(_mean(joints, "left_shoulder", "right_shoulder") - _mean(joints, "left_hip", "right_hip"))
     leftwards = sum(_unit(joints[:, J[f"left_{j}"]] - joints[:, J[f"right_{j}"]]) for j in ("hip", "shoulder"))
     forwards = _unit(np.cross(leftwards, upwards))
@@ -159,7 +159,7 @@ def _handedness(skeleton: Skeleton, positions: Floats, joints: Floats) -> float:
 
 
 def _mean(joints: Floats, *names: str) -> Floats:
-    """(T, 3) the mean of those of the joints that are seen; NaN where none is."""
+    """(T, 3) mean of the observed joints among these; NaN if none is observed."""
     chosen = joints[:, [J[name] for name in names]]
     seen = finite_joints(chosen)
     total = np.where(seen[..., None], chosen, 0.0).sum(axis=1)

@@ -1,10 +1,10 @@
-"""Skeletons of motion files, recognised by their topology: which joints of a file the canonical 22 are made of.
+"""Recognises the skeletons of motion files by their topology, and maps their joints to the canonical 22.
 
-No two programs name or cut a body alike, but all bodies are the same tree. What is needed of the names is one thing:
-which joints come in pairs. The longest two bones in a row of the lowest pair of limbs are thigh and shin, those of
-another pair upper arm and forearm; what lies between is the spine, on which the canonical joints stand at the heights
-that the rest skeleton has them, scaled to the file's neck and head. Each lies within a bone that is there and so moves
-rigidly with it; collars, which rigs place anywhere, are mixtures of their neighbours in all.
+Programs name and divide bodies differently, but all bodies are the same tree. The names only have to show which joints
+are left-right pairs. In the lowest pair of limbs, the longest two consecutive bones are thigh and shin; in another
+pair, they are upper arm and forearm. The spine lies between. The canonical spine joints are placed on it at their
+heights in the rest skeleton, scaled to the file's neck and head. Each lies within an existing bone and moves rigidly
+with it. Rigs place collars differently, so collars are always mixtures of their neighbours.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSI
 Mixture = Mapping[str, float]
 
 UNITS: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "CMU": 0.0254 / 0.45}
-"""Metres: what files count in. CMU's is an inch, scaled by the 0.45 of its ASF files."""
+"""Units of motion files, metres. CMU's unit is an inch divided by the 0.45 of its ASF files."""
 
 SHORTEST, TALLEST = 0.55, 1.35
-"""Times the rest skeleton (1.72 m): bodies of 0.95 to 2.3 m. A file whose body is none of these in any unit is not
-guessed at."""
+"""Range of a body's size relative to the rest skeleton (1.72 m): 0.95 to 2.3 m. If a body is outside it in every unit,
+the unit is not guessed."""
 
 ON_THE_JOINT = 0.15
-"""Of a bone: what is nearer to its end is at its end, where the body in fact turns."""
+"""Share of a bone within which a canonical joint near its end moves to the end, where the body turns."""
 
 _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), ("l", "r"))
 _INLINE = re.compile(r"twist|roll", re.IGNORECASE)
@@ -40,7 +40,7 @@ _PARTS = {
     "hjc": "hip", "kjc": "knee", "ajc": "ankle", "toebase": "foot", "bigtoe": "foot", "footindex": "foot",
     "toe": "foot", "toes": "foot", "clavicle": "collar", "sjc": "shoulder", "ejc": "elbow", "wjc": "wrist",
 }  # fmt: skip
-"""Other names of the parts of named points."""
+"""Synonyms of body parts in the names of points."""
 _MIDDLE_PARTS = {
     "pelvis": "pelvis", "hip": "pelvis", "hips": "pelvis", "midhip": "pelvis", "spine1": "spine1", "spine2": "spine2",
     "spine3": "spine3", "neck": "neck", "midshoulder": "neck", "head": "head",
@@ -49,23 +49,23 @@ _WORDS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _SIDE_OF = {"l": "left", "left": "left", "r": "right", "right": "right"}
 _MIDDLE = ("pelvis", "spine1", "spine2", "spine3", "neck", "head")
 _ABOVE_HIPS: Floats = REST_POSITIONS[:, 2] - REST_POSITIONS[list(HIPS), 2].mean()
-"""(22,) metres."""
+"""(22,) height of each joint above the hips in the rest pose, metres."""
 
 
 class RigError(ValueError):
-    """A skeleton in which no body is recognised; the message says what was looked for."""
+    """No body is recognised in a skeleton; the message says what was expected."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """How the skeleton of a motion file becomes the canonical one.
+    """The mapping from a motion file's skeleton to the canonical one.
 
     Attributes:
-        skeleton: the file's joints that matter, and their table.
-        metres: the size of the file's unit.
-        lost_bones: joints whose OFFSET the family's converter has lost (it is zero), each with the bone's length as a
-            multiple of its parent's OFFSET, whose direction it shares.
-        up: the file's axis that points up, ``y``, ``-y`` or ``z``; empty where the motion is to tell.
+        skeleton: the file's joints that are used, and their table.
+        metres: the file's unit, metres.
+        lost_bones: joints whose OFFSET is zero because a converter lost it, each with the bone's length as a multiple
+            of its parent's OFFSET, whose direction it shares.
+        up: the file's axis that points up: ``y``, ``-y`` or ``z``; empty if the motion determines it.
     """
 
     skeleton: Skeleton
@@ -75,7 +75,7 @@ class Rig:
 
 
 def mirror_names(names: Sequence[str]) -> dict[str, str]:
-    """Joint of the left -> its counterpart on the right: the names that stay names with the side exchanged."""
+    """Map each joint of the left to its counterpart on the right: names that exist with the side exchanged."""
     known, pairs = set(names), {}
     for name in names:
         for left, right in _SIDES:
@@ -88,12 +88,12 @@ def mirror_names(names: Sequence[str]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Tree:
-    """A skeleton as a file has it.
+    """A file's skeleton.
 
     Attributes:
         joints: J names, parents first.
         parents: index of each joint's parent; -1 for a root.
-        offsets: (J, 3) from the parent, in the file's unit.
+        offsets: (J, 3) offsets from the parent, in the file's unit.
     """
 
     joints: Sequence[str]
@@ -102,7 +102,7 @@ class Tree:
 
     @cached_property
     def rest(self) -> Floats:
-        """(J, 3) with all angles zero, the root at the origin. Its limbs may point anywhere."""
+        """(J, 3) positions with all angles zero and the root at the origin. Limbs may point in any direction."""
         placed = np.zeros_like(self.offsets)
         for joint, parent in enumerate(self.parents):
             if parent >= 0:
@@ -110,14 +110,14 @@ class Tree:
         return placed
 
     def path(self, joint: int) -> list[int]:
-        """From the root to a joint."""
+        """Return the path from the root to a joint."""
         path = [joint]
         while self.parents[path[-1]] >= 0:
             path.append(self.parents[path[-1]])
         return path[::-1]
 
     def above(self, joint: int) -> int:
-        """The nearest ancestor that is elsewhere, and no helper inside a bone (which twists skin); -1 for none."""
+        """Return the nearest ancestor at another position that is no twist helper inside a bone; -1 for none."""
         parent = self.parents[joint]
         while parent >= 0 and (
             _INLINE.search(self.joints[parent]) or not np.linalg.norm(self.rest[joint] - self.rest[parent]) > 0
@@ -126,13 +126,13 @@ class Tree:
         return parent
 
     def length(self, joint: int) -> float:
-        """Of the bone to a joint from that `above` it."""
+        """Return the length of the bone to a joint from the joint `above` it."""
         above = self.above(joint)
         return float(np.linalg.norm(self.rest[joint] - self.rest[above])) if above >= 0 else 0.0
 
 
 class _Limb(NamedTuple):
-    """The two longest bones in a row of what leaves the trunk on the left."""
+    """The two longest consecutive bones of a limb on the left."""
 
     trunk: int
     joints: tuple[int, int, int]
@@ -140,7 +140,7 @@ class _Limb(NamedTuple):
 
 
 class _Spine(NamedTuple):
-    """The middle of the body, upwards: names, heights (file's unit) above the hips, and which are neck and head."""
+    """The middle of the body, upwards: joint names, heights above the hips (file's unit), indices of neck and head."""
 
     joints: list[str]
     heights: Floats
@@ -149,10 +149,10 @@ class _Spine(NamedTuple):
 
 
 def recognise(tree: Tree, name: str = "file") -> Rig:
-    """The rig of a file's skeleton: see this module. One with the canonical names is taken at its word.
+    """Recognise the rig of a file's skeleton (see the module). A skeleton with the canonical names is used as it is.
 
     Raises:
-        RigError: there are no two pairs of limbs below a head, or the body has no size that a person has.
+        RigError: there are no two pairs of limbs below a head, or no unit gives the body a person's size.
     """
     pairs = mirror_names(tree.joints)
     legs, arms = _limbs(tree, pairs)
@@ -172,7 +172,7 @@ def recognise(tree: Tree, name: str = "file") -> Rig:
 
 
 def up_axis(bodies: Floats) -> str:
-    """The axis that points up: ``y``, ``-y`` or ``z``, that along which heads are furthest from ankles.
+    """Return the axis that points up, ``y``, ``-y`` or ``z``: the one along which heads are farthest from ankles.
 
     Args:
         bodies: (T, 22, 3) canonical joints in a file's axes; NaN where missing.
@@ -189,13 +189,13 @@ def skeleton(
     left: Mapping[str, str | Mixture],
     to_right: Callable[[str], str],
 ) -> Skeleton:
-    """A skeleton from its table.
+    """Build a skeleton from its table.
 
     Args:
-        name: of the skeleton.
+        name: name of the skeleton.
         middle: canonical joints of the middle.
-        left: those of the left side, named without it.
-        to_right: counterpart of a joint of the file's left; others as they are.
+        left: canonical joints of the left side, named without the side.
+        to_right: counterpart on the right of each joint of the file's left; other joints stay the same.
     """
     table = {joint: _weights(source) for joint, source in middle.items()}
     for joint, source in left.items():
@@ -205,7 +205,7 @@ def skeleton(
 
 
 def mix(*parts: tuple[str | Mixture, float]) -> Mixture:
-    """A mixture of mixtures."""
+    """Combine mixtures by weights."""
     total: dict[str, float] = {}
     for part, weight in parts:
         named = _weights(part)
@@ -219,18 +219,19 @@ def _weights(source: str | Mixture) -> Mixture:
 
 
 def collar(spine3: str | Mixture, neck: str | Mixture, shoulder: str | Mixture) -> Mixture:
-    """The rest skeleton's collar as a mixture of its neighbours."""
+    """Return the rest skeleton's collar as a mixture of its neighbours."""
     return mix((spine3, 0.333), (neck, 0.278), (shoulder, 0.389))
 
 
 def recognise_points(names: Sequence[str]) -> Skeleton:
-    """The skeleton of named points, as TRC and C3D files hold them: by their names alone, as points have no tree.
+    """Recognise the skeleton of named points in TRC and C3D files by their names, as points have no tree.
 
-    A name has a side and a part: ``RAnkle``, ``right_ankle``, ``ANKLE_R`` and ``R.Ankle`` are one joint. Pelvis, neck
-    and head may be the middle of hips, shoulders and ears; a joint that no point is of stays unobserved.
+    A name has a side and a part: ``RAnkle``, ``right_ankle``, ``ANKLE_R`` and ``R.Ankle`` are the same joint. Pelvis,
+        neck
+    and head may be midpoints of hips, shoulders and ears. A joint without points stays unobserved.
 
     Raises:
-        RigError: hips or shoulders are not among them.
+        RigError: hips or shoulders are missing.
     """
     table: dict[str, str | dict[str, float]] = {}
     sided: dict[str, str] = {}
@@ -253,7 +254,7 @@ def recognise_points(names: Sequence[str]) -> Skeleton:
 
 
 def _limbs(tree: Tree, pairs: Mapping[str, str]) -> tuple[_Limb, _Limb]:
-    """Leg and arm of the left side."""
+    """Return leg and arm of the left side."""
     longest: dict[int, _Limb] = {}
     for joint in range(len(tree.joints)):
         path = tree.path(joint)
@@ -274,7 +275,7 @@ def _limbs(tree: Tree, pairs: Mapping[str, str]) -> tuple[_Limb, _Limb]:
 
 
 def _spine(tree: Tree, legs: _Limb, arms: _Limb, pairs: Mapping[str, str]) -> _Spine:
-    """From where the ways of legs and head part to the top of the head."""
+    """Return the spine, from the joint where legs and head branch to the top of the head."""
     sided, trunk = {*pairs, *pairs.values()}, tree.path(arms.trunk)
     ways = (tree.path(joint) for joint in range(len(tree.joints)) if not _TIP.search(tree.joints[joint]))
     upwards = [
@@ -289,7 +290,7 @@ def _spine(tree: Tree, legs: _Limb, arms: _Limb, pairs: Mapping[str, str]) -> _S
     neck = way[len(trunk)] if way[len(trunk)] != head else arms.trunk
     tips = [j for j, p in enumerate(tree.parents) if p == head and _TIP.search(tree.joints[j]) and tree.length(j) > 0]
     chain = way[base:] + tips[:1]
-    # Base and hips are one bone: how far it is above them, along the way to the first joint that is elsewhere.
+    # base and hips form one bone: the base's height above the hips, along the way to the first joint elsewhere
     hips = tree.rest[[legs.joints[0], tree.joints.index(pairs[tree.joints[legs.joints[0]]])]].mean(axis=0)
     out = tree.rest[chain] - hips
     up = next((step / norm for step in out[1:] if (norm := np.linalg.norm(step)) > 0), np.zeros(3))
@@ -298,7 +299,7 @@ def _spine(tree: Tree, legs: _Limb, arms: _Limb, pairs: Mapping[str, str]) -> _S
 
 
 def _on_spine(spine: _Spine, height: float) -> Mixture:
-    """The point of the spine at a height above the hips: of the bone that it lies in, or of the spine's end."""
+    """Return the point of the spine at a height above the hips, in the bone that contains it or at the spine's end."""
     above = int(np.searchsorted(spine.heights, height))
     if above in (0, len(spine.heights)):
         return {spine.joints[min(above, len(spine.heights) - 1)]: 1.0}
@@ -310,7 +311,7 @@ def _on_spine(spine: _Spine, height: float) -> Mixture:
 
 
 def _metres(size: float) -> float:
-    """The unit in which a body's thigh, shin and trunk to the neck are together so long."""
+    """Return the unit, metres, in which thigh, shin and trunk up to the neck have this total length ``size``."""
     person = -REST_OFFSETS[[J["left_knee"], J["left_ankle"]], 2].sum() + _ABOVE_HIPS[J["neck"]]
     times = {unit: size * unit / person for unit in UNITS.values()}
     unit = min(times, key=lambda unit: abs(np.log(max(times[unit], 1e-9))))

@@ -1,12 +1,13 @@
-"""Filters of what one frame's joints show badly of rotations: the twist of straight limbs, and how short bones lie.
+"""Filters for rotations that one frame's joints hardly show: the twist of straight limbs, the direction of short bones.
 
-The plane of a bent limb shows the twist of its upper bone, with an error that grows as the limb straightens: a joint's
-noise by the length of the bent part across the bone. A Kalman filter of one angle a limb weighs it so: a process that
-returns to the middle of the joint's range (Ornstein and Uhlenbeck), as no limb stays straight and twisted for long.
+The plane of a bent limb shows the twist of its upper bone. The error of this twist is a joint's noise divided by the
+length of the lower bone across the upper one, so it grows as the limb straightens. A Kalman filter with one angle per
+limb weighs it accordingly. Its process is an Ornstein-Uhlenbeck process that returns to the middle of the joint's
+range, because no limb stays straight and twisted for long.
 
-A bone of 6 to 15 cm shows its direction badly, and turns little: collars, neck, and the spine between chest and pelvis.
-They lie to the bones above them as they usually do of this body, the more so the noisier they are. What is usual of a
-body is learned from itself: motion files draw these bones each in their own way.
+Bones of 6 to 15 cm (collars, neck, and the spine between chest and pelvis) hardly show their direction, but turn
+little. They are rotated towards their usual direction relative to the bone above, by more if their joints are noisier.
+The usual direction is learned from the body itself, because motion files draw these bones differently.
 """
 
 from __future__ import annotations
@@ -34,10 +35,11 @@ from steadypose.prior.compiled import njit
 from steadypose.prior.timing.rate import FPS
 
 TWIST_RANGE, TWIST_MEMORY_S = 0.3, 0.3
-"""Standard deviation of a twist that nothing shows, radians, and time in which it returns to the middle, seconds."""
+"""Standard deviation of an unobserved twist, radians, and time constant of its return to the middle, seconds."""
 _TWIST_KEPT = math.exp(-1.0 / (TWIST_MEMORY_S * FPS))
 UNBENT = 0.2
-"""Error of a perfect joint about the plane in which knee or elbow bends, which is no perfect hinge, metres."""
+"""Sine of the bend at which the twist's error is 1 radian even without noise, as knee and elbow are no perfect
+hinges."""
 
 LIMBS = len(HIPS) + len(SHOULDERS)
 _BALL = np.array([*HIPS, *SHOULDERS])
@@ -49,36 +51,36 @@ _SHORT = [J["spine2"], J["neck"], *COLLARS]
 _SHORT_END = [J["spine3"], J["head"], *SHOULDERS]
 
 TURN_RANGE = np.radians((3.0, 25.0, 16.0, 16.0))
-"""Standard deviations about an axis by which each of them turns about what is usual of a body, radians."""
+"""Standard deviation about an axis of each short bone's rotation from its usual direction, radians."""
 
 BODIES, TURN_MEMORY_S = math.radians(20.0), 60.0
-"""Standard deviation about an axis by which what is usual differs between bodies, radians, and time in which it is
-forgotten, seconds."""
+"""Standard deviation about an axis of the usual directions between bodies, radians, and time constant with which a
+usual direction is forgotten, seconds."""
 _TURN_KEPT = math.exp(-1.0 / (TURN_MEMORY_S * FPS))
 
 CORRELATED = 60.0
-"""Number of frames that count as one in the estimate of what is usual, as noise and posture last."""
+"""Number of frames that count as one in the estimate of the usual direction, because noise and posture last, frames."""
 
 MAX_SIGMA = 0.5
-"""Standard deviation of a joint that is not known, metres."""
-_LEAST_LENGTH = 0.03  # metres, of a bone
+"""Standard deviation of an unknown joint, metres."""
+_LEAST_LENGTH = 0.03  # least length of a bone, metres
 
 
 def unknown_twist(slots: int) -> Floats:
-    """(S, 4, 2) angle and variance of each limb's twist, of which nothing is known."""
+    """(S, 4, 2) angle and variance of each limb's twist before the first observation."""
     state = np.zeros((slots, LIMBS, 2))
     state[..., 1] = TWIST_RANGE**2
     return state
 
 
 def follow_twist(orientations: Floats, offsets: Floats, sigma: Floats, state: Floats) -> None:
-    """One frame on: turns limbs about their bones, in place. Directions of bones, and so joints, stay.
+    """Filter the twist of limbs for one frame, in place. Directions of bones, and so joint positions, do not change.
 
     Args:
-        orientations: (B, 22, 3, 3) of all joints in one frame of reference, as `solve_rotations` has them.
+        orientations: (B, 22, 3, 3) of all joints in one frame of reference, from `solve_rotations`.
         offsets: (B, 22, 3) metres, the bones.
-        sigma: (B, 22) metres, of the joints solved from, along an axis.
-        state: (B, 4, 2) of `unknown_twist`, updated.
+        sigma: (B, 22) metres along an axis, standard deviations of the joints used for the solution.
+        state: (B, 4, 2) from `unknown_twist`, updated.
     """
     _follow(orientations, offsets, sigma, state)
 
@@ -118,7 +120,7 @@ def _follow(orientations, offsets, sigma, state):
                     before[2, i, j] = world[end, i, j]
             write_rotation(upper, math.sin(angle), math.cos(angle), 1.0 - math.cos(angle), twist)
             write_product(twist, turn, world[ball])
-            # knee and elbow swing from the upper bone as it is turned now, and carry what hangs on them
+            # knee and elbow swing from the upper bone's new orientation, and carry the joints below
             write_swing(point(bones, end), rotated_back(world[ball], lower), swing)
             write_product(world[ball], swing, world[middle])
             last = _CHAIN_END[limb]
@@ -144,21 +146,20 @@ def _follow(orientations, offsets, sigma, state):
 
 
 def unknown_turns(bodies: int) -> Floats:
-    """(B, 4, 4) of each short bone the usual rotation vector and its variance about an axis, of which nothing is
-    known."""
+    """(B, 4, 4) usual rotation vector of each short bone and its variance about an axis, before any observation."""
     turns = np.zeros((bodies, len(_SHORT), 4))
     turns[..., 3] = BODIES**2
     return turns
 
 
 def follow_short_bones(orientations: Floats, offsets: Floats, sigma: Floats, turns: Floats) -> None:
-    """One frame on: turns short bones towards how they usually lie, in place. All others stay.
+    """Turn short bones towards their usual directions for one frame, in place. Other bones do not change.
 
     Args:
-        orientations: (B, 22, 3, 3) of all joints in one frame of reference, as `solve_rotations` has them.
+        orientations: (B, 22, 3, 3) of all joints in one frame of reference, from `solve_rotations`.
         offsets: (B, 22, 3) metres, the bones.
-        sigma: (B, 22) metres, of the joints solved from, along an axis.
-        turns: (B, 4, 4) of `unknown_turns`, updated.
+        sigma: (B, 22) metres along an axis, standard deviations of the joints used for the solution.
+        turns: (B, 4, 4) from `unknown_turns`, updated.
     """
     above = orientations[:, PARENT[_SHORT]]
     shown = to_rotation_vectors(above.swapaxes(-1, -2) @ orientations[:, _SHORT])

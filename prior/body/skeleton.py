@@ -1,7 +1,7 @@
-"""The canonical skeleton: its joints, its tree, its rest pose, and every table of body parts.
+"""The canonical skeleton: joints, tree, rest pose, and tables of body parts.
 
-The joints are the 22 SMPL body joints in SMPL's order (joint names only; the rest pose and its measures are our own, so
-that no licensed body model is involved). What a sensor shows of them: `prior.body.layouts`.
+The joints are the 22 SMPL body joints in SMPL's order. Only the joint names are SMPL's; the rest pose and its
+dimensions are our own, so that no licensed body model is involved. `prior.body.layouts` maps sensors' joints to them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13
 """Parent of each canonical joint; -1 for the root."""
 
 PARENT: NDArray[np.intp] = np.array(PARENTS)
-"""(22,) the same for compiled loops."""
+"""(22,) parents, for compiled loops."""
 
 CHILDREN: tuple[tuple[int, ...], ...] = tuple(
     tuple(child for child, parent in enumerate(PARENTS) if parent == joint) for joint in range(len(PARENTS))
@@ -37,12 +37,12 @@ def _bones_between() -> NDArray[np.int64]:
 
 
 BONES_BETWEEN: NDArray[np.int64] = _bones_between()
-"""(22, 22) how many bones lie between two joints."""
+"""(22, 22) number of bones between two joints."""
 
 MIRROR: NDArray[np.intp] = np.array(
     [J[n.replace("left", "#").replace("right", "left").replace("#", "right")] for n in JOINTS]
 )
-"""(22,) index of each joint's counterpart on the other side; a joint of the middle is its own."""
+"""(22,) index of each joint's counterpart on the other side; a joint of the middle is its own counterpart."""
 
 REST_OFFSETS: NDArray[np.float64] = np.array(
     [
@@ -70,9 +70,9 @@ REST_OFFSETS: NDArray[np.float64] = np.array(
         [0.0, -0.25, 0.0],  # right_wrist
     ]
 )
-"""(22, 3) metres from parent to joint in the rest pose: a T-pose facing +x, left +y, up +z (REP-103).
+"""(22, 3) offset from parent to joint in the rest pose, metres: a T-pose facing +x, left +y, up +z (REP-103).
 
-A generic adult of 1.72 m, from common anthropometric proportions.
+It is a generic adult of 1.72 m with common anthropometric proportions.
 """
 
 
@@ -84,29 +84,29 @@ def _rest_positions() -> NDArray[np.float64]:
 
 
 REST_POSITIONS: NDArray[np.float64] = _rest_positions()
-"""(22, 3) metres from the pelvis in the rest pose."""
+"""(22, 3) positions relative to the pelvis in the rest pose, metres."""
 
 HIPS = (J["left_hip"], J["right_hip"])
 SHOULDERS = (J["left_shoulder"], J["right_shoulder"])
 COLLARS = (J["left_collar"], J["right_collar"])
 
 TRUNK = (J["pelvis"], *HIPS, J["spine1"], J["spine2"], J["spine3"], J["neck"], *SHOULDERS)
-"""Joints that lie about alike to each other in every pose."""
+"""Joints whose positions relative to each other hardly depend on the pose."""
 
 TRUNK_LANDMARKS = (J["pelvis"], *HIPS, J["spine3"], J["neck"], *SHOULDERS)
-"""Those of them that sensors distinguish from their neighbours."""
+"""Joints of the trunk that sensors distinguish from their neighbours."""
 
 LIMB_ENDS = frozenset(j for j, name in enumerate(JOINTS) if name.endswith(("knee", "ankle", "elbow", "wrist")))
-"""Joints at the lower end of the four bones of the arms and the four of the legs."""
+"""Joints at the lower ends of the four arm bones and the four leg bones."""
 
 
 def limbs(*chains: tuple[str, ...]) -> list[list[int]]:
-    """Joints of chains such as ``("elbow", "wrist")``: all of the left side, then all of the right."""
+    """Return the joints of chains such as ``("elbow", "wrist")``: all of the left side, then all of the right."""
     return [[J[f"{side}_{part}"] for part in chain] for side in ("left", "right") for chain in chains]
 
 
 def finite_joints(positions: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """(..., J) which joints of (..., J, 3) have three finite coordinates: those that were observed."""
+    """(..., J) which joints of (..., J, 3) have three finite coordinates, so were observed."""
     return np.asarray(np.isfinite(positions).all(axis=-1))
 
 
@@ -120,11 +120,11 @@ _AVATAR_BONES = {
 _SIDED = [joint.rpartition("_") for joint in JOINTS]
 
 VRM: tuple[str, ...] = tuple(side + _AVATAR_BONES[part][0] for side, _, part in _SIDED)
-"""(22,) names of VRM 1.0's humanoid bones; with a capital first letter those of Unity and of the VMC protocol."""
+"""(22,) names of VRM 1.0's humanoid bones. Unity and the VMC protocol use them with a capital first letter."""
 
 AVATAR_NAMES: Mapping[str, tuple[str, ...]] = {
     "smpl22": JOINTS,
     "vrm": VRM,
     "mixamo": tuple(f"mixamorig:{side.capitalize()}{_AVATAR_BONES[part][1]}" for side, _, part in _SIDED),
 }
-"""Names of the canonical joints in avatars' rigs, whose tree is the same and whose rest pose is a T too."""
+"""Names of the canonical joints in avatars' rigs, which have the same tree and also rest in a T-pose."""

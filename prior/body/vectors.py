@@ -1,6 +1,6 @@
-"""Vectors (x, y, z) and rotation matrices (3, 3) in compiled loops.
+"""Vectors (x, y, z) and rotation matrices (3, 3) for compiled loops.
 
-Vectors are tuples: each assignment of an array to a part of another takes a second more to compile.
+Vectors are tuples, because each assignment of an array to a part of another adds a second of compilation.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def write_product(a, b, out):
 
 @njit(cache=True)
 def frame_axes(left, up):
-    """Of a right-handed frame, forward, left and up: y along ``left``, z in the plane of ``up``."""
+    """Return forward, left and up of a right-handed frame: y along ``left``, z in the plane of ``left`` and ``up``."""
     y = normalised(left)
     x = normalised(cross(y, up))
     return x, y, cross(x, y)
@@ -80,8 +80,11 @@ def frame_axes(left, up):
 
 @njit(cache=True)
 def write_rotation(axis, sine, cosine, rest, out):
-    """Write Rodrigues' rotation: ``sine`` times the cross product with ``axis``, ``cosine`` times the identity, and
-    ``rest`` times the outer product of ``axis`` with itself."""
+    """Write Rodrigues' rotation.
+
+    It is the sum of ``sine`` times the cross product with ``axis``, ``cosine`` times the identity, and ``rest`` times
+    the outer product of ``axis`` with itself.
+    """
     for i in range(3):
         for j in range(3):
             out[i, j] = rest * axis[i] * axis[j]
@@ -99,7 +102,7 @@ def write_swing(a, b, out):
     """Write the smallest rotation (3, 3) that turns direction ``a`` into ``b``."""
     a, b = normalised(a), normalised(b)
     cosine = dot(a, b)
-    if cosine < -1.0 + 1e-8:  # opposite directions have no smallest rotation: any half turn will do
+    if cosine < -1.0 + 1e-8:  # opposite directions have no unique smallest rotation; use any half turn
         other = (1.0, 0.0, 0.0) if abs(a[0]) < 0.9 else (0.0, 1.0, 0.0)
         write_rotation(normalised(cross(a, other)), 0.0, -1.0, 2.0, out)
     else:
