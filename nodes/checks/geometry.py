@@ -128,8 +128,8 @@ def check_speed(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
         what = f"a body moves at {whole:.0f} m/s" if whole > RUNNER_M_S else f"a limb swings at {limb:.0f} m/s"
         yield warning(
             "too_fast",
-            f"{what}, as no person does for a second, and frames are {interval / 1e6:.3g} ms apart: expected the times "
-            "of capture; give fps the rate at which the recording was made, 30 for instance, or stamps of capture",
+            f"{what} for a second, which no person does, with frames {interval / 1e6:.3g} ms apart: expected times of "
+            "capture; set fps to the rate at which the recording was made, such as 30, or give stamps of capture",
         )
 
 
@@ -144,8 +144,8 @@ def _degenerate(messages: Sequence[PoseRaw], joints: Floats) -> Problem | None:
         axis = "xyz"[int(np.argmax(flat == 0))]
         return error(
             "flat",
-            f"{axis} is the same of all joints: key points of an image, without depth; expected three coordinates in "
-            "metres: with a depth image, from_coco lifts them (docs/sources.md)",
+            f"{axis} is the same for all joints, as in 2D key points without depth: expected three coordinates in "
+            "metres; if you have a depth image, from_coco lifts key points to 3D (docs/sources.md)",
         )
     stamps = {raw.stamp_ns for raw in messages}
     if len(stamps) >= ENOUGH and len(joints) >= len(messages):
@@ -157,8 +157,9 @@ def _degenerate(messages: Sequence[PoseRaw], joints: Floats) -> Problem | None:
         if same:
             return error(
                 "frozen",
-                f"the joints are the same to the last bit in {len(messages)} messages of {len(stamps)} stamps: the "
-                "tracker repeats its last answer; expected new joints with each stamp, or no message",
+                f"the joints are identical to the last bit in {len(messages)} messages with {len(stamps)} "
+                "different stamps: the tracker repeats its last answer; expected new joints with each stamp, or no "
+                "message",
             )
     return None
 
@@ -169,15 +170,15 @@ def _no_body(skeleton: Skeleton, like: Likeness, joints: Floats) -> Problem:
     if others and others[0].is_body:
         return error(
             "wrong_order",
-            f"in the order of {skeleton.name} these joints are no body ({off}), in that of {others[0].skeleton} they "
-            f"are: expected skeleton {others[0].skeleton!r}",
+            f"in the order of {skeleton.name} these joints do not form a body ({off}), but in that of "
+            f"{others[0].skeleton} they do: expected skeleton {others[0].skeleton!r}",
         )
     tried = ", ".join(other.skeleton for other in others)
     return error(
         "wrong_order",
-        f"in the order of {skeleton.name} these joints are no body "
-        f"({off}){f', nor in that of {tried}' if tried else ''}: expected {', '.join(skeleton.joints[:4])}, … as "
-        "prior/body/layouts.py has them; reorder yours, or describe them (docs/sources.md)",
+        f"in the order of {skeleton.name} these joints do not form a body "
+        f"({off}){f', nor in that of {tried}' if tried else ''}: expected {', '.join(skeleton.joints[:4])}, …, as in "
+        "prior/body/layouts.toml; reorder yours, or describe your layout (docs/sources.md)",
     )
 
 
@@ -192,8 +193,8 @@ def _unit(like: Likeness) -> Problem:
             )
     return error(
         "unit",
-        f"the body is {height:.3g} m tall: expected metres; coordinates of an image, normalised or in pixels, are "
-        "none: take the tracker's world coordinates",
+        f"the body is {height:.3g} m tall: expected metres, not image coordinates (pixels or normalised); use the "
+        "tracker's world coordinates",
     )
 
 
@@ -205,18 +206,18 @@ def _frame(pose: Pose, stand: Stance) -> Iterator[Problem]:
         if mirrored:
             yield error(
                 "mirrored",
-                "bodies are mirrored: toes, noses and knees point backwards by their left and right; expected a "
+                "bodies are mirrored: given their left and right, toes, noses and knees point backwards; expected a "
                 "right-handed frame and the person's own left: negate x, or undo an exchange of two axes, or of left "
-                "and right (a selfie picture)",
+                "and right (a mirrored image)",
             )
         return
     axis = int(np.argmax(np.abs(stand.up)))
     if abs(stand.up[axis]) < ALONG:
         yield warning(
             "not_upright",
-            f"bodies are {np.degrees(np.arccos(np.clip(up[2], -1, 1))):.0f} degrees from upright, along no axis of "
-            "their frame: expected sensor_pose.orientation to turn their frame to z up; calibrate the sensor, or give "
-            "gravity (docs/calibrate.md)",
+            f"bodies lean by {np.degrees(np.arccos(np.clip(up[2], -1, 1))):.0f} degrees, along no axis of their frame: "
+            "expected sensor_pose.orientation to turn their frame to z up; calibrate the sensor, or give the direction "
+            "of gravity (docs/calibrate.md)",
         )
         return
     name = ("-" if stand.up[axis] < 0 else "") + "xyz"[axis]
@@ -224,7 +225,7 @@ def _frame(pose: Pose, stand: Stance) -> Iterator[Problem]:
     if abs(abs(x) - 1.0) < 0.01 and abs(w) < 0.01 and name == "z":
         yield error(
             "quaternion_order",
-            "sensor_pose.orientation is 1 0 0 0, which turns bodies upside down: read as wxyz it is the identity; "
+            "sensor_pose.orientation is 1 0 0 0, which turns bodies upside down; it seems to be the identity as wxyz: "
             "expected xyzw, 0 0 0 1",
         )
     elif mirrored and name in ("y", "-y"):
@@ -243,7 +244,7 @@ def _frame(pose: Pose, stand: Stance) -> Iterator[Problem]:
         wanted = f"up {name!r}: Pose.from_up({name!r}), or up = {name!r} in the file"
         yield warning(
             "up_axis",
-            f"bodies stand along {name} of their frame, which lies flat in the world: unless they lie down, expected "
+            f"bodies lie down in the world: they stand along {name} of their frame; unless people do lie, expected "
             + (wanted if name in ("z", "y", "-y") else "sensor_pose.orientation to turn that axis to the world's z"),
         )
 
@@ -255,8 +256,8 @@ def _place(raw: PoseRaw, skeleton: Skeleton, joints: Floats) -> Iterator[Problem
     if np.isfinite(pelvis).any() and np.nanmax(np.abs(pelvis)) < AT_ORIGIN_M:
         yield warning(
             "root_relative",
-            "the pelvis is at the origin in every frame: joints relative to the root, so that nobody moves; expected "
-            "metres from the sensor: add the root's place",
+            "the pelvis is at the origin in every frame, so that nobody moves: the joints seem to be relative to the "
+            "root; expected positions relative to the sensor: add the root's place",
         )
     elif raw.calibrated:
         world = SensorFrame.of(raw.sensor_pose).to_world(canonical)
@@ -267,6 +268,6 @@ def _place(raw: PoseRaw, skeleton: Skeleton, joints: Floats) -> Iterator[Problem
         ):
             yield warning(
                 "floor",
-                f"the sensor is said to be calibrated, but feet are at a height of {lowest:.2f} m: expected the floor "
-                "at 0; calibrate again (docs/calibrate.md), or say calibrated=False",
+                f"the sensor is marked as calibrated, but feet are at a height of {lowest:.2f} m: expected "
+                "the floor at 0; calibrate again (docs/calibrate.md), or set calibrated=False",
             )

@@ -53,7 +53,7 @@ def _unknown(messages: Sequence[PoseRaw]) -> Problem:
     close = nearest(name.lower().replace("_", "").replace("-", ""), SKELETONS)
     return error(
         "unknown_skeleton",
-        f"skeleton {name!r}{close}{hint}: expected one of {', '.join(SKELETONS)}; of joints of your own, see "
+        f"skeleton {name!r}{close}{hint}: expected one of {', '.join(SKELETONS)}; for a layout of your own, see "
         "docs/sources.md",
     )
 
@@ -62,7 +62,7 @@ def _wrong_count(messages: Sequence[PoseRaw], skeleton: Skeleton, count: int) ->
     same = [s.name for s in SKELETONS.values() if len(s.joints) == count]
     like = _best(messages)
     if like:
-        hint = f"; these are most like {like[0]!r}: name that"
+        hint = f"; these are most like {like[0]!r}: use that name"
     elif same:
         hint = f"; {' and '.join(same)} have {count}"
     else:
@@ -89,9 +89,9 @@ def _sensor_pose(raw: PoseRaw) -> Iterator[Problem]:
     if not np.isfinite(pose.position).all() or not abs(norm - 1.0) < UNIT_TOLERANCE:
         yield error(
             "sensor_pose",
-            f"sensor_pose is no pose: position {np.round(pose.position, 3).tolist()}, orientation "
+            f"sensor_pose is not a valid pose: position {np.round(pose.position, 3).tolist()}, orientation "
             f"{np.round(pose.orientation, 3).tolist()} of norm {norm:.3g}; expected finite numbers and a unit "
-            "quaternion xyzw: Pose.from_up('-y') of a level camera, 0 0 0 1 where z is up",
+            "quaternion xyzw: Pose.from_up('-y') for a level camera, 0 0 0 1 if z is up",
         )
 
 
@@ -103,7 +103,8 @@ def _confidence(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     seen = np.concatenate([np.isfinite(body.positions).all(axis=1) for body in bodies(messages)])
     if not np.isfinite(values).any():
         yield error(
-            "confidence_nan", "confidence is NaN of every joint: expected 0 to 1; 1 where the source has no confidences"
+            "confidence_nan",
+            "confidence is NaN for every joint: expected 0 to 1; 1 where the source has no confidences",
         )
         return
     most, least = float(np.nanmax(values)), float(np.nanmin(values))
@@ -111,7 +112,7 @@ def _confidence(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
         top = 100 if most <= 100 else 255 if most <= 255 else None
         yield warning(
             "confidence_range",
-            f"confidence goes up to {most:g}: expected 0 to 1, all above counts as 1; "
+            f"confidence goes up to {most:g}: expected 0 to 1; above 1 counts as 1; "
             + (f"divide by {top}" if top and most > 1.5 else "scale or clip it"),
         )
     elif least < 0.0:
@@ -119,8 +120,8 @@ def _confidence(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     elif seen.any() and not (np.nan_to_num(values[seen]) > 0).any():
         yield warning(
             "confidence_zero",
-            "confidence is 0 of every joint that has a position: expected 0 to 1; give 1 where the source has none, "
-            "and NaN positions where it saw nothing",
+            "confidence is 0 for every joint that has a position: expected 0 to 1; give 1 if the source has no "
+            "confidences, and NaN positions for joints that it did not see",
         )
 
 
@@ -131,8 +132,8 @@ def _seen(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     if seen and 0 < (usual := int(np.median(seen))) < MIN_JOINTS:
         yield warning(
             "few_joints",
-            f"{usual} joints of a body are seen, the rest is NaN: a body is taken up from {MIN_JOINTS} on; expected "
-            "most of the body in the picture: stand farther away, or lower the tracker's own threshold",
+            f"only {usual} joints of a body are seen, the others are NaN: expected {MIN_JOINTS} or more; get the whole "
+            "body into the image, or lower the tracker's own threshold",
         )
 
 
@@ -141,8 +142,8 @@ def _ids(messages: Sequence[PoseRaw], max_bodies: int, identified: bool) -> Iter
     if most > max_bodies:
         yield warning(
             "too_many_bodies",
-            f"{most} bodies in a message, the prior follows {max_bodies}: expected [prior] max_bodies of {most} or "
-            f"more; set --set prior.max_bodies={most}, or send those that matter",
+            f"{most} bodies in a message: expected at most {max_bodies} ([prior] max_bodies); raise the limit with "
+            f"--set prior.max_bodies={most}, or send fewer",
         )
     twice = sum(len({body.id for body in raw.bodies}) < len(raw.bodies) for raw in messages)
     if identified:
@@ -150,8 +151,8 @@ def _ids(messages: Sequence[PoseRaw], max_bodies: int, identified: bool) -> Iter
     if twice > len(messages) / 2:
         yield error(
             "ids_repeated",
-            f"bodies of one message have the same id in {twice} of {len(messages)} messages: expected an id a person; "
-            "number them, or --set prior.identify.enabled=true",
+            f"bodies of one message share an id in {twice} of {len(messages)} messages: expected one id per person; "
+            "number them, or let steadypose assign ids: --set prior.identify.enabled=true",
         )
         return
     appearances = Counter(body.id for body in bodies(messages))

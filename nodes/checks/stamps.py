@@ -45,28 +45,28 @@ def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem
     if (steps < 0).sum() > max(1, 0.1 * len(steps)):
         yield warning(
             "stamps_out_of_order",
-            f"{(steps < 0).sum()} of the last {len(steps)} stamps are older than the one before: expected stamps that "
-            "rise; publish frames in the order of their capture, from one thread",
+            f"{(steps < 0).sum()} of the last {len(steps)} stamps are older than the one before: expected "
+            "increasing stamps; publish frames in the order of their capture, from one thread",
         )
     elif (steps == 0).sum() > 0.3 * len(steps):
         yield warning(
             "stamps_repeated",
-            f"{(steps == 0).sum()} of the last {len(steps)} stamps repeat the one before: expected one message a "
-            "frame, with all its bodies; put bodies of one moment into one message",
+            f"{(steps == 0).sum()} of the last {len(steps)} stamps repeat the one before: expected one message per "
+            "frame; put all bodies of a frame into one message",
         )
     rate = SECOND_NS / max(float(np.median(steps)), 1.0)
     if (longer := _stretched(rate)) is not None:
         unit, factor = longer
         yield error(
             "stamps_unit",
-            f"stamps are {1 / rate:.3g} s apart: they seem to be {unit} taken for seconds, expected the time of "
-            f"capture; divide by {factor:.0f}",
+            f"stamps are {1 / rate:.3g} s apart: they seem to be {unit}, converted as if they were seconds; expected "
+            f"times of capture: divide by {factor:.0f}",
         )
     elif 0 < rate < SLOW_HZ:
         yield warning(
             "slow",
-            f"stamps are {1e3 / rate:.0f} ms apart, {rate:.1f} frames a second: expected {SLOW_HZ:.0f} or more, best "
-            "30; what moves is lost in between: a smaller network, or a picture of less size",
+            f"stamps are {1e3 / rate:.0f} ms apart, {rate:.1f} frames a second: expected {SLOW_HZ:.0f} or more, "
+            "ideally 30; fast motion is lost: use a smaller network or smaller images",
         )
     if live:
         yield from _against_clock(arrivals, stamps)
@@ -78,8 +78,8 @@ def check_length(first_ns: int, last_ns: int, delay_frames: int) -> Iterator[Pro
         yield warning(
             "short",
             f"the stream lasts {(last_ns - first_ns) / SECOND_NS:.2f} s, less than the delay of {delay_frames} frames: "
-            "its deviations leave out the sensor's error in depth, which bones show later; expected a longer stream, "
-            "or a shorter delay",
+            "standard deviations are too small, because the sensor's error in depth is not estimated yet; expected a "
+            "longer stream, or a shorter delay",
         )
 
 
@@ -89,8 +89,8 @@ def _unit(stamps: np.ndarray) -> Problem | None:
     if not stamps.any():
         return error(
             "stamps_zero",
-            "stamp is 0 in every message: expected nanoseconds of capture; set stamp_ns, such as time.time_ns() when "
-            "the picture was taken",
+            "stamp is 0 in every message: expected nanoseconds of capture; set stamp_ns to time.time_ns() when the "
+            "image is taken",
         )
     step = float(np.median(rising[rising > 0])) if (rising > 0).any() else 0.0
     if not step and (rising < 0).any():
@@ -98,8 +98,8 @@ def _unit(stamps: np.ndarray) -> Problem | None:
     if not (stamps % SECOND_NS).any() and (step == 0 or step >= SECOND_NS):
         return error(
             "stamps_whole_seconds",
-            f"stamps are whole seconds, the last {newest // SECOND_NS} s: the part below the second is lost; expected "
-            "nanoseconds of capture: in ROS both stamp.sec and stamp.nanosec, else time.time_ns()",
+            f"stamps are whole seconds, the last {newest // SECOND_NS} s: expected nanoseconds of capture; in ROS use "
+            "both stamp.sec and stamp.nanosec, otherwise time.time_ns()",
         )
     if not step and newest < SECONDS_BELOW:
         return _of_unit("seconds", f"stamp is {newest} in every message", UNITS["seconds"])
@@ -129,7 +129,7 @@ def _of_unit(unit: str, found: str, factor: float) -> Problem:
     return error(
         "stamps_unit",
         f"{found}: they seem to be {unit}, expected nanoseconds of capture; multiply by {factor:.0f}, or use "
-        "time.time_ns(), when the picture was taken",
+        "time.time_ns() when the image is taken",
     )
 
 
@@ -139,8 +139,8 @@ def _against_clock(arrivals: Sequence[Arrival], stamps: np.ndarray) -> Iterator[
     if -late.max() > AHEAD_NS:
         yield warning(
             "stamps_ahead",
-            f"stamps are {-late.max() / SECOND_NS:.1f} s ahead of this machine's clock: expected times of capture, "
-            "which are past; synchronise the two clocks (NTP or PTP)",
+            f"stamps are {-late.max() / SECOND_NS:.1f} s ahead of this machine's clock: expected times of capture "
+            "in the past; synchronise the two clocks (NTP or PTP)",
         )
     # delayed messages arrive late and then catch up; after a clock was set, the offset stays
     step = int(np.argmax(np.abs(np.diff(late)))) + 1
@@ -148,7 +148,6 @@ def _against_clock(arrivals: Sequence[Arrival], stamps: np.ndarray) -> Iterator[
     if min(len(before), len(after)) >= SETTLED and abs(moved := int(after.min() - before.min())) > STEP_NS:
         yield warning(
             "clock_jumped",
-            f"the source's clock moved by {abs(moved) / SECOND_NS:.1f} s against this machine's from one message to "
-            "the next: the stream starts anew; expected a clock that runs on: let NTP slew that clock instead of "
-            "setting it",
+            f"the source's clock jumped by {abs(moved) / SECOND_NS:.1f} s relative to this machine's, so the stream "
+            "restarts: expected a steady clock; let NTP slew that clock instead of setting it",
         )

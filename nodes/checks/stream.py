@@ -55,8 +55,8 @@ class Answers:
                 warning(
                     "nearly_all_refused",
                     f"{100 * refused / self._joints:.0f} % of the joints seen were refused as jumps: expected a few; "
-                    "if ids go from one person to another, --set prior.identify.enabled=true; if stamps are those of "
-                    "arrival, take those of capture",
+                    "if ids switch between people, --set prior.identify.enabled=true; if stamps are times of arrival, "
+                    "use times of capture",
                 )
             )
         nearly_all = self._out >= ENOUGH and self._flagged > MAX_SHARE * self._out
@@ -65,9 +65,8 @@ class Answers:
             found.append(
                 warning(
                     "nearly_all_flagged",
-                    f"{self._flagged} of the last {self._out} poses were flagged as no human motion: expected a few "
-                    "in a thousand; look at the picture (--view) whether left and right, axes and order are the "
-                    "sensor's",
+                    f"{self._flagged} of the last {self._out} poses were flagged as unlike human motion: expected a "
+                    "few in a thousand; check left and right, axes and joint order in the 3D view (--view)",
                 )
             )
         self._forget()
@@ -125,8 +124,8 @@ class StreamCheck:
             return []
         if live and (silent_ns := now_ns - max(last.at_ns, self._heard_ns)) > SILENT_NS:
             text = (
-                f"no message for {silent_ns / 1e9:.0f} s, after {self._window.received}: the tracker has stopped, "
-                "hangs, or its connection is cut; start it again: this goes on when it does"
+                f"no message for {silent_ns / 1e9:.0f} s, after {self._window.received} messages: the tracker has "
+                "stopped, hangs, or lost its connection; restart it, and the stream continues"
             )
             return [error("stopped", text)]
         if anew:
@@ -148,8 +147,8 @@ class StreamCheck:
         if not self._window.inhabited and self._window.received >= NOBODY:
             yield warning(
                 "nobody",
-                f"{self._window.received} messages and nobody in any: expected bodies; if somebody stands there, the "
-                "tracker does not find them, or the publisher leaves `bodies` empty",
+                f"{self._window.received} messages, none with a body: expected bodies; if people are in view, the "
+                "tracker does not detect them, or the publisher leaves `bodies` empty",
             )
         if not _usable(names):  # with a wrong layout, checks of joints mean nothing
             return

@@ -97,7 +97,7 @@ def clean(
     for problem in done.problems:
         terminal.print(f"  {problem}", style="yellow")
     if not done.poses:
-        terminal.print(f"  {NOBODY}; steadypose info {source} says what it holds", style="red")
+        terminal.print(f"  {NOBODY}; `steadypose info {source}` shows what it contains", style="red")
     if done.unread:
-        terminal.print(f"  {source} is damaged: what could be read of it is clean", style="red")
+        terminal.print(f"  {source} is damaged: the readable part is cleaned", style="red")
     return 1 if done.unread or not done.poses else 0

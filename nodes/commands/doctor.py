@@ -124,7 +124,7 @@ def listen(launch_file: str, console: Console, clock: Clock | None = None) -> in
         problems.append(
             error(
                 "not_a_message",
-                f"{refused} of what came were no messages: expected the topic, a zero byte, a header of 9 bytes, and "
+                f"{refused} frames were not valid messages: expected the topic, a zero byte, a header of 17 bytes, and "
                 "CDR (docs/other_languages.md)",
             )
         )

@@ -188,7 +188,7 @@ class _Run:
             width = self._console.width
             self._console.print(table(self._launch.nodes, self._diagnostics, supervisor, width, summary=True))
         if unread := self._not_read():
-            self._print(f"{unread}: what could be read of the input was played")
+            self._print(f"{unread}: the readable part of the input was played")
             status = status or 1
         if status == 0 and not interrupted and (lost := self._not_through()):
             self._print(f"not every frame went through: {lost}")
@@ -268,7 +268,7 @@ class _Run:
                 return 0
             if not self._over:
                 self._over = True
-                self._print("the stream has ended; the picture stays until Ctrl-C")
+                self._print("the stream has ended; the view stays open until Ctrl-C")
             return None
         if self._clock.monotonic_ns() - self._progress_ns > STALL_NS:
             self._print("the stream ended, but its end did not come through all nodes; see dropped and restarts")

@@ -88,8 +88,8 @@ class Health:
         return [
             error(
                 "no_output",
-                f"frames come in and for {(now - self._unanswered_ns) / 1e9:.0f} s none went out: see what is refused, "
-                "and who is waited for",
+                f"frames come in, but none went out for {(now - self._unanswered_ns) / 1e9:.0f} s: see which are "
+                "refused, and which node this one waits for",
             )
         ]
 

@@ -347,8 +347,8 @@ class Node(ABC):
         if self._deaf:
             yield error(
                 "deaf",
-                f"{', '.join(sorted(self._deaf))} has not read for {DEAF_S:g} s, and is not waited for any more: what "
-                "it misses is counted there; stop it, or, if it is a second one of that name, call it something else",
+                f"{', '.join(sorted(self._deaf))} has not read for {DEAF_S:g} s, and is not waited for any more; "
+                "it counts what it misses: stop it or restart it; if it is a second subscriber of that name, rename it",
             )
 
     def _wire_problems(self) -> Iterator[Problem]:
@@ -358,13 +358,14 @@ class Node(ABC):
         if second := new.pop(SECOND, 0):
             yield error(
                 "second_publisher",
-                f"{second} messages came from a second publisher of a source, and were refused: expected one publisher "
-                "a source; give each sensor a name of its own (`source` of its messages), or stop one of the two",
+                f"{second} messages came from a second publisher with the same source name, and were refused: "
+                "expected one publisher per source; give each sensor its own name (`source` of its messages), or stop "
+                "one of the two",
             )
         if new:
             yield error(
                 "not_a_message",
-                f"{new.total()} of what came were no messages ({', '.join(sorted(new))}): expected the topic, a zero "
+                f"{new.total()} frames were not valid messages ({', '.join(sorted(new))}): expected the topic, a zero "
                 "byte, a header of 17 bytes, and CDR (docs/other_languages.md)",
             )
 

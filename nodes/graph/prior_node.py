@@ -109,7 +109,7 @@ class PriorNode(Node):
             yield warning(
                 "overload",
                 f"this machine has time for {self._limit.bodies} of {self._pipeline.offered} bodies: those farthest "
-                "from the sensor are left out; switch off [prior.score] and [prior.impute], or take a faster machine",
+                "from the sensor are left out; switch off [prior.score] and [prior.impute], or use a faster machine",
             )
 
     @property
@@ -120,9 +120,8 @@ class PriorNode(Node):
     def _no_source(self, now_ns: int) -> Problem:
         return error(
             "no_source",
-            f"nothing has come on {POSE_RAW} for {(now_ns - self._started_ns) / 1e9:.0f} s, ever: expected a "
-            f"publisher at {', '.join(self.launch.addresses('pose_input'))}; start the tracker, or have it bind that "
-            "address",
+            f"no {POSE_RAW} since the start {(now_ns - self._started_ns) / 1e9:.0f} s ago: expected a publisher at "
+            f"{', '.join(self.launch.addresses('pose_input'))}; start the tracker, or let it bind that address",
         )
 
     def status(self) -> dict[str, str]:

@@ -130,7 +130,7 @@ WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     "the camera's axes": (lambda j: steadypose.clean(turned(j), fps=30), "up = '-y'"),
     "another order of joints": (
         lambda j: steadypose.clean(j[:, np.random.default_rng(0).permutation(22)], fps=30),
-        "in the order of smpl22 these joints are no body",
+        "in the order of smpl22 these joints do not form a body",
     ),
     "left and right exchanged": (lambda j: steadypose.clean(j * [1.0, -1.0, 1.0], fps=30), "bodies are mirrored"),
     "stamps in milliseconds": (
@@ -139,15 +139,15 @@ WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     ),
     "milliseconds, frame by frame": (
         lambda j: frame_by_frame(j, 1e3 * seconds()),
-        "they seem to be milliseconds taken for seconds",
+        "they seem to be milliseconds, converted as if they were seconds",
     ),
     "the last frame first": (
         lambda j: steadypose.clean(j, stamp_ns=np.arange(FRAMES)[::-1] * 33_333_333),
-        "stamps that rise; publish frames in the order of their capture",
+        "increasing stamps; publish frames in the order of their capture",
     ),
     "ten times the rate": (
         lambda j: steadypose.clean(j, fps=300),
-        r"frames are 3\.33 ms apart: .* give fps the rate at which the recording was made",
+        r"frames 3\.33 ms apart: .* set fps to the rate at which the recording was made",
     ),
     "shorter than the delay": (
         lambda j: steadypose.clean(j[:4], fps=30),

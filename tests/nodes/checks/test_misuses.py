@@ -296,7 +296,7 @@ class TestNode:
     def test_a_tracker_that_stops(self, node: PriorNode, clock: VirtualClock) -> None:
         self.play(node, clock, walk())
         clock.time_ns += round(2.5 * SECOND_NS)
-        assert "start it again" in from_values(node.diagnostics().values)["stopped"]
+        assert "restart it" in from_values(node.diagnostics().values)["stopped"]
 
     def test_a_stream_that_ended_has_not_stopped(self, node: PriorNode, clock: VirtualClock) -> None:
         frames = walk()
