@@ -1,4 +1,4 @@
-"""Frame by frame: the nodes `prior` and `trajectory` as one object, for a program that has the joints itself."""
+"""Frame by frame: the nodes `prior` and `trajectory` as one object, for programs with joints of their own."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ _NAMES = np.array(JOINTS)
 
 
 class FilterError(ValueError):
-    """A frame, or an argument, that cannot be used. The text says what was expected, what came, and what to do."""
+    """An invalid frame or argument. The text says what was expected, what came, and what to do."""
 
 
 class Filter:
-    """Cleans joints as they come: ``pose = filter(joints, t)``, what the nodes do, with the same numbers.
+    """Cleans joints live: ``pose = filter(joints, t)``. The result is the same as that of the nodes.
 
-    A filter serves one camera, with all bodies in its picture, from one thread. Nothing in it reads a clock or draws a
-    random number. Poses are of a grid of 30 Hz, ``delay`` frames behind; a stream whose stamps go back, or stop for
-    longer than the prior's timeout, begins anew.
+    Use one filter per camera, from one thread. It handles all bodies in view. The same input always gives the same
+    output. Poses are at 30 Hz, ``delay`` frames behind the input. The stream restarts if stamps go back, or pause for
+    longer than the prior's timeout.
 
     Args:
-        skeleton: the joints' names and order, or a layout of your own, as of `clean`.
+        skeleton: name of the joint layout, or a layout of your own, as for `clean`.
         up: the axis of the joints' frame that points up: ``z``, ``y``, or ``-y`` (a level camera: y down).
-        delay: frames at 30 Hz that an answer waits for, 0 to 16; more is smoother.
-        sensor_pose: where the sensor stands in the world, of which the floor is then at 0; instead of ``up``.
-        settings: ``prior`` and ``trajectory`` of a launch file.
+        delay: frames at 30 Hz that the output lags behind, 0 to 16; more is more accurate.
+        sensor_pose: pose of the sensor in the world, instead of ``up``. The floor is then at z = 0.
+        settings: sections ``prior`` and ``trajectory`` of a launch file.
 
     Attributes:
-        problems: what is probably wrong with the input so far, in words. Each is warned of once, as `InputWarning`.
+        problems: probable faults of the input so far, as text. Each is warned of once, as `InputWarning`.
 
     Raises:
         ValueError: an unknown skeleton, axis or setting.
@@ -91,23 +91,23 @@ class Filter:
         ids: Sequence[int] | None = None,
         sensor_pose: Pose | None = None,
     ) -> Poses | None:
-        """Take a frame; the newest pose that it completes.
+        """Take a frame, and return the newest pose that it completes.
 
         Args:
-            joints: (J, 3) metres of one body, NaN where a joint is missing; or (B, J, 3) of as many as there are in
-                this frame, none included.
-            t: seconds of capture, on any clock that only goes forward.
-            stamp_ns: the same in whole nanoseconds, instead of ``t``.
-            confidence: (J,) or (B, J) 0 to 1, where the source tells it.
-            ids: the B bodies' numbers, each person's own; 0, 1, … unless given.
-            sensor_pose: of this frame, where the camera moves.
+            joints: (J, 3) metres of one body, NaN where a joint is missing; or (B, J, 3) of the B bodies in this frame,
+                where B may be 0.
+            t: time of capture in seconds, on any clock that only goes forward.
+            stamp_ns: time of capture in whole nanoseconds, instead of ``t``.
+            confidence: (J,) or (B, J) 0 to 1, if the source has it.
+            ids: ids of the B bodies, one per person. Default: 0, 1, ….
+            sensor_pose: pose of the sensor in this frame, if the camera moves.
 
         Returns:
-            The pose: of one body, or with an axis of bodies where ``joints`` has one. None while the delay fills,
-            while nobody is there, and where a camera of more than 30 Hz completes none.
+            The pose of one body, or poses with an axis of bodies if ``joints`` has one. None for the first ``delay``
+            frames, while nobody is visible, and in some calls if the camera is faster than 30 Hz.
 
         Raises:
-            FilterError: an array has the wrong form, or there is no time; the frame is not used.
+            FilterError: an array has the wrong shape, or there is no time of capture; the frame is not used.
         """
         found = self.update(joints, t, stamp_ns=stamp_ns, confidence=confidence, ids=ids, sensor_pose=sensor_pose)
         return found[-1] if found else None
@@ -122,7 +122,7 @@ class Filter:
         ids: Sequence[int] | None = None,
         sensor_pose: Pose | None = None,
     ) -> list[Poses]:
-        """Take a frame as a call does; all poses that it completes, oldest first: several of a camera below 30 Hz."""
+        """Take a frame, and return all poses that it completes, oldest first: several if the camera is below 30 Hz."""
         stamp = _stamp(t, stamp_ns)
         bodies, self._several = self._bodies(joints, confidence, ids)
         if sensor_pose is not None:
@@ -137,7 +137,7 @@ class Filter:
         return poses
 
     def flush(self) -> list[Poses]:
-        """The poses that the delay still holds, oldest first. The stream ends; the next frame begins another."""
+        """End the stream, and return its last ``delay`` poses, oldest first. The next frame begins a new stream."""
         if self._last is None:
             return []
         end = replace(self._last, bodies=[], end_of_stream=True)
@@ -155,7 +155,7 @@ class Filter:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Frames, bodies and joints that were not used so far, by cause."""
+        """Counts of unused frames, bodies and joints so far, by cause."""
         return {cause: n for cause, n in (self._prior.counters + self._trajectory.counters).items() if n}
 
     def _poses(self, cleaned: list[PoseClean]) -> list[Poses]:

@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     import xarray  # pyright: ignore[reportMissingImports]
 
 ALWAYS = ("stamp_ns", "joint_names", "body_id")
-"""arrays that have no axis of bodies"""
+"""Arrays without an axis of bodies."""
 BY_CONTACT, BY_JOINT = ("contacts",), ("joint_anomaly", "rotations", "sigma", "state", "positions", "world_positions")
 _NAMES = dict.fromkeys(BY_CONTACT, CONTACTS) | dict.fromkeys(BY_JOINT, JOINTS)
 _LAST = ("x", "y", "z", "w")
 
 
 class ByName(NDArray[Any] if TYPE_CHECKING else np.ndarray):
-    """An array with an axis of joints that takes their names: ``positions["left_wrist"]``, ``sigma[["neck", "head"]]``.
+    """An array that you can index by joint names: ``positions["left_wrist"]``, ``sigma[["neck", "head"]]``.
 
-    Indexing in any other way is numpy's own, and gives a plain array.
+    Any other index works as in numpy, and gives a plain array.
     """
 
     _names: tuple[str, ...] = ()
@@ -67,14 +67,14 @@ class ByName(NDArray[Any] if TYPE_CHECKING else np.ndarray):
 
 
 class Poses(dict[str, NDArray[Any]]):
-    """Poses of one moment, or of T moments: the arrays that ``steadypose clean`` writes, by name and as attributes.
+    """Poses of one frame or of T frames: the arrays that ``steadypose clean`` writes, by name and as attributes.
 
-    Shapes are those of one body at one moment. Of T moments all have an axis T before these, and where the input had
-    an axis of bodies, one of B bodies after it, in the order of ``body_id``.
+    The shapes below are for one body in one frame. With T frames, each array has a leading axis T. If the input has an
+    axis of bodies, an axis of B bodies follows it, in the order of ``body_id``.
 
     Attributes:
-        problems: what is probably wrong with the input, in words, with what to do.
-        refused: frames, bodies and joints that were not used, by cause.
+        problems: probable faults of the input, as text, with the remedy.
+        refused: counts of unused frames, bodies and joints, by cause.
     """
 
     def __init__(
@@ -89,72 +89,72 @@ class Poses(dict[str, NDArray[Any]]):
 
     @property
     def stamp_ns(self) -> NDArray[np.int64]:
-        """Nanoseconds of capture; of one moment a number."""
+        """Time of capture in nanoseconds; for one frame, a number."""
         return self["stamp_ns"][()]
 
     @property
     def t(self) -> NDArray[np.float64]:
-        """Seconds of capture: `stamp_ns` / 1e9."""
+        """Time of capture in seconds: `stamp_ns` / 1e9."""
         return self["stamp_ns"][()] / 1e9
 
     @property
     def positions(self) -> ByName:
-        """(22, 3) metres, in the input's frame; by joint."""
+        """(22, 3) metres, in the input's frame, by joint."""
         return self._by_name("positions")
 
     @property
     def world(self) -> ByName:
-        """(22, 3) metres in the world: z up, the floor at 0 where the sensor's place is known; by joint."""
+        """(22, 3) metres, world frame, by joint: z up; floor at z = 0 if the sensor's pose is known."""
         return self._by_name("world_positions")
 
     @property
     def rotations(self) -> ByName:
-        """(22, 4) xyzw, each from the joint's to its parent's frame, the pelvis' to the input's; by joint."""
+        """(22, 4) xyzw, by joint: from the joint's frame to its parent's; for the pelvis, to the input's frame."""
         return self._by_name("rotations")
 
     @property
     def state(self) -> ByName:
-        """(22,) `JointState`: seen, refined, imputed or unknown; by joint."""
+        """(22,) `JointState`, by joint: seen, refined, imputed or unknown."""
         return self._by_name("state")
 
     @property
     def sigma(self) -> ByName:
-        """(22,) metres, standard deviation of a position along an axis; by joint."""
+        """(22,) metres, by joint: standard deviation of the position along one axis."""
         return self._by_name("sigma")
 
     @property
     def joint_anomaly(self) -> ByName:
-        """(22,) as `anomaly`, joint by joint; NaN where not seen."""
+        """(22,) anomaly score of each joint, by joint; NaN if it was not observed."""
         return self._by_name("joint_anomaly")
 
     @property
     def anomaly(self) -> Any:
-        """How unlike human motion: -log10 of the rate at which clean motion scores as high. NaN if not scored."""
+        """Anomaly score: -log10 of the rate at which clean motion scores as high; NaN if not scored."""
         return self["anomaly"][()]
 
     @property
     def anomaly_flag(self) -> Any:
-        """Whether the pose cannot be trusted."""
+        """True if the pose should not be trusted."""
         return self["anomaly_flag"][()]
 
     @property
     def contacts(self) -> ByName:
-        """(8,) probability that a knee, ankle, foot or wrist bears load; by joint (`CONTACTS`)."""
+        """(8,) probability that a joint of `CONTACTS` (knees, ankles, feet, wrists) bears load, by joint."""
         return self._by_name("contacts")
 
     @property
     def root_velocity(self) -> NDArray[np.float64]:
-        """(3,) m/s of the pelvis, world."""
+        """(3,) m/s, velocity of the pelvis, world frame."""
         return self["root_velocity"]
 
     @property
     def body_id(self) -> NDArray[np.int32]:
-        """(B,) the bodies' numbers; 0 alone where the input had no axis of bodies."""
+        """(B,) ids of the bodies; only 0 if the input has no axis of bodies."""
         return self.get("body_id", np.zeros(1, np.int32))
 
     @property
     def bodies(self) -> dict[int, Poses]:
-        """The poses of each body by its number, without an axis of bodies."""
+        """Poses of each body, by id, without an axis of bodies."""
         if "body_id" not in self:
             return {0: self}
         axis = self["stamp_ns"].ndim
@@ -166,11 +166,11 @@ class Poses(dict[str, NDArray[Any]]):
         }
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
-        """The plain arrays by name, as in the ``.npz``."""
+        """Plain arrays by name, as in the ``.npz``."""
         return dict(self)
 
     def to_xarray(self) -> xarray.Dataset:
-        """A dataset with named axes: time, body, joint, contact, axis, quaternion.
+        """Convert to a dataset with named axes: time, body, joint, contact, axis, quaternion.
 
         Raises:
             ModuleNotFoundError: xarray is not installed.
@@ -191,7 +191,7 @@ class Poses(dict[str, NDArray[Any]]):
         return xarray.Dataset({name: (lead + tails[name], self[name]) for name in tails}, coords=coordinates)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """A table with a row for each moment and body, and columns such as ``left_wrist_x`` (metres, world).
+        """Convert to a table with one row per frame and body, and columns such as ``left_wrist_x`` (metres, world).
 
         Raises:
             ModuleNotFoundError: pandas is not installed.
@@ -221,7 +221,7 @@ class Poses(dict[str, NDArray[Any]]):
 
 
 def _installed(name: str) -> Any:
-    """A library that no extra brings, for who has it already uses it.
+    """Import an optional library, which no extra installs.
 
     Raises:
         ModuleNotFoundError: it is not installed; says what to type.
@@ -237,21 +237,21 @@ def _installed(name: str) -> Any:
 
 
 BUNDLED = "walk_turn"
-"""the one in every installation"""
+"""Sample of every installation."""
 
 
 class SampleError(ValueError):
-    """There is no sample of that name here. The text says which there are."""
+    """Unknown sample. The text lists the samples."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A stream as a simulated depth camera sees it, with hidden joints, jumps and noise.
+    """A recording of a simulated depth camera, with hidden joints, jumps and noise.
 
     Attributes:
-        positions: (T, 22, 3) metres, world, z up; NaN where a joint was not seen. Of several bodies (T, B, 22, 3).
-        stamp_ns: (T,) nanoseconds of capture.
-        truth: as ``positions``, without noise or gaps, interpolated at these stamps; of each person by number.
+        positions: (T, 22, 3) metres, world, z up; NaN where a joint was not seen. With several bodies, (T, B, 22, 3).
+        stamp_ns: (T,) times of capture in nanoseconds.
+        truth: ground truth without noise or gaps, in the shape of ``positions``, interpolated at these stamps.
     """
 
     positions: NDArray[np.float64]
@@ -260,14 +260,14 @@ class Sample:
 
 
 def sample(name: str = BUNDLED) -> Sample:
-    """Sample data: ``s = steadypose.sample(); steadypose.clean(s.positions, stamp_ns=s.stamp_ns)``.
+    """Load sample data: ``s = steadypose.sample(); steadypose.clean(s.positions, stamp_ns=s.stamp_ns)``.
 
     Args:
-        name: of a stream. ``walk_turn``, 20 s of a walk, comes with every installation; ``reach``, ``sit_rise``,
+        name: name of the sample. ``walk_turn``, 20 s of a walk, is in every installation; ``reach``, ``sit_rise``,
             ``wave_hidden_arm``, ``crossing`` (two people), ``leave_reenter`` and ``idle`` are in a checkout only.
 
     Raises:
-        ValueError: it is not here; says which are.
+        ValueError: unknown name; the message lists the samples.
     """
     streams = {file.parent.name: file.parent for file in bundled("sim_data").glob("*/metadata.yaml")}
     if name not in streams:

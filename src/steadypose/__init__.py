@@ -1,11 +1,11 @@
 """Clean, world-space human pose for robots and kiosks, live, from any noisy 3D skeleton source.
 
-On arrays: `clean`, `complete`, `fit`, `plot`. Frame by frame: `Filter`. On topics: `Publisher`, `Subscriber` and the
-messages. Data to try them on: `sample`.
-
-In the repository the rooms `msgs`, `prior`, `nodes`, `launch` and `benchmarks` stand at the top; they are installed in
-here, so that nobody's own package of such a name is shadowed.
+For arrays, use `clean`, `complete`, `fit` and `plot`. For single frames, live, use `Filter`. For messages, use
+`Publisher` and `Subscriber`. `sample` gives data to try them with.
 """
+
+# the folders beside this file link to those at the top of the repository; they are installed inside this package, so
+# that they shadow nobody's own `msgs` or `launch`
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ __all__ = [
 ]
 
 PACKAGE = Path(__file__).parent
-"""Where this package lies, with launch files, weights and a sample stream inside."""
+"""Folder of this package, which contains launch files, weights and a sample stream."""
 
 _MESSAGES = (
     *("CONTACTS", "JOINTS", "CleanBody", "Diagnostics", "JointState", "Pose", "PoseClean", "PoseRaw", "PoseWorld"),
@@ -79,7 +79,7 @@ _MODULES = {
     **dict.fromkeys(("Poses", "sample"), "nodes.library.poses"),
     "SKELETONS": "prior.body.layouts",
 }
-"""where each public name is"""
+"""Module of each public name."""
 
 
 def __getattr__(name: str) -> Any:
