@@ -1,4 +1,4 @@
-"""The offline commands on arrays, for a program that has no stream: what they do for an ``.npz``, the same numbers."""
+"""The offline commands as functions of arrays: `clean`, `complete`, `fit` and `plot`, with the same numbers."""
 
 from __future__ import annotations
 
@@ -33,33 +33,33 @@ if TYPE_CHECKING:
 
 
 Positions = ArrayLike | Mapping[str, NDArray[Any]] | str | os.PathLike[str]
-"""an array, the arrays of an ``.npz`` or of an earlier call, or the path of a recording, ``.npz`` or ``.csv``"""
+"""An array; the arrays of an ``.npz`` or of an earlier call; or the path of a recording, ``.npz`` or ``.csv``."""
 SkeletonLike = str | Sequence[str] | Mapping[str, Any]
-"""a known name, or a layout of one's own: the names of its joints, or ``joints`` with ``canonical`` as in TOML"""
+"""The name of a known layout; or a custom layout: its joints' names, or ``joints`` and ``canonical`` as in TOML."""
 ARRAYS = Path("arrays")
-"""what errors call that which is no file"""
+"""Name in errors of an input that is not a file."""
 
 
 class InputWarning(UserWarning):
-    """Something is probably wrong with the input. The text says what was expected, what came, and what to do."""
+    """The input is probably wrong. The text says what was expected, what came, and what to do."""
 
 
 logger = logging.getLogger("steadypose")
 
 
 def compile_loops() -> None:
-    """Compile what is not in the cache, once for all programs; a minute of silence would look like a hang."""
+    """Compile the loops that are not in the cache, and log progress: a minute of silence would look like a hang."""
     compile_missing(logger.warning)
 
 
 def warn(texts: Iterable[str]) -> None:
-    """Tell the caller of the library."""
+    """Issue each text as an `InputWarning` at the caller's line."""
     for text in texts:
         warnings.warn(text, InputWarning, stacklevel=_callers_level())
 
 
 def _callers_level() -> int:
-    """How far up the stack the program lies, which no warning should blame this package for."""
+    """The stack level of the first caller outside this package, to which a warning should point."""
     level, frame = 1, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("steadypose."):
         level, frame = level + 1, frame.f_back
@@ -67,10 +67,10 @@ def _callers_level() -> int:
 
 
 def sections(settings: Settings | None, delay: int) -> Settings:
-    """``prior`` and ``trajectory`` as a program gives them, over ``delay``.
+    """The sections ``prior`` and ``trajectory``; a delay in ``settings`` takes precedence over ``delay``.
 
     Raises:
-        LaunchError: there is another section.
+        LaunchError: ``settings`` has another section.
     """
     given = dict(settings or {})
     for section in given.keys() - {"prior", "trajectory"}:
@@ -83,10 +83,10 @@ def sections(settings: Settings | None, delay: int) -> Settings:
 
 
 def skeleton_name(skeleton: SkeletonLike) -> str:
-    """The name of a layout; one of the caller's own is made known under a name of its contents.
+    """The name of a layout. A custom layout is registered under a name derived from its content.
 
     Raises:
-        ValueError: it describes no skeleton.
+        ValueError: the description is not a valid skeleton.
     """
     if isinstance(skeleton, str):
         return skeleton
@@ -109,10 +109,10 @@ def source_of(
     confidence: ArrayLike | None = None,
     up: str | None = None,
 ) -> RecordedSource:
-    """The source of what the library was given.
+    """The source for the arguments of a library function.
 
     Raises:
-        ValueError: it cannot be used; says what was expected.
+        ValueError: the arguments cannot be used. The text says what was expected.
     """
     given = {"fps": fps, "stamp_ns": stamp_ns, "confidence": confidence, "up": up}
     stated = {name: as_array(name, value) for name, value in given.items() if value is not None}
@@ -133,8 +133,10 @@ def source_of(
 
 
 def as_array(name: str, value: ArrayLike) -> NDArray[Any]:
-    """Raises:
-    NpzError: it is no array: lists of different lengths, or of something else than numbers.
+    """Convert a value to an array.
+
+    Raises:
+        NpzError: the value is not an array: lists of different lengths, or of something other than numbers.
     """
     try:
         array = np.asarray(value)
@@ -165,31 +167,31 @@ def clean(
     """Clean joints, offline: `steadypose clean` on arrays.
 
     Args:
-        positions: (T, J, 3) metres, or (T, B, J, 3) of several bodies; NaN where a joint, or a body, is missing. Or the
-            arrays of an ``.npz``, by name, or the path of a recording, ``.npz`` or ``.csv``.
-        fps: frames a second, of a stream that is regular; else ``stamp_ns``.
-        stamp_ns: (T,) whole nanoseconds of capture.
-        skeleton: the joints' names and order, such as ``coco17`` (`steadypose.SKELETONS`), ``smpl22`` unless given; or
-            a layout of your own: a list of its joints' names, where they are those of smpl22, or a mapping with
-            ``joints`` and ``canonical`` as in a launch file (docs/sources.md).
-        confidence: (T, J) or (T, B, J) 0 to 1, where the source tells it.
-        up: the axis of the positions that points up: ``z`` (unless given), ``y`` or ``-y``.
-        delay: frames at 30 Hz that an answer may wait for, 0 to 16; more is smoother.
-        settings: ``prior`` and ``trajectory`` of a launch file, over these.
+        positions: (T, J, 3) metres, or (T, B, J, 3) for several bodies; NaN where a joint or a body is missing. Or the
+            arrays of an ``.npz`` by name, or the path of a recording, ``.npz`` or ``.csv``.
+        fps: frame rate of a regular stream, Hz; otherwise give ``stamp_ns``.
+        stamp_ns: (T,) capture times, integer nanoseconds.
+        skeleton: name of the joint layout, such as ``coco17`` (`steadypose.SKELETONS`); default ``smpl22``. Or a custom
+            layout: a list of its joints' names, if they are those of smpl22, or a mapping with ``joints`` and
+            ``canonical`` as in a launch file (docs/sources.md).
+        confidence: (T, J) or (T, B, J) 0 to 1, if the source provides it.
+        up: the axis of the positions that points up: ``z`` (default), ``y`` or ``-y``.
+        delay: delay of the output, 0 to 16 frames at 30 Hz; more is smoother.
+        settings: ``prior`` and ``trajectory`` as in a launch file; they take precedence over ``delay``.
 
     Returns:
-        The arrays of ``steadypose clean``'s ``.npz``, a row for each of ``positions``, as a dictionary and as
-        attributes: ``positions`` (T, 22, 3) metres in the input's frame, ``rotations`` (T, 22, 4) local, xyzw,
-        ``state`` (T, 22) `JointState`, ``sigma`` (T, 22) metres, ``anomaly`` and ``anomaly_flag`` (T,),
-        ``joint_anomaly`` (T, 22), ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s, ``world_positions`` (T, 22, 3)
-        metres, z up (the attribute ``world``), and ``joint_names`` (22,), among them. Of several bodies, an axis B
-        after time, and ``body_id`` (B,) with as many as were recognised.
+        The arrays of ``steadypose clean``'s ``.npz``, one row per input frame, as a dictionary and as attributes. They
+        include ``positions`` (T, 22, 3) metres in the input's frame, ``rotations`` (T, 22, 4) local, xyzw, ``state``
+        (T, 22) `JointState`, ``sigma`` (T, 22) metres, ``anomaly`` and ``anomaly_flag`` (T,), ``joint_anomaly``
+        (T, 22), ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s, ``world_positions`` (T, 22, 3) metres, z up (the
+        attribute ``world``), and ``joint_names`` (22,). For several bodies, an axis B follows time, and ``body_id``
+        (B,) lists the recognised bodies.
 
     Raises:
-        ValueError: an array has the wrong form, or neither fps nor stamp_ns is given; says what was expected.
+        ValueError: an array has the wrong form, or neither fps nor stamp_ns is given. The text says what was expected.
 
     Warns:
-        InputWarning: the numbers are probably not what they should be: unit, axes, order. Also in ``problems``.
+        InputWarning: units, axes or joint order are probably wrong. The texts are also in ``problems``.
     """
     compile_loops()
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
@@ -213,15 +215,20 @@ def complete(
     """Complete motion, offline: `steadypose complete` on arrays.
 
     Args:
-        positions, fps, stamp_ns, skeleton, confidence, up: as of `clean`; what is NaN, or 0 in confidence, is missing,
-            and so are frames between stamps more than 1/20 s apart.
-        weights: weight set of the completer: 'default', or a .safetensors file of your own.
+        positions: as in `clean`. Joints that are NaN are missing, and so are frames between stamps more than 1/20 s
+            apart.
+        fps: as in `clean`.
+        stamp_ns: as in `clean`.
+        skeleton: as in `clean`.
+        confidence: as in `clean`. Joints with confidence 0 are missing.
+        up: as in `clean`.
+        weights: weight set of the completer: 'default', or a .safetensors file.
 
     Returns:
         The arrays of `clean`, with a row every 1/30 s from the first stamp to the last.
 
     Raises:
-        ValueError: as `clean`; or there is no body.
+        ValueError: as in `clean`, or if there is no body.
     """
     from steadypose.nodes.offline import complete_source, load_completer
 
@@ -242,20 +249,25 @@ def fit(
     weights: str = "default",
     delay: int = 8,
 ) -> Poses:
-    """Fit a motion to joints, offline: `steadypose fit` on arrays. Takes seconds for a second of a body.
+    """Fit a motion to joints, offline: `steadypose fit` on arrays. Takes seconds per second of one body's motion.
 
     Args:
-        positions, fps, stamp_ns, skeleton, confidence, up: as of `clean`.
-        points: (T, N, 3) metres of the body's surface, in the same frame, from a depth camera; NaN where fewer.
-        weights: of the model of transitions: 'default', or a .safetensors file.
-        delay: of `clean`, which initialises the fit, frames at 30 Hz.
+        positions: as in `clean`.
+        fps: as in `clean`.
+        stamp_ns: as in `clean`.
+        skeleton: as in `clean`.
+        confidence: as in `clean`.
+        up: as in `clean`.
+        points: (T, N, 3) metres, points on the body's surface from a depth camera, in the same frame; padded with NaN.
+        weights: weight set of the transition model: 'default', or a .safetensors file.
+        delay: delay of `clean`, which initialises the fit, frames at 30 Hz.
 
     Returns:
-        The arrays of `clean`. Where a fit failed, those that `clean` gives, with ``anomaly_flag``, and ``problems``
-        says so.
+        The arrays of `clean`. For a body whose fit failed, they are the output of `clean` with ``anomaly_flag`` set,
+        and ``problems`` names the body.
 
     Raises:
-        ValueError: as `clean`; nobody is seen for long enough; or torch is not installed (the extra 'train').
+        ValueError: as in `clean`, or nobody is observed for long enough, or torch is not installed (extra 'train').
     """
     require_extra("train")
     from steadypose.nodes.offline import fit_source, load_transitions
@@ -268,19 +280,19 @@ def fit(
 
 
 def plot(poses: Positions, output: str | Path | None = None, *, body: int | None = None) -> Figure:
-    """Draw what happened, as `steadypose plot` does.
+    """Plot poses, as `steadypose plot` does.
 
     Args:
-        poses: what `clean`, `complete` or `fit` gave; or the path of a recording, or of what they wrote.
-        output: picture to write as well: .png, .svg or .pdf.
-        body: number of the body to draw; the one seen the longest if left out.
+        poses: the result of `clean`, `complete` or `fit`; or the path of a recording, or of their output file.
+        output: image file to write as well: .png, .svg or .pdf.
+        body: id of the body to plot; default: the one observed the longest.
 
     Returns:
-        The figure, which a notebook shows.
+        The figure, which a notebook displays.
 
     Raises:
-        ValueError: there is nothing to draw, or nowhere to write to.
-        ModuleNotFoundError: matplotlib is not installed: it comes with the extra 'view'.
+        ValueError: there is nothing to plot, or the output cannot be written.
+        ModuleNotFoundError: matplotlib is not installed (extra 'view').
     """
     if not isinstance(poses, Mapping | str | os.PathLike):
         raise NpzError(
