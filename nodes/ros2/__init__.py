@@ -1,4 +1,4 @@
-"""ROS 2 without ROS: its messages, its topics over plain DDS or a sourced ROS's rclpy, and its transforms.
+"""ROS 2 without a ROS installation: messages, and topics over plain DDS or over the rclpy of a sourced ROS.
 
 `connect` joins the ROS domain.
 """
@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 
 def check_ros() -> None:
-    """Raises:
-    LaunchError: neither a sourced ROS 2 nor Cyclone DDS is there.
+    """Check that ROS 2's topics can be reached.
+
+    Raises:
+        LaunchError: there is neither a sourced ROS 2 nor Cyclone DDS.
     """
     if not has_sourced_ros() and find_spec("cyclonedds") is None:
         raise LaunchError(
@@ -28,19 +30,19 @@ def check_ros() -> None:
 
 
 def has_sourced_ros() -> bool:
-    """Whether a whole ROS 2 is there, not only what PyPI has of it."""
+    """Whether a complete ROS 2 is sourced, not only its packages from PyPI."""
     return all(find_spec(package) is not None for package in ("rclpy", "tf2_msgs"))
 
 
 def connect(name: str, namespace: str = "") -> Connection:
-    """Join the ROS domain: through the rclpy of a ROS that is sourced, or else over plain DDS.
+    """Join the ROS domain, through rclpy if a ROS is sourced, otherwise over plain DDS.
 
     Args:
-        name: of the node, which only rclpy's are seen to have.
-        namespace: of the node; topics are named in full.
+        name: the node's name; visible only with rclpy.
+        namespace: the node's namespace. Topics are given by their full names.
 
     Raises:
-        LaunchError: nothing that can do so is installed.
+        LaunchError: there is neither a usable rclpy nor Cyclone DDS.
     """
     check_ros()
     if has_sourced_ros():

@@ -1,16 +1,16 @@
-"""ROS 2's topics over plain DDS: Cyclone DDS, and nothing of ROS.
+"""ROS 2's topics over plain DDS (Cyclone DDS), without ROS.
 
-A ROS 2 topic is a DDS topic with a prefix to its name, its type has another spelling, and its hash goes along in the
-writer's user data: with these a ROS 2 node whose middleware is DDS hears it as it hears those of ROS. Cyclone's Python
-gets the types' descriptions from rosbags' definitions, and serialised messages in the place of its own: its own
-serialisation, in Python, would cost a millisecond a message.
+A ROS 2 topic is a DDS topic with a prefix in its name, a differently spelled type, and the type's hash in the writer's
+user data. A ROS 2 node on a DDS middleware receives such a topic like any other. Type descriptions come from rosbags'
+definitions. Messages are passed to Cyclone in serialised form, because serialisation in its Python package would take a
+millisecond per message.
 
-Fast DDS 3, of Kilted, announces descriptions of sequences that Cyclone takes for invalid, so that these two do not
-hear each other; Jazzy's Fast DDS does, and what shares its version 2.
+Fast DDS 3 (Kilted) announces descriptions of sequences that Cyclone rejects as invalid, so the two cannot communicate.
+Fast DDS 2 (Jazzy) works.
 """
 
 # pyright: reportMissingImports=false
-# an optional extra, which need not be installed
+# an optional extra that may not be installed
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ LOCALHOST = """<CycloneDDS><Domain>
 <AllowMulticast>false</AllowMulticast></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers></Discovery>
 </Domain></CycloneDDS>"""
-"""Cyclone's configuration where ROS's discovery is limited to this machine"""
+"""Cyclone's configuration if ROS's discovery is limited to this machine, XML."""
 _BASES = {"bool": bool, "string": str, "byte": idl.uint8, "char": idl.uint8}
 
 
 class DdsConnection:
-    """A participant in the ROS domain that ``ROS_DOMAIN_ID`` names; implements `Connection`."""
+    """A participant in the ROS domain given by ``ROS_DOMAIN_ID``; implements `Connection`."""
 
     def __init__(self) -> None:
         domain = int(os.environ.get("ROS_DOMAIN_ID") or 0)
@@ -95,7 +95,7 @@ class DdsConnection:
         del self._writers[publish]
 
     def close(self) -> None:
-        """Leave the domain: Cyclone deletes what Python has let go of, which has to be in this order."""
+        """Leave the domain. Cyclone deletes an entity when Python releases it, so the order matters."""
         self._writers.clear()
         self._readers.clear()
         del self._participant
@@ -103,12 +103,12 @@ class DdsConnection:
 
 @cache
 def _stay_here(domain: int) -> Domain:
-    """Configure a domain, once for the process."""
+    """Restrict a domain to this machine, once per process."""
     return Domain(domain, LOCALHOST)
 
 
 class _Wakes(Listener):
-    """Sets an event when something has come."""
+    """Sets an event when data has arrived."""
 
     def __init__(self, event: threading.Event) -> None:
         super().__init__()
@@ -119,7 +119,7 @@ class _Wakes(Listener):
 
 
 def _sample(kind: Any, cdr: bytes) -> Any:
-    """What Cyclone takes for a message of that type, serialised already."""
+    """A message of a type that carries its serialised form."""
     sample = kind.__new__(kind)
     sample.cdr = bytes(cdr)
     return sample
@@ -127,7 +127,7 @@ def _sample(kind: Any, cdr: bytes) -> Any:
 
 @cache
 def _described(name: str) -> Any:
-    """The type as Cyclone's Python describes one, of which messages stay serialised."""
+    """Cyclone's description of a type, whose messages stay serialised."""
     kind = _struct(name)
     kind.serialize = lambda self, **_: self.cdr
     kind.deserialize = classmethod(lambda cls, data, **_: _sample(cls, data))

@@ -1,5 +1,5 @@
-"""ROS 2's message types from their definitions: made, serialised and read without a ROS installation; and what a
-connection to its topics can do.
+"""ROS 2's messages, created and serialised from their definitions without a ROS installation; and the interface of a
+connection to its topics.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from rosbags.typesys.store import Typestore
 from steadypose.msgs.codec import DEFINITIONS
 
 IDS_LIST = "std_msgs/Header header\nstring[] ids\n"
-"""hri_msgs/IdsList of REP-155"""
+"""Definition of hri_msgs/IdsList (REP-155)."""
 
 
 @cache
 def ros_types() -> Typestore:
-    """The types of Jazzy, of `msgs/msg`, and what is used of hri_msgs."""
+    """The types of ROS 2 Jazzy, of `msgs/msg`, and those used of hri_msgs."""
     store = get_typestore(Stores.ROS2_JAZZY)
     definitions = get_types_from_msg(IDS_LIST, "hri_msgs/msg/IdsList")
     for path in sorted(DEFINITIONS.glob("*.msg")):
@@ -31,7 +31,10 @@ def ros_types() -> Typestore:
 
 
 def new(kind: str, /, **fields: Any) -> Any:
-    """A message of a type such as ``nav_msgs/msg/Odometry``; fields that are left out are zero or empty, and shared."""
+    """Create a message of a type such as ``nav_msgs/msg/Odometry``.
+
+    Omitted fields are zero or empty. They are shared between messages, so do not modify them.
+    """
     return ros_types().types[kind](**_blank(kind) | fields)
 
 
@@ -43,24 +46,26 @@ def header(stamp_ns: int, frame_id: str) -> Any:
 
 
 def stamp_ns(header: Any) -> int:
-    """Nanoseconds of a header."""
+    """Stamp of a header, nanoseconds."""
     return header.stamp.sec * 10**9 + header.stamp.nanosec
 
 
 def serialise(message: Any, name: str) -> bytes:
-    """A message as CDR, with its four bytes of encapsulation."""
+    """Encode a message as CDR, with the four-byte encapsulation header."""
     return bytes(ros_types().serialize_cdr(message, name))
 
 
 def deserialise(cdr: bytes, name: str) -> Any:
-    """Raises:
-    rosbags.serde.SerdeError: the bytes are no such message.
+    """Decode a message of a type from CDR.
+
+    Raises:
+        rosbags.serde.SerdeError: the bytes are not a message of this type.
     """
     return ros_types().deserialize_cdr(cdr, name)
 
 
 def type_hash(name: str) -> str:
-    """REP-2011's hash of a type, by which ROS 2 distinguishes its versions."""
+    """REP-2011's hash of a type, by which ROS 2 distinguishes versions of a type."""
     return ros_types().hash_rihs01(name)
 
 
@@ -83,21 +88,21 @@ def _zero(node: Any) -> Any:
 
 
 Publish = Callable[[bytes], None]
-"""a message, as CDR"""
+"""Function that publishes a message, given as CDR."""
 DEPTH = 10
-"""messages held for a subscriber that is late"""
+"""Queue length for a late subscriber, messages."""
 
 
 class Connection(Protocol):
     """A node in a ROS domain. Not thread-safe."""
 
     def publisher(self, topic: str, kind: str, *, latched: bool = False) -> Publish:
-        """A reliable publisher of messages on a topic.
+        """Create a reliable publisher.
 
         Args:
-            topic: such as ``tf``; without a leading slash.
-            kind: such as ``tf2_msgs/msg/TFMessage``.
-            latched: whether late subscribers get the last message (TRANSIENT_LOCAL).
+            topic: its name, such as ``tf``, without a leading slash.
+            kind: its type, such as ``tf2_msgs/msg/TFMessage``.
+            latched: whether late subscribers receive the last message (TRANSIENT_LOCAL).
 
         Raises:
             LaunchError: the type is not available.
@@ -107,15 +112,15 @@ class Connection(Protocol):
     def subscribe(
         self, topic: str, kind: str, heard: Callable[[bytes], None], *, latched: bool = False, depth: int = DEPTH
     ) -> None:
-        """Call ``heard`` with each message of a topic from `spin`; publishers may be reliable or best-effort."""
+        """Subscribe to a topic. `spin` calls ``heard`` with each message. Publishers may be reliable or best-effort."""
         ...
 
     def spin(self, timeout_s: float) -> None:
-        """Wait for messages, for so long at most, and pass them to their callbacks."""
+        """Wait for messages for at most ``timeout_s``, and pass them to their callbacks."""
         ...
 
     def drop(self, publish: Publish) -> None:
-        """Publish there no more."""
+        """Remove a publisher."""
         ...
 
     def close(self) -> None: ...

@@ -1,7 +1,7 @@
-"""ROS 2's topics through the rclpy of a ROS that is sourced: any middleware, any processor that ROS runs on."""
+"""ROS 2's topics through the rclpy of a sourced ROS, with any middleware, on any processor that ROS supports."""
 
 # pyright: reportMissingImports=false
-# comes with ROS
+# rclpy is installed with ROS
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from steadypose.nodes.settings import LaunchError
 
 
 class RclpyConnection:
-    """A ROS 2 node that sends and gets serialised messages; implements `Connection`."""
+    """A ROS 2 node that sends and receives serialised messages; implements `Connection`."""
 
     def __init__(self, name: str, namespace: str = "") -> None:
         self._context = Context()
-        # Ctrl-C is this process's business, not rclpy's
+        # this process handles Ctrl-C itself
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._node: Any = rclpy.create_node(
             name,

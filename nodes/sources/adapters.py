@@ -1,7 +1,7 @@
-"""Adapters: the output of other trackers as ``pose/raw``, one function ``from_...`` for each.
+"""Adapters that convert the output of other trackers to ``pose/raw``, one function ``from_...`` for each.
 
-Their packages are not imported: any object with the right attributes will do. Each function documents which axis of its
-frame points up; for a calibrated camera, set ``sensor_pose`` and ``calibrated`` of the result.
+They do not import the trackers' packages: any object with the right attributes works. Each function documents which
+axis of its frame points up. For a calibrated camera, set ``sensor_pose`` and ``calibrated`` of the result.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from steadypose.prior.body.layouts import AZURE_KINECT32, BLAZEPOSE33, COCO17, Z
 from steadypose.prior.body.skeleton import finite_joints
 
 ZED_BODY_38 = 2
-"""``body_format`` of ZED's ROS message for the skeleton of 38 key points"""
+"""Value of ``body_format`` in ZED's ROS message for the skeleton of 38 key points."""
 AZURE_IDS = 100
-"""the driver's marker id is body · 100 + joint"""
+"""Factor of the body in the driver's marker ids: id = body · 100 + joint."""
 MIN_POINTS = 6
-"""key points of an image, at least, that determine where a body is"""
+"""Smallest number of image landmarks that determine a body's position."""
 
 
 def from_mediapipe(
     result: Any, stamp_ns: int, image_size: tuple[int, int], intrinsics: Floats, source: str = "mediapipe"
 ) -> PoseRaw:
-    """World landmarks of MediaPipe's pose landmarker.
+    """Convert the result of MediaPipe's pose landmarker.
 
-    They have the middle of the hips as their origin; the body is put where, seen by the camera, they fall on the
-    landmarks of the image.
+    World landmarks are relative to the middle of the hips. The body is placed so that they project onto the image's
+    landmarks.
 
     Args:
         result: ``PoseLandmarkerResult`` with ``pose_world_landmarks`` and ``pose_landmarks``.
-        stamp_ns: of capture, nanoseconds.
+        stamp_ns: capture time, nanoseconds.
         image_size: width and height in pixels.
-        intrinsics: (3, 3) of the camera. If it is not calibrated, a guess (`pinhole`) shifts the distance only.
+        intrinsics: (3, 3) of the camera. For an uncalibrated camera, a guess (`pinhole`) affects only the distance.
         source: the camera's name.
 
     Returns:
-        bodies in the camera's optical frame (x right, y down, z forward), of a camera taken for level. One of which too
-        few landmarks are seen to determine where it is, is left out.
+        Bodies in the optical frame (x right, y down, z forward) of a camera assumed to be level. A body with too few
+        observed landmarks to determine its position is omitted.
     """
     bodies = []
     for number, (world, image) in enumerate(zip(result.pose_world_landmarks, result.pose_landmarks, strict=True)):
@@ -57,14 +57,14 @@ def from_mediapipe(
 
 
 def from_zed(message: Any, source: str = "zed") -> PoseRaw:
-    """``ObjectsStamped`` of the ZED ROS 2 wrapper (``body_trk/skeletons``), in its frame, of which z points up.
+    """Convert ``ObjectsStamped`` of the ZED ROS 2 wrapper (``body_trk/skeletons``), in its frame, whose z points up.
 
     Args:
-        message: with skeletons of 38 key points; set ``body_format: BODY_38`` in the wrapper's configuration.
+        message: skeletons of 38 key points; set ``body_format: BODY_38`` in the wrapper's configuration.
         source: the camera's name.
 
     Raises:
-        ValueError: skeletons of another format.
+        ValueError: the skeletons have another format.
     """
     bodies = []
     for person in message.objects:
@@ -77,17 +77,17 @@ def from_zed(message: Any, source: str = "zed") -> PoseRaw:
             )
         points = [point.kp for point in person.skeleton_3d.keypoints][: len(ZED38.joints)]
         joints = _table(ZED38, points, "skeleton_3d.keypoints")
-        # one number a body, 1 to 99
+        # ZED gives one confidence per body, 1 to 99
         confidence = finite_joints(joints) * np.clip(person.confidence / 100, 0.0, 1.0)
         bodies.append(RawBody(person.label_id, joints, confidence))
     return _message(_stamp_ns(message.header), message.header.frame_id, source, ZED38, "z", bodies)
 
 
 def from_azure_kinect(markers: Any, source: str = "azure_kinect") -> PoseRaw | None:
-    """``MarkerArray`` of the Azure Kinect ROS driver (``body_tracking_data``), in the depth camera's optical frame.
+    """Convert ``MarkerArray`` of the Azure Kinect ROS driver (``body_tracking_data``), in the depth camera's frame.
 
     Returns:
-        None for an array without markers, which has no stamp either.
+        Bodies in the optical frame; None for an array without markers, because it has no stamp either.
     """
     found: dict[int, Floats] = {}
     for marker in markers.markers:
@@ -104,16 +104,16 @@ def from_azure_kinect(markers: Any, source: str = "azure_kinect") -> PoseRaw | N
 
 
 def from_pose_array(poses: Any, skeleton: Skeleton, up: str, source: str = "pose_array") -> PoseRaw:
-    """``geometry_msgs/PoseArray`` with the joints of one body after the other, NaN where a joint is missing.
+    """Convert ``geometry_msgs/PoseArray`` with the joints of one body after another, NaN where a joint is missing.
 
     Args:
-        poses: the message; of its poses only the positions are read. The bridge's own ``steadypose/poses`` is one.
-        skeleton: its joints.
+        poses: the message, such as the bridge's own ``steadypose/poses``. Only positions are read.
+        skeleton: its joint layout.
         up: the axis of its frame that points up: ``z``, ``y`` or ``-y``.
         source: the tracker's name.
 
     Raises:
-        ValueError: not a whole number of bodies.
+        ValueError: the number of poses is not a multiple of the layout's joints.
     """
     joints = len(skeleton.joints)
     points = np.array([(p.position.x, p.position.y, p.position.z) for p in poses.poses], np.float64).reshape(-1, 3)
@@ -130,19 +130,19 @@ def from_coco(
     stamp_ns: int,
     source: str = "coco",
 ) -> PoseRaw:
-    """Key points in COCO's format and a depth image of the same moment.
+    """Convert COCO key points and a depth image of the same time.
 
     Args:
         detections: each with ``keypoints``, 17 times x, y in pixels of the depth image and a confidence from 0 to 1.
         depth: (H, W) metres if floating, millimetres if integer, aligned to the image of the key points.
-        intrinsics: (3, 3) of that image, which has no distortion.
-        stamp_ns: of capture, nanoseconds.
+        intrinsics: (3, 3) of that image, which must be undistorted.
+        stamp_ns: capture time, nanoseconds.
         source: the camera's name.
 
     Returns:
-        bodies in the camera's optical frame, of a camera taken for level.
+        Bodies in the optical frame of a camera assumed to be level.
     """
-    from steadypose.prior.camera.depth_lifting import lift  # compiles: not for those who have no depth image
+    from steadypose.prior.camera.depth_lifting import lift  # imported late, because importing it compiles a loop
 
     joints = len(COCO17.joints)
     points = np.array([detection["keypoints"] for detection in detections], np.float64)
@@ -155,16 +155,16 @@ def from_coco(
 
 
 def pinhole(image_size: tuple[int, int], field_of_view: float) -> Floats:
-    """(3, 3) intrinsics of a camera of which only the horizontal field of view, in radians, is known."""
+    """(3, 3) intrinsics of a camera of which only the horizontal field of view is known, radians."""
     width, height = image_size
     focal = width / 2 / math.tan(field_of_view / 2)
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
 
 
 def _placed(joints: Floats, pixels: Floats, confidence: Floats, intrinsics: Floats) -> Floats | None:
-    """(3,) where joints (J, 3) have to be moved to so that they fall on pixels (J, 2): linear least squares.
+    """(3,) translation t of joints (J, 3) that projects them onto pixels (J, 2), by linear least squares.
 
-    A joint at p + t is seen at (u, v, 1) · depth: x + tx = u (z + tz), y + ty = v (z + tz). None if undetermined.
+    A joint at p + t projects to (u, v, 1) · depth: x + tx = u (z + tz), y + ty = v (z + tz). None if undetermined.
     """
     seen = (confidence > 0.5) & finite_joints(joints) & finite_joints(pixels)
     if seen.sum() < MIN_POINTS:
@@ -179,7 +179,7 @@ def _placed(joints: Floats, pixels: Floats, confidence: Floats, intrinsics: Floa
 
 
 def _table(skeleton: Skeleton, points: Sequence[Any], name: str) -> Floats:
-    """(J, 3) of as many points as the skeleton has joints."""
+    """(J, 3) array of points, checked against the skeleton's number of joints."""
     table = np.array(points, np.float64)
     if table.shape != (len(skeleton.joints), 3):
         raise ValueError(f"{name}: expected {len(skeleton.joints)} points of 3 numbers, got shape {table.shape}")
@@ -191,5 +191,5 @@ def _message(stamp_ns: int, frame_id: str, source: str, skeleton: Skeleton, up: 
 
 
 def _stamp_ns(header: Any) -> int:
-    """Nanoseconds of a ROS 2 header."""
+    """Stamp of a ROS 2 header, nanoseconds."""
     return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec

@@ -1,8 +1,8 @@
-"""Cameras as sources: OAK cameras and any of the system's with MediaPipe, opened again when they are unplugged, and
-several calibrated ones in place of one (``[input] source = "merge"``).
+"""Cameras as sources: OAK cameras, webcams with MediaPipe, and several calibrated cameras merged into one source
+(``[input] source = "merge"``). A camera that is unplugged is reopened when it returns.
 
-What runs with depthai is in `nodes.sources.oak_device`, what runs with OpenCV and MediaPipe in
-`nodes.sources.webcam_device`; both are imported where a camera is opened.
+The code that needs depthai is in `nodes.sources.oak_device`, that for OpenCV and MediaPipe in
+`nodes.sources.webcam_device`. Both are imported only when a camera is opened.
 """
 
 from __future__ import annotations
@@ -35,36 +35,36 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 PAUSES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
-"""pauses before successive attempts to open the camera; the last one repeats"""
+"""Pauses before successive attempts to open the camera, seconds; the last one repeats."""
 
 STREAMING = "streaming"
 
 
 class Connection(Protocol):
-    """A camera that is open."""
+    """An open camera."""
 
     name: str
 
     @property
     def counts(self) -> Counter[str]:
-        """Frames dropped or refused since it was opened, by cause."""
+        """Number of frames dropped or refused since the camera was opened, by cause."""
         ...
 
     def frames(self) -> Iterator[PoseRaw | None]:
-        """Skeletons as they come, None where none came for a while; ends when the camera does."""
+        """Skeletons as they arrive, or None after a while without one. Ends when the camera disconnects."""
         ...
 
     def status(self) -> dict[str, str]:
-        """What there is to say of it in `diagnostics`."""
+        """Its entries in `diagnostics`."""
         ...
 
 
 class CameraSource(LiveSource):
-    """The skeletons of a camera. While it is disconnected, it is tried again at growing intervals, indefinitely.
+    """The skeletons of a camera. While it is disconnected, it is retried forever at growing intervals.
 
     Args:
-        clock: of the node.
-        connect: opens the camera; raises RuntimeError if it cannot be opened now.
+        clock: the node's clock.
+        connect: opens the camera; raises RuntimeError if it cannot be opened at present.
     """
 
     def __init__(self, clock: Clock, connect: Callable[[], AbstractContextManager[Connection]]) -> None:
@@ -74,7 +74,7 @@ class CameraSource(LiveSource):
         self._connection: Connection | None = None
         self._connections = 0
         self._tried = False
-        self._dropped: Counter[str] = Counter()  # by connections that are closed
+        self._dropped: Counter[str] = Counter()  # of closed connections
 
     def frames(self) -> Generator[PoseRaw | None, None, None]:
         tries = 0
@@ -89,7 +89,7 @@ class CameraSource(LiveSource):
                         yield frame
                 trouble = "camera lost"
                 self.refused[trouble] += 1
-            except RuntimeError as error:  # depthai and MediaPipe have no narrower ones
+            except RuntimeError as error:  # depthai and MediaPipe raise nothing more specific
                 trouble = str(error)
             if self._connection:
                 self._dropped.update(self._connection.counts)
@@ -123,7 +123,7 @@ class CameraSource(LiveSource):
 
 
 def open_oak(settings: OakSettings, context: SourceContext) -> CameraSource:
-    """The skeletons of an OAK camera.
+    """Create the source for an OAK camera.
 
     Raises:
         LaunchError: a setting cannot be used.
@@ -135,7 +135,7 @@ def open_oak(settings: OakSettings, context: SourceContext) -> CameraSource:
         )
 
     def connect_oak() -> AbstractContextManager[Connection]:
-        from steadypose.nodes.sources.oak_device import connect  # brings depthai
+        from steadypose.nodes.sources.oak_device import connect  # imports depthai
 
         return connect(settings, context.clock)  # pyright: ignore[reportArgumentType]  (one class, found under two names)
 
@@ -143,7 +143,7 @@ def open_oak(settings: OakSettings, context: SourceContext) -> CameraSource:
 
 
 def open_webcam(settings: WebcamSettings, context: SourceContext) -> CameraSource | VideoSource:
-    """The camera, or the video in its place.
+    """Create the source for a webcam, or for the video given in its place.
 
     Raises:
         LaunchError: the model is missing, or a setting cannot be used.
@@ -160,7 +160,7 @@ def open_webcam(settings: WebcamSettings, context: SourceContext) -> CameraSourc
         )
 
     def connect_webcam() -> AbstractContextManager[Connection]:
-        from steadypose.nodes.sources.webcam_device import connect  # brings OpenCV
+        from steadypose.nodes.sources.webcam_device import connect  # imports OpenCV
 
         return connect(settings, context.calibration, context.clock, image_file=context.image_file)  # pyright: ignore[reportArgumentType]
 
@@ -172,25 +172,25 @@ def open_webcam(settings: WebcamSettings, context: SourceContext) -> CameraSourc
 
 
 LATE_S = 1.0
-"""age from which a camera's skeletons are not merged any more"""
+"""Age beyond which a camera's skeletons are not merged, seconds."""
 
 
 @dataclass(frozen=True)
 class MergeSettings:
-    """``[input.merge]``: several calibrated cameras in place of one."""
+    """``[input.merge]``: several calibrated cameras merged into one source."""
 
     cameras: list[str] = field(default_factory=list)
-    """addresses of their input nodes (``tcp://192.168.1.21:7111``)"""
+    """addresses of the cameras' input nodes (``tcp://192.168.1.21:7111``)"""
 
     def __post_init__(self) -> None:
         check_addresses("[input.merge] cameras", self.cameras)
 
 
 class MergeSource(LiveSource):
-    """The ``pose/raw`` of several cameras, each an input node of its own with its own calibration, merged.
+    """Merges ``pose/raw`` of several cameras, each with its own input node and calibration.
 
     Raises:
-        LaunchError: fewer than two cameras are named, or one twice.
+        LaunchError: fewer than two cameras are named, or one is named twice.
     """
 
     def __init__(self, settings: MergeSettings, context: SourceContext) -> None:
@@ -200,7 +200,7 @@ class MergeSource(LiveSource):
                 "[input.merge] cameras: expected the addresses of two input nodes or more, each once, such as "
                 f"tcp://192.168.1.21:7111; got {settings.cameras}"
             )
-        from steadypose.prior.camera.multi_view import Merge  # brings scipy: not for reading a launch file
+        from steadypose.prior.camera.multi_view import Merge  # imported late, so that launch files load without scipy
 
         self._addresses, self._context = settings.cameras, context
         self._merge = Merge()

@@ -1,6 +1,6 @@
-"""The newest image of a camera for the viewer: a file of this user, beside the sockets. Off unless ``[input] image``.
+"""The newest camera image for the viewer, in a file of this user beside the sockets. Enabled by ``[input] image``.
 
-A file and no message, because images of people belong in no recording, and on no network.
+It is a file and not a message, so that images of people appear in no recording and on no network.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from steadypose.prior.arrays import Floats
 
 NAME = "image"
-"""of the file, in the directory of the sockets"""
+"""Name of the file in the directory of the sockets."""
 PERIOD_NS = 66_000_000
-"""Time between images in nanoseconds: half the frames of a camera are enough to see what it sees."""
+"""Shortest interval between images, nanoseconds. Half of a camera's frames are enough for viewing."""
 WIDTH = 480
-"""Width of a kept image in pixels, at most."""
+"""Largest width of a stored image, pixels."""
 _HEAD = struct.Struct("<q2I4d")
 
 
 class CameraImage(NamedTuple):
-    """An image, and how points in its camera's optical frame come into it."""
+    """An image, and the intrinsics that project points in the camera's optical frame into it."""
 
     stamp_ns: int
     size: tuple[int, int]
@@ -36,17 +36,17 @@ class CameraImage(NamedTuple):
 
 
 class ImageWriter:
-    """Keeps the newest image in a file."""
+    """Writes the newest image to a file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._stamp_ns: int | None = None
 
     def put(self, image: NDArray[Any], stamp_ns: int, intrinsics: Floats) -> None:
-        """Keep an image (H, W, 3), BGR, without distortion, unless the last one is younger than `PERIOD_NS`."""
+        """Store an undistorted BGR image (H, W, 3), unless the last one is younger than `PERIOD_NS`."""
         if self._stamp_ns is not None and 0 <= stamp_ns - self._stamp_ns < PERIOD_NS:
             return
-        import cv2  # of the sources that have images
+        import cv2  # imported late: installed only with the extras of sources that have images
 
         self._stamp_ns = stamp_ns
         height, width = image.shape[:2]
@@ -61,19 +61,19 @@ class ImageWriter:
         part.replace(self._path)
 
     def close(self) -> None:
-        """Leave no image behind."""
+        """Delete the file."""
         self._path.unlink(missing_ok=True)
 
 
 class ImageReader:
-    """Reads what an `ImageWriter` of the same machine and user keeps."""
+    """Reads the image of an `ImageWriter` of the same machine and user."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._changed_ns = 0
 
     def next(self) -> CameraImage | None:
-        """The newest image, once."""
+        """The newest image; None if there is none or it was already returned."""
         try:
             changed_ns = self._path.stat().st_mtime_ns
             if changed_ns == self._changed_ns:

@@ -1,9 +1,11 @@
-"""Key points of an image as ``.npz``, with the camera that took it: what ``steadypose fit`` lifts to a motion.
+"""Reads an ``.npz`` of 2D key points and their camera, which ``steadypose fit`` lifts to a motion.
 
-In: ``keypoints`` (T, J, 2) pixels, NaN where not found; ``skeleton``, a name; ``stamp_ns`` (T,) or ``fps``; ``focal``,
-pixels, one number or two; ``centre`` (2,) pixels; and where known ``confidence`` (T, J) in 0..1, ``up``, the axis of
-the camera that points up (``-y``, a level camera, unless given), ``camera_height``, metres above the floor, and
-``points`` (T, N, 3) metres in the camera's frame, of the body's surface, from a depth camera.
+Required arrays: ``keypoints`` (T, J, 2) pixels, NaN where not detected; ``skeleton``, a layout's name; ``stamp_ns``
+(T,) or ``fps``; ``focal``, pixels, one number or two; ``centre`` (2,) pixels.
+
+Optional arrays: ``confidence`` (T, J) 0 to 1; ``up``, the camera's axis that points up (default ``-y``, a level
+camera); ``camera_height``, metres above the floor; ``points`` (T, N, 3) metres in the camera's frame, points on the
+body's surface from a depth camera.
 """
 
 from __future__ import annotations
@@ -25,19 +27,19 @@ from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.camera.key_points import KeyPointRecording, in_sight
 
 HIGHEST = 100.0
-"""Height in metres of a camera above the floor, at most."""
+"""Largest height of a camera above the floor, metres."""
 
 LONGEST_GAP_NS = 200_000_000
-"""over which key points are interpolated"""
+"""Longest gap over which key points are interpolated, nanoseconds."""
 
 LONGEST_NS = 24 * 3600 * 10**9
-"""of a recording: one wrong stamp must not make a grid of years"""
+"""Longest duration of a recording, nanoseconds. It prevents a single wrong stamp from creating a grid of years."""
 
 _NUMBERS = {"keypoints", "confidence", "focal", "centre", "camera_height", "points"}
 
 
 def has_key_points(path: Path) -> bool:
-    """Whether an ``.npz`` holds key points of an image, not positions."""
+    """Whether an ``.npz`` contains 2D key points and no positions."""
     if path.suffix != ".npz" or not path.is_file():
         return False
     try:
@@ -49,10 +51,10 @@ def has_key_points(path: Path) -> bool:
 
 
 def read_key_points(path: Path) -> KeyPointRecording:
-    """Read and check it.
+    """Read and check a file of key points.
 
     Raises:
-        NpzError: an array is missing, or has the wrong form; says what was expected.
+        NpzError: an array is missing, or has the wrong form. The text says what was expected.
     """
     arrays = read_arrays(path)
     missing = [name for name in ("skeleton", "focal", "centre") if name not in arrays]
@@ -124,7 +126,10 @@ def _stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDAr
 def _on_grid(
     pixels: Floats, sure: Floats, stamps: NDArray[np.int64], grid: NDArray[np.int64], nearest: NDArray[np.intp]
 ) -> tuple[Floats, Floats]:
-    """Interpolated between neighbours that both have a key point, if they are near in time."""
+    """Key points and confidences on a time grid.
+
+    Key points are interpolated if both neighbours in time have one and are near; otherwise the nearest frame's is used.
+    """
     after = np.clip(np.searchsorted(stamps, grid, side="right"), 1, len(stamps) - 1)
     span = stamps[after] - stamps[after - 1]
     share = np.where(span > 0, (grid - stamps[after - 1]) / np.maximum(span, 1), 0.0)[:, None, None]

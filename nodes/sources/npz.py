@@ -1,9 +1,10 @@
-"""Poses as plain arrays: ``.npz``, those that ``steadypose clean`` has written, and files of motion.
+"""Poses as plain arrays: from an ``.npz``, also one written by ``steadypose clean``, and from motion capture files.
 
-In: ``positions`` (T, J, 3) metres, NaN where missing; ``skeleton``, a name; ``stamp_ns`` (T,) or ``fps``; and where
-known ``confidence`` (T, J) in 0..1 and ``up``, the axis that points up (``z``, ``y`` or ``-y``). Of several bodies,
-``positions`` (T, B, J, 3), all NaN where one is not there, ``confidence`` (T, B, J), and ``body_id`` (B,), their
-numbers, if they are not to be 0, 1, ….
+Required arrays: ``positions`` (T, J, 3) metres, NaN where missing; ``skeleton``, a layout's name; ``stamp_ns`` (T,) or
+``fps``. Optional arrays: ``confidence`` (T, J) 0 to 1; ``up``, the axis that points up (``z``, ``y`` or ``-y``).
+
+For several bodies: ``positions`` (T, B, J, 3), all NaN where a body is absent; ``confidence`` (T, B, J); and
+``body_id`` (B,), their ids (default 0, 1, …).
 """
 
 from __future__ import annotations
@@ -36,18 +37,21 @@ from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.npz import check_arrays
 
 CLEANED = ("world_positions", "state")
-"""arrays of an output that an input lacks"""
+"""Names of arrays that an output has and an input lacks."""
 
 Arrays = Mapping[str, NDArray[Any]]
 
 
 def is_output(arrays: Arrays) -> bool:
-    """Whether these are the arrays of an output: they name no skeleton, and have joints in the world."""
+    """Whether arrays are an output of ``steadypose clean``: without a skeleton's name, with joints in the world."""
     return "skeleton" not in arrays and all(name in arrays for name in CLEANED)
 
 
 def as_input(arrays: Arrays) -> Arrays:
-    """An output as the arrays of an input: its observed joints in the world, z up, those imputed NaN; others as are."""
+    """Convert the arrays of an output to those of an input; the arrays of an input are returned unchanged.
+
+    The positions are the output's observed joints in the world, z up. Imputed joints are NaN.
+    """
     if not is_output(arrays):
         return arrays
     observed = np.isin(arrays["state"], (JointState.SEEN, JointState.REFINED))
@@ -57,7 +61,7 @@ def as_input(arrays: Arrays) -> Arrays:
 
 
 def as_messages(arrays: Arrays) -> Iterator[tuple[str, Message]]:
-    """An output as ``pose/clean`` and ``pose/world``, both in the world, without what went in."""
+    """Convert the arrays of an output to ``pose/clean`` and ``pose/world``, both in the world, without input joints."""
     several = "body_id" in arrays
     ids = arrays["body_id"].tolist() if several else [0]
     names = [name for name in arrays if name not in ("stamp_ns", "joint_names", "body_id", "bone_lengths")]
@@ -101,21 +105,21 @@ def as_messages(arrays: Arrays) -> Iterator[tuple[str, Message]]:
 
 
 STAMPS_END_NS = 2**31 * 10**9
-"""ROS 2 counts seconds in 31 bits"""
+"""Upper bound of stamps, nanoseconds. ROS 2 stores seconds in an int32."""
 
 _ARRAYS = ("positions", "skeleton", "stamp_ns", "fps", "confidence", "up", "body_id")
 
 
 class NpzError(ValueError):
-    """An ``.npz`` that does not hold poses. The text says what was expected, what was found, and what to do."""
+    """An ``.npz`` that does not contain poses. The text says what was expected, what came, and what to do."""
 
 
 class ArraySource:
-    """The frames of arrays, by their names in an ``.npz``, as messages; a source for `steadypose.clean`.
+    """The frames of arrays as messages; a source for `steadypose.clean`.
 
     Args:
-        path: the file that they are of, or what errors should call them.
-        arrays: as above.
+        path: the arrays' file, or their name in errors.
+        arrays: arrays by their names in an ``.npz`` (see the module).
 
     Raises:
         NpzError: an array is missing, or has the wrong form.
@@ -142,7 +146,7 @@ class ArraySource:
         if not frames:
             raise NpzError(f"{path}: positions: expected at least one frame, got none")
         self.stamps_ns = read_stamps(path, arrays, frames)
-        """(T,) int64"""
+        """(T,) capture times, nanoseconds"""
         confidence = np.asarray(np.isfinite(positions).all(axis=-1), np.float32)
         if "confidence" in arrays:
             confidence = _numbers(path, arrays, "confidence")
@@ -193,10 +197,10 @@ class NpzSource(ArraySource):
 
 
 def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Those of the arrays ``names`` (None: of all) that an ``.npz`` holds.
+    """Read the arrays ``names`` of an ``.npz``, if it has them; None reads all.
 
     Raises:
-        NpzError: it cannot be read, or holds what only pickle could read, which runs code.
+        NpzError: the file cannot be read, or contains pickled objects, which could run code.
     """
     if not zipfile.is_zipfile(path):
         raise NpzError(f"{path}: cannot be read as .npz: expected a zip archive of arrays, as numpy.savez writes it")
@@ -204,7 +208,7 @@ def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, N
         check_arrays(path)
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file if names is None or name in names}
-    except Exception as error:  # of damaged bytes zipfile, zlib and numpy's parser of headers raise a dozen kinds
+    except Exception as error:  # for damaged files, zipfile, zlib and numpy raise a dozen kinds of exceptions
         raise NpzError(f"{path}: cannot be read as .npz: {error}") from error
 
 
@@ -221,7 +225,7 @@ def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], name: str) -> NDArr
     array = _array(path, arrays, name)
     if array.dtype.kind not in "fiu":
         raise NpzError(f"{path}: {name}: expected numbers, got {array.dtype}")
-    with np.errstate(over="ignore"):  # what does not fit is infinite, and refused as such where it is used
+    with np.errstate(over="ignore"):  # values too large for float32 become infinite, and are refused later
         return array.astype(np.float32)
 
 
@@ -246,10 +250,10 @@ def _ids(path: Path, arrays: Mapping[str, NDArray[Any]], bodies: int) -> list[in
 
 
 def read_stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:
-    """(T,) nanoseconds of capture, from ``stamp_ns``, or counted from 0 by ``fps``.
+    """(T,) capture times, nanoseconds: ``stamp_ns``, or counted from 0 at ``fps``.
 
     Raises:
-        NpzError: there is neither, or not of this length, or beyond what a message can hold.
+        NpzError: both are missing, the length is wrong, or a stamp exceeds what a message can hold.
     """
     if "stamp_ns" in arrays:
         stamps = arrays["stamp_ns"]
@@ -272,29 +276,29 @@ def read_stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> 
 
 
 SUFFIXES = (".bvh", ".trc", ".c3d", ".npy")
-"""Of files that hold nothing else; an .npz may."""
+"""File name suffixes of motion capture. An .npz may contain motion capture, too."""
 
 
 class MotionSource(ArraySource):
-    """The one body of a file of motion, its joints canonical, z up.
+    """The body in a motion capture file, in canonical joints, z up.
 
     Args:
-        path: of the file.
-        rig: what it does not say (`prior.mocap.files.Description`), as TOML has it.
+        path: path of the file.
+        rig: description for what the file itself lacks (`prior.mocap.files.Description`), as a TOML table.
 
     Raises:
-        MotionError: it cannot be read, or no body is recognised in it.
+        MotionError: the file cannot be read, or no body is recognised in it.
     """
 
     def __init__(self, path: Path, rig: Mapping[str, Any]) -> None:
-        from steadypose.prior.mocap.files import describe, read_motion  # scipy, which nodes that play none do without
+        from steadypose.prior.mocap.files import describe, read_motion  # imported late, because it imports scipy
 
         fps, positions = read_motion(path.name, path.read_bytes(), describe(rig))
         super().__init__(path, {"positions": positions, "skeleton": np.array(CANONICAL.name), "fps": np.array(fps)})
 
 
 def holds_motion(path: Path) -> bool:
-    """Whether a file is one of motion; an .npz is if it holds poses, as AMASS' do, and no positions."""
+    """Whether a file is motion capture: by its suffix, or an .npz with the arrays of AMASS."""
     if path.suffix.lower() in SUFFIXES:
         return True
     if path.suffix != ".npz" or not zipfile.is_zipfile(path):

@@ -1,11 +1,11 @@
-"""An OAK camera that is open (depthai 3): people are detected on the camera, and lifted to 3D on this machine.
+"""An open OAK camera (depthai 3). The camera detects people; this machine lifts their key points to 3D.
 
-On the camera run colour, a pose network, stereo depth aligned to colour, and the IMU. What it sends is one object for
-the rest of the program (`Host`), made of nodes that run on this machine; tests feed the same nodes from a pipeline that
-has no camera. `steadypose calibrate` wants one image with its depth, lens and level (`Still`).
+The camera runs its colour sensor, a pose network, stereo depth aligned to colour, and the IMU. `Host` combines depthai
+nodes that run on this machine and receive the camera's data; tests feed the same nodes from a pipeline without a
+camera. `steadypose calibrate` uses one image with its depth, lens and level (`Still`).
 """
 
-# without `from __future__ import annotations`: depthai reads those of `process` to know what an input takes
+# without `from __future__ import annotations`: depthai reads the annotations of `process` as the types of its inputs
 
 import queue
 import time
@@ -34,19 +34,19 @@ MODELS = {
     "RVC2": ("luxonis/yolov8-nano-pose-estimation:coco-512x288", 12.0),
     "RVC4": ("luxonis/yolov8-large-pose-estimation:coco-640x352", 30.0),
 }
-"""by platform: the pose network of Luxonis' model zoo that it runs, and the frames a second it does"""
+"""Pose network of Luxonis' model zoo, and its frame rate in Hz, by platform."""
 DEPTH_SIZE = (640, 400)
 DEPTH_FPS = 30.0
 SYNC_THRESHOLD = timedelta(seconds=0.5 / DEPTH_FPS)
-"""maximum difference of the stamps of paired colour and depth images: their sensors are not synchronised"""
+"""Largest difference between the stamps of paired colour and depth images. Their sensors are not synchronised."""
 IMU_HZ = 100
 MAX_BODIES = 8
 QUEUE = 4
-"""frames kept when the node is late; then the oldest is dropped"""
+"""Largest number of frames queued when the node is late; beyond it the oldest is dropped."""
 TIMEOUT_S = 5.0
-"""time without a frame after which the camera is closed and opened again"""
+"""Time without a frame after which the camera is closed and reopened, seconds."""
 STARTUP_TIMEOUT_S = 30.0
-"""the same before its first frame"""
+"""Time without a first frame after which the camera is closed and reopened, seconds."""
 
 
 def _nanoseconds(time: timedelta) -> int:
@@ -54,11 +54,11 @@ def _nanoseconds(time: timedelta) -> int:
 
 
 class Skeletons(dai.node.HostNode):
-    """Detections with key points and the depth image of the same moment, in pairs, to skeletons.
+    """Converts pairs of detections (with key points) and depth images of the same time to skeletons.
 
     Attributes:
-        found: skeletons not yet taken.
-        counts: frames that were dropped or refused, by cause.
+        found: queue of skeletons.
+        counts: number of frames dropped or refused, by cause.
     """
 
     def __init__(self) -> None:
@@ -73,24 +73,24 @@ class Skeletons(dai.node.HostNode):
         """Link the node.
 
         Args:
-            pairs: of ``detections`` (``ImgDetections`` with key points) and ``depth`` (``ImgFrame``, millimetres,
-                aligned to the image of the detections).
-            level: the camera's, which says its pose.
+            pairs: output of pairs: ``detections`` (``ImgDetections`` with key points) and ``depth`` (``ImgFrame``,
+                millimetres, aligned to the image of the detections).
+            level: estimator of the camera's orientation by gravity.
             source: the camera's name, for the messages.
-            epoch_ns: wall time, nanoseconds since 1970, of zero on depthai's clock.
+            epoch_ns: wall time of zero on depthai's clock, nanoseconds since 1970.
         """
         self.link_args(pairs)
         self._level, self._source, self._epoch_ns = level, source, epoch_ns
         return self
 
     def process(self, pair: dai.MessageGroup) -> None:
-        """Work on what was captured at one moment; what it cannot use it counts."""
+        """Process one pair. Unusable pairs are counted."""
         try:
             detections, depth = pair["detections"], pair["depth"]
             assert isinstance(detections, dai.ImgDetections)
             assert isinstance(depth, dai.ImgFrame)
             frame = self._lifted(detections, depth)
-        except Exception as error:  # whatever the camera sends, the next frame may be good
+        except Exception as error:  # a bad frame must not stop the node
             count_failure(self.counts, self._source, error)
             return
         while self.found.qsize() >= QUEUE:
@@ -105,7 +105,7 @@ class Skeletons(dai.node.HostNode):
         found = detections.transformTo(view).detections if detections.getTransformation() else detections.detections
         found = sorted(found, key=lambda detection: -detection.confidence)
         people = [p for p in (detection.getKeypoints() for detection in found) if len(p) == len(COCO17.joints)]
-        if strangers := len(found) - len(people):  # another network than one of poses, or of other poses
+        if strangers := len(found) - len(people):  # the network detects no poses, or has other key points
             self.counts["person without the 17 key points of COCO"] += strangers
         people = people[:MAX_BODIES]
         points = np.array([[(k.imageCoordinates.x, k.imageCoordinates.y, k.confidence) for k in p] for p in people])
@@ -125,10 +125,10 @@ class Skeletons(dai.node.HostNode):
 
 
 class ImuReader(dai.node.HostNode):
-    """Readings of the IMU, in the camera's frame, to its level."""
+    """Passes the IMU's readings, rotated to the camera's frame, to the gravity estimator."""
 
     def build(self, readings: dai.Node.Output, level: GravityEstimator, imu_to_camera: Floats) -> "ImuReader":
-        """Link the node; ``imu_to_camera`` (3, 3) turns from the IMU's frame to the camera's optical one."""
+        """Link the node; ``imu_to_camera`` (3, 3) rotates from the IMU's frame to the camera's optical frame."""
         self.link_args(readings)
         self._level, self._turn = level, imu_to_camera
         return self
@@ -141,8 +141,8 @@ class ImuReader(dai.node.HostNode):
 
 
 def _pairs(pipeline: dai.Pipeline, **outputs: dai.Node.Output) -> dai.Node.Output:
-    """What was captured at one moment, by name."""
-    # a host node's own pairing wants it within 10 ms, and would wait for ever
+    """An output of groups of messages captured at the same time, by name."""
+    # a host node's own pairing tolerates only 10 ms, and would wait forever
     sync = pipeline.create(dai.node.Sync)
     sync.setRunOnHost(True)
     sync.setSyncThreshold(SYNC_THRESHOLD)
@@ -152,14 +152,15 @@ def _pairs(pipeline: dai.Pipeline, **outputs: dai.Node.Output) -> dai.Node.Outpu
 
 
 class Host:
-    """What runs on this machine for one camera: takes the outputs of its nodes and gives skeletons.
+    """The part of one camera's pipeline that runs on this machine and produces skeletons.
 
     Args:
-        pipeline: that of the outputs, not yet started.
-        detections, depth: what `Skeletons.build` takes pairs of.
-        readings: of the IMU and the rotation (3, 3) from its frame to the camera's; None without one.
+        pipeline: pipeline of the outputs, not yet started.
+        detections: output of detections, as in `Skeletons.build`.
+        depth: output of depth images, as in `Skeletons.build`.
+        readings: output of the IMU, and the rotation (3, 3) from its frame to the camera's; None without an IMU.
         source: the camera's name.
-        clock: of the stamps.
+        clock: clock of the stamps.
     """
 
     def __init__(
@@ -186,11 +187,11 @@ class Host:
 
     @property
     def counts(self) -> Counter[str]:
-        """Frames dropped or refused, by cause: a copy, because the pipeline's thread goes on counting."""
+        """Number of frames dropped or refused, by cause; a copy, because the pipeline's thread goes on counting."""
         return self._skeletons.counts.copy()
 
     def frames(self) -> Iterator[PoseRaw | None]:
-        """Skeletons as they come, None where none came for a while; ends when the camera does."""
+        """Skeletons as they arrive, or None after a while without one. Ends when the camera disconnects."""
         last_frame_ns, timeout_s = self._clock.now_ns(), STARTUP_TIMEOUT_S
         while self._pipeline.isRunning():
             try:
@@ -203,7 +204,7 @@ class Host:
 
 
 def open_device(settings: OakSettings) -> dai.Device:
-    """The camera that the settings name.
+    """Open the camera that the settings name.
 
     Raises:
         RuntimeError: there is no such camera, or it cannot be opened.
@@ -218,11 +219,12 @@ def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
     """Open the camera and run the whole pipeline on it.
 
     Raises:
-        RuntimeError: there is no such camera, it cannot be opened, or the model cannot be had; depthai says which.
+        RuntimeError: there is no such camera, it cannot be opened, or the model cannot be downloaded. The text is
+            depthai's.
     """
     device = open_device(settings)
     with device:
-        device.setMaxReconnectionAttempts(0)  # this program does that, and says so
+        device.setMaxReconnectionAttempts(0)  # `CameraSource` reconnects itself, and reports it
         platform = device.getPlatformAsString()
         zoo, usual_fps = MODELS.get(platform, MODELS["RVC2"])
         fps = settings.fps or usual_fps
@@ -245,14 +247,14 @@ def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
 def aligned_depth(
     pipeline: dai.Pipeline, colour: dai.node.Camera, platform: str
 ) -> tuple[dai.Node.Output, dai.Node.Output]:
-    """Images of the colour camera, without distortion, and stereo depth in the same view."""
+    """Outputs of undistorted colour images, and of stereo depth in the same view."""
     stereo = pipeline.create(dai.node.StereoDepth).build(
         autoCreateCameras=True, presetMode=dai.node.StereoDepth.PresetMode.DEFAULT, size=DEPTH_SIZE, fps=DEPTH_FPS
     )
     stereo.setLeftRightCheck(True)
     stereo.setSubpixel(True)
     view = colour.requestOutput(DEPTH_SIZE, enableUndistortion=True)
-    if platform == "RVC4":  # has no alignment in its stereo block
+    if platform == "RVC4":  # its stereo block cannot align
         align = pipeline.create(dai.node.ImageAlign)
         stereo.depth.link(align.input)
         view.link(align.inputAlignTo)
@@ -262,7 +264,7 @@ def aligned_depth(
 
 
 def accelerometer(pipeline: dai.Pipeline, device: dai.Device) -> tuple[dai.Node.Output, Floats] | None:
-    """The accelerometer's readings and how it is mounted; None for a camera that lacks it, or was not calibrated."""
+    """The accelerometer's output, and its rotation (3, 3) to the camera; None if it is missing or not calibrated."""
     if device.getConnectedIMU() in ("", "NONE"):
         return None
     try:
@@ -277,22 +279,22 @@ def accelerometer(pipeline: dai.Pipeline, device: dai.Device) -> tuple[dai.Node.
 
 
 SETTLE_PAIRS = 30
-"""pairs skipped while exposure and the direction of gravity settle"""
+"""Number of pairs skipped while exposure and the direction of gravity settle."""
 PAIR_TIMEOUT_S = 20.0
-"""for each pair"""
+"""Longest time to wait for a pair, seconds."""
 READING_TIMEOUT_S = 1.0
-"""for the accelerometer, which may speak after the image"""
+"""Longest time to wait for the accelerometer after the image, seconds."""
 
 
 @dataclass(frozen=True)
 class Still:
-    """One moment of a camera.
+    """A still image of a camera, with depth.
 
     Attributes:
-        colour: (H, W, 3) BGR, without distortion.
+        colour: (H, W, 3) BGR, undistorted.
         depth: (H, W) millimetres, in the view of ``colour``; 0 in holes.
         intrinsics: (3, 3) of both.
-        up: (3,) what the IMU feels as up, optical frame; None without an IMU that is calibrated.
+        up: (3,) direction of up measured by the IMU, optical frame; None without a calibrated IMU.
     """
 
     colour: NDArray[np.uint8]
@@ -302,7 +304,7 @@ class Still:
 
 
 class Pairs(dai.node.HostNode):
-    """Hands out pairs of ``colour`` and ``depth``."""
+    """Queues pairs of ``colour`` and ``depth``."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -325,10 +327,10 @@ def capture(
     readings: tuple[dai.Node.Output, NDArray[np.float64]] | None,
     settle: int = SETTLE_PAIRS,
 ) -> Still:
-    """Start a pipeline that has these outputs, and capture the image that comes after ``settle`` others.
+    """Start a pipeline with these outputs, and capture the image that follows ``settle`` others.
 
     Raises:
-        CameraError: none comes.
+        CameraError: no image arrives in time.
     """
     pairs = pipeline.create(Pairs).build(_pairs(pipeline, colour=colour, depth=depth))
     level = GravityEstimator()
@@ -349,10 +351,10 @@ def capture(
 
 
 def capture_with_camera(settings: OakSettings) -> Still:
-    """An image of the camera that the settings name.
+    """Capture an image of the camera that the settings name.
 
     Raises:
-        RuntimeError: the camera cannot be opened, or gives none.
+        RuntimeError: the camera cannot be opened, or gives no image.
     """
     device = open_device(settings)
     with device, dai.Pipeline(device) as pipeline:

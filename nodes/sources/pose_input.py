@@ -1,4 +1,4 @@
-"""The input node: gives the skeletons of a source at the pace they were captured, at another, or as they are taken."""
+"""The input node: publishes a source's skeletons at their capture rate, at another rate, or as fast as possible."""
 
 from __future__ import annotations
 
@@ -19,18 +19,20 @@ from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import LiveSource, RecordedSource
 
 LEAP_NS = 15_000_000_000
-"""a step of stamps, either way, that is a clock set anew, not a pause: it is not waited for"""
+"""Step of stamps, in either direction, that counts as a clock reset instead of a pause, nanoseconds. It is not waited
+for."""
 LOOP_PAUSE_NS = 1_000_000_000
-"""between the end of a stream and its start over; long enough for every stage to let go of its bodies"""
+"""Pause between the end of a looped recording and its restart, nanoseconds. It is long enough for every stage to drop
+its bodies."""
 
 
 class Position(NamedTuple):
-    """Where a recording is."""
+    """The playback position in a recording."""
 
     loops_ns: int = 0
-    """by how much stamps are later than in the recording, because it was played before"""
+    """offset of stamps against the recording from earlier loops, nanoseconds"""
     messages: int = 0
-    """of this time through, that were published"""
+    """number of messages published in this loop"""
 
 
 class _Played(NamedTuple):
@@ -40,9 +42,10 @@ class _Played(NamedTuple):
 
 
 class PoseInputNode(Node):
-    """Publishes ``pose/raw``, and ``pose/truth`` where the source has it; ends when the source does.
+    """Publishes ``pose/raw``, and ``pose/truth`` if the source has it. Ends when the source ends.
 
-    When it is restarted while it plays a recording for listeners who miss nothing, it resumes where they are.
+    If it is restarted while it plays a recording to reliable subscribers, it resumes at the first message that they
+    have not acknowledged.
     """
 
     name = "pose_input"
@@ -65,7 +68,7 @@ class PoseInputNode(Node):
         self._pose = settings.calibration.pose
         self._last_ns: int | None = None
         self._at = Position()
-        self._pace: Timeline | None = None  # on the monotonic clock, so that setting the wall clock halts nothing
+        self._pace: Timeline | None = None  # on the monotonic clock, so that setting the wall clock has no effect
 
     def handle(self, topic: str, message: Message) -> None:
         raise AssertionError("the input node subscribes to none")
@@ -77,7 +80,7 @@ class PoseInputNode(Node):
             self._play(self._source)
 
     def _pass_on(self, source: LiveSource) -> None:
-        """Pass a camera's skeletons on as they come."""
+        """Publish a live source's skeletons as they arrive."""
         with closing(source.frames()) as frames:
             for frame in frames:
                 if self.stopping:
@@ -85,7 +88,7 @@ class PoseInputNode(Node):
                 if frame:
                     if self.timeline is None:
                         now = self.clock.now_ns()
-                        # a topic may replay what was captured long ago
+                        # a subscribed topic may be a replay with old stamps
                         wall_ns = frame.stamp_ns if abs(now - frame.stamp_ns) < LEAP_NS else now
                         self.timeline = Timeline(frame.stamp_ns, wall_ns, 1.0)
                         self.report()
@@ -102,20 +105,20 @@ class PoseInputNode(Node):
             self._at, topic, message = played
             last = message if isinstance(message, PoseRaw) else last
             if self._at <= began:
-                continue  # the node that was here before has published it, and it was taken
+                continue  # this node's predecessor published it, and it was acknowledged
             if message.stamp_ns != self._last_ns:
                 self._wait_for(message.stamp_ns, due_ns)
             if self.stopping:
                 return
             try:
                 self.publish(topic, self._with_pose(message))
-            except ValueError as error:  # a message that was recorded, and still cannot be sent
+            except ValueError as error:  # a recorded message that breaks a limit of the transport
                 self.refuse(topic, error)
             self.settle()
             self.report_if_due()
         if last and not self.stopping:
             self.publish(POSE_RAW, end_of(last))
-        while not self.settle(POLL_S):  # what was not taken is here alone
+        while not self.settle(POLL_S):  # unacknowledged messages exist only in this process
             if self.stopping:
                 return
             self.report_if_due()
@@ -129,7 +132,7 @@ class PoseInputNode(Node):
         return self._source.problems() if isinstance(self._source, LiveSource) else []
 
     def _tell_pace(self) -> None:
-        """Say in wall time, which may have been set since, which stamp is played when."""
+        """Convert the playback timeline to wall time, which may have been set since."""
         if self._pace:
             set_ns = self.clock.now_ns() - self.clock.monotonic_ns()
             self.timeline = dataclasses.replace(self._pace, wall_ns=self._pace.wall_ns + set_ns)
@@ -141,7 +144,7 @@ class PoseInputNode(Node):
         return camera | refused | (self.timeline.values() if self.timeline else {})
 
     def _with_pose(self, message: Message) -> Message:
-        """The message with the calibrated pose of its camera, unless it has one of its own."""
+        """The message with the launch file's sensor pose, unless the message is calibrated already."""
         if self._pose and isinstance(message, PoseRaw) and not message.calibrated:
             return dataclasses.replace(message, sensor_pose=self._pose, calibrated=True)
         return message
@@ -161,11 +164,11 @@ class PoseInputNode(Node):
             shift_ns += newest_ns - first_ns + LOOP_PAUSE_NS
 
     def _wait_for(self, stamp_ns: int, due_stamp_ns: int) -> None:
-        """Wait until a frame is due; where the source's clock was set, go on from now.
+        """Wait until a frame is due. If the source's clock was set, restart the timeline from now.
 
         Args:
-            stamp_ns: its own.
-            due_stamp_ns: that of the moment at which it is due.
+            stamp_ns: stamp of the frame.
+            due_stamp_ns: stamp at whose playback time the frame is due.
         """
         last_ns, self._last_ns = self._last_ns, stamp_ns
         if not self._rate:
@@ -181,8 +184,10 @@ class PoseInputNode(Node):
 
 
 def _with_due(messages: Iterable[_Played]) -> Iterator[tuple[_Played, int]]:
-    """Messages, each with the stamp of the moment at which it is due: its own, but where that is ahead of the next one
-    by mistake, the next one's."""
+    """Messages, each with the stamp at which it is due.
+
+    This is its own stamp. If that lies ahead of the following message's stamp by mistake, it is the following one's.
+    """
     waiting: list[_Played] = []
     last_ns = 0
     for played in messages:

@@ -1,4 +1,4 @@
-"""Recorded skeletons: a rosbag2 directory, an ``.mcap``, an ``.npz``, a ``.csv``, a file of motion, or a video."""
+"""Recorded sources: rosbag2 directory, ``.mcap``, ``.npz``, ``.csv``, motion capture file, or video."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from steadypose.prior.body.layouts import SKELETONS, Skeleton
 NO_RIG: Mapping[str, Any] = MappingProxyType({})
 _FILES = ".csv, .npz, .bvh, .trc, .c3d, .npy"
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
-"""videos, in which MediaPipe finds the skeletons"""
+"""File name suffixes of videos, in which MediaPipe detects skeletons."""
 
 LOST, BROKEN, UNDECODABLE = "bytes of a damaged recording", "damaged recording", "undecodable"
 DAMAGE = (LOST, BROKEN, UNDECODABLE)
-"""how the causes begin that count what a recording holds and nobody can read"""
+"""Prefixes of the causes that count unreadable parts of a recording."""
 
 
 class RecordingSource:
-    """The skeletons of a recording, without the mark of its end.
+    """The skeletons of a recording, without end-of-stream messages.
 
     Raises:
-        RecordingError: there is no recording, or no ``pose/raw`` in it.
+        RecordingError: there is no recording, or it has no ``pose/raw``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -67,17 +67,17 @@ class RecordingSource:
 
 
 def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, image_file: Path | None = None) -> RecordedSource:
-    """The recording at ``path``: a rosbag2 directory, ``.mcap``, ``.npz`` or ``.csv``, a file of motion, or a video.
+    """Open a recorded source: rosbag2 directory, ``.mcap``, ``.npz``, ``.csv``, motion capture file, or video.
 
     Args:
-        path: of the recording.
-        rig: what a file of motion does not say (`prior.mocap.files.Description`).
-        image_file: file that the newest image of a video is kept in, for the viewer.
+        path: path of the recording.
+        rig: description of a motion capture file, for what the file itself lacks (`prior.mocap.files.Description`).
+        image_file: file for the newest image of a video, for the viewer.
 
     Raises:
         LaunchError: there is nothing at the path, or it is a video and MediaPipe is not installed.
-        RecordingError, NpzError, CsvError, MotionError: the file holds no skeletons. All are ValueErrors that say what
-            to do.
+        RecordingError, NpzError, CsvError, MotionError: the file contains no skeletons. All are ValueErrors that say
+            what to do.
     """
     if not str(path):
         raise LaunchError(
@@ -104,7 +104,7 @@ def _open_video(path: Path, image_file: Path | None) -> RecordedSource:
 
 
 def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:
-    """The messages, followed by the end-of-stream mark."""
+    """The messages, followed by the end-of-stream message."""
     last: PoseRaw | None = None
     for topic, message in messages:
         yield topic, message
@@ -115,36 +115,36 @@ def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Mes
 
 
 def end_of(last: PoseRaw) -> PoseRaw:
-    """The mark of the end of a stream, after its last message."""
+    """The end-of-stream message that follows the last message."""
     return dataclasses.replace(last, bodies=[], end_of_stream=True)
 
 
 AXES = ("x", "y", "z")
 LATEST_S = 2.0**31
-"""of a stamp, as ROS 2 counts seconds"""
+"""Upper bound of a stamp, seconds. ROS 2 stores seconds in an int32."""
 
 
 class CsvError(ValueError):
-    """A CSV that does not hold poses. The text says what was expected, what was found, and what to do."""
+    """A CSV that does not contain poses. The text says what was expected, what came, and what to do."""
 
 
 class CsvSource:
     """The frames of a CSV as messages; a source for the input node and for ``steadypose clean``.
 
-    A header and one row for each frame or, with several bodies, for each body in it::
+    The CSV has a header and one row per frame or, with several bodies, one per body and frame::
 
         stamp, left_shoulder_x, left_shoulder_y, left_shoulder_z, left_elbow_x, ...
         0.000, 0.183, 1.402, 2.918, 0.301, ...
 
-    ``stamp`` is in seconds, of capture; positions in metres, empty or ``nan`` where missing. Joints have the names of a
-    skeleton (`prior.body.layouts`), in any order; those without columns are unobserved. Further columns:
-    ``JOINT_confidence``, 0 to 1, and ``body``, an integer id of each body of a stamp. Lines before the header may say
-    ``# skeleton: NAME``, where the joints' names fit several, and ``# up: z`` (the default), ``y`` or ``-y``.
+    ``stamp`` is the capture time in seconds; positions are in metres, empty or ``nan`` where missing. Joints have the
+    names of a layout (`prior.body.layouts`), in any order; joints without columns are unobserved. Optional columns are
+    ``JOINT_confidence``, 0 to 1, and ``body``, an integer id of each body. Lines before the header may contain
+    ``# skeleton: NAME``, if the joints' names fit several layouts, and ``# up: z`` (the default), ``y`` or ``-y``.
 
-    Rows that cannot be read are counted in ``refused`` and left out.
+    Unreadable rows are skipped and counted in ``refused``.
 
     Raises:
-        CsvError: the header, or all of the file, does not hold poses.
+        CsvError: the header or all rows are unusable.
     """
 
     def __init__(self, path: Path) -> None:
@@ -188,7 +188,7 @@ class CsvSource:
             yield POSE_RAW, message
 
     def _read(self, rows: list[list[str]], columns: list[str]) -> list[tuple[int, list[RawBody]]]:
-        """Each frame's stamp and bodies, in the order of the file."""
+        """Stamp and bodies of each frame, in file order."""
         positions = _columns(columns, self._skeleton, AXES)
         confidence = _columns(columns, self._skeleton, ("confidence",))
         stamp, body = columns.index("stamp"), columns.index("body") if "body" in columns else None
@@ -198,7 +198,7 @@ class CsvSource:
                 self.refused["rows of another length than the header"] += 1
                 continue
             try:
-                # the last number is what a missing column refers to
+                # the NaN at the end stands for missing columns, whose index is -1
                 numbers = np.array([*(float(cell) if cell.strip() else math.nan for cell in row), math.nan])
                 seconds = numbers[stamp]
                 if not 0 <= seconds < LATEST_S:
@@ -218,7 +218,7 @@ class CsvSource:
 
 
 def _skeleton(path: Path, columns: list[str], named: str | None) -> Skeleton:
-    """The skeleton that has all the joints of the header."""
+    """The layout that has all joints of the header."""
     if "stamp" not in columns:
         raise CsvError(
             f"{path}: expected a header with a column 'stamp', in seconds; got {', '.join(columns[:8]) or 'none'} ...; "
@@ -245,6 +245,6 @@ def _skeleton(path: Path, columns: list[str], named: str | None) -> Skeleton:
 
 
 def _columns(columns: list[str], skeleton: Skeleton, endings: tuple[str, ...]) -> NDArray[np.intp]:
-    """(J, len(endings)) where each joint's columns are; -1 where it has none."""
+    """(J, len(endings)) index of each joint's columns; -1 for a missing column."""
     place = {name: index for index, name in enumerate(columns)}
     return np.array([[place.get(f"{joint}_{ending}", -1) for ending in endings] for joint in skeleton.joints])

@@ -1,4 +1,4 @@
-"""Every source, declared once: a new source is a module with its settings and its class, and one field here."""
+"""Declares every source once. To add a source, write a module with its settings and class, and add one field here."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ class SourceDeclaration:
     """One source of skeletons."""
 
     opens: Callable[[Any, SourceContext], RecordedSource | LiveSource]
-    """makes the source from its settings; a camera is opened only when its frames are requested"""
+    """creates the source from its settings; a camera is opened only when its frames are requested"""
     extra: str
-    """of `nodes.extras.EXTRAS`, that it needs; empty: none"""
+    """the extra in `nodes.extras.EXTRAS` that it needs; empty if none"""
 
 
 def _declare(
     opens: Callable[[Any, SourceContext], RecordedSource | LiveSource], extra: str = ""
 ) -> dict[str, SourceDeclaration]:
-    """What makes a field of `InputSettings` a source of the field's name, whose settings are the field's."""
+    """Metadata that declare a field of `InputSettings` as a source with the field's name and settings."""
     return {_SOURCE: SourceDeclaration(opens, extra)}
 
 
 def _open_recording(path: str, context: SourceContext) -> RecordedSource:
-    from steadypose.nodes.sources.recording import open_recording  # 3 MB, which nodes that play none do without
+    from steadypose.nodes.sources.recording import open_recording  # imported late (3 MB), only if a recording is played
 
     return open_recording(path, image_file=context.image_file)
 
@@ -56,21 +56,22 @@ class InputSettings:
     """``[input]``: where skeletons come from."""
 
     source: str = "recording"
-    """name of a source: one of the fields declared below, or ``module:name`` of another package's, a function of its
-    ``options`` and a `SourceContext`"""
+    """name of a source: one of the fields below, or ``module:name`` of a function in another package, which is called
+    with ``options`` and a `SourceContext`"""
     options: dict[str, Any] = field(default_factory=dict)
     """settings of another package's source"""
     rate: float = 1.0
-    """times real time; 0 is as fast as the subscribers take it"""
+    """playback speed relative to real time; 0: as fast as the subscribers accept"""
     loop: bool = False
-    """repeat the recording endlessly, with stamps that keep increasing"""
+    """whether to repeat the recording endlessly, with stamps that keep increasing"""
     image: bool = False
-    """show the viewer of this machine and user the newest image of a webcam or a video, at most 15 a second"""
+    """whether to give the viewer of this machine and user the newest image of a webcam or video, at most 15 per
+    second"""
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     tf: TfSettings = field(default_factory=TfSettings)
 
     recording: str = path_setting(_declare(_open_recording))
-    """rosbag2 directory, .mcap, .npz or .csv to play; a relative path starts at the launch file"""
+    """rosbag2 directory, .mcap, .npz or .csv to play; relative to the launch file"""
     oak: OakSettings = field(default_factory=OakSettings, metadata=_declare(open_oak, extra="oak"))
     webcam: WebcamSettings = field(default_factory=WebcamSettings, metadata=_declare(open_webcam, extra="webcam"))
     ros2: Ros2Settings = field(default_factory=Ros2Settings, metadata=_declare(Ros2Source))
@@ -90,7 +91,7 @@ class InputSettings:
 SOURCES: Mapping[str, SourceDeclaration] = {
     setting.name: setting.metadata[_SOURCE] for setting in fields(InputSettings) if _SOURCE in setting.metadata
 }
-"""by name"""
+"""Sources by name."""
 
 
 def open_input(
@@ -101,17 +102,17 @@ def open_input(
     clear_text: bool = False,
     image_file: Path | None = None,
 ) -> RecordedSource | LiveSource:
-    """The source that ``[input]`` names.
+    """Open the source that ``[input]`` names.
 
     Args:
-        settings: of the launch.
-        clock: of the node.
-        keys: for cameras on other machines.
-        clear_text: whether to listen to these without keys.
-        image_file: file for the newest image, if ``[input] image`` asks for it.
+        settings: ``[input]`` of the launch file.
+        clock: the node's clock.
+        keys: keys for cameras on other machines.
+        clear_text: whether to subscribe to other machines without keys.
+        image_file: file for the newest image, if ``[input] image`` is set.
 
     Raises:
-        LaunchError, RecordingError, NpzError, CsvError: a setting, or the recording, cannot be used.
+        LaunchError, RecordingError, NpzError, CsvError: a setting or the recording cannot be used.
     """
     if ":" in settings.source:
         declared, own = SourceDeclaration(load_plugin("[input] source", settings.source), ""), settings.options
@@ -128,7 +129,9 @@ def open_input(
 
 
 def check_input(launch: Launch) -> None:
-    """Raises:
-    LaunchError, RecordingError, NpzError, CsvError: the input node could not open its source.
+    """Check that the input node can open its source.
+
+    Raises:
+        LaunchError, RecordingError, NpzError, CsvError: a setting or the recording cannot be used.
     """
     open_input(launch.settings(InputSettings), SystemClock())

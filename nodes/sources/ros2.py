@@ -1,4 +1,4 @@
-"""Skeletons from a ROS 2 topic, and the pose of a sensor that moves from ROS 2's transforms."""
+"""Skeletons from a ROS 2 topic, and the pose of a moving sensor from TF."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 CACHE_NS = 10_000_000_000
-"""for how long transforms are kept, as tf2 does"""
+"""Time for which transforms are kept, nanoseconds; the same as in tf2."""
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 Moment = tuple[int, Floats, Floats]
-"""stamp, translation (3,) metres and quaternion (4,) xyzw, from the child's frame to the parent's"""
+"""Stamp in nanoseconds, translation (3,) metres and quaternion (4,) xyzw, from the child's frame to the parent's."""
 _stamp = itemgetter(0)
 
 
 class TransformError(LookupError):
-    """A transform that is not known, yet or at all. The text says which, and why."""
+    """A transform that is not known, or not yet. The text says which, and why."""
 
 
 class TransformBuffer:
@@ -47,11 +47,11 @@ class TransformBuffer:
     def __init__(self) -> None:
         self._parents: dict[str, str] = {}
         self._moments: dict[str, list[Moment]] = {}
-        """by child, in the order of their stamps"""
+        """transforms by child frame, ordered by stamp"""
         self._static: set[str] = set()
 
     def add(self, message: Any, *, static: bool) -> None:
-        """Take a ``tf2_msgs/TFMessage``; transforms that are no pose are ignored."""
+        """Add a ``tf2_msgs/TFMessage``. Invalid transforms are ignored."""
         for transform in message.transforms:
             child, parent = transform.child_frame_id.lstrip("/"), transform.header.frame_id.lstrip("/")
             at, turned = transform.transform.translation, transform.transform.rotation
@@ -67,20 +67,20 @@ class TransformBuffer:
             moments = self._moments.setdefault(child, [])
             moment = stamp_ns(transform.header), place, quaternion
             if static or (moments and moment[0] < moments[-1][0] - CACHE_NS):
-                moments.clear()  # or the clock was set back, as when a bag begins again
+                moments.clear()  # static transforms have no history; or the clock was set back, as by a restarted bag
             at_index = bisect_left(moments, moment[0], key=_stamp)
             if at_index == len(moments) or moments[at_index][0] != moment[0]:  # the first of a stamp counts, as in tf2
                 moments.insert(at_index, moment)
             del moments[: bisect_left(moments, moments[-1][0] - CACHE_NS, key=_stamp)]
 
     def lookup(self, target: str, source: str, at_ns: int) -> tuple[Floats, Floats]:
-        """The pose of a frame in another at a time.
+        """The pose of the frame ``source`` in the frame ``target`` at a time.
 
         Returns:
-            position (3,) metres and quaternion (4,) xyzw of ``source`` in ``target``.
+            Position (3,) metres and quaternion (4,) xyzw.
 
         Raises:
-            TransformError: the frames are not connected, or not at that time.
+            TransformError: the frames are not connected, or no transform is known at that time.
         """
         up, down = self._path(source), self._path(target)
         shared = next((frame for frame in up if frame in down), None)
@@ -95,7 +95,7 @@ class TransformBuffer:
         return inverse.apply(place - other), (inverse * turned).as_quat()
 
     def _path(self, frame: str) -> list[str]:
-        """From a frame up to the root of its tree."""
+        """The frames from ``frame`` up to the root of its tree."""
         path = [frame]
         while (parent := self._parents.get(path[-1])) is not None and parent not in path:
             path.append(parent)
@@ -128,7 +128,7 @@ class TransformBuffer:
 
 
 def _rotation(quaternion: Floats) -> Rotation:
-    from scipy.spatial.transform import Rotation  # 16 MB: not for those nodes that only read a launch file
+    from scipy.spatial.transform import Rotation  # imported late (16 MB): every node reads the settings here
 
     return Rotation.from_quat(quaternion)
 
@@ -138,14 +138,14 @@ TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 
 @dataclass(frozen=True)
 class TfSettings:
-    """``[input.tf]``: the sensor's pose from TF, also of a robot that moves."""
+    """``[input.tf]``: the sensor's pose from TF, also on a moving robot."""
 
     fixed_frame: str = ""
     """a fixed frame with z up, such as odom or map; empty: TF is not used"""
     sensor_frame: str = ""
-    """the frame of the joints; empty: what the source's messages name"""
+    """the frame of the joints; empty: the ``frame_id`` of the source's messages"""
     timeout: float = 0.2
-    """seconds that a message waits for the transform of its stamp"""
+    """longest time a message waits for the transform at its stamp, seconds"""
 
     def __post_init__(self) -> None:
         if not 0 <= self.timeout <= 5:
@@ -153,9 +153,9 @@ class TfSettings:
 
 
 class TfSource(LiveSource):
-    """A live source whose messages get the pose that TF has of their frame at their stamp.
+    """A live source whose messages get their sensor pose from TF at their stamp.
 
-    One that waited in vain is dropped and counted: where it was seen from is not known.
+    A message whose transform does not arrive in time is dropped and counted, because its sensor pose is unknown.
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class TfSource(LiveSource):
         self._buffer.add(deserialise(cdr, TF_MESSAGE), static=static)
 
     def _ready(self) -> Generator[PoseRaw, None, None]:
-        """Those whose transform is known, oldest first."""
+        """The waiting messages whose transform is known, oldest first."""
         while self._waiting:
             came_ns, frame = self._waiting[0]
             sensor = self._settings.sensor_frame or frame.frame_id
@@ -233,11 +233,11 @@ class Ros2Settings:
 
     topic: str = "/body_tracking_data"
     type: str = "MarkerArray"
-    """MarkerArray, as of the Azure Kinect's driver; or PoseArray, the joints of one body after the other"""
+    """MarkerArray, as published by the Azure Kinect's driver; or PoseArray, the joints of one body after another"""
     skeleton: str = "smpl22"
-    """of a PoseArray: the joints and their order"""
+    """name of a PoseArray's joint layout"""
     up: str = "z"
-    """of a PoseArray: the axis of its frame that points up: z, y or -y"""
+    """the axis of a PoseArray's frame that points up: z, y or -y"""
 
     def __post_init__(self) -> None:
         if self.type not in ("MarkerArray", "PoseArray"):
@@ -247,10 +247,10 @@ class Ros2Settings:
 
 
 class Ros2Source(LiveSource):
-    """A subscription to ``MarkerArray`` or ``PoseArray``.
+    """Skeletons from a topic of ``MarkerArray`` or ``PoseArray``.
 
     Raises:
-        LaunchError: there is no such skeleton.
+        LaunchError: the skeleton is unknown.
     """
 
     def __init__(self, settings: Ros2Settings, context: SourceContext) -> None:

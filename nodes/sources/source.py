@@ -1,4 +1,4 @@
-"""What all sources of skeletons share: the interfaces of recorded and live ones, and the settings of cameras."""
+"""Shared by all sources of skeletons: the interfaces of recorded and live sources, and the settings of cameras."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """``[input.calibration]``: the camera's lens and place, as ``steadypose calibrate`` writes them."""
+    """``[input.calibration]``: the camera's lens and pose, as ``steadypose calibrate`` writes them."""
 
     size: list[int] = field(default_factory=list)
-    """pixels, width and height of the images that the lens was calibrated with"""
+    """width and height in pixels of the images that the lens was calibrated with"""
     focal: list[float] = field(default_factory=list)
     """fx, fy in pixels"""
     centre: list[float] = field(default_factory=list)
     """cx, cy in pixels"""
     distortion: list[float] = field(default_factory=list)
-    """k1, k2, p1, p2, k3, as OpenCV has them"""
+    """k1, k2, p1, p2, k3, as in OpenCV"""
     position: list[float] = field(default_factory=list)
-    """metres, world"""
+    """position of the camera in the world, metres"""
     orientation: list[float] = field(default_factory=list)
-    """xyzw, from the camera's optical frame to the world"""
+    """quaternion xyzw, rotates from the camera's optical frame to the world"""
 
     def __post_init__(self) -> None:
         lengths = {"size": (2,), "focal": (2,), "centre": (2,), "position": (3,), "orientation": (4,)}
@@ -60,7 +60,7 @@ class CalibrationSettings:
 
     @property
     def pose(self) -> Pose | None:
-        """Of the camera in the world, if it is calibrated."""
+        """Pose of the camera in the world; None if it is not calibrated."""
         return Pose(np.array(self.position), np.array(self.orientation)) if self.position else None
 
 
@@ -75,15 +75,16 @@ class OakSettings:
     """``[input.oak]``: an OAK camera."""
 
     device: str = ""
-    """its id or, of one on the network, its address; empty: the first that is found"""
+    """id of the camera, or its address on the network; empty: the first camera found"""
     model: str = ""
-    """pose network of Luxonis' model zoo, COCO-17 key points; empty: the YOLO pose that suits the camera"""
+    """pose network of Luxonis' model zoo with COCO-17 key points; empty: the YOLO pose network for the camera's
+    platform"""
     archive: str = path_setting()
-    """a pose network in a file (NN archive, .tar.xz) instead of the zoo's; a relative path starts at the launch file"""
+    """pose network in a file (NN archive, .tar.xz) instead of the zoo's; relative to the launch file"""
     fps: float = 0.0
-    """frames a second; 0: what the camera's own network does"""
+    """frame rate, Hz; 0: the usual rate of the default network"""
     confidence: float = 0.5
-    """of a person, below which it is none"""
+    """smallest confidence of a detected person, 0 to 1"""
 
     def __post_init__(self) -> None:
         check_range("[input.oak] fps", self.fps, 0, 1000)
@@ -92,19 +93,19 @@ class OakSettings:
 
 @dataclass(frozen=True)
 class WebcamSettings:
-    """``[input.webcam]``: any camera that the system knows, and MediaPipe."""
+    """``[input.webcam]``: any camera of the system, with MediaPipe."""
 
     camera: int = 0
-    """its number: 0 is /dev/video0"""
+    """number of the camera: 0 is /dev/video0"""
     video: str = path_setting()
-    """a video to read instead; a relative path starts at the launch file"""
+    """video to read instead of a camera; relative to the launch file"""
     model: str = path_setting()
-    """a pose landmarker for MediaPipe, a .task file, in place of its own, which finds one body; a relative path starts
-    at the launch file"""
+    """pose landmarker for MediaPipe (.task file) instead of the built-in one, which detects one body; relative to the
+    launch file"""
     bodies: int = 1
-    """maximum number of bodies to detect; more than one with a model alone"""
+    """largest number of bodies to detect; more than one only with ``model``"""
     field_of_view: float = 1.05
-    """radians, of the image's width, where the lens is not calibrated: scales how far away bodies seem"""
+    """horizontal field of view of an uncalibrated lens, radians; it scales the distance of bodies"""
 
     def __post_init__(self) -> None:
         check_range("[input.webcam] camera", self.camera, 0, 1000)
@@ -113,13 +114,13 @@ class WebcamSettings:
 
 
 class RecordedSource(Protocol):
-    """Skeletons in order, each with its topic: ``pose/raw``, and ``pose/truth`` if the recording has it."""
+    """Recorded messages in order, each with its topic: ``pose/raw``, and ``pose/truth`` if the recording has it."""
 
     refused: Counter[str]
-    """messages that could not be read, by cause"""
+    """number of messages that could not be read, by cause"""
 
     def __len__(self) -> int:
-        """The number of frames, those that cannot be read among them."""
+        """Number of frames, including unreadable ones."""
         ...
 
     def __iter__(self) -> Iterator[tuple[str, Message]]: ...
@@ -130,43 +131,43 @@ class LiveSource(ABC):
 
     def __init__(self) -> None:
         self.refused: Counter[str] = Counter()
-        """frames dropped or refused, by cause"""
+        """number of frames dropped or refused, by cause"""
 
     @abstractmethod
     def frames(self) -> Generator[PoseRaw | None, None, None]:
-        """Skeletons, endlessly; None after a short time without one, so that the caller can check whether to stop."""
+        """Skeletons without end; None after a short time without one, so that the caller can check whether to stop."""
 
     @abstractmethod
     def status(self) -> dict[str, str]:
-        """Values for `diagnostics`."""
+        """The source's entries in `diagnostics`."""
 
     def problems(self) -> list[Problem]:
-        """Present problems with the source."""
+        """Current problems of the source."""
         return []
 
 
 @dataclass(frozen=True)
 class SourceContext:
-    """What a source is given in addition to its own settings."""
+    """What a source receives besides its own settings."""
 
     clock: Clock
-    """of the input node"""
+    """the input node's clock"""
     calibration: CalibrationSettings
-    """of the camera"""
+    """the camera's calibration"""
     keys: Keys | None = None
-    """for publishers on other machines"""
+    """keys for publishers on other machines"""
     clear_text: bool = False
-    """whether to listen to other machines without keys"""
+    """whether to subscribe to other machines without keys"""
     image_file: Path | None = None
-    """file that the newest image is kept in, for the viewer"""
+    """file for the newest image, for the viewer"""
 
 
 class CameraError(RuntimeError):
-    """A camera that cannot be used at present. The text says what is wrong."""
+    """A camera that cannot be used at present. The text says why."""
 
 
 def count_failure(counts: Counter[str], camera: str, error: Exception) -> None:
-    """Count a frame of a camera that could not be worked on, and log the first of its kind."""
+    """Count a camera's frame that could not be processed, and log the first of its kind."""
     cause = f"frame: {type(error).__name__}"
     if cause not in counts:
         logger.error("%s: a frame failed; more are only counted", camera, exc_info=error)

@@ -1,4 +1,4 @@
-"""Images of a webcam or a video, undistorted, and the skeletons that MediaPipe finds in them, by OpenCV."""
+"""Webcams and videos by OpenCV: undistorts the images, and detects skeletons in them by MediaPipe."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from steadypose.nodes.sources.image import ImageWriter
 from steadypose.nodes.sources.source import MODEL, CalibrationSettings, CameraError, WebcamSettings, count_failure
 
 Landmarker = Callable[[NDArray[Any], int], Any]
-"""an RGB image (H, W, 3) and its milliseconds, which rise, to a ``PoseLandmarkerResult``"""
+"""Function from an RGB image (H, W, 3) and its time in increasing milliseconds to a ``PoseLandmarkerResult``."""
 
 
 class Lens:
-    """Undistorts a webcam's images, with intrinsics as calibrated, or guessed from the field of view.
+    """Undistorts a webcam's images, with calibrated intrinsics, or intrinsics guessed from the field of view.
 
     Args:
-        size: width and height of the images.
-        field_of_view: radians; used without a calibration.
-        calibration: of the camera; scaled to images of another size.
+        size: width and height of the images, pixels.
+        field_of_view: horizontal field of view, radians; used without a calibration.
+        calibration: the camera's calibration; scaled to images of another size.
 
     Raises:
         LaunchError: the calibration is for another aspect ratio.
@@ -43,7 +43,7 @@ class Lens:
         self._maps = None
         if calibration.size:
             scale = np.array(size) / calibration.size
-            if abs(scale[0] / scale[1] - 1.0) > 0.01:  # another part of the lens's view, and nobody says which
+            if abs(scale[0] / scale[1] - 1.0) > 0.01:  # cropped to an unknown part of the lens's view
                 width, height = calibration.size
                 raise LaunchError(
                     f"[input.calibration] size: the lens was calibrated for images of {width} x {height}, the camera "
@@ -58,15 +58,15 @@ class Lens:
                 )
 
     def undistort(self, image: NDArray[Any]) -> NDArray[Any]:
-        """An image (H, W, 3) without distortion."""
+        """Undistort an image (H, W, 3)."""
         return cv2.remap(image, *self._maps, cv2.INTER_LINEAR) if self._maps else image
 
 
 class PoseFinder:
-    """Bodies in the images of one camera, each image later than the last.
+    """Detects bodies in the images of one camera, given in the order of time.
 
     Attributes:
-        counts: images that failed, by cause.
+        counts: number of failed images, by cause.
     """
 
     def __init__(
@@ -86,9 +86,9 @@ class PoseFinder:
         self._last_ms = -1
 
     def find(self, image: NDArray[Any], stamp_ns: int) -> PoseRaw | None:
-        """The bodies in an image (H, W, 3), BGR, taken at ``stamp_ns``; None, counted, if it fails."""
+        """The bodies in a BGR image (H, W, 3) taken at ``stamp_ns``. None if it fails, which is counted."""
         self._started_ns = stamp_ns if self._started_ns is None else self._started_ns
-        # the landmarker wants them to rise
+        # the landmarker requires increasing times
         self._last_ms = max((stamp_ns - self._started_ns) // 1_000_000, self._last_ms + 1)
         size = (image.shape[1], image.shape[0])
         if self._lens is None or self._lens.size != size:
@@ -99,7 +99,7 @@ class PoseFinder:
                 self._newest.put(straight, stamp_ns, self._lens.intrinsics)
             result = self._landmarker(cv2.cvtColor(straight, cv2.COLOR_BGR2RGB), self._last_ms)
             return from_mediapipe(result, stamp_ns, size, self._lens.intrinsics, self._name)
-        except (cv2.error, ValueError) as error:  # an image of another kind, a result that is none
+        except (cv2.error, ValueError) as error:  # an unsupported image, or an invalid result
             count_failure(self.counts, self._name, error)
             return None
 
@@ -121,7 +121,7 @@ class Webcam:
 
     def frames(self) -> Iterator[PoseRaw | None]:
         while self._capture.grab():
-            stamp_ns = self._clock.now_ns()  # of arrival: the system has no stamp of capture
+            stamp_ns = self._clock.now_ns()  # time of arrival, because the system gives no capture time
             good, image = self._capture.retrieve()
             if good:
                 yield self._finder.find(image, stamp_ns)
@@ -135,10 +135,10 @@ class Webcam:
 
 @contextmanager
 def mediapipe_landmarker(settings: WebcamSettings) -> Iterator[Landmarker]:
-    """MediaPipe's pose landmarker, in its mode for video: of the model that is given, or the one it comes with.
+    """MediaPipe's pose landmarker in video mode, with the configured model or the built-in one.
 
     Raises:
-        LaunchError: the model is none, or there is none.
+        LaunchError: the model cannot be used, or MediaPipe has no built-in one.
     """
     with _landmarker_of(settings) if settings.model else _own_landmarker() as landmarker:
         yield landmarker
@@ -146,7 +146,7 @@ def mediapipe_landmarker(settings: WebcamSettings) -> Iterator[Landmarker]:
 
 @contextmanager
 def _own_landmarker() -> Iterator[Landmarker]:
-    """Of one body. MediaPipe would smooth what it finds, which is the prior's task."""
+    """MediaPipe's built-in landmarker for one body, without its smoothing, which is the prior's task."""
     try:
         from mediapipe.python.solutions.pose import Pose  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
@@ -173,7 +173,6 @@ def _own_landmarker() -> Iterator[Landmarker]:
 
 @contextmanager
 def _landmarker_of(settings: WebcamSettings) -> Iterator[Landmarker]:
-    # an extra, of which nobody need have the types
     import mediapipe  # pyright: ignore[reportMissingImports]
     from mediapipe.tasks.python import BaseOptions, vision  # pyright: ignore[reportMissingImports]
 
@@ -206,13 +205,13 @@ def connect(
 
     Raises:
         CameraError: the camera cannot be opened now.
-        LaunchError: the landmarker's model is none.
+        LaunchError: the landmarker's model cannot be used.
     """
     capture = cv2.VideoCapture(settings.camera)
     try:
         if not capture.isOpened():
             raise CameraError(f"camera {settings.camera} cannot be opened; `ls /dev/video*` lists them")
-        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest image, not the oldest that waits
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # read the newest image, not the oldest in the buffer
         with make_landmarker(settings) as landmarker:
             name = f"webcam-{settings.camera}"
             with closing(PoseFinder(name, landmarker, settings, calibration, image_file)) as finder:
@@ -222,12 +221,12 @@ def connect(
 
 
 def stamped_images(video: cv2.VideoCapture) -> Iterator[tuple[int, NDArray[Any] | None]]:
-    """The images (H, W, 3), BGR, of an open video, each with its nanoseconds; None where one cannot be decoded."""
+    """Stamps in nanoseconds and BGR images (H, W, 3) of an open video; None for an image that cannot be decoded."""
     period_ns = round(1e9 / (video.get(cv2.CAP_PROP_FPS) or 30.0))
     stamp_ns = -1
     while video.grab():
         reported_ns = round(video.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-        # some containers state the frame rate alone
+        # some containers have only a frame rate
         if reported_ns > stamp_ns:
             stamp_ns = reported_ns
         else:
@@ -237,7 +236,7 @@ def stamped_images(video: cv2.VideoCapture) -> Iterator[tuple[int, NDArray[Any] 
 
 
 class VideoSource:
-    """The skeletons that MediaPipe sees in a video, a recorded source: no image is left out, however long it takes.
+    """The skeletons that MediaPipe detects in a video. As a recorded source it processes every image.
 
     Raises:
         LaunchError: the video cannot be opened.
