@@ -160,18 +160,16 @@ def test_denoising_weighs_two_estimates_of_which_one_has_part_of_the_others_nois
         seen |= history.seen_since(back) & (history.unseen_s[-1 - back] < reconstruct.BRIEF_S)
         moved = stage._reconstructed[-1 - back] - frame
         square = np.square(moved).mean(axis=-1)
-        for slot, joint in np.ndindex(SLOTS, 22):
-            at = slot, joint
-            position, sigma = frame[at].copy(), smoothed.sigma[at]
-            if seen[at] and np.isfinite(square[at]):
-                count[at] += 1
-                apart[at] += (square[at] - apart[at]) / min(count[at], reconstruct.MEMORY)
-                gained = (1 - reconstruct.NOISE_LEFT) * min(sigma, jitter[slot]) ** 2
-                own = max(max(apart[at], square[at] / reconstruct.SUDDEN) - gained, reconstruct.MODEL_SIGMA**2)
-                own += late**2 * np.square(np.nan_to_num(frame[at] - before[at])).mean()
-                share = gained / (gained + own)
-                position += share * moved[at]
-                sigma *= np.sqrt(1 - share * (1 - reconstruct.NOISE_LEFT))
-            np.testing.assert_allclose(found.positions[at], position, rtol=1e-12)
-            np.testing.assert_allclose(found.sigma[at], sigma, rtol=1e-12)
+        positions, sigmas = frame.copy(), smoothed.sigma.copy()
+        for at in zip(*np.nonzero(seen & np.isfinite(square)), strict=True):
+            count[at] += 1
+            apart[at] += (square[at] - apart[at]) / min(count[at], reconstruct.MEMORY)
+            gained = (1 - reconstruct.NOISE_LEFT) * min(sigmas[at], jitter[at[0]]) ** 2
+            own = max(max(apart[at], square[at] / reconstruct.SUDDEN) - gained, reconstruct.MODEL_SIGMA**2)
+            own += late**2 * np.square(np.nan_to_num(frame[at] - before[at])).mean()
+            share = gained / (gained + own)
+            positions[at] += share * moved[at]
+            sigmas[at] *= np.sqrt(1 - share * (1 - reconstruct.NOISE_LEFT))
+        np.testing.assert_allclose(found.positions, positions, rtol=1e-12)
+        np.testing.assert_allclose(found.sigma, sigmas, rtol=1e-12)
         before = frame

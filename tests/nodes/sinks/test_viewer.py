@@ -30,11 +30,12 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.topology import TransportSettings
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.viewer import node as viewer_node
+from steadypose.nodes.sinks.viewer import scene
 from steadypose.nodes.sinks.viewer import server as drawings
 from steadypose.nodes.sinks.viewer import server as viewer_server
 from steadypose.nodes.sinks.viewer.layout import FAINT_RGB, SIDE_RGB
 from steadypose.nodes.sinks.viewer.node import ViewerNode, ViewerSettings
-from steadypose.nodes.sinks.viewer.scene import PATH_SECONDS, PoseView
+from steadypose.nodes.sinks.viewer.scene import PoseView
 from steadypose.nodes.sinks.viewer.server import LOOPBACK, Drawings, ViewerError, ViewerServer
 from steadypose.nodes.sources.image import CameraImage
 
@@ -130,14 +131,15 @@ def test_a_body_that_left_is_cleared(view: PoseView, log: Log) -> None:
     assert isinstance(log.last("world/made-up/1"), rr.Clear)
 
 
-def test_tracking_and_path_are_told_in_the_world(view: PoseView, log: Log) -> None:
-    stream = only(messages(PATH_SECONDS + 1.0), POSE_WORLD)
+def test_tracking_and_path_are_told_in_the_world(view: PoseView, log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene, "PATH_SECONDS", 2.0)
+    stream = only(messages(3.0), POSE_WORLD)
     stream[-1][1].bodies[0].tracking = Tracking.COASTING  # type: ignore[union-attr]
     for topic, message in stream:
         view.log(topic, message)
     assert log.last("world/made-up/0/label").labels.as_arrow_array().to_pylist() == ["0 · coasting"]
     way = log.last("world/made-up/0/path").strips.as_arrow_array().to_pylist()[0]
-    assert len(way) == pytest.approx(PATH_SECONDS * 30, abs=2)
+    assert len(way) == pytest.approx(2.0 * 30, abs=2)
 
 
 def test_truth_is_drawn_thin_and_draws_no_rate(view: PoseView, log: Log) -> None:

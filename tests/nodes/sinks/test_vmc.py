@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import socket
 from collections.abc import Callable
+from itertools import count
 
 import numpy as np
 import pytest
 from conftest import repeated, running
 from scipy.spatial.transform import Rotation
+from tests.helpers import synthetic_poses
 
-from steadypose.msgs.topics import POSE_WORLD
+from steadypose.msgs.topics import POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import PoseWorld
-from steadypose.nodes.graph.launch import Launch, bundled
+from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.settings import LaunchError
 from steadypose.prior.body.skeleton import PARENTS, J
-from steadypose.prior.sim.streams import make, read_manifest
 
 pytest.importorskip("pythonosc", reason="the extra 'vmc' is not installed")
 
@@ -26,8 +28,10 @@ from pythonosc.osc_message import OscMessage
 from steadypose.nodes.sinks.datagrams import BONES, VmcNode, VmcSettings, osc_bundles
 
 
-def worlds(name: str) -> list[PoseWorld]:
-    return make(read_manifest(bundled("sim_data", "manifest.json"))[name])[1]
+def world() -> PoseWorld:
+    """Of somebody who walks, as it truly was."""
+    *_, last = (m for topic, m in synthetic_poses.messages(0.5) if topic == POSE_TRUTH and isinstance(m, PoseWorld))
+    return last
 
 
 def messages(bundles: list[bytes]) -> list[tuple[str, list[object]]]:
@@ -37,7 +41,7 @@ def messages(bundles: list[bytes]) -> list[tuple[str, list[object]]]:
 
 
 def test_the_bones_give_the_body_back_in_unitys_axes() -> None:
-    body = worlds("walk_turn")[40].bodies[0]
+    body = world().bodies[0]
     bundles = osc_bundles(1.5, body)
     assert all(len(data) < 1400 for data in bundles)
     said = messages(bundles)
@@ -62,18 +66,17 @@ def test_nobody_is_said_too() -> None:
 
 
 def test_the_node_sends_to_where_it_is_told(make_launch: Callable[..., Launch]) -> None:
-    stream = worlds("idle")
+    one, stamps = world(), count(10**9, 33_333_333)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
         listener.settimeout(30)
         launch = make_launch(
             nodes='["trajectory", "vmc"]', transport__lossless="false", vmc__port=str(listener.getsockname()[1])
         )
-        frames = iter(stream)
         with (
             Publisher(launch.transport.endpoint("trajectory")) as publisher,
             running(VmcNode(launch)),
-            repeated(lambda: publisher.publish(POSE_WORLD, next(frames, stream[-1]))),
+            repeated(lambda: publisher.publish(POSE_WORLD, dataclasses.replace(one, stamp_ns=next(stamps)))),
         ):
             said = messages([listener.recv(65536)])
     assert said[0] == ("/VMC/Ext/OK", [1])
