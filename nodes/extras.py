@@ -26,20 +26,20 @@ class Extra:
 
 EXTRAS: Mapping[str, Extra] = {
     "dev": Extra("the tests", ("pytest",)),
-    "docs": Extra("the documentation as a site", ("mkdocs",)),
+    "docs": Extra("building the documentation site", ("mkdocs",)),
     "export": Extra("steadypose export to .glb and .vrma", ("pygltflib",)),
-    "foxglove": Extra("poses live in Foxglove", ("foxglove",)),
+    "foxglove": Extra("live poses in Foxglove", ("foxglove",)),
     "mocap": Extra("reading .c3d", ("ezc3d",)),
-    "oak": Extra("an OAK camera as the source, and calibrating any camera", ("depthai", "cv2")),
-    "ray": Extra("steadypose clean --ray, on a cluster", ("ray",)),
+    "oak": Extra("OAK cameras, and calibration of any camera", ("depthai", "cv2")),
+    "ray": Extra("steadypose clean --ray, on a Ray cluster", ("ray",)),
     "ros2": Extra("the ROS 2 bridge, and skeletons from ROS 2 topics", ("cyclonedds",)),
     "ros2-test": Extra("the tests of ROS 2", ("rclpy",)),
     "train": Extra("steadypose train, fit and evaluate", ("torch", "roma", "sklearn"), "5 GB, torch with CUDA"),
-    "retarget": Extra("steadypose retarget: motion for a robot or an avatar", ("mink", "mujoco", "daqp")),
-    "vmc": Extra("avatars by the VMC protocol: steadypose run vmc", ("pythonosc",)),
-    "view": Extra("the picture in the browser, and steadypose plot", ("rerun", "matplotlib")),
-    "web": Extra("poses in the browser: steadypose run web", ("websockets",)),
-    "webcam": Extra("a webcam as the source", ("mediapipe",)),
+    "retarget": Extra("steadypose retarget", ("mink", "mujoco", "daqp")),
+    "vmc": Extra("avatars over VMC: steadypose run vmc", ("pythonosc",)),
+    "view": Extra("the 3D view (run --view) and steadypose plot", ("rerun", "matplotlib")),
+    "web": Extra("poses in your own web page: steadypose run web", ("websockets",)),
+    "webcam": Extra("webcams and videos", ("mediapipe",)),
 }
 """Extras by their name in ``[project.optional-dependencies]``. A module that several install is listed at one."""
 

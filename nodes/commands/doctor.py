@@ -151,7 +151,7 @@ def listen(launch_file: str, console: Console, clock: Clock | None = None) -> in
         )
     if problems or reported:
         return 1
-    console.print("nothing is wrong with it")
+    console.print("no problems found")
     return 0
 
 
@@ -169,7 +169,7 @@ def _name(check: Callable[[], Iterator[Finding]]) -> str:
 
 
 PYTHONS = ((3, 10), (3, 13))
-"""the oldest and the newest that all packages of an installation come for"""
+"""Oldest and newest Python for which all packages of an installation are available."""
 
 
 KEY_PACKAGES = ("numpy", "numba", "rosbags", "pyzmq")
@@ -179,7 +179,7 @@ def check_python() -> Iterator[Finding]:
     running = ".".join(map(str, sys.version_info[:3]))
     oldest, newest = PYTHONS
     good = oldest <= sys.version_info[:2] <= newest
-    fix = "" if good else f"install Python {_dotted(oldest)} to {_dotted(newest)}, and steadypose anew with it"
+    fix = "" if good else f"install Python {_dotted(oldest)} to {_dotted(newest)}, and reinstall steadypose with it"
     yield Finding("Python", Verdict.GOOD if good else Verdict.BAD, running, fix)
 
 
@@ -197,7 +197,8 @@ def check_packages() -> Iterator[Finding]:
     for extra, wanted in sorted(extras.items()):
         if _missing(wanted):
             size = f" ({EXTRAS[extra].size})" if EXTRAS[extra].size else ""
-            yield Finding(f"extra {extra}", Verdict.NOTE, f"{EXTRAS[extra].purpose}{size}: {install_command(extra)}")
+            found = f"not installed, for {EXTRAS[extra].purpose}{size}: {install_command(extra)}"
+            yield Finding(f"extra {extra}", Verdict.NOTE, found)
 
 
 def required() -> tuple[list[str], dict[str, list[str]]]:

@@ -68,7 +68,7 @@ def check_processor() -> Iterator[Finding]:
         "processor",
         Verdict.NOTE if busy else Verdict.GOOD,
         f"{cores} cores, load {load:.1f}",
-        "stop what else is running: frames will be late. `top` shows what it is" if busy else "",
+        "frames will be late: stop other programs, which `top` lists" if busy else "",
     )
     settings = Path("/sys/devices/system/cpu").glob("cpu*/cpufreq/scaling_governor")
     governors = {path.read_text().strip() for path in settings}
@@ -89,7 +89,7 @@ def check_memory() -> Iterator[Finding]:
     lines = dict(line.split(":") for line in file.read_text().splitlines())
     free = int(lines["MemAvailable"].split()[0]) / 1e6
     short = free < NEEDED_GB
-    fix = f"free some: the nodes take about {NEEDED_GB:g} GB" if short else ""
+    fix = f"free memory: the nodes take about {NEEDED_GB:g} GB" if short else ""
     yield Finding("memory", Verdict.NOTE if short else Verdict.GOOD, f"{free:.1f} GB available", fix)
 
 
@@ -98,7 +98,7 @@ def check_clock() -> Iterator[Finding]:
     clock = time.get_clock_info("monotonic")
     coarse = clock.resolution > 1e-3
     year = time.gmtime().tm_year
-    found = f"monotonic to {clock.resolution * 1e9:.0f} ns, the year is {year}"
+    found = f"resolution {clock.resolution * 1e9:.0f} ns, year {year}"
     fix = "set the clock: sudo timedatectl set-ntp true" if year < 2025 else ""
     yield Finding("clock", Verdict.NOTE if coarse or fix else Verdict.GOOD, found, fix)
 
@@ -127,7 +127,7 @@ def check_webcam() -> Iterator[Finding]:
     cameras = sorted(DEVICES.glob("video*"))
     closed = [camera.name for camera in cameras if not os.access(camera, os.R_OK | os.W_OK)]
     if closed:
-        yield Finding("webcams", Verdict.NOTE, f"{', '.join(closed)} may not be used by you", VIDEO_GROUP)
+        yield Finding("webcams", Verdict.NOTE, f"{', '.join(closed)} may not be opened by you", VIDEO_GROUP)
     else:
         yield Finding("webcams", Verdict.GOOD, ", ".join(camera.name for camera in cameras) or "none")
 
@@ -167,7 +167,7 @@ def check_messages() -> Iterator[Finding]:
         fix = f"sudo chown {os.getuid()} {directory}; or set [transport] directory in the launch file"
         yield Finding("messages", Verdict.BAD, f"cannot write to {directory}: {error.strerror}", fix)
         return
-    yield Finding("messages", Verdict.GOOD, f"{took_ms:.1f} ms through {directory}")
+    yield Finding("messages", Verdict.GOOD, f"latency {took_ms:.1f} ms, sockets in {directory}")
 
 
 def _round_trip(endpoint: str) -> float:
@@ -220,7 +220,7 @@ def check_models() -> Iterator[Finding]:
             yield Finding(f"weights of {model}", Verdict.BAD, str(error).split(". ")[0], fix)
         else:
             numbers = sum(array.size for array in state.values())
-            yield Finding(f"weights of {model}", Verdict.GOOD, f"default, {numbers:,} numbers")
+            yield Finding(f"weights of {model}", Verdict.GOOD, f"default, {numbers:,} parameters")
     if whole:
         yield _self_test()
 
@@ -243,13 +243,13 @@ def _self_test() -> Finding:
             bodies += clean.bodies
         spent_ms.append((time.perf_counter() - started) * 1e3)
     p50, p99 = np.percentile(spent_ms[WARM_UP:], (50, 99))
-    found = f"{p50:.1f} ms a frame, p99 {p99:.1f} ms, of {BUDGET_MS:.0f}"
+    found = f"{p50:.1f} ms a frame, p99 {p99:.1f} ms; {BUDGET_MS:.0f} ms are available"
     if not bodies or not all(np.isfinite(body.positions).all() for body in bodies):
-        return Finding("prior", Verdict.BAD, "gave no pose for a body that stands still", restored("prior"))
+        return Finding("prior", Verdict.BAD, "returned no pose for a standing body", restored("prior"))
     if p99 > BUDGET_MS:
         return Finding("prior", Verdict.NOTE, found, "too slow for 30 Hz at the moment: free the processor")
     if p99 > TARGET_MS:
-        return Finding("prior", Verdict.NOTE, found, f"keeps up, but slower than the {TARGET_MS:g} ms of a free core")
+        return Finding("prior", Verdict.NOTE, found, f"keeps up, but a free core takes {TARGET_MS:g} ms")
     return Finding("prior", Verdict.GOOD, found)
 
 
@@ -286,4 +286,4 @@ def check_streams() -> Iterator[Finding]:
     for stream in streams:
         with RecordingReader(stream) as reader:
             seconds += reader.duration_s
-    yield Finding("bundled streams", Verdict.GOOD, f"{len(streams)}, {seconds:.0f} s together")
+    yield Finding("bundled streams", Verdict.GOOD, f"{len(streams)} recordings, {seconds:.0f} s in all")

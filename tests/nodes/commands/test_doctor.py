@@ -81,7 +81,7 @@ def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) 
     findings = {finding.what: finding for finding in command.check_packages()}
     extra = findings["extra view"]
     assert extra.verdict is Verdict.NOTE
-    assert extra.found.startswith("the picture in the browser, and steadypose plot: ")
+    assert extra.found.startswith("not installed, for the 3D view (run --view) and steadypose plot: ")
     assert extra.found.endswith(install_command("view"))
     assert not extra.fix, "one line an extra"
     packages = findings["packages"]
