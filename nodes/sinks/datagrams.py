@@ -54,13 +54,13 @@ class Followed:
 
     def __init__(self, body: int | None = None) -> None:
         self.id = self._only = body
-        self._seen_ns = 0
+        self._seen_ns: int | None = None
 
     def update(self, world: PoseWorld) -> WorldBody | None:
         """The body to follow at a message's moment; None while it is not there."""
         bodies = {body.id: body for body in world.bodies if body.tracking != Tracking.LOST}
-        gone = self.id not in bodies and abs(world.stamp_ns - self._seen_ns) > GONE_NS
-        if gone and bodies and self._only is None:
+        gone = self._seen_ns is None or abs(world.stamp_ns - self._seen_ns) > GONE_NS
+        if self.id not in bodies and gone and bodies and self._only is None:
             self.id = min(bodies)
         if self.id is None or self.id not in bodies:
             return None
