@@ -93,7 +93,7 @@ def clean(
     spent = f"{done.duration_s:.1f} s, cleaned in {done.spent_s:.1f} s"
     terminal.print(f"{out}: {done.frames} frames, {spent}")
     for cause, count in done.refused.items():
-        terminal.print(f"  refused or dropped, {cause}: {count}")
+        terminal.print(f"  not used as given, {cause}: {count}")
     for problem in done.problems:
         terminal.print(f"  {problem}", style="yellow")
     if not done.poses:

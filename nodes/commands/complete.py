@@ -28,34 +28,38 @@ def complete(
     picture: File = None,
     force: bool = False,
 ) -> int:
-    """Complete recorded poses: motion between key frames, and unobserved parts of a body.
+    """Fill in gaps between key frames, and unobserved parts of a body, offline.
 
-    Missing are joints that are NaN or of confidence 0, in any frame, and frames between stamps more than 1/20 s apart.
-    Known joints stay unchanged, so clean a noisy recording first: steadypose clean IN CLEAN. OUT has a frame every
-    1/30 s from the first stamp to the last, interpolated where the input has other stamps. Completed joints have the
-    state IMPUTED, and a standard deviation that grows with the time to the nearest observation. In gaps of up to two
-    seconds the motion is plausible; in longer ones it becomes less so, and after 8 s without any joint a new stretch
-    begins.
+    A joint is missing in a frame if it is NaN or has confidence 0. A frame is missing between stamps more than 1/20 s
+    apart. Known joints stay unchanged, so clean a noisy recording first: steadypose clean IN CLEAN.
 
-    Where the pelvis lies at the origin all the time, as in many files of poses lifted from images, the way over the
-    floor is read from the motion of the body; world_positions, or pose/world, have it.
+    OUT has one frame every 1/30 s from the first stamp to the last, interpolated if the input has another rate.
+    Completed joints have the state IMPUTED, and a standard deviation that grows with the time to the nearest
+    observation. Gaps of up to two seconds get plausible motion, longer ones less so. After 8 s without any joint, a new
+    segment begins.
 
-    Key frames to motion: steadypose complete keys.npz motion.npz. A part of a body to all of it, as a recording, and a
-    picture of what was done: steadypose complete upper_body.npz whole --picture whole.png. More in docs/complete.md.
+    If the pelvis is always at the origin, as in many files of poses lifted from images, the path over the floor is
+    predicted from the body's motion. It lies in world_positions or pose/world.
+
+    Try:
+      steadypose complete keys.npz motion.npz
+      steadypose complete upper_body.npz whole --picture whole.png
+
+    See docs/complete.md.
 
     Args:
-        source: a recording, a .csv, or .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
-            what is missing is NaN, or 0 in confidence (T, J); or motion, as 'clean' reads it. Of an .npz or .csv
-            that 'clean' wrote, what it imputed is missing.
-        out: the recording to make, or .npz or .csv.
-        optimise: search HM-VAE for the motion that fits what is known, as the paper does: first its latent vectors,
-            then its decoder, from the answer of the feed-forward completer. Takes seconds for each window of 64
-            frames and the extra 'train'; no nearer to the truth than the completer, but as fast-moving as people.
-        weights: weight set of the completer: 'default', or a .safetensors file of your own.
-        skeletons: TOML with [skeletons.NAME] of joint layouts of your own; a launch file with them will do.
-        rig: TOML that says of files of motion what they do not: see 'clean'.
-        picture: what was done, as .png, .svg or .pdf.
-        force: replace what is at OUT, if it is a recording, an .npz or a .csv.
+        source: a recording; a .csv; an .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps,
+            NaN or confidence 0 where a joint is missing; or motion capture, as for 'clean'. In an .npz or .csv from
+            'clean', imputed joints count as missing.
+        out: the result: a recording, or an .npz or .csv.
+        optimise: also optimise HM-VAE's latents, then its decoder, for the motion that fits the known joints. Takes
+            several seconds per window of 64 frames and needs the extra 'train'. The error is not lower, but fast
+            motion is less smoothed.
+        weights: weights of the completer: 'default', or a .safetensors file.
+        skeletons: TOML file, or launch file, with joint layouts of your own as [skeletons.NAME].
+        rig: TOML file that describes motion capture which is not recognised: see 'clean'.
+        picture: plot to write: .png, .svg or .pdf.
+        force: replace OUT if it is a recording, an .npz or a .csv.
     """
     if skeletons is not None:
         add_layouts(read_toml(skeletons).get("skeletons", {}))
@@ -88,11 +92,11 @@ def complete(
         f"their joints were given, the rest completed; the longest gap was {longest:.1f} s"
     )
     if completion.unreached:
-        terminal.print(f"  left out, for nothing near them is known: {completion.unreached} joints", style="yellow")
+        terminal.print(f"  left unknown, too far from any observation: {completion.unreached} joints", style="yellow")
     for body in completion.centred:
-        terminal.print(f"  body {body} stands on its pelvis: its trajectory is predicted from its motion")
+        terminal.print(f"  body {body}: the pelvis is always at the origin, so the path is predicted from the motion")
     for cause, count in completed.refused.items():
-        terminal.print(f"  refused or dropped, {cause}: {count}")
+        terminal.print(f"  not used as given, {cause}: {count}")
     if picture is not None:
         save(draw_completion(completion, source.name), picture)
         terminal.print(f"wrote {picture}")

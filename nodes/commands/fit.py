@@ -39,30 +39,28 @@ def fit(
     smpl: Annotated[Path | None, tyro.conf.arg(metavar="MODEL.npz")] = None,
     force: bool = False,
 ) -> int:
-    """Fit a motion to a recording, with all of it in view: what `clean` cannot do while frames come in.
+    """Fit a motion to a whole recording, offline, by optimisation with a learned motion model (HuMoR).
 
-    Starts from the answer of `clean`, and optimises poses, bones and floor until joints lie where they were seen, steps
-    are likely ones of people, and feet in contact stand still (HuMoR). Takes seconds for a second of a body; finished
-    windows are kept, so that the same call goes on where it was stopped. Where a fit fails, the answer of `clean`
-    stays, flagged as an anomaly.
+    Starts from the result of `clean`, and optimises poses, bones and floor, so that joints match the observations,
+    steps are likely, and feet in contact stand still. Takes several seconds per second of recording and body. If it is
+    stopped, the same command resumes after the last finished window. If a fit fails, the result of `clean` is kept and
+    flagged as an anomaly.
 
-    An .npz may hold, instead of positions, what one camera saw of one person: `keypoints` (T, J, 2) pixels, skeleton,
-    fps or stamp_ns, `focal` and `centre` in pixels, and where known confidence (T, J), `up` (-y, a level camera, unless
-    given) and `camera_height` in metres. Beside either, `points` (T, N, 3) metres of the body's surface, in the same
-    frame, from a depth camera.
+    Instead of positions, an .npz may contain 2D key points of one person from one camera: `keypoints` (T, J, 2)
+    pixels, skeleton, fps or stamp_ns, `focal` and `centre` in pixels, and optionally confidence (T, J), `up` (default
+    -y, a level camera) and `camera_height` in metres. Either kind of .npz may also contain `points` (T, N, 3) metres:
+    surface points of the body from a depth camera, in the same frame.
 
-    Beside OUT lie OUT.misfit.npz, the residual of each joint and frame, with bones and ground, and OUT.fit.png, a
-    picture of it.
+    Also writes OUT.misfit.npz (the residual of each joint and frame, bones and ground) and OUT.fit.png (a plot of it).
 
     Args:
-        source: a recording, a .csv or .npz, as for `clean`; or an .npz with key points.
-        out: the recording to make, or .npz or .csv with one row for each row of the input; of key points, .npz at
-            30 Hz.
-        weights: of the model of transitions: 'default', or a .safetensors file.
-        delay: of `clean`, which initialises the fit, frames at 30 Hz; without effect on key points.
-        smpl: your copy of SMPL or SMPL-H; OUT.smpl.0.npz is its motion, in the form of AMASS' files, and so on for
-            each further body.
-        force: replace what is at OUT, if it is a recording, an .npz or a .csv.
+        source: a recording, .csv or .npz, as for `clean`; or an .npz with key points.
+        out: the result: a recording, or an .npz or .csv with one row per input row. For key points, an .npz at 30 Hz.
+        weights: weights of the motion model: 'default', or a .safetensors file.
+        delay: delay of `clean`, which initialises the fit, in frames at 30 Hz. Not used for key points.
+        smpl: your copy of SMPL or SMPL-H. OUT.smpl.0.npz is then the motion of the first body in AMASS format,
+            OUT.smpl.1.npz that of the second, and so on.
+        force: replace OUT if it is a recording, an .npz or a .csv.
     """
     if not source.exists():
         raise LaunchError(f"{source} does not exist: expected a recording, an .npz or a .csv")

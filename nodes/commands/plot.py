@@ -22,17 +22,17 @@ def plot(
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     over: Annotated[Path | None, tyro.conf.arg(metavar="VIDEO")] = None,
 ) -> None:
-    """Draw what happened in a recording.
+    """Plot a recording as an image or a video.
 
     Args:
-        recording: rosbag2 directory, or one .mcap, with any of pose/raw, pose/clean, pose/world, pose/truth; or a file
-            of poses, as `clean` reads and writes them.
-        output: picture to write: .png, .svg or .pdf; named after the recording, in this folder, if left out.
-        body: id of the body to draw; the one seen the longest if left out.
-        video: moving picture to write instead, .gif or .mp4 (the latter by OpenCV, which the extra 'oak' brings): raw
-            beside clean beside world, as far as the recording has them.
-        over: the video that was cleaned, as in 'steadypose clean walk.mp4 walk': with --video, raw (which an .npz
-            lacks) and clean are drawn over its images. A camera of the field of view that 'clean' takes is assumed.
+        recording: rosbag2 directory or .mcap with any of pose/raw, pose/clean, pose/world, pose/truth; or a file of
+            poses in a format of 'clean'.
+        output: image to write: .png, .svg or .pdf. Default: named after the recording, in the current folder.
+        body: id of the body to draw. Default: the one that is visible longest.
+        video: video to write instead: .gif, or .mp4 (needs the extra 'oak'). It shows raw, clean and world side by
+            side.
+        over: the video that was cleaned, as in 'steadypose clean walk.mp4 walk'. With --video, raw (not in an .npz)
+            and clean are drawn over its images, with the field of view that 'clean' assumes.
 
     Raises:
         RecordingError: the recording cannot be read.
@@ -42,7 +42,7 @@ def plot(
 
     _refuse_folder(recording)
     if over is not None and video is None:
-        raise PlotError("over: expected a video to write as well: --video FILE.mp4")
+        raise PlotError("over: expected --video FILE.mp4 too, the video to write")
     if video is not None:
         from steadypose.nodes.sinks.plot.video import VIDEOS, write_overlay, write_video
 

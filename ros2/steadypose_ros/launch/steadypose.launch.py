@@ -11,9 +11,9 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 ARGUMENTS = {
-    "launch": ("ros2", "a launch file of steadypose with ros2_bridge among its nodes, or the name of one of its own"),
-    "command": ("steadypose", "the program: its path, where it is not on PATH"),
-    "namespace": ("", "of the node and its topics, but for /tf, /tf_static, /clock and /diagnostics"),
+    "launch": ("ros2", "a launch file of steadypose whose nodes include ros2_bridge, or the name of a bundled one"),
+    "command": ("steadypose", "the steadypose program; its path, if it is not on PATH"),
+    "namespace": ("", "namespace of the node and its topics, except /tf, /tf_static, /clock and /diagnostics"),
     "params_file": (
         str(Path(__file__).parents[1] / "config/steadypose.yaml"),
         "parameters: any setting of the launch file",

@@ -20,7 +20,7 @@ const pose = connect();
 
 pose.on("state", (state) => {
   if (ended) return; // the last poses stay
-  notice.textContent = state === "open" ? "" : "no connection: is `steadypose run web` running, and the address its own?";
+  notice.textContent = state === "open" ? "" : "no connection: is `steadypose run web` running, and is this the address that it printed?";
 });
 pose.on("world", (message) => {
   ended = message.end;
